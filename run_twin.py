@@ -50,7 +50,7 @@ app = typer.Typer(no_args_is_help=False, pretty_exceptions_enable=False, rich_ma
 app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
 
 
-@app.callback(invoke_without_command=True, epilog="What the words of the output mean: docs/words.md.")
+@app.callback(invoke_without_command=True, epilog="Terms in the output: docs/words.md.")
 def _without_command(context: typer.Context, version: VersionOption = False) -> None:
     """Plan a needle puncture and rehearse it. Research software, not a medical device."""
     del version  # its callback has printed it
@@ -60,7 +60,7 @@ def _without_command(context: typer.Context, version: VersionOption = False) -> 
 
 @app.command()
 def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> None:
-    """The main job on the embedded abdomen: search, plan, rehearse, report."""
+    """Search, plan, rehearse and report on the embedded abdomen."""
     require_extra("twin", "demo")
     from puncture_twin.twin.jobs.patient import main_job
 
@@ -71,7 +71,7 @@ def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> 
 
 @app.command()
 def schema() -> None:
-    """Print the JSON Schema of case.toml, by which editors complete its keys."""
+    """Print the JSON Schema of case.toml. Editors use it to complete keys."""
     import json
 
     from puncture_twin.planning.case.case_file import case_schema
@@ -82,48 +82,48 @@ def schema() -> None:
 
 @app.command()
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="With a CT and a segmentation.")],
-    target: Annotated[str | None, typer.Option("--target", help="X,Y,Z in mm.")] = None,
-    target_label: Annotated[str | None, typer.Option("--target-label", help="Or the deepest point of this.")] = None,
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with a CT and a segmentation.")],
+    target: Annotated[str | None, typer.Option("--target", help="Target position X,Y,Z, mm.")] = None,
+    target_label: Annotated[str | None, typer.Option("--target-label", help="Its deepest point is the target.")] = None,
     hit_radius: Annotated[
         float | None,
-        typer.Option("--hit-radius", metavar="MM", help="The target is a ball of its own, in no structure."),
+        typer.Option("--hit-radius", metavar="MM", help="The target is a ball of this radius, in no structure."),
     ] = None,
     space: Annotated[
-        Space | None, typer.Option("--space", help="Of the target, of the case, and of meshes.", show_default="LPS")
+        Space | None, typer.Option("--space", help="Space of the target, the case and meshes.", show_default="LPS")
     ] = None,
-    region: Annotated[str | None, typer.Option("--region", help="What the CT shows; else told by organs.")] = None,
+    region: Annotated[str | None, typer.Option("--region", help="Body region; default: inferred from organs.")] = None,
     naming: Annotated[
-        str | None, typer.Option("--naming", help="Of labels: totalsegmentator-v1, -v2, a table.")
+        str | None, typer.Option("--naming", help="Label names: totalsegmentator-v1, -v2, or a table.")
     ] = None,
-    unit: Annotated[Unit | None, typer.Option("--unit", help="Of meshes; else told by their extent.")] = None,
+    unit: Annotated[Unit | None, typer.Option("--unit", help="Unit of meshes; default: inferred from size.")] = None,
     up: Annotated[
         Up | None,
-        typer.Option("--up", help="Axis of meshes that is up: y (turned to z) or z; GLB need it.", show_default="z"),
+        typer.Option("--up", help="Up axis of meshes: y (rotated to z) or z; required for GLB.", show_default="z"),
     ] = None,
-    ct: Annotated[str | None, typer.Option("--ct", help="Which file, where FOLDER holds several CTs.")] = None,
+    ct: Annotated[str | None, typer.Option("--ct", help="CT to use if FOLDER holds several.")] = None,
     segmentation: Annotated[
-        str | None, typer.Option("--segmentation", help="Which file or folder, where FOLDER holds several.")
+        str | None, typer.Option("--segmentation", help="Segmentation to use if FOLDER holds several.")
     ] = None,
     trust_labels: Annotated[
-        bool, typer.Option("--trust-labels", help="You have looked: structures lie right.")
+        bool, typer.Option("--trust-labels", help="Accept the structures; you have checked them on the CT.")
     ] = False,
     skin: Annotated[
-        str | None, typer.Option("--skin", metavar="NAME", help="Structure that is the skin; else the CT's body.")
+        str | None, typer.Option("--skin", metavar="NAME", help="Structure that is the skin; default: found in the CT.")
     ] = None,
     ignore: Annotated[
-        list[str] | None, typer.Option("--ignore", metavar="NAME", help="Structure or file to be left out.")
+        list[str] | None, typer.Option("--ignore", metavar="NAME", help="Structure or file to leave out; repeatable.")
     ] = None,
     unknown: Annotated[
-        list[str] | None, typer.Option("--unknown", metavar="NAME", help="Structure that no path may cross.")
+        list[str] | None, typer.Option("--unknown", metavar="NAME", help="Structure no path may cross; repeatable.")
     ] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Of the case, such as ct.arms=none.")
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a case key, such as ct.arms=none.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a case.toml that is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing case.toml.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write FOLDER/case.toml from what is in the folder: roles and margins from the table of default roles."""
+    """Write FOLDER/case.toml from a CT and a segmentation. Roles and margins are the default ones."""
     from puncture_twin.planning.init.finder import Wanted
     from puncture_twin.planning.init.overrides import overrides_of
     from puncture_twin.planning.init.start import Request
@@ -147,19 +147,19 @@ def search(
     arm: ArmOption = None,
     pictures: PicturesOption = True,
     engine: EngineOption = "fast",
-    check_again: Annotated[int, typer.Option("--cross-check", min=0, help="Directions that FCL measures again.")] = 0,
-    certified: Annotated[bool, typer.Option("--certify", help="Judge the angles between the grid points too.")] = False,
+    check_again: Annotated[int, typer.Option("--cross-check", min=0, help="Directions to measure again with FCL.")] = 0,
+    certified: Annotated[bool, typer.Option("--certify", help="Also certify the angles between grid points.")] = False,
     certify_size: Annotated[
         float | None,
         typer.Option(min=0.05, max=10, help="Smallest cell of --certify, degrees.", show_default="0.25"),
     ] = None,
     certify_touch: Annotated[
         float | None,
-        typer.Option(metavar="P", help="With --certify: no structure is touched more often."),
+        typer.Option(metavar="P", help="With --certify: highest chance to touch any structure."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Judge every entry direction of a case; write the table, the map, the scene and the page."""
+    """Check every entry direction of a case. Write the table, the map, the scene and the page."""
     from puncture_twin.twin.jobs.patient import main_job
 
     folder = out_folder(out_dir, case, "search")
@@ -172,11 +172,11 @@ def search(
 
 @app.command()
 def verify(
-    certificate: Annotated[Path, typer.Argument(metavar="CERTIFICATE", help="What search --certify wrote.")],
+    certificate: Annotated[Path, typer.Argument(metavar="CERTIFICATE", help="Written by search --certify.")],
     case: Annotated[Path, typer.Option("--case", help="The case that it certifies.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Prove every cell of a certificate again, with a plain checker that shares none of the fast code."""
+    """Prove every cell of a certificate again. The plain checker shares no code with the fast one."""
     from puncture_twin.twin.jobs.patient import answers
 
     with prepared(case, arm=False) as context:
@@ -191,21 +191,21 @@ def check(
     choice: Choice,
     arm: ArmOption = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE.png", help="Draw the CT's slices about it.")
+        Path | None, typer.Option("--picture", metavar="FILE.png", help="Write the CT slices through the path.")
     ] = None,
     every: Annotated[bool, typer.Option("--all", help="List every structure, not only the nearest.")] = False,
     entries: Annotated[
-        Path | None, typer.Option("--entries", metavar="FILE", help="Check every row: entries, or angles.")
+        Path | None, typer.Option("--entries", metavar="FILE", help="Check every row of a list of entries or angles.")
     ] = None,
     targets: Annotated[
-        Path | None, typer.Option("--targets", metavar="FILE", help="Check every row: each another target.")
+        Path | None, typer.Option("--targets", metavar="FILE", help="Check every row of a list of targets.")
     ] = None,
     out_dir: Annotated[
-        Path | None, typer.Option("--out", help="Folder for checked.csv and checked.parquet of a list.")
+        Path | None, typer.Option("--out", help="Folder for the checked.csv and checked.parquet of a list.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Explain one candidate in full, the best where none is named; or check a list, a row a row."""
+    """Explain one candidate in full, or check a list. Without a choice, the best candidate is explained."""
     from puncture_twin.planning.search.choice import explain_choice
     from puncture_twin.planning.search.explain import NEAREST
     from puncture_twin.twin.jobs.choosing.list_job import check_list, lists_of
@@ -227,17 +227,17 @@ def check(
 @app.command()
 def compare(
     source: SourceArgument,
-    other: Annotated[Path | None, typer.Argument(metavar="PLAN_B", help="The other plan.json, of two plans.")] = None,
-    case: Annotated[Path | None, typer.Option("--case", help="Of two plans: check them again.")] = None,
-    theta: Annotated[list[float] | None, typer.Option("--theta", min=0, max=180, help="As for check; twice.")] = None,
-    beta: Annotated[list[float] | None, typer.Option("--beta", min=0, max=360, help="As for check; twice.")] = None,
-    rank: Annotated[list[int] | None, typer.Option("--rank", min=1, help="As for check; may be repeated.")] = None,
-    window: Annotated[list[int] | None, typer.Option("--window", min=1, help="The same.")] = None,
-    entry: Annotated[list[str] | None, typer.Option("--entry", metavar="X,Y,Z", help="The same.")] = None,
+    other: Annotated[Path | None, typer.Argument(metavar="PLAN_B", help="The second plan.json, to compare.")] = None,
+    case: Annotated[Path | None, typer.Option("--case", help="Case of the two plans: checks them again.")] = None,
+    theta: Annotated[list[float] | None, typer.Option("--theta", min=0, max=180, help="See check; repeatable.")] = None,
+    beta: Annotated[list[float] | None, typer.Option("--beta", min=0, max=360, help="See check; repeatable.")] = None,
+    rank: Annotated[list[int] | None, typer.Option("--rank", min=1, help="See check; repeatable.")] = None,
+    window: Annotated[list[int] | None, typer.Option("--window", min=1, help="See check; repeatable.")] = None,
+    entry: Annotated[list[str] | None, typer.Option("--entry", metavar="X,Y,Z", help="See check; repeatable.")] = None,
     arm: ArmOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show two paths side by side: two choices of a case, one and the best, or two plans; 1 where one is rejected."""
+    """Compare two paths of a case, or two plans. One choice is compared with the best. Exit 1 if one is rejected."""
     from puncture_twin.twin.jobs.choosing.compare_job import compare_source
 
     stated = (theta or [], beta or [], rank or [], window or [], entry or [])
@@ -254,7 +254,7 @@ def plan(
     out_dir: OutOfCaseOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Search, plan to the best candidate that the arm can come to, or to the one that is named; write plan.json."""
+    """Plan the arm's motion to the best or a chosen candidate. Searches first, and writes plan.json."""
     from puncture_twin.twin.jobs.patient import main_job
 
     folder = out_folder(out_dir, case, "plan")
@@ -271,17 +271,17 @@ def rehearse(
     case: Annotated[Path | None, typer.Option("--case", help="The case of a plan.json.")] = None,
     out_dir: OutOfCaseOption = None,
     seeds: Annotated[
-        int | None, typer.Option("--seeds", min=1, max=1_000_000, help="Rooms, each with a truth of its own.")
+        int | None, typer.Option("--seeds", min=1, max=1_000_000, help="Trials, each with its own ground truth.")
     ] = None,
-    physics: Annotated[int, typer.Option("--physics", min=0, max=MOST_SEEDS, help="Of them in the simulator.")] = 0,
-    sweep: Annotated[bool, typer.Option("--sweep", help="Turn the needle about the target instead, outside.")] = False,
+    physics: Annotated[int, typer.Option("--physics", min=0, max=MOST_SEEDS, help="Trials run in the simulator.")] = 0,
+    sweep: Annotated[bool, typer.Option("--sweep", help="Rotate the needle about the target, outside.")] = False,
     to: Annotated[
         str | None,
-        typer.Option("--to", metavar="THETA,BETA", help="Where it ends.", show_default="its window's farthest"),
+        typer.Option("--to", metavar="THETA,BETA", help="End of the sweep.", show_default="its window's farthest"),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Execute a plan in the twin, where the truth differs from the belief, and say where the tip ended."""
+    """Execute a plan in the twin; report where the tip ended. The ground truth differs from the belief."""
     require_extra("twin", "rehearse")
     from puncture_twin.twin.jobs.experiment.sweep_job import sweep_case, sweep_end, sweep_text
     from puncture_twin.twin.jobs.patient import main_job
@@ -308,10 +308,10 @@ def touch(
     case: CaseArgument,
     choice: Choice,
     out_dir: OutOfCaseOption = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**31 - 1, help="Of the motions and of the truth.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, max=2**31 - 1, help="Seed of motions and ground truth.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Plan how markers are touched for a puncture, touch them in the twin, write touch.csv; 1 if too few were."""
+    """Plan the marker touches and execute them in the twin. Writes touch.csv. Exit 1 if too few were touched."""
     require_extra("twin", "touch")
     from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
 
@@ -326,22 +326,20 @@ def pivot(
     case: CaseArgument,
     joints: Annotated[
         Path | None,
-        typer.Argument(metavar="JOINTS.csv", help="Touches of one place: a line a pose, with q1_deg to q6_deg."),
+        typer.Argument(metavar="JOINTS.csv", help="Touches of one point: one pose per line, with q1_deg to q6_deg."),
     ] = None,
     out_dir: OutOfCaseOption = None,
-    poses: Annotated[
-        int | None, typer.Option("--poses", help="How many, in the twin: 4 to 12.", show_default="8")
-    ] = None,
+    poses: Annotated[int | None, typer.Option("--poses", help="Poses in the twin, 4 to 12.", show_default="8")] = None,
     at: Annotated[
         str | None,
-        typer.Option("--at", metavar="X,Y,Z", help="Where, mm, base frame.", show_default="beside the patient"),
+        typer.Option("--at", metavar="X,Y,Z", help="Touched point, mm, base frame.", show_default="beside the patient"),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", min=0, max=2**31 - 1, help="Of the truth.", show_default="0")
+        int | None, typer.Option("--seed", min=0, max=2**31 - 1, help="Seed of the ground truth.", show_default="0")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the needle's tip on the flange: from touches of one place, or executed in the twin; 1 if they contradict."""
+    """Find the tip on the flange from touches of one point. Read, or executed in the twin. Exit 1 on contradiction."""
     from puncture_twin.planning.case.case import load_case
     from puncture_twin.twin.jobs.experiment import pivot_job
 
@@ -381,19 +379,17 @@ def place(
 
 @app.command()
 def mirror(
-    case: Annotated[Path, typer.Option("--case", help="The case whose patient the arm stands at.")],
-    host: Annotated[
-        str | None, typer.Argument(metavar="HOST", help="Address of a running UR; it is only read.")
-    ] = None,
+    case: Annotated[Path, typer.Option("--case", help="Case of the patient.")],
+    host: Annotated[str | None, typer.Argument(metavar="HOST", help="Address of a running UR (read only).")] = None,
     recorded: Annotated[
         Path | None,
-        typer.Option("--from", help="A CSV with time_s and q1_rad..q6_rad, or of RTDE."),
+        typer.Option("--from", help="CSV with time_s and q1_rad to q6_rad, or a recording of RTDE."),
     ] = None,
-    seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="How long; else until Ctrl-C.")] = None,
-    rate: Annotated[float, typer.Option("--rate", min=0.1, max=125, help="Readings a second.")] = 10.0,
+    seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="Duration; default: until Ctrl-C.")] = None,
+    rate: Annotated[float, typer.Option("--rate", min=0.1, max=125, help="Readings per second.")] = 10.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Show a running arm's needle in the CT: tip, distance to the target. Writes nothing to the robot."""
+    """Show a running arm's needle in the CT. Prints tip and distance to the target; only reads the robot."""
     from puncture_twin.planning.base.provenance import inputs_document
     from puncture_twin.planning.case.case import load_case
     from puncture_twin.twin.jobs.robot.mirror import Mirror, mirror_text, readings_of
@@ -422,14 +418,14 @@ def export(
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="urscript, ros2, moveit, csv, slicer, candidates-csv, candidates-json, or a package's own.",
+            help="urscript, ros2, moveit, csv, slicer, candidates-csv, candidates-json, or one of another package.",
         ),
     ],
-    case: Annotated[Path | None, typer.Option("--case", help="The plan's case: check the plan again.")] = None,
+    case: Annotated[Path | None, typer.Option("--case", help="Case of the plan: checks the plan again.")] = None,
     out_dir: OutOfCaseOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a plan for a robot, read back and within the arm's limits. Research software, not a medical device."""
+    """Export a plan for a robot, or a path for 3D Slicer. It is read back. Research software, not a medical device."""
     from puncture_twin.twin.jobs.patient.export_jobs import export_source, refuse_format
 
     refuse_format(format_name)
@@ -443,19 +439,19 @@ def export(
 def register(
     source: Annotated[Path, typer.Argument(metavar="CASE_OR_MARKERS_CT", help="A case, or markers read in the CT.")],
     markers_base: Annotated[
-        Path | None, typer.Argument(metavar="MARKERS_BASE", help="The same markers as the robot touched them.")
+        Path | None, typer.Argument(metavar="MARKERS_BASE", help="The same markers, touched by the robot.")
     ] = None,
-    target: Annotated[str | None, typer.Option("--target", help="X,Y,Z in mm, of two lists of markers.")] = None,
+    target: Annotated[str | None, typer.Option("--target", help="Target X,Y,Z, mm, for two lists of markers.")] = None,
     space: Annotated[
-        Space, typer.Option("--space", help="Of the CT's list and the target, where the file is silent.")
+        Space, typer.Option("--space", help="Space of the CT list and the target, if the file states none.")
     ] = Space.LPS,
     fle: Annotated[float | None, typer.Option("--fle", min=0.001, help="Known localisation error (rms), mm.")] = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE.png", help="Draw a case's error budget.")
+        Path | None, typer.Option("--picture", metavar="FILE.png", help="Write a picture of the case's error budget.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Register a case's markers, or two lists of markers; print residuals, the expected error and its sources."""
+    """Register markers; print residuals and expected error. They are a case's, or two lists."""
     from puncture_twin.twin.jobs.patient import answers
 
     report = answers.register_report(source, markers_base, target, space, fle)
@@ -469,12 +465,12 @@ def register(
 @app.command()
 def selfcal(
     case: Annotated[Path | None, typer.Argument(metavar="[CASE]", help="selfcal.toml or its folder.")] = None,
-    recording: Annotated[Path | None, typer.Option("--recording", help="Calibrate this CSV, or its folder.")] = None,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Rooms that are drawn.")] = 3,
+    recording: Annotated[Path | None, typer.Option("--recording", help="Recording: a CSV, or its folder.")] = None,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Number of trials.")] = 3,
     out_dir: OutOption = Path("out/selfcal"),
     as_json: JsonOption = False,
 ) -> None:
-    """Let two arms calibrate themselves by ultrasound, AXP = YBQ, and send the needle to targets in the image."""
+    """Calibrate two arms by ultrasound, AXP = YBQ. Then send the needle to targets in the image."""
     require_extra("twin", "selfcal")
     from puncture_twin.twin.jobs.selfcal.job import run_selfcal
     from puncture_twin.twin.jobs.selfcal.report import selfcal_facts, selfcal_text
@@ -489,16 +485,16 @@ def selfcal(
 def servo(
     case: Annotated[Path, typer.Argument(metavar="CASE", help="Servo case, or the folder that holds servo.toml.")],
     out_dir: OutOfCaseOption = None,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="How many rooms to draw.")] = 1,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="Number of trials.")] = 1,
     recording: Annotated[
         Path | None, typer.Option("--recording", metavar="FOLDER", help="Read this recorded session instead.")
     ] = None,
     record: Annotated[
-        Path | None, typer.Option("--record", metavar="FOLDER", help="Keep the first session there, to be read again.")
+        Path | None, typer.Option("--record", metavar="FOLDER", help="Keep the first session in this new folder.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Servo the tool onto every target by two cameras, in rooms whose truth is drawn; pictures, plot and page."""
+    """Guide the tool to every target with two cameras. Errors are drawn per trial. Writes pictures, plot and page."""
     require_extra("twin", "servo")
     from puncture_twin.twin.jobs.servo.job import follow_recording, refuse_with_recording, run_servo
 
@@ -518,20 +514,22 @@ def servo(
 def scan(
     case: CaseArgument,
     out_dir: OutOfCaseOption = None,
-    spacing: Annotated[float, typer.Option("--spacing", min=0.3, max=10, help="Of slices as thick, mm.")] = 2.5,
+    spacing: Annotated[float, typer.Option("--spacing", min=0.3, max=10, help="Slice spacing (thickness), mm.")] = 2.5,
     pixel: Annotated[float, typer.Option("--pixel", min=0.2, max=5, help="Side of a pixel, mm.")] = 0.8,
-    noise: Annotated[float, typer.Option("--noise", min=0, max=200, help="Standard deviation, HU.")] = 20.0,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of noise, grid and the markers' true places.")] = 0,
+    noise: Annotated[float, typer.Option("--noise", min=0, max=200, help="Noise (standard deviation), HU.")] = 20.0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of noise, grid and true marker positions.")] = 0,
     fov: Annotated[
         float | None, typer.Option("--fov", min=20, max=2000, help="Side of the image, mm.", show_default="the body")
     ] = None,
     length: Annotated[
-        float | None, typer.Option("--length", min=5, max=5000, help="About the target.", show_default="the body")
+        float | None, typer.Option("--length", min=5, max=5000, help="Scan length, mm.", show_default="the body")
     ] = None,
-    turn: Annotated[float, typer.Option("--turn", min=-180, max=180, help="The patient's, about the bed, °.")] = 0.0,
-    marker: Annotated[str, typer.Option("--marker", metavar="disc|ball|none", help="Of metal, 8 mm.")] = "disc",
+    turn: Annotated[
+        float, typer.Option("--turn", min=-180, max=180, help="Rotation about the bed's axis, degrees.")
+    ] = 0.0,
+    marker: Annotated[str, typer.Option("--marker", metavar="disc|ball|none", help="Metal markers, 8 mm.")] = "disc",
     rehearsal: Annotated[
-        Path | None, typer.Option("--rehearsal", metavar="rehearsal.json", help="Its needle in a control CT.")
+        Path | None, typer.Option("--rehearsal", metavar="rehearsal.json", help="Show the needle of a rehearsal.")
     ] = None,
     arms: Annotated[
         str,
@@ -541,12 +539,12 @@ def scan(
     ] = "none",
     bed: Annotated[
         str,
-        typer.Option("--bed", metavar="none|flat|curved|pad", help="Mattress on a flat table, curved table, or gel."),
+        typer.Option("--bed", metavar="none|flat|curved|pad", help="Mattress on a flat or curved table, or a gel pad."),
     ] = "none",
-    lines: Annotated[int, typer.Option("--lines", min=0, max=12, help="Tubes and cables over the skin.")] = 0,
+    lines: Annotated[int, typer.Option("--lines", min=0, max=12, help="Number of tubes and cables over the skin.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Scan a case with a virtual CT; write DICOM, NIfTI, labels, and what is read off it beside the truth."""
+    """Scan a case with a virtual CT. Write DICOM, NIfTI, labels, and its readings next to the ground truth."""
     from math import radians
 
     from puncture_twin.twin.jobs.experiment.scan_job import (
@@ -567,18 +565,18 @@ def scan(
 
 @app.command()
 def reproduce(
-    paper: Annotated[str, typer.Argument(metavar="chen2019|liu2007|axp-ybq", help="Which paper.")],
+    paper: Annotated[str, typer.Argument(metavar="chen2019|liu2007|axp-ybq", help="Paper to reproduce.")],
     out_dir: OutOfCaseOption = None,
-    seeds: Annotated[int | None, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="How many draws, if any.")] = None,
+    seeds: Annotated[int | None, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="Number of draws.")] = None,
     experiment: Annotated[
-        bool, typer.Option("--experiment", help="Of chen2019: draw its experiment anew, --seeds times.")
+        bool, typer.Option("--experiment", help="For chen2019: draw its experiment anew, --seeds times.")
     ] = False,
     runs: Annotated[
-        int, typer.Option("--runs", min=0, max=MOST_SEEDS, help="Of --experiment: so many in the simulator too.")
+        int, typer.Option("--runs", min=0, max=MOST_SEEDS, help="With --experiment: runs in the simulator.")
     ] = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Print a paper's numbers beside ours; exit 0 only if every one holds."""
+    """Print a paper's numbers next to ours. Exit 0 only if all are within their limits."""
     require_extra("twin", "reproduce")
     from puncture_twin.twin.jobs.papers.papers import reproduced
 

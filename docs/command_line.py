@@ -11,10 +11,10 @@ HEAD = """# Command line
 
 `run-twin COMMAND` where the package is installed, `python run_twin.py COMMAND` from a checkout; without a command it
 prints its help, and `--version` prints the version. Exit codes: 0 done; 1 done, and the answer is no; 2 bad input, one
-line that says what, where and what is allowed; 3 the program failed; 130 interrupted; 141 nobody reads what it prints
-(as after `| head -1`). With `--json` stdout holds one JSON object and nothing else; progress goes to stderr. Where bad
-input is refused, or nothing is found, the object has `error` alone: `code` (the kind of mistake:
-[sentences.md](sentences.md)), `sentence`, `where`, `allowed`, `numbers`; the line stands on stderr as ever. Without
+line that says what, where and what is allowed; 3 the program failed; 130 interrupted; 141 the reader closed the pipe
+(as in `| head -1`). With `--json` stdout holds one JSON object and nothing else; progress goes to stderr. Where bad
+input is refused, or nothing is found, the object has only `error`: `code` (the kind of mistake:
+[sentences.md](sentences.md)), `sentence`, `where`, `allowed`, `numbers`; the line is also on stderr. Without
 `--out` files go to `out/`, into a folder named after case and command (`out/abdomen-search`). What is written:
 [outputs.md](outputs.md).
 

@@ -17,12 +17,12 @@ ROOMS = ("planning", "twin", "puncture_twin/api.py", "run_twin.py")
 
 HEAD = """# Sentences
 
-What the program says where it refuses an input (exit code 2), answers no (1), or finds something odd in inputs that fit
-(a finding, with its severity). The code says what kind of mistake it is, and is the same wherever that kind is found;
-`--json` prints it. `{...}` stands for a value, or for words that depend on the input. `bad_value` is also a key of
-another type or range, in Pydantic's own words.
+Every sentence with which the program refuses an input (exit code 2), answers no (1), or reports a finding (with its
+severity). The code is the kind of mistake, the same everywhere; `--json` prints it. `{...}` is a value, or words that
+depend on the input. `bad_value` is also a key of another type or range ("must be 0.1 or more"). How the sentences are
+written: [words](../words.md#how-texts-are-written).
 
-*Written by `python docs/sentences.py` from the source, and held beside it by a test.*
+*Written by `python docs/sentences.py` from the source; a test compares them.*
 
 | code | kind | room | sentence | allowed |
 |---|---|---|---|---|

@@ -212,8 +212,8 @@ def make_rehearsal(plan, *, shift=(0.6, 0.0, 0.8), total_s=2.0):
         predicted_error_mm=1.25,
         target_true_ct=plan.target_ct,
         truth_is_belief=False,
-        followed_text="by a spring at the tip (impedance), at most 0.010 mm off its commanded path",
-        force_text="no force of tissue: the case declares none ([tissue])",
+        followed_text="with a spring at the tip (impedance), at most 0.010 mm off its commanded path",
+        force_text="no force of tissue: the case declares no [tissue]",
         standing=None,
     )
 

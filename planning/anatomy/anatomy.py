@@ -35,14 +35,14 @@ UNNAMED_DENSE, UNNAMED_GAS = "unnamed_dense", "unnamed_gas"
 """Names of the structures that the CT adds."""
 
 OUTSIDE_NOT_KNOWN = (
-    "outside of the body: not known (no CT; [ct] file names one), so table, clothes and arms count as air"
+    "outside the body: not known (no CT; [ct] file can state one), so table, clothes and arms count as air"
 )
 
-LIMB_ATTACHED = "a limb seems to be pressed against the part of the body that holds the target"
+LIMB_ATTACHED = "a limb seems to be pressed against the trunk"
 NO_ARMS = '[ct] arms = "none"'
 """The line that overrules the rule."""
 
-UNNAMED_FREE = '[ct] unnamed = "free": what the CT shows inside the body beside the structures is not checked'
+UNNAMED_FREE = '[ct] unnamed = "free": what the CT shows inside the body outside the structures is not checked'
 
 CELLS = 24
 """Along the ball's diameter."""
@@ -126,7 +126,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
             guesses.append(guessed(ATTACHED_LIMB, LIMB_ATTACHED, limb.volume / 1e3, body_side(limb, skin), NO_ARMS))
         if case.ct.unnamed == "free":
             loader.warnings.append(UNNAMED_FREE)
-        progress("what no structure names")
+        progress("unnamed tissue in the body")
         structures.extend(_unnamed(case, scan, structures))
     unseen, beyond = beyond_images(case, skin, scan), beyond_labels(case, skin, structures, cache.memory)
     outside = (*outside, *unseen.structures)
@@ -150,7 +150,7 @@ def guessed(code: str, what: str, volume: float, side: str, overrule: str) -> Fi
         overrule: The line of the case.
     """
     said = (
-        f"{what}: {volume / 1000:.1f} l at its {side} side (slices.png shows it); paths through it are unknown_region "
+        f"{what}: {volume / 1000:.1f} l at its {side} side (see slices.png); paths through it are unknown_region "
         f"({code}); if that is wrong: {overrule}"
     )
     return Finding(code, Severity.WARNING, said, {"volume_ml": volume, "side": side, "overruled_by": overrule})
@@ -227,10 +227,10 @@ def _check_names(case: Case, structures: list[Structure]) -> None:
     names = [structure.name for structure in structures]
     twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
-        refuse(f"structure '{twice[0]}' stands twice", case.path, "unique names", "duplicate_name")
+        refuse(f"structure '{twice[0]}' appears twice", case.path, "unique names", "duplicate_name")
     if case.target_structure not in names:
         what = (
-            f"target.structure '{case.target_structure}' is no structure of the case"
+            f"target.structure '{case.target_structure}' is not a structure of the case"
             f"{did_you_mean(case.target_structure, names)}"
         )
         refuse(what, case.path, ", ".join(names), "unknown_structure")
@@ -239,7 +239,7 @@ def _check_names(case: Case, structures: list[Structure]) -> None:
 def _check_demands(case: Case, structures: list[Structure]) -> None:
     """Refuse a patient without margins: every path would be "safe". A phantom may hold nothing but its target."""
     if case.region != "phantom" and not any(structure.demands_margin for structure in structures):
-        what = "no structure is to be avoided, so that no verdict would say anything about safety"
+        what = 'no structure has role "avoid" or "unknown", so no verdict would say anything about safety'
         refuse(what, case.path, 'a structure of role "avoid" or "unknown", or region = "phantom"', "nothing_to_avoid")
 
 

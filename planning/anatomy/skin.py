@@ -104,13 +104,13 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
     """
     where = f"{labelmap.path}, label {label}"
     if label not in labelmap.boxes:
-        allowed = f"the labels present: {', '.join(map(str, labelmap.labels_present()))}"
+        allowed = f"labels present: {', '.join(map(str, labelmap.labels_present()))}"
         refuse("no voxel has the label of the skin", where, allowed, "label_absent")
     oriented = canonical(labelmap.labels, labelmap.T_ct_index)
     box = box or tuple((0, n) for n in oriented.values.shape)
     body = filled_slices(oriented.values[tuple(slice(*ends) for ends in box)] == label)
     if body.all():
-        refuse("no air around the body", where, "a label with a border inside the image", "no_air")
+        refuse("no air around the body", where, "a label whose border lies inside the image", "no_air")
     T_ct_box = shifted(oriented.T_ct_index, box)
     return _skin(mask_surface(body, T_ct_box, where=where), BodyMask(body, np.zeros_like(body), ()), T_ct_box)
 
@@ -126,9 +126,7 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
         InputError: If no triangle lies in the plane where a side was cut.
     """
     mesh = split_at_creases(mesh)
-    warnings = (
-        () if mesh.closed else ("the skin mesh is open: what lies inside it, and where it is missing, is not known",)
-    )
+    warnings = () if mesh.closed else ("the skin mesh is open: its inside, and where skin is missing, are not known",)
     if not cut:
         return Skin(mesh, np.zeros(len(mesh.faces), dtype=np.bool_), None, warnings)
     low, high = mesh.bounds
@@ -139,7 +137,7 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
         sides[axis, end] = True
         in_plane = np.all(np.abs(mesh.triangles[:, :, axis] - (low, high)[end][axis]) < CUT_PLANE_MM, axis=1)
         if not in_plane.any():
-            refuse(f"no flat end at its {name}", "skin mesh", "a side where the body was cut", "no_flat_end")
+            refuse(f"no flat end at side {name}", "skin mesh", "a side at which the body was cut", "no_flat_end")
         cut_faces |= in_plane
     return Skin(mesh, cut_faces, FieldOfView(pose(np.eye(3), low), high - low, sides), warnings)
 

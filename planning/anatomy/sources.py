@@ -15,7 +15,7 @@ from puncture_twin.planning.anatomy.surfaces import Imaged, VolumeSurfaces, cach
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Names
-from puncture_twin.planning.base.text import first_few
+from puncture_twin.planning.base.text import first_few, plural
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.tables import StructureSection, StructuresSection
 from puncture_twin.planning.formats.labels.label_sources import check_one_grid
@@ -26,7 +26,7 @@ from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, ref
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up, parse_space, parse_unit
 
-EMPTY_MASKS = "{folder}: {count} masks are empty, so that nothing is there: {names}"
+EMPTY_MASKS = "{folder}: {empty}: {names}"
 
 
 class StructureSources:
@@ -82,7 +82,8 @@ class StructureSources:
         present = [number for number, mask in masks.items() if mask.labels]
         self.warnings.extend(said for number, mask in masks.items() for said in mask.notes(Path(files[names[number]])))
         if empty := [name for number, name in names.items() if number not in present]:
-            self.warnings.append(EMPTY_MASKS.format(folder=folder, count=len(empty), names=first_few(empty)))
+            count = plural(len(empty), "empty mask")
+            self.warnings.append(EMPTY_MASKS.format(folder=folder, empty=count, names=first_few(empty)))
         rules = self._kept_rules(section, names, present)
         return [partial(self._ruled, rule, None, files[rule.name], *masks[rule.label].labels) for rule in rules]
 
@@ -121,7 +122,7 @@ class StructureSources:
             return []
         names = (volume.names or {}) if name.lower().endswith(NRRD_ENDINGS) else {}
         shown = first_few([f"{label} {names[label]}" if label in names else str(label) for label in others])
-        return [f"{name} holds labels that the case does not name, and they count as free: {shown}"]
+        return [f"{name} has labels that the case does not list; they count as free: {shown}"]
 
     def skin(self, section: StructureSection, structures: Sequence[Structure] = ()) -> Skin:
         """The body's surface, from whatever the case names.
@@ -137,8 +138,8 @@ class StructureSources:
         local = self._case.space is Space.LOCAL or section.cut is not None
         ends = () if local else kept.get((flat_ends.__name__, mesh.digest), partial(flat_ends, mesh), _no_bytes)
         if ends:
-            what = f"skin mesh {section.mesh} ends flat at its {', '.join(ends)} side: was the body cut there?"
-            allowed = f"cut = {json.dumps(ends)} where no skin is, or cut = [] if all of it is skin"
+            what = f"skin mesh {section.mesh} has a flat end at side {', '.join(ends)}: was the body cut there?"
+            allowed = f"cut = {json.dumps(ends)} where there is no skin, or cut = [] if all of it is skin"
             refuse(what, self._case.path, allowed, "skin_cut_unstated")
         cut = section.cut or ()
         return cached_skin(mesh, cut, self._cache)
@@ -158,16 +159,16 @@ class StructureSources:
         """The CT of the case: of its skin, or the one that ``[ct]`` names; None where there is none."""
         own, named = skin_section.ct, self._case.ct.file
         if own is not None and named not in {None, own}:
-            allowed = "one CT: leave out [ct] file where the skin comes from a CT"
+            allowed = "one CT: omit [ct] file if the skin comes from a CT"
             refuse(f"[ct] file '{named}' is not the CT of the skin, '{own}'", self._case.path, allowed, "several_cts")
         name = own or named
         if name is None:
             return None
-        self._progress("CT beside the structures")
+        self._progress("CT with the structures")
         seen = self._seen(name, None, structures, skin_section.cut if own else None)
         if not seen.surfaces.source.grid.holds(self._case.target_ct):
-            what = f"[ct] file '{name}' does not show the target: a slip of file or space?"
-            allowed = "a CT that holds the target, in the space of the structures"
+            what = f"[ct] file '{name}' does not contain the target: wrong file or space?"
+            allowed = "a CT that contains the target, in the space of the structures"
             refuse(what, self._case.path, allowed, "target_outside_ct")
         return Scan(name, seen, None if own else skin)
 

@@ -59,7 +59,7 @@ class Present(NamedTuple):
 
     def notes(self, path: Path) -> tuple[str, ...]:
         """Notes for a person on how a file was read."""
-        said = f"{path.name}: its labels are up to {self.rounded_by:.2g} off whole numbers, and were rounded"
+        said = f"{path.name}: its labels differ from whole numbers by up to {self.rounded_by:.2g} and were rounded"
         return (said,) if self.rounded_by else ()
 
 

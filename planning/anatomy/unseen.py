@@ -75,7 +75,7 @@ def beyond_images(case: Case, skin: Skin, scan: Scan | None) -> Beyond:
     found = [assumed(case, view, skin) for view, _ in ends]
     mesh = joined([beyond_image(*end, one.wider_mm, _breath(case)) for end, one in zip(ends, found, strict=True)])
     solid = Structure(BEYOND_IMAGE, Role.UNKNOWN, case.ct.margin_mm, mesh, "beyond the image", True, np.zeros((3, 3)))
-    own = "; cut of the skin's table, [] if all of it is skin" if case.skin_section.mesh else ""
+    own = "; set cut in the skin's table, [] if all of it is skin" if case.skin_section.mesh else ""
     said = [_finding(view, one, own) for (view, _), one in zip(ends, found, strict=True)]
     return Beyond((solid,), tuple({one.sentence: one for one in said}.values()))
 
@@ -93,8 +93,8 @@ def assumed(case: Case, view: FieldOfView, skin: Skin) -> Assumed:
     if ct.arms == "none" or case.region == "phantom":
         return Assumed(USUAL_MM, "no arms" if ct.arms == "none" else "a phantom")
     if not view.cut[0].any() and (ct.arms == "present" or _shows_arms(skin.mesh)):
-        return Assumed(USUAL_MM, "the image shows the arms, and the body's whole width")
-    return Assumed(np.inf, "nothing says where the arms lie")
+        return Assumed(USUAL_MM, "the image shows the arms and the whole width of the body")
+    return Assumed(np.inf, "the position of the arms is not known")
 
 
 def _shows_arms(skin: TriangleMesh) -> bool:
@@ -178,9 +178,9 @@ def _breath(case: Case) -> Floats:
 def _finding(view: FieldOfView, what: Assumed, own: str) -> Finding:
     names = ", ".join(name for name, (axis, end) in SIDES.items() if view.cut[axis, end])
     everything = bool(np.isinf(what.wider_mm))
-    wide = "all beyond it" if everything else f"the body drawn on, {what.wider_mm:g} mm wider to its sides,"
-    said = f"the body is cut at its {names} side: no skin is known there, and {wide} is unknown to needle and arm"
-    way_out = '; [ct] arms = "none" where no arm lies there, or beyond_mm' if everything else ""
+    wide = "all space beyond it" if everything else f"the body extended, {what.wider_mm:g} mm wider on each side,"
+    said = f"the body is cut at its {names} side: the skin is not known there, and {wide} is unknown to needle and arm"
+    way_out = '; [ct] arms = "none" if no arm is there, or beyond_mm' if everything else ""
     numbers = {"beyond_mm": "all" if everything else what.wider_mm}
     return Finding(BEYOND_IMAGE, Severity.WARNING, f"{said} ({BEYOND_IMAGE}; {what.because}{way_out}{own})", numbers)
 
@@ -195,7 +195,7 @@ CELL_MM = 2.0
 """Least edge of the cells by which the body beyond a map is found; it is widened by one cell to all sides."""
 
 ENDS = (
-    "label map {name} ends {voxels:.0f} voxels inside the body, within the needle's reach: what lies beyond is unknown"
+    "label map {name} ends {voxels:.0f} voxels inside the body, within the needle's reach: the space beyond is unknown"
 )
 
 
@@ -267,8 +267,8 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure], memor
         margin = _largest_margin(case, grid, structures) + float(grid.voxels.spacing_mm.max()) / 2
         extent = _extent(case, skin.mesh, grid, margin, memory)
         if not grid.voxels.holds(case.target_ct):
-            what = f"label map {grid.name} ends before the target, so that all about it is unknown"
-            refuse(what, case.path, "label maps that hold the target", "labels_end")
+            what = f"label map {grid.name} does not contain the target, so its surroundings are unknown"
+            refuse(what, case.path, "label maps that contain the target", "labels_end")
         if extent.gaps.max() <= VOXELS_OF_SLACK:
             continue
         said = ENDS.format(name=grid.name, voxels=extent.gaps.max())

@@ -95,7 +95,7 @@ def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop
         return None
     far = singularity(model, path[at])
     if np.isnan(path[at, 0]):
-        what = "the arm does not reach on"
+        what = "the arm cannot reach further"
     elif far.least() > MIN_SINGULARITY:
         what = "a joint would jump"
     else:

@@ -196,9 +196,9 @@ def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[Tr
         next_low, next_high = following.transformed(T_link_next).bounds[:, 2]
         gaps = [(a, b) for a, b in ((high, next_low), (next_high, low)) if b >= a - FLUSH_MM]
         if not model.shipped and (widest := max((b - a for a, b in gaps), default=0.0)) > MOST_GAP_MM:
-            what = f"the shapes of {LINK_NAMES[link]} and {LINK_NAMES[link + 1]} leave a gap of {widest:.4g} mm"
+            what = f"the shapes of {LINK_NAMES[link]} and {LINK_NAMES[link + 1]} are {widest:.4g} mm apart"
             allowed = (
-                f"shapes that meet along their joint's axis, to {MOST_GAP_MM:g} mm: see their unit, scale and origin"
+                f"shapes that touch along their joint's axis, within {MOST_GAP_MM:g} mm: check unit, scale and origin"
             )
             refuse(what, model_urdf(model).where, allowed, "links_apart")
         pins.append(tuple(_pin(a - PIN_ROOT_MM, b + PIN_ROOT_MM) for a, b in gaps))
@@ -243,8 +243,8 @@ def model_urdf(model: UrModel) -> ArmUrdf:
     if model.urdf is not None:
         return model.urdf
     if not model.shipped:
-        what = f"the arm {model.name!r} is known by its numbers alone"
-        refuse(what, "robot", "the case that names its URDF", "urdf_missing")
+        what = f"the arm {model.name!r} is known only by its numbers"
+        refuse(what, "robot", "the case that states its URDF", "urdf_missing")
     return _shipped(model.name)
 
 

@@ -116,6 +116,48 @@ class NoAnswerError(PlanningError):
         super().__init__(message)
 
 
+MUST_BE = MappingProxyType(
+    {
+        "bool_type": "true or false",
+        "int_type": "a whole number",
+        "int_parsing": "a whole number",
+        "float_type": "a number",
+        "float_parsing": "a number",
+        "finite_number": "a finite number",
+        "string_type": "a text in quotes",
+        "tuple_type": "a list in brackets, [ ]",
+        "list_type": "a list in brackets, [ ]",
+        "dict_type": "a table",
+        "model_type": "a table",
+        "literal_error": "{expected}",
+        "enum": "{expected}",
+        "greater_than": "above {gt}",
+        "greater_than_equal": "{ge} or more",
+        "less_than": "below {lt}",
+        "less_than_equal": "{le} or less",
+        "too_short": "a list of {min_length} or more",
+        "too_long": "a list of {max_length} at most",
+        "string_too_short": "a text of {min_length} or more characters",
+        "string_too_long": "a text of {max_length} characters at most",
+        "string_pattern_mismatch": "a text of the pattern {pattern}",
+    }
+)
+"""What a value must be, by Pydantic's name of what is wrong with it."""
+
+
+def schema_words(error: Mapping[str, Any]) -> str:
+    """What is wrong with a key, in this project's words, of one of Pydantic's ``ValidationError.errors()``.
+
+    >>> schema_words({"type": "less_than_equal", "msg": "Input should be ...", "ctx": {"le": 10.0}})
+    'must be 10 or less'
+    """
+    if error["type"] == "missing":
+        return "missing"
+    words = MUST_BE.get(error["type"])
+    given = {name: f"{value:g}" if isinstance(value, float) else value for name, value in error.get("ctx", {}).items()}
+    return str(error["msg"]).removeprefix("Value error, ") if words is None else "must be " + words.format(**given)
+
+
 class CacheWarning(UserWarning):
     """Something kept from an earlier run could not be trusted and was made anew: the answer is the same."""
 
@@ -210,7 +252,9 @@ def _install_line(extra: str, missing: list[str]) -> str:
     if all(name in NO_WHEEL_FROM and sys.version_info >= NO_WHEEL_FROM[name][1] for name in missing):
         names = " ".join(NO_WHEEL_FROM[name][0] for name in missing)
         version = ".".join(map(str, sys.version_info[:2]))
-        return f"pip install {names} (no wheel for Python {version}: built in some minutes, with a C++ compiler)"
+        return (
+            f"pip install {names} (no wheel for Python {version}: it is built in some minutes and needs a C++ compiler)"
+        )
     parts = Path(__file__).parents[2]
     if (parts / "pyproject.toml").is_file():
         return f"pip install --editable '{parts}[{extra}]'"

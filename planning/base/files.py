@@ -86,7 +86,7 @@ def atomic(path: Path) -> Iterator[Path]:
     except OSError as error:
         what = f"cannot be written ({error.strerror})"
         where = _shown(path)
-        raise InputError(what, where=where, allowed="a folder that may be written to", code="unwritable") from error
+        raise InputError(what, where=where, allowed="a writable folder", code="unwritable") from error
     os.close(handle)
     temporary = Path(name)
     temporary.chmod(0o644)
@@ -105,7 +105,7 @@ def check_writable(folder: Path | str) -> Path:
     Raises:
         InputError: The name cannot be used, something else stands there, or it may not be written to.
     """
-    allowed = "a folder that may be written to, or the name of a new one"
+    allowed = "a writable folder, or a new name"
     if not isinstance(folder, str | Path):
         refuse(f"a {type(folder).__name__} is no path", "output folder", allowed, "wrong_type")
     folder = Path(folder)
@@ -149,12 +149,14 @@ def read_input(path: Path, *, max_bytes: int, where: str, allowed: str = "") -> 
     try:
         if not path.exists():
             other = _other_case(path)
-            refuse(f"no such file; there is '{other}'" if other else "no such file", where, allowed, "no_such_file")
+            refuse(
+                f"no such file; did you mean '{other}'?" if other else "no such file", where, allowed, "no_such_file"
+            )
         if not path.is_file():
-            refuse("not a file but a directory or device", where, allowed, "not_a_file")
+            refuse("is a directory or device, not a file", where, allowed, "not_a_file")
         size = path.stat().st_size
         if not 0 < size <= max_bytes:
-            refuse(f"file of {size} bytes", where, allowed, "file_size")
+            refuse(f"has {size} bytes", where, allowed, "file_size")
         return path.read_bytes()
     except (OSError, ValueError) as error:  # unreadable, or a path with a NUL in it
         raise InputError(f"cannot be read ({error})", where=where, allowed=allowed, code="unreadable") from error
@@ -166,15 +168,15 @@ def absence(path: Path) -> str:
         if path.is_dir():
             return "is a folder"
         if path.exists():
-            return "is no plain file"
+            return "is not a regular file"
         if path.is_symlink():
-            return "is a link to a file that is not there"
+            return "is a link to a missing file"
         other = _other_case(path)
     except PermissionError as error:
         return f"cannot be looked up ({error.strerror})"
     except (OSError, ValueError):  # a name that no file system takes
-        return "is not there"
-    return f"is not there; there is '{other}'" if other else "is not there"
+        return "does not exist"
+    return f"does not exist; did you mean '{other}'?" if other else "does not exist"
 
 
 def _other_case(path: Path) -> str:
@@ -194,7 +196,7 @@ def unfinished_warnings(content: bytes, name: str) -> tuple[str, ...]:
     """
     if content.rstrip(b" \t").endswith((b"\n", b"\r")):
         return ()
-    return (f"{name}: its last line does not end with a line break; was the file cut?",)
+    return (f"{name}: its last line has no line break at its end; was the file cut?",)
 
 
 def decode_text(data: bytes, where: str) -> str:

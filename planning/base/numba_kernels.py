@@ -76,7 +76,7 @@ def _use_folder() -> None:
     try:
         folder = _own_folder(_place() / name)
     except (OSError, RuntimeError) as error:  # the latter where the user has no home
-        warnings.warn(f"cache: kernels are compiled for this run alone ({error})", CacheWarning, stacklevel=2)
+        warnings.warn(f"cache: kernels are compiled for this run only ({error})", CacheWarning, stacklevel=2)
         place = Path(tempfile.mkdtemp(prefix="puncture-twin-"))
         atexit.register(shutil.rmtree, place, ignore_errors=True)
         folder = _own_folder(place / name)
@@ -111,7 +111,7 @@ def _own_folder(folder: Path) -> Path:
     os.utime(folder)
     for file in _damaged(folder):
         file.unlink(missing_ok=True)
-        what = "cache: a compiled kernel is cut or damaged; it is compiled anew and replaced"
+        what = "cache: a compiled kernel is cut or damaged; it is compiled again and replaced"
         warnings.warn(what, CacheWarning, stacklevel=1)
     return folder
 

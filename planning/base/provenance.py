@@ -52,10 +52,10 @@ def read_inputs(document: Any) -> tuple[Input, ...]:
         TypeError, KeyError, ValueError: It is no such list, or an input has two hashes in it.
     """
     if not isinstance(document, list):
-        raise TypeError("inputs is no list")
+        raise TypeError("inputs is not a list")
     inputs = tuple(Input(*(text(one[key]) for key in ("role", "path", "sha256"))) for one in document)
     if len({_place(one) for one in inputs}) != len({(_place(one), one.sha256) for one in inputs}):
-        raise ValueError("an input stands twice, with two hashes")
+        raise ValueError("an input appears twice, with two hashes")
     return inputs
 
 

@@ -39,7 +39,8 @@ SAFE: Rgb = (0, 158, 115)
 UNSEEN_AIR: Rgb = (190, 190, 196)
 """An unknown region outside of the body; one within it is darker, as `REASON_COLOURS` has it."""
 
-UNSEEN_AIR_TEXT, NOT_SEARCHED_TEXT = "unknown beside the body (image ends, or no air)", "outside the grid, not searched"
+UNSEEN_AIR_TEXT = "unknown outside the body (image ends, or no air)"
+NOT_SEARCHED_TEXT = "outside the grid, not searched"
 
 REASON_COLOURS = MappingProxyType(
     {
@@ -75,7 +76,7 @@ REASON_TEXT = MappingProxyType(
         Reason.UNKNOWN_REGION: "unknown in the body (image ends, or not named)",
         Reason.UNREACHABLE: "arm cannot reach the pose",
         Reason.ARM_COLLISION: "arm would collide",
-        Reason.INSERTION_BLOCKED: "straight insertion not drivable",
+        Reason.INSERTION_BLOCKED: "straight insertion not possible",
         Reason.APPROACH_NOT_FOUND: "no approach found",
     }
 )

@@ -118,7 +118,7 @@ def text(value: Any) -> str:
         TypeError: Something else.
     """
     if not isinstance(value, str):
-        raise TypeError(f"{_shown(value)} is no text")
+        raise TypeError(f"{_shown(value)} is not a text")
     return value
 
 
@@ -129,7 +129,7 @@ def whole(value: Any) -> int:
         TypeError: Something else.
     """
     if isinstance(value, bool) or not isinstance(value, int):
-        raise TypeError(f"{_shown(value)} is no whole number")
+        raise TypeError(f"{_shown(value)} is not a whole number")
     return value
 
 
@@ -140,9 +140,9 @@ def number(value: Any) -> float:
         TypeError, ValueError: Something else, or a larger one.
     """
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"{_shown(value)} is no number")
+        raise TypeError(f"{_shown(value)} is not a number")
     if not abs(value) <= MAX_NUMBER:
-        raise ValueError(f"{_shown(value)} is beyond {MAX_NUMBER:g}")
+        raise ValueError(f"{_shown(value)} is beyond {MAX_NUMBER:,.0f}")
     return float(value)
 
 
@@ -158,13 +158,15 @@ def array(value: Any, shape: tuple[int, ...]) -> Floats:
         ValueError: Another shape, a larger number, or something else than numbers.
     """
     if not _numbers_only(value):
-        raise ValueError("an array of something else than numbers")
+        raise ValueError("an array with values other than numbers")
     try:
         found = np.array(value, dtype=np.float64)
     except OverflowError as error:
-        raise ValueError(f"a number beyond {MAX_NUMBER:g}") from error
-    if found.shape != shape or not np.all(np.abs(found) <= MAX_NUMBER):
-        raise ValueError(f"an array of shape {found.shape} where {shape} numbers within {MAX_NUMBER:g} belong")
+        raise ValueError(f"a number beyond {MAX_NUMBER:,.0f}") from error
+    if found.shape != shape:
+        raise ValueError(f"an array of shape {found.shape} instead of {shape}")
+    if not np.all(np.abs(found) <= MAX_NUMBER):
+        raise ValueError(f"a number beyond {MAX_NUMBER:,.0f}")
     found.setflags(write=False)
     return found
 
@@ -181,7 +183,7 @@ def texts(value: Any) -> tuple[str, ...]:
         TypeError: Something else.
     """
     if not isinstance(value, list):
-        raise TypeError(f"{_shown(value)} is no list")
+        raise TypeError(f"{_shown(value)} is not a list")
     return tuple(map(text, value))
 
 
@@ -203,7 +205,7 @@ def _unique_keys(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         keys = [key for key, _ in pairs]
-        raise ValueError(f"key {_shown(next(key for key in keys if keys.count(key) > 1))} stands twice")
+        raise ValueError(f"key {_shown(next(key for key in keys if keys.count(key) > 1))} appears twice")
     return found
 
 

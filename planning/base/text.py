@@ -55,6 +55,15 @@ def first_few(names: Sequence[str], most: int = 8) -> str:
     return ", ".join(names[:most]) + more
 
 
+def plural(count: int, noun: str, more: str = "s") -> str:
+    """A count with its noun.
+
+    >>> plural(1, "window"), plural(1200, "window"), plural(2, "mesh", "es")
+    ('1 window', '1,200 windows', '2 meshes')
+    """
+    return f"{count:,} {noun}{more if count != 1 else ''}"
+
+
 def unprintable_texts(document: object) -> Iterator[str]:
     """Every key and string of a nested document (tables, lists) that holds a control or format character."""
     waiting = [document]

@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ValidationError
 
-from puncture_twin.planning.base.errors import InputError, SchemaError, refuse
+from puncture_twin.planning.base.errors import InputError, SchemaError, refuse, schema_words
 from puncture_twin.planning.base.files import read_input
 
 MAX_BYTES = 1_000_000
@@ -65,7 +65,7 @@ def find_toml(path: Path | str, usual_name: str) -> Path:
     try:
         path = path / usual_name if path.is_dir() else path
         if path.exists() and not path.is_file():
-            refuse("is no plain file", path, allowed, "not_a_file")
+            refuse("is not a regular file", path, allowed, "not_a_file")
     except (OSError, ValueError) as error:
         what = f"cannot be looked up ({error})"
         raise InputError(what, where=str(path)[:80], allowed=allowed, code="unreadable") from error
@@ -114,7 +114,7 @@ def parse_toml(
         return model.model_validate(data)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        place, said = _said(data, first["loc"], first["msg"].removeprefix("Value error, "), first["type"])
+        place, said = _said(data, first["loc"], schema_words(first), first["type"])
         value = "" if isinstance(first["input"], dict | list | tuple | None) else f" (given: {first['input']!r:.60})"
         allowed = f"the keys, types and ranges of {keys}"
         code = getattr(first.get("ctx", {}).get("error"), "code", CODES.get(first["type"], "bad_value"))
@@ -161,7 +161,7 @@ def check_toml_bounds(text: str, where: Path | str, allowed: str) -> None:
         if len(line) > MAX_LINE:
             _refuse(f"has {len(line)} characters, more than {MAX_LINE}", where, number, allowed)
         if tables > MAX_TABLES:
-            _refuse(f"begins more than {MAX_TABLES} tables", where, number, allowed)
+            _refuse(f"starts more than {MAX_TABLES} tables", where, number, allowed)
     depth = parts = 0
     for token in _TOKEN.finditer(text):
         kind, found = str(token.lastgroup), token.group()

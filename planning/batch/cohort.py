@@ -69,7 +69,7 @@ def read_cohort(cohort: Path) -> tuple[tuple[CohortCase, ...], tuple[Input, ...]
     else:
         cases, inputs = _listed_cases(cohort)
     if not 0 < len(cases) <= MOST_CASES:
-        what = f"holds {len(cases)} cases" if cases else "holds no case"
+        what = f"has {len(cases)} cases" if cases else "has no case"
         refuse(what, cohort, f"1 to {MOST_CASES} cases: {ALLOWED}", "cohort_size")
     for one in cases:
         _check_path(one, cohort)
@@ -81,14 +81,14 @@ def _check_path(case: CohortCase, cohort: Path) -> None:
     try:
         str(case.path.absolute()).encode("utf-8")
     except UnicodeEncodeError as error:
-        what = f"the path '{one_line(case.stated, 100)}' is no UTF-8"
-        raise InputError(what, where=cohort, allowed="cases whose paths are UTF-8", code="not_text") from error
+        what = f"the path '{one_line(case.stated, 100)}' is not UTF-8"
+        raise InputError(what, where=cohort, allowed="cases with UTF-8 paths", code="not_text") from error
 
 
 def _listed_cases(path: Path) -> tuple[list[CohortCase], tuple[Input, ...]]:
     readers = {".csv": csv_cases, ".toml": toml_cases}
     if path.suffix.lower() not in readers:
-        refuse("is no cohort", path, ALLOWED, "not_a_cohort")
+        refuse("is not a cohort", path, ALLOWED, "not_a_cohort")
     content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     return readers[path.suffix.lower()](content, path), (content_input("cohort", path.name, content),)
 
@@ -111,7 +111,7 @@ def _folder_cases(cohort: Path) -> list[CohortCase]:
             path = Path(folder) / CASE_FILE
             found.append(CohortCase(path.relative_to(cohort).as_posix(), path))
         elif below and (lost := [one for one in files if not (Path(folder) / one).exists()]):
-            _refuse(f"'{one_line(lost[0], 100)}' is a link to what is not there", folder)
+            _refuse(f"'{one_line(lost[0], 100)}' is a broken link", folder)
     return sorted(found, key=lambda one: one.stated)
 
 
@@ -120,7 +120,7 @@ def _refuse_unreadable(error: OSError) -> NoReturn:
 
 
 def _refuse(what: str, where: str) -> NoReturn:
-    refuse(what, where, "folders of patients that can be read", "cohort_not_whole")
+    refuse(what, where, "readable folders of patients", "cohort_not_whole")
 
 
 CASE, NAME, TARGET = "case", "name", "target"
@@ -157,7 +157,7 @@ def _rows(content: bytes, path: Path) -> Any:
     """Lines of a CSV as a reader that counts them."""
     text = decode_text(content, str(path))
     if "\0" in text or max(map(len, text.splitlines()), default=0) > LONGEST_CELL:
-        refuse("is no CSV", path, f"text, lines of at most {LONGEST_CELL} characters", "not_csv")
+        refuse("is not a CSV file", path, f"text, lines of at most {LONGEST_CELL} characters", "not_csv")
     return csv.reader(io.StringIO(text), strict=False)
 
 
@@ -170,14 +170,14 @@ def _header(row: list[str], path: Path) -> list[str]:
         if name not in (CASE, NAME, TARGET) and not (kind in SECTIONS and key):
             refuse(f"column '{name}' is not known", f"{path}: line 1", ALLOWED_COLUMNS, "unknown_column")
         if header.count(name) > 1:
-            refuse(f"column '{name}' stands twice", f"{path}: line 1", "each column once", "duplicate_column")
+            refuse(f"column '{name}' appears twice", f"{path}: line 1", "each column once", "duplicate_column")
     return header
 
 
 def _case(cells: dict[str, str], path: Path, where: str) -> CohortCase:
     stated = cells[CASE]
     if not stated.strip() or any(unprintable_texts(cells)):
-        refuse("has no case that can be printed", where, "the path of a case", "bad_name")
+        refuse("the case is empty or not printable", where, "the path of a case", "bad_name")
     return CohortCase(stated, path.parent / stated.strip(), cells.get(NAME, "").strip(), _options(cells, where))
 
 
@@ -264,7 +264,7 @@ def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
     axes = [axis for name, kind in AXES.items() if (axis := _axis(getattr(stated, name), name, kind, path))]
     count = len(found) * math.prod(len(axis) for axis in axes)
     if count > MOST_CASES:
-        refuse(f"makes {count} cases", path, f"at most {MOST_CASES}", "cohort_size")
+        refuse(f"gives {count} cases", path, f"at most {MOST_CASES}", "cohort_size")
     combinations = [_combined(choices, path) for choices in product(*axes)]
     return [CohortCase(one, path.parent / one, name, options) for one in found for name, options in combinations]
 
@@ -296,7 +296,7 @@ def _table(values: Any, kind: str, where: str) -> Mapping[str, Any]:
         return {"position_mm": list(values)}
     if kind == "arm" and isinstance(values, str):
         return {"model": values}
-    what = f"option '{kind}' is no table"
+    what = f"option '{kind}' is not a table"
     raise InputError(what, where=where, allowed="keys and values, as in the case", code="not_a_table")
 
 

@@ -85,7 +85,7 @@ def union_schema(schemas: Sequence[pa.Schema], where: Path) -> pa.Schema:
             known = fields.setdefault(one.name, one)
             if known.type != one.type:
                 what = f"column '{one.name}' is {known.type} in one case and {one.type} in another"
-                refuse(what, where, "results of one version: batch plan and run again", "tables_differ")
+                refuse(what, where, "results of one version: repeat batch plan and batch run", "tables_differ")
     return pa.schema(list(fields.values()))
 
 
@@ -268,7 +268,7 @@ def read_cases(place: Path) -> list[dict[str, Any]]:
     try:
         table = pq.read_table(io.BytesIO(data))
     except (pa.ArrowException, OSError) as error:
-        what = f"is no table ({one_line(str(error), 100)})"
+        what = f"is not a table ({one_line(str(error), 100)})"
         raise InputError(what, where=path, allowed=ALLOWED, code="not_parquet") from error
     missing = [name for name in (*NEEDED, *ENTRY) if name not in table.column_names]
     if missing:

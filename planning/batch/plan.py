@@ -47,7 +47,7 @@ ID_DIGITS = 32
 """Hexadecimal digits of an id: 128 bits, and too many digits for a number in any reader of partitions."""
 
 OWN_FOLDER = "the case's folder"
-NO_PLAN = "a folder that `batch plan COHORT --out DIR` has written to"
+NO_PLAN = "a folder written by `batch plan COHORT --out DIR`"
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def read_plan_table(out: Path) -> Plan:
         made_by = (table.schema.metadata or {})[b"version"].decode()
         return Plan(tuple(PlannedCase(**row) for row in rows), found.sha256, made_by)
     except (pa.ArrowException, TypeError, KeyError, OSError) as error:
-        what = f"is no plan ({one_line(str(error), 100)})"
+        what = f"is not a plan ({one_line(str(error), 100)})"
         raise InputError(what, where=path, allowed=NO_PLAN, code="not_parquet") from error
 
 
@@ -260,7 +260,7 @@ def discard(out: Path, case_id: str, work: Path) -> None:
     """Remove a result that is not final or not whole, at once or not at all."""
     folder = out / case_id
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        refuse(f"{case_id} there is not a result of this cohort", out, "a folder of its own", "folder_of_another")
+        refuse(f"{case_id} in it is not a result of this cohort", out, "a folder of its own", "folder_of_another")
     if folder.is_dir():
         gone = new_draft(work, case_id)
         folder.rename(gone / "old")

@@ -78,7 +78,7 @@ def parse_part(text: str) -> Part:
     """
     found = re.fullmatch(r"([0-9]{1,7})/([0-9]{1,7})", text)
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
-        refuse(f"'{text[:40]}' is no part", "--part", ALLOWED_PARTS, "bad_part")
+        refuse(f"'{text[:40]}' is not a part", "--part", ALLOWED_PARTS, "bad_part")
     return Part(int(found[1]), int(found[2]))
 
 
@@ -92,7 +92,7 @@ def slurm_part(environment: Mapping[str, str]) -> Part | None:
         return None
     stated = {name: environment.get(name, "1" if name == STEP else "") for name in (TASK, COUNT, FIRST, STEP)}
     if not all(re.fullmatch(r"[0-9]{1,9}", value) for value in stated.values()):
-        refuse(f"{stated} are no numbers", "SLURM's array", f"--part {ALLOWED_PARTS}", "bad_part")
+        refuse(f"{stated} are not numbers", "SLURM's array", f"--part {ALLOWED_PARTS}", "bad_part")
     task, count, first, step = (int(stated[name]) for name in (TASK, COUNT, FIRST, STEP))
     place, odd = divmod(task - first, max(step, 1))
     if odd or not 0 <= place < count:
@@ -105,7 +105,7 @@ RunTasks = Callable[[Sequence[CaseTask], Limits], Generator[CaseEnd, None, None]
 """Runs cases somewhere, and yields how each ended."""
 
 LOCK_NAME = ".puncture-twin-run-lock"
-ALLOWED_AT_ONCE = "one run at a time, parts beside each other (--part i/n), or another folder"
+ALLOWED_AT_ONCE = "one run at a time, parallel parts (--part i/n), or another folder"
 
 
 @dataclass(frozen=True)
@@ -181,8 +181,8 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     """
     plan = read_plan_table(out)
     if plan.version != version("puncture-twin"):
-        what = f"the plan is of version {plan.version}, this is {version('puncture-twin')}"
-        refuse(what, out, "batch plan again: what is unchanged since is not lost", "unknown_version")
+        what = f"the plan is of version {plan.version}, this program is {version('puncture-twin')}"
+        refuse(what, out, "repeat batch plan: unchanged results are kept", "unknown_version")
     with running(out, request.part) as work:
         rows = request.part.of(plan.cases)
         cases = distinct(rows)
@@ -196,7 +196,7 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
         with closing(_ends(tasks, request, elsewhere)) as ends:
             for done, end in enumerate(ends, start=1):
                 if end.full:
-                    what = f"cannot be written ({end.full}); the cases that are done stay"
+                    what = f"cannot be written ({end.full}); finished cases are kept"
                     refuse(what, out, "a folder with enough free space", "unwritable")
                 counts.add(end)
                 watcher.count("cases", done, len(tasks), counts.failed)
@@ -258,7 +258,7 @@ def _locked(out: Path, name: str, kind: int) -> Iterator[None]:
         fcntl.flock(handle, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         os.close(handle)
-        what = "another run is at work in this folder"
+        what = "another run is using this folder"
         raise InputError(what, where=out, allowed=ALLOWED_AT_ONCE, code="folder_in_use") from None
     try:
         yield
@@ -419,15 +419,17 @@ def on_scheduler(address: str) -> RunTasks:
 
     def run(tasks: Sequence[CaseTask], limits: Limits) -> Generator[CaseEnd, None, None]:
         if limits != NO_LIMITS:
-            what = "memory and time of a case are limited by Dask's workers"
-            refuse(what, "--scheduler", "dask worker --memory-limit alone", "dask_limits")
+            what = "Dask's workers limit the memory and time of a case"
+            refuse(what, "--scheduler", "only dask worker --memory-limit", "dask_limits")
         try:
             library: Any = distributed
             client = library.Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, ValueError, TypeError) as error:
-            what = f"no scheduler answers there ({one_line(str(error), 150)})"
+            what = f"no scheduler answers at this address ({one_line(str(error), 150)})"
             where = f"--scheduler {address[:80]}"
-            raise InputError(what, where=where, allowed="tcp://HOST:PORT of one", code="no_scheduler") from error
+            raise InputError(
+                what, where=where, allowed="tcp://HOST:PORT of a running scheduler", code="no_scheduler"
+            ) from error
         with client:
             yield from _dask_ends(distributed, client, tasks)
 
@@ -442,7 +444,7 @@ def _dask_ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Gene
             task = futures.pop(future)
             error = future.exception() if future.status == "error" else None
             if future.status not in ("error", "finished"):
-                allowed = "a scheduler that stays; what is done is kept"
+                allowed = "a scheduler that keeps running; finished cases are kept"
                 refuse(f"the scheduler has lost a case ({future.status})", "--scheduler", allowed, "scheduler_lost")
             if error is None:
                 yield future.result()

@@ -82,7 +82,7 @@ class CaseEnd(NamedTuple):
     full: str = ""
 
 
-STALE = "its files are not those of the plan"
+STALE = "its files differ from those of the plan"
 
 
 def run_case(task: CaseTask, memory: Memory = NO_MEMORY) -> CaseEnd:

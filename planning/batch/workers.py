@@ -124,7 +124,7 @@ def run_tasks(tasks: Iterable[CaseTask], jobs: int, limits: Limits) -> Generator
         InputError: Memory cannot be watched on this system.
     """
     if limits.memory_mb is not None and not Path(STATM.format(os.getpid())).exists():
-        refuse("memory cannot be watched here", "--memory-mb", "a system with /proc", "memory_not_watched")
+        refuse("memory cannot be monitored on this system", "--memory-mb", "a system with /proc", "memory_not_watched")
     queue, workers = TaskQueue(tasks), list[_Worker]()
     try:
         while queue or workers:

@@ -74,7 +74,7 @@ class Breathing:
     def window_text(self) -> str:
         """When a safe candidate is safe, in words; never that a needle may stay while the patient breathes."""
         if self.gate is None and not self.whole:
-            return "at exhale, if inserted there; no other phase was looked at"
+            return "at exhale, if inserted at exhale; no other phase was checked"
         if self.gate is None:
             return "at each phase if inserted at that phase"
         return f"when gated to this window (s <= {self.gate:g})"

@@ -11,6 +11,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.breathing.breathing import fraction_within
 from puncture_twin.planning.budget.chain import GATES, Chain, other_gauges
 from puncture_twin.planning.case.errors import ARM_KINDS, UNIFORM, ErrorModel
@@ -123,9 +124,9 @@ def _touches(chain: Chain) -> Iterator[Change]:
     except NoAnswerError:
         return
     planned = replace(chain, q_touch=q_touch).expected_mm()
-    yield Change("touches", "markers touched in the poses of least error", planned)
+    yield Change("touches", "markers touched in the best poses", planned)
     fresh = replace(chain.errors, arm=replace(chain.errors.arm, drift=0.0))
-    yield Change("touches", "markers touched right before the insertion", chain.with_errors(fresh).expected_mm())
+    yield Change("touches", "markers touched just before the insertion", chain.with_errors(fresh).expected_mm())
 
 
 def _arms(chain: Chain) -> Iterator[Change]:
@@ -170,7 +171,7 @@ def _fewer_markers(chain: Chain) -> Iterator[Change]:
         every = np.arange(len(chain.points_ct))
         rest = [_with_rows(chain, np.delete(every, row)) for row in every]
         chain = min(rest, key=lambda one: one.expected_mm())
-        found.append(Change("markers", f"only {len(chain.points_ct)} markers", chain.expected_mm()))
+        found.append(Change("markers", f"only {plural(len(chain.points_ct), 'marker')}", chain.expected_mm()))
     yield from reversed(found)
 
 
@@ -189,7 +190,7 @@ def _more_markers(chain: Chain, skin_points_ct: Floats) -> Iterator[Change]:
         if not grown:
             return
         chain = min(grown, key=lambda one: one.expected_mm())
-        yield Change("markers", f"{len(chain.points_ct)} markers", chain.expected_mm(), chain.points_ct[-1])
+        yield Change("markers", f"{plural(len(chain.points_ct), 'marker')}", chain.expected_mm(), chain.points_ct[-1])
 
 
 def _with_one_more(chain: Chain, point_ct: Floats, q: Floats) -> Chain:

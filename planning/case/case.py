@@ -331,7 +331,7 @@ def _facts(case: Case) -> Facts:
     if case.tool is not None:
         size = " × ".join(f"{edge:.0f}" for edge in np.ptp(case.tool.mesh.bounds, axis=0))
         yield "tool", f"{case.tool.file.name}, {size} mm along the flange's axes"
-    stated = [one.name for one in case.structure] + [f"those of {one.source}" for one in case.structures]
+    stated = [one.name for one in case.structure] + [f"as in {one.source}" for one in case.structures]
     yield "structures", ", ".join(stated) or "none"
     (low, high), (first, last) = np.degrees(case.search.theta), np.degrees(case.search.beta)
     step = np.degrees(case.search.step)

@@ -72,7 +72,7 @@ def count_difference(stated: int, found: int) -> str:
     """Sentence on a case with another number of structures than it states; empty where they agree."""
     if stated == found:
         return ""
-    return f"structures = {stated} is stated, and the case has {found}, the skin among them; was the file cut?"
+    return f"structures = {stated} is stated, but the case has {found}, the skin included; was the file cut?"
 
 
 class EndSection(Section):
@@ -121,7 +121,7 @@ class CaseFile(Section):
             what = "schema = 2 needs its last table, [end] with structures = N; was the file cut?"
             raise SchemaError(what, "file_cut")
         if at_top not in {None, stated}:
-            raise SchemaError(f"structures = {at_top} at the top and {at_end} in [end]; keep one", "stated_twice")
+            raise SchemaError(f"structures = {at_top} at the top but {at_end} in [end]; keep one", "stated_twice")
         return stated
 
     @property
@@ -146,39 +146,39 @@ class CaseFile(Section):
     @classmethod
     def _refuse_unprintable(cls, data: Any) -> Any:
         for text in unprintable_texts(data):
-            what = f"{text[:60]!a} holds a control or format character; names and paths are plain text"
+            what = f"{text[:60]!a} has a control or format character; names and paths are plain text"
             raise SchemaError(what, "bad_name")
         return data
 
     @model_validator(mode="after")
     def _no_contradiction(self) -> Self:
         if self.registration is not None and self.robot.mount is not None:
-            raise SchemaError("[registration] and [robot.mount] both say where the base is; keep one", "stated_twice")
+            raise SchemaError("[registration] and [robot.mount] both place the base; keep one", "stated_twice")
         if self.errors is None and self.rehearsal.errors is not None:
-            what = "[rehearsal.errors] is a truth that differs from [errors], which is not there"
+            what = "[rehearsal.errors] differs from [errors], and [errors] is missing"
             raise SchemaError(what, "missing_errors")
         if self.errors is None and self.registration is not None and self.registration.correct:
-            what = "registration.correct needs [errors]: it tells the arm's errors by what is declared of them"
+            what = "registration.correct needs [errors]: it estimates the arm's errors from the declared ones"
             raise SchemaError(what, "missing_errors")
         chances = (self.search.min_hit, self.search.max_touch, self.search.max_touch_of or None)
         if self.errors is None and any(chance is not None for chance in chances):
-            what = "search.min_hit and max_touch need [errors]: without declared errors there is no chance"
+            what = "search.min_hit and max_touch need [errors]: without declared errors there are no chances"
             raise SchemaError(what, "missing_errors")
         if self.space == "local" and self.registration is not None and self.registration.transform is not None:
-            what = 'registration.transform: a transform file speaks of patient space; space "local" has none'
+            what = 'registration.transform: a transform file is in patient space; space "local" has none'
             raise SchemaError(what, "local_space")
         if self.space == "local" and self.ct.file is not None:
-            raise SchemaError('ct.file: a CT says its own patient space; space "local" has none', "local_space")
+            raise SchemaError('ct.file: a CT is in patient space; space "local" has none', "local_space")
         if self.space == "local" and any(s.cut for s in self.structure):
             raise SchemaError('cut names sides of a patient; space "local" has none', "local_space")
         if self.space == "local" and self.search.frame not in {None, "ct"}:
             raise SchemaError('search.frame must be "ct" for space "local": it has no head and no front', "local_space")
         for name, count in Counter(s.name for s in self.structure).items():
             if count > 1:
-                raise SchemaError(f"structure '{name}' stands twice; names are unique", "duplicate_name")
+                raise SchemaError(f"structure '{name}' appears twice; names are unique", "duplicate_name")
         skins = [s.name for s in self.structure if s.role == "skin"]
         if len(skins) != 1:
-            raise SchemaError(f'one structure has role "skin"; here {skins or "none"}', "not_one_skin")
+            raise SchemaError(f'exactly one structure must have role "skin"; here {skins or "none"}', "not_one_skin")
         return self
 
     @model_validator(mode="after")

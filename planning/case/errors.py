@@ -176,7 +176,7 @@ def error_model(
         twice = sorted(stated & {"ct_pixel_mm", "ct_spacing_mm", "ct_in_plane_mm", "ct_slice_mm", "touch_mm"})
         if twice:
             message = f"registration.fle_mm and errors.{twice[0]} state the same error"
-            refuse(message, where, "fle_mm alone, or CT and touch in [errors]", "stated_twice")
+            refuse(message, where, "only fle_mm, or CT and touch in [errors]", "stated_twice")
     reading, touch = _reading_cov(section, space, cells, where), _or(section.touch_mm, DEFAULT_TOUCH_MM)
     target = reading if section.target_mm is None else section.target_mm**2 * np.eye(3)
     if fle_mm is not None:

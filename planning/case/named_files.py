@@ -211,7 +211,7 @@ class CaseVolumes:
             found = parse_segmentation(path, name, self._files.content, series)
         elif series is None:
             what = f"rtstruct '{name}' needs the CT on which it was drawn, as a DICOM series"
-            refuse(what, self._path, 'ct = "FOLDER" beside it, or as the CT of the case', "rtstruct_without_ct")
+            refuse(what, self._path, 'ct = "FOLDER" next to it, or as the CT of the case', "rtstruct_without_ct")
         else:
             found = parse_structure_set(path, name, self._files.content, series)
         self._add_masks(name, found)
@@ -247,15 +247,15 @@ def _key(file: str, called: str) -> str:
 
 
 TOP_COUNT_NOTE = (
-    "structures = N stands at the top of the case, so that a cut after its last structure would not be seen; "
-    "state it in [end], the file's last table"
+    "structures = N is at the top of the case, so a cut after the last structure would go unnoticed; state it in "
+    "[end], the file's last table"
 )
 
-NOT_LAST_NOTE = "[end] is not the last table of the case: what stands after it could be cut off unseen"
+NOT_LAST_NOTE = "[end] is not the last table of the case: a cut after it would go unnoticed"
 
 ROBOT_NOWHERE = (
-    "the case names a robot ({robot}), but not where its base is: the arm is not checked "
-    "([registration] or [robot.mount] says it)"
+    "the case states a robot ({robot}) but not the position of its base: the arm is not checked ([registration] or "
+    "[robot.mount] places it)"
 )
 
 _HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([^\[\]\n]+?)[ \t]*\]{1,2}[ \t]*(?:#.*)?$", re.MULTILINE)
@@ -274,7 +274,7 @@ def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tupl
     """
     for name in _line_files(files):
         for said in unfinished_warnings(files.content(name), name):
-            refuse(said, path, "files of which every line ends with a line break", "file_cut")
+            refuse(said, path, "files in which every line ends with a line break", "file_cut")
     if content.end is None:
         return (TOP_COUNT_NOTE,)
     return () if ends_with_end(files.content(path.name).decode("utf-8")) else (NOT_LAST_NOTE,)

@@ -119,9 +119,9 @@ def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
     """
     for kind, values in sections.items():
         if kind not in SECTIONS:
-            refuse(f"'{kind}' is no kind of option", where, ", ".join(SECTIONS), "unknown_key")
+            refuse(f"'{kind}' is not a kind of option", where, ", ".join(SECTIONS), "unknown_key")
         if not isinstance(values, Mapping) or not all(isinstance(key, str) for key in values):
-            refuse(f"option '{kind}' is no table", where, "keys and values, as in the case", "not_a_table")
+            refuse(f"option '{kind}' is not a table", where, "keys and values, as in the case", "not_a_table")
     try:
         plain = json.loads(CaseOptions({kind: values for kind, values in sections.items() if values}).text)
     except (TypeError, ValueError) as error:
@@ -152,13 +152,13 @@ def _set_margins(data: dict[str, Any], values: Mapping[str, Any], where: Path | 
     stated = list(_margins(data))
     for pattern, margin in values.items():
         if not isinstance(margin, int | float) or isinstance(margin, bool):
-            refuse(f"margins '{pattern}' is no number", where, "mm", "not_a_number")
+            refuse(f"margins '{pattern}' is not a number", where, "mm", "not_a_number")
         if pattern == ADDED:
             continue
         fitting = [one for one in stated if fnmatchcase(one[0], pattern)]
         if not fitting:
             known = ", ".join(name for name, _, _ in stated) or "none"
-            refuse(f"margins '{pattern}' fits nothing that has a margin", where, known, "no_match")
+            refuse(f"margins '{pattern}' matches no structure with a margin", where, known, "no_match")
         for _, table, key in fitting:
             table[key] = margin
     for _, table, key in stated if ADDED in values else ():

@@ -92,7 +92,7 @@ def _mesh(address: str, *, urdf: str, files: InputFiles, path: Path) -> bytes:
     """The bytes of a mesh that a URDF names."""
     if "://" in address or PurePosixPath(address).is_absolute():
         allowed = "paths relative to the URDF's folder, such as meshes/base.stl"
-        refuse(f"robot.urdf: mesh '{address}' is no path beside the URDF", path, allowed, "outside_folder")
+        refuse(f"robot.urdf: mesh '{address}' is not a path next to the URDF", path, allowed, "outside_folder")
     name = str(PurePosixPath(urdf).parent / address)
     return files.read(MESH_ROLE, name, max_bytes=meshes.MAX_FILE_BYTES, key=f"robot.urdf: mesh '{address}'", where=path)
 
@@ -122,13 +122,13 @@ def bending_of(needle: NeedleSection, tissue: Mapping[str, TissueSection], where
     stated = [key for key in ("gauge", "solid", "bevel_deg", "modulus_gpa") if getattr(needle, key) is not None]
     if not tissue:
         if stated:
-            message = f"needle.{stated[0]}: how far it bends depends on the tissue, and there is none"
-            refuse(message, where, "[tissue.PATTERN] for each pattern of names; or no such key", "no_tissue")
+            message = f"needle.{stated[0]}: the bending depends on the tissue, and there is no [tissue]"
+            refuse(message, where, "[tissue.PATTERN] for each pattern of names; or omit this key", "no_tissue")
         return None
     if needle.bevel_deg is None:
         refuse("[tissue] needs needle.bevel_deg", where, "degrees; 0 for a symmetric tip", "no_bevel")
     if REST not in tissue:
-        message = f'[tissue."{REST}"] is missing: between the structures there is tissue too'
+        message = f'[tissue."{REST}"] is missing: there is tissue between the structures too'
         refuse(message, where, f'a table for "{REST}", the rest of the body', "no_tissue")
     tissues = {pattern: Tissue(**section.model_dump()) for pattern, section in tissue.items()}
     return Bending(_shaft(needle, where), float(np.radians(needle.bevel_deg)), ByName(tissues))
@@ -143,7 +143,9 @@ def _shaft(needle: NeedleSection, where: str | Path) -> Shaft:
         refuse(what, where, f"{min(GAUGES)} to {max(GAUGES)}", "unknown_gauge")
     gauge = GAUGES[needle.gauge]
     if abs(gauge.outer_mm - needle.diameter_mm) > SAME_MM:
-        message = f"needle.gauge {needle.gauge} is {gauge.outer_mm:g} mm wide, diameter_mm says {needle.diameter_mm:g}"
+        message = (
+            f"needle.gauge {needle.gauge} is {gauge.outer_mm:g} mm wide, but diameter_mm is {needle.diameter_mm:g}"
+        )
         refuse(message, where, f"diameter_mm within {SAME_MM:g} of the gauge's", "gauge_contradicted")
     return Shaft(needle.shaft_mm, gauge.outer_mm, 0.0 if needle.solid else gauge.inner_mm, modulus)
 

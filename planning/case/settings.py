@@ -241,7 +241,7 @@ def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
         refuse(f"robot.mount: x_axis and z_axis are {angle:.1f} degrees apart", path, allowed, "axes_not_square")
     far = float(np.linalg.norm(mount.position_mm))
     if 0.0 < far < LIKE_METRES:
-        what = f"robot.mount: position_mm is {far:g} mm from the origin, which would be a base within the patient"
+        what = f"robot.mount: position_mm is {far:g} mm from the origin: the base would be in the patient"
         refuse(what, path, "millimetres (these look like metres)", "wrong_unit")
     T_ct_base = pose(frame_of_axes(z, x), to_lps(np.asarray([mount.position_mm]), space)[0])
     return read_only(np.linalg.inv(T_ct_base))

@@ -99,23 +99,23 @@ class StructureSection(Section):
     def _one_source(self) -> Self:
         sources = [key for key in ("mesh", "labelmap", "ct") if getattr(self, key) is not None]
         if len(sources) != 1:
-            what = f"'{self.name}' needs exactly one of mesh, labelmap, ct; it has {sources or 'none'}"
+            what = f"'{self.name}' needs exactly one of mesh, labelmap, ct; given: {sources or 'none'}"
             raise SchemaError(what, "not_one_source")
         if (self.labelmap is None) != (self.label is None):
             raise SchemaError(f"'{self.name}': labelmap and label go together", "keys_together")
         if self.mesh is not None and self.unit is None:
-            what = f'\'{self.name}\': a mesh needs unit = "mm", "cm" or "m"; no mesh file says it'
+            what = f'\'{self.name}\': a mesh needs unit = "mm", "cm" or "m"; mesh files do not state it'
             raise SchemaError(what, "unit_not_stated")
         if self.mesh is None and (self.unit or self.space or self.up):
-            what = f"'{self.name}': unit, space and up belong to a mesh; a volume says its own"
+            what = f"'{self.name}': unit, space and up are for a mesh; a volume states its own"
             raise SchemaError(what, "key_not_of_it")
         if self.ct is not None and self.role != "skin":
-            raise SchemaError(f"'{self.name}': ct finds the body's skin only; role must be \"skin\"", "key_not_of_it")
+            raise SchemaError(f"'{self.name}': ct gives only the body's skin; role must be \"skin\"", "key_not_of_it")
         if self.cut is not None and self.role != "skin":
-            what = f"'{self.name}': cut belongs to the skin: it says where the body was cut"
+            what = f"'{self.name}': cut is for the skin: it states where the body was cut"
             raise SchemaError(what, "key_not_of_it")
         if self.margin_mm is not None and self.role not in {"avoid", "unknown"}:
-            raise SchemaError(f'\'{self.name}\': margin_mm belongs to role "avoid", not "{self.role}"', "key_not_of_it")
+            raise SchemaError(f'\'{self.name}\': margin_mm is for role "avoid", not "{self.role}"', "key_not_of_it")
         return self
 
 
@@ -139,15 +139,15 @@ class StructuresSection(Section):
         sources = [key for key in ("labelmap", "masks", "seg", "rtstruct") if getattr(self, key) is not None]
         if len(sources) != 1:
             raise SchemaError(
-                "needs either labelmap (a file) or masks (a folder with one file a structure), not both; "
-                f"or seg (DICOM, or Slicer's .seg.nrrd), or rtstruct; it has {' and '.join(sources) or 'none'}",
+                "needs either labelmap (a file) or masks (a folder with one file per structure), not both; "
+                f"or seg (DICOM, or Slicer's .seg.nrrd), or rtstruct; given: {' and '.join(sources) or 'none'}",
                 "not_one_source",
             )
         if self.labelmap is None and self.naming is not None:
-            what = "naming belongs to labelmap; masks are named after their files, SEG and RTSTRUCT state their names"
+            what = "naming is for labelmap; masks are named after their files, SEG and RTSTRUCT state their names"
             raise SchemaError(what, "key_not_of_it")
         if self.ct is not None and self.seg is None and self.rtstruct is None:
-            what = "ct belongs to seg and rtstruct: the DICOM series on which they were drawn"
+            what = "ct is for seg and rtstruct: the DICOM series on which they were drawn"
             raise SchemaError(what, "key_not_of_it")
         return self
 
@@ -236,7 +236,7 @@ class RankingSection(Section):
     @model_validator(mode="after")
     def _one_counts(self) -> Self:
         if not any(getattr(self, name) > 0 for name in type(self).model_fields):
-            raise SchemaError("every weight is 0; one at least is above", "no_weight")
+            raise SchemaError("every weight is 0; at least one must be above 0", "no_weight")
         return self
 
 
@@ -266,10 +266,10 @@ class NeedleSection(Section):
             raise SchemaError(f"shaft_mm {self.shaft_mm:g} is longer than length_mm {self.length_mm:g}", "out_of_range")
         least = self.length_mm - self.shaft_mm + 10.0
         if self.lengths_mm and (self.length_mm not in self.lengths_mm or min(self.lengths_mm) < least):
-            what = f"lengths_mm holds length_mm, and none below {least:g}: the holder, and 10 mm of shaft"
+            what = f"lengths_mm must include length_mm, and none below {least:g} mm (the holder, and 10 mm of shaft)"
             raise SchemaError(what, "out_of_range")
         if self.solid is not None and self.gauge is None:
-            raise SchemaError("solid belongs to gauge; without one the shaft is solid, of diameter_mm", "key_not_of_it")
+            raise SchemaError("solid is for gauge; without gauge the shaft is solid, of diameter_mm", "key_not_of_it")
         return self
 
 
@@ -285,7 +285,7 @@ class TissueSection(Section):
     @model_validator(mode="after")
     def _capsule_is_whole(self) -> Self:
         if (self.capsule_n > 0) != (self.capsule_mm > 0):
-            what = "capsule_n and capsule_mm go together: force at the rupture, and how far in it is"
+            what = "capsule_n and capsule_mm go together: force at the rupture, and its depth"
             raise SchemaError(what, "keys_together")
         return self
 
@@ -305,7 +305,7 @@ class TargetSection(Section):
             what = "needs either position_mm or points (a file, with the target's name), not both"
             raise SchemaError(what, "not_one_source")
         if self.structure is None and self.hit_radius_mm is None:
-            raise SchemaError("needs structure, or hit_radius_mm where the target lies in no structure", "missing_key")
+            raise SchemaError("needs structure, or hit_radius_mm if the target lies in no structure", "missing_key")
         return self
 
 
@@ -360,9 +360,9 @@ class RobotSection(Section):
     @model_validator(mode="after")
     def _one_arm(self) -> Self:
         if self.urdf is not None and "model" in self.model_fields_set:
-            raise SchemaError("model and urdf both say which arm it is; keep one", "stated_twice")
+            raise SchemaError("model and urdf both state the arm; keep one", "stated_twice")
         if self.urdf is None and "flange" in self.model_fields_set:
-            raise SchemaError("flange names a link of urdf, which is not there", "key_not_of_it")
+            raise SchemaError("flange names a link of urdf, and urdf is missing", "key_not_of_it")
         return self
 
     @model_validator(mode="after")
@@ -412,9 +412,9 @@ class PlaceSection(Section):
     @model_validator(mode="after")
     def _mounts_make_sense(self) -> Self:
         if self.mounts is not None and (not self.mounts or len(set(self.mounts)) < len(self.mounts)):
-            raise SchemaError(f"mounts {list(self.mounts)}: at least one, each once", "duplicate_name")
+            raise SchemaError(f"mounts {list(self.mounts)}: must have at least one, each once", "duplicate_name")
         if self.rail.across_mm is not None:
-            raise SchemaError("rail.across_mm: a rail lies beside the table; rail_gap_mm says how far", "key_not_of_it")
+            raise SchemaError("rail.across_mm: a rail is next to the table; use rail_gap_mm", "key_not_of_it")
         return self
 
 
@@ -448,9 +448,9 @@ class RegistrationSection(Section):
     @model_validator(mode="after")
     def _corrected(self) -> Self:
         if self.correct_joints_deg is not None and not self.correct:
-            raise SchemaError("correct_joints_deg is the insertion that correct = true corrects for", "keys_together")
+            raise SchemaError("correct_joints_deg needs correct = true, the correction for it", "keys_together")
         if self.correct and self.method not in {None, "weighted"}:
-            what = f'correct = true has a fit of its own; method "{self.method}" has another'
+            what = f'correct = true has its own fit; method "{self.method}" has another'
             raise SchemaError(what, "conflicting_keys")
         return self
 
@@ -462,26 +462,26 @@ class RegistrationSection(Section):
                 what = f"{' and '.join(markers)}: missing; markers_ct and markers_base, or transform"
                 raise SchemaError(what, "missing_key")
             if self.transform_maps or self.base_axes:
-                raise SchemaError("transform_maps and base_axes belong to transform", "key_not_of_it")
+                raise SchemaError("transform_maps and base_axes are for transform", "key_not_of_it")
             return self
         if len(markers) == 1:
-            what = f"{markers[0]}: missing; beside transform both lists of markers, which it is held against"
+            what = f"{markers[0]}: missing; with transform, give both lists of markers, to check it"
             raise SchemaError(what, "missing_key")
         placing = (*_OF_MARKERS, *_OF_COMPARISON) if markers else _OF_MARKERS
         given = [key for key in placing if getattr(self, key)]
         if given:
-            what = f"transform stands in place of markers; {', '.join(given)} belongs to markers"
+            what = f"transform replaces markers; {', '.join(given)} is for markers"
             raise SchemaError(what, "key_not_of_it")
         if self.transform_maps is None:
             raise SchemaError(
-                'transform needs transform_maps = "base_to_ct" (as Slicer saves a transform that moves the CT to the '
-                'robot) or "ct_to_base": no file says which way it goes',
+                'transform needs transform_maps = "base_to_ct" (as Slicer saves a transform from the CT to the '
+                'robot) or "ct_to_base": the file does not state its direction',
                 "missing_key",
             )
         if self.base_axes is None:
             raise SchemaError(
                 'transform needs base_axes = "RAS" (the robot\'s x, y, z are what Slicer shows as R, A, S) or "LPS" '
-                "(they stand in the file as they are)",
+                "(the file has them unchanged)",
                 "missing_key",
             )
         return self
@@ -596,7 +596,7 @@ class BreathingSection(Section):
     @model_validator(mode="after")
     def _full_inhale_is_a_phase(self) -> Self:
         if self.phases > 1 and self.phases % 2:
-            what = f"phases {self.phases}: an even number, so that full inhale is one of them, or 1"
+            what = f"phases {self.phases}: must be 1, or an even number, so that full inhale is one of them"
             raise SchemaError(what, "out_of_range")
         return self
 

@@ -25,13 +25,13 @@ from puncture_twin.planning.formats.points import plainly_radians
 
 def _plain_name(value: str) -> str:
     if not re.fullmatch(r"[^\W_]([\w .\-]*[\w.\-])?", unicodedata.normalize("NFC", value)):
-        raise SchemaError("letters, digits, spaces and . _ - alone, a letter or digit first", "bad_name")
+        raise SchemaError("must be letters, digits, spaces and . _ -, a letter or digit first", "bad_name")
     return value
 
 
 def _degrees(value: tuple[float, ...]) -> tuple[float, ...]:
     if plainly_radians(value):
-        raise SchemaError(f"all six within {max(map(abs, value)):g} of zero: radians? They are degrees", "wrong_unit")
+        raise SchemaError(f"all six are within {max(map(abs, value)):g} of zero: not in degrees?", "wrong_unit")
     return value
 
 

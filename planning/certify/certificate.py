@@ -213,7 +213,7 @@ def leaves_of(cap: Cells, tree: tuple[str, ...], where: str | Path = "certificat
         beta.append(cells.beta[~inner])
         cells = split(cells.take(inner), letters[inner]).cells
     if len(cells):
-        refuse(f"the tree ends with {len(cells)} cells missing", where, "a whole tree", "certificate_damaged")
+        refuse(f"the tree ends {len(cells)} cells early", where, "a complete tree", "certificate_damaged")
     return Cells(np.concatenate(theta), np.concatenate(beta))
 
 
@@ -291,7 +291,7 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     leaves = leaves_of(question.cap(), tree, path)
     rows = document["witness"]
     if len(rows) != len(leaves):
-        refuse(f"{len(rows)} witnesses for {len(leaves)} cells", path, "one for each", "certificate_damaged")
+        refuse(f"{len(rows)} witnesses for {len(leaves)} cells", path, "one witness per cell", "certificate_damaged")
     reasons, structures, triangles, bounds = zip(*rows, strict=True)
     return Certificate(
         question=question,
@@ -344,9 +344,9 @@ def _facts(certificate: Certificate) -> Facts:
     for word in ("safe", "rejected", "undecided"):
         text = "proven safe for the organs" if word == "safe" else word
         yield text, f"{summary[f'{word}_square_deg']:.2f} deg², {summary[f'{word}_cells']:,} cells"
-    yield "cells are halved down to", f"{summary['size_deg']:g}°"
-    yield "holds all over a safe cell", "; ".join(summary["certified"])
-    yield "says nothing about", "; ".join(summary["not_certified"])
+    yield "smallest cell", f"{summary['size_deg']:g}°"
+    yield "proven for every direction of a safe cell", "; ".join(summary["certified"])
+    yield "not certified", "; ".join(summary["not_certified"])
 
 
 def _map(certificate: Certificate) -> PolarMap:

@@ -121,16 +121,16 @@ def verify(
 def _check_question(certificate: Certificate, case: Case, anatomy: Anatomy, error: PoseError | None) -> None:
     stated = certificate.question
     if not (np.all(np.isfinite(stated.theta)) and 0 <= stated.theta[0] <= stated.theta[1] <= np.pi + 1e-12):
-        refuse(f"theta {stated.theta} is no range", "certificate", "0 to pi", "out_of_range")
+        refuse(f"theta {stated.theta} is not a range", "certificate", "0 to pi", "out_of_range")
     derived = question_of(case, anatomy, theta=stated.theta, beta=stated.beta, touch=stated.touch, error=error)
     changed = differing_input(stated.inputs, derived.inputs)
     if changed is not None:
-        what = f"input '{changed}' is not the one that the certificate was made from"
-        refuse(what, "certificate", f"a certificate of {case.path}, unchanged since", "input_changed")
+        what = f"input '{changed}' differs from the one used for the certificate"
+        refuse(what, "certificate", f"a certificate of {case.path}, unchanged since then", "input_changed")
     for name in vars(derived):
         if name != "inputs" and not np.array_equal(getattr(stated, name), getattr(derived, name)):
-            what = f"its {name} is not that of the case: the certificate was made for something else"
-            refuse(what, "certificate", f"a certificate of {case.path}, unchanged since", "certificate_of_another")
+            what = f"its {name} differs from the case's: the certificate was made for another question"
+            refuse(what, "certificate", f"a certificate of {case.path}, unchanged since then", "certificate_of_another")
 
 
 class _Checker:
@@ -216,7 +216,7 @@ class _Checker:
             theta, beta = (f"{np.degrees(low):.4f}..{np.degrees(high):.4f}" for low, high in (cell.theta, cell.beta))
             claim = {"S": "safe", "R": f"rejected ({reason})", "U": "small"}[letter]
             what = f"cell {row} (theta {theta}, beta {beta} degrees) is not proven {claim}"
-            refuse(what, "certificate", "claims that follow from the case", "cell_not_proven")
+            refuse(what, "certificate", "claims that the case supports", "cell_not_proven")
 
     def _safe(self, known: _Known) -> bool:
         """Whether no structure comes near, and the skin is crossed once, soon enough and steeply enough."""

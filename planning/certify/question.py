@@ -80,10 +80,10 @@ def question_of(
     ):
         if declared is not None:
             what = f"[{table}]: a certificate proves {straight}"
-            refuse(what, case.path, f"a case without [{table}]; or a search, which counts it", "not_certifiable")
+            refuse(what, case.path, f"a case without [{table}]; or a search, which includes it", "not_certifiable")
     theta, beta = theta or case.search.theta, beta or case.search.beta
     if not (0 <= theta[0] <= theta[1] <= np.pi + 1e-12 and beta[0] <= beta[1] <= beta[0] + 2 * np.pi + 1e-12):
-        refuse("the cap is no range of angles", "certify", "theta 0 to 180, beta 0 to 360", "out_of_range")
+        refuse("the cap is not a range of angles", "certify", "theta 0 to 180, beta 0 to 360", "out_of_range")
     demanding = [s for s in anatomy.checked if s.demands_margin]
     return Question(
         case_name=case.name,
@@ -113,8 +113,8 @@ def _margins(case: Case, demanding: list[Structure], touch: float | None, error:
     if not 0.0 < touch <= MOST_TOUCH:
         refuse(f"chance to touch {touch:g}", "certify", f"above 0, at most {MOST_TOUCH:g}", "out_of_range")
     if error is None:
-        message = "a chance to touch cannot be certified: only markers and [errors] give the needle's error"
-        refuse(message, case.path, "[registration] with markers, and [errors]; or no chance", "not_certifiable")
+        message = "a chance to touch cannot be certified: the needle's error needs markers and [errors]"
+        refuse(message, case.path, "[registration] with markers, and [errors]; or no such limit", "not_certifiable")
     farthest = np.array([np.linalg.norm(s.mesh.vertices - case.target_ct, axis=1).max() for s in demanding])
     waiting = farthest_flange(case.needle, case.search.max_skin_angle)
     lengths = np.array([waiting if s.outside else case.needle.length_mm for s in demanding])

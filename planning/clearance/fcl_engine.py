@@ -175,7 +175,7 @@ def cross_check(
     if difference.size and difference.max() > AGREE_MM:
         row, column = np.unravel_index(int(difference.argmax()), difference.shape)
         raise CrossCheckError(
-            f"direction {rows[row]}, structure {column}: the engine says {found.distance[rows[row], column]:.9f} mm,"
+            f"direction {rows[row]}, structure {column}: the engine finds {found.distance[rows[row], column]:.9f} mm,"
             f" FCL {rated.distance[row, column]:.9f} mm"
         )
     return CrossChecked(len(rows), difference.size, float(difference.max(initial=0.0)))

@@ -40,7 +40,7 @@ FLANGE_FRAME = 6
 
 NEVER_TESTED: Mapping[tuple[str, str], str] = MappingProxyType(
     {
-        ("base", "shoulder"): "joined by a joint: they overlap at every angle",
+        ("base", "shoulder"): "connected by a joint: they overlap at every angle",
         ("shoulder", "upper_arm"): "joined by a joint",
         ("upper_arm", "forearm"): "joined by a joint",
         ("forearm", "wrist_1"): "joined by a joint",
@@ -58,7 +58,7 @@ NEVER_TESTED: Mapping[tuple[str, str], str] = MappingProxyType(
 
 NEVER_TOUCHING: Mapping[tuple[str, str], str] = MappingProxyType(
     {
-        ("wrist_2", "holder"): "the holder begins at the flange, beyond wrist 2, and leads away from it at every angle",
+        ("wrist_2", "holder"): "the holder starts at the flange, beyond wrist 2, and points away at every angle",
         ("wrist_2", "needle"): "as the holder",
     }
 )

@@ -268,7 +268,7 @@ def _nearest(bodies: Sequence[Body], others: Mapping[str, Solid], bounds: Mappin
 def _boxes(boxes: Sequence[Box], taken: Set[str]) -> dict[str, Solid]:
     names = [box.name for box in boxes]
     if len(set(names)) < len(names) or set(names) & taken:
-        refuse(f"box names {names}", "cell", "each once, and none a body's or the patient's", "duplicate_name")
+        refuse(f"box names {names}", "cell", "unique names, not those of a body or the patient", "duplicate_name")
     return {
         box.name: Solid(partial(fcl.Box, *box.size_mm), fcl.Transform(box.T_base_box[:3, :3], box.T_base_box[:3, 3]))
         for box in boxes
@@ -319,8 +319,8 @@ def _joined(model: UrModel, links: Sequence[Link], solids: Solids, joint: int) -
         gaps = _gaps_mm(solids[joint], solids[joint + 1])
         if gaps.min() > 0.0:
             at = f"at {np.degrees(angle):g} degrees of their joint"
-            what = f"the shapes of {links[joint].name} and {links[joint + 1].name} do not meet {at}"
-            allowed = "links that hang together: see the unit, scale and origin of their meshes"
+            what = f"the shapes of {links[joint].name} and {links[joint + 1].name} do not touch {at}"
+            allowed = "connected links: check the unit, scale and origin of their meshes"
             refuse(what, model_urdf(model).where, allowed, "links_apart")
         always &= gaps <= APART_MM
     return always
@@ -345,8 +345,8 @@ def _check_hanging(model: UrModel, links: Sequence[Link], solids: Solids, joined
             if (number, piece) not in hanging:
                 low, high = shape.bounds
                 size = " x ".join(f"{edge:.4g}" for edge in high - low)
-                what = f"a shape of {body.name}, {size} mm, hangs on nothing"
-                allowed = f"shapes of one body that touch, to {APART_MM:g} mm: see unit, scale and origin; or one mesh"
+                what = f"a shape of {body.name}, {size} mm, is not connected"
+                allowed = f"connected shapes, within {APART_MM:g} mm: check unit, scale and origin; or use one mesh"
                 refuse(what, model_urdf(model).where, allowed, "shape_detached")
 
 

@@ -60,7 +60,7 @@ class FclSkin:
         count = len(mesh.vertices)
         usable = len(mesh.faces) > 0 and bool(np.isfinite(mesh.vertices).all())
         if not usable or mesh.faces.min() < 0 or mesh.faces.max() >= count:
-            refuse("mesh is empty, not finite or has an index out of range", name, "a checked mesh", "bad_mesh")
+            refuse("mesh is empty, not finite or has an index out of range", name, "a valid mesh", "bad_mesh")
         self._mesh = mesh
 
     def touches(self, solid: Solid, box: Floats) -> bool:
@@ -201,10 +201,10 @@ def refuse_base_in(
     centre = collision_links(model)[0].mesh.bounds.mean(axis=0)
     hit = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
     if hit or _encloses(patient, centre):
-        refuse("the robot's base stands in the patient", "workcell", "a base outside the skin", "base_in_patient")
+        refuse("the robot's base is in the patient", "workcell", "a base outside the skin", "base_in_patient")
     if surface is not patient and _encloses(surface, centre):
-        what = "the robot's base stands in what is not known to be free: the table that a CT shows, or beyond its end"
-        allowed = 'a base outside of it; where no body lies there, [ct] arms = "none" or beyond_mm'
+        what = "the robot's base is in space not known to be free: the table in the CT, or beyond the image"
+        allowed = 'a base outside of it; if no body is there, [ct] arms = "none" or beyond_mm'
         refuse(what, "workcell", allowed, "base_in_unseen")
 
 
@@ -248,5 +248,5 @@ def check_hanging(tool: ToolBody, bodies: Sequence[Body]) -> None:
     if free:
         low, high = tool.mesh.bounds
         span = " by ".join(f"{a:.4g}..{b:.4g}" for a, b in zip(low, high, strict=True))
-        what = f"the tool ({span} mm in the flange's frame) does not hang on wrist, holder or needle"
-        refuse(what, tool.key, "a body that touches them: see unit, position_mm, rotation_deg", "tool_detached")
+        what = f"the tool ({span} mm in the flange's frame) is not connected to wrist, holder or needle"
+        refuse(what, tool.key, "a connected body: check unit, position_mm, rotation_deg", "tool_detached")

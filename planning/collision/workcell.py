@@ -108,7 +108,7 @@ OF_CASE_FILE = "case file"
 """Source of the solids that the case file describes."""
 
 NOWHERE = (
-    'obstacles of the frame "base" are not checked, since the case does not say where the robot\'s base is: {names}'
+    'obstacles of the frame "base" are not checked, because the case does not state where the robot\'s base is: {names}'
 )
 
 
@@ -180,8 +180,8 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
     """
     deep = 0.0 if case.gantry is None else gantry_in_patient_mm(case.gantry, skin)
     if deep > 0.0:
-        what = f"the gantry's wall stands {np.ceil(10 * deep) / 10:g} mm in the patient"
-        refuse(what, f"{case.path}: gantry", "a bore about the body: see center_mm, tilt_deg", "gantry_in_patient")
+        what = f"the gantry's wall is {np.ceil(10 * deep) / 10:g} mm inside the patient"
+        refuse(what, f"{case.path}: gantry", "a bore around the body: check center_mm, tilt_deg", "gantry_in_patient")
 
 
 def with_surroundings(anatomy: Anatomy, case: Case, T_base_ct: Floats | None) -> Anatomy:

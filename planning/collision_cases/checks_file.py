@@ -112,7 +112,7 @@ class ChecksFile(Section):
     @model_validator(mode="after")
     def _refuse_nothing(self) -> ChecksFile:
         if not (self.check or self.window or self.plan):
-            raise SchemaError(f"nothing is expected; there are no {ALLOWED}", "missing_key")
+            raise SchemaError(f"the file expects nothing; it has no {ALLOWED}", "missing_key")
         return self
 
     def tables(self) -> dict[str, tuple[Expectation, ...]]:
@@ -148,7 +148,7 @@ def _parse(data: bytes, path: Path) -> ChecksFile:
     for kind, tables in content.tables().items():
         for at, table in enumerate(tables):
             if (table.case or content.case) is None:
-                allowed = "case = FILE, for the file or for the table"
+                allowed = "case = FILE, in the file or in the table"
                 refuse("no case", _where(data, path, (kind, at)), allowed, "missing_case")
     return content
 

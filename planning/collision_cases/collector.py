@@ -54,7 +54,7 @@ def direction_finding(check: CheckSection, found: Explanation) -> Finding:
         return Finding()
     case, arm = shlex.quote(str(found.case.path)), "--arm" if check.arm else "--no-arm"
     command = f"run-twin check {case} --theta {check.theta_deg:g} --beta {check.beta_deg:g} {arm} --all"
-    return Finding(differences, (*found.head(), *found.structure_lines()), f"all of it: {command}")
+    return Finding(differences, (*found.head(), *found.structure_lines()), f"full explanation: {command}")
 
 
 def _verdict(check: CheckSection, found: Explanation) -> Iterator[Difference]:
@@ -73,7 +73,7 @@ def _clearances(check: CheckSection, found: Explanation) -> Iterator[Difference]
     clearances = found.clearances()
     for name, want in check.clearance_mm.items():
         if name not in clearances:
-            yield Difference(f"clearance of {name!r}: no such structure; there are {', '.join(clearances)}")
+            yield Difference(f"clearance of {name!r}: no such structure; available: {', '.join(clearances)}")
         elif not abs(clearances[name] - want) <= check.tolerance_mm:
             got = clearances[name]
             line = f"clearance of {name}: expected {want:g} ± {check.tolerance_mm:g} mm, found {got:.4f} mm"
@@ -93,10 +93,10 @@ def _touch(check: CheckSection, found: Explanation) -> Iterator[Difference]:
     if want is None:
         return
     if found.case.errors is None:
-        yield Difference("max_touch: the case declares no [errors], so that nothing says how likely a touch is")
+        yield Difference("max_touch: the case declares no [errors], so the chance to touch is not known")
     elif chances is None or not np.isfinite(chances.touch_any[0]):
-        need = "a direction that organs and arm allow" if check.arm else "arm = true"
-        yield Difference(f"max_touch: the chance to touch is not known; it takes {need}")
+        need = "a direction that is safe for the organs and the arm" if check.arm else "arm = true"
+        yield Difference(f"max_touch: the chance to touch is not known; it needs {need}")
     elif not chances.touch_any[0] <= want:
         got = float(chances.touch_any[0])
         line = f"max_touch: expected at most {want:g}, found {got:.3g}"
@@ -136,7 +136,7 @@ def _differences(
         return
     row = nearest_row(search, direction.outward_ct[0])
     if row is None:
-        yield Difference("the direction is safe, but lies beyond the grid that the case searches")
+        yield Difference("the direction is safe but outside the grid of the case")
     elif not search.safe[row]:
         yield Difference(f"the nearest direction of the grid, {_angles(search, row)}: {reason_text(search, row)}")
     else:
@@ -146,7 +146,7 @@ def _differences(
 def _too_small(window: WindowSection, windows: Windows, number: int) -> Iterator[Difference]:
     want, got = window.min_square_deg, windows.windows[number - 1].square_deg
     if not got >= want:
-        line = f"window {number} that holds it: expected at least {want:g} square degrees, found {got:.1f}"
+        line = f"its window {number}: expected at least {want:g} square degrees, found {got:.1f}"
         yield Difference(line, NewNumber(("min_square_deg",), got, DIGIT_SQUARE_DEG, ROUND_FLOOR))
 
 
@@ -161,7 +161,7 @@ def _angles(candidates: Candidates, row: int) -> str:
     return f"theta {at['theta_deg']:g} deg, beta {at['beta_deg']:g} deg"
 
 
-ONLY_NUMBERS = f"{UPDATE} rewrites numbers alone: verdict, reason, structure and plans are for a person to change"
+ONLY_NUMBERS = f"{UPDATE} rewrites only numbers: change verdict, reason, structure and plans by hand"
 
 
 class CollisionMismatchError(AssertionError):
@@ -336,5 +336,7 @@ def plan_finding(path: Path, context: CaseContext) -> Finding:
     try:
         check_plan(read_plan(path), context, path)
     except InputError as error:
-        return Finding((Difference(f"the plan does not hold: {error.what}"),), (f"{error.where}: {error.allowed}",))
+        return Finding(
+            (Difference(f"the plan is not valid any more: {error.what}"),), (f"{error.where}: {error.allowed}",)
+        )
     return Finding()

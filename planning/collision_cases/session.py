@@ -19,6 +19,7 @@ import pytest
 
 from puncture_twin.planning.base.errors import InputError, one_line, refuse
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.text import plural
 
 if TYPE_CHECKING:
     from puncture_twin.planning.search.candidates import Candidates
@@ -110,12 +111,12 @@ def arm_notes(reports: Iterable[object]) -> list[str]:
             properties = dict(getattr(report, "user_properties", ()))
             if properties.get(ARM_PROPERTY, CHECKED) != CHECKED:
                 notes[f"{properties['case']}: arm {properties[ARM_PROPERTY]}"] += 1
-    return [f"{line} ({count} test{'s' if count != 1 else ''})" for line, count in notes.items()]
+    return [f"{line} ({plural(count, 'test')})" for line, count in notes.items()]
 
 
 def add_flag(parser: pytest.Parser) -> None:
     """Register the flag with pytest."""
-    text = "rewrite the numbers that *.collision.toml files expect; never a verdict"
+    text = "rewrite the numbers expected in *.collision.toml files; never a verdict"
     parser.getgroup("collision").addoption(UPDATE, action="store_true", help=text)
 
 
@@ -164,7 +165,7 @@ def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
     """
     path = path.resolve()
     if path.read_bytes() != data:
-        refuse("changed while the tests ran", path, "the same file; run again", "input_changed")
+        refuse("changed while the tests ran", path, "an unchanged file: run again", "input_changed")
     text, lines = _rewritten(data.decode("utf-8"), path, changes)
     with atomic(path) as draft:
         draft.write_bytes(text.encode("utf-8"))
@@ -186,7 +187,7 @@ def _rewritten(text: str, path: Path, changes: Sequence[Change]) -> tuple[str, l
         lines.append(f"{path.name}: {change.test}: {'.'.join(change.number.keys)} {old} -> {new}{weaker}")
     written = tomlkit.dumps(document)
     if tomllib.loads(written) != expected:
-        refuse("cannot be rewritten without changing more", path, "the numbers by hand", "not_rewritable")
+        refuse("cannot be rewritten without changing other text", path, "change the numbers by hand", "not_rewritable")
     return written, lines
 
 

@@ -127,15 +127,15 @@ def thick_slices(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
         spacing = float(grid.voxels.spacing_mm.max())
         if spacing > least.margin_mm:
             said = (
-                f"{grid.name}: slices {spacing:.3g} mm apart, and the least margin demanded from it is "
-                f"{least.margin_mm:g} mm ({least.name}): what lies between two slices is not seen"
+                f"{grid.name}: slices {spacing:.3g} mm apart, but its smallest margin is {least.margin_mm:g} mm "
+                f"({least.name}): objects between two slices are not seen"
             )
             yield Finding("thick_slices", Severity.WARNING, said, {"slices_mm": spacing, "margin_mm": least.margin_mm})
     name = case.skin_section.ct
     if name is not None and (spacing := float(case.volumes.source(name).grid.spacing_mm.max())) > ARM_PADDING_MM:
         said = (
-            f"{name}: slices {spacing:.3g} mm apart, and needle and arm keep {ARM_PADDING_MM:g} mm from the skin "
-            "that is found in it"
+            f"{name}: slices {spacing:.3g} mm apart, but needle and arm keep only {ARM_PADDING_MM:g} mm from the "
+            "skin found in it"
         )
         yield Finding("thick_slices", Severity.WARNING, said, {"slices_mm": spacing, "margin_mm": ARM_PADDING_MM})
 
@@ -148,7 +148,7 @@ def short_grid(case: Case) -> Iterator[Finding]:
         last = low + step * np.floor((high - low) / step + STEP_SLACK)
         if high - last > STEP_SLACK * step:
             said = (
-                f"search.{key} [{low:g}, {high:g}] is no whole number of steps of {step:g}: the last angle that is "
+                f"search.{key} [{low:g}, {high:g}] is not a whole number of steps of {step:g}: the last angle "
                 f"checked is {last:g}"
             )
             yield Finding("short_grid", Severity.WARNING, said, {"last_deg": float(last)})
@@ -159,7 +159,7 @@ def ignored_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
     roles = {name: default_role(name, case.region or "other") for name in anatomy.ignored}
     avoided = [name for name, role in roles.items() if role is not None and role.kind == "avoid"]
     if avoided:
-        said = f"ignored by the case, and so free to cross: {first_few(avoided)}"
+        said = f"ignored by the case, so paths may cross them: {first_few(avoided)}"
         yield Finding("organs_ignored", Severity.WARNING, said, {"count": float(len(avoided))})
 
 
@@ -167,5 +167,5 @@ def absent_usual_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
     """The usual organs of the case's region that nobody named: they count as free."""
     absent = absent_organs(case.region, [*(structure.name for structure in anatomy.structures), *anatomy.ignored])
     if absent:
-        said = f"no structure is named like {', '.join(absent)}; what has no structure counts as free"
+        said = f"no structure is named like {', '.join(absent)}; organs without a structure count as free"
         yield Finding("organs_absent", Severity.WARNING, f"region {case.region}: {said}")

@@ -281,9 +281,9 @@ def axes_text(order: Sequence[int], signs: Sequence[float]) -> str:
     """Exchanged and negated axes in words; empty where neither is."""
     negated = [name for name, sign in zip("xyz", signs, strict=True) if sign < 0]
     if tuple(order) != (0, 1, 2):
-        return "with its axes exchanged"
+        return "with its axes swapped"
     if len(negated) == 2:
-        return f"turned by half a turn ({' and '.join(negated)} negated)"
+        return f"rotated by 180 degrees ({' and '.join(negated)} negated)"
     return f"mirrored in {', '.join(negated)}" if negated else ""
 
 

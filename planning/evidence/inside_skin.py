@@ -40,9 +40,9 @@ LEAST_INSIDE = 0.9
 CODE = "outside_skin"
 ALLOWED_INSIDE = (
     f"at least {100 * LEAST_INSIDE:g} % of a structure's surface inside the skin; "
-    'role "unknown" for what is known to lie outside'
+    'role "unknown" for a structure known to lie outside'
 )
-CAUSES = "a part of the body that the skin does not hold (such as an arm), or a slip of space (LPS/RAS) or unit?"
+CAUSES = "a part of the body outside the skin (such as an arm), or the wrong space (LPS/RAS) or unit?"
 
 
 @dataclass(frozen=True)
@@ -169,18 +169,18 @@ def outside_skin(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding
     placed = [structure for structure in known if structure.source != OWN_TARGET]
     beside = [structure for structure in placed if _wholly_outside(anatomy.skin, structure)]
     if beside:
-        said = f"structure '{beside[0].name}' lies wholly outside the skin: a slip of space (LPS/RAS) or unit?"
+        said = f"structure '{beside[0].name}' is completely outside the skin: wrong space (LPS/RAS) or unit?"
         yield Finding(CODE, Severity.REFUSAL, said, way_out="structures that reach into the body")
         return
     if not anatomy.skin.mesh.closed:
-        said = "the skin mesh is open: how much of each structure lies inside the body is not known"
+        said = "the skin mesh is open: the part of each structure inside the body is not known"
         yield Finding("skin_open", Severity.WARNING, said)
         return
     tolerances = np.array([_surface_tolerance_mm(case, structure) for structure in placed])
     meshes = [structure.mesh for structure in placed]
     for structure, part in zip(placed, kept_inside_skin(meshes, anatomy.skin, tolerances, cache), strict=True):
         if part.inside + part.outside == 0:
-            said = f"structure '{structure.name}' lies wholly beyond a side at which the skin was cut"
+            said = f"structure '{structure.name}' is completely beyond a side at which the skin was cut"
             yield Finding("beyond_skin", Severity.WARNING, said)
         elif part.fraction < USUAL_INSIDE:
             outside = f"{100 * (1 - part.fraction):.1f} % of its surface lies outside the skin"

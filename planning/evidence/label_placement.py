@@ -98,9 +98,9 @@ LEAST_SCALE, LEAST_TURN = 0.015, np.radians(1.5)
 
 KINDS = {
     "shift": "a shift",
-    "turn": "a turn",
+    "turn": "a rotation",
     "scale": "another scale",
-    "axes": "a mirror image or a turn of it",
+    "axes": "a mirror image or a rotation of it",
     "unit": "another unit",
     "grid": "the CT's own grid",
 }
@@ -111,8 +111,8 @@ OTHER_SPACE = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 CODE = "labels_beside_image"
 ALLOWED = (
-    "structures that lie where the CT shows them; init --trust-labels, or [search] trust_labels = true, where a person "
-    "has looked at both and knows that they do"
+    "structures where the CT shows them; or init --trust-labels, or [search] trust_labels = true, if you compared "
+    "both and they agree"
 )
 
 
@@ -402,17 +402,17 @@ def _findings(case: Case, scan: Scan, source: Source, found: Assessed) -> Iterat
     if found.doubtful:
         slip = None if found.T is None else slip_of(found.T, found.middle_ct)
         place = "elsewhere" if slip is None else slip.text(own_grid=found.kind == "grid")
-        sure = "does" if found.refuses else "may"
+        sure = "is not" if found.refuses else "may not be"
         said = (
-            f"{of} {sure} not lie where {scan.name} shows it: it lies better on its edges {place} "
-            f"(z {found.z:.1f}, edges {found.ratio:.2f} times as strong)"
+            f"{of} {sure} where {scan.name} shows it: it fits the edges better {place} (z {found.z:.1f}, "
+            f"edges {found.ratio:.2f} times as strong)"
         )
         severity = Severity.REFUSAL if found.refuses and not case.ct.trust_labels else Severity.WARNING
         yield Finding(CODE, severity, said, numbers | ({} if slip is None else slip.numbers()), ALLOWED)
     odd = found.agreeing or found.odd
     if odd and not found.refuses:
         names, alike = ", ".join(odd), "at one and the same other place" if found.agreeing else "elsewhere"
-        said = f"{source.name}: {names} would lie better on the edges of {scan.name} {alike}: do they lie right?"
+        said = f"{source.name}: {names} would fit the edges of {scan.name} better {alike}: are they in the right place?"
         severity = Severity.REFUSAL if found.agreeing and not case.ct.trust_labels else Severity.WARNING
         yield Finding("structure_beside_image", severity, said, numbers | {"names": names}, ALLOWED)
     if count > 1 and not found.refuses:
@@ -421,12 +421,13 @@ def _findings(case: Case, scan: Scan, source: Source, found: Assessed) -> Iterat
         return
     if found.open:
         said = (
-            f"{of}: the edges of {scan.name} cannot tell its place from {', '.join(KINDS[one] for one in found.open)}"
+            f"{of}: the edges of {scan.name} cannot distinguish its place from "
+            f"{', '.join(KINDS[one] for one in found.open)}"
         )
         severity = Severity.WARNING if "shift" in found.open else Severity.NOTE
         yield Finding("edges_cannot_tell", severity, said, numbers)
     else:
-        said = f"{of} as a whole lies on the edges of {scan.name}, and worse wherever else it was tried"
+        said = f"{of} as a whole fits the edges of {scan.name}, and fits worse at every other place tried"
         yield Finding("labels_on_edges", Severity.NOTE, said, numbers)
 
 
@@ -461,7 +462,7 @@ class Slip(NamedTuple):
         """After "it lies better"."""
         parts = [self.axes] if self.axes else []
         parts += [f"scaled by {self.scale:.3g}"] if abs(self.scale - 1) > LEAST_SCALE else []
-        parts += [f"turned by {np.degrees(self.turn):.0f} degrees"] if self.turn > LEAST_TURN else []
+        parts += [f"rotated by {np.degrees(self.turn):.0f} degrees"] if self.turn > LEAST_TURN else []
         parts.append(f"moved by ({', '.join(f'{one:.1f}' for one in self.shift_mm)}) mm LPS")
         return ("on the CT's own grid, whose matrix it has: " if own_grid else "") + " and ".join(parts)
 

@@ -48,8 +48,8 @@ CLEARLY_MM = 10.0
 """Middles nearer to each other along the axis say nothing: a field of view may cut off most of an organ."""
 
 ALLOWED = (
-    "structures whose names, sides and places agree; init --trust-labels, or [search] trust_labels = true, where a "
-    "person knows that they do"
+    "structures whose names, sides and places agree; or init --trust-labels, or [search] trust_labels = true, if you "
+    "checked that they do"
 )
 
 INWARD_MM = 2.0
@@ -113,14 +113,14 @@ def order_of_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
         wrong = [(a, b) for a, b in pairs if middles[a][axis] > middles[b][axis]]
         if not wrong:
             continue
-        said = ", ".join(f"{a} lies nearer to the {other} than {b}" for a, b in wrong[:3])
+        said = ", ".join(f"{a} is nearer to the {other} than {b}" for a, b in wrong[:3])
         facts = max(len({_kind(pair[end]) for pair in wrong}) for end in range(2))
         all_wrong = len(wrong) == len(pairs) and facts >= 2 and not case.ct.trust_labels
         yield Finding(
             "organs_out_of_order",
             Severity.REFUSAL if all_wrong else Severity.WARNING,
-            f"{said}: {len(wrong)} of {len(pairs)} pairs of organs lie to each other as in few bodies ({one} to "
-            f"{other}); mirrored, turned, or names exchanged?",
+            f"{said}: {len(wrong)} of {len(pairs)} pairs of organs are placed as in few bodies ({one} to "
+            f"{other}); mirrored, rotated, or names swapped?",
             {"wrong": float(len(wrong)), "pairs": float(len(pairs))},
             ALLOWED,
         )
@@ -186,11 +186,12 @@ def densities(case: Case, anatomy: Anatomy, *, on_edges: bool) -> Iterator[Findi
 
         within = scan.source.kept(made_from, make, lambda stored: float(stored["within"]), by=__name__)
         if within < tissue.least:
-            said = f"{100 * within:.0f} % of what the structures call {tissue.name} has the Hounsfield units of such"
+            said = f"{100 * within:.0f} % of the structures named as {tissue.name} has matching Hounsfield units"
             yield Finding(
                 "densities",
                 severity,
-                f"{scan.name}: {said} (at least {100 * tissue.least:.0f} % is usual): do they belong together?",
+                f"{scan.name}: {said} (at least {100 * tissue.least:.0f} % is usual): do labels and CT belong "
+                "together?",
                 {"within": round(within, 3), "least": tissue.least},
             )
 

@@ -121,9 +121,9 @@ def overlaps(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding]:
     for row, other_row, fraction, ml in cache.arrays(made_from, make, by=__name__)["pairs"].tolist():
         one, other = placed[int(row)], placed[int(other_row)]
         if fraction >= LEAST_SHARED and not _belong(case, one, other, nested=fraction >= NESTED):
-            said = f"'{one.name}' lies with {100 * fraction:.0f} % of its volume ({ml:.1f} ml) in '{other.name}'"
+            said = f"'{one.name}' has {100 * fraction:.0f} % of its volume ({ml:.1f} ml) in '{other.name}'"
             numbers = {"fraction": round(fraction, 3), "ml": round(ml, 2), "names": f"{one.name}, {other.name}"}
-            yield Finding("structures_overlap", Severity.WARNING, f"{said}: does each lie right?", numbers)
+            yield Finding("structures_overlap", Severity.WARNING, f"{said}: is each in the right place?", numbers)
 
 
 def _belong(case: Case, one: Structure, other: Structure, *, nested: bool) -> bool:

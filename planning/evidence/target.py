@@ -71,7 +71,7 @@ def target_place(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
             yield _misplaced(case, lies, "a target outside every 'avoid' structure")
         elif own and structure.role is not Role.TARGET:
             said = f"target.structure '{structure.name}' has role '{structure.role}'"
-            way_out = 'role "target" for the structure that holds the target'
+            way_out = 'role "target" for the structure that contains the target'
             yield Finding("target_role", Severity.REFUSAL, said, way_out=way_out)
         elif own and side is Side.OUTSIDE:
             gap = surface_distance(structure.mesh, case.target_ct)
@@ -122,13 +122,13 @@ def target_in_vessel(case: Case) -> Iterator[Finding]:
         return
     name = case.target_structure
     if (line := never_crossed(name)) is not None:
-        said = f"of '{line.group}' ({line.reason}): every safe path ends in it; is the target's place right?"
+        said = f"of '{line.group}' ({line.reason}): every safe path ends in it; is the target's position right?"
         yield Finding("target_in_vessel", Severity.WARNING, f"the target lies in '{name}', {said}")
         return
     line = default_role(name, "other")
     part = line == LESION and not named_as_crossed(name)
     if part or (line is None and case.region != "phantom"):
-        of = "is a lesion's by a part of it alone" if part else "the table of default roles does not know"
+        of = "is like a lesion's only in part" if part else "is not in the table of default roles"
         said = f"a name that {of}, and every safe path ends in it: is it no vessel?"
         yield Finding("target_name_unknown", Severity.WARNING, f"the target lies in '{name}', {said}")
 
@@ -150,8 +150,8 @@ def target_in_other_space(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
         yield Finding(
             "target_in_other_space",
             Severity.WARNING,
-            f"the target ({point_text(case.target_ct, case.space)}) lies {place}; read in {space} the same numbers lie "
-            f"in '{name}': is it stated in the right space?",
+            f"the target ({point_text(case.target_ct, case.space)}) lies {place}; read in {space}, the same numbers "
+            f"lie in '{name}': is the space right?",
         )
 
 
@@ -176,11 +176,11 @@ def open_around_target(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
             yield Finding(
                 "open_around_target",
                 Severity.REFUSAL,
-                f"'{structure.name}' is an open mesh about the target: whether the target lies inside is not known "
-                f"({100 * odd:.0f} % of all rays from it cross the mesh an odd number of times; winding number "
+                f"'{structure.name}' is an open mesh around the target: it is not known whether the target lies inside "
+                f"({100 * odd:.0f} % of rays from it cross the mesh an odd number of times; winding number "
                 f"{turns:.2f})",
                 {"odd": odd, "winding": turns},
-                "a closed mesh, or one that goes less than half around the target",
+                "a closed mesh, or one that covers less than half of the directions from the target",
             )
 
 

@@ -116,8 +116,8 @@ def _triangle(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats
 COLUMNS = ("phase", "time_s", *(f"q{joint}_rad" for joint in range(1, 7)))
 
 NOTES = (
-    "joint angles of the controller, base to wrist 3; each phase starts at time 0 and at rest",
-    "the insertion is for the operator to start: nothing in this table waits",
+    "joint angles of the controller, base to wrist 3; each phase starts at rest, at time 0",
+    "the operator starts the insertion: nothing in this table waits",
 )
 
 
@@ -139,7 +139,7 @@ def read_csv(text: str, *, where: Path) -> SampledMotion:
     """
     rows = list(csv.reader(io.StringIO("\n".join(line for line in text.splitlines() if not line.startswith("#")))))
     if not rows or tuple(rows[0]) != COLUMNS:
-        refuse("the table's header is another", where, ",".join(COLUMNS), "wrong_columns")
+        refuse("the table has another header", where, ",".join(COLUMNS), "wrong_columns")
     phases: dict[str, list[list[float]]] = {phase: [] for phase in SampledMotion._fields}
     for number, row in enumerate(rows[1:], start=2):
         try:
@@ -226,7 +226,7 @@ def _urscript(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
     if len(program.stream_q):
         return _Draft(text, ("the approach is smooth and streamed (servoj): the controller follows it with a lag",))
     rounded = 0 if blends is None else int(np.count_nonzero(blends))
-    why = "" if checker is not None else "; corners are only rounded where the case shows them free: name it"
+    why = "" if checker is not None else "; without the case, corners are not rounded (--case)"
     return _Draft(text, (f"{len(program.moves)} joint moves, {rounded} of them rounding a corner{why}",))
 
 
@@ -297,5 +297,5 @@ def format_of(name: str) -> tuple[str, Drafting]:
         found = error
     if isinstance(found, Exporter) and found.ending.startswith(".") and found.ending != ".json":
         return found.ending, found.draft
-    where, allowed = f"{GROUP}: {entry.value}", "an Exporter whose files end otherwise than a plan's"
+    where, allowed = f"{GROUP}: {entry.value}", "an Exporter with another file ending than a plan's"
     raise InputError(f"format '{name}': {found!r}", where=where, allowed=allowed, code="no_exporter")

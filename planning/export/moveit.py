@@ -131,7 +131,7 @@ def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:
     for phase in SampledMotion._fields:
         trajectory = goals[phase]["trajectory"]
         if trajectory["joint_names"] != list(plan.model.joint_names):
-            refuse(f"{phase} is of other joints", where, ", ".join(plan.model.joint_names), "other_joints")
+            refuse(f"{phase} has other joints", where, ", ".join(plan.model.joint_names), "other_joints")
         starts = [point["time_from_start"] for point in trajectory["points"]]
         times = np.array([one["sec"] + one["nanosec"] / NANOSECONDS for one in starts])
         parts[phase] = Trajectory(times, np.array([point["positions"] for point in trajectory["points"]]))

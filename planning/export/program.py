@@ -28,6 +28,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import POSE_TOLERANCE_MM
@@ -152,10 +153,10 @@ def straight_move(model: UrModel, program: Program) -> Trajectory:
     branches = inverse(model, poses)
     off = np.abs(wrap_to_pi(branches[0] - program.standoff_q)).max(axis=1)  # by the joint farthest off
     if np.isnan(off).all():
-        refuse("the arm does not reach its standoff", "insertion", "a pose within reach", "out_of_reach")
+        refuse("the arm does not reach the standoff", "insertion", "a pose within reach", "out_of_reach")
     q = branches[:, int(np.nanargmin(off))]
     if np.isnan(q).any():
-        refuse("the arm does not reach all of the straight way", "insertion", "one branch", "out_of_reach")
+        refuse("the arm does not reach the whole straight path", "insertion", "one branch", "out_of_reach")
     first = program.standoff_q + wrap_to_pi(q[0] - program.standoff_q)
     return Trajectory(times, np.concatenate([first[None], first + np.cumsum(wrap_to_pi(np.diff(q, axis=0)), axis=0)]))
 
@@ -254,7 +255,7 @@ def check_sampled(motion: SampledMotion, plan: Plan, *, time_resolution_s: float
             and np.abs(read.times_s - planned.times_s).max() <= TIME_TOLERANCE_S
         )
         if not same:
-            refuse(f"the {name} does not read back as the plan's", where, "the plan's samples", "not_read_back")
+            refuse(f"the {name} does not read back as in the plan", where, "the plan's samples", "not_read_back")
         check_trajectory(plan.model, read, time_resolution_s=time_resolution_s, what=name, where=where)
 
 
@@ -439,17 +440,12 @@ def warning_lines(warnings: Sequence[str]) -> list[str]:
     """The warnings of a plan for a comment: how many, then each whole, on as many lines as it needs.
 
     >>> warning_lines(("the 'skin' is open; a box",))
-    ['1 warning stood when this was planned:', 'warning: the skin is open, a box']
+    ['1 warning when this was planned:', 'warning: the skin is open, a box']
     """
     if not warnings:
-        return ["warnings: none stood when this was planned"]
+        return ["warnings when this was planned: none"]
     lines = [line for one in warnings for line in textwrap.wrap(f"warning: {plain_sentence(one)}", SENTENCE_WIDTH)]
-    return [f"{counted(warnings)} stood when this was planned:", *lines]
-
-
-def counted(warnings: Sequence[str]) -> str:
-    """A number of warnings in words that can be read aloud."""
-    return f"{len(warnings)} warning{'s' if len(warnings) > 1 else ''}"
+    return [f"{plural(len(warnings), 'warning')} when this was planned:", *lines]
 
 
 def plain_sentence(text: str) -> str:

@@ -91,7 +91,7 @@ def _check_approach(program: Program, plan: Plan, model: UrModel, where: Path) -
         check_rates(model, *rates, what="approach", where=where)
         _check_tip(model, start, end, fraction * move.speed * np.sign(end - start), plan, where)
     if program.moves and program.moves[-1].blend_mm != 0.0:
-        refuse("the approach does not stop at its end", where, "a last blend of 0", "not_read_back")
+        refuse("the approach does not stop at its end", where, "a blend radius of 0 at the end", "not_read_back")
 
 
 def _check_tip(model: UrModel, start: Floats, end: Floats, speeds: Floats, plan: Plan, where: Path) -> None:
@@ -118,14 +118,14 @@ def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) 
         refuse(what, where, f"at most {plan.speeds.insertion_speed_mm_s:g} mm/s", "tip_too_fast")
     angle = _pose_difference(program.T_base_standoff, program.T_base_target)[1]
     if not angle <= TURN_TOLERANCE_RAD:
-        refuse(f"the needle turns by {angle:.3g} rad on its way", where, "a straight way", "not_straight")
+        refuse(f"the needle rotates by {angle:.3g} rad on its path", where, "a straight path", "not_straight")
     moved = straight_move(model, program)
     ends = np.abs(moved.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
     if not ends <= SAME_BRANCH_RAD:
         refuse(f"the straight move ends {ends:.3g} rad off", where, "the plan's own branch", "not_read_back")
     worst = _farthest_mm(flange_pose(model, moved.q)[:, :3, 3], flange_pose(model, plan.insertion.q)[:, :3, 3])
     if not worst <= STRAIGHT_TOLERANCE_MM:
-        refuse(f"the straight move is {worst:.3g} mm off the plan's way", where, "the plan", "not_straight")
+        refuse(f"the straight move is {worst:.3g} mm off the planned path", where, "the plan", "not_straight")
     check_trajectory(model, moved, time_resolution_s=0.0, what="insertion", where=where)
 
 
@@ -146,4 +146,4 @@ def _pose_difference(T_a: Floats, T_b: Floats) -> tuple[float, float]:
 
 def _check_same(read: Floats, planned: Floats, what: str, where: Path) -> None:
     if read.shape != planned.shape or not np.abs(read - planned).max() <= ANGLE_TOLERANCE_RAD:
-        refuse(f"{what} does not read back as the plan's", where, "the plan's angles", "not_read_back")
+        refuse(f"{what} does not read back as in the plan", where, "the plan's angles", "not_read_back")

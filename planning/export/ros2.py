@@ -28,8 +28,8 @@ and Carlson, "Monotone piecewise cubic interpolation", 1980)."""
 NOTES = (
     "two trajectory_msgs/JointTrajectory: send 'approach', wait for the operator at standoff, then send 'insertion'",
     "joint angles are the same for ROS and for the controller; base_link of ur_description is the controller's base",
-    "turned by 180 deg about z, which matters to Cartesian poses only: there are none here, and frame_id is empty",
-    "the controller must stand at the first positions before the approach is sent: check it",
+    "rotated by 180 deg about z; this matters only for Cartesian poses: there are none here, and frame_id is empty",
+    "the arm must be at the first positions before the approach is sent: check it",
 )
 
 _POINT = re.compile(

@@ -150,12 +150,12 @@ def slicer_files(case: Case, drawn: SceneContent) -> SlicerFiles:
     nodes, notes = [SceneNode("MarkupsLine", drawn.name, PATH)], []
     _read_points(texts[PATH], PATH, ("entry", "target"), ends)
     if drawn.placement is None:
-        notes.append("the case does not say where the robot stands: no transform, no markers")
+        notes.append("the case does not place the robot: no transform, no markers")
     else:
         T_ct_base = inverse(drawn.placement.T_base_ct)
         texts[TRANSFORM] = transform_text(T_ct_base)
         nodes.append(SceneNode("LinearTransform", "ct_to_robot", TRANSFORM))
-        notes.append(f"{TRANSFORM}: from base to CT in LPS, as Slicer saves what moves the CT to the robot")
+        notes.append(f"{TRANSFORM}: from base to CT in LPS, as Slicer saves a transform from the CT to the robot")
         _same(parse_transform(texts[TRANSFORM].encode(), Path(TRANSFORM)), T_ct_base, TRANSFORM)
     if drawn.placement is not None and drawn.placement.registration is not None:
         markers = drawn.placement.registration.markers

@@ -18,7 +18,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.export.program import STREAM_S, JointMove, Program, counted, heading, plain_sentence
+from puncture_twin.planning.base.text import plural
+from puncture_twin.planning.export.program import STREAM_S, JointMove, Program, heading, plain_sentence
 from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, pose
 from puncture_twin.planning.plan.plan import Plan
 
@@ -92,9 +93,9 @@ def urscript_text(program: Program, plan: Plan, *, case_checked: bool) -> str:
     blended = any(move.blend_mm > 0.0 for move in program.moves)
     notes = [
         "units: metres and radians; poses in the controller's base frame; TCP at the needle tip",
-        "corners of the approach: " + ("rounded where the plan's case shows them free" if blended else "not rounded"),
+        "corners of the approach: " + ("rounded where they are free in the plan's case" if blended else "not rounded"),
         "not set here: payload, safety limits. While it inserts, tool_contact stops the arm, with the controller's own",
-        "threshold: it tells no tissue from another and is no guard for persons.",
+        "threshold: it does not distinguish tissues and does not protect people.",
     ]
     lines = ["def puncture():", *(f"  {line}" for line in heading(plan, notes, case_checked=case_checked))]
     lines += [*_values(program), "", *_FUNCTIONS.splitlines(), ""]
@@ -117,7 +118,7 @@ def _checks() -> list[str]:
     return [
         "  set_tcp(tcp_m)",
         f"  if far_from(start_q, {START_TOLERANCE_RAD}):",
-        '    refuse("The arm does not stand at the start of the plan.")',
+        '    refuse("The arm is not at the start of the plan.")',
         "  end",
         f"  if differ_but_for_turns(get_inverse_kin(target_m, target_q), target_q, {KINEMATICS_TOLERANCE_RAD}):",
         '    refuse("This arm or its TCP is not the one of the plan.")',
@@ -140,7 +141,7 @@ def _of_warnings(warnings: Sequence[str]) -> str:
     if not warnings:
         return ""
     first = textwrap.shorten(plain_sentence(warnings[0]), FIRST_WORDS, placeholder=" ...")
-    return f"{counted(warnings)}: {first} See the program. "
+    return f"{plural(len(warnings), 'warning')}: {first} See the program. "
 
 
 def _insertion(program: Program, warnings: Sequence[str]) -> list[str]:
@@ -214,7 +215,7 @@ def read_urscript(text: str, *, where: Path) -> Program:
     at, insertion = insertions[0]
     if len(back) != 1 or back[0].groups() != insertion.groups() or lines.count(_RUN) != 1 or _GUARD not in lines:
         what = "the insertion is not guarded, or does not retract"
-        refuse(what, where, "a guard, and a way back at the same speed", "insertion_unguarded")
+        refuse(what, where, "a guard, and a retraction at the same speed", "insertion_unguarded")
     last = max((n for n, line in enumerate(lines) if line.startswith(("  movej", "  servoj"))), default=-1)
     if len(waits) != 1 or not last < waits[0] < at:
         refuse("the insertion does not wait for the operator", where, "a wait before it", "insertion_unguarded")

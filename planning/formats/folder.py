@@ -20,7 +20,7 @@ from puncture_twin.planning.base.output.manifest import is_output_folder
 FILE, FOLDER, HIDDEN = "", "is a folder", "is hidden"
 """What most entries are; of all others it is said why they are neither."""
 
-NOT_READ = "of a kind that is not read"
+NOT_READ = "of an unsupported kind"
 
 HARMLESS = (
     *(".ds_store", "thumbs.db", "desktop.ini", ".directory", ".git*", ".datalad", ".dvc", ".dvcignore"),
@@ -87,7 +87,7 @@ def entries(folder: Path, *, most: int, allowed: str = "a readable folder") -> t
         why = getattr(error, "strerror", None) or error
         raise InputError(f"cannot be read ({why})", where=folder, allowed=allowed, code="folder_not_listed") from error
     if len(found) > most:
-        refuse(f"holds {len(found)} files, more than {most}", folder, allowed, "folder_too_large")
+        refuse(f"has {len(found)} files, more than {most}", folder, allowed, "folder_too_large")
     return tuple(found)
 
 
@@ -160,5 +160,5 @@ def structure_below(folder: Path) -> str:
         if named := [one for one in (*folders, *files) if STRUCTURE_LIKE.search(one)]:
             return str(Path(top, min(named)).relative_to(folder))
         if closed or seen > MOST_INSIDE:
-            return "what cannot be listed" if closed else f"more than {MOST_INSIDE} files"
-    return "what cannot be listed" if closed else ""
+            return "an unreadable folder" if closed else f"more than {MOST_INSIDE} files"
+    return "an unreadable folder" if closed else ""

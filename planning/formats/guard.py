@@ -49,7 +49,7 @@ def guard_transform(T: ArrayLike, *, where: str | Path) -> NDArray[np.float64]:
     if matrix.shape != (4, 4):
         refuse(f"transform has shape {matrix.shape}", where, _TRANSFORM_ALLOWED, "wrong_shape")
     if not np.isfinite(matrix).all():
-        refuse("transform holds a value that is not finite", where, _TRANSFORM_ALLOWED, "not_finite")
+        refuse("transform has a value that is not finite", where, _TRANSFORM_ALLOWED, "not_finite")
     if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         refuse(f"last row of the transform is {matrix[3].tolist()}", where, _TRANSFORM_ALLOWED, "not_rigid")
     _check_rotation(matrix[:3, :3], where=where)
@@ -75,7 +75,7 @@ def guard_points(points: Many, names: Sequence[str], *, where: str | Path) -> ND
         InputError: If there is no point, a name is missing, doubled, too long or not printable, or a coordinate is not
             finite or too far.
     """
-    allowed = "one printable name per point, not empty and used once"
+    allowed = "one printable name per point, not empty, each used once"
     array = points_array(points, names, what="point", where=where)
     if len(names) != len(array):
         refuse(f"{len(names)} names for {len(array)} points", where, allowed, "wrong_count")
@@ -99,7 +99,7 @@ def _float_array(values: Many, *, what: str, where: str | Path, allowed: str) ->
     except ValueError as error:  # what numpy raises for rows of different length
         raise InputError(f"{what} is ragged ({error})", where=where, allowed=allowed, code="wrong_shape") from error
     if raw.dtype.kind not in "iuf":
-        refuse(f"{what} holds values of type {raw.dtype}", where, allowed, "wrong_type")
+        refuse(f"{what} has values of type {raw.dtype}", where, allowed, "wrong_type")
     return raw if is_frozen(raw, np.float64) else np.array(raw, dtype=np.float64, order="C")
 
 
@@ -125,7 +125,7 @@ def _check_rotation(R: NDArray[np.float64], *, where: str | Path) -> None:
         refuse(f"not a rotation: an entry of {largest:.3g}", where, _TRANSFORM_ALLOWED, "not_rigid")
     determinant = float(np.linalg.det(R))
     if determinant < 0.0:
-        what = f"the transform is mirrored (determinant {determinant:.4g}): it exchanges left and right"
+        what = f"the transform is mirrored (determinant {determinant:.4g}): it swaps left and right"
         refuse(what, where, _TRANSFORM_ALLOWED, "mirrored")
     error = float(np.abs(R.T @ R - np.eye(3)).max())
     if not error <= ROTATION_TOLERANCE:

@@ -62,7 +62,7 @@ def _text_transforms(data: bytes, where: str) -> list[StatedTransform]:
     """The transforms of a text, in its order."""
     lines = [line.strip() for line in _LINE_END.split(decode_text(data, where)) if line.strip()]
     if not lines or lines[0] != _HEADER:
-        refuse("no ITK transform file", where, ALLOWED, "wrong_format")
+        refuse("not an ITK transform file", where, ALLOWED, "wrong_format")
     return [StatedTransform(kind, *(_numbers(one, key, where) for key in _KEYS)) for kind, one in _blocks(lines, where)]
 
 
@@ -85,9 +85,9 @@ def _blocks(lines: list[str], where: str) -> list[tuple[str, dict[str, str]]]:
 def _numbers(stated: dict[str, str], key: str, where: str) -> Floats:
     words = stated.get(key, "").split()
     try:
-        return np.array([float(word if _NUMBER.fullmatch(word) else f"no number {word}") for word in words])
+        return np.array([float(word if _NUMBER.fullmatch(word) else f"not a number: {word}") for word in words])
     except ValueError as error:
-        what = f"{key} are no numbers ({str(error)[:80]})"
+        what = f"{key} are not numbers ({str(error)[:80]})"
         raise InputError(what, where=where, allowed=ALLOWED, code="not_a_number") from error
 
 
@@ -147,7 +147,7 @@ def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
         refuse(f"{len(stated)} transforms", where, f"at most {MAX_PARTS} parts of a CompositeTransform", "too_many")
     parts = stated[1:] if stated and _COMPOSITE.fullmatch(stated[0].kind) else stated
     if not parts:
-        refuse("no linear transform", where, ALLOWED, "no_linear_transform")
+        refuse("not a linear transform", where, ALLOWED, "no_linear_transform")
     T = np.eye(4)
     for part in parts:
         _check_kind(part.kind, where)
@@ -250,7 +250,7 @@ def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
         with h5py.File(BytesIO(data), "r") as file:
             return [_transform(_Members(h5py, group, data, where), where) for group in _groups(h5py, file, where)]
     except _DAMAGED as error:
-        what = f"no whole HDF5 file ({str(error)[:120]})"
+        what = f"not a complete HDF5 file ({str(error)[:120]})"
         raise InputError(what, where=where, allowed=ALLOWED, code="file_damaged") from error
 
 
@@ -272,7 +272,7 @@ def _groups(h5py: Any, file: Any, where: str) -> list[Any]:
 def _own(h5py: Any, parent: Any, name: str, kind: type, where: str) -> Any:
     """A member of the file itself; a link could name any file of the host, and is refused."""
     if not isinstance(parent.get(name, getlink=True), h5py.HardLink) or not isinstance(parent[name], kind):
-        refuse(f"{parent.name}/{name} is a link or of another sort", where, ALLOWED, "wrong_format")
+        refuse(f"{parent.name}/{name} is a link or of another type", where, ALLOWED, "wrong_format")
     return parent[name]
 
 
@@ -289,7 +289,7 @@ class _Members:
         data = self._dataset(name)
         info = self._h5py.check_string_dtype(data.dtype)
         if data.size != 1 or info is None:
-            refuse(f"{data.name} is no text", self._where, ALLOWED, "wrong_type")
+            refuse(f"{data.name} is not a text", self._where, ALLOWED, "wrong_type")
         if info.length is None:
             return heap_text(self._content, data.id.get_offset())
         return str(np.ravel(data.asstr()[()])[0])
@@ -310,7 +310,7 @@ class _Members:
     def _dataset(self, name: str) -> Any:
         data = _own(self._h5py, self._group, name, self._h5py.Dataset, self._where)
         if data.is_virtual or data.external:
-            refuse(f"{data.name} lies in another file", self._where, ALLOWED, "data_elsewhere")
+            refuse(f"{data.name} is in another file", self._where, ALLOWED, "data_elsewhere")
         if data.size <= MAX_NUMBERS and data.id.get_storage_size() > MAX_STORED_BYTES:
             refuse(f"{data.name} takes {data.id.get_storage_size()} bytes", self._where, ALLOWED, "file_size")
         return data
@@ -328,7 +328,7 @@ def heap_text(content: bytes, offset: int | None) -> str:
     Source: HDF5 file format, version 3, III.E "Disk format: global heap", IV.B "variable-length datatypes".
     """
     if offset is None:
-        raise ValueError("a text outside of contiguous storage")
+        raise ValueError("a text outside contiguous storage")
     length, start, wanted = _unpacked("<IQI", content, offset)
     magic, version, size = _unpacked("<4sB3xQ", content, start)
     if magic != b"GCOL" or version != 1 or start + size > len(content):

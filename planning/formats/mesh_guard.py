@@ -111,7 +111,7 @@ def _check_not_huge(points: NDArray[np.float64], *, where: str | Path) -> None:
         refuse(f"a coordinate lies {farthest:.6g} mm from the origin", where, _EXTENT_ALLOWED, "too_far")
     diagonal = _diagonal(points)
     if diagonal > MAX_DIAGONAL_MM:
-        hint = "looks like mm declared as cm or m, or a stray vertex"
+        hint = "looks like mm declared as cm or m, or an outlier vertex"
         refuse(f"bounding box diagonal of {diagonal:.6g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
 
 

@@ -239,7 +239,7 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
         if len(fields) != len(header):
             refuse(f"{len(fields)} fields instead of {len(header)}", f"{where}, line {line}", _ALLOWED, "ragged_row")
         if not fields[columns["name"]].strip():
-            refuse("empty name", f"{where}, line {line}", _ALLOWED, "bad_name")
+            refuse("the name is empty", f"{where}, line {line}", _ALLOWED, "bad_name")
     points = [
         tuple(parse_coordinate(fields[columns[axis]], f"{where}, line {line}") for axis in "xyz")
         for line, fields in rows[1:]
@@ -271,7 +271,7 @@ def csv_lines(data: bytes, where: str, allowed: str) -> Iterator[CsvLine]:
                 yield CsvLine(reader.line_num, fields)
     except csv.Error as error:
         place = f"{where}, line {reader.line_num}"
-        raise InputError(f"is no CSV ({error})", where=place, allowed=allowed, code="not_csv") from error
+        raise InputError(f"is not a CSV file ({error})", where=place, allowed=allowed, code="not_csv") from error
 
 
 def _unit(header: list[str], where: str) -> Unit | None:
@@ -445,7 +445,7 @@ MOST_RAD = np.radians([363.0, 363.0, 363.0, 363.0, 363.0, 720.0])
 WHOLE_TURN = 2.0 * np.pi + 0.05
 """Six angles that all lie within it are none in degrees: an arm that lies stretched out, or radians."""
 
-_ALLOWED_JOINTS = "six angles, q1_deg to q6_deg, q1_rad to q6_rad or RTDE's actual_q_0 to actual_q_5, one row a pose"
+_ALLOWED_JOINTS = "six angles, q1_deg to q6_deg, q1_rad to q6_rad or RTDE's actual_q_0 to actual_q_5, one row per pose"
 
 
 class JointRecording(NamedTuple):
@@ -486,12 +486,12 @@ def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, nam
             unit == "rad" and np.abs(given).max() > 2 * WHOLE_TURN and (np.abs(given) <= np.degrees(MOST_RAD)).all()
         )
         guess = ": degrees?" if likely else ""
-        what = f"joint {joint + 1} of {name} at {given[row, joint]:g} {unit}, beyond what it can read{guess}"
-        limits = "363 degrees (6.34 rad) to either side, wrist 3 two turns"
+        what = f"joint {joint + 1} of {name} at {given[row, joint]:g} {unit}, beyond its range{guess}"
+        limits = "363 degrees (6.34 rad) either way; wrist 3: two turns"
         refuse(what, where, limits, "joints_beyond")
     if unit == "deg" and plainly_radians(given):
-        what = f"every joint within {np.abs(given).max():.3g} degrees of zero: radians?"
-        refuse(what, where, "degrees, as the names of the columns say", "joints_unit")
+        what = f"every joint is within {np.abs(given).max():.3g} degrees of zero: in radians?"
+        refuse(what, where, "degrees, as in the names of the columns", "joints_unit")
     return q
 
 
@@ -510,8 +510,8 @@ def check_times(time_s: Floats, *, where: str | Path) -> None:
     back = np.flatnonzero(np.diff(time_s) < 0.0)
     if len(back):
         row = int(back[0])
-        what = f"row {row + 2}: the time runs backwards, from {time_s[row]:g} to {time_s[row + 1]:g} s"
-        refuse(what, where, "rows in the order of their times", "times_not_rising")
+        what = f"row {row + 2}: time goes backwards, from {time_s[row]:g} to {time_s[row + 1]:g} s"
+        refuse(what, where, "rows in order of time", "times_not_rising")
 
 
 def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecording:
@@ -532,14 +532,14 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     try:
         rows = list(csv.reader(lines, strict=True)) if comma else [line.split() for line in lines]
     except csv.Error as error:
-        raise InputError(f"is no CSV ({error})", where=path, allowed=_ALLOWED_JOINTS, code="not_csv") from error
+        raise InputError(f"is not a CSV file ({error})", where=path, allowed=_ALLOWED_JOINTS, code="not_csv") from error
     header = [cell.strip().strip('"') for cell in rows[0]] if rows else []
     joints, unit = _joint_columns(header, path)
     time = next((name for name in TIMES if name in header), None)
     if timed and time is None:
         refuse(f"lacks {' or '.join(TIMES)}", path, _ALLOWED_JOINTS, "missing_column")
     if len(rows) < 2:
-        refuse("holds no row", path, _ALLOWED_JOINTS, "empty")
+        refuse("has no row", path, _ALLOWED_JOINTS, "empty")
     tool = RTDE_TOOL if set(RTDE_TOOL) <= set(header) else ()
     wanted = [*joints, *([time] if time else []), *tool]
     table = np.array([row_numbers(row, header, wanted, f"{path}: row {i}") for i, row in enumerate(rows[1:], start=1)])

@@ -20,10 +20,10 @@ from puncture_twin.planning.init.overrides import STATED, with_keys, with_line
 from puncture_twin.planning.init.segmentation import Assigned, Segmentation, quoted
 
 HEAD = """#:schema ./case.schema.json
-# (by which editors complete keys, where `run-twin schema > case.schema.json` has written it here)
+# (editors complete keys with it, once `run-twin schema > case.schema.json` has written it here)
 
-# Written by `init`: a start. Look at the roles and margins below before any result is trusted.
-# Every key: docs/reference/case.md; where roles and margins come from: docs/reference/default-roles.md.
+# Written by `init` as a start. Check the roles and margins below before you trust any result.
+# Every key: docs/reference/case.md; source of roles and margins: docs/reference/default-roles.md.
 schema = 2
 region = "{region}"
 name = {name}
@@ -44,7 +44,7 @@ step_deg = 2.0
 max_skin_angle_deg = 60.0
 
 """
-OWN_TARGET = "hit_radius_mm = {radius!r}  # it lies in no structure: what is hit is this ball about it"
+OWN_TARGET = "hit_radius_mm = {radius!r}  # in no structure: the target is a ball of this radius"
 SKIN_OF_CT = """[[structure]]
 name = "skin"
 ct = {ct}  # the body is found in the CT
@@ -56,23 +56,23 @@ file = {ct}
 
 """
 REGISTRATION = """
-# Markers, for the arm: the same names as the robot touched them go into markers_base.
+# Markers, for the arm: list them under the same names in markers_base, as the robot touched them.
 # [registration]
 # markers_ct = {ct}  # {space}
 # markers_base = {base}
 """
 ERRORS = """
-# Errors, for the chances to hit and to touch, which need the arm's markers too: docs/reference/case.md
+# Errors, for the chances to hit and to touch; these need the markers too: docs/reference/case.md
 # [errors]
-# surface_mm = {known}  # by which contours may lie off; {reason}
+# surface_mm = {known}  # possible error of contours; {reason}
 """
 PICTURE = "see slices.png"
-LEFT_OUT = f"# Left out, as {STATED}, so that what it shows counts as free: {{file}}\n"
-OF_VOXELS = "of {sources} by the voxels, at most; left out, every direction has its own"
-OF_MESHES = "of {sources} nobody knows it who did not draw them: left out it counts as 0, and every result says so"
+LEFT_OUT = f"# Left out, as {STATED}; its content counts as free: {{file}}\n"
+OF_VOXELS = "of {sources}, at most, from the voxels; if omitted, every direction has its own"
+OF_MESHES = "of {sources}, known only to who drew them; if omitted it counts as 0, and every result says so"
 END = """
 [end]
-structures = {count}  # the last line: a file that was cut lacks it
+structures = {count}  # the last line: a truncated file lacks it
 """
 
 
@@ -135,7 +135,7 @@ def case_text(parts: CaseParts) -> str:
     return with_keys(text, parts.keys)
 
 
-IMAGE = """# What the image shows, as rules find it. A line without its # states it: then no rule guesses.
+IMAGE = """# What the image shows, as found by rules. Remove a # to state it instead.
 # arms: {arms}:
 # arms = "none"
 # table: {table}:
@@ -154,11 +154,11 @@ def with_image_seen(text: str, anatomy: Anatomy) -> str:
     view = anatomy.skin.field_of_view
     cut = [] if view is None else [name for name, (axis, end) in SIDES.items() if view.cut[axis, end]]
     seen = IMAGE.format(
-        arms=f"{arms[0]}; if that is no arm" if arms else "none found; to state it",
-        table="none found; to state it" if couch is None else f"{couch}; if the body lies on nothing",
-        beyond=f"the image cuts the body at its {', '.join(cut)} side; the body is at most so much wider there"
+        arms=f"{arms[0]}; if that is not an arm" if arms else "none found; to state it",
+        table="none found; to state it" if couch is None else f"{couch}; if nothing supports the body",
+        beyond=f"the image cuts the body at its {', '.join(cut)} side; the body is at most this much wider there"
         if cut
-        else "the image shows the body whole; where it does not, the body is at most so much wider",
+        else "the image shows the whole body; where it does not, the body is at most this much wider",
     )
     return with_line(text, "ct", seen)
 
@@ -185,5 +185,5 @@ def _markers_text(markers: Sequence[Markers], space: Space) -> str:
     base = next(
         (one.source for one in markers[1:] if set(one.points.names) == set(markers[0].points.names)), "touch.csv"
     )
-    own = "its file says its space" if markers[0].source.endswith(".json") else f"read in {space}, the case's space"
+    own = "its file states the space" if markers[0].source.endswith(".json") else f"read in {space}, the case's space"
     return REGISTRATION.format(ct=quoted(markers[0].source), base=quoted(base), space=own)

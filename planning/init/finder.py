@@ -227,7 +227,7 @@ class _Looker:
     def _like_structure(self, one: Entry) -> Entry | None:
         """An entry that is named like a structure, or a folder too deep to be looked through that holds one."""
         if one.what == FOLDER and (below := structure_below(self._folder / one.name)):
-            return one._replace(what=f"is a folder too deep to be looked through, with {below}")
+            return one._replace(what=f"is nested too deep to search, with {below}")
         return one if STRUCTURE_LIKE.search(one.name) else None
 
     def _dicom(self) -> None:
@@ -257,7 +257,7 @@ class _Looker:
         try:
             yield
         except InputError as error:
-            way = f"; or --ignore {name}, so that what it shows counts as free" if name else ""
+            way = f"; or --ignore {name}: its content then counts as free" if name else ""
             error.allowed += way
             self._found.problems.append(error)
 
@@ -283,7 +283,7 @@ class _Looker:
         alone = alone and not self._left_out
         self._only = "masks" if alone else ""
         numbered = dict(enumerate(masks, start=1))
-        said = () if alone or not empty else (f"empty masks, so that nothing is there: {', '.join(empty)}",)
+        said = () if alone or not empty else (f"empty masks: {', '.join(empty)}",)
         self._found.segmentations.append(Masks(self._place, self._source, numbered, said, alone))
 
     def _volume(self, name: str, masks: list[Mask], empty: list[str]) -> None:
@@ -364,8 +364,8 @@ def volume_kind(volume: Volume) -> tuple[str, str]:
     if different > MOST_LABELS or (different > FEW_LABELS and _differs_everywhere(whole)):
         air = int(np.argmax(counts))
         offset = ": is an offset of -1024 missing, or is it no CT?" if air <= MOST_AIR else ""
-        return OTHER, f"no Hounsfield units, its air is {air}{offset}"
-    return ("labels", "") if counts[0] > 0 else (OTHER, "no voxel is 0, the background of labels")
+        return OTHER, f"not in Hounsfield units, its air is {air}{offset}"
+    return ("labels", "") if counts[0] > 0 else (OTHER, "no voxel is 0, the label of the background")
 
 
 def _differs_everywhere(whole: NDArray[np.integer]) -> bool:

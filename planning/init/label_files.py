@@ -37,9 +37,9 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.init.segmentation import Assigned, Place, margin_line, quoted, rules_text, skin_text
 
-NUMBERING_FOUND = "{source}: numbered as {naming}, told by where its organs lie"
+NUMBERING_FOUND = "{source}: numbered as {naming}, inferred from the positions of its organs"
 NUMBERING_UNSURE = (
-    "{tables}, and where its organs lie does not tell whether totalsegmentator-v1 or -v2 numbered its labels"
+    "{tables}, and the positions of its organs do not show whether totalsegmentator-v1 or -v2 numbered its labels"
 )
 
 
@@ -206,8 +206,8 @@ def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence
         return table[0], (f"{source}: names from {table[0]}",)
     naming = likely_numbering(labels)
     if naming is None:
-        passed = f"no table beside it names all of its labels: {first_few(others)}"
-        tables = passed if others else "no table of names is beside it"
+        passed = f"no table next to it names all of its labels: {first_few(others)}"
+        tables = passed if others else "no table of names is next to it"
         allowed = f"--naming with {', '.join(BUILT_IN)} or a table (CSV, JSON) that names every label"
         refuse(NUMBERING_UNSURE.format(tables=tables), place.folder / source, allowed, "labels_without_names")
     return naming, (NUMBERING_FOUND.format(source=source, naming=naming), *(f"{source}: {one}" for one in others))
@@ -232,8 +232,8 @@ def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool
         return False
     own, told = (default_role(one, "other") for one in (name, table[1][label]))
     if own not in (None, told) and not _is_named_like(table[0], source):
-        what = f"is '{name}' by its own name, and '{table[1][label]}' by {table[0]}"
-        allowed = "--naming with that table where it is right; else the table in another folder"
+        what = f"is '{name}' by its own name, but '{table[1][label]}' by {table[0]}"
+        allowed = "--naming with that table if it is right; otherwise move the table to another folder"
         refuse(what, place.folder / source, allowed, "label_named_twice")
     return True
 
@@ -263,8 +263,8 @@ def _one_table(
     if not found or _is_named_like(found[0][0], source):
         return (found[0] if found else None), others
     if any([other[label] for label in present] != [found[0][1][label] for label in present] for _, other in found[1:]):
-        what = f"several tables name its labels in other ways: {', '.join(table for table, _ in found)}"
-        refuse(what, place.folder / source, "--naming with the table that is right", "several_namings")
+        what = f"several tables name its labels differently: {', '.join(table for table, _ in found)}"
+        refuse(what, place.folder / source, "--naming with the right table", "several_namings")
     return found[0], others
 
 
@@ -333,7 +333,7 @@ class FileMasks:
         Raises:
             InputError: Always.
         """
-        what = f"'{self.names[label]}' cannot be the skin, as one of the overlapping structures of a file"
+        what = f"'{self.names[label]}' cannot be the skin: it is one of the overlapping structures of a file"
         refuse(what, self.source, "a CT, a mesh, or a label of a label map", "no_skin")
 
     def section(self, rows: Sequence[Assigned]) -> str:

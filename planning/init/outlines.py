@@ -78,7 +78,7 @@ def skin_problems(found: SkinOf, segmentations: Sequence[Segmentation]) -> Itera
     held = [bool(np.all((one[0] >= low - SLACK_MM) & (one[1] <= high + SLACK_MM))) for one in boxes]
     if sum(held) < LEAST_HELD * len(held):
         noun = "meshes" if found.segmentation.voxel_ct is None else "structures"
-        yield f"'{found.name}' is named like the skin, but holds {sum(held)} of the {len(held)} other {noun}"
+        yield f"'{found.name}' is named like the skin, but contains {sum(held)} of the {len(held)} other {noun}"
 
 
 class Agreement(NamedTuple):
@@ -125,7 +125,7 @@ class Outlines:
             _, found = self._named[name]
             yield (
                 f"'{name}' is named like the outline of the body, but covers {found.skin_covered:.0%} of the skin, and "
-                f"{found.on_skin:.0%} of it lie there: taken for a structure like others (if it is the outline: ignore)"
+                f"{found.on_skin:.0%} of it is there: treated as an ordinary structure (if it is the outline: ignore)"
             )
 
 
@@ -195,7 +195,7 @@ def carved_notes(rows: Sequence[Assigned], target: str | None, border: Mapping[s
     for row in rows:
         if row.kind == "avoid" and border.get(row.name, 0.0) >= MOST_OF_BORDER:
             yield (
-                f"'{row.name}' goes round '{target}' without holding it, as if that was carved out of it, and is "
-                f"avoided by {row.margin_mm:g} mm, so no path through it is safe: if a path may cross it, make it "
-                "traverse in the case"
+                f"'{row.name}' surrounds '{target}' without containing it, as if cut out around it, and is avoided "
+                f"by {row.margin_mm:g} mm: no path through it is safe. If a path may cross it, make it traverse in "
+                "the case"
             )

@@ -14,8 +14,8 @@ from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case_file import CaseFile
 
 WAYS = (
-    "or with `init`: --set KEY=VALUE for a key of the case, --ignore NAME for a structure to be left out, "
-    "--unknown NAME for one that no path may cross, --skin NAME for another skin"
+    "or with `init`: --set KEY=VALUE for a key of the case, --ignore NAME to leave a structure out, --unknown NAME "
+    "for one that no path may cross, --skin NAME for another skin"
 )
 """What `init` can write for what a case would state; the refusals of a case name its keys and roles."""
 
@@ -36,7 +36,7 @@ SKIN, SKIN_ROLE = "skin", 'role = "skin"'
 LISTS = frozenset(("structure", "structures", "obstacle", "end", "schema"))
 """What `--set` cannot write: tables that stand several times, and what belongs to the file."""
 
-REASONS: Mapping[str, str] = MappingProxyType({"search.trust_labels": "a person has looked: structures lie right"})
+REASONS: Mapping[str, str] = MappingProxyType({"search.trust_labels": "a person checked the structures on the CT"})
 STATED = "stated to init"
 
 
@@ -90,7 +90,7 @@ def overrides_of(skin: str | None, ignore: Iterable[str], unknown: Iterable[str]
         keys[key] = value if _is_toml(value) else json.dumps(value)
     roles = dict.fromkeys(ignore, "ignore")
     if both := sorted(set(unknown) & set(roles)):
-        refuse(f"'{both[0]}' is to be ignored too", "--unknown", "one of the two", "two_roles")
+        refuse(f"'{both[0]}' is also ignored", "--unknown", "one of the two", "two_roles")
     return Overrides(skin, roles | dict.fromkeys(unknown, "unknown"), keys)
 
 

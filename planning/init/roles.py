@@ -110,17 +110,17 @@ def role_notes(rows: Sequence[Assigned], holding: Holding) -> Iterator[str]:
     doubted = [row.name for row in rows if row.kind == "unknown" and row.line not in {NOT_ANNOTATED, STATED}]
     if doubted:
         yield (
-            f"they hold the target too, and are not known as organs that a needle crosses, so paths through them are "
-            f"unknown_region until the case says traverse: {_list(doubted)}"
+            "they also contain the target, and are not known as organs that a needle may cross, so paths through "
+            f"them are unknown_region unless the case makes them traverse: {_list(doubted)}"
         )
     crossed = [row.name for row in rows if row.name in holding.others and row.kind == "traverse"]
     if crossed:
-        yield f"they hold the target too, so paths cross them (traverse): {_list(crossed)}"
+        yield f"they also contain the target, so paths cross them (traverse): {_list(crossed)}"
     if left_out := [row.name for row in rows if row.kind == "ignore" and row.line == STATED]:
-        yield f"left out as stated (ignore), so that paths through them may be safe: {_list(left_out)}"
+        yield f"left out as stated (ignore), so paths through them may be safe: {_list(left_out)}"
     outlines = [row.name for row in rows if row.kind == "ignore" and row.line != STATED]
     if outlines:
-        yield f"taken for the outline of the body, so not checked (ignore): {_list(outlines)}"
+        yield f"treated as the outline of the body, so not checked (ignore): {_list(outlines)}"
 
 
 def _list(names: Sequence[str]) -> str:

@@ -35,7 +35,7 @@ CASE_FILE = "case.toml"
 STATED = DefaultRole("stated", (), "unknown", 0.0, "stated to init")
 """Of a role that a person states."""
 
-HOLDS_TARGET = "it holds the target too, and its name is not known as that of an organ that a needle crosses"
+HOLDS_TARGET = "it also contains the target, and its name is not known as an organ that a needle may cross"
 """Why a structure is unknown."""
 
 
@@ -277,9 +277,9 @@ def mesh_folder(
         InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.
     """
     if len({mesh_name(one) for one in names}) < len(names):
-        refuse("two meshes have one name", place.folder / source, "one mesh a structure", "duplicate_name")
+        refuse("two meshes have the same name", place.folder / source, "one mesh per structure", "duplicate_name")
     if up is None and any(name.lower().endswith(".glb") for name in names):
-        what = f"GLB: {UP_NOT_STATED} (--up y turns them to z up, --up z keeps them)"
+        what = f"GLB: {UP_NOT_STATED} (--up y rotates them to z up, --up z keeps them)"
         refuse(what, place.folder / source, "--up y or --up z", "up_not_stated")
     extents = [mesh_extent(place.folder / name) for name in names]
     boxes = np.stack([one.box for one in extents])
@@ -288,10 +288,10 @@ def mesh_folder(
         what = f"{diagonal:.0f} units from corner to corner: a small body in mm, or a large one in cm"
         refuse(what, place.folder / source, "--unit mm or --unit cm", "unit_not_stated")
     unit = stated or next(one for one, least in LEAST_EXTENT if diagonal >= least)
-    guess = "as stated" if stated else "guessed by their extent (--unit says otherwise)"
+    guess = "as stated" if stated else "inferred from their size (--unit overrides it)"
     said = (
         f"{source}: {len(names)} meshes in {unit} ({guess}) and {_spaces([one.space for one in extents], space)}, "
-        f"together {diagonal * unit.mm:.0f} mm from corner to corner; no mesh file says its unit"
+        f"together {diagonal * unit.mm:.0f} mm from corner to corner; mesh files do not state their unit"
     )
     return MeshFolder(place, source, dict(enumerate(sorted(names), start=1)), unit, space, up, (said,))
 
@@ -300,7 +300,7 @@ def _spaces(stated: Sequence[Space | None], space: Space) -> str:
     """Of what space meshes are: of what their files state, else of what the user does."""
     counts = Counter(stated)
     parts = [f"{one}, as {count} of their files state" for one, count in counts.items() if one]
-    return " and ".join([*parts, f"{space}, which {counts[None]} of them do not state"] if counts[None] else parts)
+    return " and ".join([*parts, f"{space}, not stated in {counts[None]} of them"] if counts[None] else parts)
 
 
 def is_mesh(name: str) -> bool:

@@ -38,10 +38,10 @@ ALLOWED = (
 )
 
 
-OUTSIDE_WAYS = "a point in the body, in mm, in the space that --space states; or --skin NAME for another skin"
+OUTSIDE_WAYS = "a point in the body, mm, in the space given by --space; or --skin NAME for another skin"
 PHANTOM = (
-    'region = "phantom": no limb is looked for, and what holds together is the phantom; it lies on nothing unless '
-    "[ct] table says so or something detached lies below it"
+    'region = "phantom": no limbs are searched for, and the connected object is the phantom; it has no support unless '
+    "[ct] table says so or a separate object is below it"
 )
 
 
@@ -178,8 +178,8 @@ def _checked(found: Found, point: Floats | None, request: Request) -> Body:
     problems = list(found.problems)
     cts, stated = _holding(found.cts, point), request.wanted.overrides.skin
     if len(cts) > 1:
-        what = f"several CTs: {', '.join(one.source for one in cts)} (--ct says which)"
-        problems.append(_problem(what, "several_cts", "--ct with the one that is meant"))
+        what = f"several CTs: {', '.join(one.source for one in cts)} (choose with --ct)"
+        problems.append(_problem(what, "several_cts", "--ct with the intended one"))
     if not found.segmentations and not problems:
         problems.append(_problem(f"no segmentation (label map, masks or meshes){_lies(found)}", "no_segmentation"))
     skin = None if cts and stated is None else skin_of(found.segmentations, stated)
@@ -189,7 +189,7 @@ def _checked(found: Found, point: Floats | None, request: Request) -> Body:
         wrong = skin_problems(skin, found.segmentations)
         problems += [_problem(one, "no_skin", "--skin NAME with the structure that is the skin") for one in wrong]
     problems += [
-        _problem(one, "doubled", "--segmentation with the one that is meant") for one in _doubled(found.segmentations)
+        _problem(one, "doubled", "--segmentation with the intended one") for one in _doubled(found.segmentations)
     ]
     if problems:
         said = [
@@ -205,7 +205,7 @@ def _no_skin(found: Found) -> InputListError:
     """Nothing says where the body ends; what is there may."""
     what = f"no CT in Hounsfield units (min below {AIR_HU}), and no structure named like the skin{_lies(found)}"
     names = [name for one in found.segmentations for name in one.names.values()]
-    way = f"; --skin NAME where one of these is the skin: {first_few(names)}" if names else ""
+    way = f"; --skin NAME if one of these is the skin: {first_few(names)}" if names else ""
     return _problem(what, "no_ct", f"{ALLOWED}{way}")
 
 
@@ -223,7 +223,7 @@ def _lies(found: Found) -> str:
         (one.source, "a segmentation") for one in found.segmentations
     ]
     listed = [f"{name} ({why})" for name, why in (*found.passed, *taken)]
-    return f"; here lies: {first_few(listed)}" if listed else "; nothing here is of a kind that is read"
+    return f"; found here: {first_few(listed)}" if listed else "; no file here has a supported format"
 
 
 def _below(where: str, folder: Path) -> str:
@@ -242,7 +242,7 @@ def _doubled(segmentations: Sequence[Segmentation]) -> Iterator[str]:
     twice = [name for name, count in counts.items() if count > 1]
     if twice:
         sources = ", ".join(one.source for one in segmentations if set(one.names.values()) & set(twice))
-        yield f"{sources} hold structures of one name, such as '{twice[0]}' (--segmentation says which)"
+        yield f"{sources} have structures with the same name, such as '{twice[0]}' (choose with --segmentation)"
 
 
 def _refuse_outside(point: Floats, ct: Ct, skin: Skin, space: Space) -> None:
@@ -272,16 +272,16 @@ def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> 
         yield f"left out: {first_few([f'{name} ({why})' for name, why in found.passed])}"
     others = [one.source for one in found.cts if one.source != parts.ct]
     if others and parts.ct is not None:
-        yield f"the CT is {parts.ct}, which holds the target; left out: {', '.join(others)}"
+        yield f"the CT is {parts.ct}, which contains the target; left out: {', '.join(others)}"
     for one in found.segmentations:
         yield from one.notes
     yield from target.notes
     yield from role_notes(parts.rows, target.holding)
     if request.region is None:
         if_phantom = ", phantom for a phantom" if parts.region == "other" else ""
-        yield f'region = "{parts.region}" is told by the structures; --region says otherwise{if_phantom}'
+        yield f'region = "{parts.region}" was inferred from the structures; use --region to change it{if_phantom}'
     if parts.region == "phantom":
         yield PHANTOM
     if parts.markers:
         names = ", ".join(one.source for one in parts.markers)
-        yield f"{names}: may be markers, named in comments; without [registration] no arm is checked"
+        yield f"{names}: possibly markers (see the comments in the case); without [registration] the arm is not checked"

@@ -87,7 +87,7 @@ def typed_target(
     chosen = chosen_target(names)
     _refuse_in_danger(point_ct, chosen, space, _other_reading(point_ct, outlines, space, names))
     holding = Holding(chosen, frozenset(holders) - {chosen})
-    return Target(point_ct, holding, (f"the target lies in '{chosen}', which is the target's structure",))
+    return Target(point_ct, holding, (f"the target lies in '{chosen}', the structure of the target",))
 
 
 def _refuse_likelier(point_ct: Floats, outlines: Outlines, space: Space, names: Sequence[str]) -> None:
@@ -95,7 +95,7 @@ def _refuse_likelier(point_ct: Floats, outlines: Outlines, space: Space, names: 
     if other := _other_reading(point_ct, outlines, space, names):
         place = f"in '{chosen_target(names)}'" if names else "in no structure"
         what = f"target ({point_text(point_ct, space)}) lies {place}{other}"
-        refuse(what, "--target", "--space LPS or --space RAS, whichever is meant", "target_in_other_space")
+        refuse(what, "--target", "the intended one of --space LPS and --space RAS", "target_in_other_space")
 
 
 def _refuse_lesion_elsewhere(point_ct: Floats, outlines: Outlines, space: Space) -> None:
@@ -106,7 +106,7 @@ def _refuse_lesion_elsewhere(point_ct: Floats, outlines: Outlines, space: Space)
             f"target ({point_text(point_ct, space)}) lies in no structure"
             f"{_other_reading(point_ct, outlines, space, ())}"
         )
-        allowed = "the other --space; or --hit-radius MM, where a target in no structure is meant"
+        allowed = "the other --space; or --hit-radius MM for a target in no structure"
         refuse(what, "--target", allowed, "target_in_no_structure")
 
 
@@ -121,12 +121,12 @@ def _refuse_in_danger(point_ct: Floats, chosen: str, space: Space, other: str) -
     line = never_crossed(chosen)
     if line is not None:
         what = f"target ({point_text(point_ct, space)}) lies in '{chosen}'{other}: {_danger(line)}"
-        allowed = f"a point outside of it, or --target-label '{chosen}' where it is itself the target"
+        allowed = f"a point outside it, or --target-label '{chosen}' if it is the target itself"
         refuse(what, "--target", allowed, "target_in_danger")
 
 
 def _danger(line: DefaultRole) -> str:
-    return f"of '{line.group}' ({line.reason}), which nothing keeps the needle out of where it holds the target"
+    return f"of '{line.group}' ({line.reason}): as the target's structure, it would not be avoided"
 
 
 def label_target(name: str, outlines: Outlines, space: Space) -> Target:
@@ -139,12 +139,12 @@ def label_target(name: str, outlines: Outlines, space: Space) -> Target:
     known = {one: (seg, label) for seg in segmentations for label, one in seg.names.items()}
     if name not in known:
         what = f"no structure is named '{name}'{did_you_mean(name, known)}"
-        refuse(what, "--target-label", ", ".join(sorted(known)) or "none is there", "unknown_structure")
+        refuse(what, "--target-label", ", ".join(sorted(known)) or "there are none", "unknown_structure")
     segmentation, label = known[name]
     point, parts = deepest_point(segmentation.surface(label))
     notes = [f"the target is the deepest point of '{name}': {point_text(point, space)}"]
     if parts > 1:
-        notes.append(f"'{name}' has {parts} parts; the largest was taken")
+        notes.append(f"'{name}' has {parts} parts; the largest was used")
     others = frozenset(_holders(point, outlines)) - {name}
     return Target(point, Holding(name, others), tuple(notes))
 
@@ -185,7 +185,7 @@ def _in_nothing(
 ) -> str:
     near = "" if holders else f"; the nearest is {_nearest(point_ct, segmentations)}"
     but = f" but {', '.join(holders)}" if holders else ""
-    return f"the target lies in no structure{but}{near}; what is hit is a ball of {radius_mm:g} mm about it"
+    return f"the target lies in no structure{but}{near}; the target is a ball of {radius_mm:g} mm about it"
 
 
 def _nearest(point_ct: Floats, segmentations: Sequence[Segmentation]) -> str:

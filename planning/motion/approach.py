@@ -117,7 +117,7 @@ def plan_approach(
             if contact is None:
                 return Approach(path.waypoints, rounding, trajectory, path.goal_index, checked, seed, attempt + 1)
         assert contact is not None
-        refused = f"; before that, on a closer look {contact.body} touched {contact.other} on the way"
+        refused = f"; before that, a finer check found {contact.body} touching {contact.other}"
     raise NoAnswerError(f"approach unknown: {ATTEMPTS} paths were refused (seed {seed}){refused}", code="no_approach")
 
 
@@ -203,7 +203,9 @@ def _within_limits(checker: StateChecker, q: Floats, name: str) -> Floats:
     rows = np.atleast_2d(np.asarray(q, dtype=np.float64))
     if rows.ndim != 2 or rows.shape[1] != 6 or not checker.model.within_limits(rows).all() or len(rows) == 0:
         limits = np.round(np.degrees(checker.model.joint_limits[:, 1])).astype(int).tolist()
-        refuse(f"{name} = {rows.round(4).tolist()}", "approach", f"six angles, +-{limits} deg", "joint_beyond_limits")
+        refuse(
+            f"{name} = {rows.round(4).tolist()}", "approach", f"six angles within +-{limits} deg", "joint_beyond_limits"
+        )
     return rows
 
 
@@ -229,13 +231,13 @@ def _why_none(found: Connected, ends: _Ends, seed: int) -> str:
     busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
     n_off = 0 if cut is None else int(cut.off.sum())
     if cut is not None and n_off == n_free:
-        return f"approach impossible, proven: {cut.text}{busy}"
-    where = "the goals lie" if found.goal_states <= found.home_states else "home lies"
+        return f"approach proven impossible: {cut.text}{busy}"
+    where = "the goals are" if found.goal_states <= found.home_states else "home is"
     trees = f"{found.home_states} states joined home, {found.goal_states} the goals"
     total = sum(found.blocked.values())
     most = [f"{c.body} touches {c.other} ({n} of {total})" for c, n in Counter(found.blocked).most_common(2)]
     proven = f"; {n_off} of {n_free} goals are proven to be cut off" if n_off else ""
     return (
-        f"approach unknown after {found.samples} samples (seed {seed}): {where} in a part of the space that they did "
-        f"not reach: {trees}; most often in the way: {', '.join(most) or 'nothing'}{proven}{busy}"
+        f"approach unknown after {found.samples} samples (seed {seed}): {where} in a part of the space that the "
+        f"search did not reach: {trees}; most frequent contacts: {', '.join(most) or 'nothing'}{proven}{busy}"
     )

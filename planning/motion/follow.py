@@ -161,7 +161,7 @@ def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
     straight = lengths - np.append(cuts, 0.0) - np.append(0.0, cuts) if fits else lengths
     if not (fits and (straight >= -STANDSTILL_RAD).all()):
         what = f"cuts {cuts.tolist()} of {len(lengths)} segments"
-        refuse(what, "trajectory", "one a corner, two of them no longer than the segment between", "wrong_count")
+        refuse(what, "trajectory", "one per corner, two of them no longer than the segment between", "wrong_count")
     return np.asarray(straight.clip(0.0))  # two cuts may use a segment up, but for rounding
 
 
@@ -273,7 +273,7 @@ def follow_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_spe
     """
     q, depths = _checked_rows(q), np.asarray(depths_mm, dtype=np.float64)
     if len(q) < 2 or depths.shape != (len(q),) or not (np.diff(depths) > 0.0).all():
-        refuse("depths do not rise row by row", "trajectory", "one rising depth a row", "not_rising")
+        refuse("depths do not increase row by row", "trajectory", "one increasing depth per row", "not_rising")
     if not (math.isfinite(max_tip_speed_mm_s) and max_tip_speed_mm_s > 0.0):
         refuse(f"max_tip_speed_mm_s = {max_tip_speed_mm_s}", "trajectory", "above 0", "not_positive")
     spline = scipy.interpolate.CubicSpline(depths, q)

@@ -179,7 +179,7 @@ def _with_exact_ends(waypoints: Floats, home: Floats, goals: Floats) -> tuple[Fl
     goal_index = int(np.argmin(off))
     from_home = np.abs(waypoints[0] - home).max()
     if len(waypoints) < 2 or max(from_home, off[goal_index]) > END_TOLERANCE_RAD:
-        what = f"the planner's path does not join home and goal: {from_home:.3g}, {off.min():.3g} rad off"
+        what = f"the planned path does not connect home and goal: {from_home:.3g}, {off.min():.3g} rad off"
         raise NoAnswerError(what, code="no_approach")
     return np.concatenate([home[None], waypoints[1:-1], goals[goal_index][None]]), goal_index
 

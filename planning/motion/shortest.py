@@ -203,7 +203,7 @@ class Cut:
         """Boxes that the upper arm would have to pass: those in the cells around home's."""
         around = ndimage.binary_dilation(self._parts == self._part(self._home), np.ones((3, 3)))
         named = Counter(self._boxes[box].name for box in self._blocking[around & (self._blocking >= 0)].tolist())
-        return f"whatever the other joints do, {UPPER_ARM} would have to pass through " + " or ".join(sorted(named))
+        return f"in every configuration, {UPPER_ARM} would have to pass through " + " or ".join(sorted(named))
 
     @cached_property
     def _edges(self) -> list[Floats]:

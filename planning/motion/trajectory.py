@@ -47,7 +47,7 @@ class Trajectory:
         if not (np.isfinite(times).all() and np.isfinite(q).all()):
             refuse("a time or an angle is not finite", "trajectory", "finite numbers", "not_finite")
         if times[0] != 0.0 or (np.diff(times) <= 0.0).any():
-            refuse("times do not rise from 0", "trajectory", "0, then strictly rising", "times_not_rising")
+            refuse("times do not increase from 0", "trajectory", "0, then strictly rising", "times_not_rising")
         for name, array in (("times_s", times), ("q", q)):
             array.setflags(write=False)
             object.__setattr__(self, name, array)

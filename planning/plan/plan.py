@@ -116,7 +116,7 @@ def _facts(plan: Plan) -> Facts:
     error = plan.expected_target_error_mm
     yield (
         "expected tip error",
-        f"{error:.2f} mm (rms)" if np.isfinite(error) else "not known: no markers",
+        f"{error:.2f} mm (rms)" if np.isfinite(error) else "unknown: no markers",
     )
     yield "robot", plan.model.name
     for name in ("approach", "insertion"):

@@ -69,7 +69,7 @@ def check_inputs(plan: Plan, case: Case, path: Path) -> None:
     """
     name = differing_input(plan.inputs, case.inputs)
     if name is not None:
-        refuse(f"input '{name}' is not the one that the plan was made from", path, "plan again", "input_changed")
+        refuse(f"input '{name}' differs from the one used for the plan", path, "plan again", "input_changed")
 
 
 def check_geometry(plan: Plan, path: Path) -> None:
@@ -79,7 +79,7 @@ def check_geometry(plan: Plan, path: Path) -> None:
         InputError: Says which end is off, and by how much.
     """
     if not np.allclose(plan.approach.q[-1], plan.insertion.q[0], rtol=0, atol=JOIN_TOLERANCE_RAD):
-        refuse("the insertion does not start where the approach ends", path, "joined phases", "phases_not_joined")
+        refuse("the insertion does not start where the approach ends", path, "connected phases", "phases_not_joined")
     _check_straight(plan, path)
     _check_speeds(plan, path)
     model = plan.model
@@ -113,7 +113,7 @@ def check_angles(plan: Plan, path: Path) -> None:
     roll = roll_of(plan)
     off = abs((plan.roll - roll + np.pi) % (2 * np.pi) - np.pi)
     if off > ROLL_TOLERANCE_RAD or not 0.0 <= plan.roll < 2 * np.pi:
-        what = f"roll_deg is {np.degrees(plan.roll):g}, the joint angles at standoff give {np.degrees(roll):.4g}"
+        what = f"roll_deg is {np.degrees(plan.roll):g}, but the joint angles at standoff give {np.degrees(roll):.4g}"
         refuse(what, path, "plan again", "plan_contradicted")
 
 
@@ -144,7 +144,7 @@ def _check_straight(plan: Plan, path: Path) -> None:
     for what, amount in (
         ("tip leaves the straight path", aside),
         ("flange end of the needle swings out", swing),
-        ("insertion turns back", back),
+        ("insertion reverses", back),
         ("insertion goes beyond standoff and target", deep),
     ):
         if not amount <= STRAIGHT_TOLERANCE_MM:
@@ -156,7 +156,7 @@ def _between(q: Floats, path: Path) -> Floats:
     """The rows of a joint path and points between them, no more than `BETWEEN_RAD` apart in any joint."""
     counts = np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) / BETWEEN_RAD).clip(min=1)
     if counts.sum() > MOST_STATES:
-        refuse("the insertion turns its joints over and over", path, "a straight insertion", "not_straight")
+        refuse("the joints rotate repeatedly during the insertion", path, "a straight insertion", "not_straight")
     segment = np.repeat(np.arange(len(counts)), counts.astype(np.int64))
     starts = np.cumsum(counts) - counts
     fraction = (np.arange(len(segment)) - starts[segment]) / counts[segment]
@@ -172,7 +172,7 @@ def _check_speeds(plan: Plan, path: Path) -> None:
     ):
         speed = float(tip_speeds(model, part.q, part.times_s, plan.needle_length_mm).max(initial=0.0))
         if not speed <= limit * (1 + SPEED_ROUNDING):
-            what = f"the {phase} drives the tip at {speed:.3g} mm/s"
+            what = f"the {phase} moves the tip at {speed:.3g} mm/s"
             refuse(what, path, f"at most {limit:g} mm/s; plan again", "tip_too_fast")
         if not model.within_limits(part.q).all():
             what = f"the {phase} leaves the joint limits"
@@ -181,7 +181,7 @@ def _check_speeds(plan: Plan, path: Path) -> None:
         for rate in ("speed", "acceleration"):  # a jerk wears the arm, and does not stop it
             most = float((getattr(peaks, rate) / getattr(limits, rate)).max())
             if not most <= 1 + SPEED_ROUNDING:
-                what = f"the {phase} has {most:.3g} times the {rate} that a joint may have"
+                what = f"the {phase} has {most:.3g} times the allowed {rate} of a joint"
                 refuse(what, path, "the limits of the arm and of [robot]; plan again", "joint_too_fast")
 
 
@@ -247,7 +247,7 @@ def _check(model: UrModel) -> None:
     low, high = model.joint_limits.T
     above_zero = [positive, high - low, model.max_speeds, model.max_torques, np.array([model.max_acceleration])]
     if not all(bool((values > 0.0).all()) for values in above_zero) or len(model.joint_names) != len(low):
-        raise ValueError("lengths, limits, speeds and torques are those of no arm")
+        raise ValueError("lengths, limits, speeds and torques belong to no arm")
     if model.shipped:
         known = ur_model(model.name)
         narrower = replace(known, joint_limits=model.joint_limits, max_speeds=model.max_speeds)

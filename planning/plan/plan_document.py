@@ -133,11 +133,11 @@ def _check_stated(document: dict[str, Any], plan: Plan, path: Path) -> None:
     )
     for name, said, known in stated:
         if not _same_rates(said, known):
-            refuse(f"the {name} are not those of its numbers", path, "plan again", "plan_contradicted")
+            refuse(f"the {name} do not match its numbers", path, "plan again", "plan_contradicted")
     for phase, part in (("approach", plan.approach), ("insertion", plan.insertion)):
         even = SAMPLE_S * np.arange(len(part.times_s))
         if not np.allclose(part.times_s, even, rtol=0, atol=SAME_TIME_S):
-            refuse(f"the times of the {phase} are not even", path, f"a row every {SAMPLE_S} s", "times_uneven")
+            refuse(f"the times of the {phase} are not even", path, f"one row every {SAMPLE_S} s", "times_uneven")
 
 
 def _same_rates(said: Any, known: dict[str, list[float]]) -> bool:

@@ -147,6 +147,6 @@ def _within_limits(
     outward = np.tile(candidates.outward_ct[row], (len(goals), 1))
     satisfied = satisfies_limits(context.chance, outward, q)
     if not satisfied.any():
-        what = "no configuration that an approach may end in keeps search.min_hit and max_touch"
+        what = "no configuration at the end of an approach keeps search.min_hit and max_touch"
         raise NoAnswerError(what, code="limits_not_kept")
     return [goal for goal, keeps in zip(goals, satisfied, strict=True) if keeps]

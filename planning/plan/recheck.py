@@ -43,14 +43,14 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
     """
     check_inputs(plan, context.case, path)
     if not same_arm(plan.model, context.case.robot.model):
-        refuse("its arm is not the case's", path, "plan again", "plan_of_another")
+        refuse("its arm differs from the case's", path, "plan again", "plan_of_another")
     if context.reach is None or not np.array_equal(plan.T_base_ct, context.reach.T_base_ct):
-        refuse("T_base_ct is not the case's", path, "plan again", "plan_of_another")
+        refuse("T_base_ct differs from the case's", path, "plan again", "plan_of_another")
     candidates = context.check(plan.theta, plan.beta)
     if not np.allclose(candidates.outward_ct[0], plan.outward_ct, atol=SAME_DIRECTION):
         refuse("outward_ct is not the direction of theta_deg, beta_deg", path, "plan again", "plan_contradicted")
     if not candidates.safe[0]:
-        refuse(f"its direction is rejected: {reason_text(candidates, 0)}", path, "plan again", "direction_rejected")
+        refuse(f"its direction is rejected now: {reason_text(candidates, 0)}", path, "plan again", "direction_rejected")
     _check_limits(plan, context, path)
     if seed is not None:
         _check_same("seed", plan.seed, seed, path)
@@ -59,7 +59,7 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
     check_angles(plan, path)
     touched = motion_contact(plan, context.reach.checker)
     if touched is not None:
-        refuse(f"its {touched}", path, "a motion that touches nothing", "motion_touches")
+        refuse(f"its {touched}", path, "a motion without contact", "motion_touches")
     for phase, known in phase_clearances(plan, context.reach.checker).items():
         _check_same(f"clearance_mm.{phase}", plan.clearance_mm.get(phase, np.nan), known, path)
     return candidates
@@ -70,7 +70,7 @@ def _check_warnings(plan: Plan, context: CaseContext, path: Path) -> None:
     if plan.warnings != context.anatomy.warnings:
         apart = set(plan.warnings) ^ set(context.anatomy.warnings)
         shown = f", such as '{min(apart)}'" if apart else ""
-        refuse(f"its warnings are not those of the case{shown}", path, "plan again", "plan_of_another")
+        refuse(f"its warnings differ from the case's{shown}", path, "plan again", "plan_of_another")
 
 
 def _check_limits(plan: Plan, context: CaseContext, path: Path) -> None:
@@ -78,7 +78,7 @@ def _check_limits(plan: Plan, context: CaseContext, path: Path) -> None:
     if context.chance is None:
         return
     if not satisfies_limits(context.chance, plan.outward_ct[None], plan.insertion.q[-1:]).all():
-        what = "the configuration in which it ends does not keep search.min_hit and max_touch"
+        what = "its final configuration does not keep search.min_hit and max_touch"
         refuse(what, path, "plan again", "limits_not_kept")
 
 
@@ -120,4 +120,4 @@ def _check_same(name: str, said: Any, known: Any, path: Path) -> None:
         said, known = (np.where(np.isfinite(value), value, np.nan) for value in (said, known))
         same = np.allclose(said, known, rtol=0, atol=SAME_NUMBER_MM, equal_nan=True)
     if not same:
-        refuse(f"{name} is {said}, the case gives {known}", path, "plan again", "plan_of_another")
+        refuse(f"{name} is {said}, but the case gives {known}", path, "plan again", "plan_of_another")

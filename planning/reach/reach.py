@@ -301,7 +301,7 @@ def tried(checker: StateChecker, found: Surveyed, insertion: Insertion) -> Reach
         return Blocked(stop.depth_mm, stop.detail)
     margin = reach_margin(model, q)
     if margin < 0.0:
-        return Blocked(0.0, "a joint leaves its limits on the way", at_any_roll=False)
+        return Blocked(0.0, "a joint would leave its limits during the insertion", at_any_roll=False)
     first = checker.first_contact(q, needle_may_touch_patient=True)
     if first is None:
         return ReachAnswer(True, Reason.NONE, None, "", None, roll, branch, q, depths, margin)
@@ -312,12 +312,10 @@ def tried(checker: StateChecker, found: Surveyed, insertion: Insertion) -> Reach
 
 def why_unreachable(model: UrModel, T_base_flange: Floats) -> str:
     """Why no branch of the arm reaches one flange pose (4, 4), mm: one sentence for people."""
-    place = (
-        f"the flange would stand {np.linalg.norm(T_base_flange[:3, 3] - model.shoulder_base):.1f} mm from the shoulder"
-    )
+    place = f"the flange would be {np.linalg.norm(T_base_flange[:3, 3] - model.shoulder_base):.1f} mm from the shoulder"
     missing = float(missing_reach_mm(model, T_base_flange)[0])
     if math.isinf(missing):
-        return f"{place}, its wrist too close to the base's axis for any shoulder angle"
+        return f"{place}, its wrist too close to the base axis for any shoulder angle"
     if missing > 0.0:
         return f"{place}, {missing:.1f} mm out of the arm's reach in this direction"
     solutions = inverse(model, T_base_flange)[0]

@@ -238,9 +238,9 @@ class Distortion:
 
     def text(self) -> str:
         """The finding, in one sentence."""
-        noise = "not noise, for" if self.probability < SURE else "more than noise, it seems:"
+        noise = "not noise, because" if self.probability < SURE else "probably more than noise:"
         return (
-            f"{self.brief()}: {noise} beside it the readings err by {self.reading_mm:.2g} mm a "
+            f"{self.brief()}: {noise} besides it, the readings have errors of {self.reading_mm:.2g} mm a "
             "coordinate; without it the expected TRE at the target would be about "
             f"{self.rms_without_mm:.1f} mm instead of {self.rms_mm:.1f}; the registration does not use this"
         )
@@ -248,7 +248,7 @@ class Distortion:
     def brief(self) -> str:
         """How the lists differ, by how much, and how sure that is."""
         along = "" if self.axes == "xyz" else f" along the CT's {self.axes}"
-        said = f"markers_base look {1 + self.amount:.4f} times as large as markers_ct{along}"
+        said = f"markers_base appear {1 + self.amount:.4f} times as large as markers_ct{along}"
         if len(self.axes) == 2:
             angle = np.degrees(abs(np.arctan(self.amount)))
             said = f"the CT's frame looks {angle:.1f} degrees out of square, {self.axes[0]} against {self.axes[1]}"

@@ -9,7 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.base.text import did_you_mean
+from puncture_twin.planning.base.text import did_you_mean, plural
 from puncture_twin.planning.formats.points import NamedPoints
 
 MIN_MARKERS = 3
@@ -85,7 +85,7 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
         InputError: Fewer than three, not finite, on a line, of two sizes, or all at one place.
     """
     if len(markers) < MIN_MARKERS:
-        refuse(f"{len(markers)} markers", where, "3 or more, by the same names", "too_few_markers")
+        refuse(plural(len(markers), "marker"), where, "3 or more, by the same names", "too_few_markers")
     both = np.concatenate([markers.points_ct, markers.points_base])
     if not np.isfinite(both).all():
         bad = [n for n, a, b in zip(markers.names, markers.points_ct, markers.points_base, strict=True)
@@ -98,13 +98,13 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
             refuse(what, where, "three markers that span a triangle", "markers_collinear")
     ratio = float(np.linalg.norm(spreads[1]) / np.linalg.norm(spreads[0]))
     if not 1 / UNIT_SLIP < ratio < UNIT_SLIP:
-        what = f"base markers spread {ratio:.3g} times as wide as the CT's: a likely mm/cm/m slip"
+        what = f"base markers spread {ratio:.3g} times as wide as the CT's: probably a wrong unit (mm/cm/m)"
         refuse(what, where, "both sides in mm", "wrong_unit")
     span = max(_span(markers.points_ct), _span(markers.points_base))
     if span < LEAST_SPAN_MM:
         what = (
-            f"markers {', '.join(markers.names)} span {span:.2g} mm, no more than a needle tells apart: a likely slip "
-            "of unit (m or cm as mm) on both sides"
+            f"markers {', '.join(markers.names)} span {span:.2g} mm, too little for a needle to distinguish: "
+            "probably a wrong unit (m or cm as mm) on both sides"
         )
         refuse(what, where, f"both sides in mm, markers that span {LEAST_SPAN_MM:g} mm at least", "wrong_unit")
 

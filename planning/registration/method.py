@@ -85,7 +85,7 @@ def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path)
     if method not in get_args(Method):
         refuse(f"method {method!r}", where, ", ".join(get_args(Method)), "unknown_method")
     if method in WEIGHING and noise is None:
-        what = f"method '{method}' weighs by declared errors"
+        what = f"method '{method}' needs declared errors as weights"
         refuse(what, where, "[errors], or method rigid", "method_without_errors")
 
 
@@ -98,9 +98,9 @@ def _check_noise(
     values = np.linalg.eigvalsh(covariance.independent if method in WEIGHING else covariance.whole)
     if not values[0] > SINGULAR * values[-1]:
         allowed = "ct_in_plane_mm, ct_slice_mm or touch_mm above 0"
-        refuse("the declared errors leave readings of the markers without any", where, allowed, "no_marker_noise")
+        refuse("the declared errors leave some marker readings without error", where, allowed, "no_marker_noise")
     if found_in_mm is not None and found_in_mm < LEAST_FOUND_MM:
-        message = f"marker_noise = 'found', but the residuals ({found_in_mm:.2g} mm) hold none"
+        message = f"marker_noise = 'found', but the residuals ({found_in_mm:.2g} mm) show none"
         refuse(message, where, "markers measured on both sides, or marker_noise = 'declared'", "no_marker_noise")
 
 
@@ -182,8 +182,8 @@ class Renaming:
     def text(self) -> str:
         """Which names, how well they fit, and what would follow."""
         return (
-            f"{self.slip} fit with FRE {self.fre_mm:.2f} mm and put the target {self.target_mm:.1f} mm away, "
-            f"the patient turned by {np.degrees(self.turn):.0f} deg"
+            f"{self.slip} fit with FRE {self.fre_mm:.2f} mm and put the target {self.target_mm:.1f} mm away, the "
+            f"patient rotated by {np.degrees(self.turn):.0f} deg"
         )
 
 

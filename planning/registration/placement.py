@@ -115,7 +115,7 @@ def corrected(case: Case, registration: Registration, *, where: str | Path) -> R
             reached.
     """
     if registration.markers.joints is None:
-        message = "correct = true, but the touches do not say how the arm stood: they tell nothing of its errors"
+        message = "correct = true, but the touches have no joint angles: they give no information on the arm's errors"
         refuse(message, where, "q1_deg to q6_deg in markers_base; or correct = false", "no_touch_joints")
     model, tip = case.robot.model, case.needle.length_mm
     q = _aimed_insertion(case, registration.T_base_ct, where)
@@ -129,13 +129,13 @@ def _aimed_insertion(case: Case, T_base_ct: Floats, where: str | Path) -> Floats
         reached = reached_insertion(case, T_base_ct)
         if reached is None:
             message = "correct = true, but the arm reaches the target in none of the directions tried"
-            refuse(message, where, "correct_joints_deg, how the arm stands at the insertion's end", "out_of_reach")
+            refuse(message, where, "correct_joints_deg, the joints at the end of the insertion", "out_of_reach")
         return reached
     q = np.radians(np.asarray(case.registration.correct_joints_deg))
     T = flange_pose(case.robot.model, q)
     away = float(np.linalg.norm(T[:3, 3] + case.needle.length_mm * T[:3, 2] - apply(T_base_ct, case.target_ct)))
     if away > MAX_AIM_OFF_MM:
-        allowed = f"within {MAX_AIM_OFF_MM:g} mm: joints at an insertion's end, with this needle"
+        allowed = f"within {MAX_AIM_OFF_MM:g} mm: joints at the end of an insertion, with this needle"
         refuse(f"correct_joints_deg put the tip {away:.1f} mm from the target", where, allowed, "aim_beside_target")
     return q
 

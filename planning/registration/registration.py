@@ -60,7 +60,7 @@ def outlier_marker_of(markers: MarkerPairs, fle_mm: float | None) -> OutlierMark
     return outlier_marker(fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
 
 
-ALLOWED_RESIDUALS = "names and readings checked, the true errors declared, or registration.accept_residuals = true"
+ALLOWED_RESIDUALS = "check names and readings, declare the true errors, or set registration.accept_residuals = true"
 
 
 @dataclass(frozen=True, eq=False)

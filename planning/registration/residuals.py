@@ -128,16 +128,16 @@ class ResidualTest:
             scaled = f", scaled by {self.scale:.2f} to the residuals" if self.scale > 1 else ""
             return f"given{scaled}"
         if self._estimate_mm < MIN_FLE_MM:
-            return f"the floor of {MIN_FLE_MM:g} mm: so small an FRE of {self.count} markers is luck"
+            return f"the floor of {MIN_FLE_MM:g} mm: such a small FRE of {self.count} markers is chance"
         return "estimated from FRE of the rigid fit"
 
     def text(self) -> str:
         """What the test found, in words."""
         if self.declared_fle_mm is None:
             what = "exceeds" if not self.explained else "keeps"
-            return f"FRE {self.fre_mm:.2f} mm {what} the {MAX_FRE_MM:g} mm that pass without a declared fle_mm"
+            return f"FRE {self.fre_mm:.2f} mm {what} the {MAX_FRE_MM:g} mm allowed without a declared fle_mm"
         what = "explains" if self.explained else "does not explain"
-        scaled = "" if self.explained else f"; noise of {self.scale:.2f} times that would"
+        scaled = "" if self.explained else f"; {self.scale:.2f} times that noise would"
         return (
             f"fle_mm = {self.declared_fle_mm:g} {what} FRE {self.fre_mm:.2f} mm (chi-squared {self.chi_squared:.1f}, "
             f"{100 * (1 - REJECT_LEVEL):g} % stay below {chdtri(self.freedom, REJECT_LEVEL):.1f} at "
@@ -198,7 +198,8 @@ class OutlierMarker(NamedTuple):
         """Which marker does not fit, by how much, and what to check; one sentence."""
         return (
             f"marker {self.name} does not fit: the other {self.others} place it {self.miss_mm:.1f} mm from its "
-            f"reading, and fit each other to {self.others_fre_mm:.1f} mm; check its name, touch and place in the CT"
+            f"reading, and agree with each other to {self.others_fre_mm:.1f} mm; check its name, touch and position "
+            "in the CT"
         )
 
     def finding(self) -> Finding:
@@ -334,7 +335,7 @@ class NoiseTest:
     def text(self) -> str:
         """What the test found, in one sentence."""
         low, high = self.interval
-        size = f"the residuals say {self.estimate:.2f} times the declared errors (95 %: {low:.2f} to {high:.2f})"
+        size = f"the residuals show {self.estimate:.2f} times the declared errors (95 %: {low:.2f} to {high:.2f})"
         if self.found:
             return f"noise found: {size}"
         verdict = "agree with" if self.agrees else "do not agree with"
@@ -408,7 +409,7 @@ def conditioning(markers: Floats, target: Floats) -> Conditioning:
     lever = float(leverage(markers, target)[0])
     flags = []
     if ratio < WEAK_SPREAD:
-        said = f"markers lie almost on a line (s2/s1 {ratio:.2f} < {WEAK_SPREAD})"
+        said = f"the markers are almost on a line (s2/s1 {ratio:.2f} < {WEAK_SPREAD})"
         flags.append(Finding("markers_on_a_line", Severity.WARNING, said, {"spread_ratio": ratio}))
     if altitude < WEAK_ALTITUDE_MM:
         said = f"the widest marker triangle is flat (altitude {altitude:.0f} < {WEAK_ALTITUDE_MM:.0f} mm)"

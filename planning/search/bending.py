@@ -71,7 +71,7 @@ def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance:
     for row in rows:
         one = structures[nearest[row]]
         arrays["structure"][row], arrays["amount"][row] = one.name, clearance[row, nearest[row]]
-        arrays["detail"][row] = f"it may bend by {deflection[row]:.2f} mm, and the margin is {one.margin_mm:g} mm"
+        arrays["detail"][row] = f"it may bend by {deflection[row]:.2f} mm; the margin is {one.margin_mm:g} mm"
     return Verdict(**arrays)
 
 
@@ -95,9 +95,9 @@ class Insertion(NamedTuple):
             greatest_mm: The bound that the search keeps.
         """
         peak, free, pinned = self.force.peak_n, self.buckling_free_n, self.buckling_pinned_n
-        kept = f"{greatest_mm:.2f} mm are kept as clearance"
+        kept = f"{greatest_mm:.2f} mm are added to the margins"
         return [
-            f"  needle bends   {self.tip_mm:8.2f} mm at the tip if its bevel never turns; {kept}",
+            f"  needle bends   {self.tip_mm:8.2f} mm at the tip if the bevel is never rotated; {kept}",
             f"  axial force    {peak:8.2f} N at most; the shaft buckles at {free:.1f} N, pinned at {pinned:.1f} N",
         ]
 
@@ -144,7 +144,7 @@ def check_tissues(case: Case, anatomy: Anatomy) -> None:
         if tissue.stiffness_n_mm2 > most:
             bend = shortest_bend(case.bending.shaft)
             what = f"tissue.{pattern}: {tissue.stiffness_n_mm2:g} N/mm2 bends this shaft within {bend:.2g} mm"
-            allowed = f"at most {most:.3g} N/mm2 for it: beyond, no bound of its bending is known"
+            allowed = f"at most {most:.3g} N/mm2 for this shaft: above, no bound of its bending is known"
             refuse(what, case.path, allowed, "tissue_too_stiff")
 
 

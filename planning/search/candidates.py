@@ -19,7 +19,7 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.polar_map import NO_MAP, Entry, PolarMap, Sectors, polar_map
 from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason
-from puncture_twin.planning.base.text import Facts, Shown, brief
+from puncture_twin.planning.base.text import Facts, Shown, brief, plural
 from puncture_twin.planning.case.entry import AngleGrid
 from puncture_twin.planning.search.windows import Windows, find_windows
 from puncture_twin.planning.uncertainty.chance_model import Chances
@@ -216,7 +216,7 @@ class Candidates(Columns, Shown):
     @brief
     def __repr__(self) -> str:
         best = "" if not len(self.ranked) else "; best " + self._direction(int(self.ranked[0]))
-        return f"{len(self):,} directions, {int(self.safe.sum()):,} {self.safe_text}{best}; arm {self.arm_note}"
+        return f"{plural(len(self), 'direction')}, {int(self.safe.sum()):,} {self.safe_text}{best}; arm {self.arm_note}"
 
     def _direction(self, row: int) -> str:
         return f"theta {np.degrees(self.theta[row]):g} deg, beta {np.degrees(self.beta[row]):g} deg"

@@ -199,7 +199,7 @@ def with_file_read(case: Case, choice: Choice) -> Choice:
     away = np.linalg.norm(points - case.target_ct, axis=1)
     if len(points) == MOST_POINTS and away.min() > NEAR_ENTRY_MM:
         allowed = f"a line with one end within {NEAR_ENTRY_MM:g} mm of the target"
-        refuse(f"neither end is the target: {away.min():.1f} mm away from it", path, allowed, "line_misses_target")
+        refuse(f"neither end is at the target: {away.min():.1f} mm away", path, allowed, "line_misses_target")
     x, y, z = to_lps(points[[int(np.argmax(away))]], case.space)[0].tolist()  # the change of signs undoes itself
     return replace(choice, entry_mm=(x, y, z), read=(content_input("entry", str(path), data),))
 
@@ -225,12 +225,12 @@ def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
     apart = float(np.linalg.norm(real - _entry_ct(case, choice)))
     if apart > NEAR_ENTRY_MM:
         place = ", ".join(f"{mm:.1f}" for mm in to_lps(real[None], case.space)[0])
-        what = f"the path from there to the target enters the skin {apart:.1f} mm away, at ({place}) mm {case.space}"
+        what = f"the path from this point enters the skin {apart:.1f} mm away, at ({place}) mm {case.space}"
         refuse(what, "--entry", f"a point on the skin, to {NEAR_ENTRY_MM:g} mm", "entry_elsewhere")
 
 
 ANGLES = ("theta_deg", "beta_deg")
-ALLOWED_ANGLES = "a header with theta_deg and beta_deg, and perhaps name; then as many fields in every line"
+ALLOWED_ANGLES = "a header with theta_deg, beta_deg and optionally name; then the same number of fields in every line"
 GREATEST = (180.0, 360.0)
 """The largest θ and β, degrees."""
 

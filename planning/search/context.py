@@ -24,7 +24,7 @@ from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Cache, Memo
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.base.progress import LOG, Silent, Stages, Watcher
 from puncture_twin.planning.base.provenance import differing_input, inputs_document, read_inputs
-from puncture_twin.planning.base.text import Facts, Shown, brief, first_few
+from puncture_twin.planning.base.text import Facts, Shown, brief, first_few, plural
 from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import ClearanceEngine
@@ -55,7 +55,7 @@ EngineChoice = str | Callable[..., ClearanceEngine]
 COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
 """The unit of each engine's progress."""
 
-NO_BASE = "the case does not say where the robot's base is"
+NO_BASE = "the case does not state where the robot's base is"
 ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]"
 
 
@@ -97,7 +97,7 @@ class CaseContext(Shown):
 
     @brief
     def __repr__(self) -> str:
-        return f"case {self.case.name}, {len(self.anatomy.structures)} structures; arm {self.arm}"
+        return f"case {self.case.name}, {plural(len(self.anatomy.structures), 'structure')}; arm {self.arm}"
 
     @property
     def arm(self) -> str:
@@ -262,7 +262,7 @@ def prepare(
         cache = replace(user_cache(), memory=memory)
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), cache)
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
-        watcher.step("anatomy", "whether all fits together")
+        watcher.step("anatomy", "consistency of the inputs")
         anatomy = _with_findings(case, anatomy, placement, cache)
         check_tissues(case, anatomy)
         case.files.release()  # image and labels are read: their memory is given back
@@ -317,7 +317,7 @@ def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidat
     """Findings on what else would be safe for the organs, from the ranked candidates of the case."""
     more = safe_without_beyond(case, anatomy, candidates)
     if more:
-        text = f"{more} more directions would be safe for the organs with [ct] beyond_mm = 0"
+        text = f"{plural(more, 'more direction')} would be safe for the organs with [ct] beyond_mm = 0"
         yield Finding("hangs_on_beyond_image", Severity.NOTE, text, {"directions": more})
     if case.needle.lengths_mm:
         yield _needle_catalogue(case, anatomy, engine, candidates)
@@ -349,5 +349,5 @@ def _needle_catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, can
     shortest = [next((length for length, rows in safe.items() if rows[row]), np.nan) for row in best]
     fits = ", ".join(f"{length:g} mm" for length in shortest)
     numbers = {"lengths_mm": list(safe), "safe": [float(rows.sum()) for rows in safe.values()], "shortest_mm": shortest}
-    text += f"; the shortest that fits the best path of each window: {fits or 'none'}"
-    return Finding("needle_catalogue", Severity.NOTE, f"needles, safe for the organs: {text}", numbers)
+    text += f"; shortest for the best path of each window: {fits or 'none'}"
+    return Finding("needle_catalogue", Severity.NOTE, f"organ-safe directions per needle: {text}", numbers)

@@ -27,7 +27,7 @@ NEAREST = 8
 COARSE_VOXEL_MM = 1.0
 """A surface drawn around voxels of this size is somewhere within half of it."""
 
-NO_CHANCES = "no chances to hit and to touch: they need markers, the arm, and a direction that organs and arm allow"
+NO_CHANCES = "no chances to hit and to touch: they need markers, the arm, and a direction safe for organs and arm"
 
 UNITS = {
     Reason.SKIN_ANGLE.value: "deg",
@@ -71,7 +71,7 @@ class Explanation(Shown):
 
     @brief
     def __repr__(self) -> str:
-        return f"case {self.case.name}, {' '.join(line.strip() for line in self.head())}; .text() says all"
+        return f"case {self.case.name}, {' '.join(line.strip() for line in self.head())}; .text() has all"
 
     @property
     def safe(self) -> bool:
@@ -248,7 +248,7 @@ class Explanation(Shown):
         return [
             f"  breathing      {found.clearance[0]:8.2f} mm least clearance, at "
             f"{breathing.phase_text(float(found.worst_phase[0]))}",
-            "                 a needle in place moves with the organ and bends: no verdict is about leaving it there",
+            "                 an inserted needle moves with the organ and bends: the verdict does not cover that",
         ]
 
     def _scan(self) -> list[str]:
@@ -297,7 +297,7 @@ class Explanation(Shown):
         row = self.candidates
         if not row.arm_checked:
             return f"arm {row.arm_note}"
-        no_need = "not computed, the organs reject the direction"
+        no_need = "not computed: the organs reject the direction"
         reached = {-1: no_need, 0: "no", 1: f"yes, margin {row.arm.margin[0]:.2f}"}
         return f"arm reaches it: {reached[int(row.arm.reachable[0])]}"
 
@@ -324,8 +324,8 @@ def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
     lengths = candidates.path.length[freed]
     return [
         f"the needle is too short for {short.sum()} of {len(candidates)} directions: its longest path is "
-        f"{case.needle.longest_path_mm:g} mm, and nothing else speaks against {freed.sum()} of {lengths.min():.0f} to "
-        f"{lengths.max():.0f} mm"
+        f"{case.needle.longest_path_mm:g} mm. {freed.sum()} of them, of {lengths.min():.0f} to "
+        f"{lengths.max():.0f} mm, are rejected for nothing else"
     ]
 
 

@@ -21,6 +21,7 @@ from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.breathing.breathing import Breathing, fraction_within
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Obstacle
@@ -413,8 +414,8 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
     breathing.weights.check(needed, "breathing.weights", case.path, others=others)
     own = stated.get(case.target_structure, 1.0)
     if own != 1.0:
-        message = f"breathing.weights: '{case.target_structure}' holds the target, and {own:g} is not its weight"
-        refuse(message, case.path, "1, or no weight for it: the amplitude is the target's", "breathing_weight")
+        message = f"breathing.weights: '{case.target_structure}' contains the target, so its weight cannot be {own:g}"
+        refuse(message, case.path, "1, or no weight: the amplitude is that of the target", "breathing_weight")
     of = breathing.weights.of
     weights = [of(name) if weight is None else stated.get(name, weight) for name, weight in fixed.items()]
     return MovingWeights(float(of(skin) or 0.0), np.array(weights, dtype=np.float64))
@@ -428,15 +429,17 @@ def _by_itself(case: Case, structure: Structure) -> float | None:
 
 
 SAFE_WHEN = (
-    "breathing: a safe direction is safe {when}: checked at {count} positions, and clearances between them; a needle "
-    "in place moves with the organ and bends"
+    "breathing: a safe direction is safe {when}; checked at {count}, with clearances between them; an "
+    "inserted needle moves with the organ and bends"
 )
 
-PLANS = "breathing: plans and rehearsals go to the target where the CT shows it (s = {s:g}), the patient at rest there"
+PLANS = (
+    "breathing: plans and rehearsals go to the target where the CT shows it (s = {s:g}), with the patient at rest there"
+)
 
-OPEN = "breathing: the gate is open {part:.0%} of the time, if the breath follows the curve"
+OPEN = "breathing: the gate is open {part:.0%} of the time, if the breathing follows the curve"
 
-OUTSIDE_GATE = "breathing: the CT shows the body at s = {s:g}, outside of the gate (s <= {gate:g})"
+OUTSIDE_GATE = "breathing: the CT shows the body at s = {s:g}, outside the gate (s <= {gate:g})"
 
 
 def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
@@ -450,7 +453,7 @@ def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
         return ()
     moving_weights(case, breathing, anatomy)
     count = int(breathing.in_window.sum())
-    warnings = [SAFE_WHEN.format(when=breathing.window_text, count=count)]
+    warnings = [SAFE_WHEN.format(when=breathing.window_text, count=plural(count, "position"))]
     if breathing.gate is not None:
         warnings.append(OPEN.format(part=fraction_within(breathing.gate, breathing.exponent)))
     warnings.append(PLANS.format(s=breathing.scanned_at))

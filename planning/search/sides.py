@@ -30,7 +30,7 @@ right and to the left."""
 ROUND_ABOUT = ("front", "back", "right", "left")
 """The sides that are reported; through feet and head no image shows skin."""
 
-NOT_SHOWN = "lies on what no image shows"
+NOT_SHOWN = "is where the image does not show the body"
 """Reason for the closed back of a patient without a CT, while the front is open."""
 
 AXES = {"front": "anterior", "back": "posterior", "right": "right", "left": "left", "feet": "feet", "head": "head"}
@@ -105,9 +105,9 @@ def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) 
     """Why no needle comes from some directions, whatever organs are there, and from which."""
     length, needle = paths.path_length, case.needle
     unseen = np.isnan(length) | ~np.isnan(paths.unknown_depth)
-    table = "lies on the table" if anatomy.couch is not None else "is near to where the image ends"
-    closed = [("is beyond where the image ends", np.asarray(unseen))]
-    for name, why in ((OUTSIDE_BODY, table), (ATTACHED_LIMB, "lies at what seems to be a limb")):
+    table = "lies on the table" if anatomy.couch is not None else "is near the end of the image"
+    closed = [("is beyond the end of the image", np.asarray(unseen))]
+    for name, why in ((OUTSIDE_BODY, table), (ATTACHED_LIMB, "is at a probable limb")):
         meshes = [one.mesh for one in anatomy.checked if one.name == name]
         for mesh in meshes:
             closed.append((why, ~unseen & _crosses(mesh, case.target_ct, outward_ct, needle.length_mm)))
@@ -115,7 +115,7 @@ def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) 
         *closed,
         (f"is farther than the needle's longest path, {needle.longest_path_mm:g} mm", length > needle.longest_path_mm),
         ("is met too obliquely", paths.skin_angle > case.search.max_skin_angle),
-        ("is left and entered again", ~np.isnan(paths.reentry_depth)),
+        ("would be left and re-entered", ~np.isnan(paths.reentry_depth)),
     ]
 
 
@@ -156,7 +156,7 @@ def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:
         are = why.replace("is ", "are ", 1).replace("lies ", "lie ", 1)
         parts.append(f"the {_listed(names)} {why if len(names) == 1 else are}")
     missed = [side for side in reported if searched and side.is_open and side.name not in here]
-    parts += [f"not the {side.name}, where skin is {side.nearest_mm:.0f} mm away" for side in missed]
+    parts += [f"not the {side.name}, where the skin is {side.nearest_mm:.0f} mm away" for side in missed]
     return "; ".join(parts)
 
 

@@ -65,12 +65,14 @@ class Goal:
         """One sentence on the errors that would have to shrink."""
         if not self.remedies:
             if self.all_sources is None:
-                return f"{self.claim} cannot be had, however small the errors"
-            shrunk = f"all of them together would have to shrink to {100 * self.all_sources:.0f} %"
-            return f"for {self.claim} no single error is enough: {shrunk}"
+                return f"{self.claim} is not possible, however small the errors"
+            shrunk = f"all errors together would have to shrink to {100 * self.all_sources:.0f} %"
+            return f"for {self.claim} no single error suffices: {shrunk}"
         source, declared, needed = self.remedies[0]
         source_text, key, unit = SOURCES[source]
-        return f"for {self.claim} the {source_text} ({key}) would have to be {needed:.2g} {unit}, not {declared:.2g}"
+        return (
+            f"for {self.claim} the {source_text} ({key}) would have to be {needed:.2g} {unit} instead of {declared:.2g}"
+        )
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON, in the units of the keys of ``[errors]``."""
@@ -138,9 +140,9 @@ class UncertaintyBreakdown:
             f"  expected tip error {budget.rms_mm:.2f} mm (rms), in this configuration of the arm: "
             f"{budget.lateral_mm:.2f} across the needle, {budget.depth_mm:.2f} along it; "
             f"half axes of the 95 % ellipsoid {axes} mm",
-            f"  of its variance: {fractions}",
+            f"  sources of its variance: {fractions}",
             f"  {self.declaration}",
-            f"  touches anything: {chance_text(self.p_touch_any)} at most, the sum of all",
+            f"  touches a structure to avoid: {chance_text(self.p_touch_any)} at most, the sum over all structures",
             f"  not modelled: {self.not_modelled}",
         ]
 

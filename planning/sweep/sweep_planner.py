@@ -129,7 +129,7 @@ def _angles(start: tuple[float, float], end: tuple[float, float]) -> Floats:
     change = np.array([end[0] - start[0], (end[1] - start[1] + np.pi) % (2 * np.pi) - np.pi])
     count = int(np.ceil(np.abs(change).max() / STEP))
     if count == 0:
-        refuse("a sweep to where it starts", "--to", "another direction", "no_motion")
+        refuse("the sweep ends where it starts", "--to", "another direction", "no_motion")
     return np.asarray(start + np.linspace(0.0, 1.0, count + 1)[:, None] * change)
 
 
@@ -209,7 +209,7 @@ def _least_turn(R: Floats, z: Floats) -> Floats:
 def _why_not(checker: CellChecker, before: Floats, q: Floats, step: float) -> str:
     """Reason that the arm cannot go on to the next direction, in words; empty where it can."""
     if not np.isfinite(step):
-        return "the arm does not reach on, or a joint would be beyond its limits"
+        return "the arm cannot reach further, or a joint would exceed its limits"
     if step > MOST_JOINT_STEP:
         return "a joint would jump"
     if not away_from_singularities(checker.model, q):

@@ -82,8 +82,8 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
             return tour_through(context, stops, seed=seed, progress=progress)
         except NoMotionError:
             continue
-    where = "no place was found that can" if place_base is None else "this place cannot"
-    what = f"{where} be touched in {count} poses by free motions: {most} poses at most"
+    where = "no point was found that can" if place_base is None else "this point cannot"
+    what = f"{where} be touched in {count} poses by collision-free motions: {most} poses at most"
     raise NoAnswerError(what, code="too_few_poses")
 
 

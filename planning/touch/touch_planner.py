@@ -16,6 +16,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse
 from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.workcell import case_boxes, case_tool, outside_surface
 from puncture_twin.planning.formats.points import NamedPoints
@@ -44,7 +45,7 @@ PLANNED_PADDING_MM = 4.0
 TOUCHING_PADDING_MM = 1.0
 """The same distance while touching, when the needle's line was set onto the marker."""
 
-ALLOWED = "a case with [errors] and markers, which say where to touch and how sure that is"
+ALLOWED = "a case with [errors] and markers"
 
 MOST_MARKERS = 12
 """Markers at most: the shortest tour of more takes too long to find."""
@@ -163,11 +164,11 @@ def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
     why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
     count = f"{len(task.markers)} of {len(every.markers)} markers can be touched"
     if len(task.markers) < MIN_MARKERS:
-        raise NoAnswerError(f"{count}, {MIN_MARKERS} are needed: {why}", code="too_few_markers")
+        raise NoAnswerError(f"{count}; {MIN_MARKERS} are needed: {why}", code="too_few_markers")
     try:
         return task.error(task.q_insertion)
     except InputError as error:
-        what = f"{count}, which do not suffice: {error.what}" + (f"; {why}" if why else "")
+        what = f"{count}, too few: {error.what}" + (f"; {why}" if why else "")
         raise NoAnswerError(what, code=error.code) from error
 
 
@@ -217,8 +218,8 @@ def _task(context: CaseContext, q_insertion: Floats) -> _Task:
         refuse("no touches can be planned", context.case.path, ALLOWED, "no_markers")
     found = placement.registration.markers
     if len(found) > MOST_MARKERS:
-        what = f"{len(found)} markers"
-        refuse(what, f"{context.case.path}: registration", f"at most {MOST_MARKERS}: see registration.use", "too_many")
+        allowed = f"at most {MOST_MARKERS}; choose with registration.use"
+        refuse(plural(len(found), "marker"), f"{context.case.path}: registration", allowed, "too_many")
     believed = MarkerPairs(found.names, found.points_ct, apply(placement.T_base_ct, found.points_ct))
     return _Task(context, believed, cast(Method, placement.registration.method), q_insertion)
 

@@ -242,7 +242,7 @@ def why_not(checkers: ApproachCheckers, tip_mm: float, q_touch: Floats) -> str:
     """
     whole = checkers.whole
     if not whole.model.within_limits(q_touch[None])[0]:
-        return "a joint would be beyond its limits"
+        return "a joint would exceed its limits"
     line = line_to(whole.model, tip_mm, q_touch, STANDOFF_MM, -PAST_MM)
     if line is None:
         return "the arm cannot follow the straight line to it"
@@ -291,7 +291,7 @@ def registered_joints(
     every = nearest_within_limits(model, inverse(model, T)[0], q_insertion)
     away = np.abs(every - q_insertion).max(axis=1)
     if np.isnan(away).all():
-        raise NoAnswerError("the arm does not reach the target where the touches put it", code="out_of_reach")
+        raise NoAnswerError("the arm does not reach the target where the touches locate it", code="out_of_reach")
     return np.asarray(every[int(np.nanargmin(away))])
 
 
@@ -316,7 +316,7 @@ def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
     standoff = float(standoffs(case.needle, paths.path_length[0], paths.skin_angle[0]))
     line = line_to(model, tip_mm, q, standoff, 0.0)
     if line is None:
-        what = "the arm cannot follow the needle's line to the target where the touches put it"
+        what = "the arm cannot follow the needle's line to the target where the touches locate it"
         raise NoAnswerError(what, code="out_of_reach")
     approach = plan_approach(
         checker, home_configuration(case), line[0], seed=case.rehearsal.seed, speeds=speeds

@@ -149,10 +149,10 @@ def chance_model(case: Case, anatomy: Anatomy, engine: ClearanceEngine, error: P
     taken = [anatomy.checked[column].name for column in demanding(anatomy.checked)]
     if not TAKEN.isdisjoint(taken):
         message = f"structures {', '.join(sorted(TAKEN.intersection(taken)))}: p_touch_<name> is another column"
-        refuse(message, case.path, "other names than any and joint", "reserved_name")
+        refuse(message, case.path, "names other than any and joint", "reserved_name")
     mesh = anatomy.structure(case.target_structure).mesh
     if case.hit_radius_mm is None and not mesh.closed:
-        message = f"the mesh of '{case.target_structure}' is open: what lies in it, and is hit, is not known"
+        message = f"the mesh of '{case.target_structure}' is open: its inside, and so a hit, is not defined"
         refuse(message, case.path, "target.hit_radius_mm, or a closed mesh", "open_mesh")
     return ChanceModel(case, anatomy, engine, error, hit_model(case.hit_radius_mm, mesh, case.target_ct))
 
@@ -259,13 +259,13 @@ def check_limits(case: Case, anatomy: Anatomy, error_known: bool) -> None:
     settings = case.search
     limited = settings.min_hit is not None or settings.max_touch is not None or bool(settings.max_touch_of)
     if limited and not error_known:
-        message = "search.min_hit and max_touch cannot be checked: only markers and the arm give the needle's error"
+        message = "search.min_hit and max_touch cannot be checked: the needle's error needs markers and the arm"
         allowed = "[registration] with markers, and a search with the arm; or no such limit"
         refuse(message, case.path, allowed, "no_needle_error")
     names = [anatomy.checked[column].name for column in demanding(anatomy.checked)]
     unknown = sorted(set(settings.max_touch_of) - set(names))
     if unknown:
-        message = f"search.max_touch_of '{unknown[0]}' is no structure that must not be touched"
+        message = f"search.max_touch_of '{unknown[0]}' is not a structure to avoid"
         message += did_you_mean(unknown[0], names)
         refuse(message, case.path, ", ".join(names), "unknown_structure")
 

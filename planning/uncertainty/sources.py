@@ -14,10 +14,10 @@ from puncture_twin.planning.case.errors import ErrorModel
 
 NOT_MODELLED: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
-        "breathing": ("breathing", "breathing in the chances (they are of the body as the CT shows it)"),
+        "breathing": ("breathing", "breathing in the chances (they are for the body as in the CT)"),
         "bending": (
-            "a needle that bends",
-            "a needle that bends in the chances (its greatest deflection is kept as clearance)",
+            "needle bending",
+            "needle bending in the chances (the greatest deflection is added to the margins)",
         ),
     }
 )
@@ -36,7 +36,7 @@ def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
     """
     declared = {"breathing": case.breathing, "bending": case.bending}
     left_out = [texts[declared[name] is not None] for name, texts in NOT_MODELLED.items() if name not in counted]
-    return ", ".join([*left_out, "tissue that moves", *_unknown_contours(case)])
+    return ", ".join([*left_out, "tissue motion", *_unknown_contours(case)])
 
 
 def _unknown_contours(case: Case) -> list[str]:
@@ -47,7 +47,7 @@ def _unknown_contours(case: Case) -> list[str]:
     meshes = [one for one in case.structure if one.mesh is not None]
     names = [one.name for one in meshes if one.role in {"avoid", "unknown"} or one.name == hit]
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
-    return [f"how far meshes lie off ({', '.join(names[:NAMED])}{more}: errors.surface_mm)"] if names else []
+    return [f"errors of the meshes ({', '.join(names[:NAMED])}{more}: errors.surface_mm)"] if names else []
 
 
 ISOTROPIC = 1e-9
@@ -64,8 +64,8 @@ class Source(NamedTuple):
 
 SOURCES: Mapping[str, Source] = MappingProxyType(
     {
-        "ct_slice": Source("reading across the CT's slices", "ct_slice_mm", "mm"),
-        "ct_in_plane": Source("reading within the CT's slices", "ct_in_plane_mm", "mm"),
+        "ct_slice": Source("reading across the CT slices", "ct_slice_mm", "mm"),
+        "ct_in_plane": Source("reading within the CT slices", "ct_in_plane_mm", "mm"),
         "markers_ct": Source("reading in the CT", "ct_in_plane_mm and ct_slice_mm", "mm"),
         "touch": Source("touch noise", "touch_mm", "mm"),
         "target": Source("reading of the target", "target_mm", "mm"),

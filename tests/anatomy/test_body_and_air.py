@@ -228,7 +228,7 @@ def test_a_detached_arm_is_body(scene):
     assert not found.safe[rows].any()
     assert (found.verdict.reason[rows] == Reason.REENTERS_SKIN).sum() > 10
     said = " ".join(context.anatomy.warnings)
-    assert "do not touch the trunk" in said
+    assert "not connected to the trunk" in said
     assert "left of it" in said
     assert "right of it" in said
 
@@ -608,7 +608,7 @@ def test_where_a_volume_is_filled_up_there_is_neither_skin_nor_air(tmp_path, pad
     if padded is beyond_ends:
         assert context.anatomy.skin.field_of_view.cut[2].all()
     else:
-        assert any("filled up with one value" in warning for warning in context.anatomy.warnings)
+        assert any("a constant fill value" in warning for warning in context.anatomy.warnings)
     assert found.safe.sum() > 40
     assert hit_parts(context, found, parts, {"trunk", "table", "spine"}, beyond_mm=12.0) == {}
 

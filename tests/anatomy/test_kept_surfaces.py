@@ -125,7 +125,7 @@ def test_an_entry_without_what_it_should_say_is_made_anew(folder: Path, cache: C
     path = entry(cache, what)
     key, whole = path.name.split(".")[-2], path.read_bytes()
     path.write_bytes(packed(WRONG[wrong](unpacked(whole, key)), key))
-    with pytest.warns(CacheWarning, match="does not hold what it should; it is made anew and replaced"):
+    with pytest.warns(CacheWarning, match="does not have the expected content; it is computed again and replaced"):
         assert facts(anatomy(folder, cache)) == expected
     assert path.read_bytes() == whole
 
@@ -142,6 +142,6 @@ def test_a_changed_flag_is_seen(folder: Path, cache: Cache, what: str) -> None:
     changed = bytearray(whole)
     changed[at] = 0
     path.write_bytes(changed)
-    with pytest.warns(CacheWarning, match=r"is cut, damaged, or another's"):
+    with pytest.warns(CacheWarning, match=r"is truncated, damaged, or foreign"):
         assert facts(anatomy(folder, cache)) == expected
     assert path.read_bytes() == whole

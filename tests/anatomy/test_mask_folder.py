@@ -58,7 +58,7 @@ def test_a_folder_of_masks_is_searched_as_its_label_map_is(tmp_path):
         assert np.array_equal(one.mesh.faces, other.mesh.faces)
     found, plain = by_masks.search(), by_map.search()
     assert np.array_equal(found.verdict.reason, plain.verdict.reason)
-    assert "seg: 1 masks are empty, so that nothing is there: gallbladder" in by_masks.anatomy.warnings
+    assert "seg: 1 empty mask: gallbladder" in by_masks.anatomy.warnings
     assert by_masks.anatomy.structure("vessel left").source == "seg/vessel left.nii.gz:255"
 
 

@@ -19,9 +19,9 @@ def warnings_of(path):
     ("spacing", "margin", "said"),
     [
         ((2.0, 2.0, 2.0), "3.0", None),
-        ((2.0, 2.0, 20.0), "3.0", "slices 20 mm apart, and the least margin demanded from it is 3 mm (vessel)"),
-        ((2.0, 2.0, 20.0), "0.0", "slices 20 mm apart, and the least margin demanded from it is 0 mm (vessel)"),
-        ((2.0, 2.0, 2.0), "1.5", "slices 2 mm apart, and the least margin demanded from it is 1.5 mm (vessel)"),
+        ((2.0, 2.0, 20.0), "3.0", "slices 20 mm apart, but its smallest margin is 3 mm (vessel)"),
+        ((2.0, 2.0, 20.0), "0.0", "slices 20 mm apart, but its smallest margin is 0 mm (vessel)"),
+        ((2.0, 2.0, 2.0), "1.5", "slices 2 mm apart, but its smallest margin is 1.5 mm (vessel)"),
     ],
 )
 def test_slices_thicker_than_the_least_margin_are_a_warning(tmp_path, spacing, margin, said):
@@ -50,8 +50,8 @@ def test_a_skin_from_thick_slices_is_a_warning(tmp_path, spacing, warned):
 @pytest.mark.parametrize(
     ("theta", "step", "said"),
     [
-        ("[0, 90]", "7.0", "theta_deg [0, 90] is no whole number of steps of 7: the last angle that is checked is 84"),
-        ("[0, 90]", "0.7", "the last angle that is checked is 89.6"),
+        ("[0, 90]", "7.0", "theta_deg [0, 90] is not a whole number of steps of 7: the last angle checked is 84"),
+        ("[0, 90]", "0.7", "the last angle checked is 89.6"),
         ("[0, 90]", "0.3", None),
         ("[10, 10]", "10.0", None),
     ],
@@ -95,4 +95,4 @@ def test_labels_that_nobody_names_are_named(tmp_path):
     write_labels(tmp_path / "labels.nrrd", labels)
     found = [warning for warning in warnings_of(path) if "count as free" in warning]
     shown = "5, 6, 7, 8, 9, 10, 11, 12 and 5 more"
-    assert found == [f"labels.nrrd holds labels that the case does not name, and they count as free: {shown}"]
+    assert found == [f"labels.nrrd has labels that the case does not list; they count as free: {shown}"]

@@ -21,13 +21,13 @@ def place(tmp_path):
     ("name", "said"),
     [
         ("folder", "is a folder"),
-        ("link.stl", "is a link to a file that is not there"),
-        ("liver.stl", "is not there; there is 'Liver.STL'"),
-        ("spleen.stl", "is not there"),
-        ("folder/spleen.stl", "is not there"),
-        ("none/spleen.stl", "is not there"),
-        ("a" * 5000, "is not there"),
-        ("nul\0", "is not there"),
+        ("link.stl", "is a link to a missing file"),
+        ("liver.stl", "does not exist; did you mean 'Liver.STL'?"),
+        ("spleen.stl", "does not exist"),
+        ("folder/spleen.stl", "does not exist"),
+        ("none/spleen.stl", "does not exist"),
+        ("a" * 5000, "does not exist"),
+        ("nul\0", "does not exist"),
     ],
 )
 def test_what_is_in_the_place_is_said(place, name, said):

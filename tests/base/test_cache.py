@@ -119,7 +119,9 @@ def test_a_spoiled_file_is_made_anew_said_and_replaced(cache, spoil):
     made = cache.arrays({"file": "abc"}, counted(calls), by=BY)
     (path,) = entries(cache)
     path.write_bytes(SPOILS[spoil](path.read_bytes()))
-    with pytest.warns(CacheWarning, match=r"cache: a kept result is cut, damaged, or another's; it is made anew"):
+    with pytest.warns(
+        CacheWarning, match=r"cache: a stored result is truncated, damaged, or foreign; it is computed again"
+    ):
         again = cache.arrays({"file": "abc"}, counted(calls), by=BY)
     np.testing.assert_array_equal(again["vertices"], made["vertices"])
     assert len(calls) == 2
@@ -155,7 +157,7 @@ def test_something_else_in_an_entrys_place_is_replaced(cache, kind, tmp_path):
         os.mkfifo(path)
     else:
         path.symlink_to(tmp_path / ("elsewhere" if kind == "link" else "nowhere"))
-    with pytest.warns(CacheWarning, match="is no plain file"):
+    with pytest.warns(CacheWarning, match="is not a regular file"):
         cache.arrays({"file": "abc"}, counted(calls), by=BY)
     assert len(calls) == 2
     cache.arrays({"file": "abc"}, counted(calls), by=BY)
@@ -205,7 +207,7 @@ def test_a_whole_entry_with_other_arrays_is_made_anew(cache, wrong):
     cache.arrays({"file": "abc"}, counted(calls), by=BY, check=check)
     (path,) = entries(cache)
     path.write_bytes(packed(wrong, path.name.split(".")[-2]))
-    with pytest.warns(CacheWarning, match="does not hold what it should"):
+    with pytest.warns(CacheWarning, match="does not have the expected content"):
         found = cache.arrays({"file": "abc"}, counted(calls), by=BY, check=check)
     assert found["vertices"].shape == (4, 3)
     assert len(calls) == 2

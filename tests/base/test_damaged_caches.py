@@ -66,7 +66,7 @@ def test_a_search_survives_damage_of_what_is_kept(world: Path) -> None:
     again, said = search(world)
     assert again == first
     assert sorted(said) == [
-        "note: cache: a compiled kernel is cut or damaged; it is compiled anew and replaced",
-        "note: cache: a kept result is cut, damaged, or another's; it is made anew and replaced",
+        "note: cache: a compiled kernel is cut or damaged; it is compiled again and replaced",
+        "note: cache: a stored result is truncated, damaged, or foreign; it is computed again and replaced",
     ]
     assert search(world) == (first, [])

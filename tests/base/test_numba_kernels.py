@@ -234,7 +234,7 @@ def test_without_a_folder_kernels_live_as_long_as_the_process(project, before, t
     again = f"import subprocess, sys\nprint(subprocess.run([sys.executable, '-c', {ASKED!r}]).returncode)"
     words, warned = said(project, before + ASKED + again, **settings)
     assert sorted(words) == ["0", "0", "1", "2", "2"]
-    assert warned.count("kernels are compiled for this run alone") == 1
+    assert warned.count("kernels are compiled for this run only") == 1
     assert list(tmp_path.glob("puncture-twin-*")) == []
 
 

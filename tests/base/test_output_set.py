@@ -89,7 +89,7 @@ def test_a_smaller_set_leaves_nothing_of_the_larger(tmp_path):
     write(tmp_path, "search", {"candidates.parquet": "1", "report.html": "72 safe", "map.png": "m"})
     write(tmp_path, "search", {"candidates.parquet": "0"}, note=said.append)
     assert names(tmp_path) == {"candidates.parquet"} | OURS
-    assert said == [f"{tmp_path}: map.png, report.html of an earlier run removed: not of this search"]
+    assert said == [f"{tmp_path}: map.png, report.html of an earlier run removed: not part of this search"]
 
 
 def test_commands_that_have_nothing_to_do_with_each_other_share_a_folder(planned):
@@ -199,7 +199,7 @@ def test_readers_refuse_what_the_manifest_does_not_list(planned):
         read(planned / "other.json")
     loose = planned.parent / "loose.json"
     loose.write_text("p")
-    assert "outside of any output set" in read(loose).note
+    assert "not part of an output set" in read(loose).note
 
 
 def test_a_reader_behind_a_link_finds_the_set(planned, tmp_path_factory):

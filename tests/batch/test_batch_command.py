@@ -36,7 +36,7 @@ def test_a_dry_run_measures_and_writes_nothing(tmp_path, capfd):
     write_cohort(tmp_path / "c", 3)
     words = ("batch", "plan", tmp_path / "c", "--out", tmp_path / "out", "--no-arm", "--dry-run", "--jobs", "2")
     lines = said(capfd, 0, *words).out.splitlines()
-    assert lines[0] == "3 cases, 0 with a row already" and "p2/case.toml" in lines[1]
+    assert lines[0] == "3 cases, 0 already with a row" and "p2/case.toml" in lines[1]
     assert (
         lines[2].startswith("measured at p0/case.toml: 0.") and "MB of memory" in lines[3] and "MB of disk" in lines[3]
     )
@@ -77,10 +77,10 @@ def test_the_part_of_a_slurm_array_is_taken_and_told(planned, monkeypatch, capfd
     assert slurm_part(os.environ).text == "3/3"
     found = said(capfd, 1, "batch", "run", "--out", planned)
     assert "part 3/3, from SLURM's array" in found.err and found.out.startswith(
-        "1 case: 0 had their row, 0 done, 1 failed"
+        "1 case: 0 already had a row, 0 done, 1 failed"
     )
     again = said(capfd, 1, "batch", "run", "--out", planned, "--part", "3/3").out
-    assert again.startswith("1 case: 1 had their row (1 refused), 0 done, 0 failed")
+    assert again.startswith("1 case: 1 already had a row (1 refused), 0 done, 0 failed")
     monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "9")
     assert "SLURM's array" in said(capfd, 2, "batch", "run", "--out", planned).err
 
@@ -91,8 +91,8 @@ def test_what_cannot_be_run_is_one_line(planned, tmp_path, capfd):
         (("run", "--out", tmp_path / "new"), "has no plan"),
         (("status", "--out", tmp_path / "new"), "has no plan"),
         (("merge", "--out", tmp_path / "new"), "has no plan"),
-        (("run", "--out", planned, "--part", "4/3"), "is no part"),
-        (("plan", tmp_path / "nothing", "--out", planned), "is no cohort"),
+        (("run", "--out", planned, "--part", "4/3"), "is not a part"),
+        (("plan", tmp_path / "nothing", "--out", planned), "is not a cohort"),
         (("compare", planned, planned), "no such file"),
         (("plan", planned.parent / "c", "--out", "/proc/nowhere"), "cannot be written"),
         ((str(planned.parent / "c" / "p0"),), "No such command"),
@@ -101,7 +101,7 @@ def test_what_cannot_be_run_is_one_line(planned, tmp_path, capfd):
         assert len(found.err.strip().splitlines()) == 1 and line in found.err and "allowed: " in found.err, found.err
         assert found.out == ""
     (planned / "plan.parquet").write_bytes(b"PAR1")
-    assert "has other bytes than are listed" in said(capfd, 2, "batch", "run", "--out", planned).err
+    assert "does not match its entry" in said(capfd, 2, "batch", "run", "--out", planned).err
 
 
 def test_a_full_disk_is_one_line_and_the_merged_set_stays(planned, tmp_path, monkeypatch, capfd):

@@ -65,7 +65,7 @@ def test_a_case_that_cannot_be_read_is_planned_with_its_reason(tmp_path):
     whole = id_of(path)
     (path.parent / "rib.stl").rename(path.parent / "away")
     (row,) = plan_of(path)
-    assert row.refusal.startswith("case.toml: structure 'rib': file 'rib.stl' is not there")
+    assert row.refusal.startswith("case.toml: structure 'rib': file 'rib.stl' does not exist")
     assert str(tmp_path) not in row.refusal
     (path.parent / "away").rename(path.parent / "rib.stl")
     assert identified(row).id == whole != row.id

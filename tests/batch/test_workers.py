@@ -96,5 +96,5 @@ def test_the_same_case_twice_is_run_once(tmp_path, capfd):
         write_patient(tmp_path / "c" / name)
     assert main(["batch", "plan", str(tmp_path / "c"), "--out", str(tmp_path / "out"), "--no-arm"]) == 0
     assert main(["batch", "run", "--out", str(tmp_path / "out")]) == 0
-    assert "2 cases: 1 the same as others, 0 had their row, 1 done, 0 failed" in capfd.readouterr().out
+    assert "2 cases: 1 the same as other cases, 0 already had a row, 1 done, 0 failed" in capfd.readouterr().out
     assert rows(tmp_path / "out") == [(0, None)] * 2

@@ -124,7 +124,7 @@ def test_a_case_without_the_table_declares_none(tmp_path):
     ("keys", "whole", "text"),
     [
         ({}, True, "at each phase if inserted at that phase"),
-        ({"phases": 1}, False, "at exhale, if inserted there; no other phase was looked at"),
+        ({"phases": 1}, False, "at exhale, if inserted at exhale; no other phase was checked"),
         ({"phases": 1, "gate": 0.25}, False, "when gated to this window (s <= 0.25)"),
         ({"phases": 1, "amplitude_mm": 0.0}, True, "at each phase if inserted at that phase"),
     ],

@@ -154,4 +154,4 @@ def test_register_shows_them_where_they_are_declared(tmp_path):
     assert 0.1 < costs["bending of the needle"] < 10
     assert costs["breathing while it is inserted"] == pytest.approx(12 * mean_square_within(0.25, 2, 0.0) ** 0.5)
     assert {one["group"] for one in budget["changes"]} > {"needle", "breath"}
-    assert budget["not_modelled"] == "tissue that moves, how far meshes lie off (organ, rib: errors.surface_mm)"
+    assert budget["not_modelled"] == "tissue motion, errors of the meshes (organ, rib: errors.surface_mm)"

@@ -131,6 +131,6 @@ def test_register_prints_the_budget_and_draws_it(tmp_path):
     assert across**2 + along**2 == pytest.approx(budget["expected_mm"] ** 2) and 0 < along < across
     assert budget["best"]["expected_mm"] == min(one["expected_mm"] for one in budget["changes"])
     text = CliRunner().invoke(app, ["register", str(ABDOMEN)]).stdout
-    assert "mm is won by" in text
+    assert "mm would be gained by" in text
     refused = CliRunner().invoke(app, ["register", str(ABDOMEN), "--picture", str(tmp_path / "budget.txt")])
-    assert "no PNG's name" in str(refused.exception)
+    assert "not the name of a PNG file" in str(refused.exception)

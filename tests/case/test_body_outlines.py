@@ -73,7 +73,7 @@ def test_the_outline_itself_is_left_out(tmp_path, capfd, name, kind):
     code, said = init(capfd, tmp_path)
     assert code == 0, said
     assert name not in roles(tmp_path) and prepare(tmp_path, arm=False).search().safe.any()
-    assert any(f"taken for the outline of the body, so not checked (ignore): {name}" in line for line in said)
+    assert any(f"treated as the outline of the body, so not checked (ignore): {name}" in line for line in said)
 
 
 def test_a_limb_beside_the_target_is_no_outline(tmp_path, capfd):
@@ -113,7 +113,7 @@ def test_a_mesh_that_holds_nothing_is_no_skin(tmp_path, capfd):
         tmp_path, patient=(30.0, (-40, 0, 10)), tumor=(10.0, TARGET), aorta=(20.0, (60, 60, 0)), lung=(20.0, (0, 60, 0))
     )
     code, said = init(capfd, tmp_path, "--target", "-40,0,10", "--unit", "mm")
-    assert code == 2 and "'patient' is named like the skin, but holds 1 of the 3 other meshes" in said[-1]
+    assert code == 2 and "'patient' is named like the skin, but contains 1 of the 3 other meshes" in said[-1]
 
 
 def test_small_bodies_have_small_bounds(ball):

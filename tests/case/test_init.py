@@ -267,7 +267,7 @@ def test_no_path_through_what_nobody_knows_is_safe(tmp_path, capfd, name):
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     if code == 0:
         assert roles(tmp_path)[name][0] == "unknown"
-        assert any(f"unknown_region until the case says traverse: {name}" in line for line in said)
+        assert any(f"unknown_region unless the case makes them traverse: {name}" in line for line in said)
         found = prepare(tmp_path, arm=False).search()
         assert not found.safe.any()
         assert Reason.UNKNOWN_REGION.value in set(found.verdict.reason)
@@ -281,7 +281,7 @@ def test_the_case_says_how_to_change_it(tmp_path, capfd):
     assert init(capfd, tmp_path, "--target", TARGET)[0] == 0
     path = tmp_path / "case.toml"
     before = path.read_text()
-    (line,) = [line for line in before.splitlines() if "it holds the target too" in line]
+    (line,) = [line for line in before.splitlines() if "it also contains the target" in line]
     assert 'role = "traverse", without a margin, if a path may cross it' in line
     at = before.index(line)
     start = before.rindex('role = "unknown"', 0, at)
@@ -311,7 +311,7 @@ def test_a_typed_target_in_a_vessel_is_a_slip(tmp_path, capfd):
         assert code == 2 and out == "" and not (tmp_path / "case.toml").exists()
         (line,) = said
         assert "lies in 'aorta'" in line and "of 'aorta and venae cavae' (large vessel: bleeding)" in line
-        assert line.endswith("allowed: a point outside of it, or --target-label 'aorta' where it is itself the target")
+        assert line.endswith("allowed: a point outside it, or --target-label 'aorta' if it is the target itself")
 
 
 def test_a_vessel_that_is_meant_is_taken_and_every_result_says_so(tmp_path, capfd):
@@ -365,7 +365,7 @@ def test_a_mask_in_another_format_is_not_passed_over(tmp_path, capfd, ending):
         prepare(tmp_path, arm=False)
     code, _, said = init(capfd, tmp_path, "--target", TARGET, "--force")
     if ending == "mha":
-        assert code == 2 and "seg: beside the masks lies what is not read" in said[0] and "vein.mha" in said[0]
+        assert code == 2 and "seg: the folder also has files that cannot be read" in said[0] and "vein.mha" in said[0]
     else:
         assert code == 0 and roles(tmp_path)["vein.nhdr"] == ("avoid", 3.0)
 
@@ -377,7 +377,7 @@ def test_tables_that_contradict_each_other_are_not_guessed(tmp_path, capfd):
     (tmp_path / "a.csv").write_text("id,name\n1,muscle\n2,torso_fat\n3,rib_left_7\n")
     (tmp_path / "b.csv").write_text("id,name\n1,right lung\n2,aorta\n3,odd thing\n")
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
-    assert code == 2 and "map.nii.gz: several tables name its labels in other ways: a.csv, b.csv" in said[0]
+    assert code == 2 and "map.nii.gz: several tables name its labels differently: a.csv, b.csv" in said[0]
     assert init(capfd, tmp_path, "--target", TARGET, "--naming", "b.csv")[0] == 0
 
 
@@ -392,7 +392,9 @@ def test_organs_on_the_other_side_are_taken_where_a_person_has_looked(tmp_path, 
     if refused:
         assert "--trust-labels" in said[0] and not (tmp_path / "case.toml").exists()
         code, _, said = init(capfd, tmp_path, "--target", TARGET, "--trust-labels")
-        assert "trust_labels = true  # a person has looked" in (tmp_path / "case.toml").read_text()
+        assert (
+            "trust_labels = true  # a person checked the structures on the CT" in (tmp_path / "case.toml").read_text()
+        )
     assert code == 0, said
     findings = prepare(tmp_path, arm=False).provenance()["findings"]
     assert [one["severity"] for one in findings if one["code"] == "organs_out_of_order"] == ["warning"]
@@ -422,7 +424,7 @@ def test_a_case_that_is_there_is_kept(tmp_path, capfd):
     write_masks(tmp_path / "seg")
     (tmp_path / "case.toml").write_text("mine")
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
-    assert code == 2 and "there is a case already" in said[0] and "--force" in said[0]
+    assert code == 2 and "a case exists already" in said[0] and "--force" in said[0]
     assert init(capfd, tmp_path, "--target", "5000,0,0", "--force")[0] == 2
     assert (tmp_path / "case.toml").read_text() == "mine"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["case.toml", "scan.nii.gz", "seg"]
@@ -462,7 +464,7 @@ def test_all_that_is_wrong_is_said_at_once(tmp_path, capfd):
     (tmp_path / "seg" / "aorta.nii.gz").write_bytes(whole[: len(whole) // 2])
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert (code, len(said)) == (2, 1)
-    for part in ("seg/aorta.nii.gz: ", "compressed", "several CTs: a.nii.gz, b.nii.gz", "one name"):
+    for part in ("seg/aorta.nii.gz: ", "compressed", "several CTs: a.nii.gz, b.nii.gz", "the same name"):
         assert part in said[0], said
     (tmp_path / "seg" / "aorta.nii.gz").write_bytes(whole)
     code, _, said = init(capfd, tmp_path, "--target", TARGET, "--ct", "b.nii.gz", "--segmentation", "seg")
@@ -477,7 +479,7 @@ def test_a_folder_without_a_half_is_refused(tmp_path, capfd, write, missing):
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert (code, len(said)) == (2, 1) and missing in said[0], said
     code, _, said = init(capfd, tmp_path / "nothing", "--target", TARGET)
-    assert code == 2 and "is no folder" in said[0]
+    assert code == 2 and "is not a folder" in said[0]
 
 
 def test_a_numbering_that_is_not_told_is_asked_for(tmp_path, capfd):
@@ -510,7 +512,7 @@ def test_the_unit_of_meshes_is_guessed_and_told(tmp_path, capfd, unit, scale):
     (tmp_path / "points.csv").write_text(MARKERS)
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert code == 0, said
-    assert any(f"4 meshes in {unit} (guessed" in line for line in said)
+    assert any(f"4 meshes in {unit} (inferred" in line for line in said)
     assert roles(tmp_path) == EXPECTED
     mesh = prepare(tmp_path, arm=False).anatomy.structure("aorta").mesh
     assert np.ptp(mesh.bounds[:, 0]) == pytest.approx(16.0, abs=0.3)

@@ -46,11 +46,11 @@ def test_a_target_in_nothing_is_refused_where_the_other_space_has_a_lesion(tmp_p
     code, said = init(capfd, tmp_path, "--target", words[0], "--space", words[1])
     assert code == 2 and len(said) == 1 and not (tmp_path / "case.toml").exists()
     assert f"mm {words[1]}) lies in no structure (read in {other} it lies in 'lung_tumor': --space {other})" in said[0]
-    assert said[0].endswith("allowed: the other --space; or --hit-radius MM, where a target in no structure is meant")
+    assert said[0].endswith("allowed: the other --space; or --hit-radius MM for a target in no structure")
     assert init(capfd, tmp_path, "--target", words[0], "--space", other)[0] == 0
     code, said = init(capfd, tmp_path, "--target", words[0], "--space", words[1], "--hit-radius", "3")
     assert code == 0 and "hit_radius_mm = 3.0" in (tmp_path / "case.toml").read_text()
-    warning = f"lies in no structure; read in {other} the same numbers lie in 'lung_tumor'"
+    warning = f"lies in no structure; read in {other}, the same numbers lie in 'lung_tumor'"
     assert any(warning in one for one in said) and results_warn(capfd, tmp_path, warning)
 
 
@@ -58,7 +58,7 @@ def test_a_target_in_an_organ_is_doubted_where_the_other_space_has_a_lesion(tmp_
     """As stated it may be so; but every result says it."""
     patient(tmp_path, ("right lung", inside(HERE, 18.0)), ("liver_lesion", inside(THERE, 8.0)))
     assert init(capfd, tmp_path, "--target", "-40,0,10", "--space", "LPS")[0] == 0
-    assert results_warn(capfd, tmp_path, "lies in right lung; read in RAS the same numbers lie in 'liver_lesion'")
+    assert results_warn(capfd, tmp_path, "lies in right lung; read in RAS, the same numbers lie in 'liver_lesion'")
 
 
 def test_a_target_in_nothing_is_doubted_where_the_other_space_has_an_organ(tmp_path, capfd):
@@ -80,7 +80,7 @@ def test_a_target_in_nothing_is_doubted_where_the_other_space_has_an_organ(tmp_p
         other = "RAS" if space == "LPS" else "LPS"
         said = [one for one in prepare(case, arm=False).anatomy.warnings if "same numbers" in one]
         assert len(said) == doubted, (name, space, said)
-        assert not doubted or f"read in {other} the same numbers lie in 'liver'" in said[0]
+        assert not doubted or f"read in {other}, the same numbers lie in 'liver'" in said[0]
 
 
 def test_a_target_outside_names_its_space_and_the_readings_that_fit(tmp_path, capfd):
@@ -125,7 +125,7 @@ def test_init_tells_a_target_in_metres(tmp_path, capfd):
     sitk.WriteImage(image, str(tmp_path / "scan.nii.gz"))
     code, said = init(capfd, tmp_path, "--target", "-0.198,-0.198,0.798", "--space", "RAS")
     assert code == 2 and "(-0.2, -0.2, 0.8 mm RAS) lies outside the CT" in said[0]
-    assert "(read in m it lies in the body)" in said[0] and "in mm, in the space" in said[0]
+    assert "(read in m it lies in the body)" in said[0] and "in the space given by --space" in said[0]
 
 
 @pytest.mark.parametrize("name", ["Tumorvene", "tumor feeder", "AAA", "Segment_1"])
@@ -197,14 +197,14 @@ def test_an_organ_that_the_lesion_was_carved_out_of_holds_it(tmp_path, capfd, le
     target = ",".join(map(str, lesion_at))
     patient(tmp_path, ("liver_lesion", lesion), ("liver", liver & ~lesion), ("spleen", inside((40, 0, 10), 12.0)))
     code, said = init(capfd, tmp_path, f"--target={target}", "--space", "LPS", "--region", "abdomen")
-    told = [one for one in said if "goes round" in one]
+    told = [one for one in said if "surrounds" in one]
     if lesion_at == (-40, 0, 10):
         assert code == 0 and not told and any("(traverse): liver" in one for one in said)
     else:
         assert code == 0 and len(told) == 1 and "make it traverse" in told[0]
     patient(tmp_path, ("liver", liver))
     _, said = init(capfd, tmp_path, f"--target={target}", "--space", "LPS", "--region", "abdomen")
-    assert not any("goes round" in one for one in said) and any("(traverse): liver" in one for one in said)
+    assert not any("surrounds" in one for one in said) and any("(traverse): liver" in one for one in said)
 
 
 def test_the_ball_of_a_target_is_not_warned_of(tmp_path, capfd):

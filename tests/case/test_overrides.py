@@ -197,6 +197,6 @@ def test_a_phantom_is_taken_as_one(tmp_path, capfd):
     write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path, tuple(BALLS))
     code, said = init(capfd, tmp_path, "--region", "phantom")
-    assert code == 0 and "no limb is looked for" in said
+    assert code == 0 and "no limbs are searched for" in said
     context = prepare(tmp_path, arm=False)
     assert context.case.region == "phantom" and not [s for s in context.anatomy.checked if s.name == "attached_limb"]

@@ -70,8 +70,8 @@ def test_from_a_folder_of_masks(tmp_path, capfd):
     write_masks(folder / "segmentations")
     assert main(["init", str(folder), *LIVER]) == 0
     told = capfd.readouterr().err
-    assert "segmentations: 45 masks are empty" in told
-    assert 'region = "abdomen" is told' in told
+    assert "segmentations: 45 empty masks" in told
+    assert 'region = "abdomen" was inferred' in told
     table = searched(folder, tmp_path / "out")
     assert 0 < table.column("verdict").to_pylist().count("safe") < len(table)
     (folder / "case.toml").write_text(hand_written("case_v1.toml", "segmentations", 60).replace(*COARSE))
@@ -124,7 +124,7 @@ def test_from_a_folder_of_meshes(tmp_path, capfd):
     for mesh in (meshes_folder() / "abdomen").glob("*.ply"):
         shutil.copy(mesh, folder)
     assert main(["init", str(folder), "--target=-90,-10,60"]) == 0
-    assert "27 meshes in mm (guessed" in capfd.readouterr().err
+    assert "27 meshes in mm (inferred" in capfd.readouterr().err
     table = searched(folder, tmp_path / "out")
     assert 0 < table.column("verdict").to_pylist().count("safe") < len(table)
     text = (meshes_folder() / "abdomen" / "case.toml").read_text()

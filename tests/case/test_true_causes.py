@@ -55,7 +55,7 @@ def test_an_image_without_hounsfield_units_is_no_label_map(tmp_path):
     """It was asked who numbered its labels; its air tells the offset."""
     error = refusal(patient(tmp_path, image=np.clip(body_hu() + 1024, 0, None).astype(np.uint16), names=NAMES))
     assert error.code == "no_ct"
-    assert "ct.nii.gz (no Hounsfield units, its air is 2" in error.what and "-1024 missing" in error.what
+    assert "ct.nii.gz (not in Hounsfield units, its air is 2" in error.what and "-1024 missing" in error.what
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_labels_between_labels_are_refused_as_blended(tmp_path):
     [
         ({"background": 0, "a": 1, "b": 2}, "dataset.json lacks 3 (it names 1 to 2)"),
         ({**NAMES, "abdomen": [1, 2]}, "dataset.json: 'abdomen' is a list of labels"),
-        (None, "no table of names is beside it"),
+        (None, "no table of names is next to it"),
     ],
 )
 def test_a_table_that_lies_there_is_never_none(tmp_path, names, said):
@@ -105,7 +105,7 @@ def test_what_nobody_annotated_is_unknown_and_told(tmp_path):
 def test_nothing_at_all_says_so(tmp_path):
     """One that holds only what nobody reads lists it."""
     (tmp_path / "scan.bin").write_bytes(b"x")
-    assert "scan.bin (of a kind that is not read)" in refusal(tmp_path).what
+    assert "scan.bin (of an unsupported kind)" in refusal(tmp_path).what
 
 
 def test_a_list_that_was_cut_is_refused_before_a_volume_is_read(tmp_path):

@@ -28,8 +28,8 @@ def test_a_case_that_states_its_structures_is_read_without_a_note(tmp_path):
     case = load_case(write_case(tmp_path))
     assert (case.stated_structures, case.region, case.warnings) == (4, "other", ())
     (outside, unknown, base) = prepare(tmp_path, arm=False).anatomy.warnings
-    assert "'organ', a name that the table of default roles does not know" in unknown
-    assert outside == OUTSIDE_NOT_KNOWN and "the robot's base would stand in the patient" in base  # of equal lists
+    assert "'organ', a name that is not in the table of default roles" in unknown
+    assert outside == OUTSIDE_NOT_KNOWN and "the robot's base would be in the patient" in base  # of equal lists
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_a_lost_structure_is_refused_with_a_count_at_the_top_too(kept, tmp_path,
     said = capfd.readouterr()
     assert said.out == ""
     assert len(said.err.strip().splitlines()) == 1
-    assert f"structures = 4 is stated, and the case has {kept}, the skin among them; was the file cut?" in said.err
+    assert f"structures = 4 is stated, but the case has {kept}, the skin included; was the file cut?" in said.err
 
 
 def test_what_a_count_at_the_top_does_not_show_is_said(tmp_path):
@@ -147,7 +147,7 @@ def test_usual_organs_that_are_absent_are_listed_once(tmp_path):
     assert found[0].startswith(
         "region pelvis: no structure is named like urinary bladder, rectum or colon, small bowel"
     )
-    assert found[0].endswith("femurs; what has no structure counts as free")
+    assert found[0].endswith("femurs; organs without a structure count as free")
 
 
 @pytest.mark.parametrize(

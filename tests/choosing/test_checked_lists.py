@@ -143,4 +143,4 @@ def test_a_list_that_may_be_cut_within_a_number_is_told(context, tmp_path, capsy
     path.write_text("theta_deg,beta_deg\n10,20\n30,10" + end)
     _, told = run(capsys, context.case.path, "--entries", path)
     assert [row["beta_deg"] for row in told["rows"]] == [20.0, 10.0]
-    assert any("entries.csv: its last line does not end with a line break" in one for one in told["warnings"]) == warned
+    assert any("entries.csv: its last line has no line break at its end" in one for one in told["warnings"]) == warned

@@ -115,11 +115,11 @@ def test_two_plans_by_what_they_state_and_with_their_case_by_what_holds(tmp_path
     assert [told[side]["plan"]["theta_deg"] for side in "ab"] == [np.degrees(plan.theta) for plan in plans]
     assert main(["compare", *paths]) == OK
     shown = capsys.readouterr().out
-    assert "name their case with --case" in shown and "same files" not in shown
+    assert "--case CASE checks them again" in shown and "different files" not in shown
     changed = [replace(one, sha256="0" * 64) if one.role == "markers_ct" else one for one in plans[1].inputs]
     write_plan(replace(plans[1], inputs=tuple(changed)), tmp_path / "other.json")
     assert main(["compare", paths[0], str(tmp_path / "other.json")]) == OK
-    assert "not made from the same files (markers_ct): is it one case?" in capsys.readouterr().out
+    assert "made from different files (markers_ct): are they of one case?" in capsys.readouterr().out
     assert main(["compare", *paths, "--case", str(case), "--json"]) == OK
     told = json.loads(capsys.readouterr().out)
     for side, plan in zip("ab", plans, strict=True):

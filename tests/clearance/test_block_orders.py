@@ -103,7 +103,7 @@ def test_an_order_that_is_none_of_the_surface_is_found_anew(cache: Cache, wrong:
     whole = path.read_bytes()
     changed: Arrays = WRONG[wrong](unpacked(whole, key)["orders"].copy())
     path.write_bytes(packed(changed, key))
-    with pytest.warns(CacheWarning, match="does not hold what it should; it is made anew and replaced"):
+    with pytest.warns(CacheWarning, match="does not have the expected content; it is computed again and replaced"):
         assert content(FastEngine(SURFACES, cache=cache)) == content(FastEngine(SURFACES))
     assert path.read_bytes() == whole
 
@@ -115,5 +115,5 @@ def test_a_flipped_bit_is_seen(cache: Cache) -> None:
     damaged = bytearray(path.read_bytes())
     damaged[-3] ^= 1
     path.write_bytes(damaged)
-    with pytest.warns(CacheWarning, match=r"is cut, damaged, or another's"):
+    with pytest.warns(CacheWarning, match=r"is truncated, damaged, or foreign"):
         assert content(FastEngine(SURFACES, cache=cache)) == content(FastEngine(SURFACES))

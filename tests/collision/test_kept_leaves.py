@@ -91,7 +91,7 @@ def test_leaves_that_cannot_be_of_the_mesh_are_made_anew(kept: tuple[Cache, Path
     cache, path = kept
     key, whole = path.name.split(".")[-2], path.read_bytes()
     path.write_bytes(packed(WRONG[wrong](unpacked(whole, key)), key))
-    with pytest.warns(CacheWarning, match="does not hold what it should; it is made anew and replaced"):
+    with pytest.warns(CacheWarning, match="does not have the expected content; it is computed again and replaced"):
         assert content(TriangleTree.of(MESH, cache)) == content(TriangleTree.of(MESH))
     assert path.read_bytes() == whole
 
@@ -102,5 +102,5 @@ def test_a_flipped_bit_is_seen(kept: tuple[Cache, Path]) -> None:
     damaged = bytearray(path.read_bytes())
     damaged[-20] ^= 1
     path.write_bytes(damaged)
-    with pytest.warns(CacheWarning, match=r"is cut, damaged, or another's"):
+    with pytest.warns(CacheWarning, match=r"is truncated, damaged, or foreign"):
         assert content(TriangleTree.of(MESH, cache)) == content(TriangleTree.of(MESH))

@@ -64,7 +64,7 @@ def test_the_chance_to_touch_is_that_of_the_search(carton):
     assert check(found, max_touch=chance) == ""
     assert "max_touch: expected at most" in check(found, max_touch=chance / 2)
     organs = prepare(context.case.path, arm=False).explain(search.theta[row], search.beta[row])
-    assert "not known; it takes arm = true" in check(organs, max_touch=1.0)
+    assert "not known; it needs arm = true" in check(organs, max_touch=1.0)
 
 
 def test_a_case_without_errors_has_no_chance_to_touch(tmp_path):
@@ -93,9 +93,7 @@ def test_a_window_has_the_area_that_the_search_lists(carton):
     at = search.at(first.best)
     angles = at["theta_deg"] + 0.01, at["beta_deg"]
     assert window(carton, *angles, first.square_deg - 0.1) == ""
-    assert f"window 1 that holds it: expected at least {first.square_deg + 1:g}" in window(
-        carton, *angles, first.square_deg + 1
-    )
+    assert f"its window 1: expected at least {first.square_deg + 1:g}" in window(carton, *angles, first.square_deg + 1)
 
 
 def test_a_rejected_direction_is_in_no_window(carton):
@@ -113,7 +111,7 @@ def test_a_plan_holds_until_its_case_changes(carton, tmp_path):
     case = tmp_path / "other" / "case_m.toml"
     case.write_text(case.read_text() + "\n# one byte more\n")
     found = plan_finding(tmp_path / "plan.json", prepare(case))
-    assert "the plan does not hold: " in found.differences[0].line
+    assert "the plan is not valid any more: " in found.differences[0].line
     assert "no such file" in plan_finding(tmp_path / "no.json", context).differences[0].line
 
 
@@ -128,7 +126,7 @@ def test_a_failure_is_at_most_fifteen_lines_and_ends_with_what_shows_more(carton
     assert max(map(len, lines)) <= 300
     assert any("bolt_m" in line for line in lines)
     assert any("more that differ" in line for line in lines)
-    assert lines[-1].startswith("all of it: run-twin check ")
+    assert lines[-1].startswith("full explanation: run-twin check ")
 
 
 def test_names_stay_when_others_are_added():

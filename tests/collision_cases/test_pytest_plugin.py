@@ -48,7 +48,7 @@ def test_a_check_that_holds_passes(pytester):
     [
         ('verdict = "safe"', 'verdict = "rejected"', "*verdict: expected 'rejected', found 'safe'*"),
         ("bolt_h = 5.0", "bolt_h = 5.1", "*clearance of bolt_h: expected 5.1*found 5.0*"),
-        ("bolt_h = 5.0", "bolt_x = 5.0", "*clearance of 'bolt_x': no such structure; there are bolt_l*"),
+        ("bolt_h = 5.0", "bolt_x = 5.0", "*clearance of 'bolt_x': no such structure; available: bolt_l*"),
         ('verdict = "safe"', 'verdict = "safe"\nreason = "too_close"', "*reason: expected 'too_close', found ''*"),
         ('verdict = "safe"', 'verdict = "safe"\nstructure = "bolt_l"', "*structure: expected 'bolt_l', found ''*"),
     ],
@@ -62,7 +62,7 @@ def test_a_failing_check_prints_the_nearest_structures(pytester, old, new, messa
             message,
             "*theta 0 deg, beta 0 deg: safe*",
             "*bolt_h*avoid*",
-            "all of it: run-twin check *case_m.toml*--all",
+            "full explanation: run-twin check *case_m.toml*--all",
         ]
     )
 
@@ -73,7 +73,7 @@ def test_a_failing_check_prints_the_nearest_structures(pytester, old, new, messa
         ("[[check]", "*some.collision.toml: is not TOML*line 1*"),
         (GOOD.replace("theta_deg", "theta"), "*toml:3: check number 1: unknown key 'theta'; did you mean 'theta_deg'*"),
         (GOOD + GOOD[GOOD.index("[[") :].replace('"safe"', '"free"'), "*toml:12: check number 2*.verdict*"),
-        (f'case = "{CARTON}"', "*nothing is expected; there are no*"),
+        (f'case = "{CARTON}"', "*the file expects nothing; it has no*"),
         (GOOD.replace(f'case = "{CARTON}"', ""), "*toml:3: no case; allowed: case = FILE*"),
         (GOOD + "tolerance = 1", "*toml:3: check number 1: unknown key 'tolerance'*"),
         (GOOD + 'name = "a::b"', "*toml:9: check number 1*.name*"),
@@ -104,7 +104,7 @@ def test_a_check_of_the_arm_fails_where_the_case_does_not_say_where_it_is(pytest
     run(pytester, text).assert_outcomes(passed=1)
     result = run(pytester, text.replace("[[check]]", "[[check]]\narm = true"))
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*the case does not say where the robot's base is*"])
+    result.stdout.fnmatch_lines(["*the case does not state where the robot's base is*"])
 
 
 def test_a_run_without_an_arm_says_so_though_it_is_green(pytester, carton_without_base):
@@ -117,7 +117,7 @@ def test_a_run_without_an_arm_says_so_though_it_is_green(pytester, carton_withou
     result.stdout.fnmatch_lines(
         [
             f"*{CARTON}: arm not checked: switched off (--no-arm) (2 tests)",
-            f"*{carton_without_base}: arm not checked: the case does not say where the robot's base is (1 test)",
+            f"*{carton_without_base}: arm not checked: the case does not state where the robot's base is (1 test)",
         ]
     )
 

@@ -55,7 +55,7 @@ def test_numbers_are_rewritten_and_verdicts_never(pytester):
     result.stdout.fnmatch_lines(
         [
             "verdict: expected 'rejected', found 'safe'",
-            "--collision-update rewrites numbers alone*",
+            "--collision-update rewrites only numbers*",
             "some.collision.toml: straight: clearance_mm.bolt_h 5.100 -> 5.000",
             "some.collision.toml: straight: min_clearance_mm 6 -> * (a weaker demand)",
         ]

@@ -186,4 +186,4 @@ def test_a_slip_in_words_and_numbers():
     slip = slip_of(T, middle)
     assert slip.axes == "mirrored in x"
     assert slip.numbers() == {"shift_mm": [1.0, 2.0, 3.0], "scale": 1.1, "turn_deg": 4.0}
-    assert "scaled by 1.1 and turned by 4 degrees" in slip.text(own_grid=False)
+    assert "scaled by 1.1 and rotated by 4 degrees" in slip.text(own_grid=False)

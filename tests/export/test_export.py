@@ -683,8 +683,8 @@ DOUBT = "markers_ct with x and y negated, as LPS and RAS differ, would lie on th
 def test_warnings_stand_whole_in_every_file(plan, name, tmp_path):
     """Their words, in comments; a plan without any says that there are none."""
     said = {
-        (DOUBT, "a\nb"): "2 warnings stood when this was planned:",
-        (): "warnings: none stood when this was planned",
+        (DOUBT, "a\nb"): "2 warnings when this was planned:",
+        (): "warnings when this was planned: none",
     }
     bodies = []
     for number, (warnings, line) in enumerate(said.items()):

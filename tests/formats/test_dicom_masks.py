@@ -255,8 +255,8 @@ def test_slices_that_were_left_out_are_filled_and_small_contours_are_kept(tmp_pa
     same(found, truth, T)
     notes = " | ".join(found.notes)
     assert "not closed (points, lines) were left out of isocentre" in notes
-    assert "filled where both overlap, or all are evenly spaced, and else left empty, in organ, nodes" in notes
-    assert "smaller than a pixel count for the pixels along them, in vessel" in notes
+    assert "filled where both overlap or all are evenly spaced, and otherwise left empty, in organ, nodes" in notes
+    assert "smaller than a pixel count as the pixels along them, in vessel" in notes
     assert "beyond the CT's image end there, in couch" in notes
 
 

@@ -237,7 +237,7 @@ def test_a_folder_without_a_series_says_what_it_holds(tmp_path, what):
         (tmp_path / "series 1").mkdir()
     elif what == "capture alone":
         world.write_series(tmp_path, [capture()])
-    told = {"folders": "series 1 (is a folder)", "capture alone": "1 Secondary Capture"}.get(what, "no DICOM file")
+    told = {"folders": "series 1 (is a folder)", "capture alone": "1 Secondary Capture"}.get(what, "not a DICOM file")
     with refused("no_ct", told):
         read_series(tmp_path)
 
@@ -382,7 +382,7 @@ def test_a_class_that_only_the_meta_information_states_is_taken(tmp_path):
     assert by_place(read_series(folder)) == expected(world.affine())
     chosen = choose_series(folder)
     series = parse_series(folder, chosen.names, lambda name: (folder / name).read_bytes(), chosen.notes)
-    assert any("4 files do not say what they are" in note for note in series.notes)
+    assert any("4 files state no SOP class" in note for note in series.notes)
     slices[2].SOPClassUID = world.CAPTURE_CLASS
     with refused("uneven_slices"):
         read_series(world.write_series(tmp_path / "t", slices))

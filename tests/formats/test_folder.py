@@ -202,13 +202,13 @@ def test_init_refuses_what_it_does_not_read_among_masks_and_lists_it_elsewhere(t
     (folder / "statistics.json").write_text("{}")
     seen = found(folder)
     assert not seen.problems and len(seen.segmentations) == 1
-    assert seen.passed == [("letter.docx", "of a kind that is not read")]
+    assert seen.passed == [("letter.docx", "of an unsupported kind")]
     (folder / "seg" / "letter.docx").write_bytes(b"x")
     (folder / "vessel.nii.gz").symlink_to("annex")
     problems = {error.where: error for error in found(folder).problems}
     assert {error.code for error in problems.values()} == {"entries_not_read"}
     assert "letter.docx" in str(problems[str(folder / "seg")])
-    assert "vessel.nii.gz (is a link to a file that is not there)" in str(problems[str(folder)])
+    assert "vessel.nii.gz (is a link to a missing file)" in str(problems[str(folder)])
     (folder / "seg" / "letter.docx").unlink()
     assert not found(folder, segmentation="seg").problems, "the user said which"
 

@@ -537,7 +537,7 @@ BROKEN = [
     ("glb-garbage", ".glb", NOISE, "wrong_format"),
     ("glb-json-broken", ".glb", patched(GLB, 20, b"x"), "not_json"),
     ("glb-json-nested-without-end", ".glb", glb({}, b"").replace(b"{}", b"[["), "not_json"),
-    ("glb-json-of-another-kind", ".glb", glb({"a": 1}, b""), "bad_value asset Field"),
+    ("glb-json-of-another-kind", ".glb", glb({"a": 1}, b""), "bad_value asset missing"),
     ("glb-no-mesh", ".glb", broken_glb(nodes=[{}], meshes=[]), "mesh_not_placed"),
     ("glb-mesh-without-node", ".glb", broken_glb(nodes=[{}]), "mesh_not_placed"),
     ("glb-mesh-outside-of-scene", ".glb", broken_glb(scenes=[{"nodes": []}]), "mesh_not_placed"),
@@ -721,7 +721,7 @@ def test_an_obj_cut_at_a_line_end_is_open_where_it_is_not_refused(tmp_path: Path
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        pytest.param(lambda faces: faces[1:], "open mesh: inside or outside cannot be known", id="open"),
+        pytest.param(lambda faces: faces[1:], "open mesh: only the distance to its surface is known", id="open"),
         pytest.param(lambda faces: faces[:, ::-1], "inverted normals", id="inverted"),
         pytest.param(lambda f: np.vstack([f[:9, ::-1], f[9:]]), "wound against their neighbours", id="mixed"),
         pytest.param(lambda f: np.vstack([f, [[0, 0, 1]]]), "1 of 81 triangles have no area", id="no-area"),

@@ -161,7 +161,7 @@ def test_a_larger_margin_that_does_not_hold_is_told() -> None:
     selection = select(NAMES, [2], avoid={"rib_*": 1.0, "*_7": 3.0, "*": 9.0}, where="case.toml")
     assert [rule.margin_mm for rule in selection.rules] == [1.0]
     assert selection.warnings == (
-        "case.toml: 'rib_left_7' is named by avoid 'rib_*' and by avoid '*_7' = 3; the more specific holds: "
+        "case.toml: 'rib_left_7' is matched by avoid 'rib_*' and by avoid '*_7' = 3; the more specific applies: "
         "avoid 'rib_*', 1 mm",
     )
     assert select(NAMES, [2], avoid={"rib_left_7": 1.0, "*_7": 3.0}, where="case.toml").warnings == ()

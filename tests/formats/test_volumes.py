@@ -532,4 +532,4 @@ def test_axes_without_a_named_space_are_lps_as_to_itk_and_that_is_told(tmp_path:
     assert volume.T_ct_index[:3, 3] == pytest.approx(image.GetOrigin())
     assert volume.T_ct_index[:3] @ [1, 2, 3, 1] == pytest.approx(image.TransformIndexToPhysicalPoint((1, 2, 3)))
     source = VolumeFile(path, ("a.nrrd",), lambda name: (tmp_path / name).read_bytes())
-    assert source.notes == ("a.nrrd: its header names no patient space; read as LPS, as ITK and Slicer do",)
+    assert source.notes == ("a.nrrd: its header states no patient space; read as LPS, as in ITK and Slicer",)

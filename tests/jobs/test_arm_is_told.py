@@ -9,8 +9,8 @@ from puncture_twin.meshes import folder
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import OK
 
-NOT_CHECKED = "not checked: the case does not say where the robot's base is"
-NAMED = "the case names a robot (ur3), but not where its base is: the arm is not checked"
+NOT_CHECKED = "not checked: the case does not state where the robot's base is"
+NAMED = "the case states a robot (ur3) but not the position of its base: the arm is not checked"
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def test_terminal_and_page_say_that_no_arm_was_checked(nowhere, tmp_path, capfd)
     told, page = capfd.readouterr().out, (tmp_path / "report.html").read_text()
     assert f"arm {NOT_CHECKED}" in told and f"warning: {NAMED}" in told
     assert "safe for the organs" in told and "safe for the organs" in page
-    for words in ("the case does not say where the robot", NAMED):
+    for words in ("the case does not state where the robot", NAMED):
         assert words.replace("'", "&#39;") in page
 
 
@@ -50,4 +50,4 @@ def test_a_robot_with_a_place_is_no_warning(capfd):
     """Nor is a case that names none."""
     arguments = ["--theta", "0", "--beta", "0", "--no-arm", "--json"]
     assert main(["check", str(folder() / "carton" / "case_m.toml"), *arguments]) == OK
-    assert "names a robot" not in capfd.readouterr().out
+    assert "states a robot" not in capfd.readouterr().out

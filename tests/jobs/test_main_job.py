@@ -79,11 +79,11 @@ def test_an_expected_error_says_of_what_it_is(carton, rehearsed, capfd):
         json.loads((rehearsed / "plan.json").read_text())["expected_target_error_mm"],
     )
     assert abs(tre - tip) > 0.1  # else they may be mixed up here
-    assert f"expected TRE at the target (rms), markers alone</th><td><b>{tre:.2f} mm" in page
-    assert f"expected tip error (rms), in the plan&#39;s configuration of the arm</th><td>{tip:.2f} mm" in page
+    assert f"expected TRE at the target (rms), from the markers alone</th><td><b>{tre:.2f} mm" in page
+    assert f"expected tip error (rms), in the arm configuration of the plan</th><td>{tip:.2f} mm" in page
     assert main(["register", str(carton)]) == OK
     said = capfd.readouterr().out
-    assert re.search(rf"expected TRE at the target \(rms\), markers alone +{tre:.2f} mm", said)
+    assert re.search(rf"expected TRE at the target \(rms\), from the markers alone +{tre:.2f} mm", said)
     assert re.search(r"Expected tip error of this insertion, markers and arm together: .* inserted at theta", said)
 
 
@@ -143,7 +143,7 @@ def test_of_many_rooms_the_median_is_shown(carton, tmp_path, capfd):
     assert one["tip_error_mm"] == pytest.approx(rooms["median_mm"], abs=0.05)
     assert rooms["physics"]["rooms"] == 1 and rooms["physics"]["largest_apart_mm"] < 0.05
     page = (tmp_path / "out/report.html").read_text()
-    assert "median of 201 rooms (50th percentile" in page
+    assert "median of 201 trials (50th percentile" in page
     assert main(["rehearse", str(carton), "--physics", "1", "--out", str(tmp_path / "no")]) == BAD_INPUT
 
 
@@ -177,7 +177,7 @@ def test_a_new_search_leaves_nothing_of_an_old_one(carton, tmp_path, capfd):
     capfd.readouterr()
     assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
     said = capfd.readouterr().err
-    went = "map.png, report.html, scene.png, slices.png of an earlier run removed: not of this search"
+    went = "map.png, report.html, scene.png, slices.png of an earlier run removed: not part of this search"
     assert f"{tmp_path}: {went}" in said
     assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
     assert "removed" not in capfd.readouterr().err
@@ -196,12 +196,12 @@ def test_a_plan_of_a_set_is_read_only_as_it_was_written(rehearsed, tmp_path, cap
     plan.write_text(plan.read_text().replace('"roll_deg": ', '"roll_deg": 1'))
     assert main(["export", str(plan), "--format", "csv", "--out", str(copy)]) == BAD_INPUT
     said = capfd.readouterr().err
-    assert "other bytes than are listed" in said and len(said.splitlines()) == 1
+    assert "does not match its entry" in said and len(said.splitlines()) == 1
     loose = tmp_path / "loose.json"
     shutil.copy(rehearsed / "plan.json", loose)
     assert main(["export", str(loose), "--format", "csv", "--out", str(tmp_path / "out")]) == OK
     said = capfd.readouterr().err
-    assert "outside of any output set" in said and len(said.splitlines()) == 1
+    assert "not part of an output set" in said and len(said.splitlines()) == 1
 
 
 def test_an_export_lists_what_decided_it(rehearsed, tmp_path, capfd):
@@ -288,7 +288,7 @@ def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, cap
     (other / "case_m.toml").write_text(text.replace("margin_mm = 2.0", "margin_mm = 80.0"))
     assert main(["search", str(other / "case_m.toml"), "--no-arm", "--out", str(tmp_path / "out")]) == ANSWER_IS_NO
     said = capfd.readouterr().out
-    assert "no candidate is safe; closest came theta" in said
+    assert "no candidate is safe; the closest, theta" in said
     assert "too_close (bolt" in said
     assert (tmp_path / "out" / "map.png").is_file()
     assert main(["plan", str(other / "case_m.toml"), "--out", str(tmp_path / "plan")]) == ANSWER_IS_NO
@@ -360,7 +360,7 @@ def test_register_reports_residuals_and_expectation(carton, capfd):
     assert found["mean_error_mm"] == pytest.approx(1.43, abs=0.005)
     assert [flag.split(" (")[0] for flag in found["flags"]] == [
         "residuals do not agree with the declared errors",
-        "markers_base look 1.0675 times as large as markers_ct along the CT's z",
+        "markers_base appear 1.0675 times as large as markers_ct along the CT's z",
     ]
     assert len(found["expected_tre_along_shaft_mm"]) == 4
 

@@ -182,7 +182,7 @@ def test_a_host_without_a_robot_is_one_line(capfd):
     """Exit code 2; the library's own words do not come between."""
     assert run_twin.main(["mirror", HOST, "--case", str(ABDOMEN)]) == 2
     said = capfd.readouterr().err.strip()
-    assert "no robot answers" in said and f"mirror {HOST}, port 30004" in said and len(said.splitlines()) == 1
+    assert "the robot does not answer" in said and f"mirror {HOST}, port 30004" in said and len(said.splitlines()) == 1
 
 
 def test_a_recording_is_mirrored(drive, tmp_path, capsys):
@@ -192,7 +192,7 @@ def test_a_recording_is_mirrored(drive, tmp_path, capsys):
     path.write_text("\n".join(["# a comment", "phase,time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad", *rows]))
     assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(path)]) == 0
     captured = capsys.readouterr()
-    assert "joints.csv: its last line does not end with a line break; was the file cut?" in captured.err
+    assert "joints.csv: its last line has no line break at its end; was the file cut?" in captured.err
     lines = captured.out.strip().splitlines()
     assert len(lines) == 3 and "to target    0.00 mm" in lines[-1]
     assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(path), "--json"]) == 0

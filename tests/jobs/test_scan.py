@@ -135,7 +135,7 @@ def test_what_a_structure_is_made_of_can_be_stated(tmp_path):
 def test_a_needle_that_cannot_be_read_is_no_reason_for_no_scan():
     """Its summary and the text have the reason, and the truth beside it."""
     true = TrueRod(np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.0, -1.0]))
-    why = "the needle ends at other metal, which hides its tip; its axis passes the target by 0.0 mm"
+    why = "other metal hides the needle's tip; the needle's axis passes the target by 0.0 mm"
     summary = control_summary(Control(true, None, np.zeros(3), why))
     assert summary["found"] is None and summary["why_not"] == why
     assert summary["true"]["depth_mm"] == pytest.approx(-2.0)

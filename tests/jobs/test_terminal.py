@@ -195,5 +195,5 @@ def test_a_full_disk_under_stdout_is_told_in_one_line(arguments, unbuffered):
         )
     told = [line for line in done.stderr.splitlines() if "stdout" in line]
     assert done.returncode == PROGRAM_FAILED
-    assert told == ["stdout: No space left on device; allowed: a place that takes it"]
+    assert told == ["stdout: No space left on device; allowed: an output that can be written to"]
     assert "Traceback" not in done.stderr

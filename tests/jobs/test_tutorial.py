@@ -12,7 +12,7 @@ PAGE = ROOT / "docs" / "how-to" / "chen-2019.md"
 COMMANDS = re.findall(r"^python run_twin\.py (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
 
 SAID = {
-    "reproduce chen2019": "every number holds",
+    "reproduce chen2019": "all within their limits",
     "reproduce chen2019 --experiment": "2.99 -> 1.28 mm",
     "scan": "standard dev.  0.29 in the plane, 1.44 along the bed",
     "touch": "5 markers touched in 6",

@@ -230,7 +230,7 @@ def test_a_walled_in_goal_ends_in_a_bounded_number_of_samples(kind: type[CellChe
         plates.append(Box(f"y_{name}", T, (300.0, 4.0, 150.0)))
     checker = built(kind, UR3, TOOL, plates)
     assert checker.contact(RIGHT, needle_may_touch_patient=False) is None
-    for home, goal, where in ((LEFT, RIGHT, "the goals lie"), (RIGHT, LEFT, "home lies")):
+    for home, goal, where in ((LEFT, RIGHT, "the goals are"), (RIGHT, LEFT, "home is")):
         with refused("no_approach", "150 samples (seed 1)", where, by=NoAnswerError):
             plan_approach(checker, home, goal, seed=1, max_samples=150)
 

@@ -293,7 +293,7 @@ def test_a_plan_states_the_warnings_of_its_case(carton, document):
     stood = list(carton.anatomy.warnings)
     assert stood and content["warnings"] == stood
     for other in (stood[1:], [*stood, "another"]):
-        assert "its warnings are not those of the case" in refusal(write(warnings=other), carton)
+        assert "its warnings differ from the case's" in refusal(write(warnings=other), carton)
     for wrong in ("none", [1], None):
         with refused("bad_value"):
             read_plan(write(warnings=wrong))

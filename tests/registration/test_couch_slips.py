@@ -84,7 +84,7 @@ def test_markers_that_lie_on_the_couch_are_refused_with_every_reading_that_fits(
     for command in (["register", here], ["search", here, "--no-arm", "--out", here / "out"]):
         line = refused_command(command, capfd, "other_axes")
         assert BEHIND in line and "with x and y negated" in line and "or with y and z negated" in line
-        assert "x and z negated" not in line and "where no needle touches it" in line
+        assert "x and z negated" not in line and "where no needle can touch it" in line
     assert not (here / "out").exists()
 
 
@@ -101,7 +101,7 @@ def test_without_a_couch_the_same_list_is_a_warning(case, capfd):
     points = on_skin(DIRECTIONS, np.zeros(3))
     here = case(points * [-1, -1, 1], points, couch=False)
     assert main(["register", str(here)]) == 0
-    assert any("with x and y negated" in one and "too alike to tell" in one for one in said(here))
+    assert any("with x and y negated" in one and "too similar to decide" in one for one in said(here))
     assert BEHIND not in capfd.readouterr().out
 
 

@@ -219,7 +219,7 @@ def test_what_is_not_one_rigid_transform_is_refused(tmp_path, kind, change, says
 
 
 def test_every_truncation_is_refused(tmp_path):
-    """A file that is cut anywhere is no whole HDF5 file."""
+    """A file that is cut anywhere is not a complete HDF5 file."""
     file = tmp_path / "a.h5"
     SimpleITK.WriteTransform(random_transform("composite", np.random.default_rng(3)), str(file))
     whole = file.read_bytes()
@@ -232,8 +232,16 @@ def test_every_truncation_is_refused(tmp_path):
     ("name", "make", "says"),
     [
         ("field.h5", displacement_field, "transform of type 'DisplacementFieldTransform_double_3_3'"),
-        ("cut.h5", lambda folder, name: (folder / name).write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(99)), "no whole HDF5"),
-        ("text.h5", lambda folder, name: (folder / name).write_text("#Insight Transform File V1.0"), "no whole HDF5"),
+        (
+            "cut.h5",
+            lambda folder, name: (folder / name).write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(99)),
+            "not a complete HDF5",
+        ),
+        (
+            "text.h5",
+            lambda folder, name: (folder / name).write_text("#Insight Transform File V1.0"),
+            "not a complete HDF5",
+        ),
     ],
 )
 def test_at_the_terminal_it_is_one_line(tmp_path, capsys, name, make, says):

@@ -77,7 +77,7 @@ def test_a_square_has_its_seven_symmetries():
     assert [one.target_mm for one in found] == sorted((one.target_mm for one in found), reverse=True)
     assert found[0].target_mm > 150.0  # a flip puts the target to the other side of the square
     assert f"put the target {found[0].target_mm:.1f} mm away" in found[0].text()
-    assert "turned by 180 deg" in found[0].text()
+    assert "rotated by 180 deg" in found[0].text()
 
 
 def test_a_target_on_the_axis_does_not_hide_the_turn():

@@ -182,8 +182,8 @@ def test_a_round_body_leaves_the_half_turns_open(case, capfd):
     here = case(points, touched(points), center=np.zeros(3))
     said = registered(here, capfd)["warnings"]
     assert len(said) == 3
-    assert all("too alike to tell, and the target would be" in one and "check the axes" in one for one in said)
-    assert [one for one in warned(here) if "too alike to tell" in one] == said
+    assert all("too similar to decide, and the target would be" in one and "check the axes" in one for one in said)
+    assert [one for one in warned(here) if "too similar to decide" in one] == said
 
 
 def test_the_couch_tells_what_a_round_body_does_not(case, capfd):
@@ -247,7 +247,7 @@ def test_a_permutation_that_puts_the_robot_elsewhere_is_a_warning(case, capfd):
     shifted = touched(points) + [200.0, 0.0, 0.0]
     said = registered(case(points, shifted), capfd)["warnings"]
     (swapped,) = [one for one in said if "A and B swapped" in one]
-    assert "told apart by this alone: then the robot's base would stand in the patient" in swapped
+    assert "excluded only because then the robot's base would be in the patient" in swapped
 
 
 def test_residuals_that_the_case_accepts_are_flagged_everywhere(case, capfd):

@@ -12,7 +12,7 @@ from puncture_twin.run_twin import main
 WAYS = ("mount", "markers")
 UPRIGHT = "x_axis = [1, 0, 0]\nz_axis = [0, 0, 1]\n"
 PLACES = {
-    "the robot's base would stand in the patient": (20.0, 0.0, 30.0),
+    "the robot's base would be in the patient": (20.0, 0.0, 30.0),
     "the target would be out of the arm's reach": (0.0, -1500.0, 0.0),
     "": (0.0, -330.0, 0.0),
 }

@@ -73,7 +73,7 @@ def test_it_is_an_input_and_says_that_nothing_is_known_of_its_error(tmp_path):
     said = "stated transform ct_to_robot.tfm: no residuals, expected error unknown"
     (found,) = placement_findings(case, Surroundings(load_skin(case), None), load_placement(case))
     line = found.sentence
-    assert line.startswith(f"registration: {said} (markers_ct and markers_base beside it measure it)")
+    assert line.startswith(f"registration: {said} (markers_ct and markers_base with it would check it)")
     placement = load_placement(case)
     assert placement.registration is None and np.isnan(placement.target_error_mm)
     with refused("no_markers", said):

@@ -32,8 +32,8 @@ FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])
 MARKERS = np.array([[0.0, 0.0, 80.0], [50.0, 0.0, 75.0], [0.0, 60.0, 70.0], [-40.0, -30.0, 72.0]])
 """Of the usual patient."""
 UNMEASURED = (
-    "registration: stated transform t.tfm: no residuals, expected error unknown (markers_ct and markers_base beside it "
-    "measure it)",
+    "registration: stated transform t.tfm: no residuals, expected error unknown (markers_ct and markers_base with it "
+    "would check it)",
 )
 """All that is left to say of a transform that boxes agree with."""
 KEYS = [("ct_to_base", "LPS"), ("ct_to_base", "RAS"), ("base_to_ct", "LPS"), ("base_to_ct", "RAS")]
@@ -87,16 +87,16 @@ def warnings_of(path):
 
 def compared(path):
     """Of these the line that compares the transform with markers."""
-    return [line for line in warnings_of(path) if "from where the stated transform puts it" in line]
+    return [line for line in warnings_of(path) if "from its position by the stated transform" in line]
 
 
 @pytest.mark.parametrize("keys", KEYS[2:])
 def test_an_inverse_that_is_stated_the_wrong_way_is_named(tmp_path, keys):
     """It said only that there are no residuals. The robot's z axis would not point up."""
     said = warnings_of(stating(tmp_path, keys=keys))
-    (line,) = [one for one in said if "more usual than what is stated" in one]
+    (line,) = [one for one in said if "would be more usual than the stated keys" in one]
     assert "(the patient lies on no obstacle of frame base and the robot's z axis" in line and "another image" in line
-    assert 'would be transform_maps = "ct_to_base"' in line
+    assert 'transform_maps = "ct_to_base"' in line
 
 
 def test_what_nothing_tells_apart_is_said(tmp_path):
@@ -104,17 +104,20 @@ def test_what_nothing_tells_apart_is_said(tmp_path):
     said = warnings_of(stating(tmp_path))
     away = 2 * np.hypot(330.0, 60.0)
     (line,) = said
-    assert "no residuals" in line and "nothing tells the stated transform" in line
+    assert "no residuals" in line and "the stated transform cannot be distinguished" in line
     assert f'base_axes = "RAS" ({away:.0f} mm away)' in line and "transform_maps" not in line
-    assert "markers_ct and markers_base beside it measure it" in line and "an obstacle of frame base" in line
+    assert "markers_ct and markers_base with it would check it" in line and "an obstacle of frame base" in line
 
 
 def test_a_table_tells_the_axes(tmp_path):
     """As stated the patient lies on the table, and only its error is not known; turned, on nothing."""
     (line,) = warnings_of(stating(tmp_path, boxes=[table(BELOW_MM - 5.0)]))
-    assert line.endswith("no residuals, expected error unknown (markers_ct and markers_base beside it measure it)")
+    assert line.endswith("no residuals, expected error unknown (markers_ct and markers_base with it would check it)")
     (_, line) = warnings_of(stating(tmp_path, keys=("ct_to_base", "RAS"), boxes=[table(BELOW_MM - 5.0)]))
-    assert "more usual than what is stated" in line and "base_axes = \"LPS\" (the patient lies on 'table'" in line
+    assert (
+        "would be more usual than the stated keys" in line
+        and "base_axes = \"LPS\" (the patient lies on 'table'" in line
+    )
 
 
 @pytest.mark.parametrize(
@@ -173,8 +176,8 @@ def test_markers_that_agree_are_named_with_their_distance(tmp_path):
     case = load_case(path)
     found = placement_findings(case, Surroundings(load_skin(case), None), load_placement(case))
     (line, *_) = [one.sentence for one in found if one.severity == "note"]
-    assert "no residuals" not in line and "0.2 mm from where the stated transform puts it" in line
-    assert line.endswith("its own expected error is unknown") and "more than" not in line
+    assert "no residuals" not in line and "0.2 mm from its position by the stated transform" in line
+    assert line.endswith("own expected error is unknown") and "more than" not in line
     with refused("no_markers", "t.tfm", "0.2"):
         registration_report(tmp_path)
 
@@ -182,7 +185,7 @@ def test_markers_that_agree_are_named_with_their_distance(tmp_path):
 def test_markers_that_are_off_by_more_than_their_errors_are_doubted(tmp_path):
     """By declared errors 3 mm is much, by larger ones it is nothing."""
     (line,) = compared(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 3.0) + "fle_mm = 0.5\n"))
-    assert "3.0 mm from where the stated transform puts it" in line and "more than their errors explain" in line
+    assert "3.0 mm from its position by the stated transform" in line and "more than their errors explain" in line
     assert compared(stating(tmp_path, more=touched(tmp_path, T_BASE_CT, 3.0) + "fle_mm = 4.0\n")) == []
 
 
@@ -230,7 +233,7 @@ def test_the_declared_errors_are_the_measure(tmp_path, deviation_mm, doubted):
     more = touched(tmp_path, T_BASE_CT, 4.0) + "accept_symmetry = true\n" + declared
     lines = compared(stating(tmp_path, more=more))
     assert len(lines) == doubted
-    assert all("4.0 mm from where" in line and "more than their errors explain" in line for line in lines)
+    assert all("4.0 mm from its position" in line and "more than their errors explain" in line for line in lines)
 
 
 def test_large_declared_errors_allow_more(tmp_path):
@@ -246,7 +249,7 @@ def test_large_declared_errors_allow_more(tmp_path):
 def test_the_warning_is_in_text_json_and_page(tmp_path, capfd):
     """As others are."""
     path = stating(tmp_path, keys=("base_to_ct", "LPS"))
-    said = "more usual than what is stated"
+    said = "would be more usual than the stated keys"
     main(["search", str(path.parent), "--no-arm", "--out", str(tmp_path / "out")])
     out, err = capfd.readouterr()
     assert said in out + err

@@ -225,7 +225,7 @@ def test_a_skin_mesh_may_say_where_the_body_was_cut(box):
     assert skin.field_of_view.cut.tolist() == [[False, False], [False, False], [False, True]]
     assert verdict(skin)[0] == Reason.UNKNOWN_REGION
     assert verdict(skin, direction=[1, 0, 0])[0] == ""
-    with pytest.raises(Exception, match="no flat end at its left"):
+    with pytest.raises(Exception, match="no flat end at side left"):
         ball_like = box([100, 100, 100]).transformed(TURNED)
         skin_from_mesh(ball_like, ["left"])
 

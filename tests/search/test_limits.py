@@ -127,7 +127,7 @@ def test_meshes_of_which_nobody_knows_how_far_they_lie_off_are_named(tmp_path, e
     row = found.ranked[0]
     said = context.explain(found.theta[row], found.beta[row])
     for text in (said.text(), said.summary()["chances"]["not_modelled"]):
-        assert ("how far meshes lie off (organ, rib: errors.surface_mm)" in text) == told
+        assert ("errors of the meshes (organ, rib: errors.surface_mm)" in text) == told
 
 
 def test_an_open_target_has_no_chance_to_be_hit(tmp_path):

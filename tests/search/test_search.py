@@ -171,7 +171,7 @@ def test_the_cross_check_sees_a_wrong_engine(carton):
             found = carton.engine.measure(*arguments)
             return replace(found, distance=found.distance + np.array([0, 0, 1e-3, 0]))
 
-    with pytest.raises(CrossCheckError, match="structure 2: the engine says"):
+    with pytest.raises(CrossCheckError, match="structure 2: the engine finds"):
         replace(carton, engine=Wrong()).cross_check(40)
 
 

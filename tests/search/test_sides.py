@@ -68,12 +68,12 @@ def test_what_is_searched_is_what_the_grid_holds(tmp_path):
     """Half of a grid about the front holds no back; a wider one does."""
     wide, narrow = (prepare(write_case(tmp_path, ("[0, 10]", f"[0, {most}]")), arm=False).sides for most in (180, 90))
     assert all(one.searched == pytest.approx(1.0) for one in wide)
-    assert sides_text(wide, searched=True) == "front and sides; the back lies on what no image shows"
+    assert sides_text(wide, searched=True) == "front and sides; the back is where the image does not show the body"
     assert sides_text(narrow, searched=True).startswith("front and sides; the back")
     closed = [one._replace(open=0.0, why="is far away") if one.name == "left" else one for one in wide]
     assert sides_text(closed, searched=True).startswith("front and right; ")  # no side is named twice
     opened = [one._replace(open=1.0, why="") for one in narrow]
-    assert sides_text(opened, searched=True) == "front and sides; not the back, where skin is 88 mm away"
+    assert sides_text(opened, searched=True) == "front and sides; not the back, where the skin is 88 mm away"
     searched = {one.name: one.searched for one in narrow}
     assert searched["front"] == pytest.approx(1.0) and searched["back"] == 0.0
 

@@ -58,7 +58,7 @@ def test_where_no_single_source_is_enough_all_together_are():
     """A radius smaller than every part of the error."""
     _, needle = asked(0.3, **KEYS)
     (goal,) = goals_of(needle, needle.chance("", {}), {})
-    assert not goal.remedies and "no single error is enough" in goal.text()
+    assert not goal.remedies and "no single error suffices" in goal.text()
     factors = dict.fromkeys(needle.parts, goal.all_sources)
     assert needle.chance("", factors) == pytest.approx(WISHED_HIT, abs=1e-6)
 

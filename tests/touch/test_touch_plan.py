@@ -110,4 +110,4 @@ def test_a_box_in_the_way_is_named():
 
 def test_joints_beyond_their_limits_are_refused():
     """Before anything else."""
-    assert why_not(checkers(), TIP, HOME + 100.0) == "a joint would be beyond its limits"
+    assert why_not(checkers(), TIP, HOME + 100.0) == "a joint would exceed its limits"

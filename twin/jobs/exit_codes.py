@@ -23,6 +23,7 @@ from puncture_twin.planning.base.errors import (
     NoAnswerError,
     PlanningError,
     one_line,
+    schema_words,
 )
 from puncture_twin.twin.jobs.terminal import (
     flush_output,
@@ -58,10 +59,10 @@ def _code_of_batch(counts: Any) -> int:
     return OK if counts.whole else PROGRAM_FAILED if failed else ANSWER_IS_NO
 
 
-NEVER = "never: it shows what is there"
+NEVER = "never: it only reports"
 REHEARSED = (
-    "the tip misses the target or the true needle or the arm touches what it must not, in the room that is executed; "
-    "of many (`--seeds`) also where fewer hit, or more touch, than `search.min_hit`, `max_touch`, `max_touch_of` allow"
+    "the tip misses the target or the true needle or the arm touches what it must not, in the trial that is executed; "
+    "with `--seeds`, also if fewer hit or more touch than `search.min_hit`, `max_touch`, `max_touch_of` allow"
 )
 
 RULES: Mapping[str, Rule] = MappingProxyType(
@@ -70,24 +71,24 @@ RULES: Mapping[str, Rule] = MappingProxyType(
         "schema": Rule(NEVER),
         "init": Rule("never: a case is written, or refused"),
         "search": Rule("no direction is safe", _unless(lambda run: run.candidates.safe.any())),
-        "verify": Rule("never: a cell that does not hold is refused, as a certificate that is none"),
+        "verify": Rule("never: a cell without proof, or a damaged certificate, is refused"),
         "check": Rule("the candidate, or a row of the list, is rejected", _unless(lambda found: found.safe)),
-        "compare": Rule("one of the two is rejected", _unless(lambda found: found.safe)),
-        "plan": Rule("nothing is safe, the named direction is rejected, or the arm finds no way to it"),
+        "compare": Rule("one of the two paths is rejected", _unless(lambda found: found.safe)),
+        "plan": Rule("nothing is safe, the named direction is rejected, or no approach to it was found"),
         "rehearse": Rule(f"there is no plan; {REHEARSED}", _unless(lambda run: not run.failures)),
-        "rehearse --sweep": Rule("the sweep ends before its end", _unless(lambda run: run.whole)),
+        "rehearse --sweep": Rule("the sweep stops before its end", _unless(lambda run: run.whole)),
         "touch": Rule("too few markers were touched for a registration", _unless(lambda run: run.suffices)),
         "pivot": Rule("the touches contradict each other", _unless(lambda found: not found.pivot.large)),
-        "place": Rule("no direction is safe for the organs, or no placement holds one"),
+        "place": Rule("no direction is safe for the organs, or no placement reaches one"),
         "mirror": Rule(NEVER),
-        "export": Rule("there is no plan to write, or its case rejects it now"),
+        "export": Rule("there is no plan to write, or the case now rejects it"),
         "register": Rule("never: markers that contradict each other are refused"),
-        "selfcal": Rule("never: a recording that determines nothing is refused"),
-        "servo": Rule("a servo has not converged", _unless(lambda job: job.passed)),
+        "selfcal": Rule("never: a recording that does not determine the calibration is refused"),
+        "servo": Rule("a servo did not converge", _unless(lambda job: job.passed)),
         "scan": Rule(NEVER),
-        "reproduce": Rule("one of the paper's numbers does not hold", _unless(lambda result: result.passed)),
+        "reproduce": Rule("one of the paper's numbers is outside its limits", _unless(lambda result: result.passed)),
         "batch plan": Rule(NEVER),
-        "batch run": Rule("a case of the part has no verdict (3 where the program failed at one)", _code_of_batch),
+        "batch run": Rule("a case of the part has no verdict (3 if the program failed on one)", _code_of_batch),
         "batch status": Rule(NEVER),
         "batch merge": Rule("a case has no row, or differs from `--expect`", _unless(lambda found: found.as_expected)),
         "batch compare": Rule(NEVER),
@@ -172,10 +173,10 @@ def _failed(error: Exception, print_line: PrintLine) -> int:
     why = refusal_of(sys.stdout) if isinstance(error, OSError) else None
     if why is not None:
         leave_unread(sys.stdout)
-        print_line(f"stdout: {why}; allowed: a place that takes it")
+        print_line(f"stdout: {why}; allowed: an output that can be written to")
     elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        place = error.filename or "a file of --out, of a cache (kernels are kept in one) or in $TMPDIR"
-        print_line(f"{place}: {error.strerror}; allowed: room on that disk")
+        place = error.filename or "a file of --out, of a cache (such as that of kernels) or in $TMPDIR"
+        print_line(f"{place}: {error.strerror}; allowed: free space on that disk")
     else:
         traceback.print_exc()
     return PROGRAM_FAILED
@@ -183,7 +184,10 @@ def _failed(error: Exception, print_line: PrintLine) -> int:
 
 def _line_and_code(error: PlanningError | typer.TyperException) -> tuple[str, int]:
     if isinstance(error, typer.TyperException):
-        what = one_line(error.format_message().replace("Value error, ", ""), MOST_WHAT).rstrip(".")
+        what, cause = error.format_message(), error.__cause__
+        for first in getattr(cause, "errors", list)():  # typer's words are Pydantic's
+            what = what.replace(first["msg"], schema_words(first))
+        what = one_line(what, MOST_WHAT).rstrip(".")
         return f"command line: {what}; allowed: {allowed_text(error)}", BAD_INPUT
     if isinstance(error, NoAnswerError):
         return one_line(str(error)), ANSWER_IS_NO
@@ -242,4 +246,4 @@ def allowed_text(error: typer.TyperException) -> str:
 
 def _range(option: Any) -> str:
     bounds = (("from", getattr(option, "min", None)), ("to", getattr(option, "max", None)))
-    return "".join(f" {word} {bound:g}" for word, bound in bounds if bound is not None)
+    return "".join(f" {word} {bound:.10g}" for word, bound in bounds if bound is not None)

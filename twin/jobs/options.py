@@ -21,32 +21,26 @@ if TYPE_CHECKING:
 
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
 SourceArgument = Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json.")]
-OutOption = Annotated[
-    Path, typer.Option("--out", help="Folder for the files that are written.", callback=check_writable)
-]
+OutOption = Annotated[Path, typer.Option("--out", help="Output folder.", callback=check_writable)]
 OutOfCaseOption = Annotated[
     Path | None,
-    typer.Option(
-        "--out", help="Folder for the files that are written.", show_default="out/, then the case's and command's names"
-    ),
+    typer.Option("--out", help="Output folder.", show_default="out/CASE-COMMAND"),
 ]
 CohortOption = Annotated[
-    Path, typer.Option("--out", metavar="DIR", help="The cohort's folder.", callback=check_writable)
+    Path, typer.Option("--out", metavar="DIR", help="Folder of the cohort.", callback=check_writable)
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, and nothing else there.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 JobsOption = Annotated[
-    int, typer.Option("--jobs", min=1, help="Processes, at most one a core; the answer is the same.")
+    int, typer.Option("--jobs", min=1, help="Processes, at most one per core; the result is the same.")
 ]
-EngineOption = Annotated[str, typer.Option("--engine", help="Who measures clearance: fast, or fcl, the reference.")]
-PicturesOption = Annotated[
-    bool, typer.Option("--pictures/--no-pictures", help="Whether to draw the map, the scene and the page.")
-]
+EngineOption = Annotated[str, typer.Option("--engine", help="Clearance engine: fast, or fcl (the reference).")]
+PicturesOption = Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw the map, the scene and the page.")]
 ArmOption = Annotated[
     bool | None,
     typer.Option(
         "--arm/--no-arm",
-        help="Whether the arm must be able to reach a candidate.",
-        show_default="where the case says where its base is",
+        help="Require that the arm reaches a candidate.",
+        show_default="on if the case states its base",
     ),
 ]
 
@@ -85,12 +79,12 @@ def prepared(case: Path, *, arm: bool | None = None, engine: str = "fast") -> It
 CHOICE_OPTIONS = {
     "theta": Annotated[float | None, typer.Option("--theta", min=0, max=180, help="Puncture angle, degrees.")],
     "beta": Annotated[float | None, typer.Option("--beta", min=0, max=360, help="Azimuth, degrees.")],
-    "rank": Annotated[int | None, typer.Option("--rank", min=1, help="Of the search: 1 is the best candidate.")],
-    "window": Annotated[int | None, typer.Option("--window", min=1, help="The best of this window of the search.")],
+    "rank": Annotated[int | None, typer.Option("--rank", min=1, help="Rank in the search; 1 is the best candidate.")],
+    "window": Annotated[int | None, typer.Option("--window", min=1, help="Best candidate of this window.")],
     "entry": Annotated[
         str | None,
         typer.Option(
-            "--entry", metavar="X,Y,Z", help="Where the needle enters the skin, mm, case's space; or a Slicer line."
+            "--entry", metavar="X,Y,Z", help="Entry point on the skin, mm, in the case's space; or a Slicer line."
         ),
     ],
 }

@@ -159,11 +159,11 @@ class TissueForce(NamedTuple):
     def text(self) -> str:
         """The forces in words, for a person."""
         if self.along_n == self.across_n == 0.0:
-            return "the tissue did not push: the needle met none"
-        return f"the tissue pushed with up to {self.along_n:.2f} N along the needle, {self.across_n:.2f} N across it"
+            return "no force of tissue: the needle reached none"
+        return f"tissue force up to {self.along_n:.2f} N along the needle, {self.across_n:.2f} N across it"
 
 
-NO_TISSUE_FORCE = "no force of tissue: the case declares none ([tissue])"
+NO_TISSUE_FORCE = "no force of tissue: the case declares no [tissue]"
 """Text for an insertion without declared tissue."""
 
 

@@ -99,7 +99,7 @@ def draw_truth(case: Case, T_base_ct: Floats, *, seed: int | None = None) -> Tru
             f"{settings.fle_touch_mm:g} mm at the touch (standard deviations per axis)"
         )
     else:
-        T_true, source = T_base_ct, "the belief itself: the case has no markers that could be off"
+        T_true, source = T_base_ct, "same as the belief: the case has no markers with errors"
     return Truth(T_true, offsets, seed, source)
 
 
@@ -149,14 +149,14 @@ def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "
     Raises:
         InputError: Fewer than three points, or all on a line.
     """
-    allowed = "3 or more points by the names of the markers and the target, not on a line"
+    allowed = "3 or more points, named as the markers and the target, not on a line"
     named = ", ".join(points.names) or "none"
     if len(points) < MIN_MARKERS:
-        refuse(f"names in common with the CT: {named}", where, allowed, "too_few_points")
+        refuse(f"names shared with the CT: {named}", where, allowed, "too_few_points")
     for side in (points.points_ct, points.points_base):
         spread = np.linalg.svd(side - side.mean(axis=0), compute_uv=False)
         if spread[1] <= COLLINEAR * spread[0]:
-            refuse(f"{named} lie on a line", where, allowed, "points_collinear")
+            refuse(f"{named} are on a line", where, allowed, "points_collinear")
     T = np.array(fit_rigid(points.points_ct, points.points_base))
     if target_name in points.names:
         row = points.names.index(target_name)

@@ -30,7 +30,7 @@ from puncture_twin.twin.rehearsal.trials import Puncture, Trials, draw_trials
 CONTACT_MM = 1e-6
 """Distance of an axis from a surface that counts as contact."""
 
-ALLOWED = "a case with [errors] and markers, which say what a room may differ by"
+ALLOWED = "a case with [errors] and markers: trials are drawn from them"
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(case, registration)
     if error is None or registration is None:
-        refuse("no rooms can be drawn", case.path, ALLOWED, "no_markers")
+        refuse("no trials can be drawn", case.path, ALLOWED, "no_markers")
     q_touch = touches(case, registration.markers)
     bend = bend_along(context, outward_ct)
     believed = replace(_as_rehearsed(error, q_touch), bend=bend)

@@ -20,6 +20,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
@@ -102,7 +103,7 @@ def median_truth(found: Distribution) -> Truth:
     """
     count = len(found) + found.unreached
     row = int(spread_rows(found, 1)[0]) if len(found) else 0
-    return _of_drawn(found, row, f"the median of {count:,} rooms, drawn with seed {found.seed} from {_declared(found)}")
+    return _of_drawn(found, row, f"the median of {plural(count, 'trial')}, seed {found.seed}, from {_declared(found)}")
 
 
 def spread_rows(found: Distribution, count: int) -> Ints:
@@ -114,13 +115,13 @@ def spread_rows(found: Distribution, count: int) -> Ints:
 
 def _of_drawn(found: Distribution, row: int, source: str) -> Truth:
     if len(found) == 0:
-        what = f"in none of {found.unreached} rooms did the arm reach the pose that its registration asked for"
+        what = f"in none of {found.unreached} trials did the arm reach the pose that its registration gave"
         raise NoAnswerError(what, code="out_of_reach")
     return drawn_truth(found.puncture, found.trials, row, found.seed, source)
 
 
 def _declared(found: Distribution) -> str:
-    return "[rehearsal.errors], not from what is believed" if found.wrong_belief else "[errors]"
+    return "[rehearsal.errors], not from the believed errors" if found.wrong_belief else "[errors]"
 
 
 def error_scale(context: CaseContext, q_insertion: Floats, found: Distribution | None) -> Scale | None:
@@ -156,7 +157,7 @@ def puncture_truth(plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Truth:
     nominal[:3, 3] += plan.needle_length_mm * nominal[:3, 2]
     needle = true_needle(model, q, truth.eta, plan.needle_length_mm)
     T_base_ct = nominal @ np.linalg.inv(pose(needle.R_base_needle, needle.tip_base)) @ truth.T_base_ct
-    source = f"that of the touches, drawn with seed {truth.seed}"
+    source = f"as at the touches, drawn with seed {truth.seed}"
     return Truth(T_base_ct, at_target.arrival, truth.seed, source, at_target.target_ct)
 
 

@@ -39,19 +39,19 @@ class ErrorRank:
     def text(self) -> str:
         """The rank for headlines and text."""
         if self.trials == 0:
-            return f"{self.place} of the tip errors that are predicted"
+            return f"{self.place} of the predicted tip errors"
         return (
-            f"median of {self.trials:,} rooms ({self.place} of their tip errors)"
+            f"median of {self.trials:,} trials ({self.place} of their tip errors)"
             if self.trials > 1
-            else "the only room"
+            else "the only trial"
         )
 
     @property
     def short(self) -> str:
         """The rank for a frame of the film."""
         if self.trials == 0:
-            return f"{self.place} by prediction"
-        return f"median of {self.trials:,} rooms" if self.trials > 1 else "the only room"
+            return f"{self.place} of the prediction"
+        return f"median of {self.trials:,} trials" if self.trials > 1 else "the only trial"
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -105,9 +105,9 @@ def ordinal(number: int) -> str:
 
 CONTROLS = MappingProxyType(
     {
-        "impedance": "by a spring at the tip (impedance)",
-        "admittance": "by moved goals of the motors (admittance)",
-        "position": "by the position motors",
+        "impedance": "with a spring at the tip (impedance)",
+        "admittance": "with shifted motor setpoints (admittance)",
+        "position": "with position control",
     }
 )
 """How an insertion is followed, in words."""

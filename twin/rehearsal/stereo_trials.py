@@ -198,7 +198,7 @@ def statistics(trials: Sequence[ServoTrial]) -> Statistics:
     """
     rows = [row for one in trials for row in one.rows]
     if not rows:
-        what = "no session could be held: " + "; ".join(sorted({one.refused for one in trials}))
+        what = "no session was possible: " + "; ".join(sorted({one.refused for one in trials}))
         raise NoAnswerError(what, code="no_session")
     stereo = np.concatenate([one.stereo_mm for one in trials])
     mapping, expected, before, after, only = (

@@ -249,15 +249,15 @@ def _line(cell: TouchingCell, touch: Touch) -> _Line | str:
     deeper = float(away @ axis)
     aside = float(np.linalg.norm(away - deeper * axis))
     if aside > MOST_ASIDE_MM:
-        return f"it lies {aside:.1f} mm beside where it was believed, at most {MOST_ASIDE_MM:g} are allowed"
+        return f"it is {aside:.1f} mm to the side of its believed position; at most {MOST_ASIDE_MM:g} mm are allowed"
     far = line_to(model, tip_mm, q, STANDOFF_MM + deeper, SLOW_MM + deeper)
     near = line_to(model, tip_mm, q, SLOW_MM + deeper, deeper - PAST_MM)
     reached = line_to(model, tip_mm, q, deeper, deeper + 1.0)
     if far is None or near is None or reached is None:
-        return "the arm cannot follow the line that was set at the standoff"
+        return "the arm cannot follow the line set at the standoff"
     refused = why_not(cell.checkers, tip_mm, reached[0])
     if refused:
-        return f"on the line that was set at the standoff {refused}"
+        return f"on the line set at the standoff, {refused}"
     face = nominal_tip(model, tip_mm, q + cell.truth.arrival[touch.name])
     return _Line(far, near, face, flange_pose(model, q + cell.truth.arrival[touch.name])[:3, 2], aside)
 
@@ -269,14 +269,14 @@ def _touched_and_read(cell: TouchingCell, touch: Touch, line: _Line) -> TouchRea
     there = _run(cell, Motors(), to_near, arrival, _Contact(cell, line), PAUSE_S)
     if there.stopped:
         back = _moved(cell, _back(cell, touch, line, there.q[-1]), arrival)
-        why = f"it was felt more than {SLOW_MM:g} mm before where it was believed, and given up"
+        why = f"contact more than {SLOW_MM:g} mm before its believed position: given up"
         return FailedTouch(why, sum(map(seconds_of, (come, there, back))))
     contact = _approached_contact(cell, line, arrival)
     q = contact.q[-1]
     back = _moved(cell, _back(cell, touch, line, q), arrival)
     seconds = sum(map(seconds_of, (come, there, contact, back)))
     if not contact.stopped:
-        return FailedTouch(f"no contact: the tip went {PAST_MM:g} mm past where it was believed and came back", seconds)
+        return FailedTouch(f"no contact up to {PAST_MM:g} mm beyond its believed position", seconds)
     depth = float((1e3 * contact.tip_m[-1] - line.face_base) @ line.axis_base)
     moved = 1e3 * np.linalg.norm(contact.tip_m[-1] - contact.tip_m[-2]) / contact.dt if len(contact.tip_m) > 1 else 0.0
     force = max(float(np.linalg.norm(one.force_n, axis=1).max()) for one in (there, contact, back))
@@ -360,7 +360,7 @@ def moved_outside(cell: TouchingCell, trajectory: Trajectory, arrival: Floats) -
     found = cell.true.first_contact(done.q[::LOOK_EVERY] + arrival, needle_may_touch_patient=False)
     if found is not None:
         what = f"{found.contact.body} touched {found.contact.other}"
-        raise StoppedError(f"on the way {what}, who does not lie where they are believed to")
+        raise StoppedError(f"on the way {what}: the patient is not at the believed position")
     return done
 
 

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from scipy.special import chdtri
 
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.twin.report.figures import png, write_png
 
@@ -70,8 +71,8 @@ def _sources(axes: Axes, facts: Mapping[str, Any]) -> None:
         axes.text(one["alone_mm"], at, f" {one['alone_mm']:.2f}", va="center", fontsize=9)
     axes.invert_yaxis()
     axes.set_xlim(right=ROOM_FOR_NUMBERS * max(one["alone_mm"] for one in rows))
-    axes.set_xlabel("the tip's error (rms), were there no other source, mm")
-    axes.set_title("each source alone: their squares add up", fontsize=10)
+    axes.set_xlabel("tip error (rms) from this source alone, mm")
+    axes.set_title("each source alone (their squares add up)", fontsize=10)
     _plain(axes)
 
 
@@ -81,11 +82,11 @@ def _changes(axes: Axes, facts: Mapping[str, Any]) -> None:
     axes.hlines(range(len(rows)), now, left, color=[BETTER if mm <= now else WORSE for mm in left], linewidth=2)
     axes.scatter(left, range(len(rows)), color=[BETTER if mm <= now else WORSE for mm in left], zorder=3)
     axes.axvline(now, color="black", linewidth=1)
-    axes.text(now, -0.9, " as it is", fontsize=9, va="center")
+    axes.text(now, -0.9, " now", fontsize=9, va="center")
     axes.set_yticks(range(len(rows)), [one["text"] for one in rows])
     axes.set_ylim(len(rows) - 0.4, -1.4)
-    axes.set_xlabel("the tip's error (rms) with this one change, mm")
-    axes.set_title("what if: one change, all else as it is", fontsize=10)
+    axes.set_xlabel("tip error (rms) with this one change, mm")
+    axes.set_title("one change, all else the same", fontsize=10)
     _plain(axes)
 
 
@@ -148,7 +149,8 @@ def draw_rooms_picture(found: Any, path: Path) -> None:
     _histogram(sizes, found)
     _reliability(chances, found)
     figure.suptitle(
-        f"{len(found):,} rooms, seed {found.seed}: {100 * found.in_region.mean():.1f} % inside of the predicted 95 % "
+        f"{plural(len(found), 'trial')}, seed {found.seed}: {100 * found.in_region.mean():.1f} % inside the "
+        "predicted 95 % "
         f"ellipsoid; rms {found.realised_rms_mm:.2f} mm, predicted {found.predicted_rms_mm:.2f} mm",
         fontsize=11.5,
     )
@@ -159,8 +161,8 @@ def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int,
     """The errors on two axes, and the shadow of the 95 % ellipsoid there."""
     shown = np.arange(len(error)) < MOST_POINTS
     for rows, colour, marker, text in (
-        (shown & within, WITHIN, ".", "tip inside of the ellipsoid"),
-        (shown & ~within, BEYOND, "x", "outside of it, in some direction"),
+        (shown & within, WITHIN, ".", "tip inside the ellipsoid"),
+        (shown & ~within, BEYOND, "x", "outside it"),
     ):
         points = error[rows][:, list(pair)]
         axes.scatter(points[:, 0], points[:, 1], s=14, c=colour, marker=marker, linewidths=0.8, alpha=0.6, label=text)
@@ -184,7 +186,7 @@ def _histogram(axes: Axes, found: Any) -> None:
     sizes = found.tip_error_mm
     top = 1.02 * max(float(sizes.max()), 2.5 * found.predicted_rms_mm)
     edges = np.linspace(0, top, BINS + 1)
-    axes.hist(sizes, bins=list(edges), color=WITHIN, alpha=0.55, label="rooms")
+    axes.hist(sizes, bins=list(edges), color=WITHIN, alpha=0.55, label="trials")
     fine = np.linspace(0, top, 4 * BINS + 1)
     reached = np.array([hit_in_ball(found.cov_ct[None], radius)[0] if radius > 0 else 0.0 for radius in fine.tolist()])
     density = np.diff(reached) * len(found) * 4
@@ -193,7 +195,7 @@ def _histogram(axes: Axes, found: Any) -> None:
     axes.axvline(median, color=BEYOND, ls="--", lw=1.5, label=f"median {median:.2f} mm")
     axes.set_xlim(0, top)
     axes.set_xlabel("true tip to true target, mm")
-    axes.set_ylabel("rooms")
+    axes.set_ylabel("trials")
     axes.set_title("tip error", fontsize=10)
     axes.legend(fontsize=8)
 
@@ -206,7 +208,7 @@ def _reliability(axes: Axes, found: Any) -> None:
     within = np.searchsorted(sizes, np.interp(LEVELS, predicted, radii), side="right") / len(found)
     fine = np.linspace(0, 1, 101)
     spread = TWO_SIDED * np.sqrt(fine * (1 - fine) / len(found))
-    axes.fill_between(fine, fine - spread, fine + spread, color="0.85", lw=0, label="what chance alone does, 95 %")
+    axes.fill_between(fine, fine - spread, fine + spread, color="0.85", lw=0, label="95 % range of chance alone")
     axes.plot([0, 1], [0, 1], color=PREDICTED, lw=1.0)
     axes.scatter(LEVELS, within, s=16, c=WITHIN, label="tip within a radius", zorder=3)
     axes.scatter([found.p_hit], [found.hit.mean()], s=60, c=BEYOND, marker="*", label="target hit", zorder=4)
@@ -217,8 +219,8 @@ def _reliability(axes: Axes, found: Any) -> None:
     axes.set_ylim(-0.02, 1.02)
     axes.set_aspect("equal")
     axes.set_xlabel("predicted chance")
-    axes.set_ylabel("fraction of rooms in which it happened")
-    axes.set_title("how often it happened", fontsize=10)
+    axes.set_ylabel("observed fraction of trials")
+    axes.set_title("predicted and observed chances", fontsize=10)
     axes.legend(fontsize=7.5, loc="upper left")
 
 

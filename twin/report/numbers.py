@@ -28,8 +28,8 @@ from puncture_twin.twin.report.palette import reason_of
 from puncture_twin.twin.report.present import number
 
 TRUTH_IS_BELIEF = (
-    "in this rehearsal the patient lies exactly where they are believed to lie: what the tip misses is the joints' "
-    "alone, and says nothing about the registration"
+    "in this rehearsal the patient is exactly where the belief puts them: the tip error comes from the joints "
+    "alone and says nothing about the registration"
 )
 
 
@@ -112,8 +112,8 @@ def expected_text(error_mm: float) -> str:
 def arm_text(candidates: Candidates) -> str:
     """Whether "safe" includes the arm."""
     if not candidates.arm_checked:
-        return f"arm {candidates.arm_note}; “safe” speaks of the needle and the organs alone"
-    return "“safe” includes that the arm can reach the direction and insert the needle"
+        return f"arm {candidates.arm_note}; “safe” covers only the needle and the organs"
+    return "“safe” includes that the arm can reach the pose and insert the needle"
 
 
 def target_text(case: Any) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from markupsafe import Markup
 
 from puncture_twin.planning.base.reasons import UNSEEN_AIR, Reason, css
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.plan.plan import CLEARANCE_TEXT
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import deep_text
@@ -32,7 +33,7 @@ from puncture_twin.twin.report.present import Block, Field, Table, Warn, bold, f
 
 CONE_TEXT = MappingProxyType(
     {
-        "grid": "by the directions of the search, to one step; a certificate proves it",
+        "grid": "from the directions of the search, to one step; a certificate can prove it",
         "certificate": "proven by the certificate",
     }
 )
@@ -44,12 +45,12 @@ LEAST_SHOWN = 5e-5
 SHOWN_MM = 0.005
 """A source that costs less would be 0.00."""
 
-NO_CHANCES = "No chances: they need markers, the arm, and a direction that organs and arm allow."
-NOT_REQUESTED = "this run searched only; the plan command plans the arm's motion"
+NO_CHANCES = "No chances: they need markers, the arm, and a direction that is safe for the organs and the arm."
+NOT_REQUESTED = "this run only searched; the plan command plans the arm's motion"
 """Where no plan was made because nobody wanted one."""
 
-TRE_TEXT = "expected TRE at the target (rms), markers alone"
-TIP_ERROR_TEXT = "expected tip error (rms), in the plan's configuration of the arm"
+TRE_TEXT = "expected TRE at the target (rms), from the markers alone"
+TIP_ERROR_TEXT = "expected tip error (rms), in the arm configuration of the plan"
 """Of the registration, and of the whole insertion with the arm's declared errors."""
 
 MOST_NEAREST = 12
@@ -115,11 +116,11 @@ def _window_fields(candidates: Candidates) -> list[Field]:
 
 
 def _windows_text(candidates: Candidates, count: int) -> str:
-    shown = f"{MOST_WINDOWS} of {count}" if count > MOST_WINDOWS else f"All {count}"
-    text = f"{shown} windows (connected sets of safe directions), each with its best."
+    shown = f"the first {MOST_WINDOWS} of " if count > MOST_WINDOWS else ""
+    text = f"{shown}{plural(count, 'window')} (connected sets of safe directions), each with its best direction."
     if candidates.cone_source:
         source = CONE_TEXT[candidates.cone_source]
-        text += f" Safe cone: off by so much in any direction a needle stays safe for the organs, {source}."
+        text += f" Safe cone: angle by which the needle may be off and stay safe for the organs, {source}."
     return text
 
 
@@ -176,11 +177,11 @@ def rehearsal(
     )
     rows = [
         ("tip error at the end", bold(number(done.tip_error_mm, 2, "mm"))),
-        *([] if done.standing is None else [("of all", done.standing.text)]),
+        *([] if done.standing is None else [("rank", done.standing.text)]),
         ("its lateral part", number(done.lateral_mm, 2, "mm")),
         ("its depth part", f"{number(abs(done.depth_mm), 2, 'mm')} too {'deep' if done.depth_mm >= 0 else 'shallow'}"),
         ("expected by the plan (rms)", expected_text(done.predicted_error_mm)),
-        ("the true needle", _true_needle(least)),
+        ("true needle", _true_needle(least)),
         ("contacts", "; ".join(touched) or "none"),
         ("insertion", done.followed_text),
         ("force", done.force_text),
@@ -193,7 +194,7 @@ def rehearsal(
     ]
     named = ((name.replace("_", " "), clearance_text(mm)) for name, mm in least[:MOST_NEAREST])
     nearest = Table(("structure", "least clearance mm"), tuple(named))
-    more = f"The {MOST_NEAREST} nearest of {len(least)} structures to keep away from."
+    more = f"The {MOST_NEAREST} nearest of {len(least)} structures to avoid."
     warned = Warn(tuple(f"the answer is no: {one}" for one in failures))
     return [warned, (facts(rows), nearest), *([more] if len(least) > MOST_NEAREST else [])]
 
@@ -201,8 +202,8 @@ def rehearsal(
 def _true_needle(least: Sequence[tuple[str, float]]) -> str:
     name, mm = least[0] if least else ("nothing", math.nan)
     if mm < 0:
-        return f"crosses what it must avoid: {name}{deep_text(mm)}"
-    return f"keeps {number(mm, 2, 'mm')} at least from what it must avoid: {name}"
+        return f"crosses {name}, which it must avoid{deep_text(mm)}"
+    return f"keeps {number(mm, 2, 'mm')} or more from every structure to avoid; nearest: {name}"
 
 
 def rooms(found: Mapping[str, Any] | None) -> list[Block]:
@@ -214,20 +215,20 @@ def rooms(found: Mapping[str, Any] | None) -> list[Block]:
     if found is None:
         return []
     if found["realised_rms_mm"] is None:
-        return [Warn((f"{found['rooms']} rooms: in none did the arm reach the pose that its registration asked for",))]
+        return [Warn((f"{plural(found['rooms'], 'trial')}: the arm reached the pose of its registration in none",))]
     touched = (
         (f"touched {name.replace('_', ' ')}", fraction, found["p_touch_by_structure"][name])
         for name, fraction in found["touch_share_by_structure"].items()
     )
     shares = (
-        ("inside of the 95 % ellipsoid", found["coverage_95"], 0.95),
+        ("inside the 95 % ellipsoid", found["coverage_95"], 0.95),
         ("hit the target", found["hit_share"], found["mean_p_hit"]),
-        ("touched anything forbidden", found["touch_share"], found["mean_p_touch"]),
+        ("touched a structure to avoid", found["touch_share"], found["mean_p_touch"]),
         *((text, fraction, chance) for text, fraction, chance in touched if max(fraction, chance) >= LEAST_SHOWN),
     )
     rows = [("tip error, rms, mm", f"{found['realised_rms_mm']:.3f}", f"{found['predicted_rms_mm']:.3f}")]
     rows += [(text, _percent(fraction), _percent(chance)) for text, fraction, chance in shares]
-    head = (f"{found['rooms']:,} rooms, seed {found['seed']}", "realised", "predicted")
+    head = (f"{plural(found['rooms'], 'trial')}, seed {found['seed']}", "realised", "predicted")
     return [Table(head, tuple(rows)), Warn(tuple(_reserves(found))), *_sources(found)]
 
 
@@ -239,12 +240,12 @@ def _reserves(found: Mapping[str, Any]) -> list[str]:
     """What a reader must know before believing the table."""
     said = []
     if found["wrong_belief"]:
-        said.append("The rooms were drawn from [rehearsal.errors]: the belief is wrong by design.")
+        said.append("The trials were drawn from [rehearsal.errors]: the belief is wrong by design.")
     if found["unreached"]:
-        said.append(f"In {found['unreached']:,} rooms the arm did not reach the pose; they are not counted.")
+        said.append(f"In {found['unreached']:,} trials the arm did not reach the pose; they are not counted.")
     if found["guessed_touches"]:
         how = "a posture was assumed (touch.csv, q1_deg to q6_deg)"
-        said.append(f"Nobody says how the arm touched the markers: {how}.")
+        said.append(f"The arm's joints at the touches are not known: {how}.")
     return said
 
 
@@ -252,12 +253,12 @@ def _sources(found: Mapping[str, Any]) -> list[Block]:
     """Of the predicted variance; the needle that bends, the simulator, and what is left out."""
     shares = sorted(found.get("predicted_share", {}).items(), key=lambda source: -source[1])
     named = [f"{SOURCES[name].text} {100 * part:.0f} %" for name, part in shares if part >= LEAST_FRACTION]
-    said = [f"Of the predicted variance: {', '.join(named)}."] if named else []
+    said = [f"Sources of the predicted variance: {', '.join(named)}."] if named else []
     if found.get("deflection_mm") is not None:
-        said.append(f"The needle bends by {found['deflection_mm']:.2f} mm, to a side drawn in each room.")
+        said.append(f"The needle bends by {found['deflection_mm']:.2f} mm, to a side drawn in each trial.")
     if found.get("physics") is not None:
         said.append(
-            "{rooms} of them in the simulator: tips at most {largest_apart_mm:.4f} mm from those of the kinematics; "
+            "{rooms} of them in the simulator: tips at most {largest_apart_mm:.4f} mm from the kinematic result; "
             "contacts in {rooms_with_contacts}.".format(**found["physics"])
         )
     return [*said, f"Not modelled: {found['not_modelled']}."]
@@ -275,19 +276,19 @@ def chances(breakdown: UncertaintyBreakdown | None, registration: Mapping[str, A
     budget, (name, chance) = breakdown.budget, breakdown.likeliest
     rows = [
         ("chance to hit the target", bold(chance_text(breakdown.p_hit))),
-        ("chance to touch anything forbidden, at most", chance_text(breakdown.p_touch_any)),
+        ("chance to touch a structure to avoid, at most", chance_text(breakdown.p_touch_any)),
         *([("most likely touched", f"{name.replace('_', ' ')}, {chance_text(chance)}")] if name else []),
         ("expected tip error (rms), this insertion", number(budget.rms_mm, 2, "mm")),
         ("across the needle (rms)", number(budget.lateral_mm, 2, "mm")),
         ("along the needle (rms)", number(budget.depth_mm, 2, "mm")),
         ("half axes of the 95 % ellipsoid", vector(budget.half_axes_mm, 2, "mm")),
         ("error of a marker, CT and touch (FLE, rms)", _fle(registration or {})),
-        ("the declared errors", breakdown.declaration),
+        ("declared errors", breakdown.declaration),
         ("not modelled", breakdown.not_modelled),
     ]
     shares = ((SOURCES[source].text, f"{100 * fraction:.1f} %") for source, fraction in breakdown.sources())
     goals = Warn(tuple(goal.text() for goal in breakdown.goals))
-    return [goals, (facts(row for row in rows if row[1]), Table(("source", "of the error's variance"), tuple(shares)))]
+    return [goals, (facts(row for row in rows if row[1]), Table(("source", "fraction of the variance"), tuple(shares)))]
 
 
 def _fle(registration: Mapping[str, Any]) -> str:
@@ -310,9 +311,9 @@ REGISTRATION = (
     Field("FLE", _fle),
     Field("FLE from", "fle_source"),
     Field("TRE along the shaft, target to hub", lambda one: vector(one["expected_tre_along_shaft_mm"], 3, "mm")),
-    Field("half axes of the 95 % ellipsoid at the target, by the readings alone", lambda one: vector(
+    Field("half axes of the 95 % ellipsoid at the target, from the readings alone", lambda one: vector(
         one["half_axes_95_mm"], 2, "mm")),
-    Field("of its variance", lambda one: ", ".join(
+    Field("sources of its variance", lambda one: ", ".join(
         f"{name} {100 * part:.0f} %" for name, part in one["share"].items())),
     Field("marker spread s₂/s₁", "spread_ratio", 2),
     Field("least altitude of the triangle", "altitude_mm", 1, "mm"),
@@ -323,9 +324,9 @@ REGISTRATION = (
 def registration(report: Mapping[str, Any] | None) -> list[Block]:
     """The registration's numbers from a mapping of plain values; absent ones are left out."""
     if not report:
-        return [Markup("<p>The case has no markers: where the patient lies was stated, or is not known.</p>")]
+        return [Markup("<p>The case has no markers: the patient's position is stated, or not known.</p>")]
     expected = number(report.get("expected_tre_target_mm", math.nan), 2, "mm")
-    of_rms = _interval(report.get("expected_tre_target_interval_mm"), "of that rms, ")
+    of_rms = _interval(report.get("expected_tre_target_interval_mm"), "of this rms, ")
     rows = [(TRE_TEXT, bold(expected) + of_rms), *facts(REGISTRATION, report).rows]
     flags, residuals = tuple(map(str, report.get("flags") or ())), report.get("residual_mm") or {}
     without = report.get("without") or {}
@@ -333,7 +334,7 @@ def registration(report: Mapping[str, Any] | None) -> list[Block]:
         Field("marker", lambda item: item[0]),
         Field("residual mm", lambda item: float(item[1]), 3),
         *([Field("TRE without it, mm", lambda item: without[item[0]]["rms_mm"], 3)] if without else []),
-        *([Field("p of the residuals then", lambda item: f"{without[item[0]]['probability']:.2g}")] if without else []),
+        *([Field("p without it", lambda item: f"{without[item[0]]['probability']:.2g}")] if without else []),
     ]
     weak = Warn(tuple(f"weak: {flag}" for flag in flags)) if flags else "no flag raised"
     shown = (facts(rows), grid(markers, residuals.items())) if residuals else (facts(rows),)
@@ -345,8 +346,8 @@ def _advice(report: Mapping[str, Any]) -> list[Block]:
     said: list[Block] = []
     if "one_insertion_95_mm" in report:
         said.append(
-            f"one insertion ends within {report['one_insertion_95_mm']:.3f} mm in 95 of 100, by the markers and by the "
-            f"target, read {report['target_read']}; arm, needle and tissue come on top"
+            f"one insertion ends within {report['one_insertion_95_mm']:.3f} mm in 95 of 100 cases, counting the "
+            f"markers and the target, read {report['target_read']}; arm, needle and tissue add to it"
         )
     if "declaration" in report:
         said.append(report["declaration"]["text"])
@@ -365,7 +366,7 @@ def _correction(found: Mapping[str, Any]) -> str:
     return (
         "aim corrected for the insertion at theta {theta_deg:.0f}, beta {beta_deg:.0f} (joints {joints} deg): moved by "
         "{moved_mm:.2f} mm and {turned_deg:.2f} deg; expected there {expected_mm:.2f} mm (rms), not corrected "
-        "({uncorrected_method}) {uncorrected_mm:.2f} mm; it trusts what [errors] says of the arm"
+        "({uncorrected_method}) {uncorrected_mm:.2f} mm; this relies on the arm errors in [errors]"
     ).format(**{**found, "joints": joints})
 
 
@@ -385,9 +386,9 @@ def budget(found: Mapping[str, Any] | None) -> list[Block]:
             "{expected_depth_mm:.2f} along it; one of 20 insertions ends beyond {limit_95_mm:.2f} mm"
         ).format(**found)
     if now - best["expected_mm"] >= SHOWN_MM:
-        said.append(f"The next {now - best['expected_mm']:.2f} mm is won by {best['text']}")
+        said.append(f"The next {now - best['expected_mm']:.2f} mm would be gained by: {best['text']}")
     sources = grid(
-        (Field("source", "text"), Field("alone", "alone_mm", 2, "mm"), Field("all but it", "without_mm", 2, "mm")),
+        (Field("source", "text"), Field("alone", "alone_mm", 2, "mm"), Field("all but this", "without_mm", 2, "mm")),
         (one for one in found["sources"] if one["alone_mm"] >= SHOWN_MM),
     )
     changed = grid((Field("with this one change", "text"), Field("expected, mm", "expected_mm", 2)), found["changes"])
@@ -402,7 +403,7 @@ def certificate(summary: Mapping[str, Any]) -> list[Block]:
     if summary["safe_cells"] == 0:
         left = f", except perhaps in {area} of undecided cells" if summary["undecided_cells"] else ""
         touch = summary["touch"]
-        reached = "is safe" if touch is None else f"keeps the margins of a chance to touch of {touch:g}"
+        reached = "is safe" if touch is None else f"keeps the margins for a chance to touch of {touch:g}"
         said = f"proven: no direction of the cap {reached}, to {summary['size_deg']:g} deg{left}"
     else:
         fraction = summary["safe_share"]

@@ -251,15 +251,13 @@ def inputs_table(inputs: Iterable[Input]) -> Markup:
     return Markup("<details><summary>Files, each with its SHA-256</summary>{}</details>").format(table)
 
 
-TIMES = Markup(
-    '<p class="faint">When it ran, and how long each stage took: <a href="timings.json">timings.json</a>.</p>'
-)
+TIMES = Markup('<p class="faint">Date and duration of each stage: <a href="timings.json">timings.json</a>.</p>')
 
 
 def origin_section(seed: int | None) -> Markup:
     """Versions and seed, and where the times are: they differ from run to run, and the page does not."""
     versions = [] if seed is None else [("Python", platform.python_version()), *((n, _version(n)) for n in parts())]
-    drawn = "none: nothing was drawn" if seed is None else str(seed)
+    drawn = "none: no random numbers" if seed is None else str(seed)
     return blocks_html([facts([("seed", drawn), *versions]), TIMES])
 
 

@@ -127,8 +127,8 @@ ALIKE = 0.9
 """Overlap (intersection over union) of sections with the median one, from which on a part is one section drawn along
 the bed."""
 UNSCANNED = (
-    "what was not scanned (beyond the scanner's field of view, or filled up with one value) cuts the body; no skin is "
-    "known there, no body that the arm could meet, and what is near to it is unknown_region (outside_body)"
+    "the edge of the scanned region (the scanner's field of view, or a constant fill value) cuts the body; the skin "
+    "is not known there, nor is a body for the arm to avoid; the space near it is unknown_region (outside_body)"
 )
 
 
@@ -240,7 +240,7 @@ def body_mask(
     for first in itertools.islice(parts, 1):
         trunk[first.box] = largest_part(first.mask)
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
-        what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU hold together"
+        what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU are connected"
         refuse(what, where, f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body", "no_body")
     tables, warnings = tuple[TableSide, ...](), list[str]()
     if shown.tables:
@@ -256,7 +256,7 @@ def body_mask(
         filled[box] |= filled_slices(limb)
     _fill_cut_lungs(filled, hu, voxel_ml, warnings)
     if filled.all():
-        refuse("no air around the body", where, "a CT that shows the skin somewhere", "no_air")
+        refuse("no air around the body", where, "a CT that shows some skin", "no_air")
     unscanned = find_unscanned(hu) if unscanned is None else unscanned
     if unscanned.any() and (grown(filled) & unscanned & ~filled).any():
         warnings.append(UNSCANNED)
@@ -293,7 +293,7 @@ def _fill_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warni
     if inside.any():
         body |= air.painted(inside)
         total = (air.sizes * voxel_ml)[inside].sum()
-        warnings.append(f"{total:.1f} ml of air at the border of the volume were taken as lung or gas inside the body")
+        warnings.append(f"{total:.1f} ml of air at the border of the volume count as lung or gas inside the body")
 
 
 class Piece(NamedTuple):
@@ -378,7 +378,7 @@ def limb_warnings(limbs: Sequence[Piece], trunk: Bools, voxel_ml: float) -> Iter
     if limbs:
         middle = middle_of(trunk)
         named = [f"{_side(limb, middle)} ({np.count_nonzero(limb.mask) * voxel_ml:.0f} ml)" for limb in limbs]
-        yield f"parts that do not touch the trunk (arms, legs?) count as body: {', '.join(named)}"
+        yield f"parts not connected to the trunk (arms, legs?) count as body: {', '.join(named)}"
 
 
 def _side(limb: Piece, middle: Floats) -> str:

@@ -49,12 +49,12 @@ Box = tuple[tuple[int, int], ...]
 """First voxel and the one after the last, along each axis."""
 
 FILLED = (
-    "behind the body's {names} side the image goes on with nothing but air, up to {voxels} voxels: it was cut there "
-    'and filled up (cut in the skin\'s table says otherwise: cut = [] if it ends there; so does region = "phantom")'
+    "behind the body's {names} side the image has only air, up to {voxels} voxels: the body counts as cut there and "
+    'the image as padded (override with cut in the skin\'s table: cut = [] if it ends there; or region = "phantom")'
 )
 ENDS_FLAT = (
-    "the phantom ends flat at its {names} side, where no structure is cut that does not run through it: it counts as "
-    "whole (cut in the skin's table says otherwise)"
+    "the phantom ends flat at its {names} side, and no structure is cut there except those that run through it: it "
+    "counts as whole (cut in the skin's table overrides this)"
 )
 
 

@@ -52,19 +52,19 @@ nothing that is denser than air."""
 CUT_FRACTION = 0.5
 """A face cuts what the body lies on where something outside of the body ends at it in so many of the slices."""
 TOO_SHORT = (
-    "the image is only {length:.0f} mm long: a table or cradle that is as dense as the body and touches it cannot be "
-    "told from the body"
+    "the image is only {length:.0f} mm long: a table or cradle that is as dense as the body and touches the body "
+    "cannot be distinguished from it"
 )
 CUT_OFF = (
-    "a table {thick:.0f} mm thick touches the body at its {name} side; it is wider than the body, and was cut off there"
+    "a table {thick:.0f} mm thick touches the body at its {name} side; it is wider than the body, and was removed there"
 )
 TOUCHES = (
-    "the body ends in one section along the bed at its {name} side, over {width:.0f} mm, as a table or board does: "
-    'nothing beyond it counts as free ([ct] table = "none" where there is none)'
+    "the body ends in one section along the bed at its {name} side, over {width:.0f} mm, like a table or board: the "
+    'space beyond it does not count as free ([ct] table = "none" if there is none)'
 )
 PRISM = (
-    "the body has one section along the bed at all four sides, as a phantom has: none of them counts as a table "
-    '([ct] table = "present" says that one is; region = "phantom", if it is one, that it is whole)'
+    "the body has a constant section along the bed at all four sides, like a phantom: no side counts as a table "
+    '([ct] table = "present" if one is; region = "phantom" if it is a whole phantom)'
 )
 
 Face = tuple[int, int]
@@ -437,16 +437,16 @@ def support_warnings(seen: bool, open_faces: Sequence[Face]) -> Iterator[str]:
         seen: Whether it shows what the body lies on.
         open_faces: The faces beyond which nothing is known.
     """
-    bed = f"the CT does not show {'all of ' if seen else ''}what the body lies on"
-    for axis, said, key in ((1, bed, "[ct] table"), (0, "the CT need not show all of the arms", "[ct] arms")):
+    bed = f"the CT does not show {'all of ' if seen else ''}the support of the body"
+    for axis, said, key in ((1, bed, "[ct] table"), (0, "the CT may not show all of the arms", "[ct] arms")):
         names = " and ".join(NAMES[face] for face in open_faces if face[0] == axis)
         if names:
             yield (
-                f"{said}: what is beyond its {names} face, within {NEAR_MM:g} mm of the body, is unknown_region "
-                f'(outside_body; {key} = "none" where there is nothing)'
+                f"{said}: the space beyond its {names} face, within {NEAR_MM:g} mm of the body, is unknown_region "
+                f'(outside_body; {key} = "none" if nothing is there)'
             )
     if not seen and not open_faces:
-        yield "the CT shows nothing that the body lies on; what is beyond its faces counts as air"
+        yield "the CT shows no support below the body; the space beyond its faces counts as air"
 
 
 def _gap_mm(body: Bools, face: Face, spacing_mm: Floats) -> float:

@@ -50,10 +50,10 @@ def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tu
         for member in members:
             link, here = member.link, f"{document.where}: link '{member.link.name}'"
             if link.drawn and not link.collisions:
-                allowed = "a <collision>; the mesh of its <visual> will do"
-                refuse("it is drawn, and has no shape for contacts", here, allowed, "no_collision_shape")
+                allowed = "a <collision>; the mesh of its <visual> is enough"
+                refuse("it has a visual shape but no collision shape", here, allowed, "no_collision_shape")
             if link.collisions and link.name in chain.beyond:
-                allowed = "the arm alone; what the flange carries is [tool] of the case"
+                allowed = "only the arm; parts on the flange belong to [tool] of the case"
                 refuse(f"it is fixed beyond the flange '{chain.flange}'", here, allowed, "shape_beyond_flange")
             shapes += [
                 BodyShape(_mesh(shape, document, here, read), member.T_body_link @ shape.T_link_shape)
@@ -62,7 +62,7 @@ def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tu
         if not shapes:
             names = ", ".join(member.link.name for member in members)
             what = f"nothing has a collision shape between the joints {number} and {number + 1} (links {names})"
-            refuse(what, document.where, "one collision shape a link at least", "no_collision_shape")
+            refuse(what, document.where, "at least one collision shape per link", "no_collision_shape")
         found.append(tuple(shapes))
     return tuple(found)
 
@@ -83,13 +83,13 @@ def _mesh(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> Tr
 def _file(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> TriangleMesh:
     if Path(shape.address).suffix.lower() not in MESH_SUFFIXES:
         allowed = f"a file ending in {', '.join(MESH_SUFFIXES)}, for contacts"
-        refuse(f"mesh '{shape.address}' is of a kind that is not read", here, allowed, "unknown_format")
+        refuse(f"mesh '{shape.address}' has an unsupported format", here, allowed, "unknown_format")
     path = document.where.parent / shape.address
     try:
         return parse_mesh(read(shape.address), path, unit=Unit.M, space=Space.LOCAL, up=Up.Z, stretch=shape.size)
     except InputError as error:
         what = f"mesh '{shape.address}': {error.what}"
-        allowed = f'{error.allowed}; a URDF speaks metres, scale="0.001 0.001 0.001" reads mm'
+        allowed = f'{error.allowed}; a URDF is in metres; scale="0.001 0.001 0.001" is for mm'
         raise InputError(what, where=here, allowed=allowed, code=error.code) from error
 
 

@@ -161,8 +161,8 @@ def _root(data: bytes, where: Path) -> Element:
         what = f"XML is not well formed ({error})"
         raise InputError(what, where=where, allowed=ALLOWED, code="xml_damaged") from error
     if any("xacro" in one.tag for one in root.iter()):
-        allowed = "the URDF that they make: xacro arm.urdf.xacro > arm.urdf"
-        refuse("it holds xacro macros, which stand for what is not there yet", where, allowed, "xacro_macros")
+        allowed = "the expanded URDF: xacro arm.urdf.xacro > arm.urdf"
+        refuse("it has xacro macros, which are not expanded", where, allowed, "xacro_macros")
     if root.tag != "robot":
         refuse(f"<{root.tag}> where <robot> was expected", where, ALLOWED, "wrong_format")
     return root
@@ -171,14 +171,14 @@ def _root(data: bytes, where: Path) -> Element:
 def _by_name(parts: Sequence[Named], what: str, where: Path) -> Mapping[str, Named]:
     for name, count in Counter(part.name for part in parts).items():
         if count > 1:
-            refuse(f"{what} '{name}' stands {count} times", where, "each name once", "duplicate_name")
+            refuse(f"{what} '{name}' appears {count} times", where, "each name once", "duplicate_name")
     return {part.name: part for part in parts}  # no proxy: an arm is sent to other processes
 
 
 def _link(element: Element, where: Path) -> UrdfLink:
     name = _plain(element, "a link", where)
     if name in TAKEN:
-        refuse(f"a link called '{name}'", where, f"any name but {', '.join(TAKEN)}, the tool's", "reserved_name")
+        refuse(f"a link called '{name}'", where, f"any name except {', '.join(TAKEN)} (the tool)", "reserved_name")
     here = f"{where}: link '{name}'"
     shapes = tuple(_shape(one, here) for one in element.findall("collision"))
     return UrdfLink(name, shapes, element.find("visual") is not None, _weighs(element, here))
@@ -187,7 +187,7 @@ def _link(element: Element, where: Path) -> UrdfLink:
 def _plain(element: Element, what: str, where: Path) -> str:
     name = check_name(element.get("name", ""), what, where=where)
     if not PLAIN.fullmatch(name):
-        refuse(f"{what} is called '{name}'", where, "letters, digits and _ . / -", "bad_name")
+        refuse(f"{what} has the name '{name}'", where, "letters, digits and _ . / -", "bad_name")
     return name
 
 
@@ -225,7 +225,7 @@ def _joint(element: Element, where: Path) -> UrdfJoint:
     if kind not in JOINTS:
         refuse(f"type '{kind}'", here, ", ".join(JOINTS), "unknown_joint_type")
     if element.find("mimic") is not None:
-        refuse("it mimics another joint", here, "joints that move by themselves", "mimic_joint")
+        refuse("it mimics another joint", here, "independent joints", "mimic_joint")
     parent, child = (_only(element, end, here).get("link", "") for end in ("parent", "child"))
     axis = _axis(element, here)
     limit = element.find("limit")
@@ -251,7 +251,7 @@ def _origin(element: Element, here: str) -> Floats:
     if not origins:
         return np.eye(4)
     if len(origins) > 1 or not set(origins[0].attrib) <= {"xyz", "rpy"}:
-        refuse("an <origin> with more than xyz and rpy, or two of them", here, "one, of both", "duplicate_element")
+        refuse("an <origin> with more than xyz and rpy, or two of them", here, "one <origin>", "duplicate_element")
     xyz, rpy = (
         _numbers(origins[0], key, 3, here) if key in origins[0].attrib else np.zeros(3) for key in ("xyz", "rpy")
     )

@@ -44,7 +44,7 @@ DIRECTIONS = np.array([[0, 0, 1], [0, -1, 0], [0, -1, 0], [0, -1, 0], [0, 0, -1]
 R_BASE_FLANGE = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Orientation of a UR's flange at the angle zero, base frame."""
 
-AS_UR = "six axes as a UR's, zero and sense of rotation included (docs/how-to/own-arm.md)"
+AS_UR = "six axes like a UR's, with the same zero and sense of rotation (docs/how-to/own-arm.md)"
 
 
 class UrLengths(NamedTuple):
@@ -94,7 +94,7 @@ def ur_lengths(chain: ArmChain, document: UrdfDocument, T_base_root: Floats | No
     for name, length, sign in zip(("d1", "a2", "a3", "d4", "d5", "d6"), lengths, (1, -1, -1, 1, 1, 1), strict=True):
         if not sign * length > OFF_MM:
             what = f"its length {name} is {length:g} mm (flange '{chain.flange}')"
-            refuse(what, document.where, f"{'above' if sign > 0 else 'below'} 0, as of a UR", "arm_not_as_ur")
+            refuse(what, document.where, f"{'above' if sign > 0 else 'below'} 0, as in a UR", "arm_not_as_ur")
     return UrLengths(lengths, T_base_root)
 
 
@@ -124,9 +124,9 @@ def _base(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> Floats:
     difference = T @ stated[name]
     angle = rotation_angle(difference[:3, :3])
     if angle > SQUARE_RAD:
-        what = f"link '{name}' is turned by {np.degrees(angle):.4g} degrees against the controller's base of a UR"
+        what = f"link '{name}' is rotated by {np.degrees(angle):.4g} degrees from a UR controller's base"
         allowed = (
-            "a link 'base', fixed to the root, whose z is axis 1 and whose -y is axis 2 at the angle zero "
+            "a link 'base', fixed to the root, with z along axis 1 and -y along axis 2 at angle zero "
             '(ur_description: rpy="0 0 3.141592653589793")'
         )
         refuse(what, document.where, allowed, "arm_not_as_ur")
@@ -139,7 +139,7 @@ def _check_directions(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> N
         if np.linalg.norm(direction - wanted) > SQUARE_RAD:
             x, y, z = np.round(direction, 4) + 0.0
             as_ur = ", ".join(f"{value:g}" for value in wanted)
-            what = f"points along ({x:g}, {y:g}, {z:g}) of the base at the angle zero, a UR's along ({as_ur})"
+            what = f"points along ({x:g}, {y:g}, {z:g}) of the base at angle zero; a UR's points along ({as_ur})"
             raise _other(chain, joint, what, document)
 
 
@@ -151,16 +151,16 @@ def _check_places(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
     for joint, place in wanted.items():
         off = [0.0 if want is None else float(at - want) for at, want in zip(p[joint], place, strict=True)]
         if np.linalg.norm(off) > OFF_MM:
-            what = f"passes {np.linalg.norm(off):.4g} mm beside where a UR's does, by ({_mm(off)}) mm in the base"
+            what = f"passes {np.linalg.norm(off):.4g} mm away from a UR's axis, by ({_mm(off)}) mm in the base"
             raise _other(chain, joint, what, document)
     off = [float(T[0, 3] - p[3, 0]), 0.0, float(T[2, 3] - p[5, 2])]
     off_angle = rotation_angle(R_BASE_FLANGE.T @ T[:3, :3])
     if np.linalg.norm(off) > OFF_MM or off_angle > SQUARE_RAD:
         what = (
-            f"the flange '{chain.flange}' is {np.linalg.norm(off):.4g} mm beside axis 6 and turned by "
-            f"{np.degrees(off_angle):.4g} degrees against a UR's"
+            f"the flange '{chain.flange}' is {np.linalg.norm(off):.4g} mm off axis 6 and rotated by "
+            f"{np.degrees(off_angle):.4g} degrees from a UR's"
         )
-        refuse(what, document.where, f"the link that a UR has as tool0; {AS_UR}", "arm_not_as_ur")
+        refuse(what, document.where, f"a link like a UR's tool0; {AS_UR}", "arm_not_as_ur")
 
 
 def _mm(off: list[float]) -> str:
@@ -238,7 +238,7 @@ def narrowed(known: JointLimits, stated: StatedLimits, where: str) -> JointLimit
         if wider.any():
             joint = int(np.argmax(wider))
             low, high = np.degrees(angles[joint])
-            what = f"the angles of joint {joint + 1} go beyond the arm's own"
+            what = f"the angles of joint {joint + 1} exceed the arm's own range"
             refuse(what, where, f"from {low:g} to {high:g} degrees", "limit_beyond_arm")
         angles = stated.angles
     if stated.speeds is not None:
@@ -246,7 +246,7 @@ def narrowed(known: JointLimits, stated: StatedLimits, where: str) -> JointLimit
         if faster.any():
             joint = int(np.argmax(faster))
             allowed = f"at most {np.degrees(speeds[joint]):g} degrees/s"
-            refuse(f"the speed of joint {joint + 1} is above the arm's own", where, allowed, "limit_beyond_arm")
+            refuse(f"the speed of joint {joint + 1} exceeds the arm's own", where, allowed, "limit_beyond_arm")
         speeds = stated.speeds
     return JointLimits(angles, speeds, known.torques)
 
@@ -258,12 +258,12 @@ def _unlimited(joint: UrdfJoint, stated: StatedLimits) -> bool:
 
 def _angles(joint: UrdfJoint, here: str) -> tuple[float, float]:
     if joint.kind == "continuous":
-        refuse("it is continuous: it states no limits", here, "revolute, or [robot.limits]", "missing_limits")
+        refuse("it is continuous, without limits", here, "revolute, or [robot.limits]", "missing_limits")
     if not {"lower", "upper"} <= set(joint.limits):
-        refuse("<limit> lacks lower or upper", here, "both, in rad; or [robot.limits]", "missing_limits")
+        refuse("<limit> lacks lower or upper", here, "lower and upper, in rad; or [robot.limits]", "missing_limits")
     low, high = joint.limits["lower"], joint.limits["upper"]
     if not low < high:
-        refuse(f"limits from {low:g} to {high:g}", here, "lower below upper, in rad", "out_of_range")
+        refuse(f"limits from {low:g} to {high:g}", here, "lower less than upper, in rad", "out_of_range")
     if max(-low, high) > MOST_RAD:
         what = f"limits from {low:g} to {high:g} rad, which look like degrees"
         refuse(what, here, f"rad, at most {MOST_RAD:.2f} either way", "wrong_unit")
@@ -338,17 +338,17 @@ def arm_chain(document: UrdfDocument, flange: str) -> ArmChain:
     where = document.where
     if flange not in document.links:
         allowed = f"[robot] flange, one of {', '.join(document.links)}"
-        refuse(f"there is no link '{flange}', which would be the flange", where, allowed, "unknown_link")
+        refuse(f"there is no link '{flange}' to be the flange", where, allowed, "unknown_link")
     above = _parents(document)
     path = _path(above, flange, document)
     turning = [joint for joint in path if joint.kind != "fixed"]
     for joint in document.joints:
         if joint.kind != "fixed" and joint not in turning:
-            what = f"joint '{joint.name}' ({joint.kind}) moves something beside the way to the flange '{flange}'"
-            refuse(what, where, "six joints that turn; everything else fixed", "moving_branch")
+            what = f"joint '{joint.name}' ({joint.kind}) moves a part outside the chain to the flange '{flange}'"
+            refuse(what, where, "six revolute joints; all others fixed", "moving_branch")
     if len(turning) != JOINT_COUNT or any(joint.kind not in TURNING for joint in turning):
         found = ", ".join(f"{joint.name} ({joint.kind})" for joint in turning) or "none"
-        refuse(f"the joints that move are {found}", where, "six revolute joints in a row", "not_six_joints")
+        refuse(f"the moving joints are {found}", where, "six revolute joints in a row", "not_six_joints")
     bodies, places = _bodies(document, above, turning)
     to_joint = [places[joint.parent] @ joint.T_parent_child for joint in turning]
     beyond = frozenset(name for name in document.links if name != flange and flange in _ancestors(above, name))
@@ -360,12 +360,12 @@ def _parents(document: UrdfDocument) -> dict[str, UrdfJoint]:
     above: dict[str, UrdfJoint] = {}
     for joint in document.joints:
         if joint.child in above:
-            what = f"link '{joint.child}' hangs on two joints, '{above[joint.child].name}' and '{joint.name}'"
+            what = f"link '{joint.child}' has two parent joints, '{above[joint.child].name}' and '{joint.name}'"
             refuse(what, document.where, "a tree of links", "not_a_tree")
         above[joint.child] = joint
     roots = [name for name in document.links if name not in above]
     if len(roots) != 1 or any(roots[0] not in (name, *_ancestors(above, name)) for name in document.links):
-        what = f"it is not a tree: links that hang on no joint: {', '.join(roots) or 'none'}"
+        what = f"it is not a tree: links without a parent joint: {', '.join(roots) or 'none'}"
         refuse(what, document.where, "one root, and a tree of links below it", "not_a_tree")
     return above
 

@@ -215,7 +215,7 @@ def _most_bytes() -> int:
     if not stated:
         return MOST_BYTES
     if not (stated.isascii() and stated.isdigit() and len(stated) < 10):
-        refuse(f"{stated[:40]!r} is no size", f"${SIZE_VARIABLE}", "whole megabytes, such as 2000", "not_a_number")
+        refuse(f"{stated[:40]!r} is not a size", f"${SIZE_VARIABLE}", "whole megabytes, such as 2000", "not_a_number")
     return int(stated) * 1_000_000
 
 
@@ -261,8 +261,8 @@ def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value]
     except FileNotFoundError:
         return None
     except (DamagedError, ValueError, KeyError, TypeError, InputError) as error:
-        why = error if isinstance(error, DamagedError) else "does not hold what it should"
-        warnings.warn(f"cache: a kept result {why}; it is made anew and replaced", CacheWarning, stacklevel=1)
+        why = error if isinstance(error, DamagedError) else "does not have the expected content"
+        warnings.warn(f"cache: a stored result {why}; it is computed again and replaced", CacheWarning, stacklevel=1)
         return None
     touch(path)
     return found

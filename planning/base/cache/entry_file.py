@@ -57,11 +57,11 @@ def unpacked(content: bytes, key: str) -> Arrays:
     start = len(MAGIC) + DIGEST_BYTES
     body = memoryview(content)[start:]
     if not content.startswith(MAGIC) or content[len(MAGIC) : start] != _digest(body, key):
-        raise DamagedError("is cut, damaged, or another's")
+        raise DamagedError("is truncated, damaged, or foreign")
     try:
         return _arrays(content, start)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-        raise DamagedError(f"cannot be understood ({error})") from error
+        raise DamagedError(f"cannot be read ({error})") from error
 
 
 def check_own(path: Path) -> None:
@@ -134,7 +134,7 @@ def _refuse_foreign(path: Path, status: os.stat_result) -> None:
 
 def _refuse_writable(path: Path, status: os.stat_result) -> None:
     if _open_to_others(status, stat.S_IWGRP, stat.S_IWOTH):
-        raise _refusal(path, f"may be written by others (mode {stat.S_IMODE(status.st_mode):03o})")
+        raise _refusal(path, f"is writable by others (mode {stat.S_IMODE(status.st_mode):03o})")
 
 
 def _open_to_others(status: os.stat_result, of_group: int, of_all: int) -> bool:
@@ -157,10 +157,10 @@ def _alone_in(gid: int) -> bool:
 
 def _refusal(path: Path, what: str) -> InputError:
     allowed = (
-        "a cache of your own that nobody else may write: by chown, chmod go-w, or another place, "
-        "$PUNCTURE_TWIN_CACHE or $NUMBA_CACHE_DIR"
+        "a cache folder that only you can write to: use chown, chmod go-w, or another folder in $PUNCTURE_TWIN_CACHE "
+        "or $NUMBA_CACHE_DIR"
     )
-    return InputError(f"the cache {what}: nothing in it is read", where=path, allowed=allowed, code="cache_not_own")
+    return InputError(f"the cache {what}; it is not used", where=path, allowed=allowed, code="cache_not_own")
 
 
 def read_plain_file(path: Path) -> bytes:
@@ -172,7 +172,7 @@ def read_plain_file(path: Path) -> bytes:
     """
     try:
         if not stat.S_ISREG(os.lstat(path).st_mode):
-            raise DamagedError("is no plain file")
+            raise DamagedError("is not a regular file")
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         raise FileNotFoundError(path) from None

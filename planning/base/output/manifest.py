@@ -38,7 +38,7 @@ LONGEST_NAME = 1000
 LONGEST_PART = 255
 """Bytes of one part of it, which is what file systems take."""
 
-ANOTHER_FOLDER = "another output folder, or this one without that file"
+ANOTHER_FOLDER = "another output folder, or remove that file"
 
 
 @dataclass(frozen=True)
@@ -140,14 +140,14 @@ def read_output(path: Path, *, max_bytes: int) -> Output:
     digest = hashlib.sha256(data).hexdigest()
     home = path.resolve()
     if home.name == MANIFEST_NAME:
-        refuse("lists the files of a command and is none of them", path, "one that it lists", "not_in_manifest")
+        refuse("is not one of the files that it lists", path, "a file that it lists", "not_in_manifest")
     manifest = _set_of(home.parent)
     if manifest is None:
-        return Output(path, data, digest, f"{path} lies outside of any output set: nothing tells whether it is whole")
+        return Output(path, data, digest, f"{path} is not part of an output set, so its completeness cannot be checked")
     if manifest.files.get(home.name) != digest:
-        wrong = "is not listed" if home.name not in manifest.files else "has other bytes than are listed"
-        what = f"{wrong} in {MANIFEST_NAME} beside it: the folder's set is unfinished, or the file was edited"
-        refuse(what, path, "what the command wrote: run it again", "output_not_whole")
+        wrong = "has no entry" if home.name not in manifest.files else "does not match its entry"
+        what = f"{wrong} in {MANIFEST_NAME} next to it: the output is incomplete, or the file was edited"
+        refuse(what, path, "the unchanged output of a finished run: run the command again", "output_not_whole")
     return Output(path, data, digest, "")
 
 
@@ -166,7 +166,7 @@ def problems(folder: Path) -> tuple[str, ...]:
         if not path.is_file():
             found.append(f"{name} is missing")
         elif file_digest(path) != digest:
-            found.append(f"{name} has other bytes than are listed")
+            found.append(f"{name} does not match its entry")
     return tuple(found)
 
 
@@ -181,7 +181,7 @@ def read_manifest(folder: Path) -> Manifest | None:
         return None
     document = _document(path)
     if not isinstance(document, dict) or document.get("format") != FORMAT:
-        refuse("is not that of an output folder", path, ANOTHER_FOLDER, "not_an_output_folder")
+        refuse("is not the manifest of an output folder", path, ANOTHER_FOLDER, "not_an_output_folder")
     with fitting(path, ANOTHER_FOLDER):
         return _manifest(document)
 
@@ -234,5 +234,5 @@ def _name(name: Any) -> str:
     if not parts or set("\\\0") & set(name) or name != "/".join(parts) or {"..", "/", "."} & set(parts):
         raise ValueError(f"the name {name[:LONGEST_PART]!r}")
     if len(name.encode()) > LONGEST_NAME or max(len(part.encode()) for part in parts) > LONGEST_PART:
-        raise ValueError(f"the name {name[:LONGEST_PART]!r}, which no file has")
+        raise ValueError(f"the name {name[:LONGEST_PART]!r}, which cannot be a file name")
     return str(name)

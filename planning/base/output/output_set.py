@@ -95,7 +95,7 @@ def _explained(out: Path) -> Iterator[None]:
         if not disk_is_full(error, out):
             raise
         reason = os.strerror(error.errno or errno.ENOSPC)
-        what = f"cannot be written ({reason}); what it held before is untouched"
+        what = f"cannot be written ({reason}); its earlier content is unchanged"
         raise InputError(what, where=out, allowed="a folder with enough free space", code="unwritable") from error
 
 
@@ -120,7 +120,7 @@ def _folder(out: Path) -> Iterator[None]:
         if error.errno in NO_SPACE:
             raise
         what = f"cannot be written ({error.strerror})"
-        raise InputError(what, where=out, allowed="a folder that may be written to", code="unwritable") from error
+        raise InputError(what, where=out, allowed="a writable folder", code="unwritable") from error
     try:
         yield
     finally:
@@ -140,8 +140,8 @@ def _sources(draft: Draft, made_from: Mapping[str, str]) -> tuple[str, ...]:
         owner = draft.old.owner(name)
         if owner is not None:
             if draft.old.files[name] != digest:
-                allowed = f"another folder: what is made from one {name} does not belong beside another"
-                refuse(f"holds another {name}", draft.out, allowed, "folder_of_another")
+                allowed = f"another folder: outputs of different {name}s are not mixed"
+                refuse(f"has outputs of another {name}", draft.out, allowed, "folder_of_another")
             owners.append(owner)
     return tuple(owners)
 
@@ -177,12 +177,12 @@ def _locked(path: Path) -> int:
             holder = os.pread(handle, 20, 0).decode(errors="replace")
             os.close(handle)
             what = f"another command is writing into this folder (process {holder or 'unknown'})"
-            allowed = "one at a time, or another folder"
+            allowed = "one command at a time, or another folder"
             raise InputError(what, where=path.parent, allowed=allowed, code="folder_in_use") from None
         except OSError as error:
             os.close(handle)
             what = f"the folder cannot be locked ({error.strerror})"
-            allowed = "a folder on a file system with locks"
+            allowed = "a folder on a file system that supports locks"
             raise InputError(what, where=path.parent, allowed=allowed, code="folder_not_locked") from error
         os.close(handle)
 
@@ -193,7 +193,7 @@ def _opened(path: Path) -> int:
     except OSError as error:
         what = f"cannot be written ({error.strerror})"
         where = path.parent
-        raise InputError(what, where=where, allowed="a folder that may be written to", code="unwritable") from error
+        raise InputError(what, where=where, allowed="a writable folder", code="unwritable") from error
 
 
 def _is_at(handle: int, path: Path) -> bool:

@@ -116,8 +116,8 @@ def refuse_foreign(draft: Draft, files: Iterable[str]) -> None:
     for name in sorted({*files, TIMINGS_NAME} - known):
         foreign = _foreign_entry(draft.out, name)
         if foreign is not None:
-            what = f"{name} is to be written, but the file {foreign} there comes from no run of this program"
-            refuse(what, draft.out, "another folder, or this one without that file", "foreign_file")
+            what = f"{name} would be written, but the existing file {foreign} is not from this program"
+            refuse(what, draft.out, "another folder, or remove that file", "foreign_file")
 
 
 def _foreign_entry(out: Path, name: str) -> str | None:
@@ -147,14 +147,14 @@ def _report_outdated(draft: Draft, names: set[str]) -> None:
         return
     first, more = sorted(names)[:MOST_NAMED], max(len(names) - MOST_NAMED, 0)
     named = ", ".join(first) + (f" and {more} more" if more else "")
-    draft.note(f"{draft.out}: {named} of an earlier run removed: not of this {draft.command}")
+    draft.note(f"{draft.out}: {named} of an earlier run removed: not part of this {draft.command}")
 
 
 def _report_removed(draft: Draft, others: set[str]) -> None:
     """Name what went although neither the command's own nor made from it."""
     if others:
         named = ", ".join(sorted(others))
-        draft.note(f"{draft.out}: the files of {named} were removed: {draft.command} has replaced a part of them")
+        draft.note(f"{draft.out}: the files of {named} were removed: {draft.command} replaced some of them")
 
 
 @contextmanager

@@ -29,9 +29,9 @@ from puncture_twin.planning.formats.dicom.slices import (
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, Content, Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, check_affine, check_shape
 
-LOSSY = "{} files were compressed with loss, so that their values are not exact"
-CLASS_IN_META = "{} files do not say what they are; the SOP class of their meta information was taken"
-SCOUTS = "{} frames are scouts by their type, and were left out"
+LOSSY = "{} files have lossy compression, so their values are not exact"
+CLASS_IN_META = "{} files state no SOP class; the one in their meta information was used"
+SCOUTS = "{} frames are scouts (by their type) and were left out"
 UNMEASURED_HU = -2000.0
 """Written where the scanner did not measure: far below air, so that nothing takes it for air or body."""
 
@@ -71,8 +71,8 @@ class CtSeries:
         notes = list(self.aside)
         if (tilt := self._series.grid.tilt_deg) > 0:
             notes.append(
-                f"{self.path.name}: scanned with the gantry tilted by {tilt:.1f} degrees; its slices were moved to a "
-                "grid with right angles, and what they do not cover there counts as not scanned"
+                f"{self.path.name}: scanned with the gantry tilted by {tilt:.1f} degrees; its slices were moved to "
+                "a rectangular grid, and the part that they do not cover counts as not scanned"
             )
         return (*notes, *self._series.notes)
 
@@ -138,7 +138,7 @@ class CtSeries:
             data = parse_dicom(self.content(file), Path(file))
             header = described(data, Path(file))
             if not header.is_slice:
-                refuse(f"{header.sop_class}, no slice of a CT", file, "has the file changed?", "not_a_ct")
+                refuse(f"{header.sop_class}, not a CT slice", file, "an unchanged file", "not_a_ct")
             stated.add((header.series_uid, header.frame_of_reference))
             layouts[file] = pixel_layout(data, file)
             own = slices_of(data, file, layouts[file].frames)
@@ -179,7 +179,7 @@ def _one_size(layouts: dict[str, PixelLayout], path: Path) -> tuple[int, int]:
     for file, layout in layouts.items():
         if first and (layout.rows, layout.columns) != size:
             what = f"{first} has {size[0]} x {size[1]} pixels, {file} has {layout.rows} x {layout.columns}"
-            refuse(what, path, "slices of one size", "mixed_geometry")
+            refuse(what, path, "slices of the same size", "mixed_geometry")
         first, size = file, (layout.rows, layout.columns)
     return size
 

@@ -26,6 +26,7 @@ from pydicom.tag import BaseTag
 from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.formats.dicom.storage import BIG_ENDIAN, DEFLATED, IMPLICIT, META_START, is_dicom
 
 MAX_INFLATED_BYTES = 1 << 26
@@ -60,7 +61,7 @@ def parse_dicom(content: bytes, path: Path) -> Dataset:
         InputError: No DICOM, damaged, cut short, inflating to too much, or big endian.
     """
     if not is_dicom(content[:META_START]):
-        refuse("no DICOM file: DICM does not stand at byte 128", path, ALLOWED, "wrong_format")
+        refuse("not a DICOM file: no DICM at byte 128", path, ALLOWED, "wrong_format")
     with refused_if_damaged(path):
         stream = io.BytesIO(content)
         meta = read_meta(stream)
@@ -98,7 +99,7 @@ def _body(data: memoryview, syntax: UID, path: Path) -> memoryview:
     if not inflater.eof:
         more = len(inflated) >= MAX_INFLATED_BYTES
         what = (
-            f"inflates to more than {MAX_INFLATED_BYTES} bytes" if more else "cut short: its deflated data do not end"
+            f"inflates to more than {MAX_INFLATED_BYTES} bytes" if more else "cut short: its deflated data have no end"
         )
         refuse(what, path, ALLOWED, "file_damaged")
     return memoryview(inflated)
@@ -145,7 +146,7 @@ def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[flo
         refuse(
             what,
             where,
-            f"{count} finite number{'s' if count > 1 else ''}",
+            f"{plural(count, 'finite number')}",
             "missing_tag" if found is None else "bad_tag",
         )
     return plain
@@ -200,7 +201,7 @@ def items(data: Dataset, keyword: str, *, where: str) -> list[Dataset]:
     with refused_if_damaged(where):
         listed = list(found)
     if not all(isinstance(one, Dataset) for one in listed):
-        refuse(f"{name(keyword)} is no sequence", where, "a sequence of items", "bad_tag")
+        refuse(f"{name(keyword)} is not a sequence", where, "a sequence of items", "bad_tag")
     return listed
 
 
@@ -267,7 +268,7 @@ class _Walk:
             if closed and tag == ITEM_END:
                 return at + 8
             if tag <= last:
-                self._refuse(f"element {_shown(tag)} stands behind {_shown(last)}", at)
+                self._refuse(f"element {_shown(tag)} comes after {_shown(last)}", at)
             last = tag
             at = self._element(tag, at, end, implicit=implicit, depth=depth)
         return at
@@ -301,7 +302,7 @@ class _Walk:
         if kind not in LONG_FORM:
             self._refuse(f"element {_shown(tag)} has the unknown value representation {kind!r}", at)
         if at + 12 > end:
-            self._refuse("cut short within an element's head", at, "file_cut")
+            self._refuse("cut short within the header of an element", at, "file_cut")
         return kind, at + 12, struct.unpack_from("<L", self._data, at + 8)[0]
 
     def _items(self, at: int, end: int, *, implicit: bool, depth: int, closed: bool) -> int:
@@ -311,12 +312,12 @@ class _Walk:
             if closed and tag == SEQUENCE_END:
                 return at + 8
             if tag != ITEM:
-                self._refuse(f"element {_shown(tag)} in the place of a sequence's item", at)
+                self._refuse(f"element {_shown(tag)} in place of a sequence item", at)
             if length == UNDEFINED:
                 at = self.data_set(at + 8, end, implicit=implicit, depth=depth, closed=True)
                 continue
             if at + 8 + length > end:
-                self._refuse("cut short within a sequence's item", at, "file_cut")
+                self._refuse("cut short within a sequence item", at, "file_cut")
             at = self.data_set(at + 8, at + 8 + length, implicit=implicit, depth=depth, closed=False)
         return at
 

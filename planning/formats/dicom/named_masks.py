@@ -64,10 +64,10 @@ def unique_names(names: Sequence[str], where: Path) -> None:
         InputError: One has none, or two share one.
     """
     if not names:
-        refuse("holds no structure", where, "a file with structures", "no_structure")
+        refuse("has no structure", where, "a file with structures", "no_structure")
     for name in names:
         if not name or names.count(name) > 1:
-            what = f"{names.count(name)} structures are called {name!r}" if name else "a structure has no name"
+            what = f"{names.count(name)} structures have the name {name!r}" if name else "a structure has no name"
             refuse(what, where, "a name of its own for each structure", "duplicate_name" if name else "bad_name")
 
 
@@ -79,5 +79,5 @@ def check_frame_of_reference(stated: str, ct: CtSeries, where: Path) -> None:
     """
     if stated != ct.frame_of_reference or not stated:
         what = f"lies in the frame of reference {stated or 'not stated'}, the CT {ct.path.name} in "
-        allowed = "structures that were drawn on this CT, or on one that was registered to it"
+        allowed = "structures drawn on this CT, or on one registered to it"
         refuse(f"{what}{ct.frame_of_reference or 'one that is not stated'}", where, allowed, "other_frame_of_reference")

@@ -96,7 +96,7 @@ def check_length(data: Dataset, promised: int, where: str) -> None:
     if not isinstance(pixels, bytes):
         refuse(f"{name('PixelData')} is missing", where, "an image with pixels", "missing_tag")
     if data.file_meta.TransferSyntaxUID in PLAIN and len(pixels) != promised + promised % 2:
-        what = f"{name('PixelData')} has {len(pixels)} bytes where the header promises {promised}"
+        what = f"{name('PixelData')} has {len(pixels)} bytes, but the header states {promised}"
         refuse(what, where, "a complete file", "size_mismatch")
 
 
@@ -112,7 +112,7 @@ def stored_values(data: Dataset, layout: PixelLayout, where: str) -> NDArray[Any
     else:
         cells = _decompressed(data, data.file_meta.TransferSyntaxUID, where)
     if cells.size != np.prod(shape) or cells.dtype.itemsize * 8 != layout.allocated:
-        what = f"the compressed pixels hold {cells.size} values of {cells.dtype} where {shape} are promised"
+        what = f"the compressed pixels hold {cells.size} values of {cells.dtype}, but the header states {shape}"
         refuse(what, where, "a complete file", "size_mismatch")
     above = layout.allocated - layout.stored
     typed = cells.reshape(shape).view(f"{'i' if layout.signed else 'u'}{layout.allocated // 8}")

@@ -213,16 +213,16 @@ def choose_series(path: Path) -> SeriesFiles:
     if folder != path:
         named = next((one for one in found if one.name == path.name), None)
         if named is None or not named.is_slice:
-            what = "no DICOM file" if named is None else f"{named.sop_class}, no slice of a CT"
-            refuse(what, path, "a slice of a CT series, or its folder", "not_a_ct")
+            what = "not a DICOM file" if named is None else f"{named.sop_class}, not a CT slice"
+            refuse(what, path, "a slice of a CT series, or the folder of a series", "not_a_ct")
         slices = [one for one in slices if one.series_uid == named.series_uid]
     _check_one_series(slices, found, others, path)
     names = tuple(one.name for one in slices)
     read = {one.name: Entry(one.name, FILE) for one in found}
     left = unaccounted(folder, (*others, *read.values()), lambda path: path.name in read)
     if lost := [one for one in left if _may_be_slice(one, names)]:
-        what = f"beside the slices lies what is not read, and may be a slice: {first_few([one.line for one in lost])}"
-        allowed = "every slice of the series as a whole DICOM file (fetch it, copy it again, or move it elsewhere)"
+        what = f"other files, possibly slices, cannot be read: {first_few([one.line for one in lost])}"
+        allowed = "every slice of the series as a complete DICOM file (download or copy it again, or move it elsewhere)"
         refuse(what, path, allowed, "slices_not_read")
     aside = [one for one in found if one.name not in set(names)]
     below = [one for one in others if one.what == FOLDER and _holds_dicom(folder / one.name)]
@@ -246,8 +246,8 @@ def _check_one_series(
 ) -> None:
     if not slices:
         classes = Counter(one.sop_class for one in found)
-        shown = [f"{count} {name}" for name, count in classes.most_common()] or ["no DICOM file"]
-        allowed = "a folder with a CT series; folders in it are not entered"
+        shown = [f"{count} {name}" for name, count in classes.most_common()] or ["not a DICOM file"]
+        allowed = "a folder with a CT series (subfolders are not searched)"
         refuse(f"no CT series here: {first_few([*shown, *(one.line for one in others)])}", path, allowed, "no_ct")
     series: dict[str, list[DicomFile]] = {}
     for one in slices:
@@ -258,14 +258,14 @@ def _check_one_series(
             for uid, files in list(series.items())[:SHOWN]
         ]
         more = f"; and {len(series) - SHOWN} more" if len(series) > SHOWN else ""
-        allowed = "one series: name one of its files instead of the folder"
+        allowed = "one series: give one of its files instead of the folder"
         refuse(f"{len(series)} CT series: {'; '.join(listed)}{more}", path, allowed, "several_series")
 
 
 def _notes(aside: Sequence[DicomFile], below: Sequence[Entry], path: Path) -> tuple[str, ...]:
     kinds = Counter(f"{one.sop_class} '{one.series}'" if one.kind is Kind.CT else one.sop_class for one in aside)
     shown = [*(f"{count} {name}" for name, count in kinds.most_common()), *(f"DICOM in {one.name}" for one in below)]
-    return (f"{path.name}: files beside the CT series were left out: {first_few(shown)}",) if shown else ()
+    return (f"{path.name}: other files next to the CT series were left out: {first_few(shown)}",) if shown else ()
 
 
 def _count(files: Sequence[DicomFile]) -> str:

@@ -107,9 +107,9 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
         called: MaskVolume(path, files, (called,), placed.grid, partial(_mask, data, frames, placed, segment, path))
         for segment, called in names.items()
     }
-    notes = [] if ct else [f"{where}: whether it was drawn on this case's CT is not known, which is no DICOM series"]
+    notes = [] if ct else [f"{where}: the case's CT is not a DICOM series, so this may belong to another CT"]
     if kind == "FRACTIONAL":
-        notes.append(f"{where}: fractional segments; a voxel counts from {HALF:g} on")
+        notes.append(f"{where}: fractional segments; voxels of {HALF:g} or more count")
     return NamedMasks(masks, tuple(notes))
 
 
@@ -147,14 +147,14 @@ def _frames(data: Dataset, names: dict[int, str], ct: CtSeries | None, path: Pat
     T, slices = _regular(planes, _stated_step(groups[0], where, ct), path)
     pairs = set(zip(segments.tolist(), slices.tolist(), strict=True))
     if len(pairs) < count:
-        refuse("two frames of one segment lie at one place", path, "one frame a slice", "duplicate_place")
+        refuse("two frames of one segment are at the same position", path, "one frame per slice", "duplicate_place")
     return _Frames(segments, slices, T, rows, columns)
 
 
 def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
     found = groups.find("SegmentIdentificationSequence", label)
     if len(found) != 1:
-        refuse(f"{len(found)} items say whose segment it is", label, "one", "wrong_count")
+        refuse(f"{len(found)} items state its segment", label, "one", "wrong_count")
     segment = whole(found[0], "ReferencedSegmentNumber", low=1, high=65535, where=label)
     if segment not in names:
         refuse(f"is of segment {segment}, which is not listed", label, f"{sorted(names)}"[:200], "unknown_segment")
@@ -210,7 +210,7 @@ def _least_step(gaps: Floats, stated_mm: float | None, path: Path) -> float:
     real = gaps[gaps > 1e-3]
     if not len(real):
         if stated_mm is None:
-            refuse("one slice, and how thick it is is not stated", path, "SliceThickness", "missing_tag")
+            refuse("one slice of unknown thickness", path, "SliceThickness", "missing_tag")
         return stated_mm
     least = float(real.min())
     if not _keep_to(real, least) and stated_mm is not None and stated_mm <= least * (1 + PLACE_TOLERANCE):

@@ -29,8 +29,8 @@ four."""
 HOUNSFIELD = ("HU", "US", "")
 """Types of rescaled values that are Hounsfield units in a CT, where the standard's default is HU."""
 WITH_RESCALE = (
-    "slices with slope and intercept (usually 1 and -1024 where air is stored as 0; 1 and 0 where as -1000): "
-    "export the series again from where it was made, or give the CT as NIfTI in Hounsfield units"
+    "slices with slope and intercept (usually 1 and -1024 where air is stored as 0; 1 and 0 where as -1000): export "
+    "the series again from its source, or give the CT as NIfTI in Hounsfield units"
 )
 
 
@@ -175,7 +175,7 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
         refuse(f"{name('RescaleType')} is {kind!r}", label, "HU (Hounsfield units)", "not_hounsfield")
     for keyword in ("RescaleSlope", "RescaleIntercept"):
         if not has(rescale, keyword):
-            what = f"{name(keyword)} is missing, so that nothing tells its Hounsfield units"
+            what = f"{name(keyword)} is missing, so its Hounsfield units are not known"
             refuse(what, label, WITH_RESCALE, "no_rescale")
     slope, intercept = (number(rescale, keyword, where=label) for keyword in ("RescaleSlope", "RescaleIntercept"))
     if slope == 0 or abs(slope) > 1e6 or abs(intercept) > 1e6:
@@ -258,11 +258,11 @@ def _check_alike(first: Slice, other: Slice, where: Path) -> None:
     difference = float(np.abs(first.plane.axes_ct - other.plane.axes_ct).max())
     if difference > AXES_TOLERANCE:
         angle = np.degrees(np.arccos(np.clip(first.plane.normal_ct @ other.plane.normal_ct, -1.0, 1.0)))
-        what = f"{first.label} and {other.label} have other orientations (normals {angle:.1f} degrees apart)"
-        refuse(what, where, "slices of one orientation", "mixed_geometry")
+        what = f"{first.label} and {other.label} have different orientations (normals {angle:.1f} degrees apart)"
+        refuse(what, where, "slices of the same orientation", "mixed_geometry")
     ratios = np.array(first.plane.spacing_mm) / other.plane.spacing_mm
     if np.abs(ratios - 1.0).max() > SPACING_TOLERANCE:
-        what = f"{first.label} and {other.label} have pixels of other sizes"
+        what = f"{first.label} and {other.label} have different pixel sizes"
         refuse(f"{what}: {first.plane.spacing_mm} and {other.plane.spacing_mm} mm", where, "one", "mixed_geometry")
 
 
@@ -273,9 +273,9 @@ def _check_one_place(ordered: Sequence[Slice], steps: Floats, where: Path) -> No
     if not near.any():
         return
     named = [f"{ordered[k].label} and {ordered[k + 1].label}" for k in np.flatnonzero(near).tolist()]
-    more = f" and {len(named) - SHOWN} pairs more" if len(named) > SHOWN else ""
-    allowed = "one slice at each place (one time point, no copies)"
-    refuse(f"several slices at one place: {'; '.join(named[:SHOWN])}{more}", where, allowed, "duplicate_place")
+    more = f" and {len(named) - SHOWN} more pairs" if len(named) > SHOWN else ""
+    allowed = "one slice at each position (one time point, no copies)"
+    refuse(f"several slices at one position: {'; '.join(named[:SHOWN])}{more}", where, allowed, "duplicate_place")
 
 
 def _check_steps(ordered: Sequence[Slice], steps: Floats, step: float, where: Path) -> None:
@@ -290,8 +290,8 @@ def _check_steps(ordered: Sequence[Slice], steps: Floats, step: float, where: Pa
         what = f"{missing} slice{' is' if missing == 1 else 's are'} missing {between}: {steps[at]:.4g} mm apart"
     else:
         what = f"uneven steps: {steps[at]:.4g} mm {between}"
-    more = f", and at {len(wrong) - 1} places more" if len(wrong) > 1 else ""
-    allowed = f"even steps; the usual one here is {step:.4g} mm (resample the series, or export it again)"
+    more = f", and at {len(wrong) - 1} more places" if len(wrong) > 1 else ""
+    allowed = f"even steps; here mostly {step:.4g} mm (resample the series, or export it again)"
     refuse(f"{what}{more}", where, allowed, "uneven_slices")
 
 
@@ -335,7 +335,7 @@ def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> Straigh
     sideways_mm = plane.axes_ct.T @ stack.step_ct  # how far each slice is shifted in its own plane
     tilt = float(np.degrees(np.arctan2(np.linalg.norm(sideways_mm), along)))
     if tilt > MAX_TILT_DEG:
-        what = f"the slices' normal and the way from slice to slice are {tilt:.0f} degrees apart"
+        what = f"the slice normal and the direction from slice to slice are {tilt:.0f} degrees apart"
         refuse(what, where, f"a tilt of at most {MAX_TILT_DEG:g} degrees", "gantry_tilt")
     if np.linalg.norm(sideways_mm) * (count - 1) <= NO_TILT_MM:
         sideways_mm = np.zeros(2)

@@ -144,10 +144,10 @@ def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) ->
     at = points_ct[0].round(2).tolist()
     if len(slices) != 1 or np.abs(index[:, 2] - slices[0]).max() > ON_SLICE:
         what = f"the contour through {at} lies between the CT's slices"
-        refuse(what, label, "contours in the slices of the CT on which they were drawn", "contour_outside_ct")
+        refuse(what, label, "contours in the slices of their CT", "contour_outside_ct")
     if not 0 <= slices[0] < grid.shape[2]:
         what = f"the contour through {at} lies beyond the CT's slices"
-        refuse(what, label, "contours within the CT on which they were drawn", "contour_outside_ct")
+        refuse(what, label, "contours within their CT", "contour_outside_ct")
     length = float(np.abs(index[:, :2] - np.roll(index[:, :2], 1, axis=0)).sum())
     if length > MAX_LENGTH:
         refuse(f"the contour through {at} is {length:.3g} pixels long", label, f"{MAX_LENGTH}", "too_long")
@@ -164,7 +164,7 @@ def _points(item: Dataset, label: str) -> Floats:
     count = len(flat) // 3
     if len(flat) != 3 * count or not 3 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
         allowed = "three finite numbers for each of at least three points"
-        refuse(f"{name('ContourData')} holds {len(flat)} numbers", label, allowed, "wrong_count")
+        refuse(f"{name('ContourData')} has {len(flat)} numbers", label, allowed, "wrong_count")
     if has(item, "NumberOfContourPoints"):
         whole(item, "NumberOfContourPoints", low=count, high=count, where=label)
     return flat.reshape(-1, 3)
@@ -253,10 +253,10 @@ def _notes(regions: dict[str, _Region], grid: VolumeGrid, where: str) -> list[st
         (others, "contours that are not closed (points, lines) were left out of"),
         (
             gaps,
-            "slices without a contour between two with one were filled where both overlap, or all are evenly "
-            "spaced, and else left empty, in",
+            "slices without a contour, between two with one, were filled where both overlap or all are evenly "
+            "spaced, and otherwise left empty, in",
         ),
-        (small, "contours smaller than a pixel count for the pixels along them, in"),
+        (small, "contours smaller than a pixel count as the pixels along them, in"),
         (cut, "contours that reach beyond the CT's image end there, in"),
     )
     return [f"{where}: {problem} {first_few(some)}" for some, problem in findings if some]

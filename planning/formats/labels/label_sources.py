@@ -57,16 +57,16 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
     Raises:
         InputError: No folder, no mask in it, too many, two of one structure, or entries that would be passed over.
     """
-    allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one a structure"
+    allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one per structure"
     if not is_folder(folder):
-        refuse(f"'{folder.name[:200]}' is no folder", where, allowed, "not_a_folder")
+        refuse(f"'{folder.name[:200]}' is not a folder", where, allowed, "not_a_folder")
     found = entries(folder, most=MAX_ENTRIES, allowed=allowed)
     files = [one.name for one in found if is_mask(one) and not known(folder / one.name)]
     left = unaccounted(folder, found, lambda path: path.name in files or known(path))
     if left:
         raise not_read(left, "masks", where)
     if not 1 <= len(files) <= MAX_MASKS:
-        refuse(f"'{folder.name}' holds {len(files)} masks", where, allowed, "wrong_count")
+        refuse(f"'{folder.name}' has {len(files)} masks", where, allowed, "wrong_count")
     refuse_one_name(files, where)
     return tuple(files)
 
@@ -80,8 +80,8 @@ def refuse_one_name(files: Sequence[str], where: str | Path) -> None:
     names: dict[str, str] = {}
     for file in files:
         if (other := names.setdefault(structure_name(file), file)) is not file:
-            allowed = "one mask a structure: move one of the two out of the folder"
-            refuse(f"'{other}' and '{file}' are masks of one name", where, allowed, "masks_of_one_name")
+            allowed = "one mask per structure: move one of the two out of the folder"
+            refuse(f"'{other}' and '{file}' are masks with the same name", where, allowed, "masks_of_one_name")
 
 
 def is_mask(entry: Entry) -> bool:
@@ -92,9 +92,9 @@ def is_mask(entry: Entry) -> bool:
 def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError:
     """Entries of a folder of masks or meshes that would be passed over: their organs would count as free."""
     return InputError(
-        f"beside the {among} lies what is not read, and may be an organ: {first_few([one.line for one in left])}",
+        f"the folder also has files that cannot be read and may be organs: {first_few([one.line for one in left])}",
         where=where,
-        allowed=f"{among} in formats that are read, and nothing else: convert it, fetch it, or move it elsewhere",
+        allowed=f"{among} in supported formats, and nothing else: convert, download or move the other files",
         code="entries_not_read",
     )
 
@@ -107,8 +107,8 @@ def refuse_label_map(mask: LabelMap) -> None:
     """
     present = mask.labels_present()
     if len(present) > 1:
-        what = f"is no mask: its voxels have the labels {first_few(list(map(str, present)))}"
-        allowed = "0 and one other value; a label map is named with labelmap, outside of a folder of masks"
+        what = f"is not a mask: its voxels have the labels {first_few(list(map(str, present)))}"
+        allowed = "0 and one other value; give a label map with labelmap, outside the folder of masks"
         refuse(what, mask.path, allowed, "not_a_mask")
 
 
@@ -127,8 +127,8 @@ def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> N
             difference = f"up to {apart:.1f} mm away"
         else:
             continue
-        allowed = "masks of one CT, all on one grid; others as [[structure]] with labelmap and label"
-        refuse(f"mask {name} lies on another grid than {first}: {difference}", where, allowed, "other_grid")
+        allowed = "masks of one CT, all on one grid; other masks as [[structure]] with labelmap and label"
+        refuse(f"mask {name} has another grid than {first}: {difference}", where, allowed, "other_grid")
 
 
 SEGMENT_ENDING = ".nrrd"
@@ -156,7 +156,7 @@ def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
     """
     header = parse_layered_header(content(file), path)
     if header.data_path != path:
-        refuse(f"its voxels lie in {header.data_path.name}", path, "header and voxels in one file", "data_elsewhere")
+        refuse(f"its voxels are in {header.data_path.name}", path, "header and voxels in one file", "data_elsewhere")
     if header.cells.dtype.kind not in "iu":
         refuse(f"voxels of type {header.cells.dtype}", path, "whole numbers", "wrong_type")
     found = listed_segments(header.fields, header.layers, path)
@@ -211,6 +211,6 @@ def _mask(content: Content, file: str, header: VolumeHeader, segment: Segment, l
     layer = voxels[segment.layer] if header.layers > 1 else voxels
     lost = layer[~np.isin(layer, [0, *(one.label for one in listed if one.layer == segment.layer)])]
     if lost.size:
-        what = f"layer {segment.layer} has voxels of {np.unique(lost)[:8].tolist()}, which are no segment's"
+        what = f"layer {segment.layer} has voxels of {np.unique(lost)[:8].tolist()}, which belong to no segment"
         refuse(what, header.data_path, "a segment for each label", "label_without_segment")
     return np.asarray(layer == segment.label).astype(np.uint8)

@@ -90,7 +90,7 @@ def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer],
     """
     low, high = values.min(), values.max()
     if low < -ROUNDED_BY or high > MAX_LABEL:
-        refuse(f"values from {low} to {high} are no labels", path, ALLOWED, "no_labels")
+        refuse(f"values from {low} to {high} are not labels", path, ALLOWED, "no_labels")
     if values.dtype.kind != "f":
         return values, 0.0
     rounded = np.rint(values)
@@ -100,8 +100,8 @@ def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer],
         example = float(values[between][0])
         whole = np.count_nonzero((values > ROUNDED_BY) & ~between)
         if high > 1.5 and whole > LEAST_WHOLE * np.count_nonzero(values > ROUNDED_BY):
-            what = f"holds values between its labels, such as {example:.3g}: they were blended by an interpolation"
-            refuse(what, path, f"{ALLOWED}: resample it again, with nearest neighbours", "labels_blended")
+            what = f"has values between its labels, such as {example:.3g}: it was interpolated"
+            refuse(what, path, f"{ALLOWED}: resample it with nearest neighbours", "labels_blended")
         refuse(f"value {example} is not whole", path, ALLOWED, "no_labels")
     return rounded.astype(np.uint16), float(off.max())
 

@@ -61,10 +61,10 @@ def parse_names(data: bytes, path: Path) -> dict[int, str]:
         if label is None:
             continue
         if label in names:
-            refuse(f"id {label} stands twice", entry.where, "each id once", "duplicate_label")
+            refuse(f"id {label} appears twice", entry.where, "each id once", "duplicate_label")
         names[label] = entry.name.strip()
     if not names:
-        refuse("the naming holds no label", path, allowed, "empty")
+        refuse("the naming has no label", path, allowed, "empty")
     return names
 
 
@@ -103,7 +103,7 @@ def _rows(data: bytes, path: Path) -> list[list[str]]:
         separator = max((",", ";", "\t"), key=first.count)
         return list(csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator))
     except csv.Error as error:
-        raise InputError(f"is no CSV text ({error})", where=path, allowed=ALLOWED_CSV, code="not_csv") from error
+        raise InputError(f"is not a CSV file ({error})", where=path, allowed=ALLOWED_CSV, code="not_csv") from error
 
 
 def _columns(header: Sequence[str], path: Path) -> tuple[int, int]:
@@ -113,7 +113,7 @@ def _columns(header: Sequence[str], path: Path) -> tuple[int, int]:
     number = next((plain.index(one) for one in NUMBER_COLUMNS if one in plain and plain.index(one) != name), None)
     if name is None or number is None:
         shown = ",".join(header)[:100] or "missing"
-        refuse(f"header {shown!r} names no column of labels and names", path, ALLOWED_CSV, "wrong_columns")
+        refuse(f"header {shown!r} has no column of labels and names", path, ALLOWED_CSV, "wrong_columns")
     return number, name
 
 
@@ -121,14 +121,14 @@ def _json_entries(data: bytes, path: Path) -> Iterator[_Entry]:
     tree = parse_json(data, where=path, allowed=ALLOWED_JSON)
     table = tree.get("labels", tree) if isinstance(tree, dict) else None
     if not isinstance(table, dict):
-        refuse("no object of labels", path, ALLOWED_JSON, "wrong_format")
+        refuse("not an object of labels", path, ALLOWED_JSON, "wrong_format")
     for key, value in table.items():
         number, name = (key, value) if isinstance(value, str) else (value, key)
         if isinstance(value, list):
-            what = f"{str(key)[:60]!r} is a list of labels (a region): name its labels one by one"
+            what = f"{str(key)[:60]!r} is a list of labels (a region): list its labels one by one"
             refuse(what, path, ALLOWED_JSON, "labels_of_regions")
         if isinstance(number, bool) or not isinstance(number, str | int) or not isinstance(name, str):
-            refuse(f"entry {str(key)[:60]!r} is no pair of a number and a name", path, ALLOWED_JSON, "wrong_format")
+            refuse(f"entry {str(key)[:60]!r} is not a pair of a number and a name", path, ALLOWED_JSON, "wrong_format")
         yield _Entry(str(number), name, str(path))
 
 

@@ -172,7 +172,7 @@ def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes],
     allowed = f"{', '.join(BUILT_IN)}, a table of names ({', '.join(NAME_ENDINGS)}), or a .seg.nrrd with names"
     if naming is None or naming == OWN_NAMES:
         if labelmap.names is None:
-            refuse("the label map holds no names", labelmap.path, allowed, "labels_without_names")
+            refuse("the label map has no names", labelmap.path, allowed, "labels_without_names")
         return _unique(labelmap.names, labelmap.path)
     if naming in BUILT_IN:
         return dict(BUILT_IN[naming])
@@ -231,7 +231,7 @@ def select(
     missing = [names[label] for label, rule in zip(sorted(present), rules, strict=True) if rule is None]
     if missing:
         allowed = "a pattern in avoid, unknown, traverse, target or ignore for each"
-        refuse(f"no rule names these labels, which are present: {_listed(missing)}", where, allowed, "no_rule")
+        refuse(f"no rule covers these labels, which are present: {_listed(missing)}", where, allowed, "no_rule")
     here = [names[label] for label in present]
     unused = [p for p in patterns if not any(fnmatchcase(name, p.pattern) for name in here)]
     absent = [f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused]
@@ -251,7 +251,7 @@ def _refuse_unknown(patterns: Sequence[LabelRule], names: Mapping[int, str], whe
         if rule.pattern != REST and not any(fnmatchcase(name, rule.pattern) for name in names.values()):
             near = difflib.get_close_matches(rule.pattern.strip("*?"), names.values(), n=3, cutoff=0.4)
             allowed = f"names like {', '.join(near)}" if near else f"one of {_listed(sorted(names.values()))}"
-            refuse(f"{rule.kind} pattern {rule.pattern!r} matches no name of the naming", where, allowed, "no_match")
+            refuse(f"{rule.kind} pattern {rule.pattern!r} matches no name in the naming", where, allowed, "no_match")
 
 
 def specificity(pattern: str, name: str) -> float:
@@ -272,8 +272,8 @@ def _rule(label: int, name: str, patterns: Sequence[LabelRule], where: str | Pat
     first = max(closest, key=lambda p: p.margin_mm)
     other = next((p for p in closest if p.kind is not first.kind), None)
     if other is not None:
-        what = f"label {name!r} is named by {first.kind} {first.pattern!r} and by {other.kind} {other.pattern!r}"
-        refuse(what, where, "one of the two, or its full name under the kind that is meant", "two_roles")
+        what = f"label {name!r} is matched by {first.kind} {first.pattern!r} and by {other.kind} {other.pattern!r}"
+        refuse(what, where, "one of the two, or its full name under the intended kind", "two_roles")
     return LabelRule(label, name, first.kind, first.margin_mm, first.pattern)
 
 
@@ -286,8 +286,8 @@ def _weaker_warnings(rule: LabelRule, patterns: Sequence[LabelRule], where: str 
         if overruled and (rule.kind not in DEMANDING or other.margin_mm > rule.margin_mm):
             applies = f"{rule.kind} {rule.pattern!r}"
             yield (
-                f"{where}: {rule.name!r} is named by {applies} and by {other.kind} {other.pattern!r} = "
-                f"{other.margin_mm:g}; the more specific holds: {applies}, {rule.margin_mm:g} mm"
+                f"{where}: {rule.name!r} is matched by {applies} and by {other.kind} {other.pattern!r} = "
+                f"{other.margin_mm:g}; the more specific applies: {applies}, {rule.margin_mm:g} mm"
             )
 
 
@@ -344,7 +344,8 @@ class ByName(Generic[T]):
         """
         names, known = list(names), [*names, *others]
         if missing := [name for name in names if self.of(name) is None]:
-            refuse(f"{key}: nothing for {first_few(missing)}", where, 'a pattern for each; "*" is the rest', "no_rule")
+            allowed = 'a pattern for each; "*" matches the rest'
+            refuse(f"{key}: no pattern for {first_few(missing)}", where, allowed, "no_rule")
         for pattern in self.of_pattern:
             if not any(fnmatchcase(name, pattern) for name in known):
                 near = did_you_mean(pattern.strip("*?"), known)
@@ -359,5 +360,5 @@ def _refuse_contradiction(of_pattern: Mapping[str, T], name: str, key: str, wher
     best = max((specificity(pattern, name) for pattern in matching), default=0.0)
     equal = [pattern for pattern in matching if specificity(pattern, name) == best]
     if any(of_pattern[pattern] != of_pattern[equal[0]] for pattern in equal):
-        message = f"{key}: {' and '.join(map(repr, equal))} both name '{name}', and differ"
+        message = f"{key}: {' and '.join(map(repr, equal))} both match '{name}', with different values"
         refuse(message, where, "one pattern that is more specific than the others", "ambiguous_patterns")

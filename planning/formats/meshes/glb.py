@@ -17,12 +17,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.alias_generators import to_camel
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.errors import InputError, refuse, schema_words
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
 from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join
 
-_GLB_ALLOWED = "glTF, version 2: its length, then a JSON chunk and at most one BIN chunk, as long as they say"
+_GLB_ALLOWED = "glTF, version 2: its length, then a JSON chunk and at most one BIN chunk, of the stated lengths"
 _DOCUMENT_ALLOWED = "a glTF 2.0 document in JSON"
 _JSON_CHUNK, _BIN_CHUNK = b"JSON", b"BIN\0"
 TRIANGLES = 4
@@ -157,7 +157,7 @@ def _chunks(data: bytes, where: str) -> tuple[bytes, bytes]:
         length, kind = int.from_bytes(data[position : position + 4], "little"), data[position + 4 : position + 8]
         end = position + 8 + length
         if end > len(data):
-            refuse(f"chunk {kind!r} states {length} bytes, beyond the file's end", where, _GLB_ALLOWED, "file_cut")
+            refuse(f"chunk {kind!r} states {length} bytes, beyond the end of the file", where, _GLB_ALLOWED, "file_cut")
         chunks.append((kind, data[position + 8 : end]))
         position = end
     binaries = [body for kind, body in chunks if kind == _BIN_CHUNK]
@@ -173,7 +173,7 @@ def _parse(text: bytes, where: str) -> Document:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ascii(".".join(str(step) for step in first["loc"]))
-        what = f"{place}: {first['msg']}"
+        what = f"{place}: {schema_words(first)}"
         raise InputError(what, where=where, allowed=_DOCUMENT_ALLOWED, code="bad_value") from error
 
 
@@ -195,15 +195,15 @@ def _check_sizes(document: Document, size: int, where: str) -> None:
     """Hold the buffer against the BIN chunk, and the views against the buffer."""
     for buffer in document.buffers:
         if buffer.uri is not None:
-            what = f"the buffer lies outside of the BIN chunk ({buffer.uri[:60]!r})"
+            what = f"the buffer is outside the BIN chunk ({buffer.uri[:60]!r})"
             refuse(what, where, "one whole GLB file", "data_elsewhere")
         if buffer.byte_length > size:
-            what = f"buffer 0 states {buffer.byte_length} bytes, {size} are there"
-            refuse(what, where, "a buffer as long as it says", "size_mismatch")
+            what = f"buffer 0 states {buffer.byte_length} bytes, but has {size}"
+            refuse(what, where, "a buffer of the stated length", "size_mismatch")
     for index, view in enumerate(document.buffer_views):
         end = view.byte_offset + view.byte_length
         if view.buffer >= len(document.buffers) or end > document.buffers[view.buffer].byte_length:
-            what = f"bufferView {index} ends at byte {end} of buffer {view.buffer}, which does not reach there"
+            what = f"bufferView {index} ends at byte {end} of buffer {view.buffer}, beyond its end"
             refuse(what, where, "views inside their buffer", "size_mismatch")
 
 
@@ -257,12 +257,12 @@ class _Glb:
                 what = f"node {index} uses mesh {node.mesh}"
                 refuse(what, self.where, f"one of the {len(meshes)} meshes", "index_out_of_range")
             if index not in T_scene_node:
-                what = f"node {index} holds a mesh but is not in the scene"
+                what = f"node {index} has a mesh but is not in the scene"
                 refuse(what, self.where, "every mesh in the one scene", "mesh_not_placed")
             placed.append((node.mesh, T_scene_node[index]))
         lost = set(range(len(meshes))) - {mesh for mesh, _ in placed}
         if lost or not placed:
-            what = f"mesh {min(lost)} is placed by no node" if lost else "no mesh"
+            what = f"mesh {min(lost)} is not used by any node" if lost else "no mesh"
             refuse(what, self.where, "at least one mesh, each placed by a node of the scene", "mesh_not_placed")
         return placed
 
@@ -270,7 +270,7 @@ class _Glb:
         """The transform of every node that is below the scene's top."""
         scenes, nodes = self.document.scenes, self.document.nodes
         if self.document.scene is None and len(scenes) != 1:
-            refuse(f"{len(scenes)} scenes and none of them chosen", self.where, _TREE_ALLOWED, "several_scenes")
+            refuse(f"{len(scenes)} scenes, none of them chosen", self.where, _TREE_ALLOWED, "several_scenes")
         number = self.document.scene or 0
         if number >= len(scenes):
             refuse(f"scene {number} of {len(scenes)}", self.where, _TREE_ALLOWED, "index_out_of_range")
@@ -279,7 +279,7 @@ class _Glb:
         while waiting:
             index, T_scene_parent = waiting.pop()
             if index >= len(nodes) or index in found:
-                refuse(f"node {index} is missing, or reached twice", self.where, _TREE_ALLOWED, "not_a_tree")
+                refuse(f"node {index} is missing or used twice", self.where, _TREE_ALLOWED, "not_a_tree")
             found[index] = T_scene_parent @ _local(nodes[index], f"{self.where}, node {index}")
             waiting.extend((child, found[index]) for child in nodes[index].children)
         return found
@@ -289,12 +289,12 @@ class _Glb:
         sizes = [self._size(mesh) for mesh in self.document.meshes]
         total = _Size(*(sum(sizes[mesh][kind] for mesh, _ in placed) for kind in range(3)))
         if total.parts > MAX_PARTS:
-            refuse(f"{total.parts} parts in all places", self.where, f"at most {MAX_PARTS}", "too_many")
+            refuse(f"{total.parts} parts in all instances", self.where, f"at most {MAX_PARTS}", "too_many")
         size = len(self.binary)
         vertices = min(MAX_VERTICES, size // _VERTEX_BYTES + MAX_REPEATED_VERTICES)
         triangles = min(MAX_TRIANGLES, size // _TRIANGLE_BYTES + MAX_REPEATED_VERTICES // 3)
         if total.triangles > triangles or total.vertices > vertices:
-            what = f"{total.triangles} triangles and {total.vertices} vertices in all places"
+            what = f"{total.triangles} triangles and {total.vertices} vertices in all instances"
             refuse(what, self.where, f"at most {triangles} and {vertices} from {size} bytes of data", "too_many")
 
     def _size(self, mesh: Mesh) -> _Size:

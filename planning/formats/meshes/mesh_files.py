@@ -46,7 +46,7 @@ _READERS: Mapping[str, Callable[[bytes, str], RawMesh]] = MappingProxyType(
     {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": _read_glb, ".vtp": read_vtp, ".vtk": read_vtk}
 )
 
-UP_NOT_STATED = "glTF's rule says that y is up, some programs write z up, and the file does not tell"
+UP_NOT_STATED = "the glTF standard says y is up, some programs write z up, and the file does not state it"
 
 _STATEMENT = re.compile(rb"\bSPACE=(LPS|RAS)\b")
 
@@ -120,7 +120,7 @@ def parse_mesh(
 def _z_up(vertices: NDArray[np.float64], up: Up | None, path: Path) -> NDArray[np.float64]:
     """Points (n, 3) of a file, rotated by a quarter about x where its y is up."""
     if up is None and path.suffix.lower() == ".glb":
-        allowed = 'up = "y" (turned to z up) or up = "z" (kept as it is), or another format'
+        allowed = 'up = "y" (rotated to z up) or up = "z" (kept as it is), or another format'
         refuse(UP_NOT_STATED, path, allowed, "up_not_stated")
     return vertices if up is not Up.Y else vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
 
@@ -136,7 +136,7 @@ def _actual_space(stated: Space, space: Space, *, default: bool, where: str) -> 
         return space
     if default and space is not Space.LOCAL:
         return stated
-    allowed = 'space = "local" where that is meant' if space is Space.LOCAL else f'space = "{stated}"'
+    allowed = 'space = "local" if intended' if space is Space.LOCAL else f'space = "{stated}"'
     what = f"the file states SPACE={stated}, the case {space}"
     raise InputError(what, where=where, allowed=allowed, code="other_space")
 
@@ -163,7 +163,7 @@ def mesh_extent(path: Path) -> MeshExtent:
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     raw = reader(data, str(path))
     if not np.isfinite(raw.vertices).all() or len(raw.vertices) == 0:
-        refuse("a vertex is not finite, or there is none", path, "finite vertices", "not_finite")
+        refuse("no vertex, or one that is not finite", path, "finite vertices", "not_finite")
     box = np.stack([raw.vertices.min(axis=0), raw.vertices.max(axis=0)]).astype(np.float64)
     return MeshExtent(box, raw.space or _stated_space(data))
 
@@ -189,13 +189,15 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
         warnings.append(f"{name}: {flat} of {len(mesh.faces)} triangles have no area (kept)")
     if not mesh.closed:
         warnings.append(
-            f"{name}: open mesh: inside or outside cannot be known, only the distance to its surface; "
-            "if it should be closed, the file may be incomplete"
+            f"{name}: open mesh: only the distance to its surface is known, not inside or outside; if it should be "
+            "closed, the file may be incomplete"
         )
     elif not mesh.wound_alike:
-        warnings.append(f"{name}: triangles are given twice or wound against their neighbours: inside is found by rays")
+        warnings.append(
+            f"{name}: duplicate triangles, or triangles wound against their neighbours: inside is found with rays"
+        )
     elif mesh.volume < 0.0:
-        warnings.append(f"{name}: inverted normals: they point inward (was it mirrored?); inside is found without them")
+        warnings.append(f"{name}: inverted normals, pointing inward (was it mirrored?); inside is found without them")
     return tuple(warnings)
 
 

@@ -37,7 +37,9 @@ def read_obj(data: bytes, where: str) -> RawMesh:
     """
     text = decode_text(data, where)
     if not text.endswith("\n"):
-        refuse("the last line has no line end: the file may be cut", where, "a line end after every line", "file_cut")
+        refuse(
+            "the last line has no line end: the file may be truncated", where, "a line end after every line", "file_cut"
+        )
     content = _Content()
     text = text.replace("\\\r\n", " ").replace("\\\n", " ")
     for number, line in enumerate(text.split("\n"), start=1):
@@ -85,10 +87,10 @@ def _corner(token: str, n_vertices: int, where: str) -> int:
 def _check_complete(content: _Content, text: str, where: str) -> None:
     unused = len(content.vertices) - len(set(content.corners))
     if unused:
-        what = f"{unused} vertices that no face uses: the face list may be cut"
+        what = f"{unused} vertices are not used by any face: the face list may be truncated"
         allowed = "an OBJ whose faces use every vertex, or a format that states its counts"
         refuse(what, where, allowed, "unused_vertices")
     stated = sum(int(first or second) for first, second in _STATED_COUNT.findall(text))
     if stated > len(content.counts):
-        what = f"comments count {stated} faces, {len(content.counts)} are there"
-        refuse(what, where, "as many as counted", "size_mismatch")
+        what = f"comments state {stated} faces, but there are {len(content.counts)}"
+        refuse(what, where, "as many as stated", "size_mismatch")

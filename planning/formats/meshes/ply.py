@@ -81,7 +81,7 @@ def read_ply(data: bytes, where: str) -> RawMesh:
             refuse("triangle strips", where, "an element face with lists of vertex indices", "unsupported_feature")
     cursor.check_end()
     if vertices is None or faces is None:
-        refuse("no element vertex, or none face", where, _ALLOWED, "bad_header")
+        refuse("no element vertex, or no element face", where, _ALLOWED, "bad_header")
     return RawMesh(vertices, triangulate(faces.values.astype(np.int64), faces.counts, where))
 
 
@@ -117,7 +117,7 @@ def _elements(lines: list[list[str]], order: str, *, is_ascii: bool, where: str)
     names = [element.name for element in elements]
     for each in [names, *([p.name for p in element.properties] for element in elements)]:
         if len(set(each)) != len(each) or not each:
-            refuse(f"header names {each} repeat, or are missing", where, _ALLOWED, "bad_header")
+            refuse(f"header names {each} are repeated or missing", where, _ALLOWED, "bad_header")
     return elements
 
 
@@ -129,12 +129,14 @@ def _dtype(kind: str, order: str, is_ascii: bool, where: str) -> np.dtype[Any]:
 
 def _ascii_as_doubles(body: bytes, where: str) -> bytes:
     if not body.endswith(b"\n"):
-        refuse("the last line has no line end: the file may be cut", where, "a line end after every line", "file_cut")
+        refuse(
+            "the last line has no line end: the file may be truncated", where, "a line end after every line", "file_cut"
+        )
     tokens = token_array(decode_text(body, where).split(), where)
     try:
         return tokens.astype("<f8").tobytes()
     except ValueError as error:
-        what = f"the data holds no number ({error})"
+        what = f"the data have no number ({error})"
         raise InputError(what, where=where, allowed=_ALLOWED, code="not_a_number") from error
 
 
@@ -151,7 +153,7 @@ class _Cursor:
         smallest = sum((p.count_dtype or p.dtype).itemsize for p in element.properties)
         left = len(self.body) - self.position
         if smallest * element.rows > left:
-            what = f"{element.rows} x {element.name} take at least {smallest * element.rows} bytes, {left} are left"
+            what = f"{element.rows} x {element.name} take at least {smallest * element.rows} bytes, but {left} are left"
             refuse(what, self.where, _ALLOWED, "file_cut")
         if element.rows == 0:
             return {}
@@ -184,7 +186,7 @@ class _Cursor:
             stated = np.frombuffer(self.body, prop.count_dtype, 1, position)[0]
             if not 0 <= stated <= len(self.body) or stated != int(stated):
                 what = f"{prop.name} of length {stated}"
-                refuse(what, self.where, "lengths from 0, whole, inside the file", "out_of_range")
+                refuse(what, self.where, "whole lengths from 0, inside the file", "out_of_range")
             length = int(stated)
         if start + length * prop.dtype.itemsize > len(self.body):
             refuse(f"data ends inside {prop.name}", self.where, _ALLOWED, "file_cut")

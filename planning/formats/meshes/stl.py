@@ -63,7 +63,7 @@ def _read_ascii(data: bytes, where: str) -> RawMesh:
         refuse(f"the last line is {lines[-1][:40]!r}: the file is cut", where, _ASCII_ALLOWED, "file_cut")
     tokens = " ".join(lines[1:-1]).lower().split()
     if "endsolid" in tokens:
-        refuse("several solids, of which a cut file would lose some", where, _ASCII_ALLOWED, "several_solids")
+        refuse("several solids: a truncated file could lose some", where, _ASCII_ALLOWED, "several_solids")
     if len(tokens) == 0:
         refuse("the solid has no facet", where, _ASCII_ALLOWED, "empty")
     _check_keywords(tokens, where)
@@ -73,7 +73,7 @@ def _read_ascii(data: bytes, where: str) -> RawMesh:
     try:
         corners = np.array([[float(token) for token in column] for column in columns])
     except ValueError as error:
-        what = f"a coordinate is no number ({error})"
+        what = f"a coordinate is not a number ({error})"
         raise InputError(what, where=where, allowed=_ASCII_ALLOWED, code="not_a_number") from error
     return _from_corners(corners.T.reshape(-1, 3, 3))
 

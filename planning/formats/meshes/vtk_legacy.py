@@ -58,13 +58,13 @@ def read_vtk(data: bytes, where: str) -> RawMesh:
     cursor.line()  # the title, which anything may be
     form = cursor.line().strip().upper()
     if version is None or form not in (b"ASCII", b"BINARY"):
-        refuse("no header of a legacy VTK file", where, _ALLOWED, "wrong_format")
+        refuse("not a legacy VTK file", where, _ALLOWED, "wrong_format")
     cursor.is_ascii = form == b"ASCII"
     if cursor.words() != ["DATASET", "POLYDATA"]:
-        refuse("the data set is no POLYDATA", where, _ALLOWED, "wrong_format")
+        refuse("the data set is not POLYDATA", where, _ALLOWED, "wrong_format")
     points, polygons = _sections(cursor, offsets=int(version[1]) >= _OFFSETS_SINCE, where=where)
     if points is None or polygons is None:
-        refuse("no points or no polygons: the file is cut, or holds no surface", where, _ALLOWED, "empty")
+        refuse("no points or no polygons: the file is truncated, or has no surface", where, _ALLOWED, "empty")
     if polygons.corners.min() < 0 or polygons.corners.max() >= len(points):
         what = f"vertex indices {polygons.corners.min()} to {polygons.corners.max()}"
         refuse(what, where, f"0 to {len(points) - 1}", "index_out_of_range")
@@ -111,7 +111,7 @@ def _cells(cursor: _Cursor, words: list[str], *, offsets: bool, where: str) -> _
         _find_starts(table, starts, where)
     counts = table[starts]
     if int(counts.sum()) + first != size:
-        refuse(f"{first} cells that do not fill their {size} numbers", where, _ALLOWED, "size_mismatch")
+        refuse(f"{first} cells that do not match their {size} numbers", where, _ALLOWED, "size_mismatch")
     keep = np.ones(size, bool)
     keep[starts] = False
     return _Polygons(table[keep], counts)
@@ -136,7 +136,7 @@ def _offset_cells(cursor: _Cursor, first: int, size: int, where: str) -> _Polygo
     if first == 0:
         return _Polygons(corners[:0], corners[:0])
     if ends[0] != 0 or ends[-1] != size or (np.diff(ends) < 1).any():
-        refuse("offsets that do not rise from 0 to the number of corners", where, _ALLOWED, "bad_offsets")
+        refuse("offsets do not rise from 0 to the number of corners", where, _ALLOWED, "bad_offsets")
     return _Polygons(corners, np.diff(ends))
 
 
@@ -209,7 +209,7 @@ class _Cursor:
     def _from_bytes(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
         size = count * dtype.itemsize
         if self._at + size > len(self._data):
-            what = f"{count} numbers of {size} bytes do not fit into the file: it is cut"
+            what = f"{count} numbers of {size} bytes do not fit into the file: it is truncated"
             refuse(what, self._where, _ALLOWED, "file_cut")
         values = np.frombuffer(self._data, dtype, count, self._at)
         self._at += size
@@ -226,5 +226,5 @@ class _Cursor:
         try:
             return np.array(words, dtype=np.bytes_).astype(dtype)
         except (ValueError, OverflowError) as error:
-            what = f"no number ({error})"
+            what = f"not a number ({error})"
             raise InputError(what, where=self._where, allowed=_ALLOWED, code="not_a_number") from error

@@ -233,7 +233,7 @@ def _from_text(text: str, dtype: np.dtype[Any], where: str) -> NDArray[Any]:
             return token_array(text.split(), where).astype(np.float64)
         return np.array([int(token) for token in text.split()], dtype=dtype)
     except (ValueError, OverflowError) as error:
-        what = f"no number of type {dtype} ({error})"
+        what = f"not a number of type {dtype} ({error})"
         raise InputError(what, where=where, allowed=_ALLOWED_ARRAYS, code="not_a_number") from error
 
 

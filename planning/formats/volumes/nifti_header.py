@@ -108,8 +108,8 @@ def _scaling(fields: _Fields, path: Path) -> tuple[float, float]:
     if slope == 0.0 and intercept == 0.0:
         return 1.0, 0.0
     if abs(slope) <= LEAST_SLOPE:
-        what = f"scl_slope {slope:g} with scl_inter {intercept:g}: some programs scale by it and others do not"
-        refuse(what, path, "both 0, or a slope that is not", "scaling_ambiguous")
+        what = f"scl_slope {slope:g} with scl_inter {intercept:g}: some programs apply the slope, others do not"
+        refuse(what, path, "both 0, or a slope other than 0", "scaling_ambiguous")
     return slope, intercept
 
 
@@ -118,7 +118,7 @@ def _parse(data: bytes, path: Path) -> _Fields:
         refuse(f"the file ends inside the header ({len(data)} bytes)", path, PLAIN, "file_cut")
     order = {348: "<", 1543569408: ">"}.get(struct.unpack_from("<i", data, 0)[0])
     if order is None or data[344:348] != b"n+1\0":
-        refuse("no NIfTI-1 header (header size and magic 'n+1')", path, PLAIN, "wrong_format")
+        refuse("not a NIfTI-1 header (header size and magic 'n+1')", path, PLAIN, "wrong_format")
 
     def get(layout: str, offset: int) -> tuple[float, ...]:
         return struct.unpack_from(order + layout, data, offset)
@@ -157,7 +157,7 @@ def _affine(fields: _Fields, shape: tuple[int, int, int], path: Path) -> NDArray
     if not (np.isfinite(fields.pixdim[1:4]).all() and min(fields.pixdim[1:4]) > 0):
         refuse(f"pixdim {fields.pixdim[1:4]}", path, "positive voxel sizes", "not_positive")
     if fields.sform_code <= 0 and fields.qform_code <= 0:
-        what = "neither sform nor qform is set (both codes 0): the file does not say its space"
+        what = "neither sform nor qform is set (both codes 0): the file does not state its space"
         refuse(what, path, "sform_code or qform_code > 0", "space_not_stated")
     candidates = []
     if fields.sform_code > 0:
@@ -178,7 +178,7 @@ def _check_pixdim(T_ct_index: NDArray[np.float64], pixdim_mm: NDArray[np.float64
         spacing = np.linalg.norm(T_ct_index[:3, :3], axis=0)
     plausible = np.isfinite(spacing).all() and spacing.min() > 0
     if plausible and np.abs(spacing / pixdim_mm - 1).max() > PIXDIM_TOLERANCE:
-        what = f"pixdim says voxels of {pixdim_mm.round(4)} mm, the sform {spacing.round(4)} mm"
+        what = f"pixdim states voxels of {pixdim_mm.round(4)} mm, the sform {spacing.round(4)} mm"
         refuse(what, path, f"both agree within {PIXDIM_TOLERANCE:.1%}", "geometry_contradicted")
 
 

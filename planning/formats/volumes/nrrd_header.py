@@ -72,7 +72,7 @@ def split_header(content: bytes, path: Path) -> NrrdText:
     """
     head = content[:MAX_HEADER_BYTES]
     if re.match(rb"NRRD000[1-5]\r?\n", head) is None:
-        refuse("no NRRD header (magic NRRD0001 to NRRD0005)", path, "a .nrrd or .nhdr file", "wrong_format")
+        refuse("not a NRRD header (magic NRRD0001 to NRRD0005)", path, "a .nrrd or .nhdr file", "wrong_format")
     end = re.search(rb"\n\r?\n", head)
     if end is None and len(head) == MAX_HEADER_BYTES:
         refuse("the header has no end", path, f"at most {MAX_HEADER_BYTES} bytes", "bad_header")
@@ -103,7 +103,7 @@ def _lines(lines: list[str], path: Path) -> tuple[dict[str, str], dict[str, str]
         if not mark or key not in KNOWN_FIELDS:
             refuse(f"unknown header line {line[:60]!r}", where, ", ".join(sorted(KNOWN_FIELDS)), "unknown_line")
         if key in fields:
-            refuse(f"the field {field!r} stands twice", where, "each field once", "duplicate_key")
+            refuse(f"the field {field!r} appears twice", where, "each field once", "duplicate_key")
         fields[key] = value.strip()
     return fields, remarks
 
@@ -176,7 +176,7 @@ LAYER_KINDS = frozenset(("list", "vector"))
 """What Slicer calls the axis of its layers: "list"; older versions "vector"."""
 MAX_LAYERS = 1000
 """A layer more is needed only where another segment overlaps all the layers before."""
-UNNAMED_SPACE = "its header names no patient space; read as LPS, as ITK and Slicer do"
+UNNAMED_SPACE = "its header states no patient space; read as LPS, as in ITK and Slicer"
 
 
 def parse_nrrd_header(content: bytes, path: Path) -> VolumeHeader:
@@ -228,7 +228,7 @@ def _without_last(raw: NrrdText) -> NrrdText:
 def _wrong_dimension(fields: dict[str, str], path: Path) -> InputError:
     stated = fields.get("dimension")
     if stated == "4":
-        what = 'dimension 4: segments that overlap lie in layers; name such a file in [[structures]] seg = "FILE"'
+        what = 'dimension 4: overlapping segments are in layers; give such a file in [[structures]] seg = "FILE"'
         return InputError(what, where=path, allowed="dimension: 3, or a .seg.nrrd as seg", code="wrong_dimension")
     return InputError(f"dimension {stated}", where=path, allowed="dimension: 3", code="wrong_dimension")
 
@@ -252,7 +252,7 @@ def _layers(raw: NrrdText, path: Path) -> int:
     directions = raw.fields.get("spacedirections", "")
     if not (kinds and kinds[0] in LAYER_KINDS and sizes and directions.startswith("none")):
         allowed = "kinds: list domain domain domain, space directions: none (...)"
-        refuse("dimension 4 whose first axis is none of layers", path, allowed, "wrong_dimension")
+        refuse("dimension 4, but the first axis is not one of layers", path, allowed, "wrong_dimension")
     layers = whole_number(sizes[0], path)
     if not 1 <= layers <= MAX_LAYERS:
         refuse(f"{layers} layers", path, f"1 to {MAX_LAYERS}", "out_of_range")
@@ -294,7 +294,7 @@ def _affine(fields: dict[str, str], path: Path) -> NDArray[np.float64]:
     space = _space(fields, path)
     if space not in LPS_SIGNS:
         allowed = "left-posterior-superior, right-anterior-superior, left-anterior-superior"
-        refuse(f"space {space!r} is not patient space", path, allowed, "unknown_space")
+        refuse(f"space {space!r} is not a patient space", path, allowed, "unknown_space")
     directions = _vectors(stated_field(fields, "spacedirections", path), 3, path)
     origin = _vectors(stated_field(fields, "spaceorigin", path), 1, path)
     T = np.eye(4)
@@ -336,7 +336,7 @@ def _check_axes(fields: dict[str, str], path: Path) -> None:
         refuse(f"kinds {fields['kinds'][:80]!r}", path, "domain domain domain", "unsupported_feature")
     for key in ("axismins", "axismaxs"):
         if set(fields.get(key, "nan").lower().split()) != {"nan"}:
-            refuse(f"{key} beside a space", path, "space origin and space directions alone", "stated_twice")
+            refuse(f"{key} together with a space", path, "only space origin and space directions", "stated_twice")
 
 
 def _cells(raw: NrrdText, path: Path) -> VoxelLayout:
@@ -359,5 +359,5 @@ def _dtype(fields: dict[str, str], encoding: str, path: Path) -> np.dtype[Any]:
         return dtype
     order = {"little": "<", "big": ">"}.get(fields.get("endian", "").lower())
     if order is None:
-        refuse("the byte order is not said", path, "endian: little or big", "missing_key")
+        refuse("the byte order is not stated", path, "endian: little or big", "missing_key")
     return np.dtype(order + name)

@@ -119,7 +119,7 @@ def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volum
     try:
         values = _scaled(decoded(memoryview(stored), header), header.cells)
     except MemoryError as error:
-        what = "it does not fit this machine's memory"
+        what = "the volume does not fit into the memory of this machine"
         raise InputError(what, where=path, allowed="a smaller one", code="out_of_memory") from error
     if values.dtype.kind == "f" and not np.isfinite(values).all():
         refuse("a voxel is NaN or infinite", path, "finite values", "not_finite")

@@ -119,7 +119,7 @@ def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.
     """
     T = np.array(T_ct_index, dtype=np.float64)
     if not np.isfinite(T).all():
-        refuse("the affine holds NaN or infinity", where, "finite numbers", "not_finite")
+        refuse("the affine has NaN or infinity", where, "finite numbers", "not_finite")
     with np.errstate(over="ignore"):  # float32 headers reach 1e38; the spacing check below refuses them
         spacing = np.linalg.norm(T[:3, :3], axis=0)
     if not np.all((spacing >= MIN_SPACING_MM) & (spacing <= MAX_SPACING_MM)):
@@ -161,10 +161,10 @@ def refuse_lost_grid(labels: VolumeGrid, image: VolumeGrid, *, where: Path) -> N
     if sorted(labels.shape) == sorted(image.shape) and not labels.T_ct_index[:3, 3].any() and apart > ONE_PLACE_MM:
         sizes, steps = (" x ".join(f"{one:.4g}" for one in some) for some in (labels.shape, labels.spacing_mm))
         what = (
-            f"has the CT's {sizes} voxels, but begins at 0, 0, 0 in steps of {steps} mm, up to {apart:.0f} mm away: "
-            "where its voxels lie was lost"
+            f"has the CT's {sizes} voxels, but starts at 0, 0, 0 in steps of {steps} mm, up to {apart:.0f} mm away: "
+            "the position of its voxels was lost"
         )
-        refuse(what, where, "labels on the grid of their CT: copy its origin, spacing and direction", "grid_lost")
+        refuse(what, where, "labels on the grid of their CT: copy the CT's origin, spacing and direction", "grid_lost")
 
 
 def check_exact_size(actual: int, promised: int, *, where: Path) -> None:
@@ -174,6 +174,6 @@ def check_exact_size(actual: int, promised: int, *, where: Path) -> None:
         InputError: The two sizes (bytes) differ.
     """
     if actual != promised:
-        kind = "cut short" if actual < promised else "longer than its header says"
-        what = f"the file is {kind}: {actual} bytes where the header promises {promised}"
+        kind = "cut short" if actual < promised else "longer than its header states"
+        what = f"the file is {kind}: {actual} bytes, but the header states {promised}"
         refuse(what, where, "a complete file", "size_mismatch")

@@ -39,7 +39,7 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
         InputError: Damaged, truncated, or of another length.
     """
     if promised > len(content) * DEFLATE_RATIO:
-        what = f"{len(content)} compressed bytes cannot hold the {promised} bytes that the header promises"
+        what = f"{len(content)} compressed bytes cannot hold the {promised} bytes that the header states"
         refuse(what, where, "a complete file", "size_mismatch")
     found = np.empty(promised, np.uint8)
     count = 0
@@ -82,7 +82,7 @@ def _parts(content: memoryview, most: int) -> Iterator[bytes]:
             if at == len(content) or (content[at] == 0 and not any(content[at:])):
                 most = len(part)
         elif not part and not waiting:
-            raise EOFError("the data end before their end mark")
+            raise EOFError("the data end before their end marker")
         most -= len(part)
         if part:
             yield part
@@ -127,7 +127,7 @@ def _numbers(text: bytes, count: int, dtype: np.dtype[Any], where: Path) -> NDAr
     allowed = f"plain numbers of type {dtype}"
     pattern = FLOAT_TEXT if dtype.kind == "f" else INTEGER_TEXT
     if len(text) > count * TEXT_BYTES or pattern.fullmatch(text) is None:
-        refuse("the data hold something else than numbers", where, allowed, "not_a_number")
+        refuse("the data have values other than numbers", where, allowed, "not_a_number")
     words = text.split()
     check_exact_size(len(words), count, where=where)
     try:
@@ -135,5 +135,5 @@ def _numbers(text: bytes, count: int, dtype: np.dtype[Any], where: Path) -> NDAr
         with np.errstate(over="ignore"):  # what becomes infinite is refused
             return np.array(numbers, dtype=dtype)
     except (ValueError, OverflowError) as error:
-        what = f"the data hold no number of their type ({error})"
+        what = f"the data have no number of their type ({error})"
         raise InputError(what, where=where, allowed=allowed, code="not_a_number") from error

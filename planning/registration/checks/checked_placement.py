@@ -43,14 +43,14 @@ MAX_APART_MM = 5.0
 """Markers and a transform that differ by more, and by more than both errors explain, are of two patients or robots."""
 
 CAUSES = (
-    "the usual causes are a transform that goes the other way (transform_maps), other axes at the robot (base_axes; a "
-    "URDF's base_link is turned likewise), and a transform of another image"
+    "the usual causes are a transform in the other direction (transform_maps), other axes at the robot (base_axes; a "
+    "URDF's base_link is rotated in this way), and a transform of another image"
 )
-MARKERS_TELL = " (markers_ct and markers_base beside it measure it)"
-BOX_TELLS = " (so does what the patient lies on, as an obstacle of frame base)"
+MARKERS_TELL = " (markers_ct and markers_base with it would check it)"
+BOX_TELLS = " (so does the patient support, as an obstacle of frame base)"
 """What makes a warning needless."""
 
-ALLOWED = "a transform between this CT and this robot's base, with transform_maps and base_axes as it was saved"
+ALLOWED = "a transform between this CT and this robot's base, with transform_maps and base_axes as saved"
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ def _reading(case: Case, skin: TriangleMesh, keys: str, T_base_ct: Floats) -> Re
 def _better(others: Sequence[Reading]) -> str:
     """Which other readings nothing speaks against, as the end of a sentence."""
     plausible = [one for one in others if one.plausible]
-    return f"; plausible would be {_named(plausible)}" if plausible else "; no other reading of these keys is plausible"
+    return f"; alternatives: {_named(plausible)}" if plausible else "; no other reading of these keys is plausible"
 
 
 def _named(readings: Sequence[Reading]) -> str:
@@ -170,8 +170,8 @@ def _doubts(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[F
         yield Finding("transform_unlikely", Severity.WARNING, said)
     elif better := [one for one in _rivals(given, others) if one.better_than(given) and not given.better_than(one)]:
         said = (
-            f"registration: more usual than what is stated ({given.text()}; place.up says which way is up) would be "
-            f"{_named(better)}: {CAUSES}"
+            f"registration: {_named(better)} would be more usual than the stated keys ({given.text()}; place.up sets "
+            f"which way is up): {CAUSES}"
         )
         yield Finding("transform_unlikely", Severity.WARNING, said)
 
@@ -185,7 +185,8 @@ def _alike(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[Fi
         away = [np.linalg.norm(apply(one.T_base_ct - given.T_base_ct, case.target_ct)) for one in alike]
         named = ", ".join(f"{one.keys} ({mm:.0f} mm away)" for one, mm in zip(alike, away, strict=True))
         said = (
-            f"registration: nothing tells the stated transform from other readings, by which the target is elsewhere: "
+            "registration: the stated transform cannot be distinguished from other readings, which place the target "
+            "elsewhere: "
             f"{named}{BOX_TELLS}"
         )
         yield Finding("transform_alike", Severity.WARNING, said)
@@ -204,15 +205,15 @@ def _held_against_markers(case: Case, registration: Registration, given: Reading
     """
     found = _apart(case, registration, given.T_base_ct)
     said = (
-        f"the markers put {found.where} {found.apart_mm:.1f} mm from where the stated transform puts it; expected of "
-        f"them there are {found.expected_mm:.1f} mm (rms)"
+        f"the markers put {found.where} {found.apart_mm:.1f} mm from its position by the stated transform; expected "
+        f"from the markers there: {found.expected_mm:.1f} mm (rms)"
     )
     if found.contradicts:
         fitting = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
         better = "".join(f"; with {one.keys} they agree" for one in fitting)
         _refuse(case, f"{said}: {CAUSES}{better}")
     doubt = ", more than their errors explain" if found.unexplained else ""
-    said = f"registration: stated transform: {said}{doubt}; its own expected error is unknown"
+    said = f"registration: stated transform: {said}{doubt}; the transform's own expected error is unknown"
     severity = Severity.WARNING if found.unexplained else Severity.NOTE
     return Finding("transform_and_markers", severity, said, {"apart_mm": found.apart_mm})
 

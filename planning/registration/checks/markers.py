@@ -23,6 +23,7 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -154,8 +155,8 @@ def marker_list(
 
 
 ALLOWED_NAMES = (
-    "markers without a symmetry, fle_mm as small as it is known, or registration.accept_symmetry = true once the "
-    "names have been checked at the patient"
+    "markers without symmetry, the smallest known fle_mm, or registration.accept_symmetry = true after you checked "
+    "the names at the patient"
 )
 
 
@@ -175,20 +176,20 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> Iterator[
     given = f"as named, FRE is {test.fre_mm:.2f} mm"
     if better:
         what = f"the marker names look permuted: {min(better, key=lambda one: one.fre_mm).text()}; {given}"
-        refuse(what, where, "the names as the markers were touched", "markers_permuted")
+        refuse(what, where, "the names in the order of the touches", "markers_permuted")
     excluded = [place_excluded(case, skin.mesh, one.T_base_ct) for one in found]
     possible = [one for one, why in zip(found, excluded, strict=True) if not why]
     if possible and not _accepted(case):
-        what = f"a slip in the marker names would pass unnoticed: {_worst(possible)}; {given}"
+        what = f"swapped marker names would go unnoticed: {_worst(possible)}; {given}"
         refuse(what, where, ALLOWED_NAMES, "markers_ambiguous")
     if not complete:
-        said = f"of {len(registration.markers)} markers only swaps of two names were tested"
+        said = f"with {len(registration.markers)} markers, only swaps of two names were tested"
         yield Finding("names_not_all_tested", Severity.WARNING, said)
     if possible:
         said = f"marker names: {_worst(possible)}; accepted by accept_symmetry, {given}"
         yield Finding("marker_names_alike", Severity.WARNING, said)
     elif found:
-        said = f"marker names: {_worst(found)}; told apart by this alone: then {excluded[0]}"
+        said = f"marker names: {_worst(found)}; excluded only because then {excluded[0]}"
         yield Finding("marker_names_alike", Severity.WARNING, said)
 
 
@@ -200,7 +201,7 @@ def _accepted(case: Case) -> bool:
 def _worst(found: Sequence[Renaming]) -> str:
     """The first, which puts the target farthest away, and how many more there are."""
     more = len(found) - 1
-    return found[0].text() + (f" (and {more} more permutation{'s' if more > 1 else ''})" if more else "")
+    return found[0].text() + (f" (and {plural(more, 'more permutation')})" if more else "")
 
 
 HALF_TURNS: Mapping[str, Signs] = MappingProxyType(
@@ -254,7 +255,8 @@ def check_axes(
         if not _excluded(slip, given):
             said = (
                 f"markers_ct with {name} would lie on the skin to {slip.fit.scatter_mm:.1f} mm rms, as given to "
-                f"{given.fit.scatter_mm:.1f} mm: too alike to tell, and the target would be {slip.target_mm:.0f} mm "
+                f"{given.fit.scatter_mm:.1f} mm: too similar to decide, and the target would be {slip.target_mm:.0f} "
+                "mm "
                 "away; check the axes of their file"
             )
             yield Finding("marker_axes_alike", Severity.WARNING, said, {"target_mm": slip.target_mm})
@@ -291,7 +293,7 @@ def _as_given(registration: Registration, given: MarkerList, slip: MarkerList) -
     if _worse(given.fit, slip.fit, level=REFUSING_LEVEL):
         return f"to {given.fit.scatter_mm:.1f} mm"
     row, before = given.behind[0]
-    return f"{registration.markers.names[row]} lies behind {before}, where no needle touches it"
+    return f"{registration.markers.names[row]} lies behind {before}, where no needle can touch it"
 
 
 def off_the_skin(registration: Registration, given: MarkerList) -> Iterator[Finding]:
@@ -310,13 +312,13 @@ def off_the_skin(registration: Registration, given: MarkerList) -> Iterator[Find
 LOCAL_AXES = Finding(
     "axes_not_checked",
     Severity.NOTE,
-    'space "local": nothing tells whether the axes of markers_ct have slipped by a half turn',
+    'space "local": a 180 degree rotation of the axes of markers_ct cannot be detected',
 )
 BASE_AXES = Finding(
     "axes_not_checked",
     Severity.NOTE,
-    "not checked: a half turn of markers_base (such as ROS base_link for the controller's base); residuals, skin and "
-    "couch are blind to it",
+    "not checked: a 180 degree rotation of markers_base (such as ROS base_link instead of the controller's base); "
+    "residuals, skin and couch cannot show it",
 )
 
 

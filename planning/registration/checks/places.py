@@ -137,10 +137,10 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
     """
     column = _column_ct(case, T_base_ct)
     if base_in_patient(case, skin, T_base_ct):
-        return "the robot's base would stand in the patient"
+        return "the robot's base would be in the patient"
     for box in _boxes_ct(case):
         if any(np.all(np.abs(point - box.center_mm) <= box.size_mm / 2) for point in column):
-            return f"the robot's base would stand in obstacle '{box.name}'"
+            return f"the robot's base would be in obstacle '{box.name}'"
     return "the target would be out of the arm's reach" if out_of_reach(case, T_base_ct) else ""
 
 
@@ -257,12 +257,12 @@ def _intersects(box: Obstacle, points: Floats, directions: Floats, length_mm: fl
 
 
 OF_MOUNT = (
-    "robot.mount: {what}; the usual causes are a position in other axes, from another origin or in another unit than "
-    "the case's, and axes of another robot"
+    "robot.mount: {what}; the usual causes are other axes, another origin or another unit than the case's, or the "
+    "axes of another robot"
 )
 OF_MARKERS = (
     "registration: by the markers {what}; the usual causes are touches in other axes than the base's (a URDF's "
-    "base_link is turned by half a turn), and lists of another patient or robot"
+    "base_link is rotated by 180 degrees), or lists of another patient or robot"
 )
 
 
@@ -287,7 +287,7 @@ def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> BasePlace:
     """
     impossible = ""
     if base_in_patient(case, skin, T_base_ct):
-        impossible = "the robot's base would stand in the patient"
+        impossible = "the robot's base would be in the patient"
     elif box := in_box(case, skin, T_base_ct):
         impossible = f"the patient would lie more than {ALLOWANCE_MM:g} mm deep in obstacle '{box}' or through it"
     bed = lying(case, skin, T_base_ct)

@@ -105,4 +105,4 @@ def test_the_command_prints_the_finding_and_knows_one_experiment():
     assert "REJECTED" in done.stdout
     assert "2.99 -> 1.28 mm" in done.stdout
     refused = CliRunner().invoke(app, ["reproduce", "liu2007", "--experiment"])
-    assert "no such experiment" in str(refused.exception)
+    assert "has no experiment" in str(refused.exception)

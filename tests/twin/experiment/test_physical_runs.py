@@ -59,9 +59,9 @@ def test_the_rms_is_over_the_runs_that_ended_and_refusals_are_named():
     ended = (PhysicalRun(0, 3.0, 1.0, 14.0, 0.02), PhysicalRun(1, 4.0, 1.0, 16.0, 0.01))
     runs = PhysicalRuns(1.8, (*ended, PhysicalRun(2, *4 * (math.nan,), "stopped")), 0, DRAWN)
     assert runs.realised_mm == pytest.approx(math.sqrt(12.5))
-    assert "2 physical runs (15.0 s a touch): the tip misses the target by 3.54 mm rms" in runs.text()
-    assert "without physics the same 2 truths give 3.50 mm, 400 truths 1.90 (known to 3.5 %)" in runs.text()
-    assert "at most 0.020 mm off the path" in runs.text()
+    assert "2 physical runs (15.0 s per touch): the tip misses the target by 3.54 mm rms" in runs.text()
+    assert "without physics, the same 2 trials give 3.50 mm, all 400 trials 1.90 (known to 3.5 %)" in runs.text()
+    assert "at most 0.020 mm off its commanded path" in runs.text()
     assert "seed 2: stopped" in runs.text()
     assert runs.summary()["refused"] == {2: "stopped"}
 
@@ -76,7 +76,7 @@ def test_a_contact_on_the_way_to_the_target_refuses_its_run_alone(monkeypatch):
         monkeypatch.setattr(module, name, lambda *_: None)
     monkeypatch.setattr(module, "rehearse_touched", lambda *_: SimpleNamespace(contacts=(contact,)))
     run = module._run(context, SimpleNamespace(outward_ct=None, q_insertion=None), 7)
-    assert run.refused == "the arm stopped on its way to the target: holder touches patient"
+    assert run.refused == "the arm stopped before the target: holder touches patient"
 
 
 def test_a_marker_that_is_not_touched_refuses_its_run_alone(monkeypatch):

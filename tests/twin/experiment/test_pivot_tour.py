@@ -121,7 +121,7 @@ def test_the_twin_finds_the_tip_of_its_arm(context, tmp_path, monkeypatch):
     [
         (["--poses", "3"], "3 poses; allowed: 4 to 12"),
         (["--at", "1,2"], "--at: 2 numbers"),
-        (["touch.csv", "--poses", "8"], "JOINTS.csv alone, or the twin's options"),
+        (["touch.csv", "--poses", "8"], "JOINTS.csv, or the options of the twin"),
     ],
 )
 def test_wrong_options_are_refused(arguments, said, tmp_path):

@@ -238,7 +238,7 @@ def through_tissue(control: str):
 
 def test_the_tissues_force_acts_on_the_needle_while_it_goes_in(exact):
     """A skin that ruptures at 4 N takes the tip .15 mm off its path at most; who yields to it, is off by F / K."""
-    assert exact.tissue_force is None and exact.off_path_mm < 0.05 and "declares none" in exact.force_text
+    assert exact.tissue_force is None and exact.off_path_mm < 0.05 and "declares no [tissue]" in exact.force_text
     done, yielding = through_tissue("impedance"), through_tissue("admittance")
     assert done.tissue_force.along_n == pytest.approx(4.0, rel=0.02) and done.tissue_force.across_n > 0.05
     assert 0.02 < done.off_path_mm <= 0.15
@@ -450,8 +450,8 @@ def test_rows_are_spread_over_the_order_of_the_errors(count, wanted):
 
 def test_standing_in_words():
     """What headline and film say."""
-    assert ErrorRank(50.05, 1000).text == "median of 1,000 rooms (50th percentile of their tip errors)"
-    assert ErrorRank(2.6).text == "3rd percentile of the tip errors that are predicted"
+    assert ErrorRank(50.05, 1000).text == "median of 1,000 trials (50th percentile of their tip errors)"
+    assert ErrorRank(2.6).text == "3rd percentile of the predicted tip errors"
     assert [ordinal(n) for n in (1, 2, 3, 4, 11, 12, 13, 21, 99)] == (
         ["1st", "2nd", "3rd", "4th", "11th", "12th", "13th", "21st", "99th"]
     )

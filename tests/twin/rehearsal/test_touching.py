@@ -182,9 +182,9 @@ def test_masses_that_err_by_a_tenth_move_no_reading(context, first, monkeypatch,
 @pytest.mark.parametrize(
     ("along_mm", "aside_mm", "said"),
     [
-        (8.0, 0.0, "no contact: the tip went 5 mm past where it was believed and came back"),
-        (-9.0, 0.0, "it was felt more than 5 mm before where it was believed, and given up"),
-        (0.0, 15.0, "it lies 15.0 mm beside where it was believed, at most 10 are allowed"),
+        (8.0, 0.0, "no contact up to 5 mm beyond its believed position"),
+        (-9.0, 0.0, "contact more than 5 mm before its believed position: given up"),
+        (0.0, 15.0, "it is 15.0 mm to the side of its believed position; at most 10 mm are allowed"),
     ],
 )
 def test_a_marker_that_is_not_where_it_was_believed_is_given_up(context, first, along_mm, aside_mm, said):
@@ -281,7 +281,7 @@ def test_the_answer_says_whether_the_rest_suffices(monkeypatch, tmp_path, kept, 
     assert sorted(said["failed"]) == sorted(set("ABCDE") - set(kept))
     assert (tmp_path / "touch.csv").exists() is bool(kept)
     if code:
-        assert said["why_not"] == f"{len(kept)} of 5 markers were touched, 3 are needed"
+        assert said["why_not"] == f"{len(kept)} of 5 markers were touched; 3 are needed"
         return
     expected, of_all = said["expected_tip_error_mm"], said["expected_of_best_poses_mm"]
     assert expected == pytest.approx(of_all) if kept == "ABCDE" else expected > of_all

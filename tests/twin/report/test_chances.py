@@ -24,21 +24,21 @@ from puncture_twin.twin.report.present import Section, text
 BUDGET = ErrorBudget(1.0, 0.8, 0.6, np.array([1.9, 1.5, 1.2]), {"touch": 0.75, "ct_slice": 0.25})
 BREAKDOWN = UncertaintyBreakdown(
     0.93, {"rib_right_9": 0.02}, 0.02, BUDGET, "residuals agree with the declared errors",
-    (Goal("", 0.99, False, (Remedy("touch", 0.35, 0.1),), 0.6),), "breathing, a needle that bends, tissue that moves",
+    (Goal("", 0.99, False, (Remedy("touch", 0.35, 0.1),), 0.6),), "breathing, needle bending, tissue motion",
 )  # fmt: skip
 ROOMS = {
     "rooms": 1000, "seed": 7, "unreached": 3, "realised_rms_mm": 1.01, "predicted_rms_mm": 1.0, "coverage_95": 0.947,
     "hit_share": 0.93, "mean_p_hit": 0.931, "touch_share": 0.02, "mean_p_touch": 0.021, "wrong_belief": True,
     "touch_share_by_structure": {"rib_right_9": 0.02}, "p_touch_by_structure": {"rib_right_9": 0.021},
-    "guessed_touches": True, "not_modelled": "breathing, a needle that bends, tissue that moves",
+    "guessed_touches": True, "not_modelled": "breathing, needle bending, tissue motion",
 }  # fmt: skip
 
 TOLD = (
     "How sure it is",
     "0.93",
-    "touch noise (touch_mm) would have to be 0.1 mm, not 0.35",
+    "touch noise (touch_mm) would have to be 0.1 mm instead of 0.35",
     "75.0 %",
-    "breathing, a needle that bends",
+    "breathing, needle bending",
     "In many rooms",
     "94.70 %",
     "p_touch_any",
@@ -107,7 +107,7 @@ BUDGET = {
     ],
     "changes": [{"group": "slices", "text": "slices of 1 mm", "expected_mm": 1.25}],
     "best": {"group": "slices", "text": "slices of 1 mm", "expected_mm": 1.25},
-    "not_modelled": "tissue that moves",
+    "not_modelled": "tissue motion",
 }
 
 
@@ -120,7 +120,7 @@ def test_the_page_says_where_the_next_millimetre_is_won(shown, tmp_path):
     write_page(Shown(*parts, uncertainty=Uncertainty(BREAKDOWN, None, None)), plain)
     text = told.read_text()
     section = text[text.index('<h2 id="budget">') : text.index('<h2 id="windows">')]
-    assert "The next 0.75 mm is won by slices of 1 mm." in section
+    assert "The next 0.75 mm would be gained by: slices of 1 mm." in section
     assert "data:image/png;base64,iVBOR" in section
     for number in ("1.60", "1.20", "1.25"):
         assert f"{number}</td>" in section
@@ -142,8 +142,10 @@ def test_a_truth_that_equals_the_belief_is_said_above_all(shown, tmp_path):
 
 def test_rooms_without_any_that_was_reached_say_nothing():
     """There is no table of nothing."""
-    said = text([Section("many rooms", rooms({**ROOMS, "realised_rms_mm": None}))])
-    assert "in none did the arm reach the pose" in said and "realised" not in said and rooms(None) == []
+    said = text([Section("many trials", rooms({**ROOMS, "realised_rms_mm": None}))])
+    assert (
+        "the arm reached the pose of its registration in none" in said and "realised" not in said and rooms(None) == []
+    )
 
 
 def test_the_cloud_is_drawn_in_the_needles_frame(tmp_path):

@@ -501,9 +501,9 @@ def test_frames_of_a_film_cut_off_are_not_counted(tmp_path, rng):
         (
             "declared",
             None,
-            "tissue pushes on the needle; its bend is in where it ends, drawn straight; nothing breathes; ",
+            "tissue pushes on the needle: its end is bent, the drawing is straight; nothing breathes; ",
         ),
-        (None, "declared", "needle and tissue are rigid; the body stands still as in the CT; "),
+        (None, "declared", "needle and tissue are rigid; the body is drawn still, as in the CT; "),
     ],
 )
 def test_the_film_says_what_it_does_not_show(bending, breathing, said):
@@ -717,7 +717,7 @@ def test_a_failed_plan_is_none_that_nobody_wanted(anatomy, case, candidates, tmp
     assert 'class="card bad"' in pages["failed"] and 'class="card bad"' not in pages["searched"]
     failed, searched = visible(pages["failed"]), visible(pages["searched"])
     assert failed.count("no approach was found to any of 12 candidates") == 2 and "Planning failed" in failed
-    assert "not requested" not in failed and "searched only" not in failed
+    assert "not requested" not in failed and "only searched" not in failed
     assert "not requested" in searched and "No plan was requested" not in searched and "Planning failed" not in searched
     told = [text for text in said if "no arm is shown" in text]
     assert ["no plan was requested" in text for text in told] == [True, False] and "PLANNING FAILED" in told[1]

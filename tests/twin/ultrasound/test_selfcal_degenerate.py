@@ -42,7 +42,7 @@ def test_the_words_are_those_of_a_person():
     with refused("poses_too_alike") as caught:
         calibrate(exact_recording(*degenerate_set("constant insertion angle")))
     text = str(caught.value)
-    assert "the insertion angle in the image hardly varies: the tip can slide along the needle" in text
+    assert "the insertion angle in the image hardly varies: the tip can shift along the needle" in text
     assert "add 4 poses, each from pose" in text
     assert "change the insertion angle in the image by +25 deg (2 poses)" in text
 

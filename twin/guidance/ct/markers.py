@@ -187,8 +187,10 @@ def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[M
     for row, name in enumerate(expected.names):
         if row not in found or distance[row, found[row]] >= FARTHEST_MM:
             voxels = " x ".join(f"{size:g}" for size in spacing_mm(volume))
-            allowed = f"metal within {FARTHEST_MM:g} mm of where it is expected, and voxels that are small beside it"
-            what = f"marker {name} is not seen in the image, of {voxels} mm voxels"
+            allowed = (
+                f"metal within {FARTHEST_MM:g} mm of the expected position, and voxels far smaller than the marker"
+            )
+            what = f"marker {name} is not seen in the image (voxels of {voxels} mm)"
             refuse(what, volume.path, allowed, "marker_not_seen")
     return [pieces[found[row]] for row in range(len(expected.names))]
 
@@ -223,7 +225,7 @@ def read_lesion(volume: Volume, mask: NDArray[np.bool_]) -> Floats:
     """
     found = ndimage.find_objects(mask.astype(np.uint8))
     if not found:
-        refuse("the lesion has no voxel", volume.path, "a lesion larger than a voxel", "lesion_not_seen")
+        refuse("no voxel belongs to the lesion", volume.path, "a lesion larger than a voxel", "lesion_not_seen")
     spacing = spacing_mm(volume)
     around = np.ceil(RIM_MM / spacing).astype(int) + 1
     low = np.maximum(np.array([one.start for one in found[0]]) - around, 0)

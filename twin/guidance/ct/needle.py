@@ -120,8 +120,8 @@ def _check_tip(volume: Volume, found: FoundNeedle, target_ct: Floats, hidden: Bo
         return
     away = target_ct - found.tip_ct
     lateral = float(np.linalg.norm(away - (away @ found.forward_ct) * found.forward_ct))
-    what = f"the needle ends at other metal, which hides its tip; its axis passes the target by {lateral:.1f} mm"
-    refuse(what, volume.path, f"a tip {SEEN_MM:g} mm clear of wider metal and its blur", "tip_hidden")
+    what = f"other metal hides the needle's tip; the needle's axis passes the target by {lateral:.1f} mm"
+    refuse(what, volume.path, f"a tip at least {SEEN_MM:g} mm away from wider metal and its blur", "tip_hidden")
 
 
 def _whole(volume: Volume, metal: Metal, line: _Line, target_ct: Floats, hidden: Bools) -> tuple[Metal, _Line]:

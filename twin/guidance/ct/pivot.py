@@ -66,10 +66,10 @@ def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, 
         i, j = two
         apart = float(np.linalg.norm(tips_base[i] - tips_base[j]))
         what = (
-            f"touches of different places: {names[i]} and {names[j]} are {apart:.0f} mm apart, more than a tip "
-            f"{MOST_OFF_MM:g} mm off explains"
+            f"touches of different points: {names[i]} and {names[j]} are {apart:.0f} mm apart; a tip offset of "
+            f"{MOST_OFF_MM:g} mm cannot explain that"
         )
-        refuse(what, where, "touches of one place, the needle tilted to several sides", "touches_apart")
+        refuse(what, where, "touches of one point, with the needle tilted to several sides", "touches_apart")
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +119,12 @@ def pivot_calibration(
     """
     count = len(T_base_flange)
     if count < LEAST_POSES:
-        refuse(f"{count} poses", where, f"{LEAST_POSES} or more that turn about one another", "too_few_poses")
+        refuse(f"{count} poses", where, f"{LEAST_POSES} or more, rotated against each other", "too_few_poses")
     A = np.concatenate([T_base_flange[:, :3, :3], np.broadcast_to(-np.eye(3), (count, 3, 3))], axis=2).reshape(-1, 6)
     factors = np.linalg.svd(A, compute_uv=False)
     if not factors[-1] * WORST_FACTOR > 1.0:
         allowed = "tilts of 20 degrees or more to several sides"
-        refuse("the poses turn too little about one another to find the tip", where, allowed, "poses_too_alike")
+        refuse("the poses rotate too little against each other to find the tip", where, allowed, "poses_too_alike")
     found, *_ = np.linalg.lstsq(A, -T_base_flange[:, :3, 3].reshape(-1), rcond=None)
     left = (A @ found + T_base_flange[:, :3, 3].reshape(-1)).reshape(-1, 3)
     whole = noise_mm**2 * np.eye(3 * count) + (0.0 if arm_cov is None else arm_cov)

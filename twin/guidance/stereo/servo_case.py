@@ -12,6 +12,7 @@ from pydantic import Field, Strict, model_validator
 from puncture_twin.planning.arm.ur import UrModel, ur_model
 from puncture_twin.planning.base.errors import SchemaError, refuse
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.toml_types import Coordinate, Length, Name, Number, Section, Vector
 from puncture_twin.planning.formats import points
@@ -174,7 +175,7 @@ class ServoFile(Section):
     @model_validator(mode="after")
     def _errors_are_declared_once(self) -> Self:
         if self.errors is None and self.rehearsal.errors is not None:
-            what = "[rehearsal.errors] is a truth that differs from [errors], which is not there"
+            what = "[rehearsal.errors] is a ground truth that differs from [errors], and [errors] is missing"
             raise SchemaError(what, "missing_errors")
         for section, key in OLDER_NAMES:
             if getattr(getattr(self, section), key) is not None and getattr(self.errors, key, None) is not None:
@@ -254,7 +255,7 @@ def load_servo_case(path: Path | str) -> ServoCase:
     markers = parse_points(named["markers"], path.parent / file.head.markers, default_space=Space.LOCAL)
     targets = parse_points(named["targets"], path.parent / file.head.targets, default_space=Space.LOCAL)
     if len(markers.names) < MIN_MARKERS:
-        refuse(f"head.markers: {len(markers.names)} markers", path, "3 or more", "too_few_markers")
+        refuse(f"head.markers: {plural(len(markers.names), 'marker')}", path, "3 or more", "too_few_markers")
     return ServoCase(path, file, model, skin, markers, targets, files.inputs)
 
 

@@ -344,7 +344,7 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
     """
     every = inverse(rod.model, flange_poses(rod, points_base))
     least = np.nan_to_num(singularity(rod.model, every).least(), nan=0.0).min(axis=0)
-    why = f"a {rod.model.name} cannot hold the ball on all {len(points_base)} points on one branch"
+    why = f"a {rod.model.name} cannot bring the ball to all {len(points_base)} points on one branch"
     elbow = np.nan_to_num(link_poses(rod.model, every[0])[:, ELBOW, :3, 3] @ -rod.R_base_flange[:, 2])
     ranks = np.column_stack([np.round(least, TIE_DIGITS), np.round(elbow, ELBOW_DIGITS)])
     order = sorted(range(len(ranks)), key=lambda branch: (branch != first, *-ranks[branch]))

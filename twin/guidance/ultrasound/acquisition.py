@@ -206,6 +206,6 @@ def _too_few(
     given_up: Counter[str],
 ) -> str:
     return (
-        f"{len(shots)} of {case.content.poses.count} poses show the needle; of {len(candidates.q_probe)} candidates "
-        f"{len(missed)} showed none and {given_up.total()} were given up. More [poses] samples would help"
+        f"{len(shots)} of {case.content.poses.count} poses show the needle. Of {len(candidates.q_probe)} candidates, "
+        f"{len(missed)} did not show it and {given_up.total()} were given up. More [poses] samples would help"
     )

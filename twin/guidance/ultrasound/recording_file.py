@@ -58,8 +58,8 @@ def parse_recording(content: bytes, file: Path) -> Recording:
     try:
         rows = [row for row in csv.reader(io.StringIO(text), strict=True) if row and not row[0].startswith("#")]
     except csv.Error as error:
-        what = f"is no CSV ({error})"
-        raise InputError(what, where=file, allowed="one line per pose, fields of numbers", code="not_csv") from error
+        what = f"is not a CSV file ({error})"
+        raise InputError(what, where=file, allowed="one line per pose, with numbers", code="not_csv") from error
     header = tuple(cell.strip() for cell in rows[0]) if rows else ()
     if header not in KINDS:
         allowed = ", ".join(columns(False, (3, 1), 24))

@@ -187,7 +187,7 @@ class NoiseSection(Section):
     @model_validator(mode="after")
     def _across_the_image(self) -> Self:
         if self.robot_mm == 0.0 and self.off_plane_mm == 0.0:
-            what = "noise: robot_mm and off_plane_mm are both 0; nothing is measured exactly across the image"
+            what = "noise: robot_mm and off_plane_mm are both 0; no measurement across the image is exact"
             raise SchemaError(what, "not_positive")
         return self
 

@@ -87,7 +87,7 @@ def _refuse_slip(recording: Recording, rms_mm: float, where: Path) -> None:
         other = _residual_mm(undo, recording)
         if other < SUSPECT_MM and other < BETTER * rms_mm:
             as_given = f"residuals {rms_mm:.3g} mm" if np.isfinite(rms_mm) else "no fit"
-            what = f"it fits ({other:.2g} mm rms) if {slip}, and not as it is given ({as_given})"
+            what = f"it does not fit as given ({as_given}), but it fits ({other:.2g} mm rms) if {slip}"
             refuse(what, where, ALLOWED, "recording_slip")
 
 

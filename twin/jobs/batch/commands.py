@@ -19,14 +19,14 @@ batch_app = typer.Typer(
 
 @batch_app.command("plan")
 def _plan(
-    cohort: Annotated[Path, typer.Argument(metavar="COHORT", help="A folder, a CSV with 'case', or cohort.toml.")],
+    cohort: Annotated[Path, typer.Argument(metavar="COHORT", help="Folder, CSV with column case, or cohort.toml.")],
     out_dir: CohortOption,
-    no_arm: Annotated[bool, typer.Option("--no-arm", help="Leave the arm out of every case.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say how many, how long, how much.")] = False,
+    no_arm: Annotated[bool, typer.Option("--no-arm", help="Do not check the arm in any case.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Estimate time, memory and disk; write nothing.")] = False,
     jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Write down every case of a cohort, with the hash of its inputs, options and version."""
+    """List every case of a cohort. Stores the hash of its inputs, options and version."""
     from puncture_twin.twin.jobs.batch.jobs import plan_cohort
     from puncture_twin.twin.jobs.batch.report import plan_text
 
@@ -39,18 +39,18 @@ def _plan(
 def _run(
     out_dir: CohortOption,
     part: Annotated[
-        str | None, typer.Option("--part", metavar="i/n", help="Only this part; else SLURM's array task, else all.")
+        str | None, typer.Option("--part", metavar="i/n", help="Part to run; default: SLURM's array task, or all.")
     ] = None,
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler whose workers run the cases.")
+        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler; its workers run the cases.")
     ] = None,
     jobs: JobsOption = 1,
-    memory_mb: Annotated[int | None, typer.Option("--memory-mb", min=100, help="Most that a worker may hold.")] = None,
-    timeout_s: Annotated[float | None, typer.Option("--timeout-s", min=0.1, help="Most that a case may take.")] = None,
-    pages: Annotated[bool, typer.Option("--pages", help="Draw the pictures and the page of each case too.")] = False,
+    memory_mb: Annotated[int | None, typer.Option("--memory-mb", min=100, help="Memory limit of a worker, MB.")] = None,
+    timeout_s: Annotated[float | None, typer.Option("--timeout-s", min=0.1, help="Time limit of a case, s.")] = None,
+    pages: Annotated[bool, typer.Option("--pages", help="Also draw the pictures and the page of each case.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the cases that have no result yet; what is done is kept, whatever stops the run."""
+    """Run the cases that have no result yet. Finished cases are kept if the run is stopped."""
     from puncture_twin.planning.batch.workers import Limits
     from puncture_twin.twin.jobs.batch.jobs import Where, run_part, run_summary
     from puncture_twin.twin.jobs.batch.report import run_text
@@ -63,7 +63,7 @@ def _run(
 
 @batch_app.command("status")
 def _status(out_dir: CohortOption, as_json: JsonOption = False) -> None:
-    """Count the cases that are done, failed, missing and stale; every input is hashed again."""
+    """Count done, failed, missing and stale cases. Hashes every input again."""
     from puncture_twin.planning.batch.run import cohort_state
     from puncture_twin.twin.jobs.batch.report import state_text
 
@@ -76,14 +76,14 @@ def _status(out_dir: CohortOption, as_json: JsonOption = False) -> None:
 def _merge(
     out_dir: CohortOption,
     expect: Annotated[
-        Path | None, typer.Option("--expect", metavar="FILE", help="An earlier cases.parquet: exit 1 where it differs.")
+        Path | None, typer.Option("--expect", metavar="FILE", help="Earlier cases.parquet; exit 1 if it differs.")
     ] = None,
     tolerance: Annotated[
-        float, typer.Option("--tolerance-mm", min=0, help="By so much a best clearance may differ from --expect.")
+        float, typer.Option("--tolerance-mm", min=0, help="Allowed difference of a best clearance from --expect, mm.")
     ] = 0.01,
     as_json: JsonOption = False,
 ) -> None:
-    """Write one table of all cases, one dataset of all candidates, and one page."""
+    """Write a table, a dataset and a page of all cases. The dataset has all candidates."""
     from puncture_twin.twin.jobs.batch.jobs import merge_cohort
     from puncture_twin.twin.jobs.batch.report import merge_text
 
@@ -94,11 +94,11 @@ def _merge(
 
 @batch_app.command("compare")
 def _compare(
-    before: Annotated[Path, typer.Argument(metavar="A", help="A merged cohort: its folder, or its cases.parquet.")],
-    after: Annotated[Path, typer.Argument(metavar="B", help="Another, of the same cases.")],
+    before: Annotated[Path, typer.Argument(metavar="A", help="Merged cohort: its folder, or its cases.parquet.")],
+    after: Annotated[Path, typer.Argument(metavar="B", help="Another merged cohort of the same cases.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Say what became safe, what was lost, and how far best entries moved, from A to B."""
+    """Compare two merged cohorts. Reports which cases became safe or were lost, and how far best entries moved."""
     from puncture_twin.planning.batch.merge import compare, read_cases
     from puncture_twin.twin.jobs.batch.jobs import change_summary
     from puncture_twin.twin.jobs.batch.report import compare_text

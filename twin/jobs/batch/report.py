@@ -11,6 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.batch.merge import NO_SAFE, NOT_RUN, CaseChange, Comparison
 from puncture_twin.planning.batch.run import CohortState, RunCounts
 from puncture_twin.planning.search.candidates import ARM_CHECKED
@@ -25,38 +26,38 @@ MOST_LINES = 10
 MOST_CASES = 5
 """Named of one reason."""
 
-STALE = "the inputs have changed since the plan"
-NOW = "of the inputs as they were planned; batch status says which have changed since"
+STALE = "inputs changed since the plan"
+NOW = "for the inputs as planned; batch status lists those that changed since"
 
 
 def plan_text(run: Any, jobs: int) -> str:
     """How many cases, how many of them are refused or known, and the estimate of a dry run."""
     refused = _listed(f"{one.case}: {one.refusal}" for one in run.refused)
-    head = Section(f"{_cases(len(run.cases))}, {run.known} with a row already", refused)
+    head = Section(f"{_cases(len(run.cases))}, {run.known} already with a row", refused)
     if run.guess is None:
         plan = Section(f"plan: {run.out / 'plan.parquet'}", [])
         return text([head, plan, Section(f"next: run-twin batch run --out {run.out}", [])])
     if run.guess.sample is None:
-        return text([head, Section("nothing to measure: no case can be read", [])])
+        return text([head, Section("nothing to estimate from: no case can be read", [])])
     estimate = run.summary(jobs)["estimate"]
     return text([
         head,
-        Section(f"measured at {estimate['sample']}: {estimate['seconds_per_case']:.2f} s a case", []),
+        Section(f"measured at {estimate['sample']}: {estimate['seconds_per_case']:.2f} s per case", []),
         Section(
-            f"{jobs} worker{'s' * (jobs > 1)}: about {duration_text(estimate['seconds'])}, "
+            f"{plural(jobs, 'worker')}: about {duration_text(estimate['seconds'])}, "
             f"{estimate['memory_mb']} MB of memory, {estimate['disk_mb']:.1f} MB of disk, "
-            "as if every case were like it; nothing was written", []),
+            "if every case is like it; nothing was written", []),
     ])  # fmt: skip
 
 
 def run_text(out: Path, counts: RunCounts) -> str:
     """What a run did, and what comes next."""
     refused = f" ({counts.refused_before} refused)" if counts.refused_before else ""
-    same = f"{counts.same} the same as others, " if counts.same else ""
+    same = f"{counts.same} the same as other cases, " if counts.same else ""
     done = f"{counts.ended[0] + counts.ended[1]} done, {counts.failed} failed"
-    stale = [f"{counts.stale} not run: {STALE}; batch plan again"] if counts.stale else []
+    stale = [f"{counts.stale} not run: {STALE}; run batch plan again"] if counts.stale else []
     return text([
-        Section(f"{_cases(counts.planned)}: {same}{counts.before} had their row{refused}, {done}",
+        Section(f"{_cases(counts.planned)}: {same}{counts.before} already had a row{refused}, {done}",
                 [*_reasons(counts.reasons), *stale]),
         Section(f"next: run-twin batch status --out {out}", [f"    run-twin batch merge --out {out}"]),
     ])  # fmt: skip
@@ -89,7 +90,8 @@ def compare_text(found: Comparison) -> str:
     kinds = ", ".join(f"{counts[kind]} {kind}" for kind in sorted(counts))
     far = (
         [
-            f"best entries of the {len(moved)} that are safe in both moved by {np.median(moved):.2f} mm (median), "
+            f"cases that are safe in both: {len(moved)}; their best entries moved by {np.median(moved):.2f} mm "
+            "(median), "
             f"{max(moved):.2f} mm at most"
         ]
         if moved
@@ -113,7 +115,7 @@ def _told(row: Any) -> str:
 
 
 def _cases(count: int) -> str:
-    return f"{count} case{'s' if count != 1 else ''}"
+    return plural(count, "case")
 
 
 def _reasons(reasons: Counter[str]) -> list[str]:
@@ -139,11 +141,11 @@ DISTRIBUTIONS = (
 OUTCOMES = {1: NO_SAFE, 2: "refused", 3: "the program failed"}
 """What a person reads for an exit code."""
 
-UNDER = "One row a case; cases.parquet beside this page has every column, candidates/ every direction."
-REFUSED = "Cases without a verdict, by reason. A refused case says what in its inputs cannot be used."
+UNDER = "One row per case. cases.parquet, next to this page, has every column; candidates/ has every direction."
+REFUSED = "Cases without a verdict, by reason. A refused case states what is wrong with its inputs."
 COLUMNS = (
-    "A click on a column's head sorts by it. θ, β, clearance, path and chance are those of the best candidate; reach "
-    "is the fraction of the directions left by the organs that the arm reaches."
+    "Click a column's head to sort by it. θ, β, clearance, path and chance are those of the best candidate; reach "
+    "is the fraction of the organ-safe directions that the arm reaches."
 )
 CASE = (
     Field("case", "case"),
@@ -190,7 +192,7 @@ def _cards(rows: Sequence[Row]) -> list[Card]:
         Card("cases", f"{len(rows):,}", "of the plan"),
         Card("with a safe direction", f"{codes[0]:,}", _part(codes[0], len(rows))),
         Card("without one", f"{codes[1]:,}", _part(codes[1], len(rows))),
-        Card("failed", f"{failed:,}", f"{codes[2]} refused, {codes[3]} by the program, {codes[None]} not run"),
+        Card("failed", f"{failed:,}", f"{codes[2]} refused, {codes[3]} failed in the program, {codes[None]} not run"),
     ]
 
 
@@ -239,7 +241,7 @@ def histogram(values: Sequence[float], text: str) -> Markup:
 
     from puncture_twin.twin.report.figures import PIXEL_DPI, figure_of, png
 
-    head = f"{text}: {len(values)} case{'s' if len(values) != 1 else ''}, median {_plain(float(np.median(values)))}"
+    head = f"{text}: {_cases(len(values))}, median {_plain(float(np.median(values)))}"
     figure = figure_of(WIDTH * SHARP, HEIGHT * SHARP, dpi=PIXEL_DPI * SHARP)
     axes = figure.add_axes((0.1, 0.19, 0.87, 0.68))
     axes.hist(values, BARS, color="#00684a", rwidth=0.92)

@@ -17,7 +17,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.base.text import Shown
+from puncture_twin.planning.base.text import Shown, plural
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
@@ -54,7 +54,7 @@ def parse_two(
         InputError: None or more than two, or one angle alone.
     """
     if len(theta_deg) != len(beta_deg):
-        refuse("one angle alone gives no direction", "--theta, --beta", "both, as often", "one_angle")
+        refuse("one angle alone gives no direction", "--theta, --beta", "as many of each", "one_angle")
     choices = [parse_choice(*pair, None, None, None) for pair in zip(theta_deg, beta_deg, strict=True)]
     choices += [parse_choice(None, None, one, None, None) for one in rank]
     choices += [parse_choice(None, None, None, one, None) for one in window]
@@ -62,10 +62,10 @@ def parse_two(
     if len(choices) == 1:
         choices = [BEST_OF_ALL, *choices]
     if len(choices) == 2 and choices[0] == choices[1]:
-        refuse("the same direction twice", "compare", "two, or one that is not the best", "same_direction")
+        refuse("the same direction twice", "compare", "two directions, or one other than the best", "same_direction")
     if len(choices) != 2:
-        allowed = "two, such as --rank 1 --window 2, or one, which is compared with the best"
-        refuse(f"{len(choices)} choices", "compare", allowed, "wrong_count")
+        allowed = "two, such as --rank 1 --window 2; or one, to compare with the best"
+        refuse(plural(len(choices), "choice"), "compare", allowed, "wrong_count")
     return choices[0], choices[1]
 
 
@@ -78,10 +78,10 @@ def two_plans(source: Path, other: Path | None, case: Path | None, chosen: bool)
     allowed = "PLAN_A PLAN_B [--case CASE], or CASE with one choice or two"
     if not is_plan(source):
         if other is not None or case is not None:
-            refuse("a case and another file", "compare", allowed, "conflicting_options")
+            refuse("a case and another file were given", "compare", allowed, "conflicting_options")
         return None
     if other is None or not is_plan(other) or chosen:
-        refuse("a plan is compared with a plan", source, allowed, "conflicting_options")
+        refuse("a plan can only be compared with a plan", source, allowed, "conflicting_options")
     return source, other
 
 
@@ -163,7 +163,7 @@ def _differing(a: Plan, b: Plan) -> tuple[str, ...]:
     if not roles:
         return ()
     more = f" and {len(roles) - MOST_ROLES} more" if len(roles) > MOST_ROLES else ""
-    return (f"the plans were not made from the same files ({', '.join(roles[:MOST_ROLES])}{more}): is it one case?",)
+    return (f"the plans were made from different files ({', '.join(roles[:MOST_ROLES])}{more}): are they of one case?",)
 
 
 def _explained_side(candidates: Candidates, title: str, explained: Explanation) -> Side:
@@ -203,7 +203,7 @@ NEAREST = 5
 LEAST_CHANCE = 1e-4
 """What is shown of a chance: a smaller one is no number that anybody can rely on."""
 
-NOT_CHECKED = "as the plans state it; name their case with --case to have them checked again, with chances and windows"
+NOT_CHECKED = "values as the plans state them; --case CASE checks them again, with chances and windows"
 
 
 class OnGrid(NamedTuple):
@@ -313,11 +313,11 @@ class Comparison(Shown):
 
     def text(self) -> str:
         """A table, then what takes a sentence."""
-        entries = f", their entries {self.entries_apart_mm:.0f} mm" if np.isfinite(self.entries_apart_mm) else ""
+        entries = f", entries {self.entries_apart_mm:.0f} mm" if np.isfinite(self.entries_apart_mm) else ""
         sides = [{**side.summary(), "side": side} for side in (self.a, self.b)]
         rows = [(one.name, *(one.of(side, unit=True) for side in sides)) for one in (*FIELDS, *self._clearances())]
         table = Table(("", "A", "B"), tuple(row for row in rows if row[1:] != (NOTHING, NOTHING)))
-        head = f"case {self.case_name}: two paths {self.apart_deg:.1f} deg apart{entries}"
+        head = f"case {self.case_name}: two paths {self.apart_deg:.1f}° apart{entries}"
         return text([
             Section(head, [table, *self._sentences()]), *(Section(f"warning: {one}", []) for one in self.warnings),
         ])  # fmt: skip
@@ -418,7 +418,7 @@ FIELDS = (
     Field("safe cone", "search.safe_cone_deg", 1, "deg"),
     Field("chance to hit, %", _chance("p_hit")),
     Field("chance to touch anything, %", _chance("p_touch_any")),
-    Field("likeliest to be touched, %", _likeliest),
+    Field("most likely touched, %", _likeliest),
     Field("expected tip error (rms)", "check.chances.expected_rms_mm", 2, "mm"),
     Field("path length", "check.path_length_mm", 1, "mm"),
     Field("skin angle", "check.skin_angle_deg", 1, "deg"),
@@ -427,7 +427,7 @@ FIELDS = (
     Field("approach", "plan.approach_s", 1, "s"),
     Field("insertion", "plan.insertion_s", 1, "s"),
     Field("expected tip error in the plan", "plan.expected_target_error_mm", 2, "mm"),
-    Field("needle to the nearest", "plan.clearance_mm.needle", 2, "mm"),
+    Field("needle to the nearest structure", "plan.clearance_mm.needle", 2, "mm"),
     Field("arm on the approach", "plan.clearance_mm.approach", 2, "mm"),
     Field("arm on the insertion", "plan.clearance_mm.insertion", 2, "mm"),
     Field("least clearance", _least, 2, "mm"),

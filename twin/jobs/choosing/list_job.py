@@ -18,6 +18,7 @@ from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.choice import (
     BEST,
@@ -42,13 +43,13 @@ def lists_of(
         InputError: Two lists, a list of directions beside a choice, a picture of a list, or a folder without a list.
     """
     if entries is not None and targets is not None:
-        refuse("two lists", "--entries, --targets", "one of them", "conflicting_options")
+        refuse("two lists were given", "--entries, --targets", "one of them", "conflicting_options")
     if entries is not None and choice != BEST:
-        refuse("a list of entries beside a choice", "--entries", "the list alone", "conflicting_options")
+        refuse("a list and a choice of a direction", "--entries", "only the list", "conflicting_options")
     if (entries or targets) is not None and picture is not None:
-        refuse("a picture is of one candidate", "--picture", "check without a list", "conflicting_options")
+        refuse("--picture draws one candidate", "--picture", "check without a list", "conflicting_options")
     if (entries or targets) is None and out_dir is not None:
-        refuse("one candidate is printed, not written", "--out", "--entries or --targets", "conflicting_options")
+        refuse("one candidate is only printed", "--out", "--entries or --targets", "conflicting_options")
     return (entries or targets) is not None
 
 
@@ -156,7 +157,7 @@ class CheckedList:
         """A line a row, then what kept those that are not safe."""
         kept = [f"row {row['row']}: {_why(row)}" for row in self.rows if row["verdict"] != "safe"]
         head = Section(
-            f"case {self.case_name}: {len(self.rows)} rows, arm {self.arm}", [grid(FIELDS, self.rows), *kept]
+            f"case {self.case_name}: {plural(len(self.rows), 'row')}, arm {self.arm}", [grid(FIELDS, self.rows), *kept]
         )
         return text([head, *footer(self.files, self.warnings)])
 

@@ -20,6 +20,7 @@ import numpy as np
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.choice import BEST
 from puncture_twin.planning.search.context import CaseContext
@@ -57,7 +58,8 @@ class DrawnRuns:
         """Beside so many physical runs."""
         spread = 100.0 / np.sqrt(2.0 * self.draws)
         return (
-            f"  without physics the same {ended} truths give {self.alike_mm:.2f} mm, {self.draws} truths "
+            f"  without physics, the same {plural(ended, 'trial')} give {self.alike_mm:.2f} mm, all {self.draws} "
+            "trials "
             f"{self.realised_mm:.2f} (known to {spread:.1f} %)"
         )
 
@@ -152,15 +154,15 @@ class PhysicalRuns:
         """For a person; where one axis errs most, an rms is known to one over the root of twice their number."""
         ended = [run for run in self.runs if not run.refused]
         if not ended:
-            return f"no physical run of {len(self.runs)} ended: {self.runs[0].refused}"
+            return f"none of {plural(len(self.runs), 'physical run')} ended: {self.runs[0].refused}"
         spread = 1.0 / np.sqrt(2.0 * len(ended))
         seconds = np.mean([run.seconds_per_touch for run in ended])
-        kept = f", {self.kept} of them kept from before" if self.kept else ""
+        kept = f", {self.kept} from an earlier run" if self.kept else ""
         lines = [
-            f"{len(ended)} physical runs ({seconds:.1f} s a touch{kept}): the tip misses the target by "
+            f"{plural(len(ended), 'physical run')} ({seconds:.1f} s per touch{kept}): the tip misses the target by "
             f"{self.realised_mm:.2f} mm rms (known to {100 * spread:.0f} %), {self.expected_mm:.2f} predicted",
             f"  touched and inserted in the simulator, the tip at most {max(run.off_path_mm for run in ended):.3f} mm "
-            "off the path that it was sent on",
+            "off its commanded path",
         ]
         lines.append(self.drawn.text(len(ended)))
         lines += [f"  seed {run.seed}: {run.refused}" for run in self.runs if run.refused]
@@ -221,7 +223,7 @@ def _inserted(context: CaseContext, tour: Tour, seed: int, registration: Registr
         truth, at_target = true_touches(context, tour, seed), true_at_target(context, seed)
         inserted = rehearse_touched(context, plan, truth, at_target)
     for contact in inserted.contacts:
-        what = f"the arm stopped on its way to the target: {contact.link} touches {contact.body}"
+        what = f"the arm stopped before the target: {contact.link} touches {contact.body}"
         raise NoAnswerError(what, code="motion_touches")
     return inserted
 

@@ -83,7 +83,8 @@ def refuse_of_twin(*options: object) -> None:
         InputError: One of them is stated.
     """
     if any(option is not None for option in options):
-        refuse("touches that were read", "pivot", "JOINTS.csv alone, or the twin's options", "conflicting_options")
+        allowed = "JOINTS.csv, or the options of the twin"
+        refuse("twin options with recorded touches", "pivot", allowed, "conflicting_options")
 
 
 def pivot_case(case: Case, joints: Path) -> PivotRun:
@@ -131,9 +132,9 @@ def _pivot_said(run: PivotRun) -> list[Section]:
     tip, sd = vector(pivot.tip_flange, 3, "mm"), vector(np.sqrt(np.diag(pivot.cov_tip)), 3)
     said = [
         f"tip in the flange frame: {tip}, sd {sd}, from {len(run.names)} poses",
-        f"the case states {stated:g} mm along z: {z - stated:+.3f} mm, and {np.hypot(x, y):.3f} mm beside it",
-        f"residual {pivot.residual_mm:.3f} mm rms; the declared touch noise leaves {pivot.expected_mm:.3f}, "
-        f"with the declared arm {pivot.expected_whole_mm:.3f}",
+        f"the case states {stated:g} mm along z: {z - stated:+.3f} mm, and {np.hypot(x, y):.3f} mm off that axis",
+        f"residual {pivot.residual_mm:.3f} mm rms; expected from the declared touch noise: {pivot.expected_mm:.3f}, "
+        f"with the declared errors of the arm {pivot.expected_whole_mm:.3f}",
         *_doubt(run),
     ]
     return [Section(one, []) for one in said]
@@ -144,14 +145,14 @@ def _doubt(run: PivotRun) -> list[str]:
     pivot = run.pivot
     if not pivot.large:
         arm = pivot.expected_whole_mm > LARGE * pivot.expected_mm
-        return ["the arm's own errors, as declared, leave most of it: more poses do not help"] if arm else []
+        return ["most of it comes from the declared errors of the arm: more poses do not help"] if arm else []
     worst = int(np.argmax(pivot.misses_mm))
     rest = float(np.sqrt(np.mean(np.delete(pivot.misses_mm, worst) ** 2)))
-    head = f"more than {LARGE:g} times what is declared"
+    head = f"the residual is more than {LARGE:g} times the declared one"
     if pivot.misses_mm[worst] > STANDS_OUT * rest:
         one = f"{run.names[worst]} misses by {pivot.misses_mm[worst]:.2f} mm, the others by {rest:.2f} (rms)"
-        return [f"{head}: {one}: the tip slipped there, or touched another place"]
-    return [f"{head}, and all touches alike: the arm errs by more than it declares, or they are of several places"]
+        return [f"{head}: {one}: the tip slipped there, or touched another point"]
+    return [f"{head}, in all touches alike: arm errors larger than declared, or touches of several points"]
 
 
 PIVOT, SUMMARY = "pivot.csv", "pivot.json"
@@ -265,7 +266,7 @@ def _executed(context: CaseContext, tour: TouchTour, truth: TouchTruth) -> Touch
     if len(touched.readings) < LEAST_POSES:
         why = "; ".join(f"{name}: {reason}" for name, reason in touched.failed.items())
         poses = f"{len(touched.readings)} of {len(tour.touches)} poses were touched"
-        raise NoAnswerError(f"{poses}, {LEAST_POSES} are needed: {why}", code="too_few_poses")
+        raise NoAnswerError(f"{poses}; {LEAST_POSES} are needed: {why}", code="too_few_poses")
     return touched
 
 
@@ -273,7 +274,7 @@ def pivot_tour_text(run: PivotTourRun) -> str:
     """For the terminal."""
     at, count, seconds = vector(run.place_base, 0, "mm"), len(run.touched.readings), run.touched.seconds
     failed = [f"{name} not touched: {why}" for name, why in run.touched.failed.items()]
-    off = f"{run.error_mm:.3f} mm off, {run.expected_error_mm:.3f} expected (rms)"
+    off = f"error {run.error_mm:.3f} mm, expected {run.expected_error_mm:.3f} mm (rms)"
     true = f"the true tip (seed {run.seed}) is {vector(run.true_tip_flange, 3, 'mm')}: {off}"
     head = Section(f"{count} poses touched about {at} (base) in {seconds:.0f} s", failed)
     return text([head, *_pivot_said(run.found), Section(true, []), *footer(run.files)])

@@ -219,7 +219,7 @@ def _refuse_two_beds(context: CaseContext, request: ScanRequest) -> None:
     own = [one.name for one in context.case.obstacles if one.frame == "ct"]
     if own and request.beside is not None and request.beside.bed != "none":
         allowed = "none, or a case without obstacles in the frame ct"
-        refuse(f"the case has what stands in the scanner: {', '.join(own)}", "--bed", allowed, "two_beds")
+        refuse(f"the case already has objects in the scanner: {', '.join(own)}", "--bed", allowed, "two_beds")
 
 
 def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volume) -> tuple[Floats, Floats]:
@@ -230,7 +230,7 @@ def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volu
         return scene.target, find_needle(volume, scene.target).tip_ct
     mask = image.labels[solid.layer] == solid.label
     if not mask.any():
-        refuse(f"'{name}' is not in the image", "scan", "a field of view that shows the target", "outside_image")
+        refuse(f"'{name}' is not in the image", "scan", "a field of view that contains the target", "outside_image")
     return middle_of(solid.mesh.triangles), read_lesion(volume, mask)
 
 
@@ -244,7 +244,7 @@ def _rehearsed(path: Path | None) -> tuple[tuple[TrueRod, Floats] | None, tuple[
     """The needle at the end of a rehearsal, and the true target, in the case's frame."""
     if path is None:
         return None, ()
-    allowed = "the rehearsal.json of this version of rehearse"
+    allowed = "a rehearsal.json of this version"
     read = read_output(path, max_bytes=MAX_REHEARSAL_BYTES)
     document = parse_json(read.data, where=path, allowed=allowed)
     with fitting(path, allowed):
@@ -314,10 +314,10 @@ def scan_text(run: ScanRun) -> str:
         ("scan", f"{shape} voxels of {pixel:g} x {pixel:g} x {spacing:g} mm, noise {settings['noise_hu']:g} HU, seed "
                  f"{settings['seed']}"),
         *([] if found["markers"] else [("markers", "none")]),
-        ("lesion", f"{_vector(found['lesion']['error_mm'])}   read against true"),
+        ("lesion", f"{_vector(found['lesion']['error_mm'])}   read minus true"),
         *_needle_rows(found["needle"]),
         *([("beside", f"{beside}: surfaces in beside/")] if beside else []),
-        *([("thin", f"parts thinner than a voxel have whole voxels of the labels: {thin}")] if thin else []),
+        *([("thin", f"parts thinner than a voxel fill whole voxels of the label map: {thin}")] if thin else []),
     ]  # fmt: skip
     return text([
         Section(str(folder), [facts(rows), *_marker_blocks(found)]),
@@ -338,7 +338,7 @@ def _marker_blocks(found: dict[str, Any]) -> list[Block]:
     expected = (
         "standard dev.  {rule_in_plane:.2f} in the plane, {rule_along_bed:.2f} along the bed; the middle of the metal"
     )
-    held = " is held to {middle_along_bed:.2f} there"
+    held = ": limit {middle_along_bed:.2f} along the bed"
     return [grid(fields, [*markers, {"name": "rms", **rms}]), (expected + held).format(**theory)]
 
 
@@ -354,8 +354,8 @@ def _needle_rows(needle: dict[str, Any] | None) -> list[tuple[str, str]]:
     off = "{tip_reading_error_mm:.2f} mm and {angle_reading_error_deg:.2f}°".format(**needle)
     return [
         ("needle, in the control CT", said.format(**needle["found"])),
-        ("truly", said.format(**needle["true"])),
-        ("so that it was read off by", off),
+        ("true", said.format(**needle["true"])),
+        ("reading error", off),
     ]
 
 
@@ -474,5 +474,5 @@ def _draw_markers(ax: Axes, markers: NamedPoints, z: float, rim: list[Any]) -> N
 def _draw_needle(ax: Axes, needle: FoundNeedle, length_mm: float) -> None:
     """Its axis as found, of which the slice shows a cut."""
     ends = np.stack([needle.tip_ct, needle.tip_ct - length_mm * needle.forward_ct])
-    ax.plot(ends[:, 0], ends[:, 1], "--", color=YELLOW, linewidth=0.8, label="needle as found, projected")
-    ax.plot(*needle.tip_ct[:2], "x", color=YELLOW, label="its tip")
+    ax.plot(ends[:, 0], ends[:, 1], "--", color=YELLOW, linewidth=0.8, label="detected needle, projected")
+    ax.plot(*needle.tip_ct[:2], "x", color=YELLOW, label="detected tip")

@@ -111,9 +111,9 @@ def sweep_end(source: Path, to: str | None, *, sweep: bool, alone: bool) -> Angl
         InputError: No sweep, or none of one case.
     """
     if not sweep:
-        refuse("a sweep ends there", "--to", "--sweep --to THETA,BETA", "conflicting_options")
+        refuse("--to needs --sweep", "--to", "--sweep --to THETA,BETA", "conflicting_options")
     if is_plan(source) or not alone:
-        refuse("a sweep is of one case", "--sweep", "a case, no plan, no --seeds", "conflicting_options")
+        refuse("a sweep needs one case", "--sweep", "a case, without plan and --seeds", "conflicting_options")
     return parse_angles(to)
 
 
@@ -145,7 +145,7 @@ def _ends(context: CaseContext, choice: Choice, to: Angles | None) -> tuple[Angl
     windows = found.windows
     near = int(np.argmax(found.outward_ct @ chosen.candidates.outward_ct[row]))
     if not windows.of_row[near]:
-        refuse("the direction lies in no window of the grid", "--sweep", "--to THETA,BETA", "no_window")
+        refuse("the direction is in no window of the grid", "--sweep", "--to THETA,BETA", "no_window")
     rows = windows.rows(int(windows.of_row[near]))
     far = int(rows[np.argmin(found.outward_ct[rows] @ found.outward_ct[near])])
     return start, (float(found.theta[far]), float(found.beta[far]))

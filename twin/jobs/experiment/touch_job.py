@@ -211,7 +211,7 @@ def drawn_once(context: CaseContext, tour: Tour, seed: int) -> Use | str:
 def _use(context: CaseContext, tour: Tour, truth: TouchTruth, read: NamedPoints) -> Use | str:
     """What readings are good for; in words why they do not suffice."""
     if len(read.names) < MIN_MARKERS:
-        return f"{len(read.names)} of {len(tour.plan.touches)} markers were touched, {MIN_MARKERS} are needed"
+        return f"{len(read.names)} of {len(tour.plan.touches)} markers were touched; {MIN_MARKERS} are needed"
     try:
         fitted = registered(context, read)
         expected = expected_of_touches(context, tour.q_insertion, read)
@@ -228,7 +228,7 @@ def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
         chosen = choose(context, None, choice)
     rows = [row for row in chosen.rows if np.isfinite(chosen.candidates.arm.q_insertion[row]).all()]
     if not rows:
-        what = "the arm reaches no such candidate: nothing to touch the markers for"
+        what = "the arm does not reach this candidate: no touches are planned for it"
         raise NoAnswerError(what, code="no_safe_direction")
     return chosen.candidates.arm.q_insertion[rows[0]], chosen.candidates.outward_ct[rows[0]]
 
@@ -282,7 +282,7 @@ def _true_errors(context: CaseContext) -> ErrorModel:
 TOUCHED = (
     Field("marker", lambda one: one.name),
     Field("took", lambda one: one.seconds, 1, "s"),
-    Field("felt, deep", lambda one: one.bias_mm, 3, "mm"),
+    Field("contact, depth", lambda one: one.bias_mm, 3, "mm"),
     Field("at", lambda one: one.speed_mm_s, 1, "mm/s"),
     Field("at most", lambda one: one.force_n, 2, "N"),
     Field("line moved at the standoff", lambda one: one.aside_mm, 1, "mm"),
@@ -304,9 +304,9 @@ def _use_said(run: TouchRun) -> list[Section]:
     if isinstance(use, str):
         return [Section(f"no registration: {use}", [])]
     failed = ", ".join(run.touched.failed)
-    without = f" without {failed}, {plan.expected_mm:.2f} with" if failed else ""
-    expected = f"expected tip error: {use.expected_mm:.2f} mm rms{without}; of the worst poses {plan.worst_mm:.2f} mm"
-    truth = f"error of this truth (seed {run.seed}): {use.tip_error_mm:.2f} mm; FRE {use.registration.fre_mm:.2f} mm"
+    without = f" without {failed}, {plan.expected_mm:.2f} with them" if failed else ""
+    expected = f"expected tip error: {use.expected_mm:.2f} mm rms{without}; with the worst poses {plan.worst_mm:.2f} mm"
+    truth = f"error in this trial (seed {run.seed}): {use.tip_error_mm:.2f} mm; FRE {use.registration.fre_mm:.2f} mm"
     return [Section(expected, []), Section(truth, [flag.sentence for flag in use.registration.flags])]
 
 

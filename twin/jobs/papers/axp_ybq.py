@@ -44,7 +44,7 @@ TABLE: Mapping[int, tuple[float, float, float, float]] = MappingProxyType(
 )
 """The specification's error at the tip in mm by number of poses, in the order of ``METHODS``."""
 
-COMPARED_WITH = "this project's specification, from a simulation; the patent application prints no figure"
+COMPARED_WITH = "this project's specification, from a simulation; the patent application states no figure"
 
 LIMITS: Mapping[tuple[int, str], float] = MappingProxyType(
     {(20, "Gauss-Newton"): 0.34, (30, "closed form"): 0.30, (30, "Gauss-Newton"): 0.24, (50, "Gauss-Newton"): 0.18}
@@ -205,8 +205,8 @@ def _outliers(runs: int) -> list[AxpYbqRow]:
     (plain, unweighted, weighted), widen = _rms(one, runs, 1)
     return [
         AxpYbqRow("30 poses, 10 % outliers, plain least squares", 0.73, plain, None, "mm"),
-        AxpYbqRow("30 poses, 10 % outliers, robust, noise not told", 0.23, unweighted, 0.25 * widen[1], "mm"),
-        AxpYbqRow("30 poses, 10 % outliers, robust, noise told", 0.23, weighted, 0.25 * widen[2], "mm"),
+        AxpYbqRow("30 poses, 10 % outliers, robust, noise not given", 0.23, unweighted, 0.25 * widen[1], "mm"),
+        AxpYbqRow("30 poses, 10 % outliers, robust, noise given", 0.23, weighted, 0.25 * widen[2], "mm"),
     ]
 
 
@@ -264,8 +264,8 @@ FIELDS = (
 
 def reproduction_text(found: Mapping[str, Any]) -> str:
     """For a person: the specified numbers beside ours."""
-    verdict = "every limit holds" if found["holds"] else "NOT every limit holds"
-    wider = f"; the limits are those of {RUNS} runs, widened by what chance adds in so few"
+    verdict = "all within their limits" if found["holds"] else "NOT all within their limits"
+    wider = f"; the limits are those of {RUNS} runs, widened for the chance of fewer runs"
     ending = f"{found['runs']} runs per row, seed {found['seed']}: {verdict}{'' if found['runs'] >= RUNS else wider}"
     return text([Section(f"compared with {COMPARED_WITH}", [grid(FIELDS, found["rows"])]), Section(ending, [])])
 

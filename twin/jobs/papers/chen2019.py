@@ -198,10 +198,11 @@ FIELDS = (
 def reproduction_text(found: Mapping[str, Any]) -> str:
     """The paper's numbers beside ours."""
     reach = (
-        "the worked pose puts the flange {flange_from_shoulder_mm:.1f} mm from the shoulder of a UR3, whose links span "
+        "the worked example puts the flange {flange_from_shoulder_mm:.1f} mm from the shoulder of a UR3, whose links "
+        "span "
         "{longest_span_mm:.1f} mm at most: it is "
     ).format(**found) + ("out of reach" if found["out_of_reach"] else "within reach")
-    verdict = "every number holds" if found["holds"] else "NOT every number holds"
+    verdict = "all within their limits" if found["holds"] else "NOT all within their limits"
     return text([Section("Chen et al. 2019, and ours", [grid(FIELDS, found["rows"]), reach]), Section(verdict, [])])
 
 

@@ -95,23 +95,25 @@ def experiment_text(report: ExperimentReport) -> str:
     others = max(value for name, value in strains.items() if name != "y against z")
     verdicts = [
         f"stated: p {stated.probability:.1g}, {'REJECTED' if stated.rejected else 'not rejected'} "
-        f"(below {REJECTED:g}): slices of 5 mm cannot leave their least residuals along the bed.",
+        f"(below {REJECTED:g}): slices of 5 mm cannot give the smallest residuals along the bed.",
         f"found: p {found.probability:.2g}; every number within its range: {'yes' if found.agrees else 'NO'} "
-        "(found from these very points: no proof, but nothing speaks against it)",
-        f"a skew of the CT's y against z alone takes {100 * strains['y against z']:.0f} % of the squares, no other "
-        f"strain more than {100 * others:.0f} %; under the stated errors some strain takes as much in "
+        "(fitted to these points: consistent, but no proof)",
+        f"a skew of the CT's y against z alone takes {100 * strains['y against z']:.0f} % of the squared residuals, "
+        f"no other strain more than {100 * others:.0f} %; under the stated errors some strain takes as much in "
         f"{100 * stated.best_strain:.1f} % of draws",
     ]
     skew = (
         f"from the markers of setup 2 alone, no lesion among them, it is {np.degrees(report.skew.angle):.2f} degrees; "
-        "taken off the readings, the lesions are missed by"
+        "corrected for it, the lesions are missed by"
     )
-    open_ = "its cause is open: a carton out of square, measuring lines that are not, a bias of touches at its sides"
-    touches = "'about 40 % more efficient' counts touches (3 instead of 5); no time is printed to measure it by"
-    title = f"the experiment of Chen 2019, drawn {stated.draws} times under two declarations (seed {report.seed})"
+    open_ = (
+        "its cause is unknown: a carton out of square, skewed measuring lines, or a bias of the touches at its sides"
+    )
+    touches = "'about 40 % more efficient' counts touches (3 instead of 5); the paper states no time to check it"
+    title = f"the experiment of Chen 2019, simulated {stated.draws} times with two declarations (seed {report.seed})"
     return text([
         Section(title, [_declared(stated), _declared(found)]),
-        Section("percentile of the paper's number among the drawn ones", [_ranks(stated.printed, found.printed)]),
+        Section("percentile of the paper's number among the simulated ones", [_ranks(stated.printed, found.printed)]),
         Section("all points of both setups together, squares in mm^2 (x lies along the bed)",
                 [_ranks(stated.joint, found.joint), *verdicts]),
         Section(skew, [f"{one.name}: {one.as_read:.2f} -> {one.square:.2f} mm" for one in report.skew.lesions]),
@@ -135,7 +137,7 @@ def _declared(one: Experiment) -> str:
     parts = [
         f"slices {d.slice_mm:g} mm, pixels {d.pixel_mm:g} mm" if d.slice_mm else "",
         f"readings {d.reading_mm:g} mm" if d.reading_mm else "",
-        f"planes askew by {np.degrees(d.skew):g} degrees" if d.skew else "",
+        f"planes skewed by {np.degrees(d.skew):g} degrees" if d.skew else "",
         f"touches {d.touch_mm:g} mm",
     ]
     return f"{d.name}: {', '.join(part for part in parts if part)}"
@@ -192,9 +194,9 @@ def reproduced(
     if paper not in PAPERS:
         refuse(f"paper '{paper}' is not known", "reproduce", ", ".join(PAPERS), "unknown_choice")
     if experiment and paper != "chen2019":
-        refuse(f"{paper} has no such experiment", "--experiment", "reproduce chen2019", "unknown_choice")
+        refuse(f"{paper} has no experiment", "--experiment", "reproduce chen2019", "unknown_choice")
     if runs and not experiment:
-        refuse("--runs are of the experiment", "--runs", "reproduce chen2019 --experiment", "conflicting_options")
+        refuse("--runs needs --experiment", "--runs", "reproduce chen2019 --experiment", "conflicting_options")
     return chen2019_experiment(out_dir, seeds, runs, watcher) if experiment else PAPERS[paper](out_dir, seeds)
 
 

@@ -51,7 +51,7 @@ def register_report(
     if markers_base is None:
         return registration_report(source)
     if target is None:
-        refuse("two lists of markers need a target", "register", "--target X,Y,Z in mm", "missing_option")
+        refuse("two lists of markers were given without a target", "register", "--target X,Y,Z in mm", "missing_option")
     return lists_report(source, markers_base, target, space, fle_mm)
 
 
@@ -65,9 +65,9 @@ def registration_report(path: Path) -> dict[str, Any]:
     checked = checked_placement(case, user_cache())
     if checked is None or checked.placement.registration is None:
         file = case.robot.transform
-        what = "no [registration] with markers" if file is None else f"the base is placed by the transform {file}"
+        what = "no [registration] with markers" if file is None else f"the base is registered by the transform {file}"
         compared = () if checked is None else (one.sentence for one in checked.findings)
-        allowed = "markers_ct and markers_base alone"
+        allowed = "only markers_ct and markers_base"
         raise InputListError("; ".join((what, *compared)), where=case.path, allowed=allowed, code="no_markers")
     placement, registration = checked.placement, checked.placement.registration
     report = registration_summary(registration)
@@ -118,7 +118,7 @@ def lists_report(
     report["expected_tre_along_shaft_mm"] = []
     report |= _advice_of_lists(registration, target_ct, space)
     report["warnings"] = []
-    report["notes"] = ["two lists alone: neither skin nor couch was asked whether axes or names have slipped"]
+    report["notes"] = ["only two lists: no skin or couch to check the axes and names against"]
     return report
 
 
@@ -169,10 +169,10 @@ def _advice_of_lists(registration: Registration, target_ct: Floats, space: Space
     more = one_more(registration, target_ct, target_ct + far * sides)
     test = uncertainty.test
     stated = test.text().replace("the declared errors", "--fle")
-    found = f"the noise is the residuals' own: {registration.fle_mm:.3f} mm, with {test.freedom} degrees of freedom"
+    found = f"noise estimated from the residuals: {registration.fle_mm:.3f} mm, with {test.freedom} degrees of freedom"
     return {
         "budget": None,
-        "fle_source": "estimated from FRE of the rigid fit" if test.scaled else "stated by --fle",
+        "fle_source": "estimated from the FRE of the rigid fit" if test.scaled else "stated by --fle",
         "declaration": {**registration_summary(registration)["declaration"], "text": found if test.scaled else stated},
         "half_axes_95_mm": (uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
         "share": {"the markers in both lists": 1.0},
@@ -192,7 +192,7 @@ def _branch_warning(case: Case, registration: Registration) -> tuple[str, ...]:
     odd = odd_branches(registration, case.robot.model)
     if not odd:
         return ()
-    return (f"{', '.join(odd)} touched in another branch of the arm than the others: its errors do not cancel there",)
+    return (f"{', '.join(odd)} touched in another branch of the arm than the rest: arm errors do not cancel there",)
 
 
 def _advice(case: Case, registration: Registration) -> dict[str, Any]:
@@ -243,7 +243,7 @@ def certificate_text(report: dict[str, Any]) -> str:
     """What the plain checker proved."""
     done = report["verified"]
     proven = f"{done['safe']} safe and {done['rejected']} rejected cells proven again, {done['undecided']} undecided"
-    return text([Section(f"{report['certificate']}: every cell holds", [proven, *patient.certificate(report)])])
+    return text([Section(f"{report['certificate']}: every cell is proven", [proven, *patient.certificate(report)])])
 
 
 def registration_text(report: dict[str, Any]) -> str:

@@ -89,7 +89,7 @@ def export_candidates(table_path: Path, format_name: str, out: Path, note: Calla
     write, read = _WRITERS[format_name], _READERS[format_name]
     text = write(run, columns, rows)
     if read(text, table) != rows:
-        raise ArithmeticError(f"{name} does not read back to the table")
+        raise ArithmeticError(f"{name} does not read back as the table")
     made_from = {source.path: source.sha256}
     with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
         path = draft.folder / name

@@ -40,10 +40,10 @@ from puncture_twin.twin.jobs.patient.summaries import export_summary
 from puncture_twin.twin.report.present import Section, Warn, text
 
 NOTES = (
-    "scene, goals, arm with needle and a sender: read the sender before it is run; it asks before each phase",
-    "send 'insertion' only when the operator says so; no controller of ROS stops at tissue",
-    "nothing here has been run against a controller or MoveIt: the messages were compared with their definitions",
-    "the URDF names the meshes of this installation by absolute addresses",
+    "files: scene, goals, arm with needle, and a sender; read the sender before you run it; it asks before each phase",
+    "send 'insertion' only when the operator says so; no ROS controller stops at tissue",
+    "never run on a controller or in MoveIt; the messages were only compared with their definitions",
+    "the URDF refers to this installation's meshes by absolute paths",
 )
 
 
@@ -144,11 +144,11 @@ def export_source(
     planned_case = case_of(source, case, choice)
     if format_name == SLICER:
         if is_plan(source):
-            refuse("slicer shows a case", source, "a case, with --rank, --window, --theta or --entry", "missing_option")
+            refuse("slicer needs a case", source, "a case, with --rank, --window, --theta or --entry", "missing_option")
         shown = export_to_slicer(prepare(source, watcher=watcher), out, choice)
         return Export(shown, shown.summary(), shown.text())
     if format_name == MOVEIT and planned_case is None:
-        refuse("moveit's scene is the case's", source, "export plan.json --case CASE", "missing_option")
+        refuse("the MoveIt scene needs the case", source, "export plan.json --case CASE", "missing_option")
     context = None if planned_case is None else prepare(planned_case, watcher=watcher)
     plan_path = source
     if context is not None and not is_plan(source):
@@ -163,14 +163,14 @@ def export_source(
 
 def export_text(done: Exported, case_checked: bool) -> str:
     """What was written, and what whoever runs it should know."""
-    unchecked = [] if case_checked else ["the plan was not held against its case again: name it with --case"]
+    unchecked = [] if case_checked else ["the plan was not checked against its case again; --case CASE does so"]
     direction = f"direction: theta {np.degrees(done.plan.theta):g} deg, beta {np.degrees(done.plan.beta):g} deg"
     warned = (Section(f"warning: {one}", []) for one in done.plan.warnings)
     said = Section(f"{done.format_name}: {done.path}", [direction, *done.notes, *unchecked])
     return text([said, *warned])
 
 
-NO_APPROACH = "the directions were checked; no approach of the arm was planned"
+NO_APPROACH = "directions checked; no approach planned"
 
 
 @dataclass(frozen=True, repr=False)

@@ -76,11 +76,11 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
     _refuse_options(request)
     folder, path = request.folder, request.folder / CASE
     if not is_folder(folder):
-        refuse("is no folder", str(folder)[:200], ALLOWED, "not_a_folder")
+        refuse("is not a folder", str(folder)[:200], ALLOWED, "not_a_folder")
     if is_plain_file(path) and not force:
-        refuse("there is a case already", path, "--force to replace it", "case_exists")
+        refuse("a case exists already", path, "--force to replace it", "case_exists")
     if (request.target is None) == (request.target_label is None):
-        refuse("one target", "init", "either --target X,Y,Z or --target-label NAME", "conflicting_options")
+        refuse("two targets were given", "init", "either --target X,Y,Z or --target-label NAME", "conflicting_options")
     memory = Memory(READING_BYTES)
     start = start_case(request, replace(user_cache(), memory=memory), partial(watcher.step, "reading"))
     with atomic(path) as draft:
@@ -112,13 +112,13 @@ def _refuse_options(request: Request) -> None:
     if request.wanted.space is Space.LOCAL:
         refuse("a patient's space", "--space", "LPS or RAS", "unknown_space")
     if radius is not None and (request.target is None or not 0 < radius <= 100):
-        refuse(f"{radius:g}", "--hit-radius", "mm, above 0, at most 100, beside --target", "out_of_range")
+        refuse(f"{radius:g}", "--hit-radius", "mm, above 0, at most 100, with --target", "out_of_range")
 
 
 def _with_seen(start: Start, request: Request, context: CaseContext) -> str:
     """The case's text with what only the whole anatomy tells: what its CT shows, and where a search should look."""
     text, where = with_image_seen(start.text, context.anatomy), grid_of(context.sides)
-    looked = f"where a needle can come from: {sides_text(context.sides)}"
+    looked = f"entry sides: {sides_text(context.sides)}"
     keys = {"search.frame": where.frame, "search.theta_deg": "[{:g}, {:g}]".format(*where.theta_deg)}
     if not request.wanted.overrides.keys.keys().isdisjoint(keys):
         return text
@@ -127,7 +127,7 @@ def _with_seen(start: Start, request: Request, context: CaseContext) -> str:
 
 def _source(place: str) -> str:
     """A file or folder below the case's; meshes may lie in that itself."""
-    return "the meshes beside it" if place == "." else place
+    return "the meshes next to it" if place == "." else place
 
 
 def init_text(run: InitRun) -> str:
@@ -143,8 +143,8 @@ def init_text(run: InitRun) -> str:
         f"  target         {position} mm {parts.space}, in {parts.structure or 'no structure'}",
         f"  region         {parts.region}",
         f"  needle         {needle.length_mm:g} mm, shaft {needle.shaft_mm:g} mm, diameter {needle.diameter_mm:g} mm",
-        f"  looked         {sides_text(run.context.sides)}",
-        *([] if run.picture is None else [f"  look at        {run.picture}"]),
+        f"  entry sides    {sides_text(run.context.sides)}",
+        *([] if run.picture is None else [f"  check          {run.picture}"]),
         f"next: run-twin search {run.path.parent}",
     ]
     return "\n".join(lines)

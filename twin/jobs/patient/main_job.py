@@ -61,7 +61,7 @@ def certify_options(wanted: bool, size_deg: float | None, touch: float | None) -
     """
     for option, value in (("--certify-touch", touch), ("--certify-size", size_deg)):
         if value is not None and not wanted:
-            refuse("of a certificate that nobody asked for", option, "beside --certify", "conflicting_options")
+            refuse("options of a certificate without --certify", option, "with --certify", "conflicting_options")
     return CertifyOptions(CERTIFY_DEG if size_deg is None else size_deg, touch) if wanted else None
 
 
@@ -339,8 +339,8 @@ def case_of(source: Path, case: Path | None, choice: Choice) -> Path | None:
     """
     if is_plan(source):
         if choice != BEST:
-            refuse("a plan has its direction", source, "a case, where one is to be chosen", "conflicting_options")
+            refuse("a plan already has its direction", source, "a case, to choose a direction", "conflicting_options")
         return case
     if case is not None:
-        refuse("two cases", "--case", "CASE alone, or plan.json --case CASE", "conflicting_options")
+        refuse("two cases were given", "--case", "only CASE, or plan.json --case CASE", "conflicting_options")
     return source

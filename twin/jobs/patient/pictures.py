@@ -173,6 +173,6 @@ def _budget(context: CaseContext, q_insertion: Floats) -> Mapping[str, Any] | No
 
 def _check_png(path: Path) -> None:
     if path.suffix.lower() != ".png":
-        refuse(f"'{path.name}' is no PNG's name", "--picture", "FILE.png", "bad_file_name")
+        refuse(f"'{path.name}' is not the name of a PNG file", "--picture", "FILE.png", "bad_file_name")
     if not path.parent.is_dir():
-        refuse("there is no such folder", path.parent, "a folder that is there", "not_a_folder")
+        refuse("there is no such folder", path.parent, "an existing folder", "not_a_folder")

@@ -161,5 +161,5 @@ def in_rooms(context: CaseContext, plan: Plan, count: RoomCount, seed: int | Non
     from puncture_twin.twin.rehearsal.plan_truth import physics_trials
 
     with context.stages.time("physics"):
-        again = partial(context.watcher.count, "rooms in the simulator")
+        again = partial(context.watcher.count, "trials in the simulator")
         return replace(found, physics=physics_trials(context, plan, found, count.physics, again))

@@ -10,6 +10,7 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import Severity, refuse
 from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
@@ -57,7 +58,7 @@ def room_count(rooms: int | None, physics: int) -> RoomCount | None:
         InputError: More in the simulator than there are.
     """
     if physics > (rooms or 0):
-        refuse("--physics runs some of the rooms", "--physics", "--seeds N --physics K, K <= N", "conflicting_options")
+        refuse("--physics runs some of the trials", "--physics", "--seeds N --physics K, K <= N", "conflicting_options")
     return None if rooms is None else RoomCount(rooms, physics)
 
 
@@ -144,9 +145,9 @@ class Run:
         """What else must be known of the plan's expected error and of its aim."""
         if self.plan is None:
             return ()
-        notes = [] if self.context.case.bending is None else ["The expected error is of a needle that does not bend."]
+        notes = [] if self.context.case.bending is None else ["The expected error assumes a straight needle."]
         if self.context.chance is None:
-            notes.append("The expected error is of markers alone: no [errors] declare the arm's.")
+            notes.append("The expected error counts the markers alone: [errors] does not declare the arm's errors.")
         return (*notes, *_other_configuration(self.candidates, self.plan), *self._other_aim(self.plan))
 
     def _other_aim(self, plan: Plan) -> list[str]:
@@ -156,7 +157,7 @@ class Run:
         if registration is None or registration.aim is None or np.abs(q - registration.aim.q).max() < SAME_AIM:
             return []
         joints = ", ".join(f"{angle:.2f}" for angle in np.degrees(q))
-        return [f"The aim is corrected for another insertion; for this one: correct_joints_deg = [{joints}]."]
+        return [f"The aim is corrected for another insertion. For this one, set correct_joints_deg = [{joints}]."]
 
     def text(self) -> str:
         """What a person reads: what must be read first, the search, then what was done with it; then the files."""
@@ -168,11 +169,11 @@ class Run:
 
     def _searched(self) -> list[Section]:
         found, sides = self.candidates, self.context.sides
-        looked = f", looked from: {sides_text(sides, searched=True)}" if sides else ""
+        looked = f", entry sides: {sides_text(sides, searched=True)}" if sides else ""
         warned = (*needle_warnings(self.context.case, found), *(one.sentence for one in found.findings))
         return [
             Section(f"case {self.context.case.name}: {found.windows.headline}", []),
-            Section(f"{len(found)} direction{'s' if len(found) != 1 else ''}{looked}", patient.counts(found)),
+            Section(f"{plural(len(found), 'direction')}{looked}", patient.counts(found)),
             *(Section(one, []) for one in warned),
             Section("the best of each window", patient.windows(found)) if found.safe.any() else self._nothing_safe(),
         ]
@@ -183,7 +184,7 @@ class Run:
             return Section("no candidate is safe", [])
         at = self.candidates.at(row)
         angles = f"theta {at['theta_deg']:g} deg, beta {at['beta_deg']:g} deg"
-        return Section(f"no candidate is safe; closest came {angles}: {reason_text(self.candidates, row)}", [])
+        return Section(f"no candidate is safe; the closest, {angles}: {reason_text(self.candidates, row)}", [])
 
     def _done(self) -> list[Section]:
         """Plan, rehearsal, many rooms, certificate and cross-check, where there are any."""
@@ -196,7 +197,7 @@ class Run:
         if self.rehearsal is not None:
             done.append(Section("rehearsal", patient.rehearsal(self.rehearsal, away, failures=self.failures)))
         if self.distribution is not None:
-            done.append(Section("many rooms", patient.rooms(self.distribution.summary())))
+            done.append(Section("many trials", patient.rooms(self.distribution.summary())))
         if self.certificate is not None:
             done.append(Section("certificate", patient.certificate(self.certificate.summary())))
         if (checked := self.checked) is not None:
@@ -227,4 +228,4 @@ def _other_configuration(candidates: Candidates, plan: Plan) -> list[str]:
     other = float(np.hypot(candidates.chances.lateral_mm[row[0]], candidates.chances.depth_mm[row[0]]))
     if not abs(other - plan.expected_target_error_mm) > NOTABLE * plan.expected_target_error_mm:
         return []
-    return [f"In the configuration of the table and of check {other:.2f} mm: an approach may end in another one."]
+    return [f"In the configuration of the table and of check: {other:.2f} mm. The approach may end in another."]

@@ -140,14 +140,14 @@ def connect(host: str) -> Receiver:
         receiver: Receiver = RTDEReceiveInterface(host, variables=list(VARIABLES))
     except (OSError, RuntimeError, ValueError) as error:  # ValueError: a name that no address can have
         where = f"mirror {host}, port {RTDE_PORT}"
-        what = f"no robot answers: {error}"
-        raise InputError(what, where=where, allowed="a UR that is on", code="no_robot_answers") from error
+        what = f"the robot does not answer: {error}"
+        raise InputError(what, where=where, allowed="a UR that is switched on", code="no_robot_answers") from error
     return receiver
 
 
 def _check_host(host: str) -> None:
     if not 0 < len(host) <= MAX_HOST or not host.isprintable() or any(c.isspace() for c in host):
-        what = f"host of {len(host)} characters, or with spaces in it"
+        what = f"host name of {len(host)} characters, or with spaces"
         refuse(what, f"mirror {host}", f"a name or address of 1 to {MAX_HOST} characters", "bad_host")
 
 
@@ -173,8 +173,8 @@ def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -
             yield state
         elif not receiver.isConnected() or time.monotonic() - heard > SILENCE_S:
             # the library goes on to give the last state it has heard
-            said = "hung up" if not receiver.isConnected() else "tells nothing new"
-            refuse(f"the robot {said}, {last:.3f} s by its clock", "mirror", "a UR that is on", "robot_silent")
+            said = "closed the connection" if not receiver.isConnected() else "sends nothing new"
+            refuse(f"the robot {said}, {last:.3f} s by its clock", "mirror", "a UR that is switched on", "robot_silent")
         time.sleep(period_s)
 
 
@@ -245,7 +245,7 @@ def readings_of(
     if recording is None and host is not None:
         return Readings(live_states(connect(host), period_s=period_s, seconds=seconds), case.inputs)
     if recording is None or host is not None:
-        refuse("one arm at a time", "mirror", "either HOST or --from joints.csv", "conflicting_options")
+        refuse("two sources of joints, or none", "mirror", "HOST, or --from joints.csv", "conflicting_options")
     read = RecordedJoints.read(recording)
     return Readings(read.states(case), (read.input, *case.inputs), read.warnings())
 

@@ -46,7 +46,7 @@ REASON_TEXT = MappingProxyType(
         "probe_out_of_reach": "probe arm cannot reach",
         "needle_out_of_reach": "needle arm cannot reach",
         "probe_arm_collision": "probe arm would touch itself, the table or the phantom",
-        "needle_arm_collision": "needle arm would touch itself, the table or, with more than the needle, the phantom",
+        "needle_arm_collision": "needle arm would touch itself, the table or (except with the needle) the phantom",
         "arms_collide": "the arms, or probe and needle, would touch",
     }
 )
@@ -63,7 +63,7 @@ NOISE_TEXT = MappingProxyType(
         "across_image_mm": "spread of the residuals across the slice, mm",
     }
 )
-HELD_OUT = "Held-out: predicted minus true tip at poses that were not recorded, with what is left of the arms’ errors."
+HELD_OUT = "Held-out: predicted minus true tip at poses that were not recorded, with the remaining errors of the arms."
 
 
 def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
@@ -104,7 +104,7 @@ def write_page(run: SelfcalRun, sheet: Path | None, workcell: Path | None, path:
     shown[2:2] = [_numbers(run.calibration), Section("residuals", [RESIDUALS, residuals])]
     if sheet is not None and workcell is not None and seed is not None:
         if run.punctures:
-            errors = picture(puncture_picture(run.punctures), "Error of every target beside what is expected")
+            errors = picture(puncture_picture(run.punctures), "Error of every target, and the expected error")
             shown.insert(5, Section("", [errors]))
         shown += _pictures(seed, sheet, workcell)
     title, origin = f"{run.name}: ultrasound self-calibration", origin_section(seed)
@@ -120,13 +120,13 @@ RESIDUALS = (
 def sections(found: Facts) -> list[Section]:
     """What the terminal and the page both show."""
     shown = [
-        Section("what the data cannot show", [Warn(tuple(found["cannot_show"]))]),
+        Section("what the data cannot determine", [Warn(tuple(found["cannot_show"]))]),
         Section("calibration", [facts_table([*CALIBRATION, *_if_known(found)], found)]),
     ]
     if found["trials"]:
         shown += [
-            Section("the needle sent to targets seen in the image", _punctures(found)),
-            Section("seeds, each a room of its own", [grid(TRIAL, found["trials"]), HELD_OUT]),
+            Section("insertions to targets in the image", _punctures(found)),
+            Section("seeds, each its own trial", [grid(TRIAL, found["trials"]), HELD_OUT]),
             Section("poses", _poses(found)),
         ]
     return shown
@@ -170,22 +170,22 @@ PUNCTURES = (
 
 def counted(found: Facts) -> str:
     """What the expected error holds."""
-    return "noise alone" if found["arms"] is None else "noise and the arms' declared errors"
+    return "noise alone" if found["arms"] is None else "noise and declared errors of the arms"
 
 
 def _if_known(found: Facts) -> list[tuple[str, str]]:
     """Of the declared arms, and the noise."""
     arms = found["arms"]
-    rows = [] if arms is None else [("χ² of the residuals over their freedom", number(arms["chi2_per_freedom"], 2))]
+    rows = [] if arms is None else [("χ² of the residuals per degree of freedom", number(arms["chi2_per_freedom"], 2))]
     return rows + [(NOISE_TEXT[key], number(value, 3)) for key, value in found["noise"].items()]
 
 
 def _punctures(found: Facts) -> list[Block]:
     if found["punctures"] is None:
-        return ["No target could be reached without touching."]
+        return ["No target could be reached without contact."]
     words = (
-        "In the twin, with the true arms: the target is read off the image (with the reading's error), the needle's "
-        "arm goes where the calibration says. Targets were not recorded before."
+        "In the twin, with the true arms: the target is read in the image (with reading error) and the needle arm "
+        "moves there by the calibration. These targets were not recorded before."
     )
     return [words, facts_table(PUNCTURES, found["punctures"])]
 
@@ -198,17 +198,17 @@ def _poses(found: Facts) -> list[Block]:
         Field(f"{recorded} at random, median of {choice['random_sets']} choices", "random_bound_median_mm", 3, "mm"),
         Field("at random, the best of them", "random_bound_best_mm", 3, "mm"),
     )
-    drawn = Table(("what became of a drawn pose", "draws"), tuple(counts))
+    drawn = Table(("outcome of the drawn poses", "draws"), tuple(counts))
     return [(drawn, facts_table(bounds, choice)), "Cramér-Rao bounds over all candidates, with the usual noise."]
 
 
 def _pictures(seed: int, sheet: Path, workcell: Path) -> list[Section]:
     marks, room = "B-mode pictures with detected and true tips", "Both arms about the phantom"
-    words = "One recorded pose, by the drawing. The needle is drawn 3 mm thick; blue: the slice that the image shows."
-    seen = f"Of seed {seed}. The detector sees the grey picture alone."
+    words = "One recorded pose. The needle is drawn 3 mm thick; blue: the slice in the image."
+    seen = f"Seed {seed}. The detector sees only the grey picture."
     return [
         Section("B-mode pictures", [seen, picture(sheet, marks)]),
-        Section("the room", [picture(workcell, room), words]),
+        Section("the workcell", [picture(workcell, room), words]),
     ]
 
 
@@ -216,8 +216,8 @@ def _numbers(found: Calibration) -> Section:
     """Both transforms, and how well each number is known."""
     matrices = facts_table([("T_end1_image (X), mm", _matrix(found.X)), ("T_base1_base2 (Y), mm", _matrix(found.Y))])
     known = Table(("parameter", "sd"), tuple((name, f"{value:.4f}") for name, value in deviations(found).items()))
-    note = "w: a small turn, R exp([w]×); t: a shift; V: the needle’s direction."
-    return Section("how well each number is known", [matrices, known, note])
+    note = "w: a small rotation, R exp([w]×); t: a shift; V: the needle’s direction."
+    return Section("uncertainty of each parameter", [matrices, known, note])
 
 
 def _matrix(T: Any) -> Markup:
@@ -239,13 +239,13 @@ def _cards(found: Facts) -> list[Card]:
     expected = number(found["predicted_tre_mm"], 2, "mm")
     cards = [
         Card("expected error of the calibration", expected, f"rms at the tip: {counted(found)}"),
-        Card("residuals", number(found["residual_rms_mm"], 2, "mm"), "rms length of the poses that were used"),
+        Card("residuals", number(found["residual_rms_mm"], 2, "mm"), "rms over the poses used"),
         Card("poses", f"{poses - len(aside)} of {poses}", f"set aside: {', '.join(aside) or 'none'}"),
     ]
     if reached is not None:
         detail = (
-            f"rms over {reached['targets']} targets, worst {number(reached['error_worst_mm'], 2, 'mm')}; calibration, "
-            f"arms and reading let expect {number(reached['predicted_with_reading_rms_mm'], 2, 'mm')}"
+            f"rms over {reached['targets']} targets, worst {number(reached['error_worst_mm'], 2, 'mm')}; expected "
+            f"from calibration, arms and reading: {number(reached['predicted_with_reading_rms_mm'], 2, 'mm')}"
         )
         cards.insert(0, Card("tip to target, true", number(reached["error_rms_mm"], 2, "mm"), detail))
     return cards

@@ -22,7 +22,7 @@ from puncture_twin.twin.guidance.ultrasound.summaries import Choice
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 from puncture_twin.twin.rehearsal.selfcal_trial import Puncture, SelfcalTrial, run_trial
 
-NO_JOINTS = "{file}: no joints (columns A_q1_deg to B_q6_deg): the arms' errors that the case declares are not counted"
+NO_JOINTS = "{file}: no joints (columns A_q1_deg to B_q6_deg): the declared arm errors of the case are not counted"
 
 RANDOM_SETS = 50
 """Random choices that the informative one is compared with."""

@@ -142,11 +142,12 @@ class Liu2007Tables:
         fraction = MOST_NOT_CONFIRMED + CHANCE * np.sqrt(MOST_NOT_CONFIRMED * (1 - MOST_NOT_CONFIRMED) / ours.targets)
         return (
             Condition(
-                f"the error falls by more than chance: {gain.mean:.2f} mm, standard error {gain.error:.2f}",
+                f"the error drops by more than chance: {gain.mean:.2f} mm, standard error {gain.error:.2f}",
                 bool(gain.mean > CHANCE * gain.error),
             ),
             Condition(
-                f"after the servo, {ours.after_mean:.2f} mm, is at most {most:.2f} (1.1 of the mapping's, and chance)",
+                f"after the servo, {ours.after_mean:.2f} mm, is at most {most:.2f} (1.1 times the mapping's, plus "
+                "chance)",
                 bool(ours.after_mean <= most),
             ),
             Condition(

@@ -86,8 +86,8 @@ def _annotate(axes: Axes, session: Session, reached: Reached, number: int) -> No
         (f"camera {number + 1}: {workcell.case.name}, seed {session.seed}, at the end of target {reached.target}", INK),
         ("orange ring: ball as measured", BALL),
         ("green cross: true targets, the large one served now", TARGET),
-        ("blue rings: markers where the mapping has them", MARKER),
-        ("the room is drawn for looking at, without the lens's distortion", INK),
+        ("blue rings: marker positions by the mapping", MARKER),
+        ("the scene is drawn without lens distortion", INK),
     )
     for row, (text, colour) in enumerate(lines):
         place, weight = (16, -14 - 24 * row), "normal" if row else "bold"
@@ -148,8 +148,8 @@ def _finish(axes: Axes, session: Session, longest: int) -> None:
     for axis_format in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         axis_format("{x:g}")
     axes.set_xticks(range(longest + 1))
-    axes.set_xlabel("corrections driven (0: the robot alone)")
+    axes.set_xlabel("corrections (0: the robot alone)")
     axes.set_ylabel("ball to estimated target, mm")
-    axes.set_title("lines: true distance; dots: as the cameras saw it")
+    axes.set_title("lines: true distance; dots: as measured by the cameras")
     axes.grid(visible=True, which="both", color="#e4e6ea", linewidth=0.6)
     axes.legend(fontsize=8, title="target", loc="upper left", bbox_to_anchor=(1.01, 1.0))

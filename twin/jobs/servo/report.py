@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
@@ -58,7 +59,7 @@ PHASES = {"open_loop": "by mapping and robot alone", "servoed": "after the servo
 NO_TOUCH = "not computed: the case has no structures"
 """Of ``p_touch``: which is something else than 0."""
 
-NOT_MODELLED = "a rod that bends, cameras that move after the calibration, tissue"
+NOT_MODELLED = "bending of the rod, cameras moved after the calibration, tissue"
 
 DOUBTED = 0.01
 """Chance of residuals so large below which the declaration is doubted, as in the CT case."""
@@ -211,7 +212,7 @@ def servo_text(facts: Facts) -> str:
 def write_servo_page(case: ServoCase, facts: Facts, pictures: Pictures, path: Path) -> Path:
     """Write ``servo.html``: the sections, and the pictures of the first seed, on one page that needs no network."""
     count = len(facts["sessions"][0]["targets"])
-    title = f"{case.name}: visual servoing onto {count} targets"
+    title = f"{case.name}: visual servoing to {plural(count, 'target')}"
     return write_page(path, title, _setup(case), _cards(facts), sections(facts, pictures), case.inputs)
 
 
@@ -245,8 +246,8 @@ TARGET = (
 
 
 def _sessions(ours: Facts) -> str:
-    seeds = f"{ours['seeds']} seed" + "s" * (ours["seeds"] != 1)
-    return seeds + f"; {ours['refused']} sessions could not be held" * bool(ours["refused"])
+    seeds = plural(ours["seeds"], "seed")
+    return seeds + f"; not possible: {plural(ours['refused'], 'session')}" * bool(ours["refused"])
 
 
 STATISTICS = (
@@ -255,7 +256,7 @@ STATISTICS = (
     Field("stereo, mean and maximum", lambda ours: _mean_and_most(ours, "stereo")),
     Field("mapping, mean", "mapping_mean", 3, "mm"),
     Field("mapping, rms", "mapping_rms", 3, "mm"),
-    Field("what the mapping expects of itself, rms", "expected_tre_rms", 3, "mm"),
+    Field("error expected by the mapping, rms", "expected_tre_rms", 3, "mm"),
     Field("before, mean", "before_mean", 3, "mm"),
     Field("after, mean", "after_mean", 3, "mm"),
     Field("after over mapping (its floor is 1)", "after_over_mapping", 3),
@@ -273,11 +274,11 @@ CALIBRATION = (
 
 def _targets(first: Facts) -> list[Block]:
     if first["refused"]:
-        return [Warn((f"not held: {first['refused']}",))]
+        return [Warn((f"not possible: {first['refused']}",))]
     words = (
-        "mapping: estimated to true target; expected: what the mapping says of itself (rms); before: true ball to true "
-        "target where the robot alone brought it; after: the same after the servo; servo-only: true ball to estimated "
-        "target, the part that the servo answers for"
+        "mapping: estimated to true target; expected: its own estimate (rms); before: true ball to true target after "
+        "the robot alone; after: the same after the servo; servo-only: true ball to estimated "
+        "target, the part due to the servo"
     )
     return [grid(TARGET, first["targets"]), words]
 
@@ -285,7 +286,7 @@ def _targets(first: Facts) -> list[Block]:
 def _shown(pictures: Pictures) -> list[Section]:
     convergence = picture(pictures.convergence, "Distance from ball to estimated target against corrections")
     cameras = [picture(one, one.stem) for one in pictures.cameras]
-    return [Section("how the servo came to rest", [convergence]), Section("through the cameras", cameras)]
+    return [Section("convergence of the servo", [convergence]), Section("through the cameras", cameras)]
 
 
 def _stereo(first: Facts) -> list[Block]:
@@ -319,25 +320,25 @@ def _needle_blocks(needle: Facts, first: Facts) -> list[Block]:
     rows = [
         ("tip error, rms, mm", *_both(needle, "realised_rms_mm", "predicted_rms_mm")),
         ("direction, rms, °", *_both(needle, "realised_direction_deg", "predicted_direction_deg")),
-        ("inside of the 95 % ellipsoid", *_both(needle, "coverage_95", "")),
+        ("inside the 95 % ellipsoid", *_both(needle, "coverage_95", "")),
         *([] if radius is None else [(f"hit, within {radius:g} mm", *_both(needle, "hit_share", "mean_p_hit"))]),
     ]
     warned = []
     if needle["wrong_belief"]:
-        warned.append("The rooms were drawn from [rehearsal.errors]: the belief is wrong by design.")
+        warned.append("The trials were drawn from [rehearsal.errors]: the belief is wrong by design.")
     test = needle["declaration"]
-    tested = "not tested, the joint estimate does not settle"
+    tested = "not tested: the joint estimate does not converge"
     if test is not None:
         tested = "residuals {chi_squared:.0f} for {freedom} degrees of freedom, p = {p:.3f}".format(**test)
         if test["p"] < DOUBTED:
-            warned.append(f"WARNING: {tested}: what was measured lies farther apart than declared")
+            warned.append(f"WARNING: {tested}: the measurements differ by more than declared")
     return [
         Table(("realised / predicted", *PHASES.values()), tuple(rows)),
         Warn(tuple(warned)),
-        "The needles of one seed share its room: seeds count, not needles. "
+        "The needles of one seed share its errors: the seeds are independent, the needles are not. "
         f"Declared errors: {tested}. Chance to touch: {NO_TOUCH}. Not modelled: {NOT_MODELLED}.",
-        f"Each needle of seed {first['seed']} after the servo, mm; expected (rms) holds what the tolerance leaves; "
-        "unknown where nothing was seen at the end, or the measurements contradict each other:",
+        f"Each needle of seed {first['seed']} after the servo, mm; expected (rms) includes the tolerance; unknown if "
+        "nothing was seen at the end, or if the measurements contradict each other:",
         grid(NEEDLE, first["targets"]),
     ]
 
@@ -395,18 +396,18 @@ def _paper(facts: Facts) -> list[Section]:
     both = zip(facts["paper_table_1_mm"], first["stereo_mm"], strict=False)
     points = ((f"{theirs:.2f}", f"{own:.2f}") for theirs, own in both)
     words = (
-        "The paper's head, robot, points and targets are not ours: compare means, not rows. It did not measure what "
-        "the servo alone leaves; by the triangle's inequality it is at least |after − mapping|. "
-        f"Rows of the twin: seed {first['seed']}."
+        "The paper's head, robot, points and targets are not ours: compare means, not rows. It did not measure the "
+        "error of the servo alone; by the triangle inequality it is at least |after − mapping|. Rows of the twin: "
+        f"seed {first['seed']}."
     )
     return [
         Section("Liu et al. 2007, and ours", [words, (_means(facts), grid(_PAPER_ROW, rows))]),
         Section("its ten points, stereo, mm", [Table(("paper", "ours"), tuple(points))]),
-        Section("what the servo is worth", [
+        Section("gain of the servo", [
             f"gain, before − after: {gains[0]} mm with the rod tilted {facts['tilted_more_deg']:.0f} deg more during "
             f"the calibration than at the targets; {gains[1]} mm tilted alike; paper {facts['paper_gain_mm']:.2f} mm; "
             f"after over mapping {ours['after_over_mapping']:.3f}, paper {1.00 / 1.06:.2f}, below 1 by chance",
-            "the tilt is ours: the paper states none, and what gave its robot the error is not known",
+            "the tilt is our choice: the paper states none, and the cause of its robot's error is not known",
         ]),
         Section("demanded here (the exit code)", [Table((), tuple(
             (one["words"], "holds" if one["holds"] else "DOES NOT HOLD") for one in facts["conditions"]))]),
@@ -429,11 +430,11 @@ def _means(facts: Facts) -> Table:
     for column in facts["paper"]:
         name = column["name"]
         most = ours["stereo_max"] if name == "stereo" else max(row[f"{name}_mm"] for row in rows)
-        note = "" if column["holds"] else " (not what the rows give)"
+        note = "" if column["holds"] else " (differs from the rows)"
         printed = "{printed_mean:.2f} / {printed_max:.2f}".format(**column) + note
         by_rows = "{mean:.3f} / {max:.2f}".format(**column)
         lines.append((name, printed, by_rows, f"{ours[f'{name}_mean']:.2f} / {most:.2f}"))
     alone = f"{ours['servo_only_mean']:.3f} / {ours['servo_only_max']:.2f}"
     lines.append(("servo-only", "not measured", "–", alone))
-    head = ("mean / maximum, mm", "paper, printed", "paper, by its rows", f"ours, {ours['seeds']} seeds")
+    head = ("mean / maximum, mm", "paper, printed", "paper, by its rows", f"ours, {plural(ours['seeds'], 'seed')}")
     return Table(head, tuple(lines))

@@ -338,7 +338,7 @@ def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator
     if counts.min() < 2 or np.prod(counts, dtype=float) > MOST_VOXELS:
         shown = " x ".join(map(str, counts))
         allowed = f"2 voxels or more along each axis, {MOST_VOXELS:,} at most: larger pixels, or --fov and --length"
-        refuse(f"a scan of {shown} voxels", "scan", allowed, "out_of_range")
+        refuse(f"the scan would have {shown} voxels", "scan", allowed, "out_of_range")
     T = np.diag([*spacing, 1.0])
     T[:3, 3] = first
     return VolumeGrid((int(counts[0]), int(counts[1]), int(counts[2])), T, {})

@@ -217,7 +217,7 @@ def check_closed(solid: Solid, where: str) -> Solid:
         InputError: Its surface is open.
     """
     if not solid.mesh.closed:
-        refuse(f"'{solid.name}' has an open surface", where, "closed surfaces", "open_mesh")
+        refuse(f"'{solid.name}' is not a closed surface", where, "closed surfaces", "open_mesh")
     return solid
 
 

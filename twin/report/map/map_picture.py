@@ -18,6 +18,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
 from puncture_twin.planning.base.reasons import NOT_SEARCHED_TEXT, UNSEEN_AIR, Reason, Rgb, css
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.report.figures import figure_of, write_png
@@ -93,7 +94,7 @@ def map_figure(candidates: Candidates, case: Any, pick: Pick | None = None, rast
     _column(figure.add_axes(SIDE), candidates, view, pick)
     title = f"{case.name}: entry directions to {target_text(case)}"
     figure.text(0.02, 0.955, title, fontsize=19, weight="bold")
-    line = f"{len(candidates):,} directions, step {np.degrees(step_of(candidates)):g}°;  {needle_text(case)}"
+    line = f"{plural(len(candidates), 'direction')}, step {np.degrees(step_of(candidates)):g}°;  {needle_text(case)}"
     if not candidates.arm_checked:
         line += ";  ARM NOT CHECKED"
     figure.text(0.02, 0.918, line, fontsize=12, color="0.25")
@@ -114,9 +115,9 @@ def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None
     outside = "" if whole else f"White with lines: {NOT_SEARCHED_TEXT}.\n"
     toward = f"Centre (+), θ = 0: {view.centre}.\n" if view.centre else ""
     if view.theta_max > BEYOND:
-        toward += "Beyond the thick ring (θ 90°) it comes from the far side.\n"
+        toward += "Beyond the thick ring (θ 90°) the needle comes from the far side.\n"
     text = (
-        "HOW TO READ\nThe target is behind the centre; you look at the body\n"
+        "HOW TO READ\nThe target is behind the centre; the body is seen\n"
         "from OUTSIDE, along −z of the entry frame. A point is\n"
         "where the needle comes from: θ grows from the centre\n"
         "to the rim, β runs counter-clockwise.\n"
@@ -233,7 +234,7 @@ def _chance_legend(axes: Axes, candidates: Candidates, y: float) -> float:
     """What lines and hatching mean; nothing without chances. Returns where the next line may stand."""
     if touch_nothing(candidates) is None:
         return y
-    axes.text(0.0, y + 0.034, "chance to touch nothing forbidden", fontsize=SMALL, va="center")
+    axes.text(0.0, y + 0.034, "chance to touch no structure to avoid", fontsize=SMALL, va="center")
     text = (f"< {LEVELS[0]:g}", *(f"{low:g}–{high:g}" for low, high in pairwise(LEVELS)), f"> {LEVELS[-1]:g}")
     for place, (name, hatch) in enumerate(zip(text, HATCHES, strict=True)):
         x = 0.25 * place
@@ -262,7 +263,7 @@ def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float) -> 
     box = {"boxstyle": "round,pad=0.45", "facecolor": "#eef7f2", "edgecolor": "#00684a"}
     look: dict[str, Any] = {"fontsize": 10, "linespacing": 1.4, "va": "top", "bbox": box}
     if pick is None:
-        text = "NOTHING IS SAFE\nEvery direction of the grid is refused."
+        text = "NOTHING IS SAFE\nEvery direction of the grid is rejected."
         box |= {"facecolor": "#ffe9e0", "edgecolor": "#b03000"}
         look |= {"fontsize": 13, "weight": "bold", "color": "#a02000"}
     else:

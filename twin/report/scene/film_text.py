@@ -169,9 +169,9 @@ def model_note(case: Any) -> str:
     needle = (
         "needle and tissue are rigid"
         if case.bending is None
-        else "tissue pushes on the needle; its bend is in where it ends, drawn straight"
+        else "tissue pushes on the needle: its end is bent, the drawing is straight"
     )
-    breath = "nothing breathes" if case.breathing is None else "the body stands still as in the CT"
+    breath = "nothing breathes" if case.breathing is None else "the body is drawn still, as in the CT"
     return f"{needle}; {breath}; research software, not a medical device"
 
 
@@ -195,7 +195,7 @@ def _strip(draw: ImageDraw.ImageDraw, source: FrameText, row: int, moment: float
         parts = f"lateral {number(r.lateral_mm, 2)}, {number(abs(r.depth_mm), 2)} too {deeper}"
         place = "" if r.standing is None else f"; {r.standing.place}"
         if r.truth_is_belief:  # what matters more than the parts of so small an error, and there is room for one
-            parts, place = "the joints' alone, the patient lies exactly as believed", ""
+            parts, place = "from the joints alone; the patient is exactly where believed", ""
         result = f"tip error at the end {number(r.tip_error_mm, 2, 'mm')}: {parts}{place}"
         annotate.write(draw, (12, 51), result, size=VALUE, bold=True)
     else:

@@ -196,13 +196,13 @@ def _text(
     annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_text(case)}", size=28, bold=True)
     nothing = pick is None and plan is None
     if nothing:
-        text, colour = "NOTHING IS SAFE: every direction is refused; no needle is shown", annotate.RED
+        text, colour = "NOTHING IS SAFE: every direction is rejected; no needle is shown", annotate.RED
     else:
         text, colour = _path_text(plan, pick, failed, arm), annotate.RED if failed else annotate.FAINT
     annotate.write(draw, (18, 50), text, size=18, bold=nothing, colour=colour)
     items = [("target", palette.TARGET_POINT), (needle_text(case.needle), palette.NEEDLE)]
     if candidates.safe.any():
-        items.append((f"{candidates.safe_text}: where a needle may enter, and its corridor (overview)", SAFE))
+        items.append((f"{candidates.safe_text}: safe entry area and corridor (overview)", SAFE))
     items.append(("skin (see-through)", palette.SKIN))
     if arm:
         items += [
@@ -211,7 +211,7 @@ def _text(
                 palette.ARM,
             ),
             ("needle holder", palette.HOLDER),
-            ("where its base stands", palette.TABLE),
+            ("position of its base", palette.TABLE),
         ]
     items += [(_see_through(b), b.colour) for b in bodies if b.group == "room"]
     below = annotate.legend(draw, items, 20, LEGEND_TOP, WIDTH - 20)

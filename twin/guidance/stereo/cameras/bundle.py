@@ -127,7 +127,7 @@ def _inverse(information: Floats) -> Floats:
     """Inverse after scaling to a unit diagonal: the parameters' units differ by powers of ten."""
     scale = 1 / np.sqrt(np.diag(information))
     if not np.isfinite(scale).all() or np.linalg.cond(information * np.outer(scale, scale)) > 1e15:
-        refuse("a parameter that nothing determines", "bundle", "hold it or give it a spread", "undetermined")
+        refuse("nothing determines a parameter", "bundle", "fix it, or state its standard deviation", "undetermined")
     return np.asarray(np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale))
 
 

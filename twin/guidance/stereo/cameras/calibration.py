@@ -151,7 +151,7 @@ def _check_shapes(points: Floats, pixels: Floats, names: Sequence[str] | None, w
 def _check_points(points: Floats, pixels: Floats, names: Sequence[str], where: str | Path) -> None:
     lost = np.asarray(~np.isfinite(pixels).all(axis=1))
     if lost.any():
-        refuse(f"ball not found: {_listed(names, lost)}", where, "every ball seen", "ball_not_found")
+        refuse(f"ball not found: {_listed(names, lost)}", where, "a ball seen at every point", "ball_not_found")
     wrong = np.asarray(~np.isfinite(points).all(axis=1))
     if wrong.any():
         refuse(f"position not finite: {_listed(names, wrong)}", where, "finite mm", "not_finite")
@@ -160,18 +160,18 @@ def _check_points(points: Floats, pixels: Floats, names: Sequence[str], where: s
         refuse(f"{distinct} distinct points", where, f"{MIN_POINTS} or more, not in a plane", "too_few_points")
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[2] < COPLANAR * spread[0]:
-        what = f"the points are coplanar: {spread[2] / spread[0]:.2g} as thick as long"
-        allowed = f"a set at least {COPLANAR:g} as thick as long, such as a 3 x 2 x 2 grid"
+        what = f"the points are coplanar: thickness {spread[2] / spread[0]:.2g} of the length"
+        allowed = f"a set whose thickness is at least {COPLANAR:g} of its length, such as a 3 x 2 x 2 grid"
         refuse(what, where, allowed, "points_coplanar")
 
 
 def _check_linear(linear: LinearFit, points: Floats, pixels: Floats, names: Sequence[str], where: str | Path) -> None:
     if linear.condition > CRITICAL:
-        allowed = "points that are not on a plane and a line, or on a twisted cubic through the camera"
-        refuse(f"the points leave the camera free (condition {linear.condition:.2g})", where, allowed, "undetermined")
+        allowed = "points not on a plane and a line, nor on a twisted cubic through the camera"
+        refuse(f"the camera is undetermined (condition {linear.condition:.2g})", where, allowed, "undetermined")
     behind = np.asarray(points @ linear.M[2, :3] + linear.M[2, 3] <= 0)
     if behind.any():
-        refuse(f"behind the camera: {_listed(names, behind)}", where, "all in front of it", "behind_camera")
+        refuse(f"behind the camera: {_listed(names, behind)}", where, "points in front of the camera", "behind_camera")
     misses = np.linalg.norm(project(linear.M, points) - pixels, axis=1)
     _check_misses(misses, names, where)
 
@@ -180,14 +180,14 @@ def _check_fit(bundle: Bundle, points: Floats, names: Sequence[str], where: str 
     unseen = np.asarray(~np.isfinite(bundle.cameras[0].project(points)).all(axis=1))
     if unseen.any():
         what = f"behind the camera or beyond its lens: {_listed(names, unseen)}"
-        refuse(what, where, "all in its view", "behind_camera")
+        refuse(what, where, "all points in its view", "behind_camera")
     _check_misses(np.linalg.norm(bundle.residuals_px, axis=1), names, where)
 
 
 def _check_misses(misses: Floats, names: Sequence[str], where: str | Path) -> None:
     worst = int(np.argmax(misses))
     if misses[worst] > MAX_RESIDUAL_PX:
-        what = f"{names[worst]} misses by {misses[worst]:.1f} px: swapped, moved or found wrongly"
+        what = f"{names[worst]} misses by {misses[worst]:.1f} px: swapped, moved or wrongly detected"
         refuse(what, where, f"residuals up to {MAX_RESIDUAL_PX:g} px", "point_misses")
 
 

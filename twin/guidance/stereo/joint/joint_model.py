@@ -287,7 +287,7 @@ MAX_ITERATIONS = 30
 ARRIVED = 1e-4
 """A step of the adjustment whose every residual changes by less than this standard deviation has arrived."""
 
-UNSETTLED = "the joint adjustment does not settle: a measurement is far off, or the cameras see too little"
+UNSETTLED = "the joint adjustment does not settle: a measurement is an outlier, or the cameras see too little"
 
 
 class Offset(NamedTuple):

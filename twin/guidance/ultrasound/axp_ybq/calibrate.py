@@ -9,6 +9,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.text import plural
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, without_play
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibration_of, with_length
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
@@ -28,18 +29,18 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Reco
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import RobustFit
 
 SHAFT_BIAS = (
-    "a constant error of the detected tip along the shaft moves the tip in the needle's flange frame and leaves every "
-    "residual as it is; the known needle length would hold it"
+    "a constant error of the detected tip along the shaft shifts the tip in the needle's flange frame but changes no "
+    "residual; a known needle length would fix it"
 )
 
 ARMS_TAKEN = (
-    "errors of the arms that repeat from pose to pose (lengths, joint zeros): none were declared with the joints, so "
-    "the stated errors count noise alone and are too small"
+    "errors of the arms that repeat from pose to pose (lengths, joint zeros): none were declared together with the "
+    "joints, so the stated errors count only noise and are too small"
 )
 
 PLAY_SIGN = (
-    "on which side of their play the joints stood: the recording does not say which way they turned, so play counts as "
-    "noise, and the region is too narrow beside a noise that was found"
+    "on which side of their backlash the joints were: the recording does not state how they rotated, so backlash "
+    "counts as noise, and the region is too narrow where the noise was estimated"
 )
 
 DIRECTION_SIGN = (
@@ -108,15 +109,15 @@ def calibrate(
 
 def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: Estimate | None) -> None:
     if recording.pixels and not scale:
-        refuse("the tip is in pixels", "recording", "mm, or mm per pixel to be found (scale)", "wrong_unit")
+        refuse("the tip is in pixels", "recording", "mm, or scale to estimate mm per pixel", "wrong_unit")
     if known_tip is not None and (np.shape(known_tip) != (3,) or not np.isfinite(known_tip).all()):
         refuse(f"known tip {known_tip}", "known_tip", "three finite numbers, mm, frame end2", "not_finite")
     least = LEAST_POSES if known_tip is None else LEAST_POSES_KNOWN_TIP
     if start is not None:
         least = len(active_columns(tip=known_tip is None, scale=scale, direction=False)) // 3 + 1
     if len(recording) < least:
-        allowed = f"{least} or more" + (f", better {ADVISED_POSES}" if least == LEAST_POSES else "")
-        refuse(f"{len(recording)} poses", "recording", allowed, "too_few_poses")
+        allowed = f"{least} or more" + (f", preferably {ADVISED_POSES}" if least == LEAST_POSES else "")
+        refuse(plural(len(recording), "pose"), "recording", allowed, "too_few_poses")
 
 
 def _solve(

@@ -121,8 +121,9 @@ class Calibration(Shown):
         chance = 100.0 * self.chi_squared_chance()
         return (
             *warnings,
-            f"chi-squared of the residuals is {ratio:.2f} times their freedom ({self.freedom}): noise or arms are "
-            f"probably declared too small, and the stated errors with them; a right one gives this in {chance:.2g} %",
+            f"chi-squared of the residuals is {ratio:.2f} times their degrees of freedom ({self.freedom}): the "
+            "declared noise or arm errors are probably too small, and so are the stated errors; a correct "
+            f"declaration gives this in {chance:.2g} % of cases",
         )
 
     @property

@@ -68,9 +68,9 @@ ALLOWED = "v: the needle's direction from hub to tip, in the image's axes u and 
 
 SLIPS: Mapping[str, Floats] = MappingProxyType(
     {
-        "v is turned by a right angle": np.array([[0.0, -1.0], [1.0, 0.0]]),
+        "v is rotated by a right angle": np.array([[0.0, -1.0], [1.0, 0.0]]),
         "one axis of v has the other sign": np.diag([1.0, -1.0]),
-        "v_x and v_y are exchanged": np.array([[0.0, 1.0], [1.0, 0.0]]),
+        "v_x and v_y are swapped": np.array([[0.0, 1.0], [1.0, 0.0]]),
     }
 )
 """What people write instead, and how it is undone, but for the sign of the whole."""
@@ -146,7 +146,7 @@ def agreed_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.
     axis = axis * np.sign(along if known else np.median(seen[kept] @ axis) or 1.0)
     backward = np.asarray(seen @ axis < 0.0)
     if backward[kept].sum() > 0.5 * kept.sum():
-        what = f"{_counted(recording.names, backward, REVERSED)}: by it the tip would lie behind the flange"
+        what = f"{_counted(recording.names, backward, REVERSED)}: the tip would then be behind the flange"
         refuse(what, "recording", ALLOWED, "directions_reversed")
     agrees = (angles <= max(FAR * middle / HALF_NORMAL, LEAST_ANGLE)) & ~backward
     total = (agrees & kept) @ seen
@@ -189,7 +189,7 @@ def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection
     found = []
     for code, rows, problem, most in (
         ("directions_reversed", seen.reversed, REVERSED, 0.0),
-        ("directions_aside", aside & ~seen.reversed, "v disagrees with the other poses", FEW),
+        ("directions_aside", aside & ~seen.reversed, "v contradicts the other poses", FEW),
     ):
         if rows.any():
             severity = Severity.WARNING if rows.mean() > most else Severity.NOTE
@@ -197,8 +197,8 @@ def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection
             found.append(Finding(code, severity, text, {"count": float(rows.sum())}))
     if not seen.sign_known:
         text = (
-            "the tip does not lie along the needle's axis as it was measured: that the needle points the way that most "
-            "directions say could not be checked"
+            "the tip is not on the measured axis of the needle: its sense, taken from most directions, could not be "
+            "checked"
         )
         found.append(Finding("direction_sign", Severity.WARNING, text))
     return tuple(found)
@@ -294,7 +294,7 @@ def directions_image(recording: Recording, estimate: Estimate) -> Floats:
         ValueError: The recording holds no directions.
     """
     if recording.v is None:
-        raise ValueError("the recording holds no directions")
+        raise ValueError("the recording has no directions")
     v = np.zeros((len(recording), 3))
     v[:, : recording.v.shape[1]] = recording.v
     v[:, :2] *= estimate.scale

@@ -112,7 +112,7 @@ def observe(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
         return Observability(ratio, 0, ())
     found = [*_orientation(estimate, recording, J, active, limit), *_tip(estimate, recording, J, active, limit)]
     found += _relative(estimate, recording, J, active, limit)
-    text = "the poses leave a combination of the unknowns free that has no simple name: vary everything more"
+    text = "the poses do not determine one combination of the unknowns, which has no simple name: vary everything more"
     return Observability(
         ratio, int((values < limit).sum()), tuple(found) or (IllConditionedMotion("unnamed", 1, text),)
     )
@@ -147,16 +147,16 @@ def _orientation(
     needle[T_Q], needle[T_Y] = np.eye(3), -estimate.R_Y @ nearest_rotation(recording.B[:, :3, :3].mean(axis=0))
     found = []
     for arm, family, slides in (
-        ("probe", probe, "the image's place on the probe and the distance between the bases"),
-        ("needle", needle, "the tip's place on the needle and the distance between the bases"),
+        ("probe", probe, "the position of the image on the probe and the distance between the bases"),
+        ("needle", needle, "the position of the tip on the needle and the distance between the bases"),
     ):
         ill_conditioned, _ = _ill_conditioned_part(J, active, family, limit)
         if ill_conditioned == 3:
             found.append(
-                IllConditionedMotion(f"{arm}_orientation", 3, f"the {arm} hardly turns: {slides} can slide together")
+                IllConditionedMotion(f"{arm}_orientation", 3, f"the {arm} hardly rotates: {slides} can shift together")
             )
         elif ill_conditioned:
-            text = f"the {arm} turns about one axis only: {slides} can slide together along it"
+            text = f"the {arm} rotates about one axis only: {slides} can shift together along it"
             found.append(IllConditionedMotion(f"{arm}_axis", ill_conditioned, text))
     return found
 
@@ -170,10 +170,10 @@ def _tip(
     family[W_X], family[T_X] = np.eye(3), estimate.R_X @ skew(p)
     ill_conditioned, _ = _ill_conditioned_part(J, active, family, limit)
     if ill_conditioned == 3:
-        text = "the tip hardly moves in the image: the image can turn about it on the probe"
+        text = "the tip hardly moves in the image: the image can rotate about it on the probe"
         return [IllConditionedMotion("tip_position", 3, text)]
     if ill_conditioned:
-        text = "the tip moves along one line of the image only: the image can turn about that line on the probe"
+        text = "the tip moves along one line of the image only: the image can rotate about that line on the probe"
         return [IllConditionedMotion("tip_line", ill_conditioned, text)]
     return []
 
@@ -188,15 +188,15 @@ def _relative(
     if ill_conditioned == 0:
         return []
     if ill_conditioned == 3:
-        text = "needle and image hardly turn against each other: image and tip can slide together in any direction"
+        text = "needle and image hardly rotate against each other: image and tip can shift together in any direction"
         return [IllConditionedMotion("needle_in_image", 3, text)]
     if ill_conditioned == 1 and np.linalg.norm(a[:2]) >= IN_PLANE:
-        text = "the insertion angle in the image hardly varies: the tip can slide along the needle"
+        text = "the insertion angle in the image hardly varies: the tip can shift along the needle"
         return [IllConditionedMotion("insertion_angle", 1, text)]
     if ill_conditioned == 1 and abs(a[2]) >= IN_PLANE:
-        text = "the needle hardly turns about itself: image and tip can slide together across the image"
+        text = "the needle hardly rotates about its axis: image and tip can shift together across the image"
         return [IllConditionedMotion("needle_roll", 1, text)]
-    text = "the needle turns against the image about one axis only: image and tip can slide together along it"
+    text = "the needle rotates against the image about one axis only: image and tip can shift together along it"
     return [IllConditionedMotion("needle_in_image_axis", ill_conditioned, text)]
 
 
@@ -385,12 +385,12 @@ def _one(pose: PoseChange) -> str:
     changes = []
     for axis, angle in zip(IMAGE_AXES, pose.probe_turn_image, strict=True):
         if angle:
-            changes.append(f"turn the probe by {np.degrees(angle):+.0f} deg about the {axis} through the tip")
+            changes.append(f"rotate the probe by {np.degrees(angle):+.0f} deg about the {axis} through the tip")
     if pose.tip_shift_mm.any():
         u, v = pose.tip_shift_mm
-        changes.append(f"bring the tip to another place of the image, u {u:+.0f} mm, v {v:+.0f} mm")
+        changes.append(f"bring the tip to another point of the image, u {u:+.0f} mm, v {v:+.0f} mm")
     if pose.insertion_change:
         changes.append(f"change the insertion angle in the image by {np.degrees(pose.insertion_change):+.0f} deg")
     if pose.needle_roll:
-        changes.append(f"turn the needle about itself by {np.degrees(pose.needle_roll):+.0f} deg")
+        changes.append(f"rotate the needle about its axis by {np.degrees(pose.needle_roll):+.0f} deg")
     return " and ".join(changes)

@@ -107,12 +107,12 @@ class Recording(Shown):
         if self.shaft_mm is not None:
             object.__setattr__(self, "shaft_mm", _lengths(self.shaft_mm, self.v, names))
         if (self.q_probe is None) != (self.q_needle is None):
-            refuse("joints of one arm only", "recording", "those of both, or none", "joints_of_one_arm")
+            refuse("joints of only one arm", "recording", "joints of both arms, or of none", "joints_of_one_arm")
         for key in ("q_probe", "q_needle"):
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, _angles(getattr(self, key), key, names))
         if (self.turn_probe is None) != (self.turn_needle is None) or (self.turn_probe is not None and not self.joints):
-            refuse("turns without joints, or of one arm only", "recording", "both, with joints", "joints_of_one_arm")
+            refuse("turns without joints, or of only one arm", "recording", "both, with joints", "joints_of_one_arm")
         for key in ("turn_probe", "turn_needle"):
             if getattr(self, key) is not None:
                 object.__setattr__(self, key, _signs(getattr(self, key), key, names))
@@ -149,7 +149,7 @@ class Recording(Shown):
         """
         widths = [None if r.v is None else r.v.shape[1] for r in (self, other)]
         if widths[0] != widths[1] or self.pixels != other.pixels:
-            refuse("two recordings that hold different things", "recording", "the same columns", "tables_differ")
+            refuse("two recordings with different columns", "recording", "the same columns", "tables_differ")
         A, B, P = (np.concatenate([getattr(r, key) for r in (self, other)]) for key in "ABP")
         parts: dict[str, Any] = {key: _both(getattr(self, key), getattr(other, key)) for key in OPTIONAL}
         return Recording(A, B, P, pixels=self.pixels, **parts)
@@ -181,7 +181,7 @@ def _angles(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
 
 def _lengths(values: Floats, v: Floats | None, names: tuple[str, ...]) -> Floats:
     if v is None:
-        refuse("shaft_mm without directions", "recording", "beside v, or not at all", "missing_column")
+        refuse("shaft_mm without directions", "recording", "together with v, or not at all", "missing_column")
     array = _finite(np.reshape(values, (-1, 1)), "shaft_mm", names, widths=(1,))[:, 0]
     _refuse_first(
         array < LEAST_SHAFT_MM, names, "shaft_mm", "is too little", f"at least {LEAST_SHAFT_MM:g} mm", "out_of_range"
@@ -192,7 +192,7 @@ def _lengths(values: Floats, v: Floats | None, names: tuple[str, ...]) -> Floats
 def _signs(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
     array = _finite(values, what, names, widths=(6,))
     bad = np.asarray(~np.isin(array, (-1.0, 0.0, 1.0)).all(axis=1))
-    _refuse_first(bad, names, what, "is no way to turn", "1, -1, or 0 where nobody knows", "bad_value")
+    _refuse_first(bad, names, what, "is not a direction of rotation", "1, -1, or 0 if not known", "bad_value")
     return array
 
 

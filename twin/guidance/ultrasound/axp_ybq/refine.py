@@ -193,7 +193,7 @@ SIGNIFICANT = 0.01
 CLEAR = 3.0
 """An error so many standard deviations from zero is named with the largest one."""
 
-TEXT = ("mm per unit of P along u: {:.3f} times", "along v: {:.3f} times", "skew {:+.2f} deg", "v turned {:+.2f} deg")
+TEXT = ("mm per unit of P along u: {:.3f} times", "along v: {:.3f} times", "skew {:+.2f} deg", "v rotated {:+.2f} deg")
 
 
 class ImageErrors(NamedTuple):
@@ -230,9 +230,9 @@ class ImageErrors(NamedTuple):
             if over >= min(CLEAR, size.max())
         ]
         text = (
-            f"the residuals are not noise alone: they fit better with {', '.join(shown)} (F test of "
+            f"the residuals are more than noise: they fit better with {', '.join(shown)} (F test of "
             f"{len(self.names)} errors of the image, p {self.probability:.2g}), which leaves {self.rms_mm:.2f} mm "
-            "(rms) at the tips; the calibration does not use this: P_u_px, P_v_px as headers let it find mm per pixel"
+            "(rms) at the tips; the calibration does not use this: columns P_u_px, P_v_px let it estimate mm per pixel"
         )
         numbers = dict(zip(self.names, self.found.tolist(), strict=True))
         return Finding("image_errs", Severity.WARNING, text, {**numbers, "p": self.probability, "rms_mm": self.rms_mm})

@@ -133,9 +133,9 @@ class Missed(StrEnum):
     """Reason why there is no detection."""
 
     NO_NEEDLE = "no line stands out from the speckle"
-    TOO_SHORT = "too little of the needle shows"
+    TOO_SHORT = "too little of the needle is visible"
     TIP_AT_EDGE = "the needle leaves the image before its tip"
-    NO_END = "no clear end: the tip is not where the line fades"
+    NO_END = "no clear end of the needle in the image"
 
 
 @dataclass(frozen=True)
