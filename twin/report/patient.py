@@ -19,7 +19,7 @@ from puncture_twin.planning.plan.plan import CLEARANCE_TEXT
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import deep_text
 from puncture_twin.planning.search.uncertainty_breakdown import LEAST_FRACTION, UncertaintyBreakdown, chance_text
-from puncture_twin.planning.search.windows import MOST_WINDOWS, Window, find_windows
+from puncture_twin.planning.search.windows import MOST_WINDOWS, Window
 from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.report.numbers import (
     ReasonCount,
@@ -82,7 +82,7 @@ def _hatches(line: ReasonCount) -> str:
 
 def windows(candidates: Candidates) -> list[Block]:
     """The best candidate of each window, with the window's size."""
-    found = find_windows(candidates).windows
+    found = candidates.windows
     if not found:
         return ["No direction is safe, so there is nothing to rank."]
     return [grid(_window_fields(candidates), found[:MOST_WINDOWS]), _windows_text(candidates, len(found))]

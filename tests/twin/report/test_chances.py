@@ -39,7 +39,7 @@ TOLD = (
     "touch noise (touch_mm) would have to be 0.1 mm instead of 0.35",
     "75.0 %",
     "breathing, needle bending",
-    "In many rooms",
+    "In many trials",
     "94.70 %",
     "p_touch_any",
     "wrong by design",
@@ -93,7 +93,7 @@ def test_the_page_says_how_sure_it_is(shown, tmp_path):
     text = told.read_text()
     for words in TOLD:
         assert words in text
-    for words in ("How sure it is", "In many rooms"):
+    for words in ("How sure it is", "In many trials"):
         assert words not in plain.read_text()
     known, unknown = (map_data(case, one, None) for one in (found, replace(found, chances=None)))
     assert "p_touch_any" in known and "p_touch_any" not in unknown
@@ -119,7 +119,7 @@ def test_the_page_says_where_the_next_millimetre_is_won(shown, tmp_path):
     write_page(Shown(*parts, uncertainty=Uncertainty(BREAKDOWN, None, None, BUDGET)), told)
     write_page(Shown(*parts, uncertainty=Uncertainty(BREAKDOWN, None, None)), plain)
     text = told.read_text()
-    section = text[text.index('<h2 id="budget">') : text.index('<h2 id="windows">')]
+    section = text[text.index('<h2 id="budget">') : text.index('<h2 id="registration">')]
     assert "The next 0.75 mm would be gained by: slices of 1 mm." in section
     assert "data:image/png;base64,iVBOR" in section
     for number in ("1.60", "1.20", "1.25"):

@@ -8,7 +8,7 @@ import report_world as world
 from hypothesis import given, strategies as st
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.choice import Pick
+from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report.page import page_slices
 from puncture_twin.twin.report.page.page_map import map_data, picked_row
 from puncture_twin.twin.report.page.page_slices import block_box, ct_block, surfaces

@@ -15,7 +15,7 @@ import scipy
 from page_browser import chromium, opened, serious_findings
 from PIL import Image
 
-from puncture_twin.planning.search.choice import Pick
+from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report.slices.panel import PIXELS, TONES, draw_panel
 from puncture_twin.twin.report.slices.planes import needle_planes
 from puncture_twin.twin.report.slices.sheet import flat
@@ -153,7 +153,7 @@ def test_a_click_chooses_and_everything_follows(page):
 def test_dates_film_and_fractions_are_there(page):
     """When it was made, that the scan's day is not stated, a link to the film, parts of the solid angle."""
     said = page.locator("header").inner_text()
-    assert "Made on 20" in said and "scan of a date that its files do not state" in said
+    assert "Made on 20" in said and "scan date not stated" in said
     assert page.locator("a[href='rehearsal.mp4']").count() == 1
     assert "of solid angle" in page.locator(".mapside").inner_text()
 
@@ -234,7 +234,7 @@ def test_a_scrolled_slice_is_that_of_the_place(page, patient):
     moved = replace(plane, at_ct=plane.at_ct + 20.0 * plane.normal)
     grey = TONES["abdomen"].grey(anatomy.scan.hu_at(moved.points_ct(PIXELS)).reshape(PIXELS, PIXELS)).astype(int)
     assert (np.abs(picture(page.evaluate(SHOWN)[0][0])[..., 0] - grey) > GREYS).mean() < 1e-3
-    assert "20 mm F of the target" in page.locator("#slices-a figcaption").first.inner_text()
+    assert "20 mm from the target, toward the feet" in page.locator("#slices-a figcaption").first.inner_text()
     page.locator("#slices-centre").click()
 
 

@@ -20,7 +20,7 @@ from scipy import ndimage
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.search.candidates import Candidates, Pick, Verdict
-from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
+from puncture_twin.planning.search.windows import MOST_WINDOWS
 from puncture_twin.twin.report.figures import halo
 from puncture_twin.twin.report.map.map_raster import MapRaster, shown_front
 from puncture_twin.twin.report.map_view import BEYOND, MapView
@@ -74,7 +74,7 @@ def draw_disc(axes: Axes, candidates: Candidates, view: MapView, raster: MapRast
     axes.imshow(_lined(raster, candidates, codes), extent=(-1, 1, -1, 1), interpolation="hanning")
     _frame(axes, view)
     _chances(axes, candidates, raster.rows)
-    bests = [window.best for window in find_windows(candidates).windows[:MOST_WINDOWS]]
+    bests = [window.best for window in candidates.windows[:MOST_WINDOWS]]
     marked = view.place(candidates.theta[bests], candidates.beta[bests])
     chosen = np.zeros((0, 2)) if pick is None else view.place(*_angles(pick))
     rings = ring_labels(view, np.concatenate([marked, chosen]))

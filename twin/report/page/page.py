@@ -16,12 +16,12 @@ from markupsafe import Markup
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import Severity
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.formats.dicom.storage import is_dicom_file
 from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, chance_text
-from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.twin.report import patient
 from puncture_twin.twin.report.error_pictures import budget_png, rehearsal_png
 from puncture_twin.twin.report.map.map_raster import MapRaster
@@ -184,12 +184,12 @@ def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[s
     if uncertainty is None:
         return {"chances": None, "budget": None, "rooms": None}
     facts, tips = uncertainty.budget, uncertainty.picture
-    costs = "What each source of the error costs, and what changes leave"
+    costs = "Error sources, and the effect of single changes"
     budget = patient.budget(facts)
     budget[1:1] = [] if facts is None else [picture(budget_png(facts), costs)]
     rooms = patient.rooms(uncertainty.rooms)
     if rooms and tips is not None:
-        rooms.append(picture(tips, "Tips of all rooms in the frame of the needle"))
+        rooms.append(picture(tips, "Tips of all trials in the frame of the needle"))
     return {
         "chances": blocks_html(patient.chances(uncertainty.breakdown, registration)),
         "budget": blocks_html(budget) if budget else None,
@@ -207,7 +207,7 @@ def _doubts(candidates: Candidates, anatomy: Any) -> Markup:
 def chance_card(breakdown: UncertaintyBreakdown) -> Card:
     """Both chances and the expected error, for the top of the page."""
     detail = (
-        f"touches anything forbidden {chance_text(breakdown.p_touch_any)}; expected tip error "
+        f"touches a structure to avoid {chance_text(breakdown.p_touch_any)}; expected tip error "
         f"{number(breakdown.budget.rms_mm, 2, 'mm')} (rms); not modelled: {breakdown.not_modelled}"
     )
     return Card("chance to hit", chance_text(breakdown.p_hit), detail)
@@ -218,7 +218,7 @@ def _refused(candidates: Candidates) -> str:
     if candidates.safe.any():
         return ""
     counts = ", ".join(f"{k.replace('_', ' ')}: {v:,}" for k, v in candidates.counts().items())
-    return f"All {len(candidates):,} directions are refused ({counts})."
+    return f"{plural(len(candidates), 'direction')} searched, all rejected ({counts})."
 
 
 def _cards(shown: Shown) -> list[Card]:
@@ -237,7 +237,7 @@ def _cards(shown: Shown) -> list[Card]:
         cards.append(failed if refusal else Card("plan", "not requested", patient.NOT_REQUESTED))
     if rehearsal is not None:
         touched = len(rehearsal.contacts)
-        detail = f"{touched} contact{'s' if touched != 1 else ''}" if touched else "no contact"
+        detail = plural(touched, "contact") if touched else "no contact"
         expected = f"expected (rms) {expected_text(rehearsal.predicted_error_mm)}; {detail}"
         if rehearsal.standing is not None:
             expected = f"{rehearsal.standing.text}; {expected}"
@@ -247,20 +247,16 @@ def _cards(shown: Shown) -> list[Card]:
 
 def _window_card(candidates: Candidates) -> Card:
     """What a person can aim at, before how much of all directions that is."""
-    windows = find_windows(candidates)
+    windows = candidates.windows
     largest = windows.largest
     value, wide = ("", "") if largest is None else (f"{largest.entry_cm2:.1f} cm²", f"{largest.wide_deg:.0f}° wide")
     solid = percent(next(line.solid_angle for line in reason_counts(candidates) if line.code == "safe"))
     return Card(
         "safe directions" if candidates.arm_checked else f"directions {candidates.safe_text}",
         value,
-        f"the largest window on the skin, {wide}; in {_counted(len(windows.windows), 'window')} {solid} "
+        f"the largest window on the skin, {wide}; in {plural(len(windows), 'window')} {solid} "
         "of the solid angle",
     )
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _location(case: Any) -> str:
@@ -289,7 +285,7 @@ def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
     chances = (
         "Chances to hit and to touch were propagated from the declared errors of markers, touches and arm."
         if candidates.chances is not None
-        else "No errors were declared, so that no chances were computed."
+        else "No errors were declared, so no chances were computed."
     )
     return (
         f"Straight needle paths to the target were searched with {PROJECT} {version(PROJECT)} over {len(candidates):,} "
@@ -297,7 +293,7 @@ def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
         f"{step:g}° (angles as in Chen et al. 2019, Eq. 10-15; {needle_text(case)}). For each direction the distance "
         f"between the needle and each of {checked} structures to keep away from was computed exactly on their triangle "
         f"meshes and compared with the structure's margin; a direction through a region that the images or labels do "
-        f"not show was refused as unknown. {arm} {chances} Every input is listed below with its SHA-256. "
+        f"not show was rejected as unknown. {arm} {chances} Every input is listed below with its SHA-256. "
         + _left_out(case)
     )
 
@@ -334,7 +330,8 @@ EPOCH = "SOURCE_DATE_EPOCH"
 
 def dates_text(case: Any) -> str:
     """The day of the page and of its scan."""
-    return f"Made on {made_on()} (UTC); scan of {scan_date(case) or 'a date that its files do not state'}."
+    scan = scan_date(case)
+    return f"Made on {made_on()} (UTC); {f'scan of {scan}' if scan else 'scan date not stated'}."
 
 
 def made_on() -> str:

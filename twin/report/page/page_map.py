@@ -14,7 +14,7 @@ from puncture_twin.planning.base.arrays import Ints
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.search.candidates import NOT_SEEN, Candidates, Pick
 from puncture_twin.planning.search.constraints import closest_miss
-from puncture_twin.planning.search.windows import MOST_WINDOWS, find_windows
+from puncture_twin.planning.search.windows import MOST_WINDOWS
 from puncture_twin.twin.report.map.map_raster import PIXELS as FINE, MapRaster, map_raster, shown_front
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.template import image_address
@@ -60,7 +60,7 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
         pick: What is shown as chosen.
         raster: The map's pixels where somebody has them already.
     """
-    view, windows = map_view(case, candidates), find_windows(candidates)
+    view, windows = map_view(case, candidates), candidates.windows
     raster = map_raster(candidates, view) if raster is None else raster
     front, picked = shown_front(candidates, view), picked_row(candidates, pick)
     parts = [(candidates, np.arange(len(candidates)), windows.of_row)]
@@ -70,6 +70,8 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
         "size": PIXELS,
         "image": image_address(Image.fromarray(raster.rgba), PNG_LEVEL),
         "runs": map_raster_rows(raster.rows[::2, ::2]),
+        "searched": len(candidates),
+        "frame": np.round(np.asarray(case.T_ct_entry)[:3, :3], 9).ravel().tolist(),
         "theta_max_deg": round(float(np.degrees(view.theta_max)), 4),
         "turn_deg": round(float(np.degrees(view.turn)), 4),
         "rim": [{"text": label.text, "angle_deg": float(np.degrees(label.angle))} for label in view.rim],
@@ -118,8 +120,8 @@ def _columns(
     verdict, path, arm = found.verdict.of(rows), found.path, found.arm
     index = {name: i for i, name in enumerate(structures)}
     columns = {
-        "theta": _rounded(np.degrees(found.theta[rows]), 3),
-        "beta": _rounded(np.degrees(found.beta[rows]), 3),
+        "theta": _rounded(np.degrees(found.theta[rows]), 5),
+        "beta": _rounded(np.degrees(found.beta[rows]), 5),
         "reason": [reasons.index(str(r)) for r in verdict.reason],
         "structure": [index[str(s)] for s in verdict.named],
         "sentence": [sentences.index(str(text)) for text in verdict.detail],

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import gzip
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from puncture_twin.planning.search.bedside import slice_numbers
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.palette import SKIN
 from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, TONES, stored
-from puncture_twin.twin.report.slices.planes import letters
+from puncture_twin.twin.report.slices.planes import letters, toward_text
 from puncture_twin.twin.report.slices.subject import BESIDE, Subject
 
 AROUND_MM = 60.0
@@ -78,10 +78,11 @@ def slices_data(
     bent = None if picked < 0 or subject.bent_mm is None else np.round(subject.bent_mm, 2).tolist()
     facts = {
         "ct": None if ct is None else ct.facts,
+        "box": np.round(box - case.target_ct, 3).tolist(),
         "surfaces": shapes.facts,
         "knots": [KNOTS_HU, KNOTS_BYTE],
         "tones": dict(TONES),
-        "letters": [[letters(case.space, np.array(axis)), axis] for axis in _axes()],
+        "letters": [[letters(case.space, one), toward_text(case.space, one), one.tolist()] for one in _axes()],
         "needle": {"shaft": case.needle.shaft_mm, "radius": case.needle.radius_mm},
         "numbers": None if anatomy.scan is None else _numbers(*slice_numbers(anatomy.scan.grid)),
         "catalogue": [[mm, case.needle.of_length(mm).longest_path_mm] for mm in sorted(case.needle.lengths_mm)],
@@ -90,7 +91,8 @@ def slices_data(
         "regions": {} if regions_ct is None else _regions(regions_ct, picked, subject.region_ct),
         "margins": {
             name: float(mm)
-            for name, mm in zip(candidates.clearance.structures, candidates.clearance.margins, strict=True)
+            for found in (candidates, *(() if subject.pick is None else (subject.pick.candidates,)))
+            for name, mm in zip(found.clearance.structures, found.clearance.margins, strict=True)
             if np.isfinite(mm)
         },
     }
@@ -109,10 +111,9 @@ def _numbers(of_point: Floats, count: int) -> list[Any]:
     return [of_point.tolist(), count]
 
 
-def _axes() -> Iterator[list[float]]:
-    """The six directions along the axes."""
-    for axis, sign in itertools.product(range(3), (1.0, -1.0)):
-        yield [sign if k == axis else 0.0 for k in range(3)]
+def _axes() -> Floats:
+    """The six directions along the axes, shape (6, 3)."""
+    return np.concatenate([np.eye(3), 0.0 - np.eye(3)])
 
 
 def block_box(target_ct: Floats, candidates: Candidates) -> Floats:

@@ -17,7 +17,7 @@ from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.twin.report.annotate import SCALE_BARS_MM
 from puncture_twin.twin.report.figures import figure_of, halo, pixels
 from puncture_twin.twin.report.palette import SKIN, TARGET_POINT
-from puncture_twin.twin.report.slices.planes import Plane, capsule, ellipse, letters, outline
+from puncture_twin.twin.report.slices.planes import Plane, capsule, ellipse, letters, outline, toward_text
 from puncture_twin.twin.report.slices.subject import Subject
 
 PIXELS = 480
@@ -94,8 +94,8 @@ def leaning(subject: Subject, plane: Plane) -> str:
     lean = float(subject.outward_ct @ plane.normal)
     if abs(lean) <= IN_PLANE:
         return "Holds the needle."
-    side = letters(subject.case.space, np.sign(lean) * plane.normal)
-    return f"The skin entry is {abs(lean) * subject.path_mm:.0f} mm {side} of it."
+    side = toward_text(subject.case.space, np.sign(lean) * plane.normal)
+    return f"The skin entry is {abs(lean) * subject.path_mm:.0f} mm from it, {side}."
 
 
 def _line(axes: Axes, points: Floats, width: float, colour: Rgb, style: str = "-", rim: float = 0.0) -> None:

@@ -141,12 +141,24 @@ def _unit(vector: Floats) -> Floats:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
+LETTERS = {"patient's left": "L", "patient's right": "R", "back": "P", "front": "A", "head": "H", "feet": "F"}
+
+
 def letters(space: str, direction: Floats) -> str:
     """What lies in a direction (3,), unit: R, L, A, P, H, F, two of them where it is oblique; axes of a local frame."""
+    return " ".join(LETTERS.get(name, name) for name in _named(space, direction))
+
+
+def toward_text(space: str, direction: Floats) -> str:
+    """The same in words, such as "toward the feet" or "to the patient's left and toward the back"."""
+    side = {"patient's left": "to the patient's left", "patient's right": "to the patient's right"}
+    along = {name: f"toward the {name}" for name in ("back", "front", "head", "feet")}
+    return " and ".join((side | along).get(name, f"along {name}") for name in _named(space, direction))
+
+
+def _named(space: str, direction: Floats) -> list[str]:
     found = sorted(body_directions(space).items(), key=lambda item: -float(item[1] @ direction))
-    names = {"patient's left": "L", "patient's right": "R", "back": "P", "front": "A", "head": "H", "feet": "F"}
-    shown = [name for name, vector in found[:2] if vector @ direction > OBLIQUE]
-    return " ".join(names.get(name, name) for name in shown)
+    return [name for name, vector in found[:2] if vector @ direction > OBLIQUE]
 
 
 def outline(mesh: TriangleMesh, plane: Plane) -> Floats:

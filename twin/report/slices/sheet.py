@@ -32,8 +32,8 @@ from puncture_twin.twin.report.slices.subject import Subject
 WITHOUT_CT: Rgb = (44, 47, 54)
 """Behind the outlines of a case without CT."""
 
-NO_CT = "The case has no CT: outlines of the structures alone."
-RADIOLOGICAL = "The patient's right is on the left. A cut shows only what lies in it: look at all."
+NO_CT = "The case has no CT: only the outlines of the structures."
+RADIOLOGICAL = "The patient's right is on the left. Each slice shows only its own plane: look at all of them."
 GAP, TOP, CAPTION = 16, 92, 30
 
 
@@ -64,7 +64,7 @@ class Slices:
         shown = f"Needle ⌀ {needle.diameter_mm:g} mm as thick as it is{dashed if subject.margin_mm > 0 else ''}"
         region = "" if subject.region_ct is None else "; pink: cut of the 95 % region of the tip"
         dotted = f"Of a needle that crosses a plane its cut alone is drawn.{beads}"
-        bends = "" if subject.bent_mm is None else "Lime: where its bevel may take it, to either side."
+        bends = "" if subject.bent_mm is None else "Lime: range of bending by the bevel, to either side."
         return tuple(filter(None, (ct, f"{shown}{region}.", bends, dotted)))
 
     @property

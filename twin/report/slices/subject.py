@@ -24,7 +24,7 @@ MOST_NEAR = 8
 """So many of them at most, the nearest."""
 
 BESIDE: dict[str, tuple[str, Rgb]] = {
-    OUTSIDE_BODY: ("beside the body: table, cloths, lines, and what no image shows of them", (255, 170, 40)),
+    OUTSIDE_BODY: ("beside the body: table, cloths, lines, and their unseen parts", (255, 170, 40)),
     ATTACHED_LIMB: ("what seems to be a limb", (255, 77, 240)),
     BEYOND_IMAGE: ("the body beyond the image", (120, 170, 255)),
 }

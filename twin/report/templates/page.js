@@ -99,7 +99,7 @@
       return;
     }
     const code = map.codes[map.reason[row]], safe = code === "safe";
-    add("div", `θ ${+map.theta[row].toFixed(3)}°, β ${+map.beta[row].toFixed(3)}°`);
+    add("div", `${row === chosen && !own ? "chosen" : "pointed at"}: ${anglesOf(row)}`);
     add("b", safe ? `${map.safe}${map.rank[row] > 0 ? `, rank ${map.rank[row]}` : ""}` : `rejected: ${map.reasons[map.reason[row]]}`,
       safe ? "verdict" : "verdict bad");
     if (!safe) {
@@ -123,7 +123,7 @@
     }
     add("div", `path in the body ${shown(map.path[row], 1, "mm")}; skin angle ${shown(map.skin_angle[row], 0, "°")}`);
     if (map.p_hit && map.p_hit[row] !== null)
-      add("div", `chance to hit ${chanceWords(map.p_hit[row])}, to touch anything forbidden ${chanceWords(map.p_touch_any[row])}${map.touch_refined[row] ? "" : ", to first order"}`);
+      add("div", `chance to hit ${chanceWords(map.p_hit[row])}, to touch a structure to avoid ${chanceWords(map.p_touch_any[row])}${map.touch_refined[row] ? "" : ", to first order"}`);
     add("div", `arm: ${map.reachable[row] === 1 ? "can reach it" : map.reachable[row] === 0 ? "cannot reach it" : map.arm === "checked" ? "not computed, the organs reject it" : map.arm}`);
   }
   const surface = document.getElementById("map");
@@ -135,11 +135,11 @@
   let chosen = -1;
   const sliders = { theta: byId("theta"), beta: byId("beta") };
   for (const [name, input] of Object.entries(sliders)) {
-    const values = [...new Set(map[name])].sort((a, b) => a - b);
+    const values = [...new Set(map[name].slice(0, map.searched))].sort((a, b) => a - b); // a row more may be beside the grid
     const gaps = values.slice(1).map((value, i) => value - values[i]).filter((gap) => gap > 1e-3);
     input.min = values[0];
     input.max = values[values.length - 1];
-    input.step = gaps.length ? Math.min(...gaps).toFixed(3) : 1;
+    input.step = gaps.length ? Math.min(...gaps).toFixed(5) : 1;
     input.addEventListener("input", () => choose(nearest(+sliders.theta.value, +sliders.beta.value)));
   }
   function nearest(theta, beta) {
@@ -155,21 +155,26 @@
     if (row < 0) return;
     chosen = row;
     own = needle ?? null;
-    const [theta, beta] = [+map.theta[row].toFixed(3), +map.beta[row].toFixed(3)];
+    const [theta, beta] = own ? own.angles : [map.theta[row], map.beta[row]];
     sliders.theta.value = theta;
     sliders.beta.value = beta;
-    byId("theta-out").value = `${theta}°`;
-    byId("beta-out").value = `${beta}°`;
-    const verb = map.codes[map.reason[row]] === "safe" ? map.outcome : "check";
-    byId("command").textContent = `run-twin ${verb} ${map.file} --theta ${theta} --beta ${beta}`;
+    byId("theta-out").value = `${+theta.toFixed(3)}°`;
+    byId("beta-out").value = `${+beta.toFixed(3)}°`;
+    const verb = !own && map.codes[map.reason[row]] === "safe" ? map.outcome : "check";
+    byId("command").textContent = `run-twin ${verb} ${map.file} --theta ${+theta.toFixed(5)} --beta ${+beta.toFixed(5)}`;
     for (const button of document.querySelectorAll("button.pick"))
-      button.setAttribute("aria-pressed", String(+button.dataset.row === row));
+      button.setAttribute("aria-pressed", String(!own && +button.dataset.row === row));
+    for (const note of document.querySelectorAll(".of-first")) {
+      note.hidden = map.picked < 0 || (!own && row === map.picked);
+      note.querySelector("b").textContent = anglesOf(map.first);
+    }
     explain(row);
     probe(row);
     present(own ?? needleOf(row));
   }
   for (const button of document.querySelectorAll("button.pick"))
     button.addEventListener("click", () => choose(+button.dataset.row));
+  for (const button of document.querySelectorAll(".of-first button")) button.addEventListener("click", () => choose(map.picked));
   byId("copy").addEventListener("click", async () => {
     const text = byId("command").textContent;
     try { await navigator.clipboard.writeText(text); }
@@ -196,10 +201,11 @@
   }
   const readout = (text) => { byId("cursor").textContent = text || "Point at a slice: Hounsfield units, structure, place."; };
   const view = new slicing.View(byId("slices-a"), { readout, moved: moveNeedle });
-  let beside = null, kept = -1, own = null;
+  let beside = null, kept = null, own = null;
+  const saidOf = (needle) => needle.verdict ?? verdictOf(needle.row);
   function present(needle) {
     view.show(needle);
-    byId("slices-of").replaceChildren(make("b", {}, needle.title), ` · ${needle.verdict ?? verdictOf(needle.row)}`);
+    byId("slices-of").replaceChildren(make("b", {}, needle.title), ` · ${saidOf(needle)}`);
     byId("slices-of").classList.toggle("bad", Boolean(needle.verdict) || map.codes[map.reason[needle.row]] !== "safe");
     byId("slices-back").hidden = !own;
     slicing.drawUnits(byId("slices-units"), needle);
@@ -209,7 +215,7 @@
     const target = slicing.parts.find((part) => part.target);
     byId("slices-legend").replaceChildren(...[
       ["needle", "#00e5ff"], ["target", "#d6001e"], ...(needle.region ? [["95 % region of the tip", "#ff4df0"]] : []),
-      ...(needle.bent ? [["where its bevel may take it", "#b6ff00"]] : []), ...(target ? [[words(target.name), target.colour]] : []),
+      ...(needle.bent ? [["range of bending by the bevel", "#b6ff00"]] : []), ...(target ? [[words(target.name), target.colour]] : []),
       ...(own ? [] : named.map((one) => [`${words(one.name)}: ${clearanceText(one.mm)}, margin ${slices.margins[one.name]}`, colourOf[one.name] ?? "#80808c"])),
     ].map(([name, colour]) => {
       const patch = make("span", { class: "patch" });
@@ -219,7 +225,7 @@
     byId("slices-notes").replaceChildren(...[
       slicing.voxelNote, slicing.surfaceNote,
       `Needle as thick as it is; dashed: with the greatest margin near it${needle.margin ? `, ${needle.margin} mm` : ""}. Beads: the edge of what is unknown.`,
-      Object.keys(slices.bent).length && !needle.bent ? "Where the bevel may take the needle is drawn for the planned or best direction alone." : "",
+      Object.keys(slices.bent).length && !needle.bent ? "The range of bending by the bevel is drawn only for the planned or best direction." : "",
     ].filter(Boolean).map((note) => make("div", {}, note)));
   }
   const { halfVoxel } = slicing; // lengths have the digits that a voxel can carry
@@ -252,7 +258,7 @@
       ["safe cone", shown(map.safe_cone[row], 1, "°")], ["angle at the skin", shown(map.skin_angle[row], 0, "°")], ...placesOf(needle)];
   }
   function showNumbers(needle) {
-    const columns = [...(kept >= 0 ? [["A, kept", needleOf(kept)]] : []), [kept >= 0 ? "B, chosen" : "chosen", needle]];
+    const columns = [...(kept ? [["A, kept", kept]] : []), [kept ? "B, chosen" : "chosen", needle]];
     const texts = columns.map(([, one]) => new Map(numbersOf(one))), names = [...new Set(texts.flatMap((one) => [...one.keys()]))];
     const row = (tag, first, cells) => make("tr", {}, make(tag, {}, first), ...cells.map((text) => make(tag === "th" ? "th" : "td", {}, text)));
     byId("slices-numbers").replaceChildren(
@@ -267,30 +273,30 @@
     }
     return [best, Math.acos(Math.min(1, most)) / RAD];
   }
-  function moveNeedle({ at, outward, path, frame, what }) {
-    const moved = Math.sqrt(dot(at, at)), length = what === "entry" ? slicing.pathFrom(at, outward) : path;
+  function moveNeedle({ at, outward, frame }) {
+    const moved = Math.sqrt(dot(at, at)), length = slicing.pathFrom(at, outward);
     const [row, away] = toward(outward), strong = nearOf(row).filter((one) => one.mm < NEAR_MM).map((one) => one.name);
-    const entry = slicing.placeText(plus(at, outward, length));
+    const entry = Number.isFinite(length) ? `from ${slicing.placeText(plus(at, outward, length))}` : "whose skin entry is not on this page";
+    const [x, y, z] = [0, 1, 2].map((k) => dot([map.frame[k], map.frame[3 + k], map.frame[6 + k]], outward));
+    const angles = [Math.atan2(Math.hypot(x, y), z) / RAD, (Math.atan2(y, x) / RAD + 360) % 360];
     const verdict = moved > 0.05
       ? `not known: the target was moved by ${slicing.lengthText(moved)} to ${slicing.placeText(at)}, and nothing was searched for it`
       : `not known for this path; the nearest searched direction (${anglesOf(row)}, ${away.toFixed(1)}° away) is ${verdictOf(row)}`;
-    choose(row, { needle: { key: `own ${at} ${outward}`, at, outward, path: length, frame, row, strong: new Set(strong), margin: Math.max(0, ...strong.map((name) => slices.margins[name])), title: `your path from ${entry}`, verdict } });
-    const command = byId("command"), plain = (point) => point.map((mm, k) => (k < 2 && map.space === "RAS" ? -mm : mm).toFixed(1)).join(",");
-    command.textContent = moved > 0.05
-      ? `run-twin check ${map.file} --targets FILE.csv  # name,x_mm,y_mm,z_mm: moved,${plain(plus(at, data.target))}`
-      : `run-twin check ${map.file} --entry=${plain(plus(plus(at, outward, length), data.target))}`;
+    choose(row, { needle: { key: `own ${at} ${outward}`, at, outward, angles, path: length, frame, row, strong: new Set(strong), margin: Math.max(0, ...strong.map((name) => slices.margins[name])), title: `your path ${entry}`, verdict } });
+    const plain = (point) => point.map((mm, k) => (k < 2 && map.space === "RAS" ? -mm : mm).toFixed(1)).join(",");
+    if (moved > 0.05) byId("command").textContent = `run-twin check ${map.file} --targets FILE.csv  # name,x_mm,y_mm,z_mm: moved,${plain(plus(at, data.target))}`;
   }
   byId("slices-back").addEventListener("click", () => choose(chosen));
   byId("slices-centre").addEventListener("click", () => { for (const one of [view, beside]) if (one) { one.point = one.ruler = null; one.later(); } });
   byId("slices-keep").addEventListener("click", () => {
-    kept = kept >= 0 ? -1 : chosen;
-    byId("slices-keep").textContent = kept >= 0 ? "let go of path A" : "keep this path beside the next";
-    byId("slices-kept").hidden = kept < 0;
-    byId("slices-paths").classList.toggle("both", kept >= 0);
-    if (kept >= 0) {
+    kept = kept ? null : { ...view.needle, frame: undefined };
+    byId("slices-keep").textContent = kept ? "let go of path A" : "keep this path beside the next";
+    byId("slices-kept").hidden = !kept;
+    byId("slices-paths").classList.toggle("both", Boolean(kept));
+    if (kept) {
       beside ??= new slicing.View(byId("slices-b"), { readout, moved: null });
-      beside.show(needleOf(kept));
-      byId("slices-kept-of").textContent = `A: ${anglesOf(kept)} · ${verdictOf(kept)}`;
+      beside.show(kept);
+      byId("slices-kept-of").textContent = `A: ${kept.title} · ${saidOf(kept)}`;
     }
     showNumbers(view.needle);
   });
@@ -328,7 +334,7 @@
   const SEEN_MM = 420, PER_MM = 1 / 0.83; // plotly's lens shows 0.83 of its distance
   const firstOutward = map.picked >= 0 ? outwardOf(map.picked) : null;
   function cameraOf(view) {
-    const outward = chosen >= 0 ? outwardOf(chosen) : firstOutward;
+    const outward = own ? own.outward : chosen >= 0 ? outwardOf(chosen) : firstOutward;
     if (view === "all" || (!outward && !VIEWS[view])) return whole;
     const top = normed([whole.up.x, whole.up.y, whole.up.z]);
     let toward, up = top, about = data.target;

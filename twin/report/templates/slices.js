@@ -19,9 +19,27 @@ const ORIGIN = [0, 0, 0];
 const slicing = (() => {
   const facts = data.slices;
   const PIXELS = 480, FINE = 2;
-  const NEEDLE = "#00e5ff", REGION = "#ff4df0", BENT = "#b6ff00", TARGET = "#d6001e";
+  const GROUND = 0xff362f2c, HATCH = 0xff4a443f, NEEDLE = "#00e5ff", REGION = "#ff4df0", BENT = "#b6ff00", TARGET = "#d6001e";
   const NEAR_MM = 30, LEAST_HALF_MM = 60, BESIDE_MM = 35, PROBE_HALF_MM = 40, ALONG_LEFT = 0.95, OBLIQUE = 0.38, IN_PLANE = 1e-3;
   const LEFT = [1, 0, 0], BACK = [0, 1, 0], HEAD = [0, 0, 1], FRONT = [0, -1, 0];
+
+  // ---- what the page holds: beyond this box surfaces are coarse, not drawn, and nothing is read off them ------------
+  const [LOW, HIGH] = facts.box;
+  const holdsPoint = (point) => point.every((mm, axis) => mm >= LOW[axis] && mm <= HIGH[axis]);
+  /* From where to where a line is in the box, in steps of its direction. */
+  function within(start, along) {
+    let from = -Infinity, to = Infinity;
+    for (let axis = 0; axis < 3; axis++) {
+      if (Math.abs(along[axis]) < 1e-12) {
+        if (start[axis] < LOW[axis] || start[axis] > HIGH[axis]) return [0, -1];
+        continue;
+      }
+      const ends = [LOW[axis], HIGH[axis]].map((mm) => (mm - start[axis]) / along[axis]);
+      from = Math.max(from, Math.min(...ends));
+      to = Math.min(to, Math.max(...ends));
+    }
+    return [from, to];
+  }
 
   // ---- the block of the CT -----------------------------------------------------------------------------------
   const interpolated = (value, from, to) => {
@@ -144,7 +162,11 @@ const slicing = (() => {
     }
     return found.sort((one, other) => one - other);
   }
-  const pathFrom = (at, outward) => crossings(skin, at, outward).find((mm) => mm > 0) ?? NaN;
+  /* Target to skin, mm; NaN where the page does not hold the entry. */
+  function pathFrom(at, outward) {
+    const path = crossings(skin, at, outward).find((mm) => mm > 0) ?? NaN;
+    return holdsPoint(at) && holdsPoint(plus(at, outward, path)) ? path : NaN;
+  }
 
   // ---- the planes --------------------------------------------------------------------------------------------
   const tiltOf = (right, up) => (Math.acos(Math.min(1, Math.abs(cross(right, up)[2]))) * 180 / Math.PI).toFixed(0);
@@ -175,8 +197,12 @@ const slicing = (() => {
     ];
   }
   function lettersOf(direction) {
-    const seen = facts.letters.map(([letter, axis]) => [letter, dot(axis, direction)]).sort((a, b) => b[1] - a[1]);
-    return seen.slice(0, 2).filter(([, part]) => part > OBLIQUE).map(([letter]) => letter).join(" ");
+    return namedAxes(direction).map(({ letter }) => letter).join(" ");
+  }
+  const towardText = (direction) => namedAxes(direction).map(({ toward }) => toward).join(" and ");
+  function namedAxes(direction) {
+    const seen = facts.letters.map(([letter, toward, axis]) => ({ letter, toward, part: dot(axis, direction) }));
+    return seen.sort((a, b) => b.part - a.part).slice(0, 2).filter(({ part }) => part > OBLIQUE);
   }
   /* The cut of all within a radius of a piece of the needle's axis that begins at the target, at the plane's offset. */
   function capsule(outward, length, radius, plane) {
@@ -228,18 +254,16 @@ const slicing = (() => {
       const value = Math.round(255 * Math.min(1, Math.max(0, (hu - level) / width + 0.5)));
       return 0xff000000 | value << 16 | value << 8 | value;
     });
-    if (!ct) shade.fill(0xff362f2c);
-    else {
-      const step = 2 * plane.half / PIXELS, first = 0.5 - PIXELS / 2;
-      const index = (point) => ct.inverse.map((one) => dot(one, point));
-      const base = plus(plus(plane.at, plane.normal, plane.offset), plane.right, plane.centre[0] + first * step);
-      const corner = plus(index(plus(base, plane.up, plane.centre[1] - first * step)), ct.start);
-      const [dx, dy] = [index(scaled(plane.right, step)), index(scaled(plane.up, -step))];
-      for (let row = 0, at = 0; row < PIXELS; row++)
-        for (let column = 0; column < PIXELS; column++, at++) {
-          const byte = byteAt(corner[0] + column * dx[0] + row * dy[0], corner[1] + column * dx[1] + row * dy[1], corner[2] + column * dx[2] + row * dy[2]);
-          shade[at] = byte >= 0 ? grey[byte] : byte === -1 ? 0xff000000 : ((row + column) & 7) ? 0xff362f2c : 0xff4a443f;
-        }
+    const step = 2 * plane.half / PIXELS, first = 0.5 - PIXELS / 2, across = scaled(plane.right, step);
+    const index = (point) => ct.inverse.map((one) => dot(one, point));
+    const base = plus(plus(plane.at, plane.normal, plane.offset), plane.right, plane.centre[0] + first * step);
+    const corner = plus(base, plane.up, plane.centre[1] - first * step), dx = ct && index(across);
+    for (let row = 0, at = 0; row < PIXELS; row++) {
+      const start = plus(corner, plane.up, -row * step), [from, to] = within(start, across), begin = ct && plus(index(start), ct.start);
+      for (let column = 0; column < PIXELS; column++, at++) {
+        const byte = column < from || column > to ? -2 : ct ? byteAt(begin[0] + column * dx[0], begin[1] + column * dx[1], begin[2] + column * dx[2]) : 0;
+        shade[at] = byte === -1 ? 0xff000000 : byte === -2 ? ((row + column) & 7 ? GROUND : HATCH) : ct ? grey[byte] : GROUND;
+      }
     }
     context.putImageData(picture, 0, 0);
   }
@@ -376,16 +400,16 @@ const slicing = (() => {
   /* How the needle lies to a plane: of one that is not in it only the cut is drawn. */
   function leaning(plane, needle) {
     const lean = dot(needle.outward, plane.normal), tip = dot(plus(needle.at, plane.at, -1), plane.normal) - plane.offset;
-    const far = tip + (Math.abs(lean) <= IN_PLANE ? 0 : lean * needle.path), side = lettersOf(scaled(plane.normal, Math.sign(far)));
-    if (Math.abs(lean) <= IN_PLANE) return Math.abs(far) < 0.5 ? "Holds the needle." : `The needle is ${lengthText(Math.abs(far))} ${side} of this plane.`;
-    return Number.isFinite(far) ? `The skin entry is ${lengthText(Math.abs(far))} ${side} of this plane.` : "";
+    const far = tip + (Math.abs(lean) <= IN_PLANE ? 0 : lean * needle.path), side = towardText(scaled(plane.normal, Math.sign(far)));
+    if (Math.abs(lean) <= IN_PLANE) return Math.abs(far) < 0.5 ? "Holds the needle." : `The needle is ${lengthText(Math.abs(far))} from this plane, ${side}.`;
+    return Number.isFinite(far) ? `The skin entry is ${lengthText(Math.abs(far))} from this plane, ${side}.` : "";
   }
 
   // ---- one path in four planes ---------------------------------------------------------------------------------
   const shared = { mode: "point" };
   class View {
     constructor(host, { moved, readout }) {
-      Object.assign(this, { host, moved, readout, point: null, needle: null, ruler: null });
+      Object.assign(this, { host, moved, readout, point: null, needle: null, ruler: null, under: null });
       this.panels = [0, 1, 2, 3].map((number) => {
         const base = make("canvas", { class: "ct", width: PIXELS, height: PIXELS });
         const over = make("canvas", { class: "over", width: FINE * PIXELS, height: FINE * PIXELS, role: "img" });
@@ -400,7 +424,7 @@ const slicing = (() => {
           this.scroll(number, this.panels[number].plane.offset - Math.sign(event.deltaY) * Math.max(1, voxel));
         }, { passive: false });
         over.addEventListener("pointermove", (event) => this.pointed(number, event));
-        over.addEventListener("pointerleave", () => this.readout(""));
+        over.addEventListener("pointerleave", () => { this.under = null; this.readout(""); });
         over.addEventListener("pointerdown", (event) => this.pressed(number, event));
         for (const end of ["pointerup", "pointercancel"])
           over.addEventListener(end, () => {
@@ -427,14 +451,15 @@ const slicing = (() => {
         const handles = shared.mode === "move" && this.moved ? [needle.at, plus(needle.at, needle.outward, needle.path || facts.needle.shaft)].map((p) => this.inPlane(plane, p)) : [];
         const ruler = this.ruler?.number === number ? this.ruler.ends : null;
         panel.cuts = drawOver(panel.over, plane, needle, { point: this.point, ruler, handles });
-        const off = plane.offset, side = lettersOf(scaled(plane.normal, Math.sign(off) || 1));
-        panel.caption.textContent = off ? `${plane.name.replace(/, through the target| at the target/, "")}, ${lengthText(Math.abs(off))} ${side} of the target` : plane.name;
+        const off = plane.offset, side = towardText(scaled(plane.normal, Math.sign(off) || 1));
+        panel.caption.textContent = off ? `${plane.name.replace(/, through the target| at the target/, "")}, ${lengthText(Math.abs(off))} from the target, ${side}` : plane.name;
         panel.beside.textContent = leaning(plane, needle);
         panel.depth.value = off;
         panel.shown.textContent = `${off.toFixed(0)} mm`.replace("-", "−");
         panel.depth.setAttribute("aria-label", `${plane.name}: mm from the target`);
         panel.over.setAttribute("aria-label", `${panel.caption.textContent}: needle, outlines and target, ${needle.title}`);
       });
+      if (this.under) this.read(); // the pointer rests: what is under it has changed
       this.host.dataset.drawn = needle.key;
       this.host.dataset.tone = tone;
       this.host.dataset.ms = (performance.now() - began).toFixed(0);
@@ -470,6 +495,7 @@ const slicing = (() => {
     pointed(number, event) {
       if (!this.needle) return;
       const { plane, x, y, point } = this.at(number, event), { held, needle } = this;
+      this.under = [number, { clientX: event.clientX, clientY: event.clientY }];
       if (held?.number === number) {
         if (shared.mode === "point") { this.point = point(plane.offset); this.later(); }
         if (shared.mode === "measure") { this.ruler = { number, ends: [held.start, [x, y]] }; this.later(); }
@@ -477,10 +503,14 @@ const slicing = (() => {
           const entry = plus(needle.at, needle.outward, needle.path || facts.needle.shaft);
           const depth = (one) => dot(plus(one, plane.at, -1), plane.normal);
           const at = held.what === "target" ? point(depth(needle.at)) : needle.at, end = held.what === "entry" ? point(depth(entry)) : entry;
-          this.moved({ at, outward: normed(plus(end, at, -1)), path: Math.sqrt(dot(plus(end, at, -1), plus(end, at, -1))), frame: held.frame, what: held.what });
+          this.moved({ at, outward: normed(plus(end, at, -1)), frame: held.frame });
         }
       }
-      this.readout(textAt(this.panels[number], x, y, point(plane.offset), needle));
+      this.read();
+    }
+    read() {
+      const [number, event] = this.under, { plane, x, y, point } = this.at(number, event);
+      this.readout(textAt(this.panels[number], x, y, point(plane.offset), this.needle));
     }
   }
   function placeText(point) { // in the case's own space, from the image's origin
@@ -498,22 +528,25 @@ const slicing = (() => {
     const inside = parts.filter((part, p) => part !== skin && part.closed && holds(panel.cuts[p], x, y)).map((part) => words(part.name));
     const where = inside.join(", ") || (skin && holds(panel.cuts[parts.indexOf(skin)], x, y) ? "in no structure" : "outside of the skin");
     const from = plus(point, needle.at, -1);
-    return [...(ct ? [huText(byteOf(point))] : []), where, placeText(point), `${lengthText(Math.sqrt(dot(from, from)))} from the target`].join(" · ");
+    const read = holdsPoint(point) ? [...(ct ? [huText(byteOf(point))] : []), where] : [huText(-2)];
+    return [...read, placeText(point), `${lengthText(Math.sqrt(dot(from, from)))} from the target`].join(" · ");
   }
 
   // ---- the units along the needle --------------------------------------------------------------------------------
   function drawUnits(canvas, needle) {
     const width = canvas.width = Math.max(320, Math.min(976, canvas.parentElement.clientWidth)), narrow = width < 600;
-    const height = canvas.height = ct ? 330 : 150, context = canvas.getContext("2d"), BEHIND = 15, BEYOND = 25;
+    const BEHIND = 15, BEYOND = 25, ROW = 20, TOP = 12, NAMES = 20, BELOW = 44; // pixels: of a bar, above all, of words in the plot, below it
     const path = Number.isFinite(needle.path) ? needle.path : facts.needle.shaft, end = path + BEYOND;
+    const reach = within(needle.at, needle.outward), held = ([a, b]) => [Math.max(-BEHIND, reach[0], a), Math.min(end, reach[1], b)];
     const passed = parts.filter((part) => part !== skin && part.closed && part.role !== "unknown").map((part) => {
       const at = crossings(part, needle.at, needle.outward).filter((mm) => mm > -400);
       const inside = [];
-      for (let k = at.length - 1; k >= 0; k -= 2) inside.push([Math.max(-BEHIND, at[k - 1] ?? -BEHIND), Math.min(end, at[k])]);
+      for (let k = at.length - 1; k >= 0; k -= 2) inside.push(held([at[k - 1] ?? -BEHIND, at[k]]));
       return { part, inside: inside.filter(([a, b]) => b > a) };
     }).filter(({ inside }) => inside.length).sort((one, other) => Math.max(...other.inside.map(([, b]) => b)) - Math.max(...one.inside.map(([, b]) => b)));
-    const rowHeight = Math.min(20, 0.5 * height / Math.max(1, passed.length)), left = narrow ? 110 : 190, right = width - 14, bottom = height - 44;
-    const split = bottom - rowHeight * Math.max(1, passed.length), top = 12;
+    const count = Math.max(1, passed.length), height = canvas.height = ct ? 330 : TOP + NAMES + count * ROW + BELOW, context = canvas.getContext("2d");
+    const rowHeight = ct ? Math.min(ROW, 0.5 * height / count) : ROW, left = narrow ? 110 : 190, right = width - 14, bottom = height - BELOW;
+    const split = bottom - rowHeight * count, top = TOP;
     const px = (mm) => left + (end - mm) / (end + BEHIND) * (right - left);
     context.fillStyle = "#fff";
     context.fillRect(0, 0, width, height);
@@ -526,12 +559,18 @@ const slicing = (() => {
       Object.assign(context, { strokeStyle: colour, lineWidth: width });
       context.stroke();
     };
+    for (const [a, b] of [[-BEHIND, Math.min(end, reach[0])], [Math.max(-BEHIND, reach[1]), end]]) {
+      if (b <= a) continue;
+      context.fillStyle = "#e3e3e3";
+      context.fillRect(px(b), top, px(a) - px(b), bottom - top);
+      if (px(a) - px(b) > 110) write("not on this page", (px(a) + px(b)) / 2, (top + split) / 2, "center");
+    }
     if (ct) {
       const [low, high] = [-1050, 500], py = (hu) => split - 8 - (Math.min(high, Math.max(low, hu)) - low) / (high - low) * (split - 8 - top);
       for (const hu of [-1000, -500, 0, 500]) { line("#e5e5e5", 1, [], [left, py(hu)], [right, py(hu)]); write(`${hu} HU`.replace("-", "−"), left - 8, py(hu), "right"); }
       let run = [];
       for (let mm = -BEHIND; mm <= end; mm += 0.5) {
-        const byte = byteOf(plus(needle.at, needle.outward, mm));
+        const byte = mm < reach[0] || mm > reach[1] ? -2 : byteOf(plus(needle.at, needle.outward, mm));
         if (byte >= 0) run.push([px(mm + 0.25), py(huOf[byte])], [px(mm - 0.25), py(huOf[byte])]);
         else { if (run.length) line("#262626", 1.7, [], ...run); run = []; }
       }
@@ -552,7 +591,7 @@ const slicing = (() => {
 
   return {
     View, drawUnits, pathFrom, placeText, lengthText, shared, parts, NEAR_MM,
-    voxelNote: !ct ? "The case has no CT: outlines of the structures alone." : facts.ct.shown_mm.some((mm, axis) => mm !== facts.ct.voxel_mm[axis])
+    voxelNote: !ct ? "The case has no CT: only the outlines of the structures." : facts.ct.shown_mm.some((mm, axis) => mm !== facts.ct.voxel_mm[axis])
       ? `CT: means over ${facts.ct.shown_mm.map((mm) => +mm.toFixed(2)).join(" × ")} mm (its voxels: ${facts.ct.voxel_mm.map((mm) => +mm.toFixed(2)).join(" × ")} mm), so that it fits this page; HU rounded as the cursor says.`
       : "The CT's nearest voxels, not smoothed; HU rounded as the cursor says.",
     surfaceNote: `Outlines: the checked surfaces to ${(0.87 * facts.surfaces.unit_mm).toFixed(2)} mm. Hatched: not on this page.`,
