@@ -251,14 +251,18 @@ def make_page(path):
 REGION = np.diag([4.0, 9.0, 16.0])
 
 
-def make_scan(*, spacing=(2.0, 2.5, 3.0)):
-    """A CT whose every voxel has another value than those beside it, from the lungs' to the bones'; air about it."""
+def make_scan(*, spacing=(2.0, 2.5, 3.0), axes=((1, 0, 0), (0, 1, 0), (0, 0, 1))):
+    """A CT whose every voxel has another value than those beside it, from the lungs' to the bones'; air about it.
+
+    Its middle is the target; ``axes`` are the columns along which its indices grow.
+    """
     shape = np.ceil(300 / np.array(spacing)).astype(int)
-    T = np.diag([*spacing, 1.0])
-    T[:3, 3] = TARGET - 150.0
+    T = np.eye(4)
+    T[:3, :3] = np.array(axes) * spacing
+    T[:3, 3] = TARGET - T[:3, :3] @ (150.0 / np.array(spacing))
     rng = np.random.default_rng(0)
     index = np.stack(np.indices(shape), axis=-1)
-    far = np.linalg.norm(index * np.array(spacing) - 150.0, axis=-1)
+    far = np.linalg.norm(index @ T[:3, :3].T + T[:3, 3] - TARGET, axis=-1)
     hu = np.where(far < SKIN_RADIUS, rng.integers(-200, 300, shape), -1000).astype(np.int16)
 
     def hu_at(points):

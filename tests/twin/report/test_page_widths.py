@@ -3,8 +3,6 @@
 What its script cuts out of the page's block of the CT is what ``slices.png`` shows.
 """
 
-import base64
-import io
 import re
 from dataclasses import replace
 
@@ -12,8 +10,7 @@ import numpy as np
 import pytest
 import report_world as world
 import scipy
-from page_browser import chromium, opened, serious_findings
-from PIL import Image
+from page_browser import GREYS, SHOWN, at_pixel, chromium, drawn, opened, picture, row_of, serious_findings
 
 from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report.slices.panel import PIXELS, TONES, draw_panel
@@ -22,18 +19,8 @@ from puncture_twin.twin.report.slices.sheet import flat
 from puncture_twin.twin.report.slices.subject import Subject
 
 WIDTHS = [390, 900, 1440]
-GREYS = 2
-"""Of 255, in the window of 400 HU: half a step of the page's bytes (1.7 HU), and the rounding of a grey."""
 LETTERS = 46
 """Pixels from the middle of an edge within which letters stand; the browser's are of another font."""
-SHOWN = """() => [...document.querySelectorAll("#slices-a .slice")].map((one) => {
-    const [base, over] = one.querySelectorAll("canvas"), both = document.createElement("canvas");
-    both.width = both.height = base.width;
-    const context = both.getContext("2d");
-    context.drawImage(base, 0, 0);
-    context.drawImage(over, 0, 0, base.width, base.height);
-    return [base.toDataURL(), both.toDataURL()];
-})"""
 
 
 @pytest.fixture(scope="module")
@@ -67,25 +54,6 @@ def page(request, browser, address):
         page.wait_for_function("document.body.dataset.ready === 'true'")
         drawn(page)
         yield page
-
-
-def drawn(page, what=None):
-    """Wait until a row's slices, or any, are drawn; returns the row."""
-    one = "document.getElementById('slices-a').dataset.drawn"
-    page.wait_for_function(f"{one} === '{what}'" if what is not None else f"{one} !== undefined")
-    return page.evaluate(one)
-
-
-def picture(address):
-    """The pixels of a data address, RGB."""
-    content = base64.b64decode(address.partition(",")[2])
-    return np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
-
-
-def row_of(candidates, theta_deg, beta_deg):
-    """The row of two angles."""
-    same = np.isclose(candidates.theta, np.radians(theta_deg)) & np.isclose(candidates.beta, np.radians(beta_deg))
-    return int(np.flatnonzero(same)[0])
 
 
 def same_slices(page, patient, row):
@@ -181,17 +149,6 @@ def test_slices_of_what_is_chosen_are_those_of_the_program(page, patient):
     drawn(page, best)
     same_slices(page, patient, best)
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-
-
-def at_pixel(page, number, column, row):
-    """Point at a pixel of a slice, 480 a side; returns where that is in the window."""
-    over = page.locator("#slices-a .over").nth(number)
-    over.scroll_into_view_if_needed()
-    box = over.bounding_box()
-    place = {"x": (column + 0.5) / PIXELS * box["width"], "y": (row + 0.5) / PIXELS * box["height"]}
-    over.hover(position=place)
-    box = over.bounding_box()
-    return box["x"] + place["x"], box["y"] + place["y"]
 
 
 def plane_of(patient, row, number):

@@ -654,7 +654,7 @@ def test_the_page_needs_no_network(report):
 
 
 def test_verdict_and_doubt_come_first(report):
-    """Cards, warnings, windows, then map, slices, plan, scene and the rest; every line of the contents leads somewhere."""
+    """Cards, warnings, windows, map, slices, plan, scene, then the rest; every line of the contents leads somewhere."""
     text = visible(report)
     order = ["doubt", "windows", "directions", "slices", "plan", "scene-part", "rehearsal", "registration"]
     assert re.findall(r'<h2 id="([^"]+)"', text) == [*order, "methods", "inputs"]

@@ -233,7 +233,7 @@
   const clearanceText = (mm) => mm < 0 ? "crossed" : doubted(mm);
   function placesOf(needle) { // of a path, for whoever stands at the scanner
     const entry = plus(needle.at, needle.outward, needle.path), [left, back, head] = needle.outward, degrees = (radians) => `${Math.abs(radians / RAD).toFixed(1)}°`;
-    const rows = [["skin entry", Number.isFinite(needle.path) ? slicing.placeText(entry) : "none"], ["path in the body", Number.isFinite(needle.path) ? doubted(needle.path) : "–"]];
+    const rows = [["skin entry", Number.isFinite(needle.path) ? slicing.placeText(entry) : needle.verdict ? "not on this page" : "none"], ["path in the body", Number.isFinite(needle.path) ? doubted(needle.path) : "–"]];
     const reaching = slices.catalogue.find(([, longest]) => longest >= needle.path);
     if (slices.catalogue.length && Number.isFinite(needle.path)) rows.push(["needle to take", reaching ? `${reaching[0]} mm, the shortest that reaches` : "none reaches"]);
     if (map.space === "local") return rows;
