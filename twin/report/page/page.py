@@ -254,8 +254,7 @@ def _window_card(candidates: Candidates) -> Card:
     return Card(
         "safe directions" if candidates.arm_checked else f"directions {candidates.safe_text}",
         value,
-        f"the largest window on the skin, {wide}; in {plural(len(windows), 'window')} {solid} "
-        "of the solid angle",
+        f"the largest window on the skin, {wide}; in {plural(len(windows), 'window')} {solid} of the solid angle",
     )
 
 
