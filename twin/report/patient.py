@@ -82,7 +82,7 @@ def _hatches(line: ReasonCount) -> str:
 
 def windows(candidates: Candidates) -> list[Block]:
     """The best candidate of each window, with the window's size."""
-    found = candidates.windows
+    found = candidates.windows.windows
     if not found:
         return ["No direction is safe, so there is nothing to rank."]
     return [grid(_window_fields(candidates), found[:MOST_WINDOWS]), _windows_text(candidates, len(found))]

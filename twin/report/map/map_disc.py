@@ -74,7 +74,7 @@ def draw_disc(axes: Axes, candidates: Candidates, view: MapView, raster: MapRast
     axes.imshow(_lined(raster, candidates, codes), extent=(-1, 1, -1, 1), interpolation="hanning")
     _frame(axes, view)
     _chances(axes, candidates, raster.rows)
-    bests = [window.best for window in candidates.windows[:MOST_WINDOWS]]
+    bests = [window.best for window in candidates.windows.windows[:MOST_WINDOWS]]
     marked = view.place(candidates.theta[bests], candidates.beta[bests])
     chosen = np.zeros((0, 2)) if pick is None else view.place(*_angles(pick))
     rings = ring_labels(view, np.concatenate([marked, chosen]))

@@ -204,10 +204,10 @@ def _doubts(candidates: Candidates, anatomy: Any) -> Markup:
     return blocks_html([Warn(warned) if warned else Markup("<p>None.</p>"), Warn(noted, f"Notes ({len(noted)})")])
 
 
-def chance_card(breakdown: UncertaintyBreakdown) -> Card:
-    """Both chances and the expected error, for the top of the page."""
+def chance_card(breakdown: UncertaintyBreakdown, of: str) -> Card:
+    """Both chances and the expected error of a direction, for the top of the page."""
     detail = (
-        f"touches a structure to avoid {chance_text(breakdown.p_touch_any)}; expected tip error "
+        f"{of}; touches a structure to avoid {chance_text(breakdown.p_touch_any)}; expected tip error "
         f"{number(breakdown.budget.rms_mm, 2, 'mm')} (rms); not modelled: {breakdown.not_modelled}"
     )
     return Card("chance to hit", chance_text(breakdown.p_hit), detail)
@@ -226,7 +226,7 @@ def _cards(shown: Shown) -> list[Card]:
     if not candidates.safe.any():
         return []
     breakdown = None if shown.uncertainty is None else shown.uncertainty.breakdown
-    cards = [] if breakdown is None else [chance_card(breakdown)]
+    cards = [] if breakdown is None or shown.chosen is None else [chance_card(breakdown, _angles(*shown.chosen))]
     cards.append(_window_card(candidates))
     if shown.chosen is not None:
         cards.append(_direction_card(*shown.chosen, best=shown.chosen == candidates.best))
@@ -265,9 +265,12 @@ def _location(case: Any) -> str:
 
 
 def _direction_card(candidates: Candidates, row: int, *, best: bool) -> Card:
-    where = f"θ {np.degrees(candidates.theta[row]):.4g}°, β {np.degrees(candidates.beta[row]):.4g}°"
     detail = f"{number(float(candidates.path.length[row]), 1, 'mm')} in the body; {nearest_text(candidates, row)}"
-    return Card("best direction" if best else "chosen direction", where, detail)
+    return Card("best direction" if best else "chosen direction", _angles(candidates, row), detail)
+
+
+def _angles(candidates: Candidates, row: int) -> str:
+    return f"θ {np.degrees(candidates.theta[row]):.4g}°, β {np.degrees(candidates.beta[row]):.4g}°"
 
 
 def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
@@ -283,8 +286,8 @@ def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
     )
     chances = (
         "Chances to hit and to touch were propagated from the declared errors of markers, touches and arm."
-        if candidates.chances is not None
-        else "No errors were declared, so no chances were computed."
+        if candidates.chances is not None and np.isfinite(candidates.chances.hit).any()
+        else "No chances were computed: they need declared errors, markers, and the arm."
     )
     return (
         f"Straight needle paths to the target were searched with {PROJECT} {version(PROJECT)} over {len(candidates):,} "
