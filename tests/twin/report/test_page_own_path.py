@@ -5,6 +5,7 @@ The image's slices are tilted as by a gantry and run from the left, so the block
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +14,11 @@ from page_browser import GREYS, SHOWN, at_pixel, chromium, drawn, opened, pictur
 
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.case.entry import angles
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.page.page_slices import block_box
+from puncture_twin.twin.report.palette import organ_colours
 from puncture_twin.twin.report.slices.panel import PIXELS, TONES
 from puncture_twin.twin.report.slices.planes import needle_planes
 from puncture_twin.twin.report.slices.subject import Subject
@@ -212,6 +215,29 @@ def test_a_pick_beside_the_grid_leaves_the_sliders_whole(browser, patient, tmp_p
             page.keyboard.press("ArrowRight")
             seen.add(page.locator("#theta-out").inner_text())
         assert len(seen) == 3
+
+
+def test_an_open_structure_is_crossed_too(browser, patient, tmp_path):
+    """It has no inside: its crossings are marked along the needle, and no point in it is said to be in no structure."""
+    case, anatomy, found = patient
+    liver, rib, aorta = anatomy.checked
+    mesh = TriangleMesh(rib.mesh.vertices, rib.mesh.faces[1:])
+    toward = int(np.argmin(found.outward_ct[:, 0]))  # the rib, on the patient's right
+    right = [round(float(np.degrees(one[toward]))) for one in (found.theta, found.beta)]
+    parts = (liver, SimpleNamespace(**{**vars(rib), "mesh": mesh, "closed": False}), aorta)
+    shown = SimpleNamespace(**{**vars(anatomy), "checked": parts, "structures": parts, "scan": None})
+    write_page(Shown(case, shown, found), tmp_path / "p.html")
+    with opened(browser, (tmp_path / "p.html").as_uri(), 1300) as page:
+        page.wait_for_function("document.body.dataset.ready === 'true'")
+        row = choose(page, found, *right)
+        units = picture(page.evaluate("document.getElementById('slices-units').toDataURL()"))
+        colour = np.array(organ_colours(("liver", "rib_right_9", "aorta"))["rib_right_9"])
+        columns = np.flatnonzero((np.abs(units - colour).max(axis=2) < 8).any(axis=0))
+        assert 2 * 2 <= len(columns) <= 30 and np.diff(columns).max() > 50  # 16 mm apart, a mark of one each
+        mine = needle_planes(case.target_ct, found.outward_ct[row], found.path.length[row])[0]
+        x, y = mine.place(case.target_ct + [-70.0, 0, 0]) - mine.centre
+        at_pixel(page, 0, *((1 + np.array([x, -y]) / mine.half_mm) * PIXELS / 2))
+        assert page.locator("#cursor").inner_text().startswith("in no closed structure")
 
 
 def test_all_are_rejected_in_words(patient, tmp_path):

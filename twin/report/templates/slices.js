@@ -99,7 +99,7 @@ const slicing = (() => {
     }
     return found;
   })();
-  const skin = parts.find((part) => part.role === "skin");
+  const skin = parts.find((part) => part.role === "skin"), open = parts.some((part) => part.role !== "unknown" && !part.closed);
   /* Segments in which a plane cuts a surface: x1, y1, x2, y2 of each, mm in the plane; first those to be drawn. */
   function cut(part, plane) {
     const { normal, right, up } = plane, offset = dot(plane.at, normal) + plane.offset, { corner, faces, height } = part;
@@ -526,7 +526,8 @@ const slicing = (() => {
   }
   function textAt(panel, x, y, point, needle) {
     const inside = parts.filter((part, p) => part !== skin && part.closed && holds(panel.cuts[p], x, y)).map((part) => words(part.name));
-    const where = inside.join(", ") || (skin && holds(panel.cuts[parts.indexOf(skin)], x, y) ? "in no structure" : "outside of the skin");
+    const none = open ? "in no closed structure" : "in no structure"; // an open surface has no inside
+    const where = inside.join(", ") || (!skin.closed || holds(panel.cuts[parts.indexOf(skin)], x, y) ? none : "outside of the skin");
     const from = plus(point, needle.at, -1);
     const read = holdsPoint(point) ? [...(ct ? [huText(byteOf(point))] : []), where] : [huText(-2)];
     return [...read, placeText(point), `${lengthText(Math.sqrt(dot(from, from)))} from the target`].join(" · ");
@@ -538,10 +539,11 @@ const slicing = (() => {
     const BEHIND = 15, BEYOND = 25, ROW = 20, TOP = 12, NAMES = 20, BELOW = 44; // pixels: of a bar, above all, of words in the plot, below it
     const path = Number.isFinite(needle.path) ? needle.path : facts.needle.shaft, end = path + BEYOND;
     const reach = within(needle.at, needle.outward), held = ([a, b]) => [Math.max(-BEHIND, reach[0], a), Math.min(end, reach[1], b)];
-    const passed = parts.filter((part) => part !== skin && part.closed && part.role !== "unknown").map((part) => {
+    const passed = parts.filter((part) => part !== skin && part.role !== "unknown").map((part) => {
       const at = crossings(part, needle.at, needle.outward).filter((mm) => mm > -400);
       const inside = [];
-      for (let k = at.length - 1; k >= 0; k -= 2) inside.push(held([at[k - 1] ?? -BEHIND, at[k]]));
+      if (!part.closed) for (const mm of at) inside.push(held([mm - 0.5, mm + 0.5])); // of a surface without an inside: where it is crossed
+      else for (let k = at.length - 1; k >= 0; k -= 2) inside.push(held([at[k - 1] ?? -BEHIND, at[k]]));
       return { part, inside: inside.filter(([a, b]) => b > a) };
     }).filter(({ inside }) => inside.length).sort((one, other) => Math.max(...other.inside.map(([, b]) => b)) - Math.max(...one.inside.map(([, b]) => b)));
     const count = Math.max(1, passed.length), height = canvas.height = ct ? 330 : TOP + NAMES + count * ROW + BELOW, context = canvas.getContext("2d");
