@@ -24,7 +24,7 @@ from puncture_twin.twin.report.slices.planes import needle_planes
 from puncture_twin.twin.report.slices.subject import Subject
 
 TILTED = ((-1.0, 0.0, 0.0), (0.0, 0.9, -0.3), (0.0, 0.3, 0.95))
-GROUND, HATCH = (44, 47, 54), (63, 68, 74)
+GROUND, HATCH = (44, 47, 54), (106, 113, 122)
 
 
 @pytest.fixture(scope="module")

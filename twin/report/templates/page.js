@@ -214,7 +214,7 @@
     const colourOf = Object.fromEntries(slicing.parts.map((part) => [part.name, part.colour]));
     const target = slicing.parts.find((part) => part.target);
     byId("slices-legend").replaceChildren(...[
-      ["needle", "#00e5ff"], ["target", "#d6001e"], ...(needle.region ? [["95 % region of the tip", "#ff4df0"]] : []),
+      ["needle", "#00e5ff"], ["target", "#d6001e"], ...(needle.region || kept?.region ? [["95 % region of the tip", "#ff4df0"]] : []),
       ...(needle.bent ? [["range of bending by the bevel", "#b6ff00"]] : []), ...(target ? [[words(target.name), target.colour]] : []),
       ...(own ? [] : named.map((one) => [`${words(one.name)}: ${clearanceText(one.mm)}, margin ${slices.margins[one.name]}`, colourOf[one.name] ?? "#80808c"])),
     ].map(([name, colour]) => {

@@ -19,7 +19,7 @@ const ORIGIN = [0, 0, 0];
 const slicing = (() => {
   const facts = data.slices;
   const PIXELS = 480, FINE = 2;
-  const GROUND = 0xff362f2c, HATCH = 0xff4a443f, NEEDLE = "#00e5ff", REGION = "#ff4df0", BENT = "#b6ff00", TARGET = "#d6001e";
+  const GROUND = 0xff362f2c, HATCH = 0xff7a716a, NEEDLE = "#00e5ff", REGION = "#ff4df0", BENT = "#b6ff00", TARGET = "#d6001e";
   const NEAR_MM = 30, LEAST_HALF_MM = 60, BESIDE_MM = 35, PROBE_HALF_MM = 40, ALONG_LEFT = 0.95, OBLIQUE = 0.38, IN_PLANE = 1e-3;
   const LEFT = [1, 0, 0], BACK = [0, 1, 0], HEAD = [0, 0, 1], FRONT = [0, -1, 0];
 
@@ -262,7 +262,7 @@ const slicing = (() => {
       const start = plus(corner, plane.up, -row * step), [from, to] = within(start, across), begin = ct && plus(index(start), ct.start);
       for (let column = 0; column < PIXELS; column++, at++) {
         const byte = column < from || column > to ? -2 : ct ? byteAt(begin[0] + column * dx[0], begin[1] + column * dx[1], begin[2] + column * dx[2]) : 0;
-        shade[at] = byte === -1 ? 0xff000000 : byte === -2 ? ((row + column) & 7 ? GROUND : HATCH) : ct ? grey[byte] : GROUND;
+        shade[at] = byte === -1 ? 0xff000000 : byte === -2 ? ((row + column & 7) > 1 ? GROUND : HATCH) : ct ? grey[byte] : GROUND;
       }
     }
     context.putImageData(picture, 0, 0);
@@ -565,7 +565,7 @@ const slicing = (() => {
       if (b <= a) continue;
       context.fillStyle = "#e3e3e3";
       context.fillRect(px(b), top, px(a) - px(b), bottom - top);
-      if (px(a) - px(b) > 110) write("not on this page", (px(a) + px(b)) / 2, (top + split) / 2, "center");
+      if (px(a) - px(b) > 110) write("not on this page", (px(a) + px(b)) / 2, (split + bottom) / 2, "center");
     }
     if (ct) {
       const [low, high] = [-1050, 500], py = (hu) => split - 8 - (Math.min(high, Math.max(low, hu)) - low) / (high - low) * (split - 8 - top);
