@@ -612,22 +612,25 @@ def touch(
 
 @_public
 def place(context: CaseContext, *, jobs: int = 2, quick_s: float | None = None) -> PlaceSearch:
-    """Where the arm should stand to reach most of the directions that the organs allow; ``rated`` has the best first.
+    """The base positions from which the arm reaches most organ-safe directions; ``rated`` has the best first.
 
     ``prepare(context.case.replace(mount=dict(found.rated[0].mount)))`` is the case with the arm there.
 
     Args:
         context: From `prepare`.
         jobs: Processes; the answer of a whole search is the same.
-        quick_s: End after so many seconds with what is known then, and ``complete`` False; None searches to the end.
+        quick_s: Stop after about this time with the best so far; ``complete`` is then False. A fraction of a verdict
+            whose ``count`` is below ``directions`` is an estimate. None searches to the end.
 
     Raises:
         InputError: Bounds that contradict the case.
-        NoAnswerError: No direction is safe for the organs.
+        NoAnswerError: No direction is safe for the organs, or the arm reaches none from any placement.
     """
-    from puncture_twin.twin.jobs.patient.place_job import find_places
+    from puncture_twin.twin.jobs.patient.place_job import find_places, refuse_none
 
-    return find_places(context, jobs, math.inf if quick_s is None else time.perf_counter() + quick_s).found
+    found = find_places(context, jobs, math.inf if quick_s is None else time.perf_counter() + quick_s).found
+    refuse_none(found)
+    return found
 
 
 @_public
