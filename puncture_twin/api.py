@@ -84,13 +84,19 @@ def _public(function: Callable[Given, Found]) -> Callable[Given, Found]:
 
     @functools.wraps(function)
     def guarded(*arguments: Given.args, **named: Given.kwargs) -> Found:
-        for name, value in signature.bind(*arguments, **named).arguments.items():
+        bound = signature.bind(*arguments, **named)
+        for name, given in bound.arguments.items():
+            value = given[()] if isinstance(given, np.ndarray) and given.ndim == 0 else given
             if not any(_is(word, value) for word in words[name]):
                 allowed = " or ".join(KINDS[word].text if word in KINDS else word for word in words[name])
                 refuse(f"{name} is {_short(value)}", function.__name__, allowed, "wrong_type")
             if isinstance(value, numbers.Real):
                 _check_number(name, float(value), function.__name__)
-        return function(*arguments, **named)
+            if isinstance(value, numbers.Real) and not isinstance(
+                value, bool | int
+            ):  # half precision counts no further
+                bound.arguments[name] = int(value) if isinstance(value, numbers.Integral) else float(value)
+        return function(*bound.args, **bound.kwargs)
 
     return guarded
 
@@ -853,7 +859,7 @@ def _angles(angles_deg: ArrayLike, most: float, where: str) -> Floats:
         refuse("no angle", where, allowed, "empty")
     wrong = ~((given >= 0.0) & (given <= most))  # NaN too
     if wrong.any():
-        refuse(f"{given[wrong][0]:g}", where, allowed, "out_of_range")
+        refuse(f"{float(given[wrong][0])!r}", where, allowed, "out_of_range")
     return given
 
 

@@ -7,6 +7,7 @@ import sys
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -324,6 +325,8 @@ def test_two_choices_or_an_arm_that_is_switched_off_are_refused(arm_context, con
         pt.plan(arm_context, window=10_000)
     with refused("no_base"):
         pt.plan(context, candidate=best)
+    with refused("no_base"):
+        pt.touch(context, candidate=best)
     with refused("out_of_range"):
         pt.search(context).pick(-1)
 
@@ -482,11 +485,23 @@ def test_a_plan_of_another_case_is_neither_rehearsed_nor_shown(arm_context, tmp_
     assert pt.export(plan, "csv", tmp_path / "csv", context=arm_context).path.is_file()
 
 
+@pytest.mark.parametrize(
+    "number",
+    [np.float16, np.float32, np.longdouble, np.array, Fraction, np.int64, lambda value: np.array(value, np.int8)],
+)
+def test_an_angle_is_the_same_in_every_type_of_number(context, number):
+    """Half a degree's digits are not lost where it becomes radians: 20 in half precision was 20.003."""
+    found = pt.check(context, number(20), beta_deg=number(100))
+    assert found.candidates.at(0) == {"theta_deg": 20.0, "beta_deg": 100.0}
+
+
 def test_masked_values_are_no_numbers(context):
     """Under a mask any number may be; an array that masks nothing is an array."""
     masked, whole = (np.ma.array([30.0, 40.0], mask=mask) for mask in ([False, True], False))
     with refused("not_finite"):
         pt.check_many(context, masked, whole)
+    with refused("wrong_type"):
+        pt.check(context, np.ma.array(30.0, mask=True), 40.0)
     entry = np.ma.array(context.case.target_ct, mask=[False, True, False])
     for ask in (lambda: pt.check(context, entry=entry), lambda: context.case.replace(target_ct=entry)):
         with refused("not_finite"):
