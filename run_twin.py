@@ -361,14 +361,14 @@ def place(
     out_dir: OutOfCaseOption = None,
     quick: Annotated[
         float,
-        typer.Option("--quick", metavar="SECONDS", min=1, help="Answer after about so long, as far as known then."),
+        typer.Option("--quick", metavar="SECONDS", min=1, help="Stop after about this time, with the best so far."),
     ] = 30.0,
     full: Annotated[bool, typer.Option("--full", help="Search to the end, however long it takes.")] = False,
     jobs: JobsOption = 1,
     pictures: PicturesOption = True,
     as_json: JsonOption = False,
 ) -> None:
-    """Find where the arm should stand to hold most of the organ-safe directions; write the placements and their map."""
+    """Find the base position from which the arm reaches most organ-safe directions; write a table and a map."""
     from puncture_twin.twin.jobs.patient.place_job import place_case, place_text
 
     folder, began = out_folder(out_dir, case, "place"), time.perf_counter()

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from puncture_twin.planning.base.arrays import any_masked
 from puncture_twin.planning.base.errors import InputError, refuse
 
 if TYPE_CHECKING:
@@ -66,6 +67,7 @@ RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
         "fle_mm": (0.001, 1e3),
         "physics": (0, 10_000),
         "touch": (0, 1),
+        "quick_s": (1, 1e9),
         "tolerance_mm": (0, 1e3),
     }
 )
@@ -82,13 +84,19 @@ def _public(function: Callable[Given, Found]) -> Callable[Given, Found]:
 
     @functools.wraps(function)
     def guarded(*arguments: Given.args, **named: Given.kwargs) -> Found:
-        for name, value in signature.bind(*arguments, **named).arguments.items():
+        bound = signature.bind(*arguments, **named)
+        for name, given in bound.arguments.items():
+            value = given[()] if isinstance(given, np.ndarray) and given.ndim == 0 else given
             if not any(_is(word, value) for word in words[name]):
                 allowed = " or ".join(KINDS[word].text if word in KINDS else word for word in words[name])
                 refuse(f"{name} is {_short(value)}", function.__name__, allowed, "wrong_type")
             if isinstance(value, numbers.Real):
                 _check_number(name, float(value), function.__name__)
-        return function(*arguments, **named)
+            if isinstance(value, numbers.Real) and not isinstance(
+                value, bool | int
+            ):  # half precision counts no further
+                bound.arguments[name] = int(value) if isinstance(value, numbers.Integral) else float(value)
+        return function(*bound.args, **bound.kwargs)
 
     return guarded
 
@@ -241,7 +249,8 @@ def prepare(case: Case | Path | str, *, arm: bool | None = None, engine: str | E
         case: A case, such as ``load_case(...).replace(...)``, its file, or the folder that holds ``case.toml``.
         arm: Whether a candidate must be reachable too; None asks it where the case says where the robot's base is.
         engine: Who measures clearance: ``fast``, ``fcl`` (the plain reference), or a class of your own that keeps the
-            protocol `puncture_twin.planning.clearance.engine.ClearanceEngine`.
+            protocol `puncture_twin.planning.clearance.engine.ClearanceEngine`. The fast engine measures again what it
+            measures: where it finds more clearance than there is, the search ends with an error.
 
     Raises:
         InputError: Anything in the case that cannot be used.
@@ -283,7 +292,7 @@ def check(
     """
     from puncture_twin.planning.search.choice import explain_choice
 
-    return explain_choice(context, _choice("check", theta_deg, beta_deg, candidate, window, entry))
+    return explain_choice(context, _choice("check", context, theta_deg, beta_deg, candidate, window, entry))
 
 
 @_public
@@ -409,7 +418,7 @@ def plan(
     """
     from puncture_twin.planning.plan.planner import make_plan
 
-    choice = _choice("plan", theta_deg, beta_deg, candidate, window, entry)
+    choice = _choice("plan", context, theta_deg, beta_deg, candidate, window, entry)
     return make_plan(context, candidates, choice, seed=seed).plan
 
 
@@ -420,13 +429,9 @@ def read_plan(path: Path | str, context: CaseContext) -> Plan:
     Raises:
         InputError: It cannot be read, or it does not hold any more.
     """
-    from puncture_twin.planning.plan.plan_check import with_case_arm
     from puncture_twin.planning.plan.plan_document import read_plan
-    from puncture_twin.planning.plan.recheck import check_plan
 
-    plan = read_plan(Path(path))
-    check_plan(plan, context, Path(path))
-    return with_case_arm(plan, context.case)
+    return _own_plan(context, read_plan(Path(path)), str(path))
 
 
 @_public
@@ -564,7 +569,8 @@ def rehearse(
         physics: So many of them are executed in the simulator too.
 
     Raises:
-        InputError: Many rooms of a case without declared errors or markers, or the extra ``twin`` is not installed.
+        InputError: A plan that does not hold in this case, many rooms of a case without declared errors or markers, or
+            the extra ``twin`` is not installed.
         NoAnswerError: The arm reaches the target in none of the rooms.
     """
     from puncture_twin.planning.base.errors import require_extra
@@ -573,7 +579,7 @@ def rehearse(
     from puncture_twin.twin.jobs.patient.rehearsed import rehearse_once
     from puncture_twin.twin.jobs.patient.run import room_count
 
-    return rehearse_once(context, plan, room_count(seeds, physics), seed)
+    return rehearse_once(context, _own_plan(context, plan, "rehearse: plan"), room_count(seeds, physics), seed)
 
 
 @_public
@@ -607,27 +613,30 @@ def touch(
     require_extra("twin", "touch")
     from puncture_twin.twin.jobs.experiment.touch_job import touch
 
-    return touch(context, _choice("touch", theta_deg, beta_deg, candidate, window, entry), seed)
+    return touch(context, _choice("touch", context, theta_deg, beta_deg, candidate, window, entry), seed)
 
 
 @_public
 def place(context: CaseContext, *, jobs: int = 2, quick_s: float | None = None) -> PlaceSearch:
-    """Where the arm should stand to reach most of the directions that the organs allow; ``rated`` has the best first.
+    """The base positions from which the arm reaches most organ-safe directions; ``rated`` has the best first.
 
     ``prepare(context.case.replace(mount=dict(found.rated[0].mount)))`` is the case with the arm there.
 
     Args:
         context: From `prepare`.
         jobs: Processes; the answer of a whole search is the same.
-        quick_s: End after so many seconds with what is known then, and ``complete`` False; None searches to the end.
+        quick_s: Stop after about this time with the best so far; ``complete`` is then False. A fraction of a verdict
+            whose ``count`` is below ``directions`` is an estimate. None searches to the end.
 
     Raises:
         InputError: Bounds that contradict the case.
-        NoAnswerError: No direction is safe for the organs.
+        NoAnswerError: No direction is safe for the organs, or the arm reaches none from any placement.
     """
-    from puncture_twin.twin.jobs.patient.place_job import find_places
+    from puncture_twin.twin.jobs.patient.place_job import find_places, refuse_none
 
-    return find_places(context, jobs, math.inf if quick_s is None else time.perf_counter() + quick_s).found
+    found = find_places(context, jobs, math.inf if quick_s is None else time.perf_counter() + quick_s).found
+    refuse_none(found)
+    return found
 
 
 @_public
@@ -647,12 +656,16 @@ def compare(
         candidates: From `search`, for ranks and windows; None searches.
 
     Raises:
-        InputError: A plan that does not hold in this case.
+        InputError: A plan that does not hold in this case, or a path of another case.
     """
     from puncture_twin.planning.search.candidates import Pick
+    from puncture_twin.planning.search.explain import Explanation
     from puncture_twin.twin.jobs.choosing.compare_job import compare_paths
 
     paths = [check(context, candidate=path) if isinstance(path, Pick) else path for path in (one, other)]
+    for path in paths:
+        if isinstance(path, Explanation):
+            context.own(path.candidates)
     return compare_paths(context, context.own(candidates), *zip(("one", "other"), paths, strict=True))
 
 
@@ -672,7 +685,8 @@ def export(
             ``slicer`` need it.
 
     Raises:
-        InputError: A format that is not of this source, or a plan that breaks a limit of the arm or does not hold.
+        InputError: A format that is not of this source, a plan that breaks a limit of the arm or does not hold, or
+            candidates or a direction of another case than the context's.
     """
     from puncture_twin.twin.jobs.patient.export_jobs import export_value
 
@@ -698,7 +712,8 @@ def report(
         rehearsal: From `rehearse`, of this plan.
 
     Raises:
-        InputError: A folder that cannot be written to, or a rehearsal without its plan.
+        InputError: A folder that cannot be written to, candidates or a plan of another case, or a rehearsal without its
+            plan.
     """
     from puncture_twin.planning.base.files import check_writable
     from puncture_twin.twin.jobs.patient.main_job import report_case
@@ -706,12 +721,12 @@ def report(
 
     if rehearsal is not None and plan is None:
         refuse("a rehearsal without its plan", "report", "plan=... beside it", "missing_option")
+    candidates = context.own(candidates)
+    plan = None if plan is None else _own_plan(context, plan, "report: plan")
     pick = None if plan is None else context.check(plan.theta, plan.beta).pick(0)
     distribution = None if rehearsal is None else rehearsal.distribution
     out = check_writable(folder)
-    report_case(
-        Run(context, context.own(candidates), (), plan, rehearsal=rehearsal, distribution=distribution, pick=pick), out
-    )
+    report_case(Run(context, candidates, (), plan, rehearsal=rehearsal, distribution=distribution, pick=pick), out)
     return out / PAGE
 
 
@@ -755,6 +770,7 @@ def batch(
 
 def _choice(
     where: str,
+    context: CaseContext,
     theta_deg: float | None,
     beta_deg: float | None,
     candidate: Pick | None,
@@ -764,7 +780,7 @@ def _choice(
     """The one choice that was stated.
 
     Raises:
-        InputError: Two of them, half of one, or a value outside of its range.
+        InputError: Two of them, half of one, a value outside of its range, or a candidate of another case.
     """
     from puncture_twin.planning.search.choice import Choice, parse_choice
 
@@ -778,8 +794,35 @@ def _choice(
         return stated
     if stated != Choice():
         refuse("a candidate beside another choice", where, "one of them", "conflicting_options")
-    found, row = candidate
+    found, row = _own_pick(context, candidate, where)
     return Choice(angles=(float(found.theta[row]), float(found.beta[row])))
+
+
+def _own_pick(context: CaseContext, candidate: Pick, where: str) -> Pick:
+    """A candidate of this case: the angles of another's are another path here.
+
+    Raises:
+        InputError: It is of another case, or no row of a search.
+    """
+    found, row = candidate
+    if not _is("Candidates", found):
+        refuse(
+            f"a candidate of a value {_short(found)}", where, "candidates.best or candidates.pick(row)", "wrong_type"
+        )
+    return context.own(found).pick(row)
+
+
+def _own_plan(context: CaseContext, plan: Plan, where: str) -> Plan:
+    """A plan that holds in this case, whatever it was made for or has become since.
+
+    Raises:
+        InputError: It does not; see `read_plan`.
+    """
+    from puncture_twin.planning.plan.plan_check import with_case_arm
+    from puncture_twin.planning.plan.recheck import check_plan
+
+    check_plan(plan, context, Path(where))
+    return with_case_arm(plan, context.case)
 
 
 def _typed(point: ArrayLike, where: str) -> str:
@@ -816,7 +859,7 @@ def _angles(angles_deg: ArrayLike, most: float, where: str) -> Floats:
         refuse("no angle", where, allowed, "empty")
     wrong = ~((given >= 0.0) & (given <= most))  # NaN too
     if wrong.any():
-        refuse(f"{given[wrong][0]:g}", where, allowed, "out_of_range")
+        refuse(f"{float(given[wrong][0])!r}", where, allowed, "out_of_range")
     return given
 
 
@@ -832,6 +875,8 @@ def _numbers(values: ArrayLike, where: str, allowed: str) -> Floats:
         raise InputError("rows of different length", where=where, allowed=allowed, code="wrong_shape") from error
     if given.dtype.kind not in "iuf":
         refuse(f"values of type {given.dtype}", where, allowed, "wrong_type")
+    if any_masked(values):
+        refuse("a masked value", where, allowed, "not_finite")
     if given.ndim != 1:
         refuse(f"shape {given.shape}", where, allowed, "wrong_shape")
     return np.asarray(given, dtype=np.float64)

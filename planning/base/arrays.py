@@ -80,3 +80,8 @@ def counts_of(numbers: NDArray[np.integer], count: int) -> Ints:
         found = np.bincount(plane.ravel())
         counts[: len(found)] += found
     return counts
+
+
+def any_masked(values: object) -> bool:
+    """Whether an array, or one of a list of arrays, has a masked value, under which any number may stand."""
+    return any(np.ma.is_masked(one) for one in (values if isinstance(values, list | tuple) else [values]))

@@ -134,7 +134,9 @@ class Case(Shown):
         Args:
             target_ct: Another target in the same structure, shape (3,), mm, LPS (or the case's local frame).
             options: Tables of keys and values as in the file, in mm, degrees and the case's space: ``target``,
-                ``mount`` (in place of any registration), ``needle``, ``arm``, ``search``, ``errors``, ``margins``.
+                ``mount`` (in place of any registration), ``needle``, ``arm``, ``search``, ``errors``, ``margins``. Of
+                margins that fit one structure the last stated counts; ``add_mm`` is added to all of them,
+                and replaces an earlier ``add_mm``.
 
         Raises:
             InputError: A kind of option, a key or a value that the file could not have, or a file that has changed.

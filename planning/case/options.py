@@ -53,13 +53,13 @@ class CaseOptions:
 
     @property
     def text(self) -> str:
-        """The options as JSON: the same options give the same text."""
-        return json.dumps(
-            {kind: dict(values) for kind, values in self.sections.items()},
-            sort_keys=True,
-            allow_nan=False,
-            default=_plain,
+        """The options as JSON: the same options give the same text; of margins the order counts, so it is kept."""
+        tables = (
+            f"{json.dumps(kind)}: "
+            + json.dumps(dict(values), sort_keys=kind != MARGINS, allow_nan=False, default=_plain)
+            for kind, values in sorted(self.sections.items())
         )
+        return f"{{{', '.join(tables)}}}"
 
     def applied(self, data: dict[str, Any], *, where: Path | str) -> dict[str, Any]:
         """A case file's tables with the options in place; nothing is validated yet.
@@ -83,12 +83,15 @@ class CaseOptions:
         return changed
 
     def with_(self, other: CaseOptions) -> CaseOptions:
-        """These options with others over them: a mount takes the place of a mount, in all else a key that of a key."""
+        """These options with others over them: a mount takes the place of a mount, in all else a key that of a key.
+
+        A margin that is stated again comes last again, so that no earlier pattern is laid over it.
+        """
         sections = {kind: dict(values) for kind, values in self.sections.items()}
         for kind, values in other.sections.items():
-            if kind == MOUNT:
-                sections[kind] = {}
-            _overlay(sections.setdefault(kind, {}), values)
+            before = {} if kind == MOUNT else sections.get(kind, {})
+            sections[kind] = {key: value for key, value in before.items() if key not in values}
+            _overlay(sections[kind], values)
         return CaseOptions(sections)
 
 
@@ -127,6 +130,8 @@ def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
     except (TypeError, ValueError) as error:
         what = f"an option cannot be used ({error})"
         raise InputError(what, where=where, allowed="finite numbers, texts, lists, tables", code="bad_value") from error
+    if MARGINS in plain:  # of one statement: a pattern before the names that it fits
+        plain[MARGINS] = dict(sorted(plain[MARGINS].items()))
     return CaseOptions(plain)
 
 

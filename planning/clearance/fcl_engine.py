@@ -13,9 +13,9 @@ import fcl
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import PlanningError
+from puncture_twin.planning.base.errors import PlanningError, refuse
 from puncture_twin.planning.base.progress import Count
-from puncture_twin.planning.clearance.engine import AxisDistances
+from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine
 from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.geometry.containment import first_crossing
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -126,6 +126,64 @@ def _tree(vertices: Floats, faces: np.ndarray) -> fcl.BVHModel:
     tree.addSubModel(vertices, faces)
     tree.endModel()
     return tree
+
+
+OWN_MM = 1e-3
+"""By so much an engine of one's own may measure more than there is: single precision, 0.5 m from the origin."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeldEngine:
+    """An engine of one's own, held to an exact one: it may measure less than there is, and never more.
+
+    Attributes:
+        own: Whose distances count.
+        exact: Measures the same axes again, and answers all else.
+    """
+
+    own: ClearanceEngine
+    exact: ClearanceEngine
+
+    @property
+    def triangles(self) -> tuple[Floats, ...]:
+        """The exact engine's; see `ClearanceEngine`."""
+        return self.exact.triangles
+
+    @property
+    def blocks(self) -> tuple[Blocks, ...]:
+        """The exact engine's; see `ClearanceEngine`."""
+        return self.exact.blocks
+
+    def measure(
+        self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
+    ) -> AxisDistances:
+        """The lesser of both distances, at the exact engine's depths and triangles; see `ClearanceEngine`.
+
+        Raises:
+            InputError: The own engine gives another shape, no number, or more than there is.
+        """
+        exact = self.exact.measure(target_ct, outward_ct, length, shown=False)
+        own = np.asarray(self.own.measure(target_ct, outward_ct, length, shown=shown).distance)
+        name, allowed = type(self.own).__name__, "never more than there is"
+        if own.shape != exact.distance.shape:
+            refuse(f"distances of shape {own.shape}", name, f"{exact.distance.shape}", "wrong_shape")
+        wrong = ~(own <= exact.distance + OWN_MM)  # NaN too
+        if wrong.any():
+            row, column = np.argwhere(wrong)[0]
+            what = (
+                f"measures {own[row, column]:.4g} mm to a structure that is {exact.distance[row, column]:.4g} mm away"
+            )
+            refuse(what, name, allowed, "engine_contradicted")
+        return AxisDistances(np.minimum(own, exact.distance), exact.depth, exact.nearest)
+
+    def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
+        """Whether either engine finds a contact; see `ClearanceEngine`."""
+        asked = structure, target_ct, outward_ct, length, radius
+        return self.exact.collides(*asked) or self.own.collides(*asked)
+
+    def of(self, columns: Ints) -> HeldEngine:
+        """Both engines for some of their structures; see `ClearanceEngine`."""
+        return HeldEngine(self.own.of(columns), self.exact.of(columns))
 
 
 AGREE_MM = 1e-6

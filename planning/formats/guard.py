@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from puncture_twin.planning.base.arrays import is_frozen
+from puncture_twin.planning.base.arrays import any_masked, is_frozen
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.text import check_name
 
@@ -100,6 +100,8 @@ def _float_array(values: Many, *, what: str, where: str | Path, allowed: str) ->
         raise InputError(f"{what} is ragged ({error})", where=where, allowed=allowed, code="wrong_shape") from error
     if raw.dtype.kind not in "iuf":
         refuse(f"{what} has values of type {raw.dtype}", where, allowed, "wrong_type")
+    if any_masked(values):
+        refuse(f"{what} has a masked value", where, allowed, "not_finite")
     return raw if is_frozen(raw, np.float64) else np.array(raw, dtype=np.float64, order="C")
 
 

@@ -175,7 +175,7 @@ def search_placements(
         NoAnswerError: No direction is safe for the organs, or in none the needle could start.
     """
     if not candidates.safe.any():
-        what = "no direction is safe for the organs, so no placement can help"
+        what = "no direction is safe for the organs: no placement can change that"
         raise NoAnswerError(what, counts=candidates.counts(), code="no_safe_direction")
     # 1. The workcell, and the directions in which the needle itself is clear at its standoff.
     T_ct_bed, step_mm = bed_frame(case), case.place.step_mm

@@ -26,6 +26,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import BEST, Choice, choose
 from puncture_twin.planning.search.constraints import reach_request
 from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import reason_text
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.chance_model import satisfies_limits
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
@@ -88,6 +89,11 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     """
     assert context.reach is not None and context.placement is not None  # the caller has refused this
     case, checker = context.case, context.reach.checker
+    # 0. The direction, checked anew: candidates may be of another engine, or changed; here they are an order alone.
+    candidates = context.check(candidates.theta[row], candidates.beta[row])
+    row = 0
+    if not candidates.safe[0]:
+        raise NoAnswerError(f"its direction is rejected: {reason_text(candidates, 0)}", code="direction_rejected")
     # 1. The approach: from home to the standoff, in any of the arm's configurations that keep the limits of chances.
     request = reach_request(case, candidates, row, context.reach.T_base_ct)
     home, speeds = home_configuration(case), case.robot.speeds

@@ -15,6 +15,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.files import decode_text, read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.formats.points import (
@@ -103,11 +104,11 @@ def choose(context: CaseContext, candidates: Candidates | None, choice: Choice) 
     if not len(rows):
         raise NoAnswerError("no candidate is safe", counts=candidates.counts(), code="no_safe_direction")
     if choice.rank is not None:
-        _refuse_beyond(choice.rank, len(rows), "--rank", "safe candidates")
+        _refuse_beyond(choice.rank, len(rows), "--rank", "safe candidate")
         return Chosen(candidates, rows[choice.rank - 1 : choice.rank])
     if choice.window is not None:
         windows = candidates.windows
-        _refuse_beyond(choice.window, len(windows.windows), "--window", "windows")
+        _refuse_beyond(choice.window, len(windows.windows), "--window", "window")
         return Chosen(candidates, rows[windows.of_row[rows] == choice.window])
     return Chosen(candidates, rows)
 
@@ -210,7 +211,8 @@ def _entry_ct(case: Case, choice: Choice) -> Floats:
 
 def _refuse_beyond(number: int, count: int, where: str, what: str) -> None:
     if not 1 <= number <= count:
-        refuse(f"{number}: there are {count} {what}", where, f"1 to {count}", "out_of_range")
+        there = "there is" if count == 1 else "there are"
+        refuse(f"{number}: {there} {plural(count, what)}", where, f"1 to {count}", "out_of_range")
 
 
 def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:

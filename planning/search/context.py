@@ -29,7 +29,7 @@ from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.fast_engine import FastEngine
-from puncture_twin.planning.clearance.fcl_engine import CrossChecked, FclEngine, cross_check
+from puncture_twin.planning.clearance.fcl_engine import CrossChecked, FclEngine, HeldEngine, cross_check
 from puncture_twin.planning.collision.workcell import case_checker, with_surroundings
 from puncture_twin.planning.evidence.checks import findings
 from puncture_twin.planning.reach.standoff import axis_lengths, case_axis_lengths
@@ -50,7 +50,9 @@ ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast"
 """Clearance engines by name: the fast exact engine, and FCL alone as the plain reference."""
 
 EngineChoice = str | Callable[..., ClearanceEngine]
-"""A name of `ENGINES`, or a class of one's own that is made of (meshes, progress) and keeps `ClearanceEngine`."""
+"""A name of `ENGINES`, or a class of one's own that is made of (meshes, progress) and keeps `ClearanceEngine`.
+
+It is held to the fast engine (`HeldEngine`): it may find less clearance, and never more."""
 
 COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
 """The unit of each engine's progress."""
@@ -91,7 +93,7 @@ class CaseContext(Shown):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process: what was read; what answers is made there, since compiled libraries are not sent."""
-        kind = type(self.engine)
+        kind = type(self.engine.own if isinstance(self.engine, HeldEngine) else self.engine)
         engine = next((name for name, known in ENGINES.items() if kind is known), kind)
         return _sent, (self.case, self.anatomy, self.placement, engine, self.reach is not None)
 
@@ -288,9 +290,14 @@ def _answering(
     """What questions are answered with: clearance engine, arm's checker, model of errors."""
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
-        maker, unit = (ENGINES[engine], COUNTED[engine]) if isinstance(engine, str) else (engine, "structures")
-        cache_option = {"cache": cache} if engine == "fast" else {}
-        clearance_engine = maker(meshes, partial(watcher.count, unit), **cache_option)
+        count = partial(watcher.count, COUNTED[engine] if isinstance(engine, str) else COUNTED["fast"])
+        clearance_engine: ClearanceEngine
+        if engine == "fcl":
+            clearance_engine = FclEngine(meshes, count)
+        else:
+            clearance_engine = FastEngine(meshes, count, cache=cache)
+            if not isinstance(engine, str) and engine is not FastEngine:
+                clearance_engine = HeldEngine(engine(meshes, count), clearance_engine)
         reach = None
         if arm and placement is not None:
             reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, cache.memory), placement.T_base_ct)

@@ -45,6 +45,29 @@ def test_margins_by_name_pattern_and_addition(tmp_path):
     assert margins(loaded(path, margins={"add_mm": 2})) == {"rib": 5.0}
 
 
+@pytest.mark.parametrize(
+    ("steps", "left"),
+    [
+        (({"*": 1.0}, {"rib": 8.0}), 8.0),
+        (({"rib": 8.0}, {"*": 1.0}), 1.0),
+        (({"rib": 8.0}, {"*": 1.0}, {"rib": 8.0}), 8.0),
+        (({"*": 1.0}, {"rib": 8.0}, {"*": 1.0}), 1.0),
+        (({"r*": 1.0}, {"*b": 8.0}), 8.0),
+        (({"rib": 8.0, "*": 1.0},), 8.0),
+    ],
+)
+def test_of_margins_that_fit_one_structure_the_last_stated_counts(tmp_path, steps, left):
+    """To and fro: 8 mm stated last were 1 mm by an earlier pattern; the order is an input too."""
+    plain = load_case(write_patient(tmp_path / "a"))
+    case, back = plain, plain
+    for step in steps:
+        case = case.replace(margins=step)
+    for step in reversed(steps):
+        back = back.replace(margins=step)
+    assert margins(case) == {"rib": left}
+    assert margins(back) == margins(case) or back.inputs != case.inputs
+
+
 def test_a_mount_takes_the_place_of_a_registration(tmp_path):
     """A case has one of them."""
     path = write_patient(

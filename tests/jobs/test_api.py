@@ -7,6 +7,7 @@ import sys
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -18,6 +19,7 @@ from refusals import refused
 
 import puncture_twin as pt
 from puncture_twin.meshes import folder
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -323,6 +325,8 @@ def test_two_choices_or_an_arm_that_is_switched_off_are_refused(arm_context, con
         pt.plan(arm_context, window=10_000)
     with refused("no_base"):
         pt.plan(context, candidate=best)
+    with refused("no_base"):
+        pt.touch(context, candidate=best)
     with refused("out_of_range"):
         pt.search(context).pick(-1)
 
@@ -394,6 +398,115 @@ def test_an_engine_of_ones_own_measures_everything(context):
     for wrong in (int, "exact", FastEngine([])):
         with refused("wrong_type" if wrong != "exact" else "unknown_engine"):
             pt.prepare(case, arm=False, engine=wrong)
+
+
+class HopefulEngine(FastEngine):
+    """Measures 5 mm more than there is."""
+
+    def measure(self, target_ct, outward_ct, length, *, shown=True):
+        """Of every axis from every structure."""
+        axes = super().measure(target_ct, outward_ct, length, shown=shown)
+        return replace(axes, distance=axes.distance + 5.0)
+
+
+class BlindEngine(FastEngine):
+    """Measures no number."""
+
+    def measure(self, target_ct, outward_ct, length, *, shown=True):
+        """Of every axis from every structure."""
+        axes = super().measure(target_ct, outward_ct, length, shown=shown)
+        return replace(axes, distance=np.full_like(axes.distance, np.nan))
+
+
+@pytest.mark.parametrize("engine", [HopefulEngine, BlindEngine])
+def test_an_engine_that_finds_more_clearance_than_there_is_ends_with_an_error(context, engine):
+    """Neither a search nor one direction says "safe" by it, and its context says the same elsewhere."""
+    theirs = pt.prepare(context.case, arm=False, engine=engine)
+    for ask in (pt.search, pt.check):
+        with refused("engine_contradicted"):
+            ask(theirs)
+    with refused("engine_contradicted"):
+        pt.check(pickle.loads(pickle.dumps(theirs)), 30.0, 100.0)
+
+
+def test_a_path_of_another_case_is_not_taken_for_one_of_this(context, tmp_path):
+    """The angles of a candidate, or the clearances of a checked direction, are another path about another target."""
+    case = context.case
+    for change in ({"target_ct": case.target_ct + (0.4, 0.0, 0.0)}, {"needle": {"diameter_mm": 1.4}}):
+        other = pt.prepare(case.replace(**change), arm=False)
+        found = pt.search(other)
+        explained = pt.check(other, candidate=found.best)
+        for ask in (
+            lambda found=found: pt.check(context, candidate=found.best),
+            lambda found=found: pt.compare(context, found.best, pt.check(context)),
+            lambda explained=explained: pt.compare(context, explained, pt.check(context)),
+            lambda explained=explained: pt.export(explained, "slicer", tmp_path / "slicer", context=context),
+            lambda found=found: pt.export(found, "candidates-csv", tmp_path / "csv", context=context),
+        ):
+            with refused("input_changed"):
+                ask()
+        back = pt.prepare(other.case.replace(target_ct=case.target_ct, needle={"diameter_mm": case.needle.diameter_mm}))
+        assert same_candidates(pt.search(pt.prepare(back.case, arm=False)), pt.search(context))
+    assert not list(tmp_path.iterdir())
+    best = pt.search(context).best
+    for wrong, code in (((best.candidates, 10**9), "out_of_range"), (("x", 0), "wrong_type")):
+        with refused(code):
+            pt.check(context, candidate=type(best)(*wrong))
+
+
+def test_what_is_planned_is_checked_anew(arm_context):
+    """Candidates whose verdicts were changed are an order of preference, and make no rejected direction safe."""
+    found = pt.search(arm_context)
+    rejected = np.flatnonzero(found.verdict.reason == "too_close")[:1]
+    reason, rank = found.verdict.reason.copy(), np.zeros(len(found), np.int32)
+    reason[rejected], rank[rejected] = "", 1
+    verdict, ranking = replace(found.verdict, reason=reason), replace(found.ranking, rank=rank)
+    with pytest.raises(NoAnswerError):
+        pt.plan(arm_context, replace(found, verdict=verdict, ranking=ranking))
+
+
+def test_a_plan_of_another_case_is_neither_rehearsed_nor_shown(arm_context, tmp_path):
+    """And one of another seed is: it is what `plan` was asked for."""
+    case = arm_context.case
+    plan = pt.plan(arm_context, seed=3)
+    other = pt.prepare(case.replace(target_ct=case.target_ct + (0.4, 0.0, 0.0)))
+    for ask in (
+        lambda: pt.rehearse(other, plan),
+        lambda: pt.report(other, pt.search(other), tmp_path / "page", plan=plan),
+        lambda: pt.export(plan, "csv", tmp_path / "csv", context=other),
+        lambda: pt.compare(other, plan, pt.check(other)),
+    ):
+        with refused("input_changed"):
+            ask()
+    assert not (tmp_path / "page").exists() and not list(tmp_path.glob("csv/*.csv"))
+    with refused("plan_contradicted"):
+        pt.rehearse(arm_context, replace(plan, theta=plan.theta + 0.01))
+    assert pt.compare(arm_context, plan, pt.check(arm_context)).a.safe
+    assert pt.export(plan, "csv", tmp_path / "csv", context=arm_context).path.is_file()
+
+
+@pytest.mark.parametrize(
+    "number",
+    [np.float16, np.float32, np.longdouble, np.array, Fraction, np.int64, lambda value: np.array(value, np.int8)],
+)
+def test_an_angle_is_the_same_in_every_type_of_number(context, number):
+    """Half a degree's digits are not lost where it becomes radians: 20 in half precision was 20.003."""
+    found = pt.check(context, number(20), beta_deg=number(100))
+    assert found.candidates.at(0) == {"theta_deg": 20.0, "beta_deg": 100.0}
+
+
+def test_masked_values_are_no_numbers(context):
+    """Under a mask any number may be; an array that masks nothing is an array."""
+    masked, whole = (np.ma.array([30.0, 40.0], mask=mask) for mask in ([False, True], False))
+    with refused("not_finite"):
+        pt.check_many(context, masked, whole)
+    with refused("wrong_type"):
+        pt.check(context, np.ma.array(30.0, mask=True), 40.0)
+    entry = np.ma.array(context.case.target_ct, mask=[False, True, False])
+    for ask in (lambda: pt.check(context, entry=entry), lambda: context.case.replace(target_ct=entry)):
+        with refused("not_finite"):
+            ask()
+    assert len(pt.check_many(context, whole, whole)) == 2
 
 
 def test_candidates_of_another_case_are_not_planned_nor_shown(context, arm_context, tmp_path):

@@ -178,7 +178,7 @@ def _stated_side(path: Path, plan: Plan) -> Side:
 
 def _planned_side(context: CaseContext, candidates: Candidates, path: Path, plan: Plan) -> Side:
     """A plan that holds; its chances are those of the configuration in which it ends."""
-    check_plan(plan, context, path, seed=context.case.rehearsal.seed)
+    check_plan(plan, context, path)
     explained = context.explain(plan.theta, plan.beta)
     explained = replace(explained, breakdown=context.breakdown_at(plan.outward_ct, plan.insertion.q[-1]))
     grid = _on_grid(candidates, plan.outward_ct, safe=True)

@@ -184,6 +184,7 @@ def plan_tour(context: CaseContext, choice: Choice, seed: int) -> Tour:
     Raises:
         InputError, NoAnswerError: See `touch_case`.
     """
+    context.require_arm()
     q_insertion, outward_ct = _puncture(context, choice)
     with context.stages.time("touch plan"):
         plan = plan_touches(context, q_insertion, seed=seed, progress=partial(context.watcher.count, "motions"))

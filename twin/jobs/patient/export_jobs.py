@@ -47,15 +47,21 @@ NOTES = (
 )
 
 
-def export_to_moveit(context: CaseContext, plan_path: Path, out: Path) -> Exported:
+def export_to_moveit(context: CaseContext, plan_path: Path, out: Path, *, seed: int | None = None) -> Exported:
     """Check a plan against its case again; write the four files.
+
+    Args:
+        context: The plan's case.
+        plan_path: The plan's file.
+        out: Where the files go.
+        seed: That the plan must state; the case's by default.
 
     Raises:
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
     note = context.watcher.note
     source, plan = read_noted_plan(plan_path, note)
-    check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
+    check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed if seed is None else seed)
     plan = with_case_arm(plan, context.case)
     names, inputs = moveit_names(plan_path.stem), (source, *plan.inputs)
     texts = moveit_files(plan, context.case, context.anatomy, source=plan_path)
@@ -83,6 +89,8 @@ def export_value(
         refuse(what, "export", f"one of type {kind.__name__}", "wrong_type")
     if context is None and format_name in (MOVEIT, SLICER):
         refuse(f"the scene of {format_name} is the case's", "export", "context=... beside it", "missing_option")
+    if context is not None and not isinstance(source, Plan):
+        context.own(source if isinstance(source, Candidates) else source.candidates)
     out, note = check_writable(folder), Silent().note
     if isinstance(source, Candidates):
         return export_candidates(source.write(out), format_name, out, note)
@@ -94,8 +102,8 @@ def export_value(
         write_plan(source, draft.folder / "plan.json")
     if format_name == MOVEIT:
         assert context is not None
-        return export_to_moveit(context, out / "plan.json", out)
-    return export(out / "plan.json", format_name, out, context, note)
+        return export_to_moveit(context, out / "plan.json", out, seed=source.seed)
+    return export(out / "plan.json", format_name, out, context, note, seed=source.seed)
 
 
 class Export(NamedTuple):

@@ -250,9 +250,17 @@ def read_noted_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Pla
 
 
 def export(
-    plan_path: Path, format_name: str, out: Path, context: CaseContext | None, note: Callable[[str], None]
+    plan_path: Path,
+    format_name: str,
+    out: Path,
+    context: CaseContext | None,
+    note: Callable[[str], None],
+    *,
+    seed: int | None = None,
 ) -> Exported:
     """Write a plan for a robot; with its case, after it has been checked again, and with rounded corners where free.
+
+    The plan must state this seed; None takes the case's.
 
     Raises:
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
@@ -262,7 +270,7 @@ def export(
 
     source, plan = read_noted_plan(plan_path, note)
     if context is not None:
-        check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
+        check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed if seed is None else seed)
     checker = None if context is None or context.reach is None else context.reach.checker
     name = export_name(plan_path, format_name)
     inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}

@@ -1,4 +1,4 @@
-"""The job ``place``: search for a place to stand the arm, and the files that show it.
+"""The job ``place``: search for the best position of the arm's base, and write the files that show it.
 
 What ``place`` prints for a person.
 """
@@ -15,6 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.output.output_set import withdraw, writing
+from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.place.search import (
     PlaceSearch,
     RatedPlacement,
@@ -36,7 +37,7 @@ Ranked = tuple[str, RatedPlacement]
 
 @dataclass(frozen=True, eq=False)
 class PlaceRun:
-    """What ``place`` has found, and the files that it wrote."""
+    """Result of ``place``, and the files that it wrote."""
 
     context: CaseContext
     found: PlaceSearch
@@ -44,7 +45,7 @@ class PlaceRun:
     files: tuple[Path, ...]
 
     def summary(self) -> dict[str, Any]:
-        """Plain values for JSON: mm; shares 0..1."""
+        """Plain values for JSON: mm; fractions 0..1."""
         seconds = {stage: round(spent, 3) for stage, spent in self.context.stages.seconds.items()}
         return {**self.document, "seconds": seconds, "files": [str(path) for path in self.files]}
 
@@ -80,7 +81,7 @@ class _Clock:
         if total is not None and now + (total - done) * (now - began) / max(1, done - first) < self._end:
             self._count("directions checked", done, total)
         elif now < self._end < np.inf:
-            self._count("seconds of the search", round(now - self._began), round(self._end - self._began))
+            self._count("seconds", round(now - self._began), round(self._end - self._began))
         return now + piece < self._end
 
 
@@ -105,8 +106,8 @@ def place_case(
 
     Raises:
         InputError: Bounds that contradict the case.
-        NoAnswerError: No direction is safe for the organs, or no placement holds one; the files are written in the
-            second case.
+        NoAnswerError: No direction is safe for the organs, or no placement reaches one; the files are written in
+            the second case.
     """
     names = ("placements.csv", "place.json", *(("placements.png", "map_best_place.png") if pictures else ()))
     try:
@@ -123,10 +124,20 @@ def place_case(
     except NoAnswerError:
         withdraw(out, "place")
         raise
-    if not any(one.verdict.reached for one in run.found.rated):
-        what = f"no placement holds any of the organ-safe directions ({run.found.checked[0]:,} checks)"
-        raise NoAnswerError(what, code="no_placement")
+    refuse_none(run.found)
     return replace(run, files=draft.final(run.files))
+
+
+def refuse_none(found: PlaceSearch) -> None:
+    """Refuse a search in which no placement reaches a direction: its best is none.
+
+    Raises:
+        NoAnswerError: Says how much was checked.
+    """
+    if not any(one.verdict.reached for one in found.rated):
+        what = f"the arm reaches no organ-safe direction from any placement ({plural(found.checked[0], 'check')})"
+        what += "" if found.complete else ", as far as was searched; --full searches to the end"
+        raise NoAnswerError(what, code="no_placement")
 
 
 class Places(NamedTuple):
@@ -137,7 +148,7 @@ class Places(NamedTuple):
 
 
 def find_places(context: CaseContext, jobs: int, until: float = np.inf) -> Places:
-    """Search for a place to stand the arm.
+    """Search for the best position of the arm's base.
 
     Args:
         context: The case, whose own arm need not be checked.
@@ -193,21 +204,23 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: f
 
 def _first_text(one: RatedPlacement) -> str:
     """The first answer, while the search goes on."""
-    share = f"{100 * one.verdict.fraction:.0f} % ({one.verdict.reached} of {one.verdict.count} directions checked)"
-    return f"so far: {one.name}, base at {list(one.mount.position_mm)} mm, {share}"
+    verdict, where = one.verdict, list(one.mount.position_mm)
+    reached = f"it reaches {verdict.reached} of {plural(verdict.count, 'checked direction')}"
+    return f"best so far: {one.name}, base at {where} mm: {reached}, about {100 * verdict.fraction:.0f} % of all"
 
 
 def _ended_text(found: PlaceSearch) -> str:
     """How far a search came that the clock ended."""
     whole = sum(one.verdict.count == found.directions for one in found.rated)
     return (
-        f"ended by the clock: {whole} of {len(found.rated)} placements were checked in all directions, and positions "
-        f"are good to {found.resolution_mm:.0f} mm. Another run may check more or fewer; --full searches to the end"
+        f"the time is over: {whole} of {plural(len(found.rated), 'placement')} were checked in all directions; the "
+        f"fractions of the others are estimates. The search stopped at steps of {found.resolution_mm:.0f} mm. Another "
+        "run may check more or fewer; --full searches to the end"
     )
 
 
 HALF_A_DIGIT = 5e-4
-"""Of a share that is printed in % with one digit."""
+"""Of a fraction that is printed in % with one digit."""
 
 
 def place_text(run: PlaceRun) -> str:
@@ -218,13 +231,13 @@ def place_text(run: PlaceRun) -> str:
     ranked = [(str(rank), one) for rank, one in enumerate(found.rated, start=1)]
     own = [] if found.own is None else [("-", found.own)]
     best = Warn(tuple(str(run.document["mount_lines"] or "").splitlines()))
-    truth = "a proposal: where the arm then really stands, markers must say ([registration])"
+    truth = "this is a proposal: measure the real position of the base with markers ([registration])"
     return text([
         Section(
             f"case {case.name}: {found.directions:,} organ-safe directions; {len(found.coarse):,} + {found.refined:,} "
-            f"placements estimated, {len(found.rated)} checked",
+            f"placements were estimated; {len(found.rated)} were checked",
             [frame, *needle_line(found.possible), grid(_fields(run), [*ranked, *own])]),
-        *([Section("the best, for the case (in place of its [registration] or [robot.mount]):", [best]),
+        *([Section("the best, for the case (replaces its [registration] or [robot.mount]):", [best]),
            Section(truth, [])] if best.lines else []),
         *footer(run.files, run.document["warnings"], run.context.stages.seconds),
     ])  # fmt: skip
@@ -244,8 +257,9 @@ def _fields(run: PlaceRun) -> list[Field]:
 
     return [
         Field("rank", lambda ranked: ranked[0]),
-        Field("share", lambda ranked: 100 * ranked[1].verdict.fraction, 1, "%"),
-        Field("held", lambda ranked: ranked[1].verdict.reached),
+        Field("fraction", lambda ranked: 100 * ranked[1].verdict.fraction, 1, "%"),
+        Field("which is", lambda ranked: "exact" if ranked[1].verdict.count == run.found.directions else "estimated"),
+        Field("reached", lambda ranked: ranked[1].verdict.reached),
         Field("of checked", lambda ranked: ranked[1].verdict.count),
         Field("margin", lambda ranked: ranked[1].verdict.margin, 2),
         *(Field(name, at(axis), 0) for axis, name in enumerate(("along", "across", "height"))),
@@ -255,8 +269,8 @@ def _fields(run: PlaceRun) -> list[Field]:
 
 
 def needle_line(possible: float) -> list[str]:
-    """What no placement can mend, where there is such a thing."""
+    """The limit that no placement can exceed, where there is one."""
     if possible > 1.0 - HALF_A_DIGIT:
         return []
-    fraction = f"at most about {100 * possible:.1f} % can be held from anywhere"
-    return [f"{fraction}: elsewhere the needle itself would start too near the skin"]
+    fraction = f"no placement reaches more than about {100 * possible:.1f} %"
+    return [f"{fraction}: in the other directions the needle would start too near the skin"]

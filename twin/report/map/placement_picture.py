@@ -1,4 +1,4 @@
-"""``placements.png``: from where the arm can hold how much, each way of mounting it seen from above."""
+"""``placements.png``: the fraction that the arm reaches from each position, each way of mounting it seen from above."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PANEL_INCHES = 4.3
 MOST_COLUMNS = 4
 SHADES = colormaps["viridis"]
 NOTHING: tuple[float, float, float] = (0.9, 0.9, 0.9)
-"""Where no direction is held, or the base would stand in something."""
+"""Where no direction is reached, or the base would be inside something."""
 
 SEEN_FROM_ABOVE = (1, 0)
 """The bed's axes to the right and up: across, along. The first runs to the left, as seen from above."""
@@ -43,7 +43,7 @@ EDGE_CELLS = 1.6
 TICKS_MM = 500.0
 
 ALL_OF_IT = 1.0 - 5e-4
-"""A share that is not told from the whole."""
+"""A fraction that is printed as the whole."""
 
 HALO = halo(2.5)
 SAME_AXIS = 0.94
@@ -51,7 +51,7 @@ SAME_AXIS = 0.94
 
 
 def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Path) -> None:
-    """Write the map of shares over position.
+    """Write the map of fractions over position.
 
     Args:
         found: The search's result.
@@ -137,16 +137,17 @@ def _marks(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any)
     for rank, one in enumerate(found.rated, start=1):
         if one.site is not None and one.site.region in regions:
             along, across, height = one.site.position
-            _mark(axes, across, along, "*" if rank == 1 else "o", f"{rank}: {_worth(one)}, h {height:+.0f}")
+            _mark(axes, across, along, "*" if rank == 1 else "o", f"{rank}: {_worth(one, found)}, h {height:+.0f}")
     if found.own is None:
         return
     T = np.linalg.inv(mount_pose(found.own.mount, case.space, case.path) @ found.T_ct_bed)
     if any(float(T[:3, 2] @ np.array(region.axis)) > SAME_AXIS for region in regions if region.mount != "rail"):
-        _mark(axes, float(T[1, 3]), float(T[0, 3]), "D", f"now: {_worth(found.own)}, h {T[2, 3]:+.0f}")
+        _mark(axes, float(T[1, 3]), float(T[0, 3]), "D", f"now: {_worth(found.own, found)}, h {T[2, 3]:+.0f}")
 
 
-def _worth(one: RatedPlacement) -> str:
-    return f"{100 * one.verdict.fraction:.0f} %"
+def _worth(one: RatedPlacement, found: PlaceSearch) -> str:
+    estimated = "~" if one.verdict.count < found.directions else ""
+    return f"{estimated}{100 * one.verdict.fraction:.0f} %"
 
 
 def _mark(axes: Axes, x: float, y: float, shape: str, text: str) -> None:
@@ -181,21 +182,22 @@ def _legend(axes: Axes, figure: Figure, found: PlaceSearch, case: Any, scale: No
         "HOW TO READ\n"
         f"Every panel looks down on the bed (toward you: {up or 'place.up'}).\n"
         "Ticks are mm from the target (red +). A cell is the middle\n"
-        "of the base; its colour the best height's ESTIMATED share\n"
-        "of the organ-safe directions that the arm can hold there.\n"
-        "Grey: none, or the base would stand in something.\n\n"
-        "* best, o the others that were checked exactly: rank, share,\n"
-        "height h of the base over the target, mm."
-        + ("\nDiamond: where the case has the arm now." if found.own is not None else "")
+        "of the base. Its colour is the ESTIMATED fraction of the\n"
+        "organ-safe directions that the arm reaches, at the best height.\n"
+        "Grey: none, or the base would be inside something.\n\n"
+        "* best, o others: checked by the arm's own collision check;\n"
+        "~ in some directions only. Rank, fraction, and height h of\n"
+        "the base above the target, mm."
+        + ("\nDiamond: the arm's present position in the case." if found.own is not None else "")
         + "\n\nSolid line: the patient from above. Dashed: table, gantry,\nother boxes.\n\n"
     )
     if found.possible < ALL_OF_IT:
         text += (
-            f"From anywhere at most {100 * found.possible:.0f} % can be held: elsewhere\n"
-            "the needle itself would start too near the skin."
+            f"No position reaches more than {100 * found.possible:.0f} %: in the other\n"
+            "directions the needle would start too near the skin."
         )
     axes.text(0.0, 1.0, text, transform=axes.transAxes, fontsize=9.5, va="top", linespacing=1.35)
     bar = axes.inset_axes((0.0, 0.06, 0.95, 0.05))
     figure.colorbar(ScalarMappable(scale, SHADES), cax=bar, orientation="horizontal")
-    bar.set_xlabel("share of the organ-safe solid angle, 0..1", fontsize=9)
+    bar.set_xlabel("estimated fraction of the organ-safe solid angle, 0..1", fontsize=9)
     bar.tick_params(labelsize=8)
