@@ -131,7 +131,7 @@ def test_a_jump_and_a_singularity_stop_a_way_where_they_are() -> None:
     stop = first_stop(model, stretched[4:], depths[4:])
     assert stop is not None and stop.depth_mm == 8.0 and "elbow" in stop.detail
     stop = first_stop(model, lost, depths)
-    assert stop is not None and stop.depth_mm == 14.0 and "does not reach" in stop.detail
+    assert stop is not None and stop.depth_mm == 14.0 and "cannot reach" in stop.detail
 
 
 def test_padding_moves_farther() -> None:

@@ -124,8 +124,8 @@ def test_a_cohort_file_is_a_grid(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "missing_key Field"),
-        ("cases = []\n", "bad_value Tuple"),
+        ("", "missing_key missing"),
+        ("cases = []\n", "bad_value list"),
         ('cases = ["q*"]\n', "no_match q*"),
         ('cases = ["p0"]\ncolours = ["red"]\n', "unknown_key colours"),
         ('cases = ["p0"]\nmargins = [3]\n', "not_a_table margins.1"),

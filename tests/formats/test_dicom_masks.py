@@ -125,7 +125,7 @@ def test_a_segmentation_without_its_ct_lies_on_a_grid_of_its_own(tmp_path):
     for step in ("2.5", ""):
         found = read_seg(world.segmentation(masks(), T, step=step), tmp_path, None)
         same(found, masks(), T)
-        assert "is not known" in found.notes[0]
+        assert "may belong to another CT" in found.notes[0]
 
 
 def broken(change, names=None):

@@ -122,7 +122,7 @@ def test_a_home_in_radians_is_refused_and_one_of_zeros_is_not():
     """`home_deg` of a case."""
     assert RobotSection(home_deg=tuple(START)).home_deg == tuple(START)
     assert RobotSection(home_deg=(0.0,) * 6).home_deg == (0.0,) * 6
-    with pytest.raises(ValueError, match="radians"):
+    with pytest.raises(ValueError, match="not in degrees"):
         RobotSection(home_deg=tuple(np.radians(START)))
 
 

@@ -3,6 +3,7 @@
 import inspect
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,8 +16,8 @@ import puncture_twin as pt
 from puncture_twin.meshes import folder
 from puncture_twin.planning.place.search import PlaceSearch
 from puncture_twin.twin.guidance.ultrasound.recording_file import write_recording
-from puncture_twin.twin.guidance.ultrasound.simulate import simulate_recording
 from puncture_twin.twin.jobs.patient import place_job
+from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
 FUNCTIONS = {name: getattr(pt, name) for name in pt.__all__ if inspect.isfunction(getattr(pt, name))}
 CARTON = folder() / "carton"
@@ -71,7 +72,7 @@ def values(given):
         "certify": given["certificate"],
         "verify": pt.verify(given["certificate"], context),
         "rehearse": rehearsal,
-        "place": PlaceSearch(np.eye(4), (), 0, 1.0, (), None),
+        "place": PlaceSearch(np.eye(4), (), 0, 1.0, 1.0, 0, (0, 0), (), None),
         "touch": pt.touch(armed),
         "compare": pt.compare(context, candidates.best, candidates.pick(0), candidates=candidates),
         "export": pt.export(plan, "csv", tmp / "export"),
@@ -120,9 +121,13 @@ def test_what_they_return_is_what_the_commands_make(values, given):
 def test_where_the_arm_should_stand_goes_into_a_case(given, monkeypatch):
     """What `place` finds is a mount as `replace` takes it; the search itself is tested with the planner."""
     armed = given["armed"]
-    seen = []
-    monkeypatch.setattr(place_job, "search_placements", lambda *_, **keys: seen.append(keys["jobs"]) or "found")
-    assert pt.place(armed, jobs=1) == "found" and seen == [1]
+    seen, one = [], SimpleNamespace(verdict=SimpleNamespace(reached=1))
+    found = SimpleNamespace(rated=[one], checked=(1, 1), complete=True)
+    monkeypatch.setattr(place_job, "search_placements", lambda *_, **keys: seen.append(keys["jobs"]) or found)
+    assert pt.place(armed, jobs=1) is found and seen == [1]
+    one.verdict.reached = 0
+    with refused("no_placement", by=pt.NoAnswerError):
+        pt.place(armed)
 
 
 def test_an_export_that_is_not_of_its_source_is_refused(given):
@@ -166,8 +171,9 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", sorted(FUNCTIONS))
-def test_no_foreign_exception_leaves_a_function(name, given):
+def test_no_foreign_exception_leaves_a_function(name, given, tmp_path, monkeypatch):
     """Whatever one argument is, beside good ones: an answer, or one line; never an error of NumPy's or Python's."""
+    monkeypatch.chdir(tmp_path)  # a text is a folder too
     function, parameters = FUNCTIONS[name], inspect.signature(FUNCTIONS[name]).parameters
     context = given["armed"] if name in ("touch", "rehearse", "read_plan") else given["context"]
     good = given | {"context": context, **({"theta_deg": [10.0], "beta_deg": [20.0]} if name == "check_many" else {})}

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import Manifest, read_manifest
-from puncture_twin.planning.base.output.publish import Draft, new_draft, publish, refuse_foreign, sweep
+from puncture_twin.planning.base.output.publish import Draft, new_draft, publish, refuse_foreign, sweep, uninterrupted
 from puncture_twin.planning.base.provenance import Input
 
 NO_SPACE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO})
@@ -57,13 +57,15 @@ def writing(
             that is to be written, or another source than ``made_from``.
     """
     with _explained(out), ExitStack() as stack:
-        stack.enter_context(_folder(out))
-        stack.enter_context(locked(out))
-        sweep(out)
+        with uninterrupted():  # no folder, lock or draft without what removes it
+            stack.enter_context(_folder(out))
+            stack.enter_context(locked(out))
+            sweep(out)
+            folder = new_draft(out, stack)
         draft = Draft(command, out, out, inputs, seconds or {}, note or _silent, read_manifest(out) or Manifest({}))
         refuse_foreign(draft, names)
         draft.depends_on = _sources(draft, made_from or {})
-        draft.folder, started = new_draft(out, stack), datetime.now(UTC)
+        draft.folder, started = folder, datetime.now(UTC)
         yield draft
         publish(draft, started)
 

@@ -60,7 +60,7 @@ def publish(draft: Draft, started: datetime) -> None:
     (state / "after").write_text(Manifest({**kept, **new}).text(), encoding="utf-8")
     timings = with_timings(out, kept, draft.command, started, draft.seconds)
     (state / "timings").write_text(timings, encoding="utf-8")
-    with _uninterrupted():
+    with uninterrupted():
         (state / "before").replace(out / MANIFEST_NAME)
         for name in sorted(files):
             (out / name).parent.mkdir(parents=True, exist_ok=True)
@@ -158,8 +158,8 @@ def _report_removed(draft: Draft, others: set[str]) -> None:
 
 
 @contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """Put Ctrl-C off until the end of the block: some renames, a millisecond."""
+def uninterrupted() -> Iterator[None]:
+    """Put Ctrl-C off until the end of the block: some renames or folders, milliseconds."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
