@@ -6,26 +6,19 @@ so (`export`, `report`, `batch`, ``.write``). Whatever cannot be used is refused
 
 from __future__ import annotations
 
-import functools
-import inspect
 import math
-import numbers
-import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from enum import StrEnum
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, ParamSpec, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from puncture_twin.planning.base.arrays import any_masked
-from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.arguments import checked, checked_degrees, real_numbers, word_of
+from puncture_twin.planning.base.errors import refuse
 
 if TYPE_CHECKING:
-    from puncture_twin.planning.base.arrays import Floats
     from puncture_twin.planning.case.case import Case
     from puncture_twin.planning.certify.certificate import Certificate
     from puncture_twin.planning.certify.checker import Verification
@@ -38,7 +31,6 @@ if TYPE_CHECKING:
     from puncture_twin.planning.registration.method import Method
     from puncture_twin.planning.registration.registration import Registration
     from puncture_twin.planning.search.candidates import Candidates, Pick
-    from puncture_twin.planning.search.choice import Choice
     from puncture_twin.planning.search.context import CaseContext, EngineChoice
     from puncture_twin.planning.search.explain import Explanation
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
@@ -54,116 +46,7 @@ if TYPE_CHECKING:
     """Named points: read from a file, or name to (x, y, z) in mm."""
 
 
-Given = ParamSpec("Given")
-Found = TypeVar("Found")
-Word = TypeVar("Word", bound=StrEnum)
-
-RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {
-        "seed": (0, 2**31 - 1),
-        "seeds": (1, 1_000_000),
-        "jobs": (1, 1024),
-        "size_deg": (0.05, 10),
-        "fle_mm": (0.001, 1e3),
-        "physics": (0, 10_000),
-        "touch": (0, 1),
-        "quick_s": (1, 1e9),
-        "tolerance_mm": (0, 1e3),
-    }
-)
-"""Least and greatest of an argument, by its name."""
-
-
-def _public(function: Callable[Given, Found]) -> Callable[Given, Found]:
-    """Hold each argument against its annotation and `RANGES` before the function sees it.
-
-    Annotations are read as words: whoever only registers markers loads no simulator for the sake of a type.
-    """
-    signature = inspect.signature(function)
-    words = {name: one.annotation.split(" | ") for name, one in signature.parameters.items()}
-
-    @functools.wraps(function)
-    def guarded(*arguments: Given.args, **named: Given.kwargs) -> Found:
-        bound = signature.bind(*arguments, **named)
-        for name, given in bound.arguments.items():
-            value = given[()] if isinstance(given, np.ndarray) and given.ndim == 0 else given
-            if not any(_is(word, value) for word in words[name]):
-                allowed = " or ".join(KINDS[word].text if word in KINDS else word for word in words[name])
-                refuse(f"{name} is {_short(value)}", function.__name__, allowed, "wrong_type")
-            if isinstance(value, numbers.Real):
-                _check_number(name, float(value), function.__name__)
-            if isinstance(value, numbers.Real) and not isinstance(
-                value, bool | int
-            ):  # half precision counts no further
-                bound.arguments[name] = int(value) if isinstance(value, numbers.Integral) else float(value)
-        return function(*bound.args, **bound.kwargs)
-
-    return guarded
-
-
-def _check_number(name: str, value: float, where: str) -> None:
-    low, high = RANGES.get(name, (-math.inf, math.inf))
-    if not math.isfinite(value):
-        refuse(f"{name} is {value}", where, "a finite number", "not_finite")
-    if not low <= value <= high:
-        refuse(f"{name} is {value:g}", where, f"{low:g} to {high:g}", "out_of_range")
-
-
-def _is(word: str, value: object) -> bool:
-    """Whether a value is of the kind that one word of an annotation names."""
-    if word in KINDS:
-        return KINDS[word].holds(value)
-    return word.partition("[")[0] in {kind.__name__ for kind in type(value).__mro__}
-
-
-def _is_path(value: object) -> bool:
-    """Whether a file may have this name, whether or not there is one."""
-    if not isinstance(value, str | Path):
-        return False
-    try:
-        name = os.fsencode(value)
-    except UnicodeEncodeError:
-        return False
-    return b"\0" not in name and len(name) < MOST_PATH and max(map(len, name.split(b"/"))) <= MOST_NAME
-
-
-MOST_PATH, MOST_NAME = 4096, 255
-"""Bytes of a path and of a name in it, of Linux."""
-
-
-class Kind(NamedTuple):
-    """What a word of an annotation means that is no class of this project."""
-
-    text: str
-    holds: Callable[[Any], bool]
-
-
-KINDS: Mapping[str, Kind] = MappingProxyType(
-    {
-        "None": Kind("None", lambda value: value is None),
-        "bool": Kind("True or False", lambda value: isinstance(value, bool)),
-        "int": Kind("a whole number", lambda one: isinstance(one, numbers.Integral) and not isinstance(one, bool)),
-        "float": Kind("a number", lambda value: isinstance(value, numbers.Real) and not isinstance(value, bool)),
-        "str": Kind("text", _is_path),
-        "Path": Kind("a path", _is_path),
-        "Method": Kind("rigid or triad", lambda value: isinstance(value, str)),
-        "EngineChoice": Kind(
-            "a class with measure, collides and of",
-            lambda value: isinstance(value, type) and all(hasattr(value, one) for one in ("measure", "collides", "of")),
-        ),
-        "ArrayLike": Kind("an array", lambda value: value is not None),
-        "Sequence[str]": Kind("a list of texts", lambda value: isinstance(value, list | tuple)),
-        "Points": Kind("points by their names", lambda value: isinstance(value, Mapping) or _is("NamedPoints", value)),
-    }
-)
-
-
-def _short(value: object) -> str:
-    """A value in an error: what it is, and a number or text itself."""
-    return repr(value)[:80] if isinstance(value, int | float | complex | str) else f"of type {type(value).__name__}"
-
-
-@_public
+@checked
 def init_case(
     folder: Path | str,
     target: ArrayLike | None = None,
@@ -207,6 +90,7 @@ def init_case(
         InputError: Everything that keeps the case from being searched, in one line; nothing is written then.
     """
     from puncture_twin.planning.base.progress import Silent
+    from puncture_twin.planning.formats.points import typed_point
     from puncture_twin.planning.geometry.spaces import Space, Unit, Up
     from puncture_twin.planning.init.finder import Wanted
     from puncture_twin.planning.init.overrides import overrides_of
@@ -216,15 +100,15 @@ def init_case(
     for name, texts in (("ignore", ignore), ("unknown", unknown), ("settings", settings)):
         if not all(isinstance(text, str) for text in texts):
             refuse(f"{name} holds what is no text", "init_case", "a list of texts", "wrong_type")
-    words = _words(Space, space), _words(Unit, unit), _words(Up, up)
+    words = word_of(Space, space), word_of(Unit, unit), word_of(Up, up)
     overrides = overrides_of(skin, list(ignore), list(unknown), list(settings))
     wanted = Wanted(words[0] or Space.LPS, naming, words[1], ct, segmentation, words[2], overrides)
-    point = None if target is None else _typed(target, "init_case: target")
+    point = None if target is None else typed_point(target, "init_case: target")
     request = Request(Path(folder), point, target_label, region, wanted, space is not None, hit_radius_mm)
     return load_case(init_case(request, force=force, watcher=Silent()).path)
 
 
-@_public
+@checked
 def load_case(path: Path | str) -> Case:
     """A validated case, without what its files hold. `prepare` reads those too.
 
@@ -241,7 +125,7 @@ def load_case(path: Path | str) -> Case:
     return load_case(path)
 
 
-@_public
+@checked
 def prepare(case: Case | Path | str, *, arm: bool | None = None, engine: str | EngineChoice = "fast") -> CaseContext:
     """Read a case and all that it names: structures, registration, arm. It can be pickled, and used in threads.
 
@@ -260,13 +144,13 @@ def prepare(case: Case | Path | str, *, arm: bool | None = None, engine: str | E
     return prepare(case, arm=arm, engine=engine)
 
 
-@_public
+@checked
 def search(context: CaseContext) -> Candidates:
     """Every direction of the case's grid with its verdict, ranked."""
     return context.search()
 
 
-@_public
+@checked
 def check(
     context: CaseContext,
     theta_deg: float | None = None,
@@ -290,12 +174,12 @@ def check(
         InputError: An angle outside of its range, two choices, or an entry from which no straight path enters there.
         NoAnswerError: Nothing is safe, so that nothing is the best.
     """
-    from puncture_twin.planning.search.choice import explain_choice
+    from puncture_twin.planning.search.choice import explain_choice, stated_choice
 
-    return explain_choice(context, _choice("check", context, theta_deg, beta_deg, candidate, window, entry))
+    return explain_choice(context, stated_choice("check", context, theta_deg, beta_deg, candidate, window, entry))
 
 
-@_public
+@checked
 def check_many(context: CaseContext, theta_deg: ArrayLike, beta_deg: ArrayLike) -> Candidates:
     """Many directions at once: a row each, ranked among themselves; without the windows and safe cones of a grid.
 
@@ -307,14 +191,14 @@ def check_many(context: CaseContext, theta_deg: ArrayLike, beta_deg: ArrayLike) 
     Raises:
         InputError: No directions, two lengths, or an angle outside of its range.
     """
-    theta = _angles(theta_deg, 180.0, "check_many: theta_deg")
-    beta = _angles(beta_deg, 360.0, "check_many: beta_deg")
+    theta = checked_degrees(theta_deg, 180.0, "check_many: theta_deg")
+    beta = checked_degrees(beta_deg, 360.0, "check_many: beta_deg")
     if theta.shape != beta.shape:
         refuse(f"{len(theta)} theta and {len(beta)} beta", "check_many", "as many of both", "wrong_shape")
     return context.check(np.radians(theta), np.radians(beta))
 
 
-@_public
+@checked
 def rerank(candidates: Candidates, cost: ArrayLike) -> Candidates:
     """The candidates ranked by a cost of one's own. Which are safe stays as it is.
 
@@ -327,10 +211,10 @@ def rerank(candidates: Candidates, cost: ArrayLike) -> Candidates:
     """
     from puncture_twin.planning.search.ranking import ranked_by
 
-    return ranked_by(candidates, _numbers(cost, "rerank", f"{len(candidates)} numbers, shape (n,)"))
+    return ranked_by(candidates, real_numbers(cost, "rerank", f"{len(candidates)} numbers, shape (n,)"))
 
 
-@_public
+@checked
 def register(
     markers_ct: Points,
     markers_base: Points,
@@ -351,14 +235,15 @@ def register(
     Raises:
         InputError: Names that do not match, collinear or mirrored markers, residuals that the noise does not explain.
     """
+    from puncture_twin.planning.formats.points import named_points
     from puncture_twin.planning.registration import marker_pairs, registration
 
-    pairs = marker_pairs.match(_named(markers_ct, "register"), _named(markers_base, "register"), use=None)
-    target = _named({"target": target_ct}, "register: target_ct").points[0]
+    pairs = marker_pairs.match(named_points(markers_ct, "register"), named_points(markers_base, "register"), use=None)
+    target = named_points({"target": target_ct}, "register: target_ct").points[0]
     return registration.register(pairs, method=method, target_ct=target, fle_mm=fle_mm)
 
 
-@_public
+@checked
 def certify(context: CaseContext, *, size_deg: float = 0.25, touch: float | None = None) -> Certificate:
     """The map between the grid points: cells of directions that are proven safe for the organs, or rejected.
 
@@ -376,7 +261,7 @@ def certify(context: CaseContext, *, size_deg: float = 0.25, touch: float | None
     return certify(context.case, context.anatomy, size=float(np.radians(size_deg)), touch=touch, error=error)
 
 
-@_public
+@checked
 def verify(certificate: Certificate, context: CaseContext) -> Verification:
     """Prove every cell of a certificate again, by a plain checker that shares none of the fast code.
 
@@ -388,7 +273,7 @@ def verify(certificate: Certificate, context: CaseContext) -> Verification:
     return verify(certificate, context.case, context.anatomy, error=context.pose_error)
 
 
-@_public
+@checked
 def plan(
     context: CaseContext,
     candidates: Candidates | None = None,
@@ -417,12 +302,13 @@ def plan(
         NoAnswerError: Nothing is safe, what was chosen is rejected, or the arm finds no free approach to it.
     """
     from puncture_twin.planning.plan.planner import make_plan
+    from puncture_twin.planning.search.choice import stated_choice
 
-    choice = _choice("plan", context, theta_deg, beta_deg, candidate, window, entry)
+    choice = stated_choice("plan", context, theta_deg, beta_deg, candidate, window, entry)
     return make_plan(context, candidates, choice, seed=seed).plan
 
 
-@_public
+@checked
 def read_plan(path: Path | str, context: CaseContext) -> Plan:
     """A plan from its file, checked against its case again: same inputs, still safe, a motion that touches nothing.
 
@@ -434,7 +320,7 @@ def read_plan(path: Path | str, context: CaseContext) -> Plan:
     return _own_plan(context, read_plan(Path(path)), str(path))
 
 
-@_public
+@checked
 def read_certificate(path: Path | str) -> Certificate:
     """A certificate from its file; `verify` proves it.
 
@@ -446,7 +332,7 @@ def read_certificate(path: Path | str) -> Certificate:
     return read_certificate(Path(path))
 
 
-@_public
+@checked
 def read_points(path: Path | str) -> NamedPoints:
     """Named points from CSV, Slicer markups (.mrk.json) or .fcsv: mm, and LPS where the file states a space.
 
@@ -458,19 +344,19 @@ def read_points(path: Path | str) -> NamedPoints:
     return read_points(Path(path))
 
 
-@_public
+@checked
 def write_points(points: Points, path: Path | str) -> None:
     """Write named points as CSV in mm, whole or not at all; the space is not written, a CSV speaks in its case's.
 
     Raises:
         InputError: A point that is not three finite numbers, or a place that cannot be written to.
     """
-    from puncture_twin.planning.formats.points import write_points
+    from puncture_twin.planning.formats.points import named_points, write_points
 
-    write_points(Path(path), _named(points, "write_points"))
+    write_points(Path(path), named_points(points, "write_points"))
 
 
-@_public
+@checked
 def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS", up: str | None = None) -> TriangleMesh:
     """One surface from STL, OBJ, PLY, GLB or VTP, in mm and LPS (or its own frame), checked against its own promises.
 
@@ -486,11 +372,11 @@ def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS", up: str
     from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
     from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 
-    known = _words(Unit, unit) or Unit.MM, _words(Space, space) or Space.LPS
-    return read_mesh(Path(path), unit=known[0], space=known[1], up=_words(Up, up))
+    known = word_of(Unit, unit) or Unit.MM, word_of(Space, space) or Space.LPS
+    return read_mesh(Path(path), unit=known[0], space=known[1], up=word_of(Up, up))
 
 
-@_public
+@checked
 def read_volume(path: Path | str) -> Volume:
     """A CT or label map from NIfTI or NRRD, or a CT from a DICOM series: its voxels, and where they lie in LPS mm.
 
@@ -507,7 +393,7 @@ def read_volume(path: Path | str) -> Volume:
     return read_series(path) if is_series(path) else read_volume(path)
 
 
-@_public
+@checked
 def read_recording(path: Path | str) -> Recording:
     """What two arms and a probe's image said, pose by pose, from ``recording.csv`` or its folder; see `calibrate`.
 
@@ -519,7 +405,7 @@ def read_recording(path: Path | str) -> Recording:
     return read_recording(Path(path))
 
 
-@_public
+@checked
 def calibrate(recording: Recording, *, needle_length_mm: float | None = None) -> Calibration:
     """Probe, needle and both arms to each other (A X P = Y B Q), from a recording of the needle in the image.
 
@@ -535,7 +421,7 @@ def calibrate(recording: Recording, *, needle_length_mm: float | None = None) ->
     return calibrate(recording, needle_length_mm=needle_length_mm)
 
 
-@_public
+@checked
 def check_folder(folder: Path | str) -> tuple[str, ...]:
     """What keeps an output folder from being one whole set, a sentence each; empty if nothing does.
 
@@ -547,7 +433,7 @@ def check_folder(folder: Path | str) -> tuple[str, ...]:
     return problems(Path(folder))
 
 
-@_public
+@checked
 def write_plan(plan: Plan, path: Path | str) -> None:
     """Write a plan as JSON, whole or not at all."""
     from puncture_twin.planning.plan.plan_document import write_plan
@@ -555,7 +441,7 @@ def write_plan(plan: Plan, path: Path | str) -> None:
     write_plan(plan, Path(path))
 
 
-@_public
+@checked
 def rehearse(
     context: CaseContext, plan: Plan, *, seed: int | None = None, seeds: int | None = None, physics: int = 0
 ) -> Rehearsal:
@@ -582,7 +468,7 @@ def rehearse(
     return rehearse_once(context, _own_plan(context, plan, "rehearse: plan"), room_count(seeds, physics), seed)
 
 
-@_public
+@checked
 def touch(
     context: CaseContext,
     *,
@@ -609,14 +495,15 @@ def touch(
         NoAnswerError: Nothing is safe, or too few markers can be touched.
     """
     from puncture_twin.planning.base.errors import require_extra
+    from puncture_twin.planning.search.choice import stated_choice
 
     require_extra("twin", "touch")
     from puncture_twin.twin.jobs.experiment.touch_job import touch
 
-    return touch(context, _choice("touch", context, theta_deg, beta_deg, candidate, window, entry), seed)
+    return touch(context, stated_choice("touch", context, theta_deg, beta_deg, candidate, window, entry), seed)
 
 
-@_public
+@checked
 def place(context: CaseContext, *, jobs: int = 2, quick_s: float | None = None) -> PlaceSearch:
     """The base positions from which the arm reaches most organ-safe directions; ``rated`` has the best first.
 
@@ -639,7 +526,7 @@ def place(context: CaseContext, *, jobs: int = 2, quick_s: float | None = None) 
     return found
 
 
-@_public
+@checked
 def compare(
     context: CaseContext,
     one: Explanation | Plan | Pick,
@@ -669,7 +556,7 @@ def compare(
     return compare_paths(context, context.own(candidates), *zip(("one", "other"), paths, strict=True))
 
 
-@_public
+@checked
 def export(
     source: Plan | Candidates | Explanation, format_name: str, folder: Path | str, *, context: CaseContext | None = None
 ) -> Exported | ExportedTable | SlicerExport:
@@ -693,7 +580,7 @@ def export(
     return export_value(source, format_name, folder, context)
 
 
-@_public
+@checked
 def report(
     context: CaseContext,
     candidates: Candidates,
@@ -730,7 +617,7 @@ def report(
     return out / PAGE
 
 
-@_public
+@checked
 def batch(
     cohort: Path | str,
     folder: Path | str,
@@ -768,50 +655,6 @@ def batch(
     return merge_cohort(out, None if expect is None else Path(expect), tolerance_mm, watcher)
 
 
-def _choice(
-    where: str,
-    context: CaseContext,
-    theta_deg: float | None,
-    beta_deg: float | None,
-    candidate: Pick | None,
-    window: int | None,
-    entry: ArrayLike | None,
-) -> Choice:
-    """The one choice that was stated.
-
-    Raises:
-        InputError: Two of them, half of one, a value outside of its range, or a candidate of another case.
-    """
-    from puncture_twin.planning.search.choice import Choice, parse_choice
-
-    for name, angle, most in (("theta_deg", theta_deg, 180.0), ("beta_deg", beta_deg, 360.0)):
-        if angle is not None:
-            _angles([angle], most, f"{where}: {name}")
-    if entry is not None:
-        entry = str(entry) if isinstance(entry, str | Path) else _typed(entry, f"{where}: entry")
-    stated = parse_choice(theta_deg, beta_deg, None, window, entry)
-    if candidate is None:
-        return stated
-    if stated != Choice():
-        refuse("a candidate beside another choice", where, "one of them", "conflicting_options")
-    found, row = _own_pick(context, candidate, where)
-    return Choice(angles=(float(found.theta[row]), float(found.beta[row])))
-
-
-def _own_pick(context: CaseContext, candidate: Pick, where: str) -> Pick:
-    """A candidate of this case: the angles of another's are another path here.
-
-    Raises:
-        InputError: It is of another case, or no row of a search.
-    """
-    found, row = candidate
-    if not _is("Candidates", found):
-        refuse(
-            f"a candidate of a value {_short(found)}", where, "candidates.best or candidates.pick(row)", "wrong_type"
-        )
-    return context.own(found).pick(row)
-
-
 def _own_plan(context: CaseContext, plan: Plan, where: str) -> Plan:
     """A plan that holds in this case, whatever it was made for or has become since.
 
@@ -823,76 +666,3 @@ def _own_plan(context: CaseContext, plan: Plan, where: str) -> Plan:
 
     check_plan(plan, context, Path(where))
     return with_case_arm(plan, context.case)
-
-
-def _typed(point: ArrayLike, where: str) -> str:
-    """A point, shape (3,), mm, as it is typed on a command line.
-
-    Raises:
-        InputError: It is not three finite numbers.
-    """
-    return ",".join(map(repr, _named({"point": point}, where).points[0].tolist()))
-
-
-def _words(kind: type[Word], word: str | None) -> Word | None:
-    """One of a few words; None for none.
-
-    Raises:
-        InputError: Another word.
-    """
-    try:
-        return None if word is None else kind(word)
-    except ValueError as error:
-        allowed = ", ".join(kind)
-        raise InputError(f"{word!r}", where=kind.__name__.lower(), allowed=allowed, code="unknown_choice") from error
-
-
-def _angles(angles_deg: ArrayLike, most: float, where: str) -> Floats:
-    """Angles in degrees, shape (n,), each from 0 to the largest that there is.
-
-    Raises:
-        InputError: Another shape, none, or what is no such number.
-    """
-    allowed = f"numbers of degrees from 0 to {most:g}, shape (n,)"
-    given = _numbers(angles_deg, where, allowed)
-    if not len(given):
-        refuse("no angle", where, allowed, "empty")
-    wrong = ~((given >= 0.0) & (given <= most))  # NaN too
-    if wrong.any():
-        refuse(f"{float(given[wrong][0])!r}", where, allowed, "out_of_range")
-    return given
-
-
-def _numbers(values: ArrayLike, where: str, allowed: str) -> Floats:
-    """Real numbers, shape (n,).
-
-    Raises:
-        InputError: Another shape, or values that are no real numbers.
-    """
-    try:
-        given = np.asarray(values)
-    except ValueError as error:
-        raise InputError("rows of different length", where=where, allowed=allowed, code="wrong_shape") from error
-    if given.dtype.kind not in "iuf":
-        refuse(f"values of type {given.dtype}", where, allowed, "wrong_type")
-    if any_masked(values):
-        refuse("a masked value", where, allowed, "not_finite")
-    if given.ndim != 1:
-        refuse(f"shape {given.shape}", where, allowed, "wrong_shape")
-    return np.asarray(given, dtype=np.float64)
-
-
-def _named(points: Points, where: str) -> NamedPoints:
-    """Named points, from whichever form.
-
-    Raises:
-        InputError: A point that is not three finite numbers.
-    """
-    from puncture_twin.planning.formats.guard import guard_points
-    from puncture_twin.planning.formats.points import NamedPoints
-
-    if isinstance(points, NamedPoints):
-        return points
-    if not all(isinstance(name, str) for name in points):
-        refuse("a name is no text", where, "name to three finite numbers, mm", "wrong_type")
-    return NamedPoints(tuple(points), guard_points(list(points.values()), tuple(points), where=where), None)

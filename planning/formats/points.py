@@ -576,3 +576,25 @@ def row_numbers(row: Sequence[str], header: Sequence[str], wanted: Sequence[str]
     if len(row) != len(header):
         refuse(f"{len(row)} fields", where, f"{len(header)} fields, as in the header", "ragged_row")
     return [parse_coordinate(row[header.index(name)].strip(), f"{where}, {name}") for name in wanted]
+
+
+def named_points(points: NamedPoints | Mapping[str, ArrayLike], where: str) -> NamedPoints:
+    """Named points, from whichever form.
+
+    Raises:
+        InputError: A point that is not three finite numbers.
+    """
+    if isinstance(points, NamedPoints):
+        return points
+    if not all(isinstance(name, str) for name in points):
+        refuse("a name is no text", where, "name to three finite numbers, mm", "wrong_type")
+    return NamedPoints(tuple(points), guard_points(list(points.values()), tuple(points), where=where), None)
+
+
+def typed_point(point: ArrayLike, where: str) -> str:
+    """A point, shape (3,), mm, as it is typed on a command line.
+
+    Raises:
+        InputError: It is not three finite numbers.
+    """
+    return ",".join(map(repr, named_points({"point": point}, where).points[0].tolist()))

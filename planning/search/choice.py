@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from puncture_twin.planning.base.arguments import checked_degrees, is_kind, shown_value
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.files import decode_text, read_input, unfinished_warnings
@@ -24,9 +26,10 @@ from puncture_twin.planning.formats.points import (
     parse_coordinate,
     parse_points,
     parse_triple,
+    typed_point,
 )
 from puncture_twin.planning.geometry.spaces import Space, to_lps
-from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, reason_text
 
@@ -323,3 +326,44 @@ def _angle_row(number: int, header: list[str], fields: list[str], where: str) ->
         if not 0.0 <= angle <= most:
             refuse(f"{name} {angle:g}", where, f"0 to {most:g}", "out_of_range")
     return Listed(number, stated.get("name", ""), None, parse_choice(theta, beta, None, None, None))
+
+
+def stated_choice(
+    where: str,
+    context: CaseContext,
+    theta_deg: float | None,
+    beta_deg: float | None,
+    candidate: Pick | None,
+    window: int | None,
+    entry: ArrayLike | None,
+) -> Choice:
+    """The one choice that was stated.
+
+    Raises:
+        InputError: Two of them, half of one, a value outside of its range, or a candidate of another case.
+    """
+    for name, angle, most in (("theta_deg", theta_deg, 180.0), ("beta_deg", beta_deg, 360.0)):
+        if angle is not None:
+            checked_degrees([angle], most, f"{where}: {name}")
+    if entry is not None:
+        entry = str(entry) if isinstance(entry, str | Path) else typed_point(entry, f"{where}: entry")
+    stated = parse_choice(theta_deg, beta_deg, None, window, entry)
+    if candidate is None:
+        return stated
+    if stated != Choice():
+        refuse("a candidate beside another choice", where, "one of them", "conflicting_options")
+    found, row = _own_pick(context, candidate, where)
+    return Choice(angles=(float(found.theta[row]), float(found.beta[row])))
+
+
+def _own_pick(context: CaseContext, candidate: Pick, where: str) -> Pick:
+    """A candidate of this case: the angles of another's are another path here.
+
+    Raises:
+        InputError: It is of another case, or no row of a search.
+    """
+    found, row = candidate
+    if not is_kind("Candidates", found):
+        what = f"a candidate of a value {shown_value(found)}"
+        refuse(what, where, "candidates.best or candidates.pick(row)", "wrong_type")
+    return context.own(found).pick(row)
