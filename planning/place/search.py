@@ -50,6 +50,7 @@ from puncture_twin.planning.place.check import (
 from puncture_twin.planning.place.estimate import Estimator, ReachEstimate
 from puncture_twin.planning.place.mounts import (
     Site,
+    WantedDirections,
     mount_lines,
     mount_section,
     regions,
@@ -147,6 +148,20 @@ class PlaceSearch(Shown):
         return self.checked[1] is not None and self.checked[0] >= self.checked[1]
 
 
+def _startable(check: PlacementCheck, anatomy: Anatomy, target_ct: Floats) -> WantedDirections:
+    """The directions, of `SECOND` evenly spread, in which the needle itself is clear at its standoff.
+
+    Raises:
+        NoAnswerError: There is none.
+    """
+    spread = check.wanted.spread(SECOND)
+    found = spread.only(needle_can_start(check.tool, patient_surface(anatomy), target_ct, spread, ARM_PADDING_MM))
+    if not len(found):
+        what = "in every organ-safe direction the needle would start too near the skin"
+        raise NoAnswerError(what, code="standoff_in_skin")
+    return found
+
+
 def search_placements(
     case: Case,
     anatomy: Anatomy,
@@ -185,13 +200,7 @@ def search_placements(
     surroundings = Surroundings(
         SkinField.of(near), Boxes.of((*check.fixed, *beyond)), Boxes.of(check.carried), ARM_PADDING_MM
     )
-    startable = check.wanted.spread(SECOND)
-    startable = startable.only(
-        needle_can_start(check.tool, patient_surface(anatomy), case.target_ct, startable, ARM_PADDING_MM)
-    )
-    if not len(startable):
-        what = "in every organ-safe direction the needle would start too near the skin"
-        raise NoAnswerError(what, code="standoff_in_skin")
+    startable = _startable(check, anatomy, case.target_ct)
     # 2. All sites of a lattice, by bounding spheres (an estimate); the best of them checked in a few directions.
     estimator = Estimator(check.model, check.tool, surroundings, T_ct_bed, startable.spread(COARSE_DIRECTIONS))
     coarse = tuple(

@@ -56,6 +56,11 @@ def in_colour(folder):
     cv2.imwrite(str(folder / "points_001_1_1.png"), np.zeros((960, 1280, 3), np.uint8))
 
 
+def smaller(folder):
+    """A picture of half the size."""
+    cv2.imwrite(str(folder / "markers_001_1_1.png"), np.zeros((480, 640), np.uint8))
+
+
 WRONG = {
     "no table": (lambda folder: (folder / "stops.csv").unlink(), "no_such_file"),
     "other columns": (edited("points.csv", "q1_deg", "q1_rad"), "wrong_columns"),
@@ -65,6 +70,8 @@ WRONG = {
     "other names": (edited("markers_image.csv", CASE.markers.names[0], "Q"), "names_differ"),
     "no picture": (lambda folder: (folder / "points_004_2_1.png").unlink(), "no_such_file"),
     "a picture in colour": (in_colour, "not_grey"),
+    "a picture of another size": (smaller, "wrong_size"),
+    "a marker twice": (edited("markers.csv", CASE.markers.names[1], CASE.markers.names[0]), "duplicate_name"),
     "a picture cut short": (lambda folder: (folder / "points_001_1_1.png").write_bytes(b"\x89PNG"), "not_grey"),
 }
 
@@ -88,7 +95,7 @@ def test_joints_in_another_unit_are_noticed(recorded, tmp_path):
     lines[1] = ",".join([name, *(str(100 * float(one) + 720) for one in values)])
     (folder / "stops.csv").write_text("\n".join(lines), encoding="utf-8")
     with refused("joints_beyond"):
-        read_recording(folder)
+        read_recording(folder, (1280, 960))
 
 
 def test_a_folder_that_is_there_is_not_written_over(tmp_path):

@@ -3,8 +3,7 @@
 ``points.csv`` has a row for each point of the calibration, with the joints that were commanded and the measuring arm's
 reading in C; ``markers.csv`` where an operator pointed, in C; ``stops.csv`` the joints at which the ball was looked at,
 with the target. ``markers_image.csv`` and ``targets_image.csv`` are the readings in the CT, where they are not the
-case's. A picture is ``<table>_<row>_<camera>_<n>.png``, all counted from 1, 8 bit grey, whole or cut from a whole one
-to the left and above.
+case's. A picture is ``<table>_<row>_<camera>_<n>.png``, all counted from 1, 8 bit grey, as large as the case says.
 """
 
 from __future__ import annotations
@@ -19,9 +18,16 @@ import cv2
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.base.files import decode_text, is_plain_file, read_input
-from puncture_twin.planning.formats.points import NamedPoints, joint_readings, read_points, row_numbers, write_points
+from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.base.files import is_plain_file, read_input
+from puncture_twin.planning.formats.points import (
+    NamedPoints,
+    csv_lines,
+    joint_readings,
+    read_points,
+    row_numbers,
+    write_points,
+)
 from puncture_twin.planning.geometry.spaces import Unit
 from puncture_twin.twin.devices import Arm, Cameras, GreyImage, MeasuringArm, Operator
 from puncture_twin.twin.guidance.stereo.session import ImageReading
@@ -119,10 +125,12 @@ class Replay:
     Attributes:
         folder: The recording.
         tables: By name.
+        size_px: Width and height of every picture.
     """
 
     folder: Path
     tables: dict[str, RecordedTable]
+    size_px: tuple[int, int]
     _at: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COLUMNS, 0))
     _table: str = POINTS
     _seen: dict[tuple[str, int, int], int] = field(default_factory=dict)
@@ -178,6 +186,10 @@ class Replay:
         grey = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
         if grey is None or grey.dtype != np.uint8 or grey.ndim != 2:
             refuse("is no picture of one grey channel with 8 bits", path, "a PNG of 8-bit grey", "not_grey")
+        if grey.shape != self.size_px[::-1]:
+            width, height = self.size_px
+            what = f"a picture of {grey.shape[1]} x {grey.shape[0]} pixels"
+            refuse(what, path, f"{width} x {height}, as [cameras] size_px", "wrong_size")
         return GreyImage(np.asarray(grey, dtype=np.uint8))
 
     def reading(self, markers: NamedPoints, targets: NamedPoints) -> ImageReading:
@@ -196,8 +208,12 @@ class Replay:
         return ImageReading(*found)
 
 
-def read_recording(folder: Path) -> Replay:
+def read_recording(folder: Path, size_px: tuple[int, int]) -> Replay:
     """The tables of a recording; its pictures are read when they are looked at.
+
+    Args:
+        folder: The recording.
+        size_px: Width and height of every picture.
 
     Raises:
         InputError: A table is absent, has other columns, or a field that is no number.
@@ -205,18 +221,19 @@ def read_recording(folder: Path) -> Replay:
     tables = {}
     for table, header in COLUMNS.items():
         path = folder / f"{table}.csv"
-        text = decode_text(read_input(path, max_bytes=MAX_BYTES, where=str(path)), str(path))
-        try:
-            rows = [row for row in csv.reader(io.StringIO(text), strict=True) if row and not row[0].startswith("#")]
-        except csv.Error as error:
-            raise InputError(f"is no CSV ({error})", where=path, allowed=",".join(header), code="not_csv") from error
-        if not rows or tuple(cell.strip() for cell in rows[0]) != header:
-            shown = ",".join(rows[0])[:200] if rows else "nothing"
-            refuse(f"columns {shown}", f"{path}, header", ",".join(header), "wrong_columns")
-        numbers = [row_numbers(row, header, header[1:], f"{path}, row {i}") for i, row in enumerate(rows[1:], 2)]
-        if not numbers:
+        allowed = ",".join(header)
+        content = read_input(path, max_bytes=MAX_BYTES, where=str(path))
+        found = [one for one in csv_lines(content, str(path), allowed) if not one.fields[0].startswith("#")]
+        if not found or tuple(field.strip() for field in found[0].fields) != header:
+            shown = ",".join(found[0].fields)[:200] if found else "nothing"
+            refuse(f"columns {shown}", f"{path}, header", allowed, "wrong_columns")
+        rows = [row_numbers(fields, header, header[1:], f"{path}, line {line}") for line, fields in found[1:]]
+        if not rows:
             refuse("no row", path, "one row or more", "empty")
-        tables[table] = RecordedTable(tuple(row[0].strip() for row in rows[1:]), np.array(numbers))
+        names = tuple(fields[0].strip() for _, fields in found[1:])
+        if table == MARKERS and len(set(names)) < len(names):
+            refuse(f"a marker appears twice: {', '.join(names)}", path, "each name once", "duplicate_name")
+        tables[table] = RecordedTable(names, np.array(rows))
     for table in (POINTS, STOPS):
         joint_readings(tables[table].values[:, :6], "deg", where=folder / f"{table}.csv", names=tables[table].names)
-    return Replay(folder, tables)
+    return Replay(folder, tables, size_px)

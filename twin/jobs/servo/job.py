@@ -121,7 +121,7 @@ def follow_recording(path: Path, recording: Path) -> ServoJob:
         NoAnswerError: A point or a marker is not found in its pictures.
     """
     case = load_servo_case(path)
-    replay = read_recording(recording)
+    replay = read_recording(recording, case.file.cameras.size_px)
     unknown = {name for name, _ in replay.stops} - set(case.targets.names)
     if unknown:
         allowed = ", ".join(case.targets.names)
