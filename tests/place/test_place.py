@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -56,7 +57,7 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.constraints import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.search import organ_candidates
-from puncture_twin.twin.jobs.patient.place_job import needle_line
+from puncture_twin.twin.jobs.patient.place_job import needle_line, place_case
 
 UR3 = ur_model("ur3")
 TOOL = Tool(200.0, 150.0, 1.2, 30.0)
@@ -500,11 +501,11 @@ def test_a_base_in_what_nobody_saw_reaches_nothing(grid, z):
     assert [one.reachable for one in found.answers] == [False] * 5 and "base" in found.home_contact
 
 
-def test_what_a_clock_ends_is_said_with_the_way_to_the_end(case_folder, tmp_path, capsys):
-    """A second is over before the first answer, which is given all the same, checked as far as it says."""
-    here, out = case_folder(("step_deg = 15.0", "step_deg = 8.0"), more=FEW), tmp_path / "out"
-    assert run_twin.main(["place", str(here), "--out", str(out), "--no-pictures", "--json", "--quick", "1"]) == 0
-    said = json.loads(capsys.readouterr().out)
+def test_what_a_clock_ends_is_said_with_the_way_to_the_end(case_folder, tmp_path):
+    """The time is over before it began: the first answer is given all the same, checked as far as it says."""
+    context = prepare(case_folder(("step_deg = 15.0", "step_deg = 8.0"), more=FEW), arm=False)
+    run = place_case(context, tmp_path / "out", pictures=False, quick_s=1.0, began=time.perf_counter() - 60.0)
+    said = run.summary()
     (best,) = said["placements"]
     assert not said["search"]["complete"] and 0 < best["held"] <= best["asked"] == 64 < said["search"]["directions"]
     assert "--full" in said["warnings"][-1]
