@@ -46,8 +46,9 @@ CUT_AT_MM = (30.0, 120.0, 480.0)
 """What goes on along the bed is cut across so far beyond the image: a triangle as long as all of it would lie near
 every needle, and the search would measure most axes from most of them."""
 BLOCK_MM = 2.0
-"""The surface is drawn about blocks of voxels of at most this edge that hold any of it: what is found by means over
-``SMOOTH_MM`` has no finer shape, and a table of .8 mm voxels has a million triangles."""
+"""The surface is drawn about blocks of voxels of at most this edge that hold any of it, or are less than half a block
+beside it: what is found by means over ``SMOOTH_MM`` has no finer shape, and a table of .8 mm voxels has a million
+triangles."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
@@ -139,9 +140,10 @@ def outside_surface(
         where: The file, for messages.
     """
     edge = np.maximum(1, (BLOCK_MM / image.spacing_mm).astype(int))
-    blocks, pads = in_blocks(mask, edge) > 0, [(len(layers), len(layers)) for layers in _layers_mm(image)]
+    # A surface bevels the corners of its blocks. So what it holds lies half a block deep: no voxel in a corner is lost.
+    blocks, pads = in_blocks(widened(mask, edge // 2), edge) > 0, [(len(layers),) * 2 for layers in _layers_mm(image)]
     layered = np.pad(blocks, pads, mode="edge")
-    seen = in_blocks(mask & ~image.unscanned, edge) > 0 if image.unscanned.any() else blocks
+    seen = in_blocks(mask & ~image.unscanned, edge) > 0
     bulky = _bulky(seen, edge * image.spacing_mm)
     for axis, end in FACES:
         cut: Bools = np.asarray(bulky.take(end, axis=axis))
