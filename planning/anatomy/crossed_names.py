@@ -85,9 +85,6 @@ LEVEL = re.compile(r"[clst]?\d+")
 def named_as_crossed(name: str) -> bool:
     """Whether every word of a name is known, and one of them is an organ, a bone, a soft tissue or a lesion.
 
-    Args:
-        name: A structure's, in any spelling.
-
     >>> named_as_crossed("Left Lung"), named_as_crossed("vertebrae_L1"), named_as_crossed("liver tumour 2")
     (True, True, True)
     >>> named_as_crossed("liver veins"), named_as_crossed("Tumorvene"), named_as_crossed("left middle cerebral")

@@ -26,12 +26,10 @@ class DefaultRole(NamedTuple):
     """One line of the table.
 
     Attributes:
-        group: What a person reads.
         patterns: Shell patterns of names in lower case with underscores.
         kind: What it means to a needle: ``ignore`` for outlines of the body, which the skin is; ``unknown`` for what
             nobody looked at.
         margin_mm: The clearance that it demands; 0 where it demands none.
-        reason: Why.
     """
 
     group: str
@@ -193,12 +191,7 @@ VESSEL_WORDS = frozenset(
 
 @cache
 def default_role(name: str, region: str) -> DefaultRole | None:
-    """The line of the table that a name belongs to, or None.
-
-    Args:
-        name: A structure's, in any spelling.
-        region: As a case states it.
-    """
+    """The line of the table that a name belongs to, or None."""
     plain = plain_name(name)
     own, general = (list(_matching(plain, lines)) for lines in (BY_REGION.get(region, ()), GENERAL))
     lesion = list(_matching(plain.replace(LATERAL_MASS, ""), (LESION,)))

@@ -95,8 +95,6 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
     """The outer surface of one label, holes filled in each axial slice (a label may be a shell of skin only).
 
     Args:
-        labelmap: The map.
-        label: Its body or skin label.
         box: The part of it without what was laid around it.
 
     Raises:
@@ -228,7 +226,6 @@ def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, farthest: floa
     """Follow every path from the target outward.
 
     Args:
-        skin: The body's surface.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
         farthest: How far skin matters, mm: to where the flange can be while the tip waits.

@@ -69,8 +69,6 @@ class VolumeSurfaces:
 
     Attributes:
         source: The volume's file or files.
-        sha256: Of these.
-        cache: Where surfaces are kept.
     """
 
     source: VolumeSource
@@ -147,7 +145,6 @@ class VolumeSurfaces:
 
         Args:
             label: Of the body, in a label map; None where this is a CT.
-            organs: See `cut_ends`.
             shown: What a person says of the image; for a phantom see `cut_ends`.
             stated: The sides at which the body was cut, where a person says so.
         """
@@ -186,7 +183,6 @@ class Imaged:
     """A scanner's image of a body: a CT, or a body's label, without padding around it.
 
     Attributes:
-        surfaces: Of the whole file.
         box: The part that was seen, voxels of the canonical order.
         label: Of the body; None where this is a CT.
         notes: What was left out, one sentence each.

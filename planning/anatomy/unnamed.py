@@ -61,7 +61,6 @@ def unnamed_surfaces(
     """Find dense components and gas inside the body outside of all structures grown by one voxel.
 
     Args:
-        ct: The CT.
         body: Its body, shape (nx, ny, nz).
         structures: Every structure of the case but the skin.
         dense_hu: From here on a voxel is dense.

@@ -226,7 +226,6 @@ class _Extent:
     """A map against the body, both in the map's voxels, which may be oblique to the patient.
 
     Attributes:
-        grid: The map.
         low, high: Shape (3,), of the body within the needle's reach.
     """
 
@@ -254,9 +253,7 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure], memor
     face has its edges cut off by so much there.
 
     Args:
-        case: The case.
         skin: Its skin; where it is open, a map that ends is refused.
-        structures: What was read of the maps.
         memory: Holds the body's box in each map.
 
     Raises:

@@ -137,9 +137,7 @@ def read_input(path: Path, *, max_bytes: int, where: str, allowed: str = "") -> 
     """Read all bytes of a file.
 
     Args:
-        path: The file.
         max_bytes: A larger one is refused before it is read.
-        where: How the error names it.
         allowed: What is wanted there; empty for any file.
 
     Raises:
@@ -188,12 +186,7 @@ def _other_case(path: Path) -> str:
 
 
 def unfinished_warnings(content: bytes, name: str) -> tuple[str, ...]:
-    """What to say of a list whose last line does not end with a line break; spaces after it are no line.
-
-    Args:
-        content: The whole file.
-        name: What the warning calls it.
-    """
+    """What to say of a list whose last line does not end with a line break; spaces after it are no line."""
     if content.rstrip(b" \t").endswith((b"\n", b"\r")):
         return ()
     return (f"{name}: its last line has no line break at its end; was the file cut?",)

@@ -38,7 +38,6 @@ class CohortCase:
     """One case with its options.
 
     Attributes:
-        stated: As the cohort writes it.
         path: The case file, or the folder that holds ``case.toml``.
         name: What people call it; "" leaves it to the case.
         options: What is stated in place of what the case states.
@@ -134,7 +133,6 @@ def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
     """The cases that a CSV lists.
 
     Args:
-        content: The whole file.
         path: Its name; cases are relative to its folder.
 
     Raises:
@@ -253,7 +251,6 @@ def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
     """The cases that a cohort file describes: every match of its patterns with every combination of its options.
 
     Args:
-        content: The whole file.
         path: Its name; patterns are relative to its folder.
 
     Raises:

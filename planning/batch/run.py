@@ -113,9 +113,7 @@ class Request:
     """Cases to be run, and how.
 
     Attributes:
-        part: Of the plan.
         jobs: Processes of this machine, at most one a core.
-        limits: Of each case.
         write_page: Writes a page for each case that is searched, or None.
     """
 
@@ -130,7 +128,6 @@ class RunCounts:
     """Counts of one run.
 
     Attributes:
-        planned: Cases of the part.
         same: Of them the same as others, to the byte: they are run once.
         before: Others that had their rows.
         refused_before: Of these, cases whose inputs were refused.
@@ -172,8 +169,6 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
 
     Args:
         out: The cohort's folder, with its plan.
-        request: Which part, and how.
-        watcher: Shows progress, in cases.
         elsewhere: Runs the cases; None runs them in processes of this machine.
 
     Raises:
@@ -275,7 +270,6 @@ class Estimate:
     """Estimated time, memory and disk of a cohort.
 
     Attributes:
-        cases: In all.
         refused: That cannot be read.
         sample: The case that was measured, as the cohort writes it; None where none can be read.
         seconds: A case, in a worker that is warm.
@@ -312,11 +306,8 @@ class CohortState:
     """State of a cohort's cases, each counted once: done, failed, missing or stale.
 
     Attributes:
-        planned: Cases in all.
         safe: Done, with a safe direction.
-        no_safe: Done, without one.
         reasons: Failed, by reason: refused inputs, and failures of the program.
-        missing: Not run.
         stale: Their inputs have changed since the plan: `batch plan` again.
         stale_cases: As the cohort writes them.
     """
@@ -375,10 +366,6 @@ class CohortState:
 
 def cohort_state(out: Path, progress: Count) -> CohortState:
     """The state of every case of a plan.
-
-    Args:
-        out: The cohort's folder.
-        progress: Called with (cases looked at, cases).
 
     Raises:
         InputError: The folder has no plan.

@@ -52,8 +52,6 @@ class CaseTask:
     """One case to be run, with all that a worker needs.
 
     Attributes:
-        planned: The case.
-        out: The cohort's folder.
         work: For what is being written, on the same file system.
         write_page: Writes the case's page too, or None.
         attempt: 1, or 2 after a worker has died of it.
@@ -70,7 +68,6 @@ class CaseEnd(NamedTuple):
     """How a case ended.
 
     Attributes:
-        id: Of the case.
         exit_code: Of its row; None where there is no row.
         reason: Of its row; or why there is none: its files are not those of the plan.
         full: What the system said of a disk that takes no more, or "".
@@ -89,7 +86,6 @@ def run_case(task: CaseTask, memory: Memory = NO_MEMORY) -> CaseEnd:
     """Search a case and commit its result; nothing is done where there is a final one.
 
     Args:
-        task: The case.
         memory: What this process keeps from one case to the next.
     """
     known = ended(task)

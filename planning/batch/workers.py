@@ -117,8 +117,6 @@ def run_tasks(tasks: Iterable[CaseTask], jobs: int, limits: Limits) -> Generator
 
     Args:
         tasks: What is to be done, each id once.
-        jobs: Processes.
-        limits: Of each case.
 
     Raises:
         InputError: Memory cannot be watched on this system.

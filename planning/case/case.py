@@ -188,7 +188,6 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
     """Read and validate a case file, or a folder that holds ``case.toml``.
 
     Args:
-        path: The file or the folder.
         options: What is stated in place of what the file states; they are an input of their own.
 
     Raises:
@@ -255,12 +254,6 @@ def case_of(
 
 def _target_of(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Floats:
     """The point to reach, shape (3,), LPS (or the case's local frame) mm, read-only.
-
-    Args:
-        content: The case file.
-        path: Where it is, for errors.
-        space: The case's.
-        files: What it names, read.
 
     Raises:
         InputError: A list of points that cannot be read, or that lacks the target's name.

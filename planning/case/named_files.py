@@ -144,7 +144,6 @@ class CaseVolumes:
     """The CT and the label maps of a case.
 
     Args:
-        files: Reads and hashes the files.
         path: The case file, to whose folder names are relative.
     """
 
@@ -160,8 +159,6 @@ class CaseVolumes:
 
         Args:
             role: One of ``VOLUME_ROLES``.
-            name: As the case states it.
-            key: Of the case, for errors.
 
         Raises:
             InputError: A file that is missing, too large or not readable, or a header that is damaged.

@@ -49,8 +49,6 @@ def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> 
     """The arm with its home, its speeds, and where it is located, as far as mount or transform say so.
 
     Args:
-        content: The case file.
-        space: The case's.
         path: Where the case file is, for errors.
         files: What it names; each file that decides the arm is added.
 
@@ -154,9 +152,7 @@ def breathing_of(section: BreathingSection | None, space: Space, where: str | Pa
     """The breathing of a case; None where it declares none.
 
     Args:
-        section: As the case states it.
         space: Of the case, in which a direction is meant.
-        where: For errors.
 
     Raises:
         InputError: A direction without length, or an anatomical one in a space that knows no patient.

@@ -142,9 +142,7 @@ class Gantry:
 
     Attributes:
         T_ct_gantry: Shape (4, 4), mm: the bore's centre; its axis is z, its top x.
-        bore_diameter_mm: Of the bore.
         wall_mm: How far the wall reaches outward from the bore.
-        thickness_mm: Along the bore.
     """
 
     T_ct_gantry: Floats
@@ -158,7 +156,6 @@ class RobotSettings:
     """The arm.
 
     Attributes:
-        model: Which arm it is.
         home: Shape (6,), rad, or None for the model's own.
         T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated, or None.
         stated: The section that states a transform, or None.

@@ -137,7 +137,6 @@ class HeldEngine:
     """An engine of one's own, held to an exact one: it may measure less than there is, and never more.
 
     Attributes:
-        own: Whose distances count.
         exact: Measures the same axes again, and answers all else.
     """
 
@@ -217,12 +216,10 @@ def cross_check(
 
     Args:
         found: What an engine measured, n directions and k structures.
-        meshes: The k surfaces.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
         length: Of the axes, one number, shape (k,) or (n, k), mm.
         count: How many directions to measure again; all of them if there are fewer.
-        rng: Chooses them.
 
     Raises:
         CrossCheckError: A distance differs by more than rounding.

@@ -155,8 +155,6 @@ def arm_bodies(model: UrModel, tool: Tool, padding_mm: float) -> tuple[Body, ...
     """All bodies, in the order of ``BODY_NAMES``, at the zero configuration of their own frames.
 
     Args:
-        model: The arm.
-        tool: What its flange carries.
         padding_mm: How much fuller ``full`` is than ``bare``.
 
     Raises:
@@ -190,10 +188,6 @@ class Solid:
 
     Args:
         make: Makes its geometry, mm.
-        pose: Its first pose.
-
-    Attributes:
-        pose: Its new pose.
     """
 
     def __init__(self, make: Callable[[], fcl.CollisionGeometry], pose: fcl.Transform | None = None) -> None:

@@ -119,8 +119,6 @@ def window_finding(window: WindowSection, direction: Candidates, search: Candida
     """Differences of one window from what is expected.
 
     Args:
-        window: What is expected.
-        direction: The direction alone, checked.
         search: The search of the case's grid.
     """
     windows = search.windows
@@ -176,8 +174,6 @@ class Table:
         kind: ``check``, ``window`` or ``plan``.
         at: Its number among those, from 0 on.
         line: Where it begins, from 1 on; None where nothing tells.
-        case: The case's file.
-        expected: What it holds.
         data: The whole file's bytes.
     """
 
@@ -327,12 +323,7 @@ def unique_names(wanted: Iterable[str]) -> list[str]:
 
 
 def plan_finding(path: Path, context: CaseContext) -> Finding:
-    """Differences of a plan: inputs, its direction's verdict, contacts of its motion, its numbers.
-
-    Args:
-        path: The plan's file.
-        context: Its case, with the arm.
-    """
+    """Differences of a plan: inputs, its direction's verdict, contacts of its motion, its numbers."""
     try:
         check_plan(read_plan(path), context, path)
     except InputError as error:

@@ -153,9 +153,7 @@ def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
     """Rewrite a file, whole or not at all.
 
     Args:
-        path: The file.
         data: What it held when it was read.
-        changes: The numbers.
 
     Returns:
         One line a number: where, old and new.
@@ -209,8 +207,6 @@ class NewNumber:
     """The found number of a key that expects another.
 
     Attributes:
-        keys: From the table inward.
-        value: As computed.
         within: By how much the written number may differ.
         rounding: `ROUND_FLOOR` for a least value, `ROUND_CEILING` for a largest one: what is written must be satisfied.
     """
@@ -240,7 +236,6 @@ class Difference:
     """One difference from an expectation.
 
     Attributes:
-        line: What a person reads.
         number: What the file would have to expect; None where only a person may change it.
     """
 

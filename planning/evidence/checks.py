@@ -41,10 +41,7 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
     """Hold the inputs of a case against each other.
 
     Args:
-        case: The validated case.
-        anatomy: What was read of its structures.
         placement: Where the patient lies for the robot, or None.
-        cache: Where what takes long is kept.
 
     Returns:
         Warnings and notes, in the order in which they are shown.

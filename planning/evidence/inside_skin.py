@@ -51,7 +51,6 @@ class Inside:
 
     Attributes:
         inside: Inside the skin, or within the tolerance of it.
-        outside: Outside of it.
         beyond: Past a side at which the skin was cut: the body goes on there, so they say nothing.
     """
 

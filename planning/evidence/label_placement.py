@@ -122,7 +122,6 @@ class Source:
 
     Attributes:
         name: The file or folder, or "the meshes".
-        meshes: Name to surface.
         axes: Shape (3, 3), unit columns: of its grid, or of the patient.
         middles: Places (3,) about which it may be mirrored or turned: the middle of its grid, or of the image, and the
             origin.
@@ -278,8 +277,6 @@ class Alone(NamedTuple):
     """How each structure by itself takes other places.
 
     Attributes:
-        names: Of the structures.
-        compared: All placements.
         uneven: Shape (placements, structures), unevenness there to that as it is; NaN where nobody asks, or sees it.
     """
 

@@ -63,7 +63,6 @@ class Tissue(NamedTuple):
     """Organs whose Hounsfield units are known: measured .83 to .95 of bones, .97 of lungs where labels lie right.
 
     Attributes:
-        name: In words.
         words: Of which one is in an organ's name.
         low, high: HU.
         least: Of the points within them; a smaller fraction is a warning.

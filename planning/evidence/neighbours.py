@@ -70,7 +70,6 @@ class Shared(NamedTuple):
     Attributes:
         one, other: Rows of the structures; the first is the smaller.
         fraction: Of the smaller one's volume.
-        ml: So much of it.
     """
 
     one: int

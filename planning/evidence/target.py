@@ -93,9 +93,7 @@ def readings_inside(
 
     Args:
         point_ct: Shape (3,), LPS (or local) mm, as it was read.
-        space: In which it was stated.
         inside: Whether a point (3,) lies there.
-        place: In words.
     """
     found = [text for text, point in _readings(point_ct, space) if inside(point)]
     return f" (read {' or '.join(found)} it lies {place})" if found else ""

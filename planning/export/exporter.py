@@ -159,11 +159,7 @@ class Exported(Shown):
     """A published file.
 
     Attributes:
-        path: Where it lies.
-        format_name: One of `format_names`.
         notes: What whoever runs it should know, one sentence each.
-        inputs: Every file that decided it.
-        plan: What it holds.
     """
 
     path: Path
@@ -187,7 +183,6 @@ def export_plan(
 
     Args:
         plan: A plan that has been read (and so checked), or made.
-        format_name: One of `format_names`.
         folder: Where the file goes, under the plan file's name.
         source: The plan's file, for its name and for errors.
         checker: Of the plan's own case, against which the plan has been checked (``plan_check``); without it nothing is
@@ -208,11 +203,7 @@ def export_plan(
 
 
 def export_name(source: Path, format_name: str) -> str:
-    """Name of an export: that of the plan's file, with the format's ending.
-
-    Raises:
-        InputError: See `format_of`.
-    """
+    """Name of an export: that of the plan's file, with the format's ending."""
     return f"{source.stem}{format_of(format_name)[0]}"
 
 

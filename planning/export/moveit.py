@@ -34,8 +34,6 @@ def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
     """The scene as a difference to what MoveIt knows: all that the plan was checked against, and its first state.
 
     Args:
-        case: The plan's case.
-        anatomy: Its structures and skin.
         plan: The plan; its registration places the patient.
     """
     frames = RosFrames.of(model_urdf(plan.model))
@@ -122,11 +120,7 @@ def _point(time_s: float, q: Floats, speeds: Floats) -> dict[str, Any]:
 
 
 def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:
-    """Refuse goals that were read back and are not the plan's, or break a limit of the arm.
-
-    Raises:
-        InputError: Says what differs.
-    """
+    """Refuse goals that were read back and are not the plan's, or break a limit of the arm."""
     parts = {}
     for phase in SampledMotion._fields:
         trajectory = goals[phase]["trajectory"]
@@ -173,8 +167,6 @@ def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> M
 
     Args:
         plan: A plan that was checked against its case.
-        case: The plan's.
-        anatomy: The case's.
         source: The plan's file, for the names and for errors.
 
     Raises:

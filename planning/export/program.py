@@ -94,7 +94,6 @@ def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
     """The program of a plan.
 
     Args:
-        plan: The plan.
         blends_mm: Shape (k - 2,), a radius for each waypoint between the ends of :func:`waypoint_rows`; None for 0.
 
     Raises:
@@ -137,10 +136,6 @@ def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
 
 def straight_move(model: UrModel, program: Program) -> Trajectory:
     """The insertion as the controller runs it: the tip straight, a trapezoid in time, on the standoff's branch.
-
-    Args:
-        model: The arm.
-        program: Its poses, speed and acceleration.
 
     Raises:
         InputError: No branch leads from the standoff to the target.
@@ -239,10 +234,7 @@ def check_sampled(motion: SampledMotion, plan: Plan, *, time_resolution_s: float
     """Refuse samples that are not the plan's, or that break a limit.
 
     Args:
-        motion: What was read back.
-        plan: What was exported.
         time_resolution_s: To what the format rounds times; 0 for exact ones.
-        where: The plan's file.
 
     Raises:
         InputError: Says what differs or which limit is broken.
@@ -273,10 +265,7 @@ def check_positions(model: UrModel, q: Floats, *, what: str, where: Path) -> Non
     """Refuse angles outside the joints' limits.
 
     Args:
-        model: The arm.
         q: Shape (m, 6), rad.
-        what: The phase.
-        where: The plan.
 
     Raises:
         InputError: Names the joint and the angle. NaN is outside.
@@ -297,11 +286,8 @@ def check_rates(model: UrModel, speeds: Floats, accelerations: Floats, *, what: 
     """Refuse speeds and accelerations above the limits.
 
     Args:
-        model: The arm.
         speeds: Shape (m, 6), rad/s.
         accelerations: Shape (k, 6), rad/s^2.
-        what: The phase.
-        where: The plan.
 
     Raises:
         InputError: Names the joint, the rate and the limit. NaN is above.
@@ -330,14 +316,7 @@ def check_trajectory(
     middles, so a motion within the limits is never refused, but for rounding, which is taken off here.
 
     Args:
-        model: The arm.
-        trajectory: The samples.
         time_resolution_s: To what the times were rounded; 0 for exact ones.
-        what: The phase.
-        where: The plan.
-
-    Raises:
-        InputError: Names joint, number and limit.
     """
     q, steps = trajectory.q, np.diff(trajectory.times_s)[:, None]
     check_positions(model, q, what=what, where=where)
@@ -403,13 +382,7 @@ def _turning_row(rows: Floats) -> int | None:
 
 
 def rests_at(model: UrModel, trajectory: Trajectory, rows: NDArray[np.intp]) -> bool:
-    """Whether the arm can be at rest at each row: next to it no joint is faster than one step of braking allows.
-
-    Args:
-        model: The arm: its acceleration limit.
-        trajectory: The samples.
-        rows: Rows between the ends.
-    """
+    """Whether the arm can be at rest at each row: next to it no joint is faster than one step of braking allows."""
     steps = np.diff(trajectory.times_s)[:, None]
     most = model.max_acceleration * steps**2 * (1.0 + REST_SLACK)
     slow = np.all(np.abs(np.diff(trajectory.q, axis=0)) <= most, axis=1)
@@ -458,9 +431,7 @@ def heading(plan: Plan, notes: Iterable[str], *, case_checked: bool) -> list[str
     """Comment lines that say what a file is, what it was made from, and how to read it.
 
     Args:
-        plan: The plan that the file holds.
         case_checked: Whether the plan was compared with its case when it was exported.
-        notes: Further lines.
     """
     lines = [
         "research software, not a medical device",

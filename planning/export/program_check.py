@@ -43,10 +43,7 @@ def check_program(program: Program, plan: Plan, blends_mm: Floats | None = None,
     """Refuse a program that is not the plan's motion, or that breaks a limit.
 
     Args:
-        program: As it was read back.
-        plan: What was exported.
         blends_mm: The radii that were found free, as for :func:`program_of`.
-        where: The plan's file.
 
     Raises:
         InputError: Says what differs or which limit is broken.

@@ -66,7 +66,6 @@ def guard_points(points: Many, names: Sequence[str], *, where: str | Path) -> ND
     Args:
         points: Shape (n, 3), mm, any frame.
         names: One per point: unique, not empty.
-        where: The file, for the error.
 
     Returns:
         Shape (n, 3), float64, mm, read-only.

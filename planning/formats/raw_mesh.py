@@ -49,7 +49,6 @@ def triangulate(corners: NDArray[np.int64], counts: NDArray[np.int64], where: st
     Args:
         corners: Shape (k,), the vertex indices of all polygons, one after the other.
         counts: Shape (p,), how many of them each polygon has; they sum to k.
-        where: The file, for the error.
 
     Returns:
         Shape (m, 3): count - 2 triangles per polygon, in the order of the polygons.

@@ -22,7 +22,6 @@ class Parts:
     """The parts of a mask, numbered from 0, as they are met.
 
     Attributes:
-        shape: Of the mask.
         runs: Shape (n, 4), of each run the line's two indices, its first voxel and the one after its last.
         part: Shape (n,), its number.
     """

@@ -20,7 +20,6 @@ def voxels_inside(mesh: TriangleMesh, T_ct_index: Floats, shape: tuple[int, ...]
     Args:
         mesh: LPS mm. Of an open surface the inside is not known; its own voxels are returned.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
-        shape: Of the grid.
 
     Returns:
         Shape ``shape``.

@@ -72,7 +72,6 @@ class Wanted:
     Attributes:
         space: Of meshes, and of lists that do not say theirs.
         naming: Of label maps without names.
-        unit: Of meshes.
         up: The axis of meshes that is up.
         ct: The CT, where there are several.
         segmentation: The label map or folder, where there are several.
@@ -116,8 +115,6 @@ class Found:
     """What a folder holds.
 
     Attributes:
-        cts: CTs.
-        segmentations: Label maps, masks, meshes.
         markers: Lists of at least three points.
         problems: What could not be read or told, one line each.
         passed: What was not read, with the reason.
@@ -136,7 +133,6 @@ def find(place: Place, wanted: Wanted) -> Found:
     """Look through a folder and the folders below it, `DEPTH` levels deep.
 
     Args:
-        place: The case's folder.
         wanted: What the user says of the files.
 
     Raises:

@@ -95,8 +95,6 @@ class Outlines:
     """The structures that are named like the body, held against its skin.
 
     Attributes:
-        segmentations: Of a folder.
-        skin: Of the body.
         stated: The names of those that a person states to be the skin, or to be left out.
     """
 
@@ -170,7 +168,6 @@ def bordering(target: str | None, segmentations: Sequence[Segmentation]) -> dict
 
     Args:
         target: The structure that the case names, or None.
-        segmentations: Of a folder.
     """
     every = [SkinOf(one, label) for one in segmentations for label in one.names]
     found = {}
@@ -188,9 +185,7 @@ def carved_notes(rows: Sequence[Assigned], target: str | None, border: Mapping[s
     """That an avoided structure goes round the target's, one sentence each.
 
     Args:
-        rows: What the case says of structures.
         target: The structure that the case names, or None.
-        border: Of `bordering`.
     """
     for row in rows:
         if row.kind == "avoid" and border.get(row.name, 0.0) >= MOST_OF_BORDER:

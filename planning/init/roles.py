@@ -59,9 +59,6 @@ def assign(
     """What a case says of each structure, by label.
 
     Args:
-        names: Label to name.
-        region: As the case states it.
-        holding: What holds the target.
         outlines: Of those that are named like the body the ones that are its outline.
         stated: Name to the kind that a person states: ``skin``, ``ignore`` or ``unknown``.
     """
@@ -133,9 +130,6 @@ def chosen_target(names: Collection[str]) -> str:
     What is named as a lesion by all of its words, else one with such a word in it, else what the table knows for
     certain (an organ that a needle crosses, or a vessel that none does), else the first: beside a pancreas that holds
     the target too, an ``SMA`` is not taken for the target, nor a ``Tumorvene`` beside a tumour.
-
-    Args:
-        names: At least one, the smallest first.
     """
     sure = [name for name in names if named_as_lesion(name)]
     lesions = [name for name in names if default_role(name, "other") == LESION]

@@ -44,7 +44,6 @@ class Assigned(NamedTuple):
 
     Attributes:
         label: Its number within the segmentation.
-        name: Its name.
         kind: ``target``, ``avoid``, ``unknown``, ``traverse``, ``ignore`` or ``skin``.
         margin_mm: The clearance that it demands.
         line: Of the table of default roles.
@@ -189,10 +188,8 @@ class MeshFolder:
     """Meshes of one folder, one file a structure.
 
     Attributes:
-        place: The case's folder.
         source: The folder of the meshes.
         files: By number, relative to the case's folder.
-        unit: Of all of them.
         space: Of all of them that do not state one.
         up: The axis of all of them that is up; None where nobody says.
         voxel_ct: None: meshes do not tell what they were made of.
@@ -266,10 +263,6 @@ def mesh_folder(
     """The meshes of a folder, in the unit that their extent tells.
 
     Args:
-        place: The case's folder.
-        source: The folder of the meshes.
-        names: Of the files in it.
-        space: Of their coordinates.
         stated: Their unit where the user says it, or None.
         up: Their axis that is up where the user says it; of GLB it must.
 

@@ -73,7 +73,6 @@ class Start:
     """A new case, not yet written.
 
     Attributes:
-        text: The file.
         parts: What it was made of.
         notes: What a person should look at, one sentence each.
     """
@@ -87,8 +86,6 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     """Find the files of a folder, and write the text of a case with them.
 
     Args:
-        request: What the user wants.
-        cache: Where surfaces are kept.
         progress: Called with the name of each file that is read.
 
     Raises:

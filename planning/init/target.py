@@ -38,7 +38,6 @@ class Target:
     Attributes:
         point_ct: Shape (3,), LPS mm.
         holding: The structures that hold it.
-        notes: How it was found.
         hit_radius_mm: Of the ball that is hit where the target has no structure.
     """
 
@@ -65,7 +64,6 @@ def typed_target(
     Args:
         point_ct: Shape (3,), LPS mm.
         outlines: The body's, with all segmentations that may hold the point.
-        space: In which it was typed.
         space_stated: Whether the user said so.
         hit_radius_mm: Stated where the target is a ball of its own, whatever holds it; else None.
 

@@ -89,7 +89,6 @@ def plan_approach(
     """Plan the shortest path that is found from home to any of the goals, and its motion in time.
 
     Args:
-        checker: Checks contacts.
         q_home: Shape (6,), rad, within the joint limits.
         q_goals: Shape (6,) or (g, 6), rad, within the joint limits.
         seed: Of OMPL's generator. Same seed, same motion.

@@ -79,11 +79,8 @@ def connect(
     """Plan from home to any of several goals, and shorten what was found.
 
     Args:
-        contact_of: Checks a segment.
         home: Shape (6,), rad, free.
         goals: Shape (g, 6), rad, free.
-        limits: Where, and how long.
-        seed: Of OMPL's generator.
         clear_of: Checks a shortcut; ``contact_of`` unless stated.
 
     Raises:
@@ -271,7 +268,6 @@ def shortened(joint_limits: Floats, contact_of: SegmentContact, waypoints: Float
 
     Args:
         joint_limits: Shape (6, 2), rad.
-        contact_of: Checks a shortcut.
         waypoints: Shape (k, 6), rad: straight free segments.
 
     Returns:

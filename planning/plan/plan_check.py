@@ -62,11 +62,7 @@ def with_case_arm(plan: Plan, case: Case) -> Plan:
 
 
 def check_inputs(plan: Plan, case: Case, path: Path) -> None:
-    """Refuse a plan whose case has changed since.
-
-    Raises:
-        InputError: Names the first input that differs.
-    """
+    """Refuse a plan whose case has changed since."""
     name = differing_input(plan.inputs, case.inputs)
     if name is not None:
         refuse(f"input '{name}' differs from the one used for the plan", path, "plan again", "input_changed")
@@ -102,11 +98,7 @@ def check_geometry(plan: Plan, path: Path) -> None:
 
 
 def check_angles(plan: Plan, path: Path) -> None:
-    """Refuse a roll that is not that of the joint angles at standoff, and angles beyond their turn.
-
-    Raises:
-        InputError: Names the angle.
-    """
+    """Refuse a roll that is not that of the joint angles at standoff, and angles beyond their turn."""
     for name, angle, turn in (("theta_deg", plan.theta, np.pi), ("beta_deg", plan.beta, 2 * np.pi)):
         if not 0.0 <= angle <= turn * (1 + ANGLE_ROUNDING):
             refuse(f"{name} = {np.degrees(angle):g}", path, f"0 to {np.degrees(turn):g}", "out_of_range")
@@ -211,7 +203,6 @@ def read_arm(name: str, document: Any) -> UrModel:
     """The arm of a plan that was read; one of the user's own has no shapes yet, which its case holds.
 
     Args:
-        name: As the plan states it.
         document: Of `arm_document`, or None.
 
     Raises:

@@ -49,9 +49,7 @@ def make_plan(
     """Plan to the best candidate of a choice for which an approach is found.
 
     Args:
-        context: The case, with the arm.
         candidates: Its search result, which a choice by angles or by entry does not need; None searches.
-        choice: What is planned.
         seed: Of the approach's planner; None takes the case's.
 
     Raises:

@@ -30,9 +30,6 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
     """Check a loaded plan's direction and motion anew.
 
     Args:
-        plan: What was read.
-        context: Its case.
-        path: The plan's file, for errors.
         seed: That the plan must state: the command ``plan`` takes the case's. None where code chose another.
 
     Returns:
@@ -109,11 +106,7 @@ def _check_labels(plan: Plan, context: CaseContext, candidates: Candidates, path
 
 
 def _check_same(name: str, said: Any, known: Any, path: Path) -> None:
-    """Refuse a stated number that is another when it is computed again; no number in a file is null, whichever it is.
-
-    Raises:
-        InputError: Names it.
-    """
+    """Refuse a stated number that is another when it is computed again; in a file, no number is null."""
     if isinstance(known, str | int):
         same = said == known
     else:

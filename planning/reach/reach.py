@@ -43,8 +43,6 @@ def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAn
     """The refusal of a request without a clear motion: that of the motion that came farthest.
 
     Args:
-        model: The arm.
-        found: What kinematics says of the request.
         deepest: What blocked the motion that came farthest of those that it allows; None if it allows none.
     """
     if deepest is None:
@@ -93,8 +91,6 @@ def assess_reach_all(
 
     Args:
         checker: Checks contacts, in the base frame.
-        requests: The directions.
-        progress: Called with (answered, to answer).
         n_rolls: How many rolls, evenly over the turn.
 
     Raises:
@@ -113,13 +109,9 @@ def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswe
 
     Args:
         checker: Checks contacts, in the base frame.
-        request: The direction.
 
     Returns:
         Empty where there is none.
-
-    Raises:
-        InputError: See :func:`assess_reach_all`.
     """
     found = _surveyed(checker, [request], ROLLS)[0]
     tried = tried_all(checker, [(found, insertion) for insertion in found.insertions()])
@@ -327,7 +319,6 @@ def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
     """Length by which upper arm and forearm are too short (or too long, folded) for each flange pose.
 
     Args:
-        model: The arm.
         T_base_flange: Shape (n, 4, 4), mm.
 
     Returns:
@@ -372,11 +363,7 @@ def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats)
 
     Args:
         checker: Checks contacts, in the base frame.
-        request: The direction.
         q_home: Shape (6,), rad.
-
-    Raises:
-        InputError: See :func:`every_reach`.
     """
     reached = every_reach(checker, request)
     least = MARGIN_FRACTION * max((answer.margin for answer in reached), default=0.0)

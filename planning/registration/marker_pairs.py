@@ -54,7 +54,6 @@ def match(
         markers_ct: Markers in the CT frame.
         markers_base: Markers in the base frame.
         use: The names to use, in this order; None demands the same names on both sides.
-        where: What errors name.
 
     Raises:
         InputError: A name that one side lacks, or fewer than three markers.

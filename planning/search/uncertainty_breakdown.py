@@ -93,7 +93,6 @@ class UncertaintyBreakdown:
     """Chances, error budget and unmet limits of one candidate.
 
     Attributes:
-        p_hit: Chance to hit.
         p_touch: Structure to chance to touch it.
         p_touch_any: Of any, min(1, sum).
         budget: The tip's expected error and its sources.
@@ -184,7 +183,6 @@ def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> 
     """The uncertainty breakdown of one candidate, its chances line-sampled as those of the table's best are.
 
     Args:
-        model: Of the case.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
     """
@@ -269,8 +267,6 @@ def shrinkable(model: ChanceModel, needles: Needles, q: Floats) -> ShrinkableNee
     """Split one candidate's error into sources that can be shrunk.
 
     Args:
-        model: Of the case.
-        needles: The candidate alone.
         q: Shape (6,), rad, the tip on the target.
     """
     return ShrinkableNeedle(model, needles, _parts(model, q))

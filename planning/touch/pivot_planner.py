@@ -58,10 +58,8 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
     """Plan to set the tip onto one place in several poses, named P1, P2 and so on.
 
     Args:
-        context: Of a case with an arm.
         count: How many poses, 4 to 12.
         place_base: Shape (3,), mm, where; None for a place that is found next to the patient.
-        seed: Of the motions' planner.
         progress: Called with motions done and all of them.
 
     Raises:

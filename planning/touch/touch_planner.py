@@ -57,7 +57,6 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
     Args:
         context: Of a case with declared errors, markers and an arm.
         q_insertion: Shape (6,), rad, the tip on the target: where the error of the touches is to be least.
-        seed: Of the motions' planner.
         progress: Called with motions done and all of them.
 
     Raises:
@@ -90,7 +89,6 @@ class _Task:
     """Some markers of a case, and the insertion that they are touched for.
 
     Attributes:
-        context: The case.
         markers: Those to touch; ``points_base`` are where they are believed to be.
         method: Of the registration by these touches.
         q_insertion: Shape (6,), rad, the tip on the target.
@@ -176,9 +174,7 @@ def expected_of_touches(context: CaseContext, q_insertion: Floats, read: NamedPo
     """Expected (rms) error of the tip at the target, mm, with these touches alone.
 
     Args:
-        context: Of the case.
         q_insertion: Shape (6,), rad, the tip on the target.
-        read: Names and joints of the touches.
     """
     task, read = _task(context, q_insertion), _in_order(context, read)
     assert read.joints is not None

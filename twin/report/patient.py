@@ -207,11 +207,7 @@ def _true_needle(least: Sequence[tuple[str, float]]) -> str:
 
 
 def rooms(found: Mapping[str, Any] | None) -> list[Block]:
-    """What happened in many rooms, beside what was predicted; nothing without rooms.
-
-    Args:
-        found: A `Distribution` as plain values.
-    """
+    """What happened in many rooms, beside what was predicted; nothing without rooms."""
     if found is None:
         return []
     if found["realised_rms_mm"] is None:

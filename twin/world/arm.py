@@ -40,8 +40,6 @@ class Arm:
     """A loaded arm. Joint angles are the true ones of the simulated body.
 
     Attributes:
-        client: Physics client id.
-        body: Body id.
         joints: Indices of the six joints.
         links: Name (as in `planning.collision.checker.BODY_NAMES`, and the flange) to index; the base is -1.
         max_torque: Shape (6,), N m.
@@ -121,9 +119,6 @@ def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | Non
     """Load the arm with holder and needle, its base fixed.
 
     Args:
-        client: Physics client id.
-        model: The arm.
-        tool: What the flange carries.
         T_world_base: Pose of the controller's base, shape (4, 4), mm; None for the world's origin.
 
     Raises:

@@ -183,7 +183,6 @@ class LimbSearch(NamedTuple):
     Attributes:
         parts: Shape (nx, ny, nz), from 1 the number of the part that a block belongs to, 0 outside.
         T_ct_index: Shape (4, 4), LPS mm.
-        part: By its number.
     """
 
     parts: Ints32
@@ -205,13 +204,7 @@ class LimbSearch(NamedTuple):
 
 
 def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> LimbSearch:
-    """Sample a CT and its body.
-
-    Args:
-        image: The CT.
-        body: Its voxels that are body.
-        structures: Which explain bones.
-    """
+    """Sample a CT and its body."""
     stride = np.maximum(1, (SAMPLING_MM / image.spacing_mm).astype(int))
     T = image.T_ct_index.copy()
     T[:3, 3] += T[:3, :3] @ ((stride - 1) / 2.0)

@@ -82,7 +82,6 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     half of both counts.
 
     Args:
-        image: The CT and its body.
         air_hu: Voxels whose surroundings are denser than this are not air.
     """
     hu, body, unscanned = image.hu, image.body, image.unscanned
@@ -131,12 +130,6 @@ def outside_surface(
 
     Where the border of the image cuts it, it goes on beyond: every cut section is drawn out by ``beyond_mm``, and of
     bulky pieces also what lies between cut sections at one side. So does all that lies beyond an open face.
-
-    Args:
-        image: The CT and its body.
-        mask: Of `outside_mask`.
-        open_faces: Beyond which nothing is known.
-        where: The file, for messages.
     """
     edge = np.maximum(1, (BLOCK_MM / image.spacing_mm).astype(int))
     blocks, pads = in_blocks(mask, edge) > 0, [(len(layers), len(layers)) for layers in _layers_mm(image)]

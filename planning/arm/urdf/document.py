@@ -114,10 +114,8 @@ class UrdfDocument:
     """A whole URDF.
 
     Attributes:
-        name: The robot's.
         links: By name, in the file's order.
         joints: In the file's order.
-        where: The file, for errors.
     """
 
     name: str

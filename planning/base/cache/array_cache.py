@@ -63,8 +63,6 @@ class Memory:
         """The value of a key, made where it is not there.
 
         Args:
-            key: All that decides the value.
-            make: Makes it.
             size: About how many bytes it holds.
         """
         if key in self._kept:
@@ -123,7 +121,6 @@ class Cache:
 
     Attributes:
         folder: Where; None makes everything anew each time.
-        most_bytes: What it may hold.
         memory: What this process keeps beside it.
     """
 
@@ -143,7 +140,6 @@ class Cache:
 
         Args:
             made_from: Everything that decides the result: hashes of inputs, labels, options. Plain values.
-            make: Makes the arrays.
             by: The module whose code makes them, such as ``puncture_twin.planning.anatomy.surfaces``.
             check: Raises ValueError, KeyError, TypeError or InputError for arrays that cannot be what ``make`` gives.
         """
@@ -161,10 +157,7 @@ class Cache:
         """The value that ``read`` makes of `arrays`; reading is their check too, so a mesh is guarded once.
 
         Args:
-            made_from: See `arrays`.
-            make: Makes the arrays.
             read: Raises ValueError, KeyError, TypeError or InputError for arrays that cannot be what ``make`` gives.
-            by: See `arrays`.
         """
         if self.memory is NO_MEMORY:
             if self.folder is None:

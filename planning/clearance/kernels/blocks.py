@@ -56,7 +56,6 @@ def pack(mesh: TriangleMesh, known: NDArray[np.int32] | None = None) -> Blocks:
     """Pack a surface.
 
     Args:
-        mesh: The surface.
         known: Its `block_order`, where that has been found before.
     """
     order = np.array(block_order(mesh) if known is None else known, np.int64)

@@ -36,7 +36,6 @@ def search_bundles(  # type: ignore[no-untyped-def]  # numba infers
         at_target: Distance of the target itself from the surface, mm: an upper bound of every axis' distance.
         nearest: Row of the triangle that is nearest to the target.
         bundles: `Bundles.outward`, ``starts``, ``middle`` and ``chord``.
-        scratch: `Scratch`, for this structure's groups.
         found: `SearchOutput`, written in the bundles' order; the counts are raised.
         lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
     """

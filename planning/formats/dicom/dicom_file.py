@@ -231,7 +231,6 @@ def whole_length(data: memoryview, *, implicit: bool, where: Path) -> int:
     Args:
         data: The data set, behind its file's meta information, little endian.
         implicit: Whether value representations are left out.
-        where: The file, for the message.
 
     Raises:
         InputError: An element that ends outside of its parent, a sequence without an end, elements out of order, or
@@ -252,10 +251,8 @@ class _Walk:
         """Offset at which a data set ends that begins at an offset.
 
         Args:
-            at: Its first byte.
             end: The first byte behind it, or behind all that may hold it.
             implicit: Whether value representations are left out.
-            depth: How many sequences it lies in.
             closed: Whether a delimiter ends it, and not its length.
         """
         if depth > MAX_DEPTH:

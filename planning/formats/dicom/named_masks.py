@@ -49,7 +49,6 @@ class NamedMasks:
     """Named structures of one file as masks.
 
     Attributes:
-        masks: Name to mask.
         notes: Notes for a person, one sentence each.
     """
 

@@ -35,10 +35,6 @@ class PixelLayout:
     """Storage of an image's values.
 
     Attributes:
-        frames: Images in the file.
-        rows: Of each.
-        columns: Of each.
-        allocated: Bits of a cell.
         stored: Of them, the bits of a value: the lowest.
         signed: Whether values are two's complements.
         padding: Stored values, lowest and highest, that were not measured; None where the header names none.

@@ -63,7 +63,6 @@ class DicomFile:
 
     Attributes:
         name: The file's name in its folder.
-        kind: By its SOP class.
         sop_class: What the standard calls this class.
         series_uid: The series that it belongs to.
         series: Its number and description, as a person knows it.
@@ -186,9 +185,6 @@ class SeriesFiles:
     """The files of one CT series.
 
     Attributes:
-        folder: Where they are.
-        names: Their names there, sorted.
-        series_uid: The series.
         notes: What else lies in the folder and was left out, one sentence.
     """
 

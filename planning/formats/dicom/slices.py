@@ -62,7 +62,6 @@ class Slice:
         file: The file's key in ``content``.
         frame: Its number in the file, from 0.
         label: How a person finds it.
-        plane: Where it lies.
         slope: What a stored value is multiplied with.
         intercept: What is added then; the sum is in Hounsfield units.
     """
@@ -77,11 +76,6 @@ class Slice:
 
 def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     """The slices of a CT file; scouts among the frames of an enhanced one are left out.
-
-    Args:
-        data: The file's data set.
-        file: Its name.
-        frames: How many images it holds.
 
     Raises:
         InputError: A position, an axis, a spacing or a rescaling is missing, contradictory or not in Hounsfield units.
@@ -355,7 +349,6 @@ def moved(image: NDArray[np.float32], shift: Floats, shape: tuple[int, int]) -> 
     Args:
         image: Shape (columns, rows), NaN where nothing was measured.
         shift: Where its pixel (0, 0) lies in the larger one, along each axis; 0 or more.
-        shape: Of the larger one.
     """
     for axis in (0, 1):
         image = _moved(image, float(shift[axis]), shape[axis], axis)

@@ -78,7 +78,6 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     the pixels along it. Both are noted.
 
     Args:
-        path: Its name.
         file: Its key in ``content``.
         content: Gives its bytes.
         ct: The CT on which it was drawn.

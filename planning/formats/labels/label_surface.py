@@ -36,8 +36,6 @@ def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> Triangle
     result does not depend on the axis order or the flips in which the map is stored.
 
     Args:
-        labelmap: The map.
-        label: Which label.
         where: The file or case entry, for messages.
 
     Raises:
@@ -61,7 +59,6 @@ def mask_surface(mask: Bools, T_ct_index: NDArray[np.float64], *, where: str | P
     Args:
         mask: Shape (ni, nj, nk), somewhere True; only the box of what is True is looked at.
         T_ct_index: Shape (4, 4), determinant positive.
-        where: For messages.
     """
     box = box_in(mask)
     framed, field = frame([axis.stop - axis.start for axis in box])
@@ -97,7 +94,6 @@ def framed_surface(
     Args:
         framed: Of `frame`: within, the field, never 0, positive inside, somewhere positive; its frame is written here.
         T_ct_index: Shape (4, 4), determinant positive.
-        where: For messages.
         first: Shape (3,), index of the field's first voxel, where it is part of a larger one.
     """
     for axis in range(3):

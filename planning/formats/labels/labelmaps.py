@@ -37,7 +37,6 @@ class LabelMap:
         labels: Shape (ni, nj, nk), of the file's own type where that is whole numbers, read-only; 0 is background.
         T_ct_index: Shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm.
         names: Label to name, as a .seg.nrrd states it, or None.
-        path: Where it came from.
         rounded_by: How far the file's values are off whole numbers, at most.
     """
 
@@ -67,7 +66,6 @@ def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
     """The label map that a volume is, in LPS mm.
 
     Args:
-        volume: The volume.
         may_be_empty: Whether a map with background only is one: the mask of an organ that is not there.
 
     Raises:

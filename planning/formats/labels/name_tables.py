@@ -48,7 +48,6 @@ def parse_names(data: bytes, path: Path) -> dict[int, str]:
     """The names of a table, by label.
 
     Args:
-        data: The whole file.
         path: Its name, whose ending says the format.
 
     Raises:

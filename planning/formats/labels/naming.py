@@ -113,7 +113,6 @@ class LabelRule:
 
     Attributes:
         label: Its number in the map.
-        name: Its name.
         kind: What the case wants of it.
         margin_mm: The clearance that an avoided or unknown structure demands; 0 for the other kinds.
         pattern: The pattern that said so.
@@ -164,7 +163,6 @@ def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes],
             JSON, ITK-SNAP's or Slicer's list), or None or ``"seg.nrrd"`` for the names that a .seg.nrrd holds.
         folder: What a table's path is relative to.
         content: Gives the bytes of a table by its path.
-        labelmap: The map, for its own names.
 
     Raises:
         InputError: An unknown naming, a map without names of its own, or a table that cannot be used.
@@ -202,12 +200,8 @@ def select(
     Of equally specific ``avoid`` patterns the largest margin holds, and of ``unknown`` ones.
 
     Args:
-        names: Label to name.
-        present: The labels of the map.
         avoid: Pattern to margin in mm.
         unknown: Patterns of structures of which it is unknown whether a path may cross them.
-        traverse: Patterns of what may be crossed.
-        target: Patterns of what holds the lesion.
         ignore: Patterns of what does not count.
         all_named: Whether ``names`` holds every name that can occur, so that a pattern of none is a slip.
         where: The case file and entry, for messages.
@@ -335,12 +329,7 @@ class ByName(Generic[T]):
 
         Args:
             names: All that a pattern must match.
-            key: Of the case file, for errors.
-            where: For errors.
             others: What needs none, and may be named all the same.
-
-        Raises:
-            InputError: One of the three.
         """
         names, known = list(names), [*names, *others]
         if missing := [name for name in names if self.of(name) is None]:

@@ -70,7 +70,6 @@ def read_mesh(
     Args:
         path: An STL, OBJ, PLY, GLB, VTP or VTK file.
         unit: The unit of its coordinates.
-        space: Their space.
         space_is_default: Whether a patient space that the file states holds instead of ``space``.
         up: Its axis that is up in the file; without it, z of all but GLB.
 
@@ -95,12 +94,8 @@ def parse_mesh(
     """Parse a mesh file that has been read, like `read_mesh`; it is not opened again.
 
     Args:
-        data: The whole file.
         path: Its name, whose ending says the format.
         unit: The unit of its coordinates.
-        space: Their space.
-        space_is_default: As in `read_mesh`.
-        up: As in `read_mesh`.
         stretch: Shape (3,): factors of the file's axes on top of its unit, as a URDF states them.
 
     Raises:
@@ -181,7 +176,6 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
 
     Args:
         mesh: The structure's surface, mm.
-        name: Its name, for the text.
     """
     warnings = []
     flat = np.count_nonzero(mesh.areas == 0.0)

@@ -166,7 +166,6 @@ class Encoding(NamedTuple):
     """Encoding of a file's arrays.
 
     Attributes:
-        byte_order: "<" or ">".
         header_type: The type of the sizes before each array.
         compressed: Whether binary arrays are blocks of zlib.
         appended: The bytes after the underscore of the appended section.
@@ -184,9 +183,6 @@ def array_values(element: ElementTree.Element, count: int, encoding: Encoding, w
     """The numbers of an array.
 
     Args:
-        element: The DataArray.
-        count: How many the file states elsewhere.
-        encoding: How binary arrays are written.
         where: The file and the array, for the error.
 
     Returns:

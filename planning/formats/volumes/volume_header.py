@@ -35,7 +35,6 @@ class VoxelLayout:
         start: Bytes of the file before the encoded data.
         offset: Bytes of the decoded data before the first voxel.
         slope: What a stored value is multiplied with; 1 and an intercept of 0 leave it as it is.
-        intercept: What is added then.
     """
 
     dtype: np.dtype[Any]
@@ -112,7 +111,6 @@ def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.
 
     Args:
         T_ct_index: Shape (4, 4), maps voxel index to mm.
-        where: The file, for the message.
 
     Raises:
         InputError: Named: not finite, zero or singular, implausible spacing, sheared, implausible origin.
@@ -168,11 +166,7 @@ def refuse_lost_grid(labels: VolumeGrid, image: VolumeGrid, *, where: Path) -> N
 
 
 def check_exact_size(actual: int, promised: int, *, where: Path) -> None:
-    """Refuses a file that is shorter or longer than its header says.
-
-    Raises:
-        InputError: The two sizes (bytes) differ.
-    """
+    """Refuses a file that is shorter or longer than its header says."""
     if actual != promised:
         kind = "cut short" if actual < promised else "longer than its header states"
         what = f"the file is {kind}: {actual} bytes, but the header states {promised}"

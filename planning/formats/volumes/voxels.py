@@ -30,7 +30,6 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
     Args:
         content: The compressed bytes.
         promised: Bytes that the header says they inflate to.
-        where: The file, for the message.
 
     Returns:
         Shape (promised,).
@@ -98,10 +97,6 @@ TEXT_BYTES = LONGEST_NUMBER + 1
 
 def decoded(content: memoryview, header: VolumeHeader) -> NDArray[Any]:
     """The voxels as stored, in this machine's byte order.
-
-    Args:
-        content: The file that holds the voxels.
-        header: What the header says of them.
 
     Returns:
         Shape (ni, nj, nk), axis i running fastest in memory; (layers, ni, nj, nk) where there are several layers.

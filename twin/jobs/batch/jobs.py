@@ -68,8 +68,6 @@ class PlanRun:
     """A cohort's plan, and where it was written, if it was.
 
     Attributes:
-        cases: The plan's rows.
-        out: The cohort's folder.
         known: Cases that have a row there already.
         guess: How long the cohort will take; of a dry run alone.
     """
@@ -132,9 +130,7 @@ class Where:
     Attributes:
         part: As it was typed, or None.
         scheduler: Address of a Dask scheduler, or None for processes of this machine.
-        jobs: Processes of this machine.
         pages: Whether each case gets its page.
-        limits: Of each case.
     """
 
     part: str | None
@@ -207,7 +203,6 @@ class Merged(Shown):
     """A merged cohort.
 
     Attributes:
-        rows: Of ``cases.parquet``.
         files: That were written; of the dataset its folder.
         changed: Cases that are not as they were expected; None where nothing was.
     """
@@ -267,10 +262,8 @@ def merge_cohort(out: Path, expect: Path | None, tolerance_mm: float, watcher: W
     """Write ``cases.parquet``, the dataset of candidates and the page.
 
     Args:
-        out: The cohort's folder.
         expect: An earlier ``cases.parquet``, or the folder of one, against which the verdicts are held.
         tolerance_mm: By so much a best clearance may differ from it.
-        watcher: Whoever shows progress.
 
     Raises:
         InputError: No plan, nothing that can be expected, or a folder that cannot be written to.

@@ -91,9 +91,6 @@ def compare_source(
     """Two plans, or two choices of a case: see the functions below.
 
     Args:
-        source: A plan, or a case.
-        other: The other plan.
-        case: Of two plans.
         stated: What names choices, as `parse_two` takes it.
         arm: Whether the arm must reach a choice; None where the case says where its base is.
         watcher: Is told how far the work is.
@@ -225,7 +222,6 @@ class Side:
     """One of two paths.
 
     Attributes:
-        title: How it was chosen.
         outward_ct: Shape (3,), unit.
         entry_ct: Shape (3,), mm; NaN without a skin entry.
         explained: Checked against its case; None of a plan alone.
@@ -273,8 +269,6 @@ class Comparison(Shown):
 
     Attributes:
         case_name: The case, or those that two plans name.
-        inputs: Every file that decided it.
-        warnings: Of the case.
     """
 
     case_name: str

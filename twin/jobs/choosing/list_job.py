@@ -107,7 +107,6 @@ class Outcome(NamedTuple):
         verdict: ``safe``, ``rejected``, or `REFUSED`.
         detail: Why it has no explanation.
         safe_directions: Of a target's search; None of an entry.
-        windows: The same.
     """
 
     explained: Explanation | None
@@ -122,12 +121,10 @@ class CheckedList:
     """All rows of a list.
 
     Attributes:
-        case_name: The case.
         arm: Whether the arm was checked: see `Candidates.arm_note`.
         inputs: The list, then what the case names.
         rows: In the order of the list, by `COLUMNS`.
         warnings: Of the list and of the case.
-        files: What was written.
     """
 
     case_name: str
@@ -177,7 +174,6 @@ def check_targets(context: CaseContext, listed: ReadList, aimed: Callable[[Liste
 
     Args:
         context: Of the case, for what does not depend on the target.
-        listed: The targets.
         aimed: The case with a row's point as its target, read anew.
     """
 

@@ -44,14 +44,7 @@ STANDS_OUT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class PivotRun:
-    """A calibrated tip beside the case's.
-
-    Attributes:
-        case: Whose arm and needle.
-        pivot: What was found.
-        names: Of its touches.
-        inputs: Every file that decided.
-    """
+    """A calibrated tip beside the case's."""
 
     case: Case
     pivot: Pivot
@@ -77,11 +70,7 @@ class PivotRun:
 
 
 def refuse_of_twin(*options: object) -> None:
-    """Refuse options of the twin beside touches that were read.
-
-    Raises:
-        InputError: One of them is stated.
-    """
+    """Refuse options of the twin beside touches that were read."""
     if any(option is not None for option in options):
         allowed = "JOINTS.csv, or the options of the twin"
         refuse("twin options with recorded touches", "pivot", allowed, "conflicting_options")
@@ -107,11 +96,7 @@ def pivot_case(case: Case, joints: Path) -> PivotRun:
 
 
 def calibrated(case: Case, names: tuple[str, ...], q: Floats, *, where: str) -> Pivot:
-    """The tip from joints (n, 6), rad, that touched one place.
-
-    Raises:
-        InputError: As `pivot_case`.
-    """
+    """The tip from joints (n, 6), rad, that touched one place."""
     if case.errors is None:
         refuse("no noise is declared", case.path, "[errors] touch_mm", "no_noise")
     model, tip_mm = case.robot.model, case.needle.length_mm
@@ -164,11 +149,8 @@ class PivotTourRun:
 
     Attributes:
         found: The tip that its joints give.
-        seed: Of the truth.
         place_base: Shape (3,), mm: the place as it was planned.
         true_tip_flange: Shape (3,), mm.
-        touched: The readings.
-        files: Written.
     """
 
     found: PivotRun
@@ -217,7 +199,6 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
 
     Args:
         context: Of a case with declared errors and an arm.
-        out: The output folder.
         poses: How many, 4 to 12.
         place_base: Shape (3,), mm, where; None for a place that is found.
         seed: Of the motions and of the truth.

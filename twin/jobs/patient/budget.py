@@ -37,8 +37,6 @@ def budget_facts(
     """The budget of one insertion, mm; None where the arm reaches none, or no errors are declared.
 
     Args:
-        case: The case.
-        registration: Of its markers.
         skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
         anatomy: Its structures; called where they bend a needle alone.
         q_insertion: Shape (6,), rad, the tip on the target; None takes one that the arm reaches.

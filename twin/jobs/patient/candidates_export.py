@@ -70,9 +70,6 @@ def export_candidates(table_path: Path, format_name: str, out: Path, note: Calla
     """Write a table of candidates as text, beside its own set or elsewhere.
 
     Args:
-        table_path: What a search wrote.
-        format_name: A name of `CANDIDATE_FORMATS`.
-        out: The folder.
         note: Told in a sentence what whoever reads it should know.
 
     Raises:

@@ -51,9 +51,6 @@ def export_to_moveit(context: CaseContext, plan_path: Path, out: Path, *, seed: 
     """Check a plan against its case again; write the four files.
 
     Args:
-        context: The plan's case.
-        plan_path: The plan's file.
-        out: Where the files go.
         seed: That the plan must state; the case's by default.
 
     Raises:
@@ -115,11 +112,7 @@ class Export(NamedTuple):
 
 
 def refuse_format(name: str) -> None:
-    """Refuse a format that nothing writes.
-
-    Raises:
-        InputError: Names those that are.
-    """
+    """Refuse a format that nothing writes."""
     known = (*format_names(), MOVEIT, SLICER, *CANDIDATE_FORMATS)
     if name not in known:
         refuse(f"format '{name}' is not known", "--format", ", ".join(known), "unknown_format")
@@ -132,10 +125,6 @@ def export_source(
 
     Args:
         source: A case, a plan or, for tables, a table or its folder.
-        case: Of a plan.
-        format_name: See `refuse_format`.
-        out: Where it goes.
-        choice: Which candidate.
         watcher: Is told how far the work is.
 
     Raises:
@@ -186,11 +175,8 @@ class SlicerExport(Shown):
     """What was written.
 
     Attributes:
-        files: Where they lie.
         path: The direction that the line shows.
         notes: What whoever opens them should know, one sentence each.
-        warnings: Of the case.
-        inputs: Every file that decided them.
     """
 
     files: tuple[Path, ...]

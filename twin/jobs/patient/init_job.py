@@ -66,9 +66,7 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
     """Make the case, read it as `search` does, and write it; what is wrong leaves nothing behind.
 
     Args:
-        request: What the user asks for.
         force: Whether a case that is there may be replaced.
-        watcher: Is told how far reading is.
 
     Raises:
         InputError: Everything that keeps the case from being searched, in one line.

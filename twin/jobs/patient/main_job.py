@@ -112,10 +112,7 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
     """Plan, rehearse the plan, in many rooms too where a number is given, and write everything.
 
     Args:
-        context: The case.
-        out: The folder of the files.
         rooms: How many, beside the one that is filmed.
-        choice: What is planned.
 
     Raises:
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
@@ -338,9 +335,7 @@ def case_of(source: Path, case: Path | None, choice: Choice) -> Path | None:
     """The case of a command: its source, or what is named beside a plan; None of a plan without its case.
 
     Args:
-        source: A case, or a plan.
         case: The option ``--case``.
-        choice: Which candidate is wanted.
 
     Raises:
         InputError: A plan with a choice, since it has its direction, or two cases.

@@ -54,8 +54,6 @@ def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Pat
     """Write the map of fractions over position.
 
     Args:
-        found: The search's result.
-        case: The case.
         skin: The patient, CT frame.
         path: The PNG to write; it appears whole or not at all.
     """

@@ -101,8 +101,6 @@ def recompose(pixels: NDArray[np.uint8], shot: RasterShot, shells: Shells, befor
 
     Args:
         pixels: Shape (h, w, 3), what `compose` made of the same shells and another shot.
-        shot: What is opaque now.
-        shells: The shells.
         before: Shape of ``shot.depth``, its depths then; a sample of the same depth shows the same.
         box: The part in which something may have changed, in samples.
     """

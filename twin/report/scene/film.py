@@ -103,9 +103,6 @@ def draw_film(
     """Write the film; a GIF beside it when no H.264 encoder can be started.
 
     Args:
-        rehearsal: What was measured.
-        plan: What was planned.
-        case: The case.
         anatomy: Structures and skin, CT frame.
         path: The ``.mp4`` to write; it appears whole or not at all.
         progress: Called with frames done and all frames.

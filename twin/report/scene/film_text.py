@@ -76,9 +76,7 @@ class FrameWords:
     """Text of frames whose overview is upper left, with the close-up beside it and numbers below.
 
     Args:
-        source: Where the words come from.
         cameras: Of the overview and of the close-up.
-        case: For names, space and target.
     """
 
     def __init__(self, source: FrameText, cameras: tuple[ViewCamera, ViewCamera], case: Any) -> None:
@@ -146,7 +144,6 @@ class FrameWords:
         """The numbers below the views.
 
         Args:
-            row: The rehearsal's record shown.
             moment: Its time, s.
         """
         image = self._below.copy()

@@ -64,9 +64,7 @@ class SceneBody:
         name: What the legend calls it.
         group: "organ", "skin", "safe", "needle", "arm", "room" or "target".
         mesh: CT frame, mm.
-        colour: RGB.
         alpha: 1 for opaque; less for see-through.
-        solid: See `Surface`.
     """
 
     name: str
@@ -155,7 +153,6 @@ def needle_bodies(needle: Any, tip_ct: Floats, outward_ct: Floats, least_mm: flo
         needle: With ``length_mm``, ``shaft_mm``, ``radius_mm``, ``holder_diameter_mm``.
         tip_ct: Shape (3,).
         outward_ct: Shape (3,), unit, from the tip to the flange.
-        least_mm: Its radius at least.
     """
     radius = max(needle.radius_mm, least_mm)
     shaft, top = tip_ct + needle.shaft_mm * outward_ct, tip_ct + needle.length_mm * outward_ct
@@ -199,7 +196,6 @@ class ArmPicture:
     """The arm's links ready to be drawn at any configuration.
 
     Args:
-        model: The arm.
         T_base_ct: Shape (4, 4), where the patient is believed (or known) to be.
         tool: What its flange carries beside needle and holder, or None.
     """

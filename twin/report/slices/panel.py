@@ -58,7 +58,6 @@ class Panel(NamedTuple):
     """One slice.
 
     Attributes:
-        plane: Where it lies.
         hu: Shape (PIXELS, PIXELS), NaN where the image ends; None in a case without CT.
         overlay: Shape (PIXELS, PIXELS, 4), RGB and opacity.
     """

@@ -42,7 +42,6 @@ class Slices:
     """The drawn slices of one direction.
 
     Attributes:
-        subject: The direction.
         panels: Its four slices; three of an image alone.
         units: Hounsfield units along the needle; None without a CT or an entry.
     """
