@@ -24,7 +24,7 @@ from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import count_difference
-from puncture_twin.planning.formats.labels.label_surface import frame, framed_surface
+from puncture_twin.planning.formats.labels.labelmaps import frame, framed_surface
 from puncture_twin.planning.formats.meshes.mesh_files import cached_mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose

@@ -31,8 +31,8 @@ from puncture_twin.planning.anatomy.unnamed import Named, Unnamed, unnamed_surfa
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.formats.labels.label_surface import mask_surface
-from puncture_twin.planning.formats.mesh_guard import fits
+from puncture_twin.planning.formats.guard import fits
+from puncture_twin.planning.formats.labels.labelmaps import mask_surface
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.mesh import TriangleMesh

@@ -26,10 +26,9 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
+from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.labels.label_sources import refuse_label_map
-from puncture_twin.planning.formats.labels.label_surface import label_mesh
-from puncture_twin.planning.formats.labels.labelmaps import ROUNDED_BY, LabelMap, labelmap_of, segment_names
-from puncture_twin.planning.formats.mesh_guard import guard_mesh
+from puncture_twin.planning.formats.labels.labelmaps import ROUNDED_BY, LabelMap, label_mesh, labelmap_of, segment_names
 from puncture_twin.planning.formats.volumes.volume_files import Volume, VolumeSource, canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 

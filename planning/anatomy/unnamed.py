@@ -15,7 +15,7 @@ import scipy
 
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.base.arrays import Bools, grown, widened
-from puncture_twin.planning.formats.labels.label_surface import box_in, mask_surface
+from puncture_twin.planning.formats.labels.labelmaps import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.parts import parts_of
 from puncture_twin.planning.geometry.voxelize import mark_inside

@@ -40,8 +40,18 @@ from puncture_twin.planning.batch.plan import (
     read_plan_table,
     read_row,
 )
-from puncture_twin.planning.batch.run_case import CaseEnd, CaseTask, WritePage, commit_failure, ended, run_case
-from puncture_twin.planning.batch.workers import NO_LIMITS, WORKER_DIED, Limits, run_tasks
+from puncture_twin.planning.batch.run_case import (
+    NO_LIMITS,
+    WORKER_DIED,
+    CaseEnd,
+    CaseTask,
+    Limits,
+    WritePage,
+    commit_failure,
+    ended,
+    run_case,
+    run_tasks,
+)
 
 Item = TypeVar("Item")
 

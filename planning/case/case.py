@@ -28,7 +28,6 @@ from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direct
 from puncture_twin.planning.case.errors import ErrorModel, errors_of
 from puncture_twin.planning.case.named_files import MASK_ROLE, CaseVolumes, read_named_files, robot_warnings
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
-from puncture_twin.planning.case.sections import bending_of, breathing_of, robot_of
 from puncture_twin.planning.case.settings import (
     Axis,
     CtSettings,
@@ -38,9 +37,12 @@ from puncture_twin.planning.case.settings import (
     RobotSettings,
     SearchSettings,
     axes_frame,
+    bending_of,
+    breathing_of,
     ct_of,
     gantry_of,
     obstacle_of,
+    robot_of,
     search_of,
 )
 from puncture_twin.planning.case.tables import (

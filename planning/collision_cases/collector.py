@@ -33,8 +33,8 @@ from puncture_twin.planning.collision_cases.session import (
     session_of,
     updating,
 )
+from puncture_twin.planning.plan.plan_check import check_plan
 from puncture_twin.planning.plan.plan_document import read_plan
-from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, reason_text

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OWN_TARGET, Anatomy
-from puncture_twin.planning.anatomy.crossed_names import BONES, LEVEL, QUALIFIERS
-from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
+from puncture_twin.planning.anatomy.default_roles import BONES, LEVEL, QUALIFIERS, default_role, plain_name
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats

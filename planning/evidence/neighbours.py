@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OWN_TARGET, Anatomy
-from puncture_twin.planning.anatomy.crossed_names import BONES
-from puncture_twin.planning.anatomy.default_roles import LESION, VESSEL_WORDS, default_role, plain_name
+from puncture_twin.planning.anatomy.default_roles import BONES, LESION, VESSEL_WORDS, default_role, plain_name
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache

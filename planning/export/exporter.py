@@ -24,8 +24,14 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.collision.state_checker import StateChecker
-from puncture_twin.planning.export.program import SampledMotion, check_sampled, heading, program_of, waypoint_rows
-from puncture_twin.planning.export.program_check import check_program
+from puncture_twin.planning.export.program import (
+    SampledMotion,
+    check_program,
+    check_sampled,
+    heading,
+    program_of,
+    waypoint_rows,
+)
 from puncture_twin.planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
 from puncture_twin.planning.motion.path_check import MAX_SWEEP_MM

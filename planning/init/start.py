@@ -28,9 +28,16 @@ from puncture_twin.planning.init.outlines import (
     skin_of,
     skin_problems,
 )
-from puncture_twin.planning.init.roles import assign, likely_region, role_notes
 from puncture_twin.planning.init.segmentation import Place, Segmentation
-from puncture_twin.planning.init.target import Target, label_target, parse_point, typed_target
+from puncture_twin.planning.init.target import (
+    Target,
+    assign,
+    label_target,
+    likely_region,
+    parse_point,
+    role_notes,
+    typed_target,
+)
 
 ALLOWED = (
     "a folder with a segmentation, and a CT (NIfTI, NRRD or a DICOM series) or a structure named skin or body, see "

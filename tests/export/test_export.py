@@ -27,6 +27,7 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.export.exporter import FORMATS, GROUP, blend_radii_mm, csv_text, export_plan, read_csv
 from puncture_twin.planning.export.program import (
     PLAIN,
+    check_program,
     check_sampled,
     check_trajectory,
     corner_rows,
@@ -34,7 +35,6 @@ from puncture_twin.planning.export.program import (
     rests_at,
     waypoint_rows,
 )
-from puncture_twin.planning.export.program_check import check_program
 from puncture_twin.planning.export.ros2 import read_ros2, ros2_text, velocities
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
 from puncture_twin.planning.motion.follow import follow, follow_smoothly

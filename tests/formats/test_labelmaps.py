@@ -18,8 +18,7 @@ from scipy.spatial import cKDTree
 
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE
-from puncture_twin.planning.formats.labels.label_surface import label_mesh
-from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, label_mesh, labelmap_of
 from puncture_twin.planning.formats.volumes.volume_files import VolumeFile, read_volume
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 

@@ -20,7 +20,7 @@ from slicer_files import vtk_model
 
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.mesh_guard import guard_mesh
+from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.meshes.mesh_files import cached_mesh_warnings, mesh_warnings, read_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up

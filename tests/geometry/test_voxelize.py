@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy
 
-from puncture_twin.planning.formats.labels.label_surface import frame, framed_surface, mask_surface
+from puncture_twin.planning.formats.labels.labelmaps import frame, framed_surface, mask_surface
 from puncture_twin.planning.geometry.voxelize import mark_inside, voxels_inside
 
 WHERE = Path("made")

@@ -24,8 +24,7 @@ from puncture_twin.planning.formats.folder import FILE, Entry, entries, unaccoun
 from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL, LabelMap
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_layered_header
 from puncture_twin.planning.formats.volumes.volume_files import Content
-from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, VolumeHeader, corner_deviation_mm
-from puncture_twin.planning.formats.volumes.voxels import decoded
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, VolumeHeader, corner_deviation_mm, decoded
 
 MASK_ENDINGS = (".nii.gz", ".nii", ".seg.nrrd", ".nrrd")
 """Endings of files that are masks."""

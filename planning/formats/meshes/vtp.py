@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
-from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join, token_array, triangulate
+from puncture_twin.planning.formats.guard import MAX_TRIANGLES, MAX_VERTICES, RawMesh, join, token_array, triangulate
 from puncture_twin.planning.geometry.spaces import Space
 
 _ALLOWED = "a complete VTKFile of type PolyData whose arrays are as long as it states"

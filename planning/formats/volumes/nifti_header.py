@@ -20,8 +20,8 @@ from puncture_twin.planning.formats.volumes.volume_header import (
     check_affine,
     check_shape,
     corner_deviation_mm,
+    first_bytes,
 )
-from puncture_twin.planning.formats.volumes.voxels import first_bytes
 
 HEADER_BYTES = 348
 FIRST_VOXEL_BYTE = 352

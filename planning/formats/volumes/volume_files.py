@@ -27,8 +27,13 @@ from puncture_twin.planning.base.text import Shown, brief
 from puncture_twin.planning.formats.volumes import nrrd_header
 from puncture_twin.planning.formats.volumes.nifti_header import parse_nifti_header
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_nrrd_header
-from puncture_twin.planning.formats.volumes.volume_header import MAX_VOXELS, VolumeGrid, VolumeHeader, VoxelLayout
-from puncture_twin.planning.formats.volumes.voxels import decoded
+from puncture_twin.planning.formats.volumes.volume_header import (
+    MAX_VOXELS,
+    VolumeGrid,
+    VolumeHeader,
+    VoxelLayout,
+    decoded,
+)
 
 NIFTI_ENDINGS = (".nii", ".nii.gz")
 NRRD_ENDINGS = (".nrrd", ".nhdr")

@@ -53,7 +53,7 @@ from puncture_twin.planning.batch.run import (
     run_cohort,
     slurm_part,
 )
-from puncture_twin.planning.batch.workers import Limits
+from puncture_twin.planning.batch.run_case import Limits
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.jobs.batch.report import write_cohort_page

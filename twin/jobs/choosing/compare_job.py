@@ -19,7 +19,7 @@ from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.text import Shown, plural
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.plan.recheck import check_plan
+from puncture_twin.planning.plan.plan_check import check_plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, explain_choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext, prepare

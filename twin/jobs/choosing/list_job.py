@@ -200,7 +200,7 @@ def write_checked(checked: CheckedList, context: CaseContext, out: Path) -> Chec
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        from puncture_twin.twin.jobs.patient.candidates_export import csv_text
+        from puncture_twin.twin.jobs.patient.export_jobs import csv_text
 
         rows = [[row[name] for name in COLUMNS] for row in checked.rows]
         paths[0].write_text(csv_text(COLUMNS, rows), encoding="utf-8", newline="")

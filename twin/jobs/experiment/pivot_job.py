@@ -27,8 +27,13 @@ from puncture_twin.planning.formats.points import (
     write_points,
 )
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.touch.pivot_planner import LEAST_POSES, MOST_POSES, plan_pivot
-from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers
+from puncture_twin.planning.touch.touch_planner import (
+    LEAST_POSES,
+    MOST_POSES,
+    TOUCHING_PADDING_MM,
+    approach_checkers,
+    plan_pivot,
+)
 from puncture_twin.planning.touch.tour_motions import TouchTour
 from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, arm_covariance, check_one_place, pivot_calibration
 from puncture_twin.twin.jobs.terminal import write_result

@@ -219,8 +219,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     Raises:
         InputError: A plan that does not belong to the case or does not hold any more.
     """
-    from puncture_twin.planning.plan.plan_check import with_case_arm
-    from puncture_twin.planning.plan.recheck import check_plan
+    from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
@@ -263,7 +262,7 @@ def export(
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
     from puncture_twin.planning.export.exporter import export_name, export_plan
-    from puncture_twin.planning.plan.recheck import check_plan
+    from puncture_twin.planning.plan.plan_check import check_plan
 
     source, plan = read_noted_plan(plan_path, note)
     if context is not None:

@@ -25,10 +25,18 @@ from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface
-from puncture_twin.twin.report.scene.film_file import Frame, Part, Pixels, write_gif, write_mp4
-from puncture_twin.twin.report.scene.film_text import BELOW, FrameText, FrameWords, model_note
-from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, needle_bodies, patient, room
-from puncture_twin.twin.report.scene.shapes import bar
+from puncture_twin.twin.report.scene.film_text import (
+    BELOW,
+    Frame,
+    FrameText,
+    FrameWords,
+    Part,
+    Pixels,
+    model_note,
+    write_gif,
+    write_mp4,
+)
+from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, bar, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.views import close_up, overview
 
 MOST_THREADS = 4
