@@ -140,7 +140,6 @@ def guessed(code: str, what: str, volume: float, side: str, overrule: str) -> Fi
 
     Args:
         code: Of the finding; the structure that paths would pass through, where there is one.
-        side: Of the body, as `body_side` names it.
     """
     said = (
         f"{what}: {volume / 1000:.1f} l at its {side} side (see slices.png); paths through it are unknown_region "

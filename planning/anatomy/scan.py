@@ -68,7 +68,6 @@ class Scan:
     """A CT beside the skin of its case. Its voxels are decoded only if something is not in the cache.
 
     Attributes:
-        name: As the case writes it.
         source: What the scanner saw, in its file.
         skin: The skin, where it does not come from this CT.
     """
@@ -161,7 +160,6 @@ class Scan:
         """Surfaces of what is dense, or gas, inside the body and in no structure.
 
         Args:
-            structures: Every structure of the case but the skin.
             dense_hu: From here on a voxel is dense.
         """
 

@@ -72,9 +72,6 @@ def skin_of_image(image: CtImage) -> Skin:
     Every vertex lies between the centres of a voxel inside the body mask and one outside, so the surface is
     never more than half a voxel (along any axis) from the mask's boundary, like that of a label.
 
-    Args:
-        image: A CT, without what was laid around it.
-
     Raises:
         InputError: If no body is found, or no air around it.
     """

@@ -66,7 +66,6 @@ class LabelGrid:
 
     Attributes:
         name: The file or folder, as the case writes it.
-        files: The map, or the masks.
     """
 
     name: str

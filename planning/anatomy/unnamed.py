@@ -62,7 +62,6 @@ def unnamed_surfaces(
 
     Args:
         body: Its body, shape (nx, ny, nz).
-        structures: Every structure of the case but the skin.
         dense_hu: From here on a voxel is dense.
         slack_mm: So deep below the body's surface there may still be the ambient air, because the surface is from
             elsewhere and was widened.

@@ -254,7 +254,6 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure], memor
 
     Args:
         skin: Its skin; where it is open, a map that ends is refused.
-        memory: Holds the body's box in each map.
 
     Raises:
         InputError: A map that does not hold the target, or one that ends in a body whose skin is open.

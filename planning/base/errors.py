@@ -47,7 +47,6 @@ class InputError(PlanningError):
     """Input that cannot be used. The command line prints it as one line and exits with code 2.
 
     Args:
-        what: What is wrong, with the offending value.
         where: The file, and the place in it (key, line, marker name).
         code: What kind of mistake it is, in snake_case: the same kind has one code, wherever it is found.
         numbers: What was measured, by name with its unit.
@@ -107,7 +106,6 @@ class NoAnswerError(PlanningError):
     Args:
         message: What was not found.
         code: Why not, as an `InputError` has it.
-        counts: How many candidates fell to which reason.
     """
 
     def __init__(self, message: str, *, code: str, counts: Mapping[str, int] = MappingProxyType({})) -> None:
@@ -228,9 +226,6 @@ NO_WHEEL_FROM: Mapping[str, tuple[str, tuple[int, int]]] = MappingProxyType(
 
 def require_extra(extra: str, where: str, *, else_allowed: str = "") -> None:
     """Refuse what needs a missing part of the installation, before it works for minutes.
-
-    Args:
-        where: The command or file that needs it.
 
     Raises:
         InputError: A module of the extra is not installed.

@@ -138,7 +138,6 @@ def read_input(path: Path, *, max_bytes: int, where: str, allowed: str = "") -> 
 
     Args:
         max_bytes: A larger one is refused before it is read.
-        allowed: What is wanted there; empty for any file.
 
     Raises:
         InputError: If it is missing, no regular file, empty, too large, or not readable.

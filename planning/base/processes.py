@@ -82,7 +82,6 @@ def on_threads(work: Callable[[int], None], pieces: int, threads: int) -> Iterat
 
     Args:
         work: Called with the number of a piece.
-        threads: What the caller wants; see `worker_count`.
     """
     threads = worker_count(threads, pieces)
     if threads == 1:

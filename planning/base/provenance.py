@@ -120,7 +120,6 @@ class InputFiles:
         """The content of a file, which is read where no role has wanted it before.
 
         Args:
-            role: What the file is to the result.
             name: As ``where`` states it.
             max_bytes: A larger file is refused before it is read.
             key: Of ``where``, for errors.

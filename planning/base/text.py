@@ -29,7 +29,6 @@ def check_name(name: str, what: str, *, where: str | Path) -> str:
     """Check a name that is printed as it is, and return it.
 
     Args:
-        name: The name as the file states it.
         what: What it names, for the error: "label 3", "point 2".
 
     Raises:

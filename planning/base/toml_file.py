@@ -93,7 +93,6 @@ def parse_toml(
     """Validate the bytes of such a file; it is not opened again.
 
     Args:
-        allowed: What would have been accepted in its place.
         change: States some values otherwise, before any is looked at.
 
     Raises:

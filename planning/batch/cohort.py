@@ -132,9 +132,6 @@ LONGEST_CELL = 20_000
 def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
     """The cases that a CSV lists.
 
-    Args:
-        path: Its name; cases are relative to its folder.
-
     Raises:
         InputError: No column ``case``, an unknown column, or a line that cannot be used; names the line.
     """
@@ -249,9 +246,6 @@ class _Choice(NamedTuple):
 
 def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
     """The cases that a cohort file describes: every match of its patterns with every combination of its options.
-
-    Args:
-        path: Its name; patterns are relative to its folder.
 
     Raises:
         InputError: Not of this schema, a pattern that matches nothing, or too many combinations.

@@ -90,7 +90,6 @@ class Plan:
     """A cohort's plan.
 
     Attributes:
-        cases: In the cohort's order.
         version: Of this package, when it was made.
     """
 

@@ -178,7 +178,6 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     """Run what has no final row yet.
 
     Args:
-        out: The cohort's folder, with its plan.
         elsewhere: Runs the cases; None runs them in processes of this machine.
 
     Raises:
@@ -319,7 +318,6 @@ class CohortState:
         safe: Done, with a safe direction.
         reasons: Failed, by reason: refused inputs, and failures of the program.
         stale: Their inputs have changed since the plan: `batch plan` again.
-        stale_cases: As the cohort writes them.
     """
 
     planned: int = 0

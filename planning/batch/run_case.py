@@ -301,9 +301,6 @@ def group_of(task: CaseTask) -> str:
 def run_tasks(tasks: Iterable[CaseTask], jobs: int, limits: Limits) -> Generator[CaseEnd, None, None]:
     """Run cases in workers; yields how each ended, as they end.
 
-    Args:
-        tasks: What is to be done, each id once.
-
     Raises:
         InputError: Memory cannot be watched on this system.
     """

@@ -64,9 +64,6 @@ class CaseOptions:
     def applied(self, data: dict[str, Any], *, where: Path | str) -> dict[str, Any]:
         """A case file's tables with the options in place; nothing is validated yet.
 
-        Args:
-            data: As TOML gives them; stays as it is.
-
         Raises:
             InputError: A margin of what the case has no margin for.
         """

@@ -284,7 +284,6 @@ def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> 
     """The arm with its home, its speeds, and where it is located, as far as mount or transform say so.
 
     Args:
-        path: Where the case file is, for errors.
         files: What it names; each file that decides the arm is added.
 
     Raises:

@@ -65,7 +65,6 @@ class FastEngine:
 
     Args:
         meshes: The k surfaces, in the CT frame, mm.
-        progress: Called with (structures done in all directions, structures).
         cache: Of the order of each surface's triangles; its memory holds packed surfaces.
         threads: Threads at most, one a core; the answer does not depend on them, to the bit.
 
@@ -200,7 +199,6 @@ def measure_structure(
 
     Args:
         target: Shape (3,), mm: where every axis starts.
-        bundles: All or some of the n directions.
         placed: The same structure, placed about the target.
         lengths: Shape (n,), of the axes in the caller's order, mm.
         answer: Arrays of shape (n,) in the caller's order; the rows that ``bundles`` holds are filled.

@@ -33,7 +33,6 @@ class FclEngine:
 
     Args:
         meshes: The k surfaces, in the CT frame, mm.
-        progress: Called with (directions done, directions in all).
     """
 
     def __init__(self, meshes: Sequence[TriangleMesh], progress: Count | None = None) -> None:

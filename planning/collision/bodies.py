@@ -82,7 +82,6 @@ class Body:
         name: One of ``BODY_NAMES``.
         frame: Index of its frame among ``link_poses``.
         T_frame_body: Shape (4, 4), mm: its shapes in that frame.
-        bare: The body as it is.
         full: The body grown by the padding; ``bare`` itself where there is none.
         radius_mm: Every point of ``bare`` lies within this distance of the shapes' origin.
     """

@@ -280,9 +280,6 @@ def joined_pieces(model: UrModel) -> Mapping[tuple[str, str], Bools]:
     These are built into one another and never tested. Any other two of neighbouring links touch at some angles alone,
     as a camera on wrist 3 may touch wrist 2, or a folded forearm the upper arm: for these each state is tested.
 
-    Args:
-        model: An arm with a URDF of its own.
-
     Returns:
         For the names of each link and the next, shape (pieces of the one, pieces of the other).
 

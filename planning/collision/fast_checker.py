@@ -208,7 +208,6 @@ class SegmentChecker:
     segment is free: each segment's proof begins anew.
 
     Args:
-        checks: The questions that may find a contact.
         scratch: For them; several may share it, one after the other.
         clear_mm: What the padded arm is to keep from patient and boxes besides; of each body and obstacle that are
             nearer to one another at an end of the segment, most of their distance there. What is not proven to be kept

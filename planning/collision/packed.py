@@ -366,7 +366,6 @@ def packed_skin(patient: TriangleMesh | None, skin_triangles: int, cache: Cache)
 
     Args:
         patient: The skin, and behind it what the CT shows besides.
-        skin_triangles: How many of the triangles are skin.
     """
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))

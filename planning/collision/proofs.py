@@ -67,7 +67,6 @@ class Proofs:
 
     Args:
         patient: The skin, and behind it what the CT shows besides; or None.
-        skin_triangles: How many of its triangles are skin.
         cache: Where enclosures are kept: they depend on arm and tool alone.
     """
 

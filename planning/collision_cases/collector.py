@@ -116,11 +116,7 @@ MOST_SHOWN = 6
 
 
 def window_finding(window: WindowSection, direction: Candidates, search: Candidates) -> Finding:
-    """Differences of one window from what is expected.
-
-    Args:
-        search: The search of the case's grid.
-    """
+    """Differences of one window from what is expected."""
     windows = search.windows
     differences = tuple(_differences(window, direction, search, windows))
     return Finding(differences, tuple(_listed(search, windows))) if differences else Finding()

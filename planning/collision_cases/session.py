@@ -139,7 +139,6 @@ class Change:
     Attributes:
         kind: The array of the table, such as ``check``.
         at: Its number in the array, from 0 on.
-        test: Its name, for a person.
         number: What is to be written.
     """
 
@@ -151,9 +150,6 @@ class Change:
 
 def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
     """Rewrite a file, whole or not at all.
-
-    Args:
-        data: What it held when it was read.
 
     Returns:
         One line a number: where, old and new.

@@ -167,7 +167,6 @@ class Assessed(NamedTuple):
     Attributes:
         z: The largest over all placements that were tried; -inf where the image shows none of the surfaces.
         ratio: Of the edge strength there to that as it is.
-        kind: Of that placement; see `Placement`.
         slip: How far it is, rms over the surfaces, in shifts of the least that counts.
         T: Shape (4, 4), LPS mm: the refined place where one is named, else None.
         middle_ct: Shape (3,), of the surfaces as they are.

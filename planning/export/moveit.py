@@ -31,11 +31,7 @@ PATIENT, NEEDLE, HOLDER = "patient", "needle", "needle_holder"
 
 
 def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
-    """The scene as a difference to what MoveIt knows: all that the plan was checked against, and its first state.
-
-    Args:
-        plan: The plan; its registration places the patient.
-    """
+    """The scene as a difference to what MoveIt knows: all that the plan was checked against, and its first state."""
     frames = RosFrames.of(model_urdf(plan.model))
     solids = [_solid(box, frames) for box in case_boxes(case, plan.T_base_ct)]
     start = {"name": list(plan.model.joint_names), "position": [float(angle) for angle in plan.approach.q[0]]}
@@ -166,7 +162,6 @@ def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> M
     """Name to text of the MoveIt files.
 
     Args:
-        plan: A plan that was checked against its case.
         source: The plan's file, for the names and for errors.
 
     Raises:

@@ -135,9 +135,6 @@ class SlicerFiles:
 def slicer_files(case: Case, drawn: SceneContent) -> SlicerFiles:
     """The files of a case and a path.
 
-    Args:
-        drawn: The path, and what is next to it.
-
     Raises:
         InputError: A case in a frame of its own, which Slicer has no name for.
     """

@@ -86,7 +86,6 @@ def read_points(
     """The points of one file, in mm; in LPS where the file or the caller names a patient space.
 
     Args:
-        path: A .csv, .mrk.json or .fcsv file.
         default_space: The space of a file that states none: the case's, or None for a robot's base.
         default_unit: The unit of a file that states none; None refuses such a file.
 
@@ -106,9 +105,6 @@ def parse_points(
     default_unit: Unit | None = None,
 ) -> NamedPoints:
     """Parse a points file that has been read, like `read_points`; it is not opened again.
-
-    Args:
-        path: Its name, whose ending says the format.
 
     Raises:
         InputError: As `read_points`, but for reading.

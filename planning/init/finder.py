@@ -132,9 +132,6 @@ class Found:
 def find(place: Place, wanted: Wanted) -> Found:
     """Look through a folder and the folders below it, `DEPTH` levels deep.
 
-    Args:
-        wanted: What the user says of the files.
-
     Raises:
         InputError: A folder that cannot be read, or is no patient's.
     """

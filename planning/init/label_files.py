@@ -50,7 +50,6 @@ class LabelFile:
     Attributes:
         naming: As the case states it; None for names inside the file.
         names: Label to name, of the labels present.
-        notes: How the naming was found.
     """
 
     source: str
@@ -90,7 +89,6 @@ class Mask:
 
     Attributes:
         file: Relative to the case's folder.
-        label: The value of its voxels.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
     """
 
@@ -288,7 +286,6 @@ class FileMasks:
     Attributes:
         key: Of the case: ``seg`` or ``rtstruct``.
         parts: Name to its mask and the value of its voxels, of those that are not empty.
-        notes: How the file was read.
     """
 
     source: str

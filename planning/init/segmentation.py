@@ -43,7 +43,6 @@ class Assigned(NamedTuple):
     """What the case says of one structure.
 
     Attributes:
-        label: Its number within the segmentation.
         kind: ``target``, ``avoid``, ``unknown``, ``traverse``, ``ignore`` or ``skin``.
         margin_mm: The clearance that it demands.
         line: Of the table of default roles.
@@ -188,7 +187,6 @@ class MeshFolder:
     """Meshes of one folder, one file a structure.
 
     Attributes:
-        source: The folder of the meshes.
         files: By number, relative to the case's folder.
         space: Of all of them that do not state one.
         up: The axis of all of them that is up; None where nobody says.

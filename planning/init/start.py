@@ -59,7 +59,6 @@ class Request:
     Attributes:
         folder: Where the files are, and the case will be.
         target: ``X,Y,Z`` in mm, or None for ``target_label``.
-        target_label: The name of a structure.
         region: As a case states it, or None to be told by the structures.
         space_stated: Whether the user said in which space the target is.
         hit_radius_mm: Of the ball that the target is, if the user says that it lies in no structure; else None.
@@ -80,7 +79,6 @@ class Start:
     """A new case, not yet written.
 
     Attributes:
-        parts: What it was made of.
         notes: What a person should look at, one sentence each.
     """
 

@@ -207,7 +207,6 @@ class Target:
 
     Attributes:
         point_ct: Shape (3,), LPS mm.
-        holding: The structures that hold it.
         hit_radius_mm: Of the ball that is hit where the target has no structure.
     """
 

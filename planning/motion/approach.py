@@ -60,7 +60,6 @@ class Approach:
         goal_index: Which of the goals it ends at.
         checked_q: Shape (m, 6), rad: the states that FCL found free, in order; no body moves more than
             ``MAX_SWEEP_MM`` between two of them. For :func:`least_clearance`.
-        seed: The seed that gave it.
         attempts: How many paths were planned.
     """
 

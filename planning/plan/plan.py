@@ -31,7 +31,6 @@ class Plan(Shown):
     Attributes:
         case_name: The case that it was made for.
         inputs: Every file of that case, with role and hash.
-        seed: Of the approach's planner.
         T_base_ct: Shape (4, 4), the belief of where the patient is.
         expected_target_error_mm: Expected tip error (rms), in the insertion's configuration of the arm; without
             ``[errors]`` the registration's TRE alone; NaN for a stated mount or transform.

@@ -261,7 +261,6 @@ def tried_all(checker: StateChecker, motions: Sequence[tuple[Surveyed, Insertion
 
     Args:
         checker: Checks contacts, in the base frame.
-        motions: Each with the survey that it comes from.
 
     Returns:
         For each motion: that the arm reaches the direction by it, or where it ends.

@@ -128,10 +128,8 @@ def entry_facts(
     """Skin entry, nearest landmark and scanner angles of one path.
 
     Args:
-        markers: Those of its registration; may be none.
         entry_ct: Shape (3,), mm; NaN without a skin entry.
         outward_ct: Shape (3,), unit, from the target outward.
-        grid: Of its CT, where there is one.
     """
     landmarks = markers or (Landmark("the target", np.asarray(case.target_ct)),)
     planes = None if case.space is Space.LOCAL else needle_planes(outward_ct)

@@ -44,7 +44,6 @@ def with_breathing(
     Args:
         case: The case; nothing is done where it declares no breathing.
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        candidates: Checked where the CT shows the body.
         bound: How far the needle may bend; None bends nothing.
     """
     breathing = case.breathing

@@ -98,7 +98,6 @@ class UncertaintyBreakdown:
         budget: The tip's expected error and its sources.
         declaration: Whether the markers' residuals agree with the declared errors, in one sentence.
         goals: Limits that are not satisfied: the case's, or `WISHED_HIT` where it demands no chance to hit.
-        not_modelled: What these chances leave out.
     """
 
     p_hit: float

@@ -80,7 +80,6 @@ def plan_sweep(
         context: Of a case that says where the arm's base is.
         start: Theta and beta, rad.
         end: (theta, beta) of the end; beta takes the shorter arc.
-        progress: Called with directions checked and all of them.
 
     Raises:
         InputError: The case does not say where the robot stands, or both directions are one.

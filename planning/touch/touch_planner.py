@@ -66,7 +66,6 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
     Args:
         context: Of a case with declared errors, markers and an arm.
         q_insertion: Shape (6,), rad, the tip on the target: where the error of the touches is to be least.
-        progress: Called with motions done and all of them.
 
     Raises:
         InputError: The case declares no errors, or has no markers, or too many.
@@ -302,7 +301,6 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
     Args:
         count: How many poses, 4 to 12.
         place_base: Shape (3,), mm, where; None for a place that is found next to the patient.
-        progress: Called with motions done and all of them.
 
     Raises:
         InputError: The case has no arm.

@@ -111,7 +111,6 @@ def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Cou
 
     Args:
         stops: Each with a straight line to it that the arm can follow.
-        progress: Called with motions done and all of them.
 
     Raises:
         NoMotionError: None to a stop.
@@ -191,7 +190,6 @@ class ApproachCheckers:
     """Two views of one workcell.
 
     Attributes:
-        whole: The arm with its needle.
         blunted: The checker of a needle that is `TIP_MM` shorter.
     """
 

@@ -81,7 +81,6 @@ def body_axes(
     """A small cross of the body's directions as they lie in this view; the far ends are pale.
 
     Args:
-        space: The case's space; names the directions.
         length: Pixels of an axis that lies in the picture plane.
     """
     reach = length + 3.6 * size

@@ -139,7 +139,6 @@ class BodyMask:
     Attributes:
         body: Shape (nx, ny, nz), the solid body: the trunk, and parts of the patient that do not touch it.
         unscanned: Same shape, voxels that the scanner did not measure.
-        warnings: What the user should know.
         tables: Where the body ends as a table, cradle or board does that touches it.
     """
 
@@ -222,7 +221,6 @@ def body_mask(
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
         spacing_mm: Shape (3,).
-        shown: What a person says of the image.
         unscanned: What was not measured, where that is known.
 
     Raises:

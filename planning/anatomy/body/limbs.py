@@ -69,7 +69,6 @@ class Piece(NamedTuple):
 
     Attributes:
         near: Alone a limb's where the target lies in ``whole``.
-        whole: All that may be one.
         ml: Of a part beyond a neck: if neither it nor what holds the target is as small as a limb, it is none. Else 0.
     """
 

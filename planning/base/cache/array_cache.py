@@ -50,7 +50,6 @@ class StoredFile(NamedTuple):
     """The name of an entry.
 
     Attributes:
-        maker: The module that makes it.
         generation: 16 hexadecimal digits of its source and the libraries' versions.
         key: 64 of all that decides its content.
     """

@@ -152,7 +152,6 @@ def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-
     """Distance of the target from a surface, mm, and the row of the nearest triangle: branch and bound over its tree.
 
     Args:
-        nodes: See `bounds.disc_bounds`, made for this target.
         target: Shape (3,), mm.
         slack: Rounding of a node's coordinate, mm.
     """

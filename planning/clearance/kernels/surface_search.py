@@ -29,7 +29,6 @@ def search_bundles(  # type: ignore[no-untyped-def]  # numba infers
 
     Args:
         surface: `Blocks.triangles`, ``local`` and ``base``.
-        all_nodes: See `bounds.disc_bounds`, made for this target.
         slack: Rounding of a node's coordinate, mm.
         origin: Shape (3,), the target, where the axes start, mm.
         lengths: Shape (n,), of the axes, in the bundles' order, mm.

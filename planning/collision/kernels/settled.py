@@ -179,7 +179,6 @@ def against_triangle(hulls, hull, M, triangle, line, scratch):
     Args:
         M: Shape (3, 4) or (4, 4), mm: pose of its frame.
         triangle: Shape (3, 3), mm: its corners.
-        line: The body's axis, see :func:`_far`.
     """
     count, axis, at = len(hulls.corners), scratch.axis, scratch.at
     (mx, my, mz), (ux, uy, uz), half = line

@@ -80,7 +80,6 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     Args:
         file: Its key in ``content``.
         content: Gives its bytes.
-        ct: The CT on which it was drawn.
 
     Raises:
         InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that

@@ -148,9 +148,6 @@ def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> Triangle
     A label that touches the border of the volume is closed there, on the outer face of its border voxels. The
     result does not depend on the axis order or the flips in which the map is stored.
 
-    Args:
-        where: The file or case entry, for messages.
-
     Raises:
         InputError: If no voxel has this label.
     """

@@ -47,9 +47,6 @@ class _Entry(NamedTuple):
 def parse_names(data: bytes, path: Path) -> dict[int, str]:
     """The names of a table, by label.
 
-    Args:
-        path: Its name, whose ending says the format.
-
     Raises:
         InputError: Not such a table, a label that stands twice, or none at all; names the line where there is one.
     """

@@ -112,10 +112,8 @@ class LabelRule:
     """Rule of one label that is present.
 
     Attributes:
-        label: Its number in the map.
         kind: What the case wants of it.
         margin_mm: The clearance that an avoided or unknown structure demands; 0 for the other kinds.
-        pattern: The pattern that said so.
     """
 
     label: int
@@ -161,7 +159,6 @@ def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes],
     Args:
         naming: ``"totalsegmentator-v1"``, ``"totalsegmentator-v2"``, the path of a table of names (CSV,
             JSON, ITK-SNAP's or Slicer's list), or None or ``"seg.nrrd"`` for the names that a .seg.nrrd holds.
-        folder: What a table's path is relative to.
         content: Gives the bytes of a table by its path.
 
     Raises:
@@ -204,7 +201,6 @@ def select(
         unknown: Patterns of structures of which it is unknown whether a path may cross them.
         ignore: Patterns of what does not count.
         all_named: Whether ``names`` holds every name that can occur, so that a pattern of none is a slip.
-        where: The case file and entry, for messages.
 
     Raises:
         InputError: A label present that has no name or that no pattern names, one that two equally specific patterns

@@ -261,7 +261,6 @@ def parse_mesh(
     """Parse a mesh file that has been read, like `read_mesh`; it is not opened again.
 
     Args:
-        path: Its name, whose ending says the format.
         unit: The unit of its coordinates.
         stretch: Shape (3,): factors of the file's axes on top of its unit, as a URDF states them.
 

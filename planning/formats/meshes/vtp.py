@@ -181,9 +181,6 @@ class Encoding(NamedTuple):
 def array_values(element: ElementTree.Element, count: int, encoding: Encoding, where: str) -> NDArray[Any]:
     """The numbers of an array.
 
-    Args:
-        where: The file and the array, for the error.
-
     Returns:
         Shape (count,), of the array's own type.
 

@@ -86,7 +86,6 @@ class VolumeHeader(VolumeGrid):
     """One volume in one or two files as its header describes it.
 
     Attributes:
-        cells: How the voxels are stored.
         data_path: The file that holds them: the header's own, or one beside it.
         layers: How many values each voxel has, one for each layer of segments that overlap.
         notes: What a person should be told of how it was read, one sentence each.

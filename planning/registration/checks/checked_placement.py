@@ -219,7 +219,6 @@ class Apart:
     """Where markers and a stated transform differ most, over the error expected of the markers there.
 
     Attributes:
-        where: The target or a marker.
         expected_mm: The expected (rms) error of the markers there.
         contradicts: Whether some point differs by more than both errors explain, and by more than `MAX_APART_MM`.
     """

@@ -279,7 +279,6 @@ def _worse(fit: SkinFit, other: SkinFit, *, level: float) -> bool:
     """Whether the same markers scatter more in one list than in another beyond chance, by an F-test.
 
     Args:
-        other: Of the same markers, read in other axes.
         level: How often two lists of one scatter would seem so different.
     """
     freedom = len(fit.gaps_mm) - 1

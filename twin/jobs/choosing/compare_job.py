@@ -91,9 +91,7 @@ def compare_source(
     """Two plans, or two choices of a case: see the functions below.
 
     Args:
-        stated: What names choices, as `parse_two` takes it.
         arm: Whether the arm must reach a choice; None where the case says where its base is.
-        watcher: Is told how far the work is.
     """
     plans = two_plans(source, other, case, any(stated))
     if plans is None:

@@ -85,7 +85,6 @@ def pivot_case(case: Case, joints: Path) -> PivotRun:
     """Calibrate the tip from a list of touches of one place.
 
     Args:
-        case: For the arm and the declared errors.
         joints: CSV, a line a pose, with q1_deg to q6_deg alone or among other columns, as `pivot CASE` writes it.
 
     Raises:
@@ -206,7 +205,6 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
         context: Of a case with declared errors and an arm.
         poses: How many, 4 to 12.
         place_base: Shape (3,), mm, where; None for a place that is found.
-        seed: Of the motions and of the truth.
 
     Raises:
         InputError: The case declares no errors or has no arm, or so many poses are not planned.

@@ -62,7 +62,6 @@ class ScanRequest(NamedTuple):
     Attributes:
         marker: What stands at the markers' places.
         rehearsal: Its needle is shown in a control CT.
-        beside: What lies beside the patient.
     """
 
     settings: ScanSettings

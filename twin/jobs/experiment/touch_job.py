@@ -132,8 +132,6 @@ def touch_case(context: CaseContext, out: Path, choice: Choice, seed: int) -> To
 
     Args:
         context: Of a case with declared errors, markers and an arm.
-        choice: Of the puncture that the touches are for.
-        seed: Of the motions and of the truth.
 
     Raises:
         InputError: The case declares no errors, or has no markers.

@@ -272,7 +272,6 @@ def export_source(
 
     Args:
         source: A case, a plan or, for tables, a table or its folder.
-        watcher: Is told how far the work is.
 
     Raises:
         InputError: A source of which the format is not, or see the functions that write.

@@ -86,7 +86,6 @@ def compose(shot: RasterShot, shells: Shells) -> NDArray[np.uint8]:
     The "over" operator of Porter and Duff, Compositing Digital Images (SIGGRAPH 1984), from back to front.
 
     Args:
-        shot: The opaque part, in the sample grid.
         shells: Drawn where they lie before the opaque part.
     """
     height, width = shot.depth.shape

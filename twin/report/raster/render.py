@@ -169,7 +169,6 @@ class View:
 
     Args:
         camera: Its pixels are the samples.
-        seen: The layer's corners and their normals.
     """
 
     def __init__(self, layer: Layer, camera: ViewCamera, seen: Posed) -> None:

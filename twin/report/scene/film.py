@@ -113,7 +113,6 @@ def draw_film(
     Args:
         anatomy: Structures and skin, CT frame.
         path: The ``.mp4`` to write; it appears whole or not at all.
-        progress: Called with frames done and all frames.
 
     Returns:
         The file that was written.

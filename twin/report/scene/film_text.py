@@ -60,7 +60,6 @@ def write_mp4(ground: Pixels, frames: Iterable[Frame], path: Path, fps: int) -> 
 
     Args:
         ground: What every frame is put on; its height and width are multiples of 16, as H.264 likes them.
-        frames: Drawn while the encoder works on those before.
         path: The ``.mp4`` to write.
 
     Raises:

@@ -171,7 +171,6 @@ class SceneBody:
     """One thing of the scene.
 
     Attributes:
-        name: What the legend calls it.
         group: "organ", "skin", "safe", "needle", "arm", "room" or "target".
         mesh: CT frame, mm.
         alpha: 1 for opaque; less for see-through.
