@@ -36,8 +36,8 @@ from puncture_twin.planning.formats.labels.labelmaps import mask_surface
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.parts import voxels_inside
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.voxelize import voxels_inside
 
 SKIN_TOLERANCE_MM = 3.0
 """A skin from elsewhere (a label, a mesh) is off the CT's by so much, or by one voxel and a half: nearer to it what is

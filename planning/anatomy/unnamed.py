@@ -17,8 +17,7 @@ from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.base.arrays import Bools, grown, widened
 from puncture_twin.planning.formats.labels.labelmaps import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.parts import parts_of
-from puncture_twin.planning.geometry.voxelize import mark_inside
+from puncture_twin.planning.geometry.parts import mark_inside, parts_of
 
 GAS_HU = -300.0
 """Half way between fat (-100) and a voxel that is half gas, half tissue (-500)."""

@@ -30,8 +30,8 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.labelmaps import mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.geometry.parts import voxels_inside
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.voxelize import voxels_inside
 
 BEYOND_IMAGE = "beyond_image"
 """Its name among the structures."""

@@ -34,8 +34,7 @@ from puncture_twin.planning.formats.labels.label_sources import (
     refuse_one_name,
     structure_name,
 )
-from puncture_twin.planning.formats.labels.labelmaps import labelmap_of, whole_labels
-from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS
+from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, labelmap_of, whole_labels
 from puncture_twin.planning.formats.points import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume

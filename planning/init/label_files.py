@@ -30,8 +30,7 @@ from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.tables import StructuresSection
 from puncture_twin.planning.formats.folder import entries
 from puncture_twin.planning.formats.labels.label_sources import MAX_ENTRIES, structure_name
-from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
-from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
+from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, Box, LabelMap, parse_names
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES, names_for
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply

@@ -19,16 +19,17 @@ from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.init.case_text import CaseParts, case_text
 from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Ct, Found, Markers, Wanted, find
-from puncture_twin.planning.init.outlines import (
+from puncture_twin.planning.init.segmentation import (
     ALL_ROUND,
     Outlines,
+    Place,
+    Segmentation,
     SkinOf,
     bordering,
     carved_notes,
     skin_of,
     skin_problems,
 )
-from puncture_twin.planning.init.segmentation import Place, Segmentation
 from puncture_twin.planning.init.target import (
     Target,
     assign,

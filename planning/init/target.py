@@ -33,12 +33,11 @@ from puncture_twin.planning.formats.labels.naming import DEMANDING
 from puncture_twin.planning.formats.points import parse_triple
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.parts import voxels_inside
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.geometry.spaces import Space, point_text, to_lps
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
-from puncture_twin.planning.geometry.voxelize import voxels_inside
-from puncture_twin.planning.init.outlines import Outlines, named_like_body
-from puncture_twin.planning.init.segmentation import STATED, Assigned, Segmentation
+from puncture_twin.planning.init.segmentation import STATED, Assigned, Outlines, Segmentation, named_like_body
 
 LEAST_SHOWN = 0.3
 """Of a region's usual organs; with fewer the region is found by nothing."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from refusals import refused
 
-from puncture_twin.planning.formats.labels.name_tables import parse_names
+from puncture_twin.planning.formats.labels.labelmaps import parse_names
 
 NAMES = {1: "right lung", 7: "vein, portal"}
 

@@ -26,8 +26,7 @@ from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, 
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
 from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
-from puncture_twin.planning.geometry.parts import in_blocks
-from puncture_twin.planning.geometry.voxelize import voxels_inside
+from puncture_twin.planning.geometry.parts import in_blocks, voxels_inside
 
 SAMPLING_MM = 4.0
 """Spacing of the grid on which limbs are looked for."""

@@ -20,7 +20,7 @@ from typing import Generic, Protocol, TypeVar
 
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.text import check_name, did_you_mean, first_few
-from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
+from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, parse_names
 
 _ABDOMEN = "spleen kidney_right kidney_left gallbladder liver stomach"
 _LUNGS = "lung_upper_lobe_left lung_lower_lobe_left lung_upper_lobe_right lung_middle_lobe_right lung_lower_lobe_right"

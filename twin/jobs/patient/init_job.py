@@ -96,8 +96,8 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
         found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
     picture = None if context.anatomy.scan is None else folder / SLICES
     if picture is not None:
+        from puncture_twin.twin.report.slices.panel import Subject
         from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet  # with matplotlib
-        from puncture_twin.twin.report.slices.subject import Subject
 
         write_sheet(draw_slices(Subject(context.case, context.anatomy, None)), picture)
     return InitRun(path, replace(start, text=text), context, (*start.notes, *found), picture)
