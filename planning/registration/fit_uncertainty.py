@@ -3,8 +3,6 @@
 The declared noise of a case's markers, and how the arm stood, or may have stood, when it touched them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 What a wrong command line may say instead.
 """
 
-from __future__ import annotations
-
 import errno
 import sys
 import traceback

@@ -3,8 +3,6 @@
 Directions and mounts in the patient's words.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

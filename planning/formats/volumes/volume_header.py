@@ -3,8 +3,6 @@
 The stored voxels, from the bytes of its file: raw, gzipped or as text.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 import zlib
