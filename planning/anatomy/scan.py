@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
 from puncture_twin.planning.anatomy.body.limbs import LimbSearch, limb_search
-from puncture_twin.planning.anatomy.body.outside_body import (
-    BEYOND_LONG_MM,
-    OutsideImage,
-    outside_mask,
-    outside_surface,
-)
+from puncture_twin.planning.anatomy.body.outside_body import BEYOND_LONG_MM, OutsideImage, outside_mask, outside_surface
 from puncture_twin.planning.anatomy.body.tables import FACES, Face, TableSide, find_support
 from puncture_twin.planning.anatomy.skin import Skin, field_of_view
 from puncture_twin.planning.anatomy.surfaces import Imaged, cached_mesh, mesh_arrays

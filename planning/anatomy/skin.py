@@ -14,13 +14,7 @@ from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtI
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, WIDE, Box, FieldOfView, shifted, spacing_of
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.formats.labels.labelmaps import (
-    LabelMap,
-    box_in,
-    frame,
-    framed_surface,
-    mask_surface,
-)
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, box_in, frame, framed_surface, mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical
 from puncture_twin.planning.geometry.containment import settled_crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, smooth_normals, split_at_creases

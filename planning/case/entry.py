@@ -136,12 +136,7 @@ def direction(theta: Floats | float, beta: Floats | float, R_ct_entry: Floats) -
     return _directions(one, other, R_ct_entry)
 
 
-def grid(
-    theta: tuple[float, float],
-    beta: tuple[float, float],
-    step: float,
-    R_ct_entry: Floats,
-) -> Directions:
+def grid(theta: tuple[float, float], beta: tuple[float, float], step: float, R_ct_entry: Floats) -> Directions:
     """Every (θ, β) of a regular grid, θ outermost; β = 360° is left out where the range is the full circle.
 
     Args:

@@ -39,11 +39,7 @@ def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
     return {
         "name": "puncture",
         "is_diff": True,
-        "robot_state": {
-            "is_diff": True,
-            "joint_state": start,
-            "attached_collision_objects": carried,
-        },
+        "robot_state": {"is_diff": True, "joint_state": start, "attached_collision_objects": carried},
         "world": {"collision_objects": [_patient(anatomy, plan, frames), *solids]},
     }
 
@@ -108,11 +104,7 @@ def _goal(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
 
 def _point(time_s: float, q: Floats, speeds: Floats) -> dict[str, Any]:
     sec, nanosec = divmod(round(float(time_s) * NANOSECONDS), NANOSECONDS)
-    return {
-        "positions": q.tolist(),
-        "velocities": speeds.tolist(),
-        "time_from_start": {"sec": sec, "nanosec": nanosec},
-    }
+    return {"positions": q.tolist(), "velocities": speeds.tolist(), "time_from_start": {"sec": sec, "nanosec": nanosec}}
 
 
 def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:

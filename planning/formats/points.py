@@ -77,12 +77,7 @@ MOST_NAMED = 8
 """Points that a line about a list names."""
 
 
-def read_points(
-    path: Path,
-    *,
-    default_space: Space | None = None,
-    default_unit: Unit | None = None,
-) -> NamedPoints:
+def read_points(path: Path, *, default_space: Space | None = None, default_unit: Unit | None = None) -> NamedPoints:
     """The points of one file, in mm; in LPS where the file or the caller names a patient space.
 
     Args:
@@ -98,11 +93,7 @@ def read_points(
 
 
 def parse_points(
-    data: bytes,
-    path: Path,
-    *,
-    default_space: Space | None = None,
-    default_unit: Unit | None = None,
+    data: bytes, path: Path, *, default_space: Space | None = None, default_unit: Unit | None = None
 ) -> NamedPoints:
     """Parse a points file that has been read, like `read_points`; it is not opened again.
 

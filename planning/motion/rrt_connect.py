@@ -124,12 +124,7 @@ class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without
     """
 
     def __init__(
-        self,
-        information: ob.SpaceInformation,
-        contact_of: SegmentContact,
-        home: Floats,
-        goals: Floats,
-        limits: Limits,
+        self, information: ob.SpaceInformation, contact_of: SegmentContact, home: Floats, goals: Floats, limits: Limits
     ) -> None:
         super().__init__(information)  # and not kept: it keeps the validator, and no one would free the two
         self._contact_of, self._limits = contact_of, limits

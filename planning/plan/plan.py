@@ -105,10 +105,7 @@ def _facts(plan: Plan) -> Facts:
     yield "depth, skin to target", f"{np.linalg.norm(plan.entry_ct - plan.target_ct):.1f} mm"
     yield "standoff", f"{plan.standoff_mm:g} mm, tip to target"
     error = plan.expected_target_error_mm
-    yield (
-        "expected tip error",
-        f"{error:.2f} mm (rms)" if np.isfinite(error) else "unknown: no markers",
-    )
+    yield ("expected tip error", f"{error:.2f} mm (rms)" if np.isfinite(error) else "unknown: no markers")
     yield "robot", plan.model.name
     for name in ("approach", "insertion"):
         phase = getattr(plan, name)

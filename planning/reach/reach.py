@@ -78,11 +78,7 @@ CHUNK = 256
 
 
 def assess_reach_all(
-    checker: StateChecker,
-    requests: Sequence[ReachRequest],
-    progress: Count | None = None,
-    *,
-    n_rolls: int = ROLLS,
+    checker: StateChecker, requests: Sequence[ReachRequest], progress: Count | None = None, *, n_rolls: int = ROLLS
 ) -> list[ReachAnswer]:
     """Find, for each direction, a roll and a branch that reach the standoff pose and insert straight, untouched.
 

@@ -28,11 +28,7 @@ from puncture_twin.planning.uncertainty.hit import Proximity, touch_bound
 
 
 def with_chances(
-    case: Case,
-    anatomy: Anatomy,
-    candidates: Candidates,
-    model: ChanceModel | None,
-    axes: AxisDistances | None = None,
+    case: Case, anatomy: Anatomy, candidates: Candidates, model: ChanceModel | None, axes: AxisDistances | None = None
 ) -> Candidates:
     """Compute the chances of all candidates that are safe so far, and reject those beyond the case's limits.
 

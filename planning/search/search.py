@@ -64,11 +64,7 @@ def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, direc
 
 
 def organ_candidates(
-    case: Case,
-    anatomy: Anatomy,
-    engine: ClearanceEngine,
-    directions: Directions,
-    axes: AxisDistances | None = None,
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions, axes: AxisDistances | None = None
 ) -> Candidates:
     """Check every direction against skin and organs, needle bending and breathing included; without arm and ranks.
 

@@ -39,13 +39,7 @@ class SimulatedWorkcell:
 
 @contextmanager
 def open_workcell(
-    model: UrModel,
-    tool: Tool,
-    skin: TriangleMesh,
-    T_base_ct: Floats,
-    boxes: Sequence[Box] = (),
-    *,
-    down_ct: Floats,
+    model: UrModel, tool: Tool, skin: TriangleMesh, T_base_ct: Floats, boxes: Sequence[Box] = (), *, down_ct: Floats
 ) -> Iterator[SimulatedWorkcell]:
     """Build the workcell, yield it, and take it down.
 
@@ -86,12 +80,7 @@ CONTACT_DAMPING_NS_M = 100.0
 
 
 def load_surface(
-    client: int,
-    mesh: TriangleMesh,
-    T_world_mesh: Floats,
-    *,
-    solid: bool,
-    max_faces: int = MAX_PHYSICS_FACES,
+    client: int, mesh: TriangleMesh, T_world_mesh: Floats, *, solid: bool, max_faces: int = MAX_PHYSICS_FACES
 ) -> int:
     """A surface that does not move: triangle by triangle, hollows included.
 

@@ -337,11 +337,7 @@ def _entry(made_from: Mapping[str, Any], by: str) -> StoredFile:
 @cache
 def _generation(by: str) -> str:
     """Hash of all code that a module's results depend on; it takes milliseconds, so it is made once a process."""
-    parts = {
-        "source": source_stamp(by),
-        "python": platform.python_version(),
-        **library_versions(LIBRARIES),
-    }
+    parts = {"source": source_stamp(by), "python": platform.python_version(), **library_versions(LIBRARIES)}
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

@@ -141,12 +141,7 @@ def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[flo
         plain = tuple(float(one) for one in listed)
     if len(plain) != count or not all(map(math.isfinite, plain)):
         what = f"{name(keyword)} is missing" if found is None else f"{name(keyword)} is {str(found)[:100]}"
-        refuse(
-            what,
-            where,
-            f"{plural(count, 'finite number')}",
-            "missing_tag" if found is None else "bad_tag",
-        )
+        refuse(what, where, f"{plural(count, 'finite number')}", "missing_tag" if found is None else "bad_tag")
     return plain
 
 
@@ -214,9 +209,7 @@ ITEM, ITEM_END, SEQUENCE_END = 0xFFFEE000, 0xFFFEE00D, 0xFFFEE0DD
 PIXEL_DATA = 0x7FE00010
 LONG_FORM = frozenset((b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV"))
 """Value representations whose length has four bytes."""
-SHORT_FORM = frozenset(
-    b"AE AS AT CS DA DS DT FD FL IS LO LT PN SH SL SS ST TM UI UL US".split(),
-)
+SHORT_FORM = frozenset(b"AE AS AT CS DA DS DT FD FL IS LO LT PN SH SL SS ST TM UI UL US".split())
 MAX_DEPTH = 16
 """Sequences in sequences; structured reports go deeper, images and contours do not reach half of it."""
 MAX_ELEMENTS = 3_000_000

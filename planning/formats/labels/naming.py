@@ -77,10 +77,7 @@ V2: Mapping[int, str] = _numbered(
 """Version 2, task ``total``."""
 
 
-BUILT_IN: Mapping[str, Mapping[int, str]] = {
-    "totalsegmentator-v1": V1,
-    "totalsegmentator-v2": V2,
-}
+BUILT_IN: Mapping[str, Mapping[int, str]] = {"totalsegmentator-v1": V1, "totalsegmentator-v2": V2}
 OWN_NAMES = "seg.nrrd"
 """The naming that takes the names inside a .seg.nrrd."""
 REST = "*"

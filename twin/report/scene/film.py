@@ -100,14 +100,7 @@ def film_times(total_s: float) -> FilmTimes:
     return FilmTimes(tuple(float(m) for m in moments), float(speed), round(STILL_S * FRAMES_PER_SECOND))
 
 
-def draw_film(
-    rehearsal: Any,
-    plan: Any,
-    case: Any,
-    anatomy: Any,
-    path: Path,
-    progress: Count | None = None,
-) -> Path:
+def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path, progress: Count | None = None) -> Path:
     """Write the film; a GIF beside it when no H.264 encoder can be started.
 
     Args:
