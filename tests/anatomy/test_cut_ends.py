@@ -1,7 +1,5 @@
 """An image that was cut through the body and filled up with air: the face at which it was cut is no skin."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -682,10 +682,7 @@ DOUBT = "markers_ct with x and y negated, as LPS and RAS differ, would lie on th
 @pytest.mark.parametrize("name", FORMATS)
 def test_warnings_stand_whole_in_every_file(plan, name, tmp_path):
     """Their words, in comments; a plan without any says that there are none."""
-    said = {
-        (DOUBT, "a\nb"): "2 warnings when this was planned:",
-        (): "warnings when this was planned: none",
-    }
+    said = {(DOUBT, "a\nb"): "2 warnings when this was planned:", (): "warnings when this was planned: none"}
     bodies = []
     for number, (warnings, line) in enumerate(said.items()):
         path = export_plan(replace(plan, warnings=warnings), name, tmp_path / str(number), source=SOURCE).path

@@ -1,7 +1,5 @@
 """Tables of names as programs and people write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A mesh holds arrays that nobody writes to, copies what somebody might, and joins with others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

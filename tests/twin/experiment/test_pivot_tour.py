@@ -1,7 +1,5 @@
 """A pivot calibration executed in the twin: the tip is found back, with the error and residual that are declared."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from itertools import combinations

@@ -504,11 +504,7 @@ def test_frames_of_a_film_cut_off_are_not_counted(tmp_path, rng):
     ("bending", "breathing", "said"),
     [
         (None, None, "needle and tissue are rigid; nothing breathes; "),
-        (
-            "declared",
-            None,
-            "tissue pushes on the needle: its end is bent, the drawing is straight; nothing breathes; ",
-        ),
+        ("declared", None, "tissue pushes on the needle: its end is bent, the drawing is straight; nothing breathes; "),
         (None, "declared", "needle and tissue are rigid; the body is drawn still, as in the CT; "),
     ],
 )
