@@ -45,8 +45,7 @@ from puncture_twin.planning.batch.run_case import (
     CaseTask,
     Limits,
     WritePage,
-    commit_failure,
-    ended,
+    failed,
     run_case,
     run_tasks,
 )
@@ -442,17 +441,12 @@ def _dask_ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Gene
             if error is None:
                 yield future.result()
             elif isinstance(error, distributed.KilledWorker):
-                yield _killed(task)
+                yield failed(task, WORKER_DIED)  # it killed its workers
             else:
                 raise error
             future.release()
     finally:
         client.cancel(list(futures))
-
-
-def _killed(task: CaseTask) -> CaseEnd:
-    """The row of a case that killed its workers; or the result that was there before."""
-    return ended(task) or commit_failure(task, WORKER_DIED)
 
 
 def run_on_worker(task: CaseTask) -> CaseEnd:

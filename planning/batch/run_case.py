@@ -118,8 +118,11 @@ def ended(task: CaseTask) -> CaseEnd | None:
     return None if row is None else CaseEnd(task.planned.id, row["exit_code"], row["reason"])
 
 
-def commit_failure(task: CaseTask, reason: str) -> CaseEnd:
-    """Commit the row of a case that no worker survived, or that ran into a limit."""
+def failed(task: CaseTask, reason: str) -> CaseEnd:
+    """Commit the row of a case that no worker survived, or that ran into a limit, unless it had just ended."""
+    end = ended(task)
+    if end is not None:
+        return end
     draft = new_draft(task.work, task.planned.id)
     inputs = read_inputs(json.loads(task.planned.inputs))
     return _committed(task, draft, blank_row(task.planned, PROGRAM_FAILED, reason), inputs, {})
@@ -317,7 +320,7 @@ def run_tasks(tasks: Iterable[CaseTask], jobs: int, limits: Limits) -> Generator
                 if reason:
                     workers.remove(worker)
                     worker.end()
-                    yield _without_row(worker.task, reason)
+                    yield failed(worker.task, reason)
     finally:
         for worker in workers:
             worker.end()
@@ -374,18 +377,10 @@ def _heard(worker: _Worker, workers: list[_Worker], queue: TaskQueue) -> Iterato
 
 def _died(task: CaseTask, queue: TaskQueue) -> Iterator[CaseEnd]:
     """Requeue the case of a dead worker, or write its row; a result from before the death counts."""
-    end = ended(task)
-    if end is not None:
-        yield end
-    elif task.attempt < TRIES:
+    if task.attempt < TRIES and ended(task) is None:
         queue.again(replace(task, attempt=task.attempt + 1))
     else:
-        yield commit_failure(task, WORKER_DIED)
-
-
-def _without_row(task: CaseTask, reason: str) -> CaseEnd:
-    """The row of a stopped case, unless it had just ended."""
-    return ended(task) or commit_failure(task, reason)
+        yield failed(task, WORKER_DIED)
 
 
 def _beyond(worker: _Worker, limits: Limits) -> str:
