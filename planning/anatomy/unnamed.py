@@ -58,7 +58,7 @@ def unnamed_surfaces(
     """Find dense components and gas inside the body outside of all structures grown by one voxel.
 
     Args:
-        body: Its body, shape (nx, ny, nz).
+        body: The CT's body, shape (nx, ny, nz).
         dense_hu: From here on a voxel is dense.
         slack_mm: So deep below the body's surface there may still be the ambient air, because the surface is from
             elsewhere and was widened.

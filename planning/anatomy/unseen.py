@@ -251,7 +251,7 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure], memor
     face has its edges cut off by so much there.
 
     Args:
-        skin: Its skin; where it is open, a map that ends is refused.
+        skin: The case's skin; where it is open, a map that ends is refused.
 
     Raises:
         InputError: A map that does not hold the target, or one that ends in a body whose skin is open.

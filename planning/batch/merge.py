@@ -180,7 +180,7 @@ class CaseChange(NamedTuple):
     """One case in two cohorts.
 
     Attributes:
-        before: Its row in the first; None where it is not there.
+        before: The case's row in the first; None where it is not there.
         after: The second cohort's row of the case.
     """
 

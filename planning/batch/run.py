@@ -135,7 +135,7 @@ class RunCounts:
     """Counts of one run.
 
     Attributes:
-        same: Of them the same as others, to the byte: they are run once.
+        same: Planned cases that are others to the byte: they are run once.
         before: Others that had their rows.
         refused_before: Of these, cases whose inputs were refused.
         ended: Exit code of a row to how many rows.
@@ -314,7 +314,7 @@ class CohortState:
     Attributes:
         safe: Done, with a safe direction.
         reasons: Failed, by reason: refused inputs, and failures of the program.
-        stale: Their inputs have changed since the plan: `batch plan` again.
+        stale: Cases whose inputs have changed since the plan: `batch plan` again.
     """
 
     planned: int = 0

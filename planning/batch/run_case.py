@@ -78,7 +78,7 @@ class CaseEnd(NamedTuple):
     """How a case ended.
 
     Attributes:
-        exit_code: Of its row; None where there is no row.
+        exit_code: Of the case's row; None where there is no row.
         reason: Of its row; or why there is none: its files are not those of the plan.
         full: What the system said of a disk that takes no more, or "".
     """

@@ -199,7 +199,7 @@ def measure_structure(
 
     Args:
         target: Shape (3,), mm: where every axis starts.
-        placed: The same structure, placed about the target.
+        placed: The structure of the blocks, placed about the target.
         lengths: Shape (n,), of the axes in the caller's order, mm.
         answer: Arrays of shape (n,) in the caller's order; the rows that ``bundles`` holds are filled.
         counts: Shape (7,), added to: see `surface_search.COUNTED`.

@@ -264,7 +264,7 @@ def mesh_folder(
     """The meshes of a folder, in the unit that their extent tells.
 
     Args:
-        stated: Their unit where the user says it, or None.
+        stated: Unit of the coordinates where the user says it, or None.
         up: Their axis that is up where the user says it; of GLB it must.
 
     Raises:

@@ -73,7 +73,7 @@ def deflection_bound(shaft: Shaft, alpha: float, tissues: Iterable[Tissue], long
     """The bound of a needle in a case's tissues.
 
     Args:
-        alpha: Of its bevel, rad.
+        alpha: Of the needle's bevel, rad.
     """
     stiffest = max((tissue.stiffness_n_mm2 for tissue in tissues), default=0.0)
     step = step_for(shaft, stiffest)

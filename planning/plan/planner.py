@@ -47,7 +47,7 @@ def make_plan(
     """Plan to the best candidate of a choice for which an approach is found.
 
     Args:
-        candidates: Its search result, which a choice by angles or by entry does not need; None searches.
+        candidates: The case's search result, which a choice by angles or by entry does not need; None searches.
         seed: Of the approach's planner; None takes the case's.
 
     Raises:

@@ -79,7 +79,7 @@ class ScannedEntry(NamedTuple):
 
     Attributes:
         slice: Its slice, 1 at the feet; 0 or beyond ``slices`` outside of the image.
-        table_mm: Its z, as DICOM has it: a console's slice location or, with its own sign, table position.
+        table_mm: The slice's z, as DICOM has it: a console's slice location or, with its own sign, table position.
         sagittal_mm: From the sagittal laser's line, positive to the patient's left, if x = 0 is the isocentre.
         coronal_mm: From the coronal laser's line, positive toward the back, if y = 0 is the isocentre.
     """

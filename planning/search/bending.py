@@ -141,7 +141,7 @@ def path_layers(
     A surface is a capsule where it is entered. That of the rest is the skin: coming out of an organ there is none.
 
     Args:
-        anatomy: Its structures; only closed ones have an inside.
+        anatomy: The case's structures; only closed ones have an inside.
         target_ct: Shape (3,), mm.
         outward_ct: Shape (3,), unit.
         path_length: Target to skin, mm.

@@ -70,7 +70,7 @@ def organ_candidates(
 
     Args:
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        axes: Their `organ_distances`; None measures them here.
+        axes: `organ_distances` of the directions; None measures them here.
     """
     needle, outward, checked = case.needle, directions.outward_ct, anatomy.checked
     paths = case_paths(case, anatomy.skin, outward)  # where each path crosses the skin, and at which angle

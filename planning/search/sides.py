@@ -39,7 +39,7 @@ class Side(NamedTuple):
     """The open directions nearest to one axis of the body, seen from the target.
 
     Attributes:
-        open: Of its solid angle, the fraction from where a needle can come, whatever organs are in its path.
+        open: Fraction of its solid angle from where a needle can come, whatever organs are in its path.
         searched: The fraction that the case's grid holds.
         nearest_mm: The shortest path to its skin; NaN where none is known.
         why: What closes most of it; "" where it is open.

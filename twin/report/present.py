@@ -66,7 +66,7 @@ class Field(NamedTuple):
     """One fact of a row.
 
     Attributes:
-        value: Its key, with dots for keys within (of which each may be missing or None), or what finds it in a row.
+        value: A key, with dots for keys within (of which each may be missing or None), or what finds it in a row.
         digits: Of a number; None shows the value as it is.
     """
 

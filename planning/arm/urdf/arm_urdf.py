@@ -115,7 +115,7 @@ class ArmUrdf:
 
     Attributes:
         text: The file's bytes.
-        chain: Its six joints and seven bodies.
+        chain: The document's six joints and seven bodies.
         lengths_mm: d1, a2, a3, d4, d5, d6.
         T_base_root: Shape (4, 4), mm: the URDF's root in the controller's base frame.
         shapes: Of each of the seven bodies, in its own frame.

@@ -189,7 +189,7 @@ def left_of(scene, movers, segment, part, span, into, scratch, answered, answer)
     robots in complex environments".
 
     Args:
-        part: Its middle and half its width, fractions of the segment.
+        part: The part's middle and half its width, fractions of the segment.
         span: Which list of ``scratch.lists`` holds the checks to clear, and its first and last (excluded) index.
         into: Index in the other list at which the checks that are left are written.
 

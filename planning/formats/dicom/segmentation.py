@@ -81,7 +81,7 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
     """The segments of a DICOM SEG, each by its label.
 
     Args:
-        file: Its key in ``content``.
+        file: The file's key in ``content``.
         content: Gives its bytes.
         ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
 

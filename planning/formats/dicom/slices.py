@@ -50,7 +50,7 @@ class PixelLayout:
     """Storage of an image's values.
 
     Attributes:
-        stored: Of them, the bits of a value: the lowest.
+        stored: Bits of a value: the lowest of those allocated.
         signed: Whether values are two's complements.
         padding: Stored values, lowest and highest, that were not measured; None where the header names none.
     """

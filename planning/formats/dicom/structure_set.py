@@ -76,7 +76,7 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     the pixels along it. Both are noted.
 
     Args:
-        file: Its key in ``content``.
+        file: The file's key in ``content``.
         content: Gives its bytes.
 
     Raises:

@@ -88,8 +88,8 @@ class PhysicalRun:
 
     Attributes:
         tip_error_mm: The needle's tip from the true target; NaN where a touch or the puncture stopped.
-        seconds_per_touch: Of the tour, home to home, likewise.
-        off_path_mm: Of the tip from its commanded path, at most while it went in, likewise.
+        seconds_per_touch: Of the tour, home to home; NaN likewise.
+        off_path_mm: Of the tip from its commanded path, at most while it went in; NaN likewise.
         refused: Why it stopped; empty where it did not.
     """
 

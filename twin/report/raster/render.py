@@ -168,7 +168,7 @@ class View:
     """A layer as a camera has it before it: corners in the camera's frame, and where each triangle lies.
 
     Args:
-        camera: Its pixels are the samples.
+        camera: The samples are its pixels.
     """
 
     def __init__(self, layer: Layer, camera: ViewCamera, seen: Posed) -> None:
@@ -250,7 +250,7 @@ def shells_of(layer: Layer, camera: ViewCamera) -> Shells:
 
     Args:
         layer: The surfaces, CT frame.
-        camera: Its pixels are the samples.
+        camera: The samples are its pixels.
     """
     view = View(layer, camera, posed(layer, camera))
     depth = np.full((camera.height, camera.width), np.inf, dtype=np.float32)

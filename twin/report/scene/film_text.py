@@ -247,7 +247,7 @@ class FrameWords:
         """The numbers below the views.
 
         Args:
-            moment: Its time, s.
+            moment: Time of the record, s.
         """
         image = self._below.copy()
         _strip(ImageDraw.Draw(image), self._source, row, moment)

@@ -174,7 +174,7 @@ def _cut(vertices, faces, normal, offset):
     Args:
         vertices: Shape (v, 3), mm, read-only.
         faces: Shape (m, 3), read-only.
-        offset: Of its points along the normal, mm.
+        offset: Of the plane's points along the normal, mm.
     """
     height = np.empty(len(vertices))
     for v in range(len(vertices)):

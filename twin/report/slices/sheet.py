@@ -40,7 +40,7 @@ class Slices:
     """The drawn slices of one direction.
 
     Attributes:
-        panels: Its four slices; three of an image alone.
+        panels: Four slices; three of an image alone.
         units: Hounsfield units along the needle; None without a CT or an entry.
     """
 
