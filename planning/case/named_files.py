@@ -269,16 +269,12 @@ def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tupl
     Raises:
         InputError: A list whose last line does not end.
     """
-    for name in _line_files(files):
+    for name in dict.fromkeys(one.path for one in files.inputs if one.path.lower().endswith(LINE_FILES)):
         for said in unfinished_warnings(files.content(name), name):
             refuse(said, path, "files in which every line ends with a line break", "file_cut")
     if content.end is None:
         return (TOP_COUNT_NOTE,)
     return () if ends_with_end(files.content(path.name).decode("utf-8")) else (NOT_LAST_NOTE,)
-
-
-def _line_files(files: InputFiles) -> list[str]:
-    return list(dict.fromkeys(one.path for one in files.inputs if one.path.lower().endswith(LINE_FILES)))
 
 
 def ends_with_end(text: str) -> bool:

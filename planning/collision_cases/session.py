@@ -85,11 +85,6 @@ def write_changes(config: pytest.Config) -> bool:
     return whole
 
 
-def rewritten_lines(config: pytest.Config) -> list[str]:
-    """Lines on the rewritten numbers, one a number."""
-    return session_of(config).lines
-
-
 ARM_PROPERTY = "arm"
 """Name of a property of a test's report: it comes back from other processes too, and into JUnit's file."""
 

@@ -207,7 +207,7 @@ class JointSpace:
         space = ob.RealVectorStateSpace(6)
         space.setBounds(box)
         self.information = ob.SpaceInformation(space)
-        self.information.setStateValidityChecker(_everything)  # a segment is checked with its end
+        self.information.setStateValidityChecker(lambda _: True)  # a segment is checked with its end
 
     def set_up(self, validator: ob.MotionValidator) -> None:
         """Have segments checked by a validator."""
@@ -226,10 +226,6 @@ def angles_of(state: ob.State, wrist_divisor: float = WRIST_DIVISOR) -> Angles:
     """The angles of a state, rad. Beyond six coordinates OMPL reads garbage."""
     wrist = wrist_divisor * state[3], wrist_divisor * state[4], wrist_divisor * state[5]
     return state[0], state[1], state[2], *wrist
-
-
-def _everything(state: ob.State) -> bool:
-    return True
 
 
 @contextmanager

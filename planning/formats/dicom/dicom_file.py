@@ -20,7 +20,6 @@ from pydicom.datadict import dictionary_VR, tag_for_keyword
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.filereader import read_dataset
 from pydicom.multival import MultiValue
-from pydicom.tag import BaseTag
 from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError, refuse
@@ -75,13 +74,9 @@ def parse_dicom(content: bytes, path: Path) -> Dataset:
 def read_meta(stream: BinaryIO) -> FileMetaDataset:
     """The meta information of a DICOM file, whose data set begins where the stream then is; its syntax may be empty."""
     stream.seek(META_START)
-    meta = FileMetaDataset(read_dataset(stream, False, True, stop_when=_behind_meta))
+    meta = FileMetaDataset(read_dataset(stream, False, True, stop_when=lambda tag, *_: tag.group != 2))
     meta.TransferSyntaxUID = UID(str(meta.get("TransferSyntaxUID", "")).strip(" \0"))
     return meta
-
-
-def _behind_meta(tag: BaseTag, vr: str | None, length: int) -> bool:
-    return tag.group != 2
 
 
 def _body(data: memoryview, syntax: UID, path: Path) -> memoryview:

@@ -232,7 +232,8 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     found = []
     for frame, groups in enumerate(frame_groups(data, frames, where=file)):
         label = f"{file}, frame {frame + 1}"
-        kinds = [part.upper() for one in groups.find("CTImageFrameTypeSequence", label) for part in _types(one, label)]
+        frame_types = groups.find("CTImageFrameTypeSequence", label)
+        kinds = [part.upper() for one in frame_types for part in texts(one, "FrameType", where=label)]
         if not set(kinds) & NO_SLICES:
             found.append(_slice(file, frame, label, groups))
     return found
@@ -320,10 +321,6 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
         what = f"rescaling by {slope:g} and {intercept:g}"
         refuse(what, label, "a slope other than 0, both within a million", "out_of_range")
     return Slice(file, frame, label, plane_of(groups, label), slope, intercept)
-
-
-def _types(item: Dataset, label: str) -> tuple[str, ...]:
-    return texts(item, "FrameType", where=label)
 
 
 AXES_TOLERANCE = 1e-3

@@ -45,8 +45,8 @@ from puncture_twin.planning.batch.run import (
     Part,
     Request,
     RunCounts,
-    RunTasks,
     estimate,
+    on_scheduler,
     parse_part,
     run_cohort,
     slurm_part,
@@ -147,7 +147,8 @@ def run_part(out: Path, where: Where, watcher: Watcher) -> RunCounts:
     part = _part(where.part, watcher)
     write_page = write_case_page if where.pages else None
     request = Request(part, where.jobs, where.limits, write_page)
-    return run_cohort(out, request, watcher, _elsewhere(where.scheduler))
+    elsewhere = None if where.scheduler is None else on_scheduler(where.scheduler)
+    return run_cohort(out, request, watcher, elsewhere)
 
 
 def _part(typed: str | None, watcher: Watcher) -> Part:
@@ -159,14 +160,6 @@ def _part(typed: str | None, watcher: Watcher) -> Part:
         return WHOLE
     watcher.note(f"part {part.text}, from SLURM's array ({TASK}={os.environ[TASK]}); --part i/n overrides it")
     return part
-
-
-def _elsewhere(scheduler: str | None) -> RunTasks | None:
-    if scheduler is None:
-        return None
-    from puncture_twin.planning.batch.run import on_scheduler
-
-    return on_scheduler(scheduler)
 
 
 def write_case_page(context: CaseContext, candidates: Candidates, folder: Path) -> None:
