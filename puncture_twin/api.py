@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     from puncture_twin.twin.jobs.batch.jobs import Merged
     from puncture_twin.twin.jobs.choosing.compare_job import Comparison
     from puncture_twin.twin.jobs.experiment.touch_job import TouchRun
-    from puncture_twin.twin.jobs.patient.candidates_export import ExportedTable
-    from puncture_twin.twin.jobs.patient.export_jobs import SlicerExport
+    from puncture_twin.twin.jobs.patient.export_jobs import ExportedTable, SlicerExport
     from puncture_twin.twin.rehearsal.result import Rehearsal
 
     Points = NamedPoints | Mapping[str, ArrayLike]
@@ -661,8 +660,7 @@ def _own_plan(context: CaseContext, plan: Plan, where: str) -> Plan:
     Raises:
         InputError: It does not; see `read_plan`.
     """
-    from puncture_twin.planning.plan.plan_check import with_case_arm
-    from puncture_twin.planning.plan.recheck import check_plan
+    from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
 
     check_plan(plan, context, Path(where))
     return with_case_arm(plan, context.case)

@@ -189,9 +189,7 @@ def structure_set(regions, frame=FRAME):
         made = []
         for one in listed:
             kind, points = one if isinstance(one, tuple) else ("CLOSED_PLANAR", one)
-            made.append(
-                item(ContourGeometricType=kind, NumberOfContourPoints=len(points), ContourData=ds(points)),
-            )
+            made.append(item(ContourGeometricType=kind, NumberOfContourPoints=len(points), ContourData=ds(points)))
         if made:
             drawn.ContourSequence = Sequence(made)
         contours.append(drawn)

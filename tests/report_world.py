@@ -18,7 +18,7 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
 from puncture_twin.twin.report.page.page import Shown, write_page
-from puncture_twin.twin.report.slices.subject import Subject
+from puncture_twin.twin.report.slices.panel import Subject
 
 TARGET = np.array([10.0, -20.0, 30.0])
 SKIN_RADIUS = 100.0

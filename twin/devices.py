@@ -4,8 +4,6 @@
 here holds a true pose or an error that was drawn: the simulated plant answers like this, and so can real devices.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -39,7 +37,6 @@ class Cameras(Protocol):
         Args:
             number: Of the camera, from 0.
             about_px: Shape (2,), a pixel; the image shows at least what is within reach of it.
-            reach_px: How far.
         """
 
 

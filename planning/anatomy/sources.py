@@ -1,7 +1,5 @@
 """Reads what a case's structures come from: meshes, label maps, folders of masks, the CT."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
@@ -128,7 +126,6 @@ class StructureSources:
         """The body's surface, from whatever the case names.
 
         Args:
-            section: Of the skin.
             structures: What lies in the body, as far as it was read: where it is cut, the body is too.
         """
         self._progress(section.name)

@@ -3,8 +3,6 @@
 The grids on which a case's labels lie: of each label map, and one of each folder or DICOM file of masks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -32,7 +30,6 @@ class Structure:
     """A named surface with a role.
 
     Attributes:
-        name: Unique in the case.
         role: What it means to the needle.
         margin_mm: The clearance that it demands, where its role demands one.
         mesh: In the CT frame, mm.
@@ -67,8 +64,6 @@ class LabelGrid:
 
     Attributes:
         name: The file or folder, as the case writes it.
-        files: The map, or the masks.
-        voxels: Where they lie.
     """
 
     name: str

@@ -4,8 +4,6 @@ Source: the collision shapes of the URDF behind an arm's model: the user's own, 
 ships under its name (``meshes/ur/LICENSE`` says whence).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -144,7 +142,6 @@ def convex_pieces(mesh: TriangleMesh, count: int) -> tuple[TriangleMesh, ...]:
     """The hulls of the surface's parts in equal slabs across the longest side. Their union contains the surface.
 
     Args:
-        mesh: The surface.
         count: Slabs; one hull of all is made where a slab's part of the surface is flat.
 
     Returns:

@@ -4,8 +4,6 @@ Source of the Denavit-Hartenberg numbers: Universal Robots, "DH parameters for c
 dynamics"; joint ranges and speeds: the data sheets. An old manual prints d1 = 118 mm for the UR3: wrong.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Mapping
@@ -52,7 +50,6 @@ class UrModel:
         max_speeds: Shape (6,), rad/s.
         max_torques: Shape (6,), N m: what each joint's motor can give.
         max_acceleration: rad/s^2, for every joint.
-        joint_names: As ROS has them.
         shipped: Whether its shapes are those that ship under its name.
         urdf: Its own URDF, if it has one; an arm that neither ships nor has one is known by its numbers alone.
     """

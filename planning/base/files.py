@@ -3,8 +3,6 @@
 The bytes of an input file: it must be there, be a file, have a plausible size, and end a list with a whole line.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import tempfile
@@ -137,10 +135,7 @@ def read_input(path: Path, *, max_bytes: int, where: str, allowed: str = "") -> 
     """Read all bytes of a file.
 
     Args:
-        path: The file.
         max_bytes: A larger one is refused before it is read.
-        where: How the error names it.
-        allowed: What is wanted there; empty for any file.
 
     Raises:
         InputError: If it is missing, no regular file, empty, too large, or not readable.
@@ -188,12 +183,7 @@ def _other_case(path: Path) -> str:
 
 
 def unfinished_warnings(content: bytes, name: str) -> tuple[str, ...]:
-    """What to say of a list whose last line does not end with a line break; spaces after it are no line.
-
-    Args:
-        content: The whole file.
-        name: What the warning calls it.
-    """
+    """What to say of a list whose last line does not end with a line break; spaces after it are no line."""
     if content.rstrip(b" \t").endswith((b"\n", b"\r")):
         return ()
     return (f"{name}: its last line has no line break at its end; was the file cut?",)

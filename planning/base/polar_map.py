@@ -5,8 +5,6 @@ bin takes the verdict that comes last in the legend's order among the cells that
 best to the most cautious never shows more as safe than is safe.
 """
 
-from __future__ import annotations
-
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -99,8 +97,6 @@ def polar_map(cells: Sectors, legend: Sequence[Entry], bin_rad: float = FINEST) 
     """The map with its legend; empty without cells.
 
     Args:
-        cells: What is mapped.
-        legend: From the best to the most cautious.
         bin_rad: Wanted size of a bin; it is made no smaller than `FINEST`.
     """
     rim = float(cells.theta.max(initial=0.0))

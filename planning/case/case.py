@@ -28,7 +28,6 @@ from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direct
 from puncture_twin.planning.case.errors import ErrorModel, errors_of
 from puncture_twin.planning.case.named_files import MASK_ROLE, CaseVolumes, read_named_files, robot_warnings
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
-from puncture_twin.planning.case.sections import bending_of, breathing_of, robot_of
 from puncture_twin.planning.case.settings import (
     Axis,
     CtSettings,
@@ -38,9 +37,12 @@ from puncture_twin.planning.case.settings import (
     RobotSettings,
     SearchSettings,
     axes_frame,
+    bending_of,
+    breathing_of,
     ct_of,
     gantry_of,
     obstacle_of,
+    robot_of,
     search_of,
 )
 from puncture_twin.planning.case.tables import (
@@ -188,7 +190,6 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
     """Read and validate a case file, or a folder that holds ``case.toml``.
 
     Args:
-        path: The file or the folder.
         options: What is stated in place of what the file states; they are an input of their own.
 
     Raises:
@@ -255,12 +256,6 @@ def case_of(
 
 def _target_of(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Floats:
     """The point to reach, shape (3,), LPS (or the case's local frame) mm, read-only.
-
-    Args:
-        content: The case file.
-        path: Where it is, for errors.
-        space: The case's.
-        files: What it names, read.
 
     Raises:
         InputError: A list of points that cannot be read, or that lacks the target's name.

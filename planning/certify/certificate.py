@@ -1,7 +1,5 @@
 """A certified map of a cap of directions: the value, its versioned file, and the safe cone that it gives candidates."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -84,7 +82,6 @@ class Certificate(Shown):
     """A certified map: directions proven safe, proven rejected, and cells too small to decide.
 
     Attributes:
-        question: What it answers.
         size: No undecided cell has a larger angular diameter, rad.
         tree: Level by level, a letter for each cell of the level: a split, or a leaf's verdict. The parts of a level's
             split cells, in order, are the next level.

@@ -1,7 +1,5 @@
 """The skin over a cone of directions, in plain numpy, for the checker: the lemmas of docs/concepts/certificate.md."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass
 
@@ -55,8 +53,6 @@ class PlainSkin:
             u: Shape (3,), unit.
             rho: Less than π/2.
             ray: Shape (3,), a direction inside the cell.
-            length: Needle, tip to flange.
-            longest: The longest path.
         """
         rho = rho + CONE_PAD_RAD
         near, far = _depths(self.corners[rows], u, rho)

@@ -3,8 +3,6 @@
 docs/concepts/certificate.md derives each bound; `puncture_twin.planning.certify.checker` has the lemmas in plain form.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,8 +57,6 @@ def skin_bounds(
     """Bound the skin's crossings over cones.
 
     Args:
-        skin: From the target.
-        lists: Of the n cells.
         centres: Shape (n, 3), unit.
         radius: Shape (n,), less than π/2.
         test_rays: Shape (n, 3), a ray inside each cell.

@@ -3,8 +3,6 @@
 Obstacles and gantry are boxes for the arm and solids for the needle, which is checked against them also without an arm.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -174,9 +172,6 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
 
     The skin alone is tested against it. What the CT shows outside of the skin is not: a bed goes through the bore, and
     beyond the image its surface goes on by assumption.
-
-    Raises:
-        InputError: Its wall cuts the patient.
     """
     deep = 0.0 if case.gantry is None else gantry_in_patient_mm(case.gantry, skin)
     if deep > 0.0:
@@ -206,7 +201,6 @@ def surroundings(case: Case, T_base_ct: Floats | None) -> tuple[Structure, ...]:
     """Obstacles and gantry as structures of role ``avoid`` without a margin, CT frame.
 
     Args:
-        case: The case.
         T_base_ct: Shape (4, 4); None where nothing says where the arm is: obstacles of the frame ``base`` are then
             nowhere, and are left out.
     """

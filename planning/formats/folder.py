@@ -4,8 +4,6 @@ An organ may lie in a format that nobody reads, behind a link to a file that is 
 end or in a folder of its own. A reader that looks for what it knows passes it over, and it counts as free.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable, Collection
@@ -61,7 +59,6 @@ class Entry(NamedTuple):
     """One entry of a folder.
 
     Attributes:
-        name: In the folder.
         what: `FILE`, `FOLDER`, `HIDDEN` (either, by its name), or why it is neither.
     """
 
@@ -106,10 +103,7 @@ def unaccounted(folder: Path, found: tuple[Entry, ...], known: Callable[[Path], 
     A folder in it is accounted for if it is passed over, or if all that it holds is accounted for.
 
     Args:
-        folder: Where they lie.
-        found: What lies there.
         known: Whether a path is read, by whoever asks or by someone else.
-        depth: How many folders have been entered.
     """
     names = {one.name for one in found}
     return [

@@ -1,7 +1,5 @@
 """What a person states where `init` would guess or refuse: one option each, so that a refusal can name a way out."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib
@@ -106,8 +104,6 @@ def with_keys(text: str, keys: Mapping[str, str], reasons: Mapping[str, str] = R
 
     Args:
         text: Of the case; every table but ``[end]`` may be missing.
-        keys: As `Overrides.keys`.
-        reasons: What stands beside some of them.
     """
     for key, value in keys.items():
         table, _, name = key.rpartition(".")

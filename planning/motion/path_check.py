@@ -1,7 +1,5 @@
 """Checks of a finished joint path: dense states, the first contact, and the least clearance."""
 
-from __future__ import annotations
-
 from heapq import heappop, heappush
 
 import numpy as np
@@ -44,7 +42,6 @@ def dense_states(checker: StateChecker, waypoints: Floats, step_rad: float) -> F
     """States along a path, so close that neither joint distance nor any body's motion exceeds its bound.
 
     Args:
-        checker: Knows the bodies.
         waypoints: Shape (k, 6), rad.
         step_rad: Largest joint distance between two states; ``MAX_SWEEP_MM`` bounds the bodies.
 
@@ -82,7 +79,6 @@ def least_clearance(checker: StateChecker, q_path: Floats) -> Distances:
     """The least of each distance over states along a path, to ``CLEARANCE_STEP_MM``.
 
     Args:
-        checker: Measures distances.
         q_path: Shape (m, 6), rad.
     """
     path = _Path(checker, np.asarray(q_path, dtype=np.float64))

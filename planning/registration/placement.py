@@ -18,8 +18,6 @@ best for the one insertion whose J_f was taken, and honest for all others.
 What would make a registration better: which marker to leave out, and where one more would help most.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -183,11 +181,9 @@ def aimed_uncertainty(
     """The uncertainty of a joint fit whose pose was corrected.
 
     Args:
-        fit: Of the joint fit.
         points_ct: Shape (N, 3), mm, its markers.
         T_base_ct: Shape (4, 4), the corrected pose.
         target_base: Shape (3,), mm, where the pose was turned about.
-        aim: What it was corrected for.
     """
     A = design(apply(T_base_ct, points_ct), fit.center_base)
     M = np.eye(len(A)) - A @ fit.fit_map
@@ -206,7 +202,6 @@ class WithoutMarker:
     """A registration without one of its markers.
 
     Attributes:
-        name: The one left out.
         rms_mm: Expected error at the target by the readings of the others, scaled as the registration's is.
         probability: Of residuals as large as those of the others, if the declaration holds; NaN where three are left
             and two are not enough.

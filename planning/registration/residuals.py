@@ -6,8 +6,6 @@ nu s^2 = 3 sum |r_i|^2 / fle^2, distributed as chi-squared with nu = 3 N - 6 deg
 How well a set of markers determines a registration at a point: expected error, and the three flags of a weak set.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
@@ -183,9 +181,7 @@ class OutlierMarker(NamedTuple):
     """A marker that does not fit the others.
 
     Attributes:
-        name: Its name.
         miss_mm: How far off its reading the others place it.
-        others: How many they are.
         others_fre_mm: How well they fit each other, root mean square.
     """
 
@@ -228,7 +224,6 @@ def outlier_marker(
 
     Args:
         fit: Makes T_base_ct of two sets of points by least squares.
-        names: Of the markers.
         points_ct: Shape (n, 3), mm.
         points_base: Shape (n, 3), the same as they were touched.
         fle_mm: Their noise (rms length, both sides together) where it is declared: no less is taken.

@@ -3,8 +3,6 @@
 `first_broken` checks skin and organs of all candidates at once, `with_reach` the arm for those that they leave.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import repeat
@@ -47,10 +45,6 @@ def first_broken(
     last: some matter only to a tip that waits at its standoff, so only on paths that satisfy the others.
 
     Args:
-        paths: The skin along the n paths.
-        clearances: To the k structures.
-        structures: The k structures.
-        needle: For the longest path.
         max_skin_angle: rad.
     """
     count = len(paths.path_length)

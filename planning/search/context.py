@@ -5,8 +5,6 @@ checks and explains single directions, and gives errors and provenance. A search
 (`alternatives`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -243,8 +241,6 @@ def prepare(
     Args:
         case: A case, its file, or the folder that holds ``case.toml``.
         arm: Whether the arm is checked too; None checks it where the case says where its base is.
-        engine: Who measures clearance.
-        watcher: Shows progress.
         memory: What this process keeps from one case to the next; the answer is the same.
 
     Raises:

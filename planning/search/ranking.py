@@ -3,8 +3,6 @@
 One of the terms is the safe cone: by how much a direction may be off and still be safe, as far as the grid shows.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -76,7 +74,6 @@ def ranked_by(candidates: Candidates, cost: Floats) -> Candidates:
     """The safe candidates ranked by a cost of the caller's, smaller is better; equal costs keep their order.
 
     Args:
-        candidates: Candidates.
         cost: Shape (n,); rejected candidates' entries are not looked at.
 
     Raises:
@@ -185,7 +182,6 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
     certificate excludes that.
 
     Args:
-        grid: The directions.
         safe: Shape (n,), row by row.
     """
     theta, beta = np.repeat(grid.theta, len(grid.beta)), np.tile(grid.beta, len(grid.theta))

@@ -4,8 +4,6 @@ An error's variance enters every covariance linearly: a source of f times its de
 The registration's weights stay as they are: with better ones the errors could be a little larger.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -93,13 +91,11 @@ class UncertaintyBreakdown:
     """Chances, error budget and unmet limits of one candidate.
 
     Attributes:
-        p_hit: Chance to hit.
         p_touch: Structure to chance to touch it.
         p_touch_any: Of any, min(1, sum).
         budget: The tip's expected error and its sources.
         declaration: Whether the markers' residuals agree with the declared errors, in one sentence.
         goals: Limits that are not satisfied: the case's, or `WISHED_HIT` where it demands no chance to hit.
-        not_modelled: What these chances leave out.
     """
 
     p_hit: float
@@ -184,7 +180,6 @@ def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> 
     """The uncertainty breakdown of one candidate, its chances line-sampled as those of the table's best are.
 
     Args:
-        model: Of the case.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
     """
@@ -269,8 +264,6 @@ def shrinkable(model: ChanceModel, needles: Needles, q: Floats) -> ShrinkableNee
     """Split one candidate's error into sources that can be shrunk.
 
     Args:
-        model: Of the case.
-        needles: The candidate alone.
         q: Shape (6,), rad, the tip on the target.
     """
     return ShrinkableNeedle(model, needles, _parts(model, q))

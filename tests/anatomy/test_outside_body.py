@@ -1,7 +1,5 @@
 """What the border of an image cuts goes on beyond it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

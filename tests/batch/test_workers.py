@@ -8,7 +8,7 @@ from refusals import refused
 from puncture_twin.planning.base.progress import Silent
 from puncture_twin.planning.batch.plan import read_plan_table
 from puncture_twin.planning.batch.run import Part, Request, run_cohort, running
-from puncture_twin.planning.batch.workers import NO_LIMITS, Limits
+from puncture_twin.planning.batch.run_case import NO_LIMITS, Limits
 from puncture_twin.run_twin import main
 
 

@@ -3,8 +3,6 @@
 What a wrong command line may say instead.
 """
 
-from __future__ import annotations
-
 import errno
 import sys
 import traceback
@@ -99,13 +97,6 @@ RULES: Mapping[str, Rule] = MappingProxyType(
 
 def finish(command: str, found: Any, summary: dict[str, Any], text: str, as_json: bool) -> None:
     """Print what a command found, and end it with the code that its rule gives.
-
-    Args:
-        command: Its name in `RULES`.
-        found: What its rule is about.
-        summary: For ``--json``.
-        text: For a person.
-        as_json: Which of them is printed.
 
     Raises:
         typer.Exit: The code is not 0.

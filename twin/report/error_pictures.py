@@ -4,8 +4,6 @@
 far tip and needle were from target and structures over time.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -133,7 +131,6 @@ def draw_rooms_picture(found: Any, path: Path) -> None:
     """Write the picture.
 
     Args:
-        found: A `Distribution` of one room or more.
         path: The PNG to write; it appears whole or not at all.
     """
     R = needle_frame(found.puncture.outward_ct)

@@ -4,8 +4,6 @@ A `Figure` on Agg, without pyplot and its state. What has coordinates is drawn s
 films, camera images) are those of `annotate`, in the same font.
 """
 
-from __future__ import annotations
-
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -37,7 +35,6 @@ def halo(width: float, colour: str = "white") -> list[Any]:
 
     Args:
         width: Of the rim on both sides together, and of the line itself, points.
-        colour: Of the rim.
     """
     return [withStroke(linewidth=width, foreground=colour)]
 
@@ -48,7 +45,6 @@ def picture_axes(
     """Axes in an image's own pixels (right, down; 0 is its upper left corner) that hold it.
 
     Args:
-        figure: Where.
         image: Shape (h, w) or (h, w, 3).
         at: Left, lower edge, width and height, of the figure's.
     """

@@ -3,8 +3,6 @@
 Directions and mounts in the patient's words.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -38,10 +36,7 @@ class ReasonCount:
     """One line of the legend.
 
     Attributes:
-        text: What a person reads.
         code: The reason's code, "safe" for safe.
-        colour: Its colour.
-        count: How many directions.
         fraction: Of the grid's directions, 0..1.
         solid_angle: Of the searched solid angle, 0..1; the grid is denser near θ = 0, this is not.
     """
@@ -137,7 +132,6 @@ def direction_text(direction_ct: Floats, space: str) -> str:
 
     Args:
         direction_ct: Shape (3,), unit.
-        space: The case's.
     """
     for name, vector in body_directions(space).items():
         if float(vector @ direction_ct) > NEARLY:

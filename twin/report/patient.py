@@ -3,8 +3,6 @@
 Each takes what was computed, or the plain values of it that ``--json`` prints too.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
@@ -207,11 +205,7 @@ def _true_needle(least: Sequence[tuple[str, float]]) -> str:
 
 
 def rooms(found: Mapping[str, Any] | None) -> list[Block]:
-    """What happened in many rooms, beside what was predicted; nothing without rooms.
-
-    Args:
-        found: A `Distribution` as plain values.
-    """
+    """What happened in many rooms, beside what was predicted; nothing without rooms."""
     if found is None:
         return []
     if found["realised_rms_mm"] is None:

@@ -4,8 +4,6 @@ None of it is free space for a needle, its holder or the arm. It becomes one clo
 checked by the same engine as every organ, along the whole needle while it waits at its standoff.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +16,7 @@ from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.anatomy.body.tables import FACES, Face
 from puncture_twin.planning.base.arrays import Bools, Floats, widened
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.formats.labels.label_surface import box_in, mask_surface
+from puncture_twin.planning.formats.labels.labelmaps import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.parts import in_blocks, parts_of
 from puncture_twin.planning.geometry.rigid import apply, pose
@@ -83,7 +81,6 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     half of both counts.
 
     Args:
-        image: The CT and its body.
         air_hu: Voxels whose surroundings are denser than this are not air.
     """
     hu, body, unscanned = image.hu, image.body, image.unscanned
@@ -132,12 +129,6 @@ def outside_surface(
 
     Where the border of the image cuts it, it goes on beyond: every cut section is drawn out by ``beyond_mm``, and of
     bulky pieces also what lies between cut sections at one side. So does all that lies beyond an open face.
-
-    Args:
-        image: The CT and its body.
-        mask: Of `outside_mask`.
-        open_faces: Beyond which nothing is known.
-        where: The file, for messages.
     """
     edge = np.maximum(1, (BLOCK_MM / image.spacing_mm).astype(int))
     # A surface bevels the corners of its blocks. So what it holds lies half a block deep: no voxel in a corner is lost.

@@ -8,8 +8,6 @@ cut off there: what is left is the body.
 A body that has one section at all four sides is no table, whatever it lies on: it is a phantom, or a part of one.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -137,7 +135,6 @@ class Touching(NamedTuple):
     Attributes:
         cut_off: Shape of the body, what of it is a table whose thickness is seen beside the body.
         sides: At which the body ends as a table does, which could not be cut off.
-        warnings: One sentence each.
     """
 
     cut_off: Bools
@@ -190,7 +187,6 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
 
     Args:
         dense: Shape (nx, ny, nz).
-        side: Its far side.
         spacing_mm: Shape (3,).
     """
     axis, end = side.face
@@ -264,7 +260,6 @@ class _View(NamedTuple):
     """Where lines of sight end at one side of a body.
 
     Attributes:
-        face: The side.
         ends: Shape (n, nz), voxels along its axis, NaN where they end at nothing.
         counts: Shape (n, nz), which of them count.
         spacing_mm: Shape (3,).

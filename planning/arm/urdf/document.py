@@ -1,7 +1,5 @@
 """URDF documents as plain values, mm and rad: links with shapes, and joints. What cannot be read whole is refused."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter
@@ -74,7 +72,6 @@ class UrdfLink:
     """One link.
 
     Attributes:
-        name: As the URDF has it.
         collisions: What it is made of for contacts.
         drawn: Whether it has a visual shape.
         weighs: Whether it states a mass and a tensor of inertia that physics can use.
@@ -91,7 +88,6 @@ class UrdfJoint:
     """One joint.
 
     Attributes:
-        name: As the URDF has it.
         kind: One of ``JOINTS``.
         parent: Name of the link before it.
         child: Name of the link that it moves.
@@ -114,10 +110,8 @@ class UrdfDocument:
     """A whole URDF.
 
     Attributes:
-        name: The robot's.
         links: By name, in the file's order.
         joints: In the file's order.
-        where: The file, for errors.
     """
 
     name: str

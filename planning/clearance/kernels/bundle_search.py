@@ -5,8 +5,6 @@ Pairs of an axis and a block are filtered in float32 (`_test_block`), the triang
 between the steps do the upper bounds fall.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import nb
@@ -44,14 +42,9 @@ def measure_bundle(surface, needle, count, low, high, lanes, scratch, answer, se
 
     Args:
         surface: `Blocks.triangles` and ``local``.
-        needle: `NeedleAxes`.
         count: How many blocks were collected; their nodes are in ``scratch.chosen``.
-        low: First direction of the bundle.
-        high: One past its last.
         lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
-        scratch: `Scratch`.
         answer: `SearchOutput`; rows ``low`` to ``high`` are lowered.
-        seed: Returned where nothing nearer is found.
 
     Returns:
         The row of a triangle that is nearest to one of the axes: the next bundle begins with its distance.

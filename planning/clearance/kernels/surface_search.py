@@ -4,8 +4,6 @@ For each bundle: an upper bound for every member, a walk down the tree that coll
 not exceed the worst of them (branch and bound), and `measure_bundle`, which measures these blocks.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import nb
@@ -29,14 +27,12 @@ def search_bundles(  # type: ignore[no-untyped-def]  # numba infers
 
     Args:
         surface: `Blocks.triangles`, ``local`` and ``base``.
-        all_nodes: See `bounds.disc_bounds`, made for this target.
         slack: Rounding of a node's coordinate, mm.
         origin: Shape (3,), the target, where the axes start, mm.
         lengths: Shape (n,), of the axes, in the bundles' order, mm.
         at_target: Distance of the target itself from the surface, mm: an upper bound of every axis' distance.
         nearest: Row of the triangle that is nearest to the target.
         bundles: `Bundles.outward`, ``starts``, ``middle`` and ``chord``.
-        scratch: `Scratch`, for this structure's groups.
         found: `SearchOutput`, written in the bundles' order; the counts are raised.
         lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
     """

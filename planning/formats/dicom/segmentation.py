@@ -1,7 +1,5 @@
 """DICOM SEG: segments as masks, which may overlap (DICOM PS3.3, A.51 and C.8.20)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -31,15 +29,16 @@ from puncture_twin.planning.formats.dicom.named_masks import (
     check_frame_of_reference,
     unique_names,
 )
-from puncture_twin.planning.formats.dicom.pixels import check_length, sizes
 from puncture_twin.planning.formats.dicom.slices import (
     AXES_TOLERANCE,
     PLACE_TOLERANCE,
     SPACING_TOLERANCE,
     Groups,
     Plane,
+    check_length,
     frame_groups,
     plane_of,
+    sizes,
 )
 from puncture_twin.planning.formats.dicom.storage import PLAIN, SEGMENTATION
 from puncture_twin.planning.formats.volumes.volume_files import Content
@@ -61,7 +60,6 @@ class _Frames:
         segments: Shape (n,), the segment of each frame.
         slices: Shape (n,), where it lies, in steps from the first.
         T_ct_index: Shape (4, 4), maps (column, row, slice) to LPS mm.
-        rows, columns: Of each.
     """
 
     segments: NDArray[np.int64]
@@ -83,8 +81,7 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
     """The segments of a DICOM SEG, each by its label.
 
     Args:
-        path: Its name.
-        file: Its key in ``content``.
+        file: The file's key in ``content``.
         content: Gives its bytes.
         ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
 

@@ -1,7 +1,5 @@
 """DICOM RTSTRUCT: contours as masks on the slices of the CT on which they were drawn (PS3.3, C.8.8.5 and C.8.8.6)."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from functools import partial
@@ -78,10 +76,8 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     the pixels along it. Both are noted.
 
     Args:
-        path: Its name.
-        file: Its key in ``content``.
+        file: The file's key in ``content``.
         content: Gives its bytes.
-        ct: The CT on which it was drawn.
 
     Raises:
         InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that

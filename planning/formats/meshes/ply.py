@@ -4,8 +4,6 @@ The numbers of an ASCII file are turned into a binary body of doubles, so that o
 Source: G. Turk, "The PLY Polygon File Format", 1994.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import decode_text
-from puncture_twin.planning.formats.raw_mesh import RawMesh, token_array, triangulate
+from puncture_twin.planning.formats.guard import RawMesh, token_array, triangulate
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 _TYPES = {

@@ -13,10 +13,9 @@ import scipy
 from page_browser import GREYS, SHOWN, at_pixel, chromium, drawn, opened, picture, row_of, serious_findings
 
 from puncture_twin.planning.search.candidates import Pick
-from puncture_twin.twin.report.slices.panel import PIXELS, TONES, draw_panel
+from puncture_twin.twin.report.slices.panel import PIXELS, TONES, Subject, draw_panel
 from puncture_twin.twin.report.slices.planes import needle_planes
 from puncture_twin.twin.report.slices.sheet import flat
-from puncture_twin.twin.report.slices.subject import Subject
 
 WIDTHS = [390, 900, 1440]
 LETTERS = 46

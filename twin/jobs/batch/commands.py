@@ -1,7 +1,5 @@
 """The commands below ``batch``: they parse, call and print, and load what they need themselves."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -51,7 +49,7 @@ def _run(
     as_json: JsonOption = False,
 ) -> None:
     """Run the cases that have no result yet. Finished cases are kept if the run is stopped."""
-    from puncture_twin.planning.batch.workers import Limits
+    from puncture_twin.planning.batch.run_case import Limits
     from puncture_twin.twin.jobs.batch.jobs import Where, run_part, run_summary
     from puncture_twin.twin.jobs.batch.report import run_text
 

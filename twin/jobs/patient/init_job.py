@@ -1,7 +1,5 @@
 """The job ``init``: a folder with a CT and a segmentation becomes a case that has been read as a search reads it."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
@@ -66,9 +64,7 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
     """Make the case, read it as `search` does, and write it; what is wrong leaves nothing behind.
 
     Args:
-        request: What the user asks for.
         force: Whether a case that is there may be replaced.
-        watcher: Is told how far reading is.
 
     Raises:
         InputError: Everything that keeps the case from being searched, in one line.
@@ -98,8 +94,8 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
         found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
     picture = None if context.anatomy.scan is None else folder / SLICES
     if picture is not None:
+        from puncture_twin.twin.report.slices.panel import Subject
         from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet  # with matplotlib
-        from puncture_twin.twin.report.slices.subject import Subject
 
         write_sheet(draw_slices(Subject(context.case, context.anatomy, None)), picture)
     return InitRun(path, replace(start, text=text), context, (*start.notes, *found), picture)

@@ -1,7 +1,5 @@
 """The pictures and the page of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,8 +24,8 @@ from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Shown, Uncertainty, write_page
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
+from puncture_twin.twin.report.slices.panel import Subject
 from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
-from puncture_twin.twin.report.slices.subject import Subject
 
 
 class Drawn(NamedTuple):

@@ -3,8 +3,6 @@
 Beside the disc a column: what its colours and marks mean, and the chosen direction in numbers.
 """
 
-from __future__ import annotations
-
 import textwrap
 from collections.abc import Sequence
 from itertools import pairwise
@@ -75,7 +73,6 @@ def draw_map(
     """Write the map of a search.
 
     Args:
-        candidates: The grid, checked.
         case: The case: ``name``, ``space``, ``T_ct_entry``, ``needle``, ``target_name``.
         path: The PNG to write; it appears whole or not at all.
         pick: The planned candidate, or the one to be shown; None shows the best.

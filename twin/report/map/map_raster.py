@@ -5,8 +5,6 @@ It is finer than anything that shows it, which smooths the cells' borders.
 The Pareto front on the map: hundreds of dots hide the shades below, so a large front is thinned, and says so.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -52,7 +50,6 @@ class ClearanceScale(NamedTuple):
     """The clearances that the shades of safe stand for, mm.
 
     Attributes:
-        low: Of the lightest shade.
         high: Of the darkest; infinite, as ``low`` is, where no structure has a margin.
     """
 
@@ -94,13 +91,7 @@ def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
 
 
 def map_raster(candidates: Candidates, view: MapView, size: int = PIXELS) -> MapRaster:
-    """Draw the cap.
-
-    Args:
-        candidates: The grid's rows.
-        view: The map's geometry.
-        size: Pixels per side.
-    """
+    """Draw the cap."""
     rows = MapCells.of(candidates).picture(view, size)
     table = np.zeros((len(candidates) + 1, 4), dtype=np.uint8)
     table[:-1, :3] = row_colours(candidates)

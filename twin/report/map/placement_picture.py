@@ -1,7 +1,5 @@
 """``placements.png``: the fraction that the arm reaches from each position, each way of mounting it seen from above."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,8 +52,6 @@ def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Pat
     """Write the map of fractions over position.
 
     Args:
-        found: The search's result.
-        case: The case.
         skin: The patient, CT frame.
         path: The PNG to write; it appears whole or not at all.
     """

@@ -56,8 +56,7 @@ from puncture_twin.twin.report.present import (
     percent,
     picture,
 )
-from puncture_twin.twin.report.slices.panel import TONES
-from puncture_twin.twin.report.slices.subject import Subject
+from puncture_twin.twin.report.slices.panel import TONES, Subject
 
 
 class Uncertainty(NamedTuple):

@@ -20,9 +20,8 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.bedside import slice_numbers
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.palette import SKIN
-from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, TONES, stored
+from puncture_twin.twin.report.slices.panel import BESIDE, KNOTS_BYTE, KNOTS_HU, TONES, Subject, stored
 from puncture_twin.twin.report.slices.planes import letters, toward_text
-from puncture_twin.twin.report.slices.subject import BESIDE, Subject
 
 AROUND_MM = 60.0
 """What the block holds beyond target and entries, to every side."""

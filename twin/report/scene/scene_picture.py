@@ -1,7 +1,5 @@
 """``scene.png``: the patient with the safe corridor, the needle and the arm, from afar and close by."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -66,7 +64,6 @@ def draw_scene(
     """Write the picture of the scene.
 
     Args:
-        case: The case.
         anatomy: Structures and skin, CT frame.
         candidates: The search's rows; the safe ones make the corridor.
         plan: The plan, or None: then the needle is that of the best candidate, and the arm that of the search.
@@ -246,11 +243,7 @@ MOST_ENTRIES = 26
 
 
 def families(names: list[tuple[str, Rgb]]) -> list[tuple[str, Rgb]]:
-    """Legend entries, with numbered families (ribs, vertebrae) folded into one when there are many.
-
-    Args:
-        names: Name and colour of each structure.
-    """
+    """Legend entries, with numbered families (ribs, vertebrae) folded into one when there are many."""
     if len(names) <= MOST_ENTRIES:
         return names
     folded: dict[tuple[str, Rgb], int] = {}
