@@ -4,6 +4,8 @@
 here holds a true pose or an error that was drawn: the simulated plant answers like this, and so can real devices.
 """
 
+from __future__ import annotations
+
 from typing import NamedTuple, Protocol
 
 import numpy as np

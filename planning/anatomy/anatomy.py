@@ -1,5 +1,7 @@
 """The structures of a case, with roles and margins, from meshes or label maps, and the skin."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

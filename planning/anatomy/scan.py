@@ -3,6 +3,8 @@
 What the voxels hold in which points lie.
 """
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """Reads what a case's structures come from: meshes, label maps, folders of masks, the CT."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial

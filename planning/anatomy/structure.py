@@ -3,6 +3,8 @@
 The grids on which a case's labels lie: of each label map, and one of each folder or DICOM file of masks.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum

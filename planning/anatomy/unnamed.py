@@ -4,6 +4,8 @@ A rib that a segmentation lost, a stent, a calcified vessel: dense, and part of 
 hold gas: a loop of bowel or a piece of lung that nobody labelled. Both become structures of role ``unknown``.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Sequence
 from typing import NamedTuple

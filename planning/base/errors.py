@@ -5,6 +5,8 @@ What a check of plausibility found: a code and numbers for a program, a sentence
 Parts of the installation that planner, map and page do without, and what is said where one is missing.
 """
 
+from __future__ import annotations
+
 import copy
 import json
 import sys

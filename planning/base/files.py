@@ -3,6 +3,8 @@
 The bytes of an input file: it must be there, be a file, have a plausible size, and end a list with a whole line.
 """
 
+from __future__ import annotations
+
 import hashlib
 import os
 import tempfile

@@ -3,6 +3,8 @@
 And on threads, where compiled code does it.
 """
 
+from __future__ import annotations
+
 import copyreg
 import multiprocessing
 import os

@@ -4,6 +4,8 @@ A key that stands twice has two meanings, of which a reader sees one; NaN and in
 The readers of single values raise what `fitting` turns into one line about the file.
 """
 
+from __future__ import annotations
+
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager

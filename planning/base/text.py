@@ -7,6 +7,8 @@ The known name that was likely meant by an unknown one: another capital, a lette
 How a value shows itself in a notebook: a small piece of HTML that needs nothing from outside, and never raises.
 """
 
+from __future__ import annotations
+
 import difflib
 import functools
 import html

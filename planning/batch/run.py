@@ -8,6 +8,8 @@ where every worker sees them under one path; a worker reads a patient's files it
 memory by the hash of their bytes, so that no mesh travels with a case.
 """
 
+from __future__ import annotations
+
 import fcntl
 import os
 import re

@@ -7,6 +7,8 @@ memory of a worker is watched from outside (its resident set), not limited by th
 and its threads reserve many times what they use.
 """
 
+from __future__ import annotations
+
 import json
 import multiprocessing
 import os

@@ -1,5 +1,7 @@
 """What the tables of a case file are made of: numbers with bounds, names, and a table that knows its keys."""
 
+from __future__ import annotations
+
 import difflib
 import re
 import unicodedata

@@ -1,5 +1,7 @@
 """The question that a certificate answers: everything but the surfaces that a verdict depends on."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The skin as seen from one target: the data of each triangle that bounds over cones of directions need."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np

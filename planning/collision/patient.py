@@ -4,6 +4,8 @@ A `Check` is one query to FCL. A base that stands in the patient is refused, and
 hangs on nothing: one that floats could lie wholly in the patient, unseen.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple

@@ -3,6 +3,8 @@
 Obstacles and gantry are boxes for the arm and solids for the needle, which is checked against them also without an arm.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np

@@ -5,6 +5,8 @@ small organ that is off among many that are right has too few edges to be told b
 elsewhere mostly lies in another organ too. How often that tells: ``python -m slips`` in ``tests``.
 """
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

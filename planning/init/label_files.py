@@ -8,6 +8,8 @@ Versions 1 and 2 give the same numbers to other organs. Under the wrong one, lef
 lie in no order.
 """
 
+from __future__ import annotations
+
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence

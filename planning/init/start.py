@@ -1,5 +1,7 @@
 """A folder in, the text of a case out: what is found, whether it fits together, and what a person should look at."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -3,6 +3,8 @@
 The roles that a new case gives its structures, and the region that they show.
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType

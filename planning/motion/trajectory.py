@@ -1,5 +1,7 @@
 """Joint trajectories: angles over time, and the highest rates that they need."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -5,6 +5,8 @@ How a plan shows itself in a notebook.
 A plan's motion, looked at anew: what it touches, and how near it comes.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

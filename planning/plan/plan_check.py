@@ -5,6 +5,8 @@ The arm of a plan as its file states it: a name, and for any but the table's own
 A plan, compared with its case again: same inputs, same verdict, and a motion that FCL finds free.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -3,6 +3,8 @@
 The declared noise of a case's markers, and how the arm stood, or may have stood, when it touched them.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path

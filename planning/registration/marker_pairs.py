@@ -1,5 +1,7 @@
 """Markers paired by name: the same ones in the CT and at the robot."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 

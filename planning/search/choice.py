@@ -3,6 +3,8 @@
 `choose` returns the rows of one choice; `read_entries` and `read_targets` read many choices from a file, one a row.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple

@@ -3,6 +3,8 @@
 `first_broken` checks skin and organs of all candidates at once, `with_reach` the arm for those that they leave.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import repeat

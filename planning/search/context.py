@@ -5,6 +5,8 @@ checks and explains single directions, and gives errors and provenance. A search
 (`alternatives`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial

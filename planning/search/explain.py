@@ -1,5 +1,7 @@
 """One candidate, explained in full: every constraint with its number and its limit."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import cached_property

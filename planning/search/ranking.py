@@ -3,6 +3,8 @@
 One of the terms is the safe cone: by how much a direction may be off and still be safe, as far as the grid shows.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,6 +4,8 @@
 direction for skin and organs.
 """
 
+from __future__ import annotations
+
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy

@@ -3,6 +3,8 @@
 What a wrong command line may say instead.
 """
 
+from __future__ import annotations
+
 import errno
 import sys
 import traceback

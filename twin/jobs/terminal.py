@@ -12,6 +12,8 @@ memory is freed twice where its Python side learns not that it was freed, which 
 The JSON of an experiment beside its other files: the same bytes wherever the folder lies.
 """
 
+from __future__ import annotations
+
 import atexit
 import gc
 import json

@@ -3,6 +3,8 @@
 The font is matplotlib's own DejaVu Sans, so that no system font is needed and all pictures have one.
 """
 
+from __future__ import annotations
+
 from functools import cache
 from pathlib import Path
 from typing import Literal

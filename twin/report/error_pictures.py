@@ -4,6 +4,8 @@
 far tip and needle were from target and structures over time.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType

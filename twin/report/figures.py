@@ -4,6 +4,8 @@ A `Figure` on Agg, without pyplot and its state. What has coordinates is drawn s
 films, camera images) are those of `annotate`, in the same font.
 """
 
+from __future__ import annotations
+
 from io import BytesIO
 from pathlib import Path
 from typing import Any

@@ -3,6 +3,8 @@
 Directions and mounts in the patient's words.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,5 +1,7 @@
 """Colours for what the pictures and the page show. Those of the verdicts stand beside the reasons."""
 
+from __future__ import annotations
+
 import re
 
 import numpy as np

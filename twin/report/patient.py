@@ -3,6 +3,8 @@
 Each takes what was computed, or the plain values of it that ``--json`` prints too.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType

@@ -3,6 +3,8 @@
 The arm as PyBullet reads it: its URDF with absolute addresses, holder and needle added.
 """
 
+from __future__ import annotations
+
 import math
 import tempfile
 import xml.etree.ElementTree as ET

@@ -3,6 +3,8 @@
 PyBullet is imported without the line that it writes to standard error each time.
 """
 
+from __future__ import annotations
+
 import os
 import sys
 from collections.abc import Iterator, Sequence

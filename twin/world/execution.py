@@ -1,5 +1,7 @@
 """Execution by the position motors, step by step of the physics, and the contacts that the physics reports."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import NamedTuple
 

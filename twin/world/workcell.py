@@ -3,6 +3,8 @@
 The world frame is the controller's base frame. Surfaces may be loaded to be seen only.
 """
 
+from __future__ import annotations
+
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -11,6 +11,8 @@ organ may as well be pressed on something (`puncture_twin.planning.anatomy.body.
 says what is right.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

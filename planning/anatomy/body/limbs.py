@@ -10,6 +10,8 @@ neck a leg's bone is evidence too. No part that is larger than a limb can be is 
 nor its organ. All of it is decided on a grid of 4 mm.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

@@ -4,6 +4,8 @@ None of it is free space for a needle, its holder or the arm. It becomes one clo
 checked by the same engine as every organ, along the whole needle while it waits at its standoff.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

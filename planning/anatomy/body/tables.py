@@ -8,6 +8,8 @@ cut off there: what is left is the body.
 A body that has one section at all four sides is no table, whatever it lies on: it is a phantom, or a part of one.
 """
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

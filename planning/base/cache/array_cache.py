@@ -9,6 +9,8 @@ What one process keeps of values that cost time to make, from one case to the ne
 The folder is bounded in size: the least recently used goes first, and nothing of older versions stays.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
 import os

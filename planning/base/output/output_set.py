@@ -3,6 +3,8 @@
 New files are written into a draft (`draft`); when all of them are there they become the command's set (`publish`).
 """
 
+from __future__ import annotations
+
 import errno
 import fcntl
 import os

@@ -9,6 +9,8 @@ however badly conditioned, can make the distance too small; and one of them is t
 blocks of 16, tell which faces may be skipped.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -6,6 +6,8 @@ The library that reads values takes what is left of an element that was cut shor
 one tag. A contour or a frame would be lost without a word; so the nesting is checked first (DICOM PS3.5, chapter 7).
 """
 
+from __future__ import annotations
+
 import io
 import math
 import struct

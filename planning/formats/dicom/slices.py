@@ -8,6 +8,8 @@ them.
 Stored values have as many bits as the header says, no more and no fewer bytes.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

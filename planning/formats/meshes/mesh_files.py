@@ -14,6 +14,8 @@ detected is refused: a last line without its end, a vertex that no face uses, fe
 remains shows as an open mesh, of which ``mesh_warnings`` tells. Material files are never opened.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

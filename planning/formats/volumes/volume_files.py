@@ -9,6 +9,8 @@ A volume before its voxels are decoded: which files it is made of, where it lies
 One array order for every volume: axis 0 runs mostly to the patient's left, 1 to the back, 2 to the head.
 """
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field

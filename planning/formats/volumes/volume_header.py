@@ -3,6 +3,8 @@
 The stored voxels, from the bytes of its file: raw, gzipped or as text.
 """
 
+from __future__ import annotations
+
 import itertools
 import re
 import zlib

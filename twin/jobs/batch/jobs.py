@@ -5,6 +5,8 @@
 ``batch merge``: one table, one dataset and one page of a cohort.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,5 +1,7 @@
 """What the commands of a cohort show: each one's sections for the terminal, and ``cohort.html``."""
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path

@@ -6,6 +6,8 @@ marker, so a run and its drawn twin err alike; and drawn ones cost milliseconds.
 A physical run is kept once it is done, under the hash of all that decided it: an interrupted command goes on there.
 """
 
+from __future__ import annotations
+
 import hashlib
 import json
 from collections.abc import Iterable

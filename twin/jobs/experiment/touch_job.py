@@ -1,5 +1,7 @@
 """Markers touched in the twin: planned, executed where everything truly is, written as `registration` reads them."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path

@@ -4,6 +4,8 @@ Chen G. et al., "Robot-Assisted Puncture Positioning Methods under CT Navigation
 2019, DOI 10.7652/xjtuxb201904013. The constants below and in `chen2019_tables` are what the paper prints (mm).
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType

@@ -1,5 +1,7 @@
 """The papers whose numbers this project prints beside its own, by name."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,5 +1,7 @@
 """The commands that answer without writing files: register, verify."""
 
+from __future__ import annotations
+
 import hashlib
 from dataclasses import asdict
 from functools import partial

@@ -1,5 +1,7 @@
 """The pictures and the page of a run."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -3,6 +3,8 @@
 What ``place`` prints for a person.
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -5,6 +5,8 @@ shade of safe, in print, and for colour-blind people. The chance to hit hardly c
 stands beside the map as a number.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple

@@ -3,6 +3,8 @@
 Beside the disc a column: what its colours and marks mean, and the chosen direction in numbers.
 """
 
+from __future__ import annotations
+
 import textwrap
 from collections.abc import Sequence
 from itertools import pairwise

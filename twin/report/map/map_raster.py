@@ -5,6 +5,8 @@ It is finer than anything that shows it, which smooths the cells' borders.
 The Pareto front on the map: hundreds of dots hide the shades below, so a large front is thinned, and says so.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import NamedTuple
 

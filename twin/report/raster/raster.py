@@ -10,6 +10,8 @@ scan conversion using 2D homogeneous coordinates", Graphics Hardware 1997.)
 # numba infers the types
 # mypy: disable-error-code="no-untyped-def"
 
+from __future__ import annotations
+
 import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb

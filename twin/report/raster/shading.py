@@ -3,6 +3,8 @@
 # numba infers the types
 # mypy: disable-error-code="no-untyped-def"
 
+from __future__ import annotations
+
 import numpy as np
 
 from puncture_twin.planning.base.numba_kernels import nb

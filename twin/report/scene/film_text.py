@@ -3,6 +3,8 @@
 The film as a file: what changes from frame to frame is put on a ground, and goes to the encoder as whole frames.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path

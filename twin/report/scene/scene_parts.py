@@ -6,6 +6,8 @@ Whether a surface hides its own back from whoever is outside of it.
 Simple bodies that the pictures need: needle, holder, ball, box, and the corridor of safe directions.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any

@@ -1,5 +1,7 @@
 """Views of the scene: the workcell with the arm, and close to the needle's path."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

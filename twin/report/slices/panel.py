@@ -5,6 +5,8 @@ How Hounsfield units become grey: the windows that radiologists use, and one sca
 Its subject: one direction, its needle and the structures near it, or an image alone.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType

@@ -4,6 +4,8 @@
 Where a plane cuts surfaces, the needle, and the ellipsoid of the tip.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 

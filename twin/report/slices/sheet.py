@@ -1,5 +1,7 @@
 """``slices.png``: the slices of a direction and the units along its needle, or of an image alone, on one sheet."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
 
