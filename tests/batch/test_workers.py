@@ -55,7 +55,7 @@ def test_a_worker_that_dies_once_costs_nothing_but_time(planned):
 @pytest.mark.parametrize(
     ("page", "limits", "reason"),
     [
-        (cohort_world.sleep, Limits(timeout_s=2.0), "timed_out"),
+        (cohort_world.sleep, Limits(timeout_s=4.0), "timed_out"),
         (cohort_world.eat, Limits(memory_mb=1500), "out_of_memory"),
     ],
 )

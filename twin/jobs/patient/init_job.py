@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
@@ -57,7 +58,12 @@ class InitRun:
             "sides": [side.document() for side in self.context.sides],
             "warnings": list(self.warnings),
             "findings": self.context.provenance()["findings"],
-            "inputs": inputs_document(self.context.case.inputs),
+            "inputs": inputs_document(
+                replace(one, path=CASE, sha256=hashlib.sha256(self.start.text.encode()).hexdigest())  # as it is written
+                if one.role == "case"
+                else one
+                for one in self.context.case.inputs
+            ),
             "files": [str(path) for path in (self.path, self.picture) if path is not None],
         }
 
