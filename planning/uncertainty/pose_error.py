@@ -54,6 +54,24 @@ class Bend(NamedTuple):
     tip_mm: float
     clamped_mm: float
 
+    def sides(self, model: UrModel, q: Floats) -> Floats:
+        """S with S S' the covariance of a tip off by d to a uniform side, the shaft rotated about its clamp.
+
+        For the sides x and y of the needle, whose z points to the tip: the tip by d x with the shaft about y by d / h,
+        and by d y with the shaft about -x; each with half the variance.
+
+        Args:
+            model: The arm.
+            q: Shape (..., 6), rad.
+
+        Returns:
+            Shape (..., 6, 2), base axes.
+        """
+        R = flange_pose(model, q)[..., :3, :3]  # the needle lies along the flange's z
+        x, y, turn = R[..., 0], R[..., 1], 1 / self.clamped_mm
+        columns = [np.concatenate([x, turn * y], axis=-1), np.concatenate([y, -turn * x], axis=-1)]
+        return np.asarray(self.tip_mm / np.sqrt(2.0) * np.stack(columns, axis=-1))
+
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
@@ -153,15 +171,9 @@ class PoseError:
 
 
 def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
-    """Covariance of a tip off by d to a uniform side, the shaft rotated about its clamp, (n, 6, 6), base axes.
-
-    For the sides x and y of the needle, whose z points to the tip: the tip by d x with the shaft about y by d / h, and
-    by d y with the shaft about -x; each with half the variance.
-    """
-    R = flange_pose(model, q)[..., :3, :3]  # the needle lies along the flange's z
-    x, y, turn = R[..., 0], R[..., 1], 1 / bend.clamped_mm
-    sides = np.stack([np.concatenate([x, turn * y], axis=-1), np.concatenate([y, -turn * x], axis=-1)], axis=-1)
-    return np.asarray(bend.tip_mm**2 / 2 * sides @ np.swapaxes(sides, -1, -2))
+    """Covariance of the bend, (n, 6, 6), base axes."""
+    sides = bend.sides(model, q)
+    return np.asarray(sides @ np.swapaxes(sides, -1, -2))
 
 
 def _outer(J: Floats, variances: Floats) -> Floats:

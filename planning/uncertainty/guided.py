@@ -1,0 +1,315 @@
+"""The needle's error under each way of guidance: one linear model of all devices, and the best linear estimate in it.
+
+Everything that errs is a source, normal with deviation 1: x. Everything of which nothing is known beforehand is flat:
+u, the patient's pose and the cameras' frame. Needle (shift and rotation at the tip), anatomy, target and each reading
+are linear in both:
+
+    needle_k = J_k (eta + drift + arrival_k)             eta 28 parameters of arm and tool, k a look or the end
+    anatomy  = pose + motion                             of the target and what surrounds it, since the scan
+    target   = anatomy + reading of the target in the CT
+    touch_i  = A_i pose - J_i eta - R r_i + n            marker i: r its reading in the CT, A_i = [I, -[p_i - f]x]
+    cameras  = A_i (pose + frame) - R r_i + n            markers,
+               [I, -[b]x] needle_k + A_b frame + n       and balls b behind the tip
+    picture  = target + calibration + n                  ultrasound: the target,
+               needle_k + calibration + n                and the tip
+
+All readings stacked are z = H x + F u. A way uses some of them. What it estimates is t = tip - target = a x + b u;
+the tip is moved by -K z, with the weights K of the least error among those that no flat part enters:
+
+    min |a - K H|^2  with  K F = b       <=>      [H H'  F; F'  0] [K'; l] = [H a'; b']
+
+The flat parts are eliminated, not given a large variance. ct is the registration as it is, K = -X L. The needle keeps
+the direction that the registration gave it: in every way
+
+    e = needle - anatomy + G z,   G = [-K; (X L)_rotation],   Sigma6 = (E + G H)(E + G H)'.
+
+After the last look the arm arrives anew. Errors in reading an ultrasound picture last as long as its plane: looking
+again does not average them. Cameras err anew with each picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.settings import Stereo, Ultrasound
+from puncture_twin.planning.registration.fits import design
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+
+WAYS: Mapping[str, frozenset[str]] = {
+    "ct": frozenset({"touch"}),
+    "stereo": frozenset({"cameras"}),
+    "us": frozenset({"target"}),
+    "us+tip": frozenset({"target", "tip"}),
+    "ct+stereo": frozenset({"touch", "cameras"}),
+    "ct+us": frozenset({"touch", "target"}),
+    "ct+us+tip": frozenset({"touch", "target", "tip"}),
+    "all": frozenset({"touch", "cameras", "target", "tip"}),
+}
+"""Ways of guidance, by the devices whose readings each uses; ultrasound reads a target and a tip."""
+
+LEVER_MM = 100.0
+"""Flat rotations are counted in mm at this distance, so that the columns of F are of one size."""
+
+RANK = 1e-11
+"""Relative size below which a singular value is 0: two readings say the same."""
+
+FREE = 1e-6
+"""What K F may differ from b by: more, and the readings leave a flat part open."""
+
+FLAT = ("pose", "frame")
+"""The patient's pose and the cameras' frame: shift and rotation at the target, of which nothing is known beforehand."""
+
+Rows = dict[str, Floats]
+"""Values that are linear in the sources: by source the columns, shape (m, k)."""
+
+
+def _sum(*parts: Rows) -> Rows:
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {name: np.sum([part[name] for part in parts if name in part], axis=0) for name in names}
+
+
+def _times(M: Floats, rows: Rows) -> Rows:
+    return {name: M @ part for name, part in rows.items()}
+
+
+def _root(cov: Floats) -> Floats:
+    """S with S S' = cov, of covariances (..., 3, 3) that may be singular."""
+    values, axes = np.linalg.eigh(cov)
+    return np.asarray(axes * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
+def picture_root(sd_mm: tuple[float, float], across: Floats) -> Floats:
+    """S with S S' the covariance of a point read in a picture, shape (3, 3), in the axes of the plane's normal (3,)."""
+    return sd_mm[0] * np.eye(3) + (sd_mm[1] - sd_mm[0]) * np.outer(across, across)
+
+
+class Look(NamedTuple):
+    """One look of the devices on the way in."""
+
+    q: Floats
+    """Shape (6,), rad: the arm as it is planned there."""
+    inserted: float
+    """Fraction of the way: 1 at the target, 0 at the skin, below 0 before it."""
+    hidden: frozenset[str] = frozenset()
+    """What is out of sight, by the names of `Reading`."""
+
+
+class Reading(NamedTuple):
+    """Some rows of z."""
+
+    device: str
+    """touch, cameras, target or tip."""
+    name: str
+    """markers, ``ball <mm behind the tip>``, target or tip."""
+    look: int
+    """-1 for the touches, which precede all looks."""
+    rows: Rows
+
+
+@dataclass(frozen=True, eq=False)
+class GuidedModel:
+    """One insertion as guidance knows it; base axes.
+
+    Attributes:
+        error: Of the needle by its registration, the touches known or assumed.
+        points_base: Shape (N, 3), mm: the markers by the registration.
+        q_insertion: Shape (6,), rad, the tip on the target.
+        looks: In their order.
+        motion: Shape (3, 3), mm^2: second moment of the target's motion since the scan.
+        stereo: The cameras, or None.
+        ultrasound: The probe, or None.
+        across: Shape (3,), unit: the normal of its picture.
+    """
+
+    error: PoseError
+    points_base: Floats
+    q_insertion: Floats
+    looks: Sequence[Look]
+    motion: Floats
+    stereo: Stereo | None = None
+    ultrasound: Ultrasound | None = None
+    across: Floats | None = None
+
+    def _at(self, points_base: Floats) -> Floats:
+        """A, shape (3 m, 6): how a shift and rotation at the target move points (m, 3)."""
+        return design(points_base, self.error.target_base)
+
+    def needle(self, q: Floats, arrival: str) -> Rows:
+        """Deviation of the straight needle from where the nominal arm puts it, 6 rows."""
+        arm, scale = self.error.errors.arm, self.error.fit.test.scale
+        J = scale * error_jacobian(self.error.model, q, self.error.tip_mm)
+        Jq = J[:, PARAMETERS["joint"]]
+        own = J * np.sqrt(self.error.fit.noise.eta_variances)
+        return {"arm": own, "drift": arm.drift * Jq, arrival: arm.repeatability * Jq}
+
+    def _bent(self, q: Floats, inserted: float) -> Rows:
+        """What the bend adds to it: tissue bends the needle the more, the deeper it is."""
+        bend = self.error.bend
+        return {} if bend is None else {"bend": max(inserted, 0.0) ** 2 * bend.sides(self.error.model, q)}
+
+    @cached_property
+    def anatomy(self) -> Rows:
+        """Deviation of the anatomy at the target from where the registration puts it, 6 rows."""
+        return {"pose": np.eye(6), "motion": np.vstack([_root(self.motion), np.zeros((3, 3))])}
+
+    @cached_property
+    def target(self) -> Rows:
+        """Deviation of the true target, 3 rows."""
+        return _sum(_times(np.eye(6)[:3], self.anatomy), {"target": _root(self.error.target_covariance)})
+
+    @cached_property
+    def readings(self) -> tuple[Reading, ...]:
+        """All readings, less what the registration expects of them: the touches, then look by look."""
+        found = [Reading("touch", "markers", -1, self._touches())]
+        for number, look in enumerate(self.looks):
+            needle = self.needle(look.q, f"arrival {number}")
+            found += self._seen_by_cameras(look, number, needle)
+            tip = _times(np.eye(6)[:3], _sum(needle, self._bent(look.q, look.inserted)))
+            found += self._in_pictures(number, tip)
+        hidden = [look.hidden | (frozenset({"tip"}) if look.inserted <= 0 else frozenset()) for look in self.looks]
+        return tuple(one for one in found if one.look < 0 or one.name not in hidden[one.look])
+
+    def _touches(self) -> Rows:
+        noise, scale, count = self.error.fit.noise, self.error.fit.test.scale, len(self.points_base)
+        touch = np.zeros((count, 3, count, 3))
+        touch[np.arange(count), :, np.arange(count)] = scale * _root(noise.cov_base)
+        arm = -scale * noise.arm_jacobian * np.sqrt(noise.eta_variances)
+        return _sum(self._markers(), {"arm": arm, "touch": touch.reshape(3 * count, 3 * count)})
+
+    def _markers(self) -> Rows:
+        """Deviation of the markers from where their readings in the CT put them, 3 N rows."""
+        R, noise = self.error.fit.R_base_ct, self.error.fit.noise
+        read = self.error.fit.test.scale * R @ _root(noise.cov_ct)
+        return {
+            "pose": self._at(self.points_base),
+            "markers": np.asarray(-np.kron(np.eye(len(self.points_base)), read)),
+        }
+
+    def _seen_by_cameras(self, look: Look, number: int, needle: Rows) -> list[Reading]:
+        if self.stereo is None:
+            return []
+        T = flange_pose(self.error.model, look.q)
+        tip, outward = T[:3, 3] + self.error.tip_mm * T[:3, 2], -T[:3, 2]
+        seen = {"markers": _sum(self._markers(), {"frame": self._at(self.points_base)})}
+        for behind in self.stereo.balls_mm:
+            ball = behind * outward[None]
+            on_needle = _times(design(ball, np.zeros(3)), needle)
+            seen[ball_name(behind)] = _sum(on_needle, {"frame": self._at(tip + ball)})
+        return [
+            Reading(
+                "cameras", name, number, {**rows, f"{name} {number}": self.stereo.sd_mm * np.eye(len(rows["frame"]))}
+            )
+            for name, rows in seen.items()
+        ]
+
+    def _in_pictures(self, number: int, tip: Rows) -> list[Reading]:
+        if self.ultrasound is None or self.across is None:
+            return []
+        one, found = self.ultrasound, []
+        for name, rows, sd_mm in (("target", self.target, one.target_sd_mm), ("tip", tip, one.tip_sd_mm)):
+            own = {
+                "calibration": one.calibration_sd_mm * np.eye(3),
+                f"pictured {name}": picture_root(sd_mm, self.across),
+            }
+            found.append(Reading(name, name, number, _sum(rows, own)))
+        return found
+
+    @cached_property
+    def end(self) -> Rows:
+        """The needle after the last correction, 6 rows."""
+        return _sum(self.needle(self.q_insertion, "arrival"), self._bent(self.q_insertion, 1.0))
+
+    @cached_property
+    def _widths(self) -> dict[str, int]:
+        every = [self.end, self.anatomy, self.target, *(one.rows for one in self.readings)]
+        return {name: part.shape[1] for rows in every for name, part in rows.items() if name not in FLAT}
+
+    def matrices(self, rows: Rows) -> tuple[Floats, Floats]:
+        """H, shape (m, n), and F, shape (m, 12), of m rows."""
+        count = len(next(iter(rows.values())))
+        H = [rows.get(name, np.zeros((count, width))) for name, width in self._widths.items()]
+        F = [rows.get(name, np.zeros((count, 6))) * np.repeat([1.0, 1.0 / LEVER_MM], 3) for name in FLAT]
+        return np.hstack(H), np.hstack(F)
+
+    @cached_property
+    def _stacked(self) -> tuple[Floats, Floats, list[tuple[Reading, int]]]:
+        """H and F of all readings, and the reading of each row."""
+        parts = [self.matrices(one.rows) for one in self.readings]
+        rows = [(one, row) for one, (H, _) in zip(self.readings, parts, strict=True) for row in range(len(H))]
+        return np.vstack([H for H, _ in parts]), np.vstack([F for _, F in parts]), rows
+
+    def guided(self, way: str, last: int | None = None) -> Guided | None:
+        """The estimate of a way after a look, by default the last; None where its readings do not determine the tip."""
+        H, F, rows = self._stacked
+        a, b = self.matrices(_sum(_times(np.eye(6)[:3], self.end), _times(-np.eye(3), self.target)))
+        last = len(self.looks) - 1 if last is None else last
+        used = np.flatnonzero([one.device in WAYS[way] and one.look <= last for one, _ in rows])
+        registered = self.error.fit.map_at(self.error.target_base)
+        touched = np.flatnonzero([one.device == "touch" for one, _ in rows])
+        gain = np.zeros((6, len(rows)))
+        gain[:, touched] = registered
+        if way != "ct":
+            K = _weights(H[used], F[used], a, b)
+            if K is None:
+                return None
+            gain[:3] = 0.0
+            gain[:3, used] = -K
+        E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy)))
+        needle, tip = E + gain @ H, a + gain[:3] @ H
+        return Guided(way, gain, needle @ needle.T, tip @ tip.T)
+
+
+def ball_name(behind_mm: float) -> str:
+    """Name of a ball's reading."""
+    return f"ball {behind_mm:g}"
+
+
+def _weights(H: Floats, F: Floats, a: Floats, b: Floats) -> Floats | None:
+    """K, shape (3, m), of the least error without a flat part; None where there is none."""
+    zero = np.zeros((F.shape[1], F.shape[1]))
+    left, right = np.block([[H @ H.T, F], [F.T, zero]]), np.vstack([H @ a.T, b.T])
+    K = np.linalg.lstsq(left, right, rcond=RANK)[0][: len(H)].T
+    return K if np.abs(K @ F - b).max(initial=0.0) < FREE else None
+
+
+class Guided(NamedTuple):
+    """The estimate of one way, and the errors that it leaves; base axes."""
+
+    way: str
+    gain: Floats
+    """G, shape (6, m): how the command follows all readings; 0 for those that the way does not use."""
+    cov: Floats
+    """Sigma6, shape (6, 6), of the needle against the CT's anatomy."""
+    tip_cov: Floats
+    """Shape (3, 3), mm^2, of the tip about the true target."""
+
+
+@dataclass(frozen=True, eq=False)
+class GuidedError(PoseError):
+    """The pose error of one direction's needle under one way of guidance, for whatever asks a `PoseError`."""
+
+    guided: Guided | None = None
+
+    def covariance(self, q: Floats) -> Floats:
+        """Sigma6 after the last correction, the same for each of the configurations (n, 6)."""
+        assert self.guided is not None
+        return np.broadcast_to(self.guided.cov, (len(q), 6, 6))
+
+    @property
+    def target_covariance(self) -> Floats:
+        """What the true target adds: less than nothing where a picture of it led the needle."""
+        assert self.guided is not None
+        return self.guided.tip_cov - self.guided.cov[:3, :3]
+
+    @property
+    def target_covariance_ct(self) -> Floats:
+        """`target_covariance` in CT axes."""
+        R = self.fit.R_base_ct
+        return np.asarray(R.T @ self.target_covariance @ R)
