@@ -443,7 +443,13 @@ def write_plan(plan: Plan, path: Path | str) -> None:
 
 @checked
 def rehearse(
-    context: CaseContext, plan: Plan, *, seed: int | None = None, seeds: int | None = None, physics: int = 0
+    context: CaseContext,
+    plan: Plan,
+    *,
+    seed: int | None = None,
+    seeds: int | None = None,
+    physics: int = 0,
+    guidance: str | None = None,
 ) -> Rehearsal:
     """Execute a plan in the twin, where the ground truth differs from the belief.
 
@@ -453,10 +459,12 @@ def rehearse(
         seed: What the ground truth is drawn from; the case's by default.
         seeds: Draw so many rooms: the median one is executed, and ``distribution`` holds all.
         physics: So many of them are executed in the simulator too.
+        guidance: How the needle is led in the rooms: ct, stereo, us, us+tip, ct+stereo, ct+us, ct+us+tip or all, by the
+            devices that the case declares, in bodies that move as it declares; None by the markers, in bodies at rest.
 
     Raises:
-        InputError: A plan that does not hold in this case, many rooms of a case without declared errors or markers, or
-            the extra ``twin`` is not installed.
+        InputError: A plan that does not hold in this case, many rooms of a case without declared errors or markers,
+            unknown guidance, one without its devices or without ``seeds``, or the extra ``twin`` is not installed.
         NoAnswerError: The arm reaches the target in none of the rooms.
     """
     from puncture_twin.planning.base.errors import require_extra
@@ -465,7 +473,8 @@ def rehearse(
     from puncture_twin.twin.jobs.patient.rehearsed import rehearse_once
     from puncture_twin.twin.jobs.patient.run import room_count
 
-    return rehearse_once(context, _own_plan(context, plan, "rehearse: plan"), room_count(seeds, physics), seed)
+    rooms = room_count(seeds, physics, guidance)
+    return rehearse_once(context, _own_plan(context, plan, "rehearse: plan"), rooms, seed)
 
 
 @checked

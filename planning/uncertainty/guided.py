@@ -5,11 +5,11 @@ u, the patient's pose and the cameras' frame. Needle (shift and rotation at the 
 are linear in both:
 
     needle_k = J_k (eta + drift + arrival_k)             eta 28 parameters of arm and tool, k a look or the end
-    anatomy  = pose + motion                             of the target and what surrounds it, since the scan
+    anatomy  = pose + motion + breath                    of the target and what surrounds it, since the scan
     target   = anatomy + reading of the target in the CT
-    touch_i  = A_i pose - J_i eta - R r_i + n            marker i: r its reading in the CT, A_i = [I, -[p_i - f]x]
-    cameras  = A_i (pose + frame) - R r_i + n            markers,
-               [I, -[b]x] needle_k + A_b frame + n       and balls b behind the tip
+    touch_i  = A_i pose - J_i eta - R r_i + w breath' + n       marker i: r its reading in the CT, w that of the skin
+    cameras  = A_i (pose + frame) - R r_i + w breath + n        markers, A_i = [I, -[p_i - f]x],
+               [I, -[b]x] needle_k + A_b frame + n              and balls b behind the tip
     picture  = target + calibration + n                  ultrasound: the target,
                needle_k + calibration + n                and the tip
 
@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -95,10 +96,12 @@ class Look(NamedTuple):
 
     q: Floats
     """Shape (6,), rad: the arm as it is planned there."""
+    out_mm: float
+    """Tip to target."""
     inserted: float
     """Fraction of the way: 1 at the target, 0 at the skin, below 0 before it."""
-    hidden: frozenset[str] = frozenset()
-    """What is out of sight, by the names of `Reading`."""
+    hidden: Mapping[str, str] = MappingProxyType({})
+    """What is out of sight, by the names of `Reading`, and why."""
 
 
 class Reading(NamedTuple):
@@ -122,7 +125,9 @@ class GuidedModel:
         points_base: Shape (N, 3), mm: the markers by the registration.
         q_insertion: Shape (6,), rad, the tip on the target.
         looks: In their order.
-        motion: Shape (3, 3), mm^2: second moment of the target's motion since the scan.
+        motion: Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan.
+        breath: Shape (3,), mm: rms displacement of the target by the breath, along its line; zero without breathing.
+        skin_weight: By how much of it the markers move.
         stereo: The cameras, or None.
         ultrasound: The probe, or None.
         across: Shape (3,), unit: the normal of its picture.
@@ -133,6 +138,8 @@ class GuidedModel:
     q_insertion: Floats
     looks: Sequence[Look]
     motion: Floats
+    breath: Floats
+    skin_weight: float = 0.0
     stereo: Stereo | None = None
     ultrasound: Ultrasound | None = None
     across: Floats | None = None
@@ -154,15 +161,19 @@ class GuidedModel:
         bend = self.error.bend
         return {} if bend is None else {"bend": max(inserted, 0.0) ** 2 * bend.sides(self.error.model, q)}
 
-    @cached_property
-    def anatomy(self) -> Rows:
-        """Deviation of the anatomy at the target from where the registration puts it, 6 rows."""
-        return {"pose": np.eye(6), "motion": np.vstack([_root(self.motion), np.zeros((3, 3))])}
+    def anatomy(self, weight: float = 1.0) -> Rows:
+        """Deviation of anatomy at the target from where the registration puts it, 6 rows.
+
+        Args:
+            weight: By how much of the target's breath it moves.
+        """
+        moved = np.column_stack([_root(self.motion), weight * self.breath])
+        return {"pose": np.eye(6), "motion": np.vstack([moved, np.zeros((3, 4))])}
 
     @cached_property
     def target(self) -> Rows:
         """Deviation of the true target, 3 rows."""
-        return _sum(_times(np.eye(6)[:3], self.anatomy), {"target": _root(self.error.target_covariance)})
+        return _sum(_times(np.eye(6)[:3], self.anatomy()), {"target": _root(self.error.target_covariance)})
 
     @cached_property
     def readings(self) -> tuple[Reading, ...]:
@@ -173,18 +184,21 @@ class GuidedModel:
             found += self._seen_by_cameras(look, number, needle)
             tip = _times(np.eye(6)[:3], _sum(needle, self._bent(look.q, look.inserted)))
             found += self._in_pictures(number, tip)
-        hidden = [look.hidden | (frozenset({"tip"}) if look.inserted <= 0 else frozenset()) for look in self.looks]
-        return tuple(one for one in found if one.look < 0 or one.name not in hidden[one.look])
+        return tuple(one for one in found if one.look < 0 or one.name not in self.looks[one.look].hidden)
 
     def _touches(self) -> Rows:
         noise, scale, count = self.error.fit.noise, self.error.fit.test.scale, len(self.points_base)
         touch = np.zeros((count, 3, count, 3))
         touch[np.arange(count), :, np.arange(count)] = scale * _root(noise.cov_base)
         arm = -scale * noise.arm_jacobian * np.sqrt(noise.eta_variances)
-        return _sum(self._markers(), {"arm": arm, "touch": touch.reshape(3 * count, 3 * count)})
+        breath = np.tile(self.skin_weight * self.breath, count)[:, None]
+        return _sum(
+            self._markers, {"arm": arm, "touch": touch.reshape(3 * count, 3 * count), "breath at touch": breath}
+        )
 
+    @cached_property
     def _markers(self) -> Rows:
-        """Deviation of the markers from where their readings in the CT put them, 3 N rows."""
+        """Deviation of the markers from where their readings in the CT put them, 3 N rows, at no breath."""
         R, noise = self.error.fit.R_base_ct, self.error.fit.noise
         read = self.error.fit.test.scale * R @ _root(noise.cov_ct)
         return {
@@ -197,14 +211,18 @@ class GuidedModel:
             return []
         T = flange_pose(self.error.model, look.q)
         tip, outward = T[:3, 3] + self.error.tip_mm * T[:3, 2], -T[:3, 2]
-        seen = {"markers": _sum(self._markers(), {"frame": self._at(self.points_base)})}
+        moved = np.tile(np.column_stack([np.zeros((3, 3)), self.skin_weight * self.breath]), (len(self.points_base), 1))
+        seen = {"markers": _sum(self._markers, {"motion": moved, "frame": self._at(self.points_base)})}
         for behind in self.stereo.balls_mm:
             ball = behind * outward[None]
             on_needle = _times(design(ball, np.zeros(3)), needle)
             seen[ball_name(behind)] = _sum(on_needle, {"frame": self._at(tip + ball)})
         return [
             Reading(
-                "cameras", name, number, {**rows, f"{name} {number}": self.stereo.sd_mm * np.eye(len(rows["frame"]))}
+                "cameras",
+                name,
+                number,
+                {**rows, f"seen {name} {number}": self.stereo.sd_mm * np.eye(len(rows["frame"]))},
             )
             for name, rows in seen.items()
         ]
@@ -228,7 +246,7 @@ class GuidedModel:
 
     @cached_property
     def _widths(self) -> dict[str, int]:
-        every = [self.end, self.anatomy, self.target, *(one.rows for one in self.readings)]
+        every = [self.end, self.anatomy(), self.target, *(one.rows for one in self.readings)]
         return {name: part.shape[1] for rows in every for name, part in rows.items() if name not in FLAT}
 
     def matrices(self, rows: Rows) -> tuple[Floats, Floats]:
@@ -251,19 +269,52 @@ class GuidedModel:
         a, b = self.matrices(_sum(_times(np.eye(6)[:3], self.end), _times(-np.eye(3), self.target)))
         last = len(self.looks) - 1 if last is None else last
         used = np.flatnonzero([one.device in WAYS[way] and one.look <= last for one, _ in rows])
-        registered = self.error.fit.map_at(self.error.target_base)
-        touched = np.flatnonzero([one.device == "touch" for one, _ in rows])
         gain = np.zeros((6, len(rows)))
-        gain[:, touched] = registered
+        gain[:, [one.device == "touch" for one, _ in rows]] = self.error.fit.map_at(self.error.target_base)
         if way != "ct":
             K = _weights(H[used], F[used], a, b)
             if K is None:
                 return None
             gain[:3] = 0.0
             gain[:3, used] = -K
-        E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy)))
-        needle, tip = E + gain @ H, a + gain[:3] @ H
-        return Guided(way, gain, needle @ needle.T, tip @ tip.T)
+        tip = a + gain[:3] @ H
+        return Guided(gain, self.cov(gain), tip @ tip.T, self._parts(tip))
+
+    def cov(self, gain: Floats, weight: float = 1.0) -> Floats:
+        """Sigma6, shape (6, 6), of the needle against anatomy of a weight (see `anatomy`), under a gain."""
+        H, _, _ = self._stacked
+        E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(weight))))
+        return np.asarray((E + gain @ H) @ (E + gain @ H).T)
+
+    def _parts(self, tip: Floats) -> dict[str, float]:
+        """Mean square of the tip's error by source, mm^2, named as in `SOURCES`."""
+        squares, parts = np.sum(tip**2, axis=0), dict[str, float]()
+        start = 0
+        for name, width in self._widths.items():
+            cut = {name: squares[start : start + width]}
+            if name == "arm":
+                cut = {kind: squares[start : start + width][part] for kind, part in PARAMETERS.items()}
+            for one, own in cut.items():
+                source = _SOURCE_OF.get(one.split(" ")[0], one)
+                parts[source] = parts.get(source, 0.0) + float(own.sum())
+            start += width
+        return {source: part for source, part in parts.items() if part > 0.0}
+
+
+_SOURCE_OF = {
+    "arrival": "repeatability",
+    "markers": "markers_ct",
+    "breath": "motion",
+    "seen": "cameras",
+    "pictured": "pictures",
+    "calibration": "pictures",
+}
+"""Sources by the first word of a row's: those of all looks together."""
+
+
+def device_of(name: str) -> str:
+    """The device that gives a look's reading of a name."""
+    return name if name in ("target", "tip") else "cameras"
 
 
 def ball_name(behind_mm: float) -> str:
@@ -282,34 +333,46 @@ def _weights(H: Floats, F: Floats, a: Floats, b: Floats) -> Floats | None:
 class Guided(NamedTuple):
     """The estimate of one way, and the errors that it leaves; base axes."""
 
-    way: str
     gain: Floats
     """G, shape (6, m): how the command follows all readings; 0 for those that the way does not use."""
     cov: Floats
-    """Sigma6, shape (6, 6), of the needle against the CT's anatomy."""
+    """Sigma6, shape (6, 6), of the needle against the CT's anatomy about the target."""
     tip_cov: Floats
     """Shape (3, 3), mm^2, of the tip about the true target."""
+    parts: Mapping[str, float]
+    """Mean square of the tip by source, mm^2."""
 
 
 @dataclass(frozen=True, eq=False)
 class GuidedError(PoseError):
-    """The pose error of one direction's needle under one way of guidance, for whatever asks a `PoseError`."""
+    """The pose error of one direction's needle under one way of guidance, for whatever asks a `PoseError`.
+
+    Attributes:
+        guided: What the way leaves; ``cov`` is of the anatomy that is asked about.
+    """
 
     guided: Guided | None = None
 
+    @property
+    def _known(self) -> Guided:
+        assert self.guided is not None
+        return self.guided
+
     def covariance(self, q: Floats) -> Floats:
         """Sigma6 after the last correction, the same for each of the configurations (n, 6)."""
-        assert self.guided is not None
-        return np.broadcast_to(self.guided.cov, (len(q), 6, 6))
+        return np.broadcast_to(self._known.cov, (len(q), 6, 6))
 
     @property
     def target_covariance(self) -> Floats:
         """What the true target adds: less than nothing where a picture of it led the needle."""
-        assert self.guided is not None
-        return self.guided.tip_cov - self.guided.cov[:3, :3]
+        return self._known.tip_cov - self._known.cov[:3, :3]
 
     @property
     def target_covariance_ct(self) -> Floats:
         """`target_covariance` in CT axes."""
         R = self.fit.R_base_ct
         return np.asarray(R.T @ self.target_covariance @ R)
+
+    def mean_squares(self, q: Floats) -> dict[str, float]:
+        """By source, those of devices and motion too."""
+        return dict(self._known.parts)

@@ -144,6 +144,13 @@ class PoseError:
         parts = {source: self.fit.test.scale**2 * cov for source, cov in found.items()}
         return parts if self.bend is None else {**parts, "bend": _bend_covariance(self.model, q, self.bend)}
 
+    def mean_squares(self, q: Floats) -> dict[str, float]:
+        """Mean square of the tip by source at one configuration (6,), rad; mm^2."""
+        parts = {source: float(np.trace(cov[0, :3, :3])) for source, cov in self.parts(q[None]).items()}
+        parts["repeatability"] += parts.pop("arrival")  # one key states both
+        parts["target"] = float(np.trace(self.target_covariance))
+        return parts
+
     def _reading_parts(self, count: int) -> dict[str, Floats]:
         """Parts of the markers: CT reading, touch, and the arm's repeatability there; the same for all rows."""
         at, noise = self.fit.map_at(self.target_base), self.fit.noise
@@ -226,10 +233,7 @@ def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudg
         q: Shape (6,), rad, the tip on the target.
         outward_base: Shape (3,), unit, from the target along the needle.
     """
-    parts = {source: float(np.trace(cov[0, :3, :3])) for source, cov in error.parts(q[None]).items()}
-    parts["repeatability"] += parts.pop("arrival")  # one key states both
-    parts["target"] = float(np.trace(error.target_covariance))
-    whole = error.tip_covariance(q[None])[0]
+    parts, whole = error.mean_squares(q), error.tip_covariance(q[None])[0]
     variance, along = float(np.trace(whole)), float(outward_base @ whole @ outward_base)
     return ErrorBudget(
         rms_mm=float(np.sqrt(variance)),

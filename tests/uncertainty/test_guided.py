@@ -40,7 +40,16 @@ TABLE = {
 }
 
 
-def model(errors=DECLARED, motion_mm=STILL, ultrasound=ULTRASOUND, looks=(1.0,), hidden=frozenset(), stereo=STEREO):
+def model(
+    errors=DECLARED,
+    motion_mm=STILL,
+    ultrasound=ULTRASOUND,
+    looks=(1.0,),
+    hidden=None,
+    stereo=STEREO,
+    breath=(0.0, 0.0, 0.0),
+    skin=0.0,
+):
     """One insertion along the case's plan, the picture in the plane of needle and bed axis."""
     points = apply(T_BASE_CT, REGISTRATION.markers.points_ct)
     noise = reading_noise(errors, MODEL, TIP_MM, REGISTRATION.markers.joints, known=True)
@@ -48,9 +57,11 @@ def model(errors=DECLARED, motion_mm=STILL, ultrasound=ULTRASOUND, looks=(1.0,),
     error = PoseError(MODEL, TIP_MM, apply(T_BASE_CT, CASE.target_ct), errors, fit)
     across = np.cross(OUTWARD_CT, [0.0, 0.0, 1.0])
     R = T_BASE_CT[:3, :3]
-    at = [Look(PLANNED, inserted, hidden) for inserted in looks]
+    at = [Look(PLANNED, 0.0, inserted, dict(hidden or {})) for inserted in looks]
     motion = R @ np.diag(np.square(motion_mm)) @ R.T
-    return GuidedModel(error, points, PLANNED, at, motion, stereo, ultrasound, R @ across / np.linalg.norm(across))
+    return GuidedModel(
+        error, points, PLANNED, at, motion, R @ breath, skin, stereo, ultrasound, R @ across / np.linalg.norm(across)
+    )
 
 
 def rms(found):
@@ -103,7 +114,7 @@ def test_no_flat_part_is_in_the_answer():
 
 def test_without_sight_there_is_no_answer():
     """Cameras that see no ball, and a picture without the target, do not say where the needle is against it."""
-    blind = model(hidden=frozenset({"ball 80", "ball 160", "target"}))
+    blind = model(hidden=dict.fromkeys(("ball 80", "ball 160", "target"), ""))
     for way in ("stereo", "us", "us+tip"):
         assert blind.guided(way) is None
     assert rms(blind.guided("ct+us")) <= rms(blind.guided("ct"))

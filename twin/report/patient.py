@@ -228,7 +228,8 @@ def rooms(found: Mapping[str, Any] | None) -> list[Block]:
     )
     rows = [("tip error, rms, mm", f"{found['realised_rms_mm']:.3f}", f"{found['predicted_rms_mm']:.3f}")]
     rows += [(text, _percent(fraction), _percent(chance)) for text, fraction, chance in shares]
-    head = (f"{plural(found['rooms'], 'trial')}, seed {found['seed']}", "realised", "predicted")
+    led = f", guidance {found['guidance']}" if "guidance" in found else ""
+    head = (f"{plural(found['rooms'], 'trial')}, seed {found['seed']}{led}", "realised", "predicted")
     return [Table(head, tuple(rows)), Warn(tuple(_reserves(found))), *_sources(found)]
 
 
@@ -243,6 +244,10 @@ def _reserves(found: Mapping[str, Any]) -> list[str]:
         said.append("The trials were drawn from [rehearsal.errors]: the belief is wrong by design.")
     if found["unreached"]:
         said.append(f"In {found['unreached']:,} trials the arm did not reach the pose; they are not counted.")
+    if found.get("stopped"):
+        left = "a correction would have left the corridor, and the needle was stopped"
+        said.append(f"In {found['stopped']:,} trials {left}; they are not counted.")
+    said += [f"{one}." for one in found.get("lost_sight", ())]
     if found["guessed_touches"]:
         how = "a posture was assumed (touch.csv, q1_deg to q6_deg)"
         said.append(f"The arm's joints at the touches are not known: {how}.")

@@ -155,7 +155,8 @@ def in_rooms(context: CaseContext, plan: Plan, count: RoomCount, seed: int | Non
     """
     seed = context.case.rehearsal.seed if seed is None else seed
     with context.stages.time("rooms"):
-        found = rehearse_trials(context, plan.outward_ct, plan.insertion.q[-1], count.rooms, seed)
+        q = plan.insertion.q[-1]
+        found = rehearse_trials(context, plan.outward_ct, q, count.rooms, seed, count.guidance)
     if not (count.physics and len(found)):
         return found
     from puncture_twin.twin.rehearsal.plan_truth import physics_trials

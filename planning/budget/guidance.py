@@ -1,0 +1,177 @@
+"""The ways of guidance of a case along one direction: where the devices look, what has moved, how far to correct.
+
+A correction moves the needle parallel to itself, by c from where the plan puts it. As certificates do, it trusts the
+clearances of the plan's own needle: with slack_j = distance to structure j - radius - margin, no point of the needle
+moves by more than |c|, so that every needle with
+
+    |c| <= min_j slack_j
+
+keeps every margin in the anatomy as the CT shows it. What would go farther is not executed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.reach.standoff import case_axis_lengths, case_paths, standoffs
+from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise
+from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.registration.residuals import NoiseTest
+from puncture_twin.planning.search.phases import moving_weights
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel
+from puncture_twin.planning.uncertainty.guided import WAYS, GuidedError, GuidedModel, Look, device_of
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+
+LOOKS = 3
+"""One at the standoff, the others evenly on the way in, the last with the tip at the target."""
+
+
+def declared_ways(case: Case) -> tuple[str, ...]:
+    """The ways whose devices a case declares, ct first."""
+    lacking = {device for device, one in _DEVICES.items() if getattr(case, one) is None}
+    return tuple(way for way, used in WAYS.items() if not used & lacking)
+
+
+_DEVICES = MappingProxyType({"cameras": "stereo", "target": "ultrasound", "tip": "ultrasound"})
+"""Tables of a case that declare what a way reads."""
+
+
+def check_way(way: str) -> None:
+    """Refuse a way that there is not.
+
+    Raises:
+        InputError: Naming those that there are.
+    """
+    if way not in WAYS:
+        refuse(f"guidance '{way}' is not known", "--guidance", ", ".join(WAYS), "unknown_guidance")
+
+
+def check_devices(case: Case, way: str) -> None:
+    """Refuse a way whose devices a case does not declare.
+
+    Raises:
+        InputError: Naming their tables.
+    """
+    needed = dict.fromkeys(table for device, table in _DEVICES.items() if device in WAYS[way])
+    lacking = [f"[{table}]" for table in needed if getattr(case, table) is None]
+    if lacking:
+        what = f"guidance '{way}' needs {' and '.join(lacking)}, which the case does not declare"
+        allowed = f"{', '.join(lacking)} in the case, or {', '.join(declared_ways(case))}"
+        refuse(what, case.path, allowed, "no_device")
+
+
+def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
+    """The pose error of trials: touched in stated configurations, errors of the estimated size as if declared.
+
+    Args:
+        error: Of a case.
+        q_touch: Shape (N, 6), rad: known, or likely ones.
+    """
+    errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
+    noise = reading_noise(errors, error.model, error.tip_mm, q_touch, known=True)
+    test = NoiseTest(fit.test.count, float(fit.test.freedom))
+    return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
+
+
+def guided_model(
+    case: Case, anatomy: Anatomy, error: PoseError, registration: Registration, outward_ct: Floats, q: Floats
+) -> GuidedModel:
+    """What guidance knows of one insertion.
+
+    Args:
+        case: Declares the devices, and what moves.
+        anatomy: Its structures.
+        error: Of the needle, as rehearsed.
+        registration: Of the case's markers.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q: Shape (6,), rad, the tip on the target.
+    """
+    R, breathing = registration.T_base_ct[:3, :3], case.breathing
+    breath, skin_weight = np.zeros(3), 0.0
+    if breathing is not None:
+        breath, skin_weight = breathing.rms_ct, moving_weights(case, breathing, anatomy).skin
+    motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
+    return GuidedModel(
+        error=error,
+        points_base=apply(registration.T_base_ct, registration.markers.points_ct),
+        q_insertion=q,
+        looks=_looks(case, anatomy, error, outward_ct, q),
+        motion=R @ motion @ R.T,
+        breath=R @ breath,
+        skin_weight=skin_weight,
+        stereo=case.stereo,
+        ultrasound=case.ultrasound,
+        across=R @ _across(outward_ct),
+    )
+
+
+def _looks(case: Case, anatomy: Anatomy, error: PoseError, outward_ct: Floats, q: Floats) -> tuple[Look, ...]:
+    paths = case_paths(case, anatomy.skin, outward_ct[None])
+    length = float(paths.path_length[0])
+    standoff = float(standoffs(case.needle, length, paths.skin_angle[0]))
+    outs = [standoff, *(length * (1 - step / (LOOKS - 1)) for step in range(1, LOOKS))]
+    T, looks = flange_pose(error.model, q), []
+    for out in outs:
+        at = T.copy()
+        at[:3, 3] -= out * T[:3, 2]
+        there = nearest_within_limits(error.model, inverse(error.model, at[None])[0], q)
+        off = np.where(np.isnan(there).any(axis=1), np.inf, np.abs(there - q).max(axis=1))
+        inserted = (length - out) / length
+        hidden = {} if inserted > 0 else {"tip": OUTSIDE}
+        looks.append(Look(there[off.argmin()], out, inserted, hidden))
+    return tuple(looks)
+
+
+def _across(outward_ct: Floats) -> Floats:
+    """Normal of the plane of the needle that comes nearest to the body's long axis."""
+    along = np.array([0.0, 0.0, 1.0]) if abs(outward_ct[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    across = np.cross(outward_ct, along)
+    return np.asarray(across / np.linalg.norm(across))
+
+
+def lost_sight(model: GuidedModel, way: str) -> tuple[str, ...]:
+    """What a way's devices do not see, where and why, a sentence each; that the tip is not yet in the body is none."""
+    return tuple(
+        f"{_where(look)}: {what} out of sight: {why}"
+        for look in model.looks
+        for what, why in look.hidden.items()
+        if device_of(what) in WAYS[way] and why != OUTSIDE
+    )
+
+
+OUTSIDE = "it is not in the body yet"
+
+
+def _where(look: Look) -> str:
+    return "at the target" if look.out_mm <= 0 else f"{look.out_mm:.0f} mm before the target"
+
+
+def guided_error(model: GuidedModel, way: str, weight: float = 1.0) -> GuidedError:
+    """The pose error that a way leaves, against anatomy that follows the target's breath by a weight.
+
+    Raises:
+        NoAnswerError: What is in sight does not determine the tip against the target.
+    """
+    found, one = model.guided(way), model.error
+    if found is None:
+        lost = "; ".join(lost_sight(model, way)) or "its readings leave the needle's place against the CT open"
+        raise NoAnswerError(f"guidance '{way}' does not see enough: {lost}", code="lost_sight")
+    found = found if weight == 1.0 else found._replace(cov=model.cov(found.gain, weight))
+    return GuidedError(one.model, one.tip_mm, one.target_base, one.errors, one.fit, one.bend, found)
+
+
+def corridor_mm(case: Case, chance: ChanceModel, outward_ct: Floats) -> float:
+    """How far a correction may move the needle, mm; see the module."""
+    lengths = case_axis_lengths(case, chance.anatomy, outward_ct[None])
+    distance = chance.engine.measure(case.target_ct, outward_ct[None], lengths).distance[0][chance.columns]
+    return float(max((distance - chance.breaking).min(initial=np.inf), 0.0))
