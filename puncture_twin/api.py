@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from puncture_twin.planning.search.candidates import Candidates, Pick
     from puncture_twin.planning.search.context import CaseContext, EngineChoice
     from puncture_twin.planning.search.explain import Explanation
+    from puncture_twin.planning.sight.cameras import CameraView
+    from puncture_twin.planning.sight.probe import ProbeView
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
     from puncture_twin.twin.jobs.batch.jobs import Merged
@@ -475,6 +477,39 @@ def rehearse(
 
     rooms = room_count(seeds, physics, guidance)
     return rehearse_once(context, _own_plan(context, plan, "rehearse: plan"), rooms, seed)
+
+
+@checked
+def camera_view(context: CaseContext, plan: Plan) -> CameraView:
+    """Where two cameras look from, and what both see of the balls on the needle and of the markers at each depth.
+
+    Args:
+        context: From `prepare`, with the arm, of a case with ``[stereo]``.
+        plan: From `plan`.
+
+    Raises:
+        InputError: The case declares no cameras, or a plan that does not hold in it.
+        NoAnswerError: The surroundings leave no place for cameras that the case does not state.
+    """
+    from puncture_twin.planning.sight.cameras import camera_view
+
+    return camera_view(context, _own_plan(context, plan, "camera_view: plan"))
+
+
+@checked
+def probe_view(context: CaseContext, plan: Plan) -> ProbeView:
+    """Where an ultrasound probe on an arm of its own sees needle and target; or that it does not, why, and the way out.
+
+    Args:
+        context: From `prepare`, with the arm, of a case with ``[ultrasound]``.
+        plan: From `plan`.
+
+    Raises:
+        InputError: The case declares no probe, its arm would stand in the patient, or a plan that does not hold in it.
+    """
+    from puncture_twin.planning.sight.probe import probe_view
+
+    return probe_view(context, _own_plan(context, plan, "probe_view: plan"))
 
 
 @checked
