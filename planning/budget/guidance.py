@@ -11,7 +11,7 @@ keeps every margin in the anatomy as the CT shows it. What would go farther is n
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -23,13 +23,18 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.reach.standoff import case_axis_lengths, case_paths, standoffs
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.registration.residuals import NoiseTest
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.phases import moving_weights
+from puncture_twin.planning.sight.cameras import CameraView, camera_view
+from puncture_twin.planning.sight.probe import ProbeView, probe_view
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
-from puncture_twin.planning.uncertainty.guided import WAYS, GuidedError, GuidedModel, Look, device_of
+from puncture_twin.planning.uncertainty.guided import CAMERAS, WAYS, GuidedError, GuidedModel, Look, device_of
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 LOOKS = 3
@@ -83,8 +88,64 @@ def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
     return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
 
 
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What the devices see during an insertion.
+
+    Attributes:
+        cameras: None where they are not asked about.
+        probe: None where it is not.
+        no_cameras: Why there is no place for cameras; empty where there is one.
+    """
+
+    cameras: CameraView | None = None
+    probe: ProbeView | None = None
+    no_cameras: str = ""
+
+    def hidden(self, out_mm: float) -> dict[str, str]:
+        """What is out of sight with the tip so far from the target, by the names of readings, and why."""
+        found = {}
+        if self.probe is not None and self.probe.T_ct_image is None:
+            found = dict.fromkeys(("target", "tip"), self.probe.sentence)
+        if self.no_cameras:
+            found[CAMERAS] = self.no_cameras
+        if self.cameras is not None:
+            row = int(np.abs(self.cameras.tip_to_target_mm - out_mm).argmin())
+            named = zip(self.cameras.names, self.cameras.hidden[row], strict=True)
+            behind = {name: f"behind {by}" for name, by in named if by}
+            markers = [name for name in self.cameras.names[self.cameras.balls :] if name not in behind]
+            found |= behind if len(markers) >= MIN_MARKERS else {**behind, CAMERAS: FEW_MARKERS}
+        return found
+
+
+FEW_MARKERS = f"fewer than {MIN_MARKERS} markers are seen"
+
+
+def sight_of(context: CaseContext, plan: Plan, way: str) -> Sight:
+    """What the devices of a way see during a plan's insertion.
+
+    Raises:
+        InputError: The case does not declare them, or states a place that cannot be used.
+    """
+    used, cameras, probe, lost = WAYS[way], None, None, ""
+    if "cameras" in used:
+        try:
+            cameras = camera_view(context, plan)
+        except NoAnswerError as error:
+            lost = str(error)
+    if used & {"target", "tip"}:
+        probe = probe_view(context, plan)
+    return Sight(cameras, probe, lost)
+
+
 def guided_model(
-    case: Case, anatomy: Anatomy, error: PoseError, registration: Registration, outward_ct: Floats, q: Floats
+    case: Case,
+    anatomy: Anatomy,
+    error: PoseError,
+    registration: Registration,
+    outward_ct: Floats,
+    q: Floats,
+    sight: Sight | None = None,
 ) -> GuidedModel:
     """What guidance knows of one insertion.
 
@@ -95,6 +156,7 @@ def guided_model(
         registration: Of the case's markers.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
+        sight: What the devices see of it; None hides nothing, and has the picture along the body.
     """
     R, breathing = registration.T_base_ct[:3, :3], case.breathing
     breath, skin_weight = np.zeros(3), 0.0
@@ -103,19 +165,22 @@ def guided_model(
     motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
     return GuidedModel(
         error=error,
+        markers=registration.markers.names,
         points_base=apply(registration.T_base_ct, registration.markers.points_ct),
         q_insertion=q,
-        looks=_looks(case, anatomy, error, outward_ct, q),
+        looks=_looks(case, anatomy, error, outward_ct, q, sight or Sight()),
         motion=R @ motion @ R.T,
         breath=R @ breath,
         skin_weight=skin_weight,
         stereo=case.stereo,
         ultrasound=case.ultrasound,
-        across=R @ _across(outward_ct),
+        across=R @ _across(outward_ct, sight or Sight()),
     )
 
 
-def _looks(case: Case, anatomy: Anatomy, error: PoseError, outward_ct: Floats, q: Floats) -> tuple[Look, ...]:
+def _looks(
+    case: Case, anatomy: Anatomy, error: PoseError, outward_ct: Floats, q: Floats, sight: Sight
+) -> tuple[Look, ...]:
     paths = case_paths(case, anatomy.skin, outward_ct[None])
     length = float(paths.path_length[0])
     standoff = float(standoffs(case.needle, length, paths.skin_angle[0]))
@@ -127,13 +192,15 @@ def _looks(case: Case, anatomy: Anatomy, error: PoseError, outward_ct: Floats, q
         there = nearest_within_limits(error.model, inverse(error.model, at[None])[0], q)
         off = np.where(np.isnan(there).any(axis=1), np.inf, np.abs(there - q).max(axis=1))
         inserted = (length - out) / length
-        hidden = {} if inserted > 0 else {"tip": OUTSIDE}
+        hidden = sight.hidden(out) | ({} if inserted > 0 else {"tip": OUTSIDE})
         looks.append(Look(there[off.argmin()], out, inserted, hidden))
     return tuple(looks)
 
 
-def _across(outward_ct: Floats) -> Floats:
-    """Normal of the plane of the needle that comes nearest to the body's long axis."""
+def _across(outward_ct: Floats, sight: Sight) -> Floats:
+    """Normal of the picture: the probe's, or of the plane of the needle that comes nearest to the body's long axis."""
+    if sight.probe is not None and sight.probe.T_ct_image is not None:
+        return sight.probe.T_ct_image[:3, 2]
     along = np.array([0.0, 0.0, 1.0]) if abs(outward_ct[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     across = np.cross(outward_ct, along)
     return np.asarray(across / np.linalg.norm(across))

@@ -64,6 +64,8 @@ RANK = 1e-11
 FREE = 1e-6
 """What K F may differ from b by: more, and the readings leave a flat part open."""
 
+CAMERAS = "cameras"
+
 FLAT = ("pose", "frame")
 """The patient's pose and the cameras' frame: shift and rotation at the target, of which nothing is known beforehand."""
 
@@ -101,7 +103,11 @@ class Look(NamedTuple):
     inserted: float
     """Fraction of the way: 1 at the target, 0 at the skin, below 0 before it."""
     hidden: Mapping[str, str] = MappingProxyType({})
-    """What is out of sight, by the names of `Reading`, and why."""
+    """What is out of sight, by the names of `Reading`, and why; `CAMERAS` is all of theirs."""
+
+    def hides(self, reading: Reading) -> bool:
+        """Whether a reading of this look is not there."""
+        return reading.name in self.hidden or (reading.device == CAMERAS and CAMERAS in self.hidden)
 
 
 class Reading(NamedTuple):
@@ -110,7 +116,7 @@ class Reading(NamedTuple):
     device: str
     """touch, cameras, target or tip."""
     name: str
-    """markers, ``ball <mm behind the tip>``, target or tip."""
+    """touch, ``marker <name>``, ``ball <mm behind the tip> mm``, target or tip."""
     look: int
     """-1 for the touches, which precede all looks."""
     rows: Rows
@@ -122,7 +128,8 @@ class GuidedModel:
 
     Attributes:
         error: Of the needle by its registration, the touches known or assumed.
-        points_base: Shape (N, 3), mm: the markers by the registration.
+        markers: Their N names.
+        points_base: Shape (N, 3), mm, by the registration.
         q_insertion: Shape (6,), rad, the tip on the target.
         looks: In their order.
         motion: Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan.
@@ -134,6 +141,7 @@ class GuidedModel:
     """
 
     error: PoseError
+    markers: tuple[str, ...]
     points_base: Floats
     q_insertion: Floats
     looks: Sequence[Look]
@@ -178,53 +186,47 @@ class GuidedModel:
     @cached_property
     def readings(self) -> tuple[Reading, ...]:
         """All readings, less what the registration expects of them: the touches, then look by look."""
-        found = [Reading("touch", "markers", -1, self._touches())]
+        found = [Reading("touch", "touch", -1, self._touches())]
         for number, look in enumerate(self.looks):
             needle = self.needle(look.q, f"arrival {number}")
             found += self._seen_by_cameras(look, number, needle)
             tip = _times(np.eye(6)[:3], _sum(needle, self._bent(look.q, look.inserted)))
             found += self._in_pictures(number, tip)
-        return tuple(one for one in found if one.look < 0 or one.name not in self.looks[one.look].hidden)
+        return tuple(one for one in found if one.look < 0 or not self.looks[one.look].hides(one))
 
     def _touches(self) -> Rows:
         noise, scale, count = self.error.fit.noise, self.error.fit.test.scale, len(self.points_base)
         touch = np.zeros((count, 3, count, 3))
         touch[np.arange(count), :, np.arange(count)] = scale * _root(noise.cov_base)
-        arm = -scale * noise.arm_jacobian * np.sqrt(noise.eta_variances)
-        breath = np.tile(self.skin_weight * self.breath, count)[:, None]
-        return _sum(
-            self._markers, {"arm": arm, "touch": touch.reshape(3 * count, 3 * count), "breath at touch": breath}
-        )
+        own = {
+            "arm": -scale * noise.arm_jacobian * np.sqrt(noise.eta_variances),
+            "touch": touch.reshape(3 * count, 3 * count),
+            "breath at touch": np.tile(self.skin_weight * self.breath, count)[:, None],
+        }
+        return _sum(self._markers, own)
 
     @cached_property
     def _markers(self) -> Rows:
         """Deviation of the markers from where their readings in the CT put them, 3 N rows, at no breath."""
-        R, noise = self.error.fit.R_base_ct, self.error.fit.noise
-        read = self.error.fit.test.scale * R @ _root(noise.cov_ct)
-        return {
-            "pose": self._at(self.points_base),
-            "markers": np.asarray(-np.kron(np.eye(len(self.points_base)), read)),
-        }
+        R, count = self.error.fit.R_base_ct, len(self.points_base)
+        read = self.error.fit.test.scale * R @ _root(self.error.fit.noise.cov_ct)
+        return {"pose": self._at(self.points_base), "markers": np.asarray(-np.kron(np.eye(count), read))}
 
     def _seen_by_cameras(self, look: Look, number: int, needle: Rows) -> list[Reading]:
         if self.stereo is None:
             return []
-        T = flange_pose(self.error.model, look.q)
+        T, seen = flange_pose(self.error.model, look.q), dict[str, Rows]()
         tip, outward = T[:3, 3] + self.error.tip_mm * T[:3, 2], -T[:3, 2]
-        moved = np.tile(np.column_stack([np.zeros((3, 3)), self.skin_weight * self.breath]), (len(self.points_base), 1))
-        seen = {"markers": _sum(self._markers, {"motion": moved, "frame": self._at(self.points_base)})}
+        moved = {"motion": np.column_stack([np.zeros((3, 3)), self.skin_weight * self.breath])}
+        for row, (name, point) in enumerate(zip(self.markers, self.points_base, strict=True)):
+            own = {source: part[3 * row : 3 * row + 3] for source, part in self._markers.items()}
+            seen[marker_name(name)] = _sum(own, moved, {"frame": self._at(point[None])})
         for behind in self.stereo.balls_mm:
             ball = behind * outward[None]
-            on_needle = _times(design(ball, np.zeros(3)), needle)
-            seen[ball_name(behind)] = _sum(on_needle, {"frame": self._at(tip + ball)})
+            seen[ball_name(behind)] = _sum(_times(design(ball, np.zeros(3)), needle), {"frame": self._at(tip + ball)})
+        noise = self.stereo.sd_mm * np.eye(3)
         return [
-            Reading(
-                "cameras",
-                name,
-                number,
-                {**rows, f"seen {name} {number}": self.stereo.sd_mm * np.eye(len(rows["frame"]))},
-            )
-            for name, rows in seen.items()
+            Reading("cameras", name, number, {**rows, f"seen {name} {number}": noise}) for name, rows in seen.items()
         ]
 
     def _in_pictures(self, number: int, tip: Rows) -> list[Reading]:
@@ -319,7 +321,12 @@ def device_of(name: str) -> str:
 
 def ball_name(behind_mm: float) -> str:
     """Name of a ball's reading."""
-    return f"ball {behind_mm:g}"
+    return f"ball {behind_mm:g} mm"
+
+
+def marker_name(name: str) -> str:
+    """Name of a marker's reading by the cameras."""
+    return f"marker {name}"
 
 
 def _weights(H: Floats, F: Floats, a: Floats, b: Floats) -> Floats | None:

@@ -60,7 +60,17 @@ def model(
     at = [Look(PLANNED, 0.0, inserted, dict(hidden or {})) for inserted in looks]
     motion = R @ np.diag(np.square(motion_mm)) @ R.T
     return GuidedModel(
-        error, points, PLANNED, at, motion, R @ breath, skin, stereo, ultrasound, R @ across / np.linalg.norm(across)
+        error,
+        REGISTRATION.markers.names,
+        points,
+        PLANNED,
+        at,
+        motion,
+        R @ breath,
+        skin,
+        stereo,
+        ultrasound,
+        R @ across / np.linalg.norm(across),
     )
 
 
@@ -114,7 +124,7 @@ def test_no_flat_part_is_in_the_answer():
 
 def test_without_sight_there_is_no_answer():
     """Cameras that see no ball, and a picture without the target, do not say where the needle is against it."""
-    blind = model(hidden=dict.fromkeys(("ball 80", "ball 160", "target"), ""))
+    blind = model(hidden=dict.fromkeys(("ball 80 mm", "ball 160 mm", "target"), ""))
     for way in ("stereo", "us", "us+tip"):
         assert blind.guided(way) is None
     assert rms(blind.guided("ct+us")) <= rms(blind.guided("ct"))

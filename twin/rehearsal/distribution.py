@@ -13,6 +13,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.budget.guidance import (
+    Sight,
     as_rehearsed,
     check_devices,
     check_way,
@@ -177,6 +178,7 @@ def rehearse_trials(
     count: int,
     seed: int,
     guidance: str | None = None,
+    sight: Sight | None = None,
 ) -> Distribution:
     """Rehearse one direction in many trials, each with a truth of its own.
 
@@ -188,6 +190,7 @@ def rehearse_trials(
         seed: Of all draws.
         guidance: One of `WAYS`, in bodies that move as the case declares: every way has the same patients by a seed.
             None is by registration, in bodies at rest.
+        sight: What its devices see of the insertion; None hides nothing.
 
     Raises:
         InputError: The case declares no errors, has no markers, or lacks a device of the way.
@@ -197,20 +200,22 @@ def rehearse_trials(
     rng = np.random.default_rng(seed)
     if guidance is None:
         return _measured(context, query, draw_trials(query.puncture, query.truth, count, rng), rng, seed)
-    way, moving = _way(context, query, guidance)
+    way, moving = _way(context, query, guidance, sight)
     truths = draw_truths(query.puncture, query.truth, count, rng, moving)
     done = guided_trials(query.puncture, truths, query.truth, way, np.random.default_rng([seed, 4]))
     return _measured(context, query, done.trials, rng, seed, (way, done.stopped))
 
 
-def _way(context: CaseContext, query: _Query, name: str) -> tuple[Way, Moving]:
+def _way(context: CaseContext, query: _Query, name: str, sight: Sight | None = None) -> tuple[Way, Moving]:
     """One way of guidance of a query's puncture, and what moves in the truth."""
     case, puncture = context.case, query.puncture
     check_way(name)
     check_devices(case, name)
     assert context.placement is not None and context.placement.registration is not None
     registration = context.placement.registration
-    model = guided_model(case, context.anatomy, query.believed, registration, puncture.outward_ct, puncture.q_insertion)
+    model = guided_model(
+        case, context.anatomy, query.believed, registration, puncture.outward_ct, puncture.q_insertion, sight
+    )
     chance = chance_model(case, context.anatomy, context.engine, query.believed)
     assert chance is not None
     motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct

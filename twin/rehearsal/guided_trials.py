@@ -17,7 +17,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.planning.uncertainty.guided import GuidedModel, Look, ball_name
+from puncture_twin.planning.uncertainty.guided import GuidedModel, Look, ball_name, marker_name
 from puncture_twin.twin.plant.room_devices import RoomCameras, RoomProbe
 from puncture_twin.twin.plant.true_needle import TrueNeedle, true_needle
 from puncture_twin.twin.rehearsal.trials import (
@@ -78,7 +78,7 @@ def guided_trials(
     room = _Room(puncture, truths, model, T_base_ct, *_devices(puncture, truths, model, rng))
     drift = _drift(errors, truths.arrival, rng)
     moved, stopped, reached = np.zeros((count, 3)), np.zeros(count, bool), np.ones(count, bool)
-    found: Readings = {("markers", -1): _flat(truths.touched_base - apply_each(T_base_ct, truths.read_ct))}
+    found: Readings = {("touch", -1): (truths.touched_base - apply_each(T_base_ct, truths.read_ct)).reshape(count, -1)}
     for number, look in enumerate(model.looks):
         q, there = commanded(puncture, T_base_ct, moved, look.out_mm, look.q)
         arrival = rng.normal(size=(count, 6)) * errors.arm.repeatability
@@ -150,7 +150,7 @@ class _Room:
         axis = nominal[:, :3, 2]
         tip = nominal[:, :3, 3] + self.puncture.tip_mm * axis
         found = {**self._by_cameras(needle, tip, axis), **self._by_probe(look, needle, tip)}
-        return {(name, number): _flat(value) for name, value in found.items() if name not in look.hidden}
+        return {(name, number): value for name, value in found.items() if name not in look.hidden}
 
     def _by_cameras(self, needle: TrueNeedle, tip: Floats, axis: Floats) -> dict[str, Floats]:
         if self.cameras is None:
@@ -163,7 +163,8 @@ class _Room:
         T_base_cameras = fit_rigid(markers, expected)  # the frame is free: anywhere near will do
         off = apply_each(T_base_cameras, balls) - (tip[:, None] - behind * axis[:, None])
         seen = {ball_name(mm): off[:, row] for row, mm in enumerate(self.cameras.device.balls_mm)}
-        return {"markers": apply_each(T_base_cameras, markers) - expected, **seen}
+        there = apply_each(T_base_cameras, markers) - expected
+        return {**{marker_name(name): there[:, row] for row, name in enumerate(self.model.markers)}, **seen}
 
     def _by_probe(self, look: Look, needle: TrueNeedle, tip: Floats) -> dict[str, Floats]:
         if self.probe is None:
@@ -175,7 +176,3 @@ class _Room:
             grown = max(look.inserted, 0.0) ** 2
             needle = bent(needle, puncture.bend._replace(tip_mm=grown * puncture.bend.tip_mm), truths.side)
         return {"target": self.probe.target(target) - expected, "tip": self.probe.tip(needle.tip_base) - tip}
-
-
-def _flat(points: Floats) -> Floats:
-    return np.asarray(points.reshape(len(points), -1))

@@ -91,7 +91,7 @@ def test_what_is_hidden_is_missing_and_named(insertion):
     """Hidden balls leave the cameras blind for the needle, which is refused; all other devices go on without them."""
     context, outward, q = insertion
     way, _ = distribution._way(context, distribution._query(context, outward, q), "all")
-    balls = dict.fromkeys(("ball 80", "ball 160"), "the arm is before it")
+    balls = dict.fromkeys(("ball 80 mm", "ball 160 mm"), "the arm is before it")
     model = replace(way.model, looks=tuple(look._replace(hidden={**look.hidden, **balls}) for look in way.model.looks))
     with pytest.raises(NoAnswerError) as caught:
         guided_error(model, "stereo")
