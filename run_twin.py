@@ -206,6 +206,7 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Explain one candidate in full, or check a list. Without a choice, the best candidate is explained."""
+    from puncture_twin.planning.budget.guidance import explained_ways
     from puncture_twin.planning.search.choice import explain_choice
     from puncture_twin.planning.search.explain import NEAREST
     from puncture_twin.twin.jobs.choosing.list_job import check_list, lists_of
@@ -216,7 +217,7 @@ def check(
         finish("check", listed, listed.summary(), listed.text(), as_json)
         return
     with prepared(case, arm=arm) as context:
-        explained = explain_choice(context, choice)
+        explained = explained_ways(context, explain_choice(context, choice))
         if picture is not None:
             from puncture_twin.twin.jobs.patient.pictures import write_check_picture
 

@@ -176,9 +176,11 @@ def check(
         InputError: An angle outside of its range, two choices, or an entry from which no straight path enters there.
         NoAnswerError: Nothing is safe, so that nothing is the best.
     """
+    from puncture_twin.planning.budget.guidance import explained_ways
     from puncture_twin.planning.search.choice import explain_choice, stated_choice
 
-    return explain_choice(context, stated_choice("check", context, theta_deg, beta_deg, candidate, window, entry))
+    explained = explain_choice(context, stated_choice("check", context, theta_deg, beta_deg, candidate, window, entry))
+    return explained_ways(context, explained)
 
 
 @checked
@@ -303,11 +305,12 @@ def plan(
         InputError: The case does not say where the robot's base is, or there is nothing of what was chosen.
         NoAnswerError: Nothing is safe, what was chosen is rejected, or the arm finds no free approach to it.
     """
+    from puncture_twin.planning.budget.guidance import with_ways
     from puncture_twin.planning.plan.planner import make_plan
     from puncture_twin.planning.search.choice import stated_choice
 
     choice = stated_choice("plan", context, theta_deg, beta_deg, candidate, window, entry)
-    return make_plan(context, candidates, choice, seed=seed).plan
+    return with_ways(context, make_plan(context, candidates, choice, seed=seed).plan)
 
 
 @checked
@@ -705,8 +708,10 @@ def _own_plan(context: CaseContext, plan: Plan, where: str) -> Plan:
     Raises:
         InputError: It does not; see `read_plan`.
     """
+    from puncture_twin.planning.budget.guidance import check_ways
     from puncture_twin.planning.plan.plan_check import with_case_arm
     from puncture_twin.planning.plan.recheck import check_plan
 
     check_plan(plan, context, Path(where))
+    check_ways(context, plan, where)
     return with_case_arm(plan, context.case)

@@ -12,6 +12,7 @@ keeps every margin in the anatomy as the CT shows it. What would go farther is n
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -21,20 +22,30 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.reach.standoff import case_axis_lengths, case_paths, standoffs
-from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise
+from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise, touches
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.registration.residuals import NoiseTest
 from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import moving_weights
 from puncture_twin.planning.sight.cameras import CameraView, camera_view
 from puncture_twin.planning.sight.probe import ProbeView, probe_view
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
-from puncture_twin.planning.uncertainty.guided import CAMERAS, WAYS, GuidedError, GuidedModel, Look, device_of
+from puncture_twin.planning.uncertainty.guided import (
+    CAMERAS,
+    WAYS,
+    GuidedError,
+    GuidedModel,
+    Look,
+    WayChance,
+    device_of,
+)
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 LOOKS = 3
@@ -112,7 +123,7 @@ class Sight:
         if self.cameras is not None:
             row = int(np.abs(self.cameras.tip_to_target_mm - out_mm).argmin())
             named = zip(self.cameras.names, self.cameras.hidden[row], strict=True)
-            behind = {name: f"behind {by}" for name, by in named if by}
+            behind = {name: f"behind the {by.replace('_', ' ')}" for name, by in named if by}
             markers = [name for name in self.cameras.names[self.cameras.balls :] if name not in behind]
             found |= behind if len(markers) >= MIN_MARKERS else {**behind, CAMERAS: FEW_MARKERS}
         return found
@@ -122,18 +133,18 @@ FEW_MARKERS = f"fewer than {MIN_MARKERS} markers are seen"
 
 
 def sight_of(context: CaseContext, plan: Plan, way: str) -> Sight:
-    """What the devices of a way see during a plan's insertion.
+    """What those devices of a way that the case declares see during a plan's insertion.
 
     Raises:
-        InputError: The case does not declare them, or states a place that cannot be used.
+        InputError: The case states a place for them that cannot be used.
     """
     used, cameras, probe, lost = WAYS[way], None, None, ""
-    if "cameras" in used:
+    if "cameras" in used and context.case.stereo is not None:
         try:
             cameras = camera_view(context, plan)
         except NoAnswerError as error:
             lost = str(error)
-    if used & {"target", "tip"}:
+    if used & {"target", "tip"} and context.case.ultrasound is not None:
         probe = probe_view(context, plan)
     return Sight(cameras, probe, lost)
 
@@ -204,6 +215,73 @@ def _across(outward_ct: Floats, sight: Sight) -> Floats:
     along = np.array([0.0, 0.0, 1.0]) if abs(outward_ct[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     across = np.cross(outward_ct, along)
     return np.asarray(across / np.linalg.norm(across))
+
+
+def way_chances(
+    context: CaseContext, outward_ct: Floats, q: Floats, sight: Sight | None = None
+) -> tuple[WayChance, ...]:
+    """What each way would leave of an insertion, ct first, by the devices of a case; nothing where it declares none.
+
+    Args:
+        context: The case.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q: Shape (6,), rad, the tip on the target.
+        sight: What the devices see; None hides nothing.
+    """
+    case, chance = context.case, context.chance
+    ways = declared_ways(case)
+    if len(ways) == 1 or chance is None or context.placement is None or context.placement.registration is None:
+        return ()
+    registration = context.placement.registration
+    path = bent_path(case, context.anatomy, outward_ct)
+    error = as_rehearsed(chance.error, touches(case, registration.markers))
+    error = replace(error, bend=None if path is None else path.bend)
+    model = guided_model(case, context.anatomy, error, registration, outward_ct, q, sight)
+    found = []
+    for way in ways:
+        lost = "; ".join(lost_sight(model, way))
+        try:
+            left = guided_error(model, way)
+        except NoAnswerError as refused:
+            found.append(WayChance(way, np.nan, np.nan, lost or str(refused)))
+            continue
+        p_hit = float(replace(chance, error=left).hit_chance(left.covariance_ct(q[None]))[0])
+        found.append(WayChance(way, float(np.sqrt(np.trace(left.tip_covariance(q[None])[0]))), p_hit, lost))
+    return tuple(found)
+
+
+def with_ways(context: CaseContext, plan: Plan) -> Plan:
+    """A plan with what each way of guidance would leave, the devices as the case's geometry lets them see."""
+    if len(declared_ways(context.case)) == 1 or context.chance is None:
+        return replace(plan, guidance=())
+    sight = sight_of(context, plan, "all")
+    return replace(plan, guidance=way_chances(context, plan.outward_ct, plan.insertion.q[-1], sight))
+
+
+def check_ways(context: CaseContext, plan: Plan, where: str | Path) -> None:
+    """Refuse a plan that states other chances by guidance than its case gives: people read them.
+
+    Raises:
+        InputError: It does.
+    """
+    known = with_ways(context, plan).guidance
+    same = len(known) == len(plan.guidance) and all(
+        a.way == b.way
+        and a.lost_sight == b.lost_sight
+        and np.allclose(a[1:3], b[1:3], rtol=0, atol=1e-6, equal_nan=True)
+        for a, b in zip(known, plan.guidance, strict=True)
+    )
+    if not same:
+        refuse("guidance is another than the case gives", where, "plan again", "plan_of_another")
+
+
+def explained_ways(context: CaseContext, explained: Explanation) -> Explanation:
+    """A checked direction with what each way of guidance would leave, nothing hidden: sight needs a plan."""
+    row = explained.candidates
+    q = row.arm.q_insertion[0]
+    if np.isnan(q).any() or np.isnan(row.path.length[0]):
+        return explained
+    return replace(explained, guidance=way_chances(context, row.outward_ct[0], q))
 
 
 def lost_sight(model: GuidedModel, way: str) -> tuple[str, ...]:

@@ -33,12 +33,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.strict_json import or_null
 from puncture_twin.planning.case.settings import Stereo, Ultrasound
 from puncture_twin.planning.registration.fits import design
 from puncture_twin.planning.uncertainty.pose_error import PoseError
@@ -348,6 +349,22 @@ class Guided(NamedTuple):
     """Shape (3, 3), mm^2, of the tip about the true target."""
     parts: Mapping[str, float]
     """Mean square of the tip by source, mm^2."""
+
+
+class WayChance(NamedTuple):
+    """What one way of guidance is expected to leave of one insertion."""
+
+    way: str
+    expected_error_mm: float
+    """Rms of the tip about the target; NaN where the way does not see enough."""
+    p_hit: float
+    lost_sight: str
+    """What is not seen, and why; empty where all is."""
+
+    def document(self) -> dict[str, Any]:
+        """Plain values for JSON; null where there is no number."""
+        numbers = {name: or_null(getattr(self, name)) for name in ("expected_error_mm", "p_hit")}
+        return {"way": self.way, **numbers, "lost_sight": self.lost_sight}
 
 
 @dataclass(frozen=True, eq=False)

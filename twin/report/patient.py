@@ -18,7 +18,13 @@ from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.plan.plan import CLEARANCE_TEXT
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import deep_text
-from puncture_twin.planning.search.uncertainty_breakdown import LEAST_FRACTION, UncertaintyBreakdown, chance_text
+from puncture_twin.planning.search.uncertainty_breakdown import (
+    LEAST_FRACTION,
+    WAY_HEAD,
+    UncertaintyBreakdown,
+    chance_text,
+    way_cells,
+)
 from puncture_twin.planning.search.windows import MOST_WINDOWS, Window
 from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.report.numbers import (
@@ -158,7 +164,8 @@ def plan(
         (TIP_ERROR_TEXT if declared else TRE_TEXT, expected_text(plan.expected_target_error_mm)),
         ("seed", str(plan.seed)),
     ]
-    return [facts(rows), *notes]
+    led = [Table(WAY_HEAD, tuple(map(way_cells, plan.guidance)))] if plan.guidance else []
+    return [facts(rows), *led, *notes]
 
 
 def rehearsal(

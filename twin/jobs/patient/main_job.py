@@ -21,6 +21,7 @@ from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.output.publish import Draft
 from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.budget.guidance import check_ways, with_ways
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
@@ -232,6 +233,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     source, plan = read_noted_plan(plan_path, context.watcher.note)
     with context.stages.time("plan"):
         candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
+        check_ways(context, plan, plan_path)
     plan = with_case_arm(plan, context.case)
     with _writing(out, "rehearse", context, ("rehearsal.json", FILM, ROOMS), source) as draft:
         run = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), rooms, partial).ended(draft.folder)
@@ -311,6 +313,7 @@ def _planned(run: Run, out: Path, choice: Choice) -> Run:
     try:
         with context.stages.time("plan"):
             plan, found, row = make_plan(context, run.candidates, choice)
+            plan = with_ways(context, plan)
     except NoAnswerError as error:
         return replace(run, refusal=str(error).removeprefix(NO_PLAN))
     write_plan(plan, out / "plan.json")
