@@ -55,10 +55,8 @@ AIR_HU, AIR_STEP_MM, RIM_MM = -300.0, 1.0, 3.0
 """In a CT what is thinner is air; how densely a line is looked at; next to the skin voxels hold both."""
 
 CLEARANCE_MM = 4.0
-"""What probe and its arm keep from needle, holder and the needle's arm, as where it calibrates itself."""
-
-STEPS = 5
-"""Depths of the insertion at which the two arms are held against each other."""
+"""What probe and its arm keep from needle, holder and the needle's arm, as where it calibrates itself, at states of the
+insertion that are so close that none between them is farther from one: so nothing touches there either."""
 
 BONE = ("vertebrae, spine", "ribs", "costal cartilages, sternum", "pelvis", "limbs and girdles", "skull and face")
 """Groups of `planning.anatomy.default_roles` that no sound passes, devices besides."""
@@ -312,7 +310,7 @@ def probe_mount() -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _ProbeArm:
-    """The arm that holds the probe, beside the needle's at the depths of an insertion."""
+    """The arm that holds the probe, beside the needle's at states (k, 6), rad, of an insertion."""
 
     model: UrModel
     T_base_ct: Floats
@@ -377,5 +375,5 @@ def _arm(context: CaseContext, plan: Plan, probe: Ultrasound, T_base_ct: Floats)
     between = BetweenArms((probe.model, needle.model), (tool, needle.tool), head, T_base_needle, CLEARANCE_MM)
     around = [one.mesh for one in anatomy.surroundings]
     solids = FclSkin(joined(around).transformed(T_base_ct), "surroundings") if around else None
-    steps = np.linspace(0, len(plan.insertion.q) - 1, STEPS).round().astype(np.int64)
-    return _ProbeArm(probe.model, T_base_ct, checker, between, solids, plan.insertion.q[steps])
+    states = plan.insertion.q[needle.swept.rows_within(plan.insertion.q, CLEARANCE_MM)]
+    return _ProbeArm(probe.model, T_base_ct, checker, between, solids, states)
