@@ -202,8 +202,6 @@ def test_the_abdomen_has_a_place_for_the_probe(abdomen, view):
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
         at, ray, _ = solid.ray.intersects_location(np.tile(plan.target_ct, (5, 1)), ways / far[:, None])
         assert (np.linalg.norm(at - plan.target_ct, axis=1) > far[ray]).all()
-    again = probe_view(context, plan)
-    assert (again.T_ct_image == T).all() and again.counts == view.counts
 
 
 def test_both_arms_keep_their_clearance_in_the_abdomen(abdomen, view):
