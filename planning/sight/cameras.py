@@ -23,7 +23,7 @@ from puncture_twin.planning.base.text import Facts, Shown, brief, first_few, plu
 from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.collision.bodies import Body, Solid, arm_bodies, touch
 from puncture_twin.planning.collision.patient import FclSkin
-from puncture_twin.planning.collision.state_checker import PATIENT
+from puncture_twin.planning.collision.state_checker import PATIENT, SweptBodies
 from puncture_twin.planning.geometry.containment import contains, crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply, inverse
@@ -37,9 +37,8 @@ LOWEST, ELEVATIONS, AZIMUTHS = np.radians(20.0), 8, 36
 """Where the middle between proposed cameras is looked for: least height over the bed, steps up to straight above it,
 and steps around: 10 degrees each. Neither camera is lower."""
 
-STEPS, APPROACH_STATES = 7, 40
-"""Depths of the insertion at which is looked, from the standoff to the target; states of the approach that are held
-against proposed cameras."""
+STEPS = 7
+"""Depths of the insertion at which is looked, from the standoff to the target."""
 
 BALL_MM = 4.0
 """Radius of a ball on the shaft. One on the holder lies around it, and is as much wider."""
@@ -47,8 +46,9 @@ BALL_MM = 4.0
 MARKER_MM = 5.0
 """A marker lies on the skin, whose surface may be read so far off: nearer to it nothing hides it."""
 
-CAMERA_MM = 80.0
-"""Radius of a ball about a proposed camera that nothing else is in: its housing and its mount."""
+CAMERA_MM, BETWEEN_MM = 80.0, 20.0
+"""Radius of a ball about a proposed camera, its housing and its mount, that nothing is in at some states of the motion;
+at all others nothing is nearer than that less by the second."""
 
 Names = NDArray[np.object_]
 """Texts, of any shape."""
@@ -129,8 +129,8 @@ def camera_view(context: CaseContext, plan: Plan) -> CameraView:
     stereo = context.case.stereo
     if stereo is None:
         refuse("no cameras are declared", context.case.path, "a table [stereo]", "no_stereo")
-    tool = context.require_arm().checker.tool
-    bodies = arm_bodies(plan.model, tool, 0.0)
+    checker = context.require_arm().checker
+    tool, bodies = checker.tool, arm_bodies(plan.model, checker.tool, 0.0)
     static = [(PATIENT, context.anatomy.skin.mesh), *((one.name, one.mesh) for one in context.anatomy.surroundings)]
     known = None if context.placement is None else context.placement.registration
     markers = {} if known is None else dict(zip(known.markers.names, known.markers.points_ct, strict=True))
@@ -152,7 +152,7 @@ def camera_view(context: CaseContext, plan: Plan) -> CameraView:
     both = (hidden == "").all(axis=3)
     keys = (-middles @ T_ct_bed[:3, 2], np.abs(middles @ plan.outward_ct).round(6), -both[:, count:].sum(axis=(0, 1)))
     order = np.lexsort((*keys, -both[:, :count].sum(axis=(0, 1)), -both[:, :count].any(axis=1).sum(axis=0)))
-    may_be = _free_places(static, bodies, plan)
+    may_be = _free_places(static, bodies, checker.swept, plan)
     for row in order:
         if all(may_be(camera) for camera in pairs[row]):
             return answer(pairs[row], hidden[:, :, row])
@@ -251,10 +251,10 @@ def _hidden(looks: Sequence[_Look], static: Surfaces, markers_ct: Floats, camera
     return np.array(found, object)
 
 
-def _free_places(static: Surfaces, bodies: Sequence[Body], plan: Plan) -> Callable[[Floats], bool]:
+def _free_places(static: Surfaces, bodies: Sequence[Body], swept: SweptBodies, plan: Plan) -> Callable[[Floats], bool]:
     """Whether a ball of `CAMERA_MM` about a point (3,), CT, is outside of everything while the arm moves."""
-    q = np.concatenate([part.q[:: max(1, len(part.q) // APPROACH_STATES)] for part in (plan.approach, plan.insertion)])
-    moving = inverse(plan.T_base_ct) @ link_poses(plan.model, q)
+    q = np.concatenate([plan.approach.q, plan.insertion.q])
+    moving = inverse(plan.T_base_ct) @ link_poses(plan.model, q[swept.rows_within(q, BETWEEN_MM)])
     skins = [FclSkin(mesh, name) for name, mesh in static]
     box = CAMERA_MM * np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from puncture_twin.planning.anatomy.anatomy import UNNAMED_DENSE, UNNAMED_GAS, A
 from puncture_twin.planning.anatomy.default_roles import default_role
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin, skin_paths
+from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.arm.inverse_kinematics import inverse as branches, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import away_from_singularities
 from puncture_twin.planning.arm.tool import Box
@@ -55,13 +55,14 @@ AIR_HU, AIR_STEP_MM, RIM_MM = -300.0, 1.0, 3.0
 """In a CT what is thinner is air; how densely a line is looked at; next to the skin voxels hold both."""
 
 CLEARANCE_MM = 4.0
-"""What probe and its arm keep from needle, holder and the needle's arm, as where it calibrates itself."""
+"""What probe and its arm keep from needle, holder and the needle's arm, as where it calibrates itself, at states of the
+insertion that are so close that none between them is farther from one: so nothing touches there either."""
 
-STEPS = 5
-"""Depths of the insertion at which the two arms are held against each other."""
-
-BONE = ("vertebrae, spine", "ribs", "costal cartilages, sternum", "pelvis", "limbs and girdles", "skull and face")
-"""Groups of `planning.anatomy.default_roles` that no sound passes, devices besides."""
+BONE = (
+    *("vertebrae, spine", "ribs", "costal cartilages, sternum", "pelvis", "limbs and girdles", "skull and face"),
+    "devices",
+)
+"""Groups of `planning.anatomy.default_roles` that no sound passes."""
 
 AIRY = ("lungs", "airways", "stomach and bowel")
 """Groups that hold air; of the last a CT says where."""
@@ -79,21 +80,23 @@ class Ruled(StrEnum):
     NO_SKIN = "no_skin"
     TOO_DEEP = "too_deep"
     TILTED = "tilted"
-    BONE = "bone"
+    UNKNOWN = "unknown_region"
     AIR = "air"
+    BONE = "bone"
     OUT_OF_REACH = "out_of_reach"
     PROBE_ARM = "probe_arm_collision"
     ARMS = "arms_collide"
 
 
-MOUNT = "another [ultrasound.mount]"
+MOUNT, ASIDE_OF_IT = "another [ultrasound.mount]", "another direction, or a narrower probe (width_mm)"
 WHY: Mapping[Ruled, tuple[str, str]] = MappingProxyType(
     {
         Ruled.NO_SKIN: ("are where no skin is known", "a CT that shows more of the skin about the entry"),
         Ruled.TOO_DEEP: ("are farther from the target than the probe sees", "a larger depth_mm in [ultrasound]"),
         Ruled.TILTED: ("lean too far against the skin", "an entry where the skin is flatter"),
-        Ruled.BONE: ("have bone in the way of the sound", "another direction, or a narrower probe (width_mm)"),
-        Ruled.AIR: ("have air in the way of the sound", "another direction, or a narrower probe (width_mm)"),
+        Ruled.UNKNOWN: ("have what nobody knows in the way of the sound", ASIDE_OF_IT),
+        Ruled.AIR: ("have air in the way of the sound", ASIDE_OF_IT),
+        Ruled.BONE: ("have bone in the way of the sound", ASIDE_OF_IT),
         Ruled.OUT_OF_REACH: ("are beyond the reach of the probe's arm", f"{MOUNT}, or a longer arm (model)"),
         Ruled.PROBE_ARM: ("have the probe's arm in the patient, in an obstacle or in itself", MOUNT),
         Ruled.ARMS: ("have probe and needle, or their arms, touch each other", f"{MOUNT}, or another direction"),
@@ -101,7 +104,7 @@ WHY: Mapping[Ruled, tuple[str, str]] = MappingProxyType(
 )
 """What is said of footprints, and what would let most of them pass."""
 
-STAGES = (tuple(Ruled)[5:], tuple(Ruled)[3:5], tuple(Ruled)[:3])
+STAGES = (tuple(Ruled)[6:], tuple(Ruled)[3:6], tuple(Ruled)[:3])
 """By arm, by sound, by skin: what came to a later stage says more."""
 
 
@@ -169,7 +172,7 @@ def probe_view(context: CaseContext, plan: Plan) -> ProbeView:
     if probe is None:
         refuse("no probe is declared", context.case.path, "a table [ultrasound]", "no_ultrasound")
     feet = footprints(context.anatomy.skin, plan.target_ct, plan.outward_ct, probe.depth_mm)
-    passing(feet, acoustic(context.anatomy, context.case.region), probe.width_mm)
+    passing(feet, opaque(context.anatomy, context.case.region), context.anatomy.scan, probe.width_mm)
     rows, stated = feet.left, probe.T_base_ct_mount
     for T_base_ct in _mounts(context, plan) if stated is None else (stated,):
         arm = _arm(context, plan, probe, T_base_ct) if len(rows) else None
@@ -241,44 +244,41 @@ def footprints(skin: Skin, target_ct: Floats, outward_ct: Floats, depth_mm: floa
     return feet
 
 
-class Acoustic(NamedTuple):
-    """What no sound passes, CT frame: surfaces of bone and of air, and the CT that shows air inside of the body."""
-
-    bone: Sequence[TriangleMesh]
-    air: Sequence[TriangleMesh]
-    scan: Scan | None
+Opaque = Mapping[Ruled, Sequence[TriangleMesh]]
+"""Reason to surfaces that no sound passes, CT frame; where two are in the way the later reason is named."""
 
 
-def acoustic(anatomy: Anatomy, region: str) -> Acoustic:
-    """What no sound passes in a body, by the names of its structures; gas in the bowel by the CT where there is one."""
-    bone, air = [], []
+def opaque(anatomy: Anatomy, region: str) -> Opaque:
+    """What no sound passes in a body, by names and roles of its structures; gas in the bowel only without a CT."""
+    found: dict[Ruled, list[TriangleMesh]] = {Ruled.UNKNOWN: [], Ruled.AIR: [], Ruled.BONE: []}
+    airy = AIRY if anatomy.scan is None else AIRY[:-1]
     for one in anatomy.structures:
         line = default_role(one.name, region)
         group = "" if line is None else line.group
-        if one.name == UNNAMED_DENSE or group in (*BONE, "devices"):
-            bone.append(one.mesh)
-        elif one.name == UNNAMED_GAS or group in (AIRY if anatomy.scan is None else AIRY[:-1]):
-            air.append(one.mesh)
-    return Acoustic(bone, air, anatomy.scan)
+        if one.name == UNNAMED_DENSE or group in BONE:
+            found[Ruled.BONE].append(one.mesh)
+        elif one.name == UNNAMED_GAS or group in airy:
+            found[Ruled.AIR].append(one.mesh)
+        elif one.role is Role.UNKNOWN:
+            found[Ruled.UNKNOWN].append(one.mesh)
+    return found
 
 
-def passing(feet: Footprints, body: Acoustic, width_mm: float) -> None:
-    """Rule out the footprints whose sector, from the face to the target, holds bone or air."""
-    rows = feet.left
-    along = np.linspace(-width_mm / 2.0, width_mm / 2.0, RAYS)
+def passing(feet: Footprints, surfaces: Opaque, scan: Scan | None, width_mm: float) -> None:
+    """Rule out the footprints whose sector, from the face to the target, meets a surface, or air in the CT."""
+    rows, along = feet.left, np.linspace(-width_mm / 2.0, width_mm / 2.0, RAYS)
     faces = feet.T_ct_image[rows, None, :3, 3] + along[:, None] * feet.T_ct_image[rows, None, :3, 0]
     apart = (faces - feet.target_ct).reshape(-1, 3)
     far = np.linalg.norm(apart, axis=1)
-    rays = apart / far[:, None]
-    for why, meshes in ((Ruled.AIR, body.air), (Ruled.BONE, body.bone)):  # bone is named where both are in the way
+    rays, farthest = apart / far[:, None], float(far.max(initial=0.0))
+    for why, meshes in surfaces.items():
         for mesh in meshes:
-            depth = first_crossing(mesh, feet.target_ct, rays, float(far.max(initial=0.0)))
+            depth = first_crossing(mesh, feet.target_ct, rays, farthest)
             shut = ((depth > 0.0) & (depth <= far)).reshape(-1, RAYS).any(axis=1) | contains(mesh, feet.target_ct)
-            feet.ruled[rows[shut]] = _ORDER.index(why)
-    if body.scan is not None and len(rows):
-        ends = np.fmin(far, first_crossing(feet.skin.mesh, feet.target_ct, rays, float(far.max()) + RIM_MM)) - RIM_MM
-        airy = _air_on(body.scan, feet.target_ct, rays, ends).reshape(-1, RAYS).any(axis=1)
-        feet.ruled[rows[airy & (feet.ruled[rows] < 0)]] = _ORDER.index(Ruled.AIR)
+            feet.rule_out(rows[shut], why)
+    if scan is not None and len(rows):
+        ends = np.fmin(far, first_crossing(feet.skin.mesh, feet.target_ct, rays, farthest + RIM_MM)) - RIM_MM
+        feet.rule_out(rows[_air_on(scan, feet.target_ct, rays, ends).reshape(-1, RAYS).any(axis=1)], Ruled.AIR)
 
 
 def _air_on(scan: Scan, target_ct: Floats, rays: Floats, ends: Floats) -> Bools:
@@ -312,7 +312,7 @@ def probe_mount() -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _ProbeArm:
-    """The arm that holds the probe, beside the needle's at the depths of an insertion."""
+    """The arm that holds the probe, beside the needle's at states (k, 6), rad, of an insertion."""
 
     model: UrModel
     T_base_ct: Floats
@@ -377,5 +377,5 @@ def _arm(context: CaseContext, plan: Plan, probe: Ultrasound, T_base_ct: Floats)
     between = BetweenArms((probe.model, needle.model), (tool, needle.tool), head, T_base_needle, CLEARANCE_MM)
     around = [one.mesh for one in anatomy.surroundings]
     solids = FclSkin(joined(around).transformed(T_base_ct), "surroundings") if around else None
-    steps = np.linspace(0, len(plan.insertion.q) - 1, STEPS).round().astype(np.int64)
-    return _ProbeArm(probe.model, T_base_ct, checker, between, solids, plan.insertion.q[steps])
+    states = plan.insertion.q[needle.swept.rows_within(plan.insertion.q, CLEARANCE_MM)]
+    return _ProbeArm(probe.model, T_base_ct, checker, between, solids, states)

