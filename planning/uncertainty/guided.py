@@ -16,7 +16,7 @@ are linear in both:
 All readings stacked are z = H x + F u. A way uses some of them. What it estimates is t = tip - target = a x + b u;
 the tip is moved by -K z, with the weights K of the least error among those that no flat part enters:
 
-    min |a - K H|^2  with  K F = b       <=>      [H H'  F; F'  0] [K'; l] = [H a'; b']
+    min |a - K H|^2  with  K F = b:      K = K0 + M N',   K0 F = b,   N' F = 0,   M by least squares
 
 The flat parts are eliminated, not given a large variance. ct is the registration as it is, K = -X L. The needle keeps
 the direction that the registration gave it: in every way
@@ -59,11 +59,15 @@ WAYS: Mapping[str, frozenset[str]] = {
 LEVER_MM = 100.0
 """Flat rotations are counted in mm at this distance, so that the columns of F are of one size."""
 
-RANK = 1e-11
-"""Relative size below which a singular value is 0: two readings say the same."""
+RANK = 1e-9
+"""Relative size below which a singular value of F is 0."""
 
-FREE = 1e-6
-"""What K F may differ from b by: more, and the readings leave a flat part open."""
+ALIKE_MM = 1e-6
+"""Two readings that differ by less say the same."""
+
+FREE = 0.01
+"""mm that the tip's estimate may follow per mm of a flat part that no reading shows: more, and it is open. Cameras do
+not see a roll about the needle; where the registered target is .1 mm beside its line, that is .001."""
 
 CAMERAS = "cameras"
 
@@ -332,10 +336,18 @@ def marker_name(name: str) -> str:
 
 def _weights(H: Floats, F: Floats, a: Floats, b: Floats) -> Floats | None:
     """K, shape (3, m), of the least error without a flat part; None where there is none."""
-    zero = np.zeros((F.shape[1], F.shape[1]))
-    left, right = np.block([[H @ H.T, F], [F.T, zero]]), np.vstack([H @ a.T, b.T])
-    K = np.linalg.lstsq(left, right, rcond=RANK)[0][: len(H)].T
-    return K if np.abs(K @ F - b).max(initial=0.0) < FREE else None
+    if not len(H):
+        return None
+    U, sizes, Vt = np.linalg.svd(F)
+    rank = int(np.sum(sizes > RANK * sizes[0]))
+    anyhow = (b @ Vt[:rank].T / sizes[:rank]) @ U[:, :rank].T
+    if np.abs(anyhow @ F - b).max() > FREE:
+        return None
+    N = U[:, rank:]
+    free, left = (N.T @ H).T, (a - anyhow @ H).T
+    eye = ALIKE_MM * np.eye(N.shape[1])  # rows of readings that say the same twice are zero
+    M = np.linalg.lstsq(np.vstack([free, eye]), np.vstack([left, np.zeros((len(eye), 3))]))[0].T
+    return np.asarray(anyhow + M @ N.T)
 
 
 class Guided(NamedTuple):
@@ -387,15 +399,10 @@ class GuidedError(PoseError):
         return np.broadcast_to(self._known.cov, (len(q), 6, 6))
 
     @property
-    def target_covariance(self) -> Floats:
-        """What the true target adds: less than nothing where a picture of it led the needle."""
-        return self._known.tip_cov - self._known.cov[:3, :3]
-
-    @property
     def target_covariance_ct(self) -> Floats:
-        """`target_covariance` in CT axes."""
+        """What the true target adds, CT axes: less than nothing where a picture of it led the needle."""
         R = self.fit.R_base_ct
-        return np.asarray(R.T @ self.target_covariance @ R)
+        return np.asarray(R.T @ (self._known.tip_cov - self._known.cov[:3, :3]) @ R)
 
     def mean_squares(self, q: Floats) -> dict[str, float]:
         """By source, those of devices and motion too."""

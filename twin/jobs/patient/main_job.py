@@ -275,6 +275,7 @@ def export(
     source, plan = read_noted_plan(plan_path, note)
     if context is not None:
         check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed if seed is None else seed)
+        check_ways(context, plan, plan_path)
     checker = None if context is None or context.reach is None else context.reach.checker
     name = export_name(plan_path, format_name)
     inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
