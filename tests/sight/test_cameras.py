@@ -139,19 +139,19 @@ def test_the_abdomen_against_another_ray_caster(abdomen, view, rng):
     ]
     c, s = np.cos(np.radians(OBLIQUE_DEG)), np.sin(np.radians(OBLIQUE_DEG))
     oblique = c * plan.outward_ct + s * frame_about(plan.outward_ct)[:, :2].T
-    places = plan.target_ct + 900.0 * np.concatenate([[[0.2, -0.9, 0.4], [-0.9, -0.4, 0.1]], oblique])
+    places = plan.target_ct + 900.0 * np.concatenate([[[0.2, -0.9, 0.4], [-0.3, -0.25, 0.92]], oblique])
     places[2:] += 160.0 * plan.outward_ct
     markers = context.placement.registration.markers.points_ct
     seen, agreed = 0, 0
     for pair, row, step in ((places[:2], 0, 0), (places[2:], len(plan.insertion.q) - 1, -1)):
-        stated = replace(context, case=replace(context.case, stereo=replace(context.case.stereo, cameras_ct=pair)))
-        answer = camera_view(stated, plan)
+        stereo = replace(context.case.stereo, cameras_ct=pair, balls_mm=(80.0, 140.0, 160.0))
+        answer = camera_view(replace(context, case=replace(context.case, stereo=stereo)), plan)
         assert not answer.proposed and (answer.cameras_ct == pair).all()
         pieces = dict(arm_in_ct(plan, tool, row))
         tip = plan.target_ct + (plan.standoff_mm if row == 0 else 0.0) * plan.outward_ct
         about = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-        things = [(tip + 80.0 * plan.outward_ct + BALL_MM * about, 0.0, ())]
-        things += [(tip + 160.0 * plan.outward_ct + (BALL_MM + 15.0) * about, 0.0, ("holder",))]
+        balls = ((80.0, BALL_MM, ()), (140.0, BALL_MM, ()), (160.0, BALL_MM + 15.0, ("holder",)))
+        things = [(tip + mm * plan.outward_ct + radius * about, 0.0, but) for mm, radius, but in balls]
         things += [(marker[None], 5.0, ()) for marker in markers]
         for column, (points, near, but) in enumerate(things):
             solids = [*still, *(piece for name in pieces if name not in but for piece in pieces[name])]
@@ -217,6 +217,7 @@ def test_the_arm_that_hides_a_ball_is_named(stated, abdomen):
     assert {row[0] for row in view.hidden} <= {"wrist_3", "wrist_2", "wrist_1", "forearm", "holder"}
     assert view.lost_mm == view.tip_to_target_mm[0] and not view.seen[:, :2].any()
     assert view.clear and "nearer" not in view.sentence
+    assert any(name not in ("", "patient") for row in view.hidden for name in row[2:])  # of markers
 
 
 def test_a_stated_camera_in_the_way_of_the_arm_is_named(stated, abdomen):
