@@ -68,6 +68,7 @@ class CameraView(Shown):
         names: What is to be seen: balls by their distance from the tip, then markers.
         balls: How many of the names are balls.
         hidden: For each depth and name, by what it is hidden from at least one camera; empty where both see it.
+        clear: Whether nothing is or comes near the cameras; of proposed ones it is so.
     """
 
     cameras_ct: Floats
@@ -76,6 +77,7 @@ class CameraView(Shown):
     names: tuple[str, ...]
     balls: int
     hidden: tuple[tuple[str, ...], ...]
+    clear: bool
 
     @cached_property
     def seen(self) -> Bools:
@@ -92,6 +94,8 @@ class CameraView(Shown):
     def sentence(self) -> str:
         """What is seen, for a person."""
         always = plural(int(self.seen[:, self.balls :].all(axis=0).sum()), "marker") + " seen throughout"
+        if not self.clear:
+            always += f"; a camera is nearer than {CAMERA_MM:g} mm to patient, surroundings or moving arm"
         if self.lost_mm is None:
             return f"both cameras see a ball during the whole insertion; {always}"
         at = self.tip_to_target_mm.tolist().index(self.lost_mm)
@@ -123,7 +127,7 @@ def camera_view(context: CaseContext, plan: Plan) -> CameraView:
         plan: Its plan.
 
     Raises:
-        InputError: The case declares no cameras.
+        InputError: The case declares no cameras, or states one in the patient.
         NoAnswerError: Whatever lies around the target leaves no place for two cameras.
     """
     stereo = context.case.stereo
@@ -138,24 +142,29 @@ def camera_view(context: CaseContext, plan: Plan) -> CameraView:
     names = (*(f"ball {mm:g} mm" for mm in stereo.balls_mm), *(f"marker {name}" for name in markers))
     points = np.array([*markers.values()]).reshape(-1, 3)
 
+    count, may_be = len(stereo.balls_mm), _free_places(static, bodies, checker.swept, plan)
+
     def answer(cameras_ct: Floats, hidden: Names) -> CameraView:
         rows = tuple(tuple(str(one or other) for one, other in row) for row in hidden)
-        left_mm = read_only(np.array([look.left_mm for look in looks]))
-        return CameraView(read_only(cameras_ct), stereo.cameras_ct is None, left_mm, names, len(stereo.balls_mm), rows)
+        left_mm, clear = read_only(np.array([look.left_mm for look in looks])), all(map(may_be, cameras_ct))
+        return CameraView(read_only(cameras_ct), stereo.cameras_ct is None, left_mm, names, count, rows, clear)
 
     if stereo.cameras_ct is not None:
+        if any(contains(static[0][1], camera) for camera in stereo.cameras_ct):
+            what = "stereo.cameras_mm: a camera is in the patient"
+            refuse(what, context.case.path, "places outside of the skin", "camera_in_patient")
         return answer(stereo.cameras_ct, _hidden(looks, static, points, stereo.cameras_ct))
-    T_ct_bed, count = bed_frame(context.case), len(stereo.balls_mm)
+    T_ct_bed = bed_frame(context.case)
     pairs, middles = candidate_pairs(T_ct_bed)
     cameras, of_pair = np.unique(pairs.reshape(-1, 3).round(6), axis=0, return_inverse=True)
     hidden = _hidden(looks, static, points, cameras)[:, :, of_pair.reshape(-1, 2)]  # depth, name, pair, camera
     both = (hidden == "").all(axis=3)
     keys = (-middles @ T_ct_bed[:3, 2], np.abs(middles @ plan.outward_ct).round(6), -both[:, count:].sum(axis=(0, 1)))
     order = np.lexsort((*keys, -both[:, :count].sum(axis=(0, 1)), -both[:, :count].any(axis=1).sum(axis=0)))
-    may_be = _free_places(static, bodies, checker.swept, plan)
     for row in order:
-        if all(may_be(camera) for camera in pairs[row]):
-            return answer(pairs[row], hidden[:, :, row])
+        view = answer(pairs[row], hidden[:, :, row])
+        if view.clear:
+            return view
     what = f"no place for two cameras {DISTANCE_MM:g} mm from the target; state cameras_mm in [stereo]"
     raise NoAnswerError(what, code="no_camera_place", counts={"pairs": len(order)})
 
@@ -197,7 +206,7 @@ def hidden_by(surfaces: Surfaces, points_ct: Floats, cameras_ct: Floats, near_mm
     names = np.full(len(cameras_ct), "", object)
     for name, mesh in surfaces:
         for point in points_ct:
-            rows = np.flatnonzero(names == "")
+            rows = np.flatnonzero((names == "") & (cameras_ct != point).any(axis=1))
             apart = cameras_ct[rows] - point
             far = np.linalg.norm(apart, axis=1)
             found = crossings(mesh, point, apart / far[:, None], float(far.max(initial=0.0)))

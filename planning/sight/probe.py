@@ -274,8 +274,7 @@ def passing(feet: Footprints, surfaces: Opaque, scan: Scan | None, width_mm: flo
     for why, meshes in surfaces.items():
         for mesh in meshes:
             depth = first_crossing(mesh, feet.target_ct, rays, farthest)
-            shut = ((depth > 0.0) & (depth <= far)).reshape(-1, RAYS).any(axis=1) | contains(mesh, feet.target_ct)
-            feet.rule_out(rows[shut], why)
+            feet.rule_out(rows[((depth > 0.0) & (depth <= far)).reshape(-1, RAYS).any(axis=1)], why)
     if scan is not None and len(rows):
         ends = np.fmin(far, first_crossing(feet.skin.mesh, feet.target_ct, rays, farthest + RIM_MM)) - RIM_MM
         feet.rule_out(rows[_air_on(scan, feet.target_ct, rays, ends).reshape(-1, RAYS).any(axis=1)], Ruled.AIR)

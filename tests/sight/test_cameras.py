@@ -12,7 +12,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.collision.bodies import arm_bodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
-from puncture_twin.planning.geometry.rigid import apply, inverse, pose
+from puncture_twin.planning.geometry.rigid import apply, frame_about, inverse, pose
 from puncture_twin.planning.sight import cameras as cameras_module
 from puncture_twin.planning.sight.cameras import (
     BALL_MM,
@@ -25,6 +25,10 @@ from puncture_twin.planning.sight.cameras import (
     hidden_by,
 )
 
+OBLIQUE_DEG = 42.0
+"""From behind, past the wrist, which hides a side of the ball around the holder, but not its middle."""
+
+LEFT_AND_RIGHT = np.array([[-50.0, 0.0, 0.0], [50.0, 0.0, 0.0]])
 MIRROR = np.diag([-1.0, 1.0, 1.0])
 
 
@@ -79,6 +83,7 @@ def test_what_lies_behind_the_camera_or_next_to_a_marker_hides_nothing():
     up_and_down = np.array([[0.0, 0.0, 900.0], [0.0, 0.0, -900.0]])
     assert hidden_by(skin, point, up_and_down, 5.0).tolist() == ["", "patient"]
     assert hidden_by(skin, point, up_and_down).tolist() == ["patient", "patient"]
+    assert hidden_by(wall, point, np.concatenate([point, up_and_down])).tolist() == ["", "wall", ""]
 
 
 def test_all_points_of_a_ball_must_be_seen():
@@ -132,20 +137,21 @@ def test_the_abdomen_against_another_ray_caster(abdomen, view, rng):
     still = [
         trimesh.Trimesh(one.vertices, one.faces) for one in (anatomy.skin.mesh, *(s.mesh for s in anatomy.surroundings))
     ]
-    places = plan.target_ct + 900.0 * np.array(
-        [[0.2, -0.9, 0.4], [-0.9, -0.4, 0.1], [-0.3, -0.5, -0.8], [0.9, 0.1, 0.1]]
-    )
+    c, s = np.cos(np.radians(OBLIQUE_DEG)), np.sin(np.radians(OBLIQUE_DEG))
+    oblique = c * plan.outward_ct + s * frame_about(plan.outward_ct)[:, :2].T
+    places = plan.target_ct + 900.0 * np.concatenate([[[0.2, -0.9, 0.4], [-0.3, -0.25, 0.92]], oblique])
+    places[2:] += 160.0 * plan.outward_ct
     markers = context.placement.registration.markers.points_ct
     seen, agreed = 0, 0
     for pair, row, step in ((places[:2], 0, 0), (places[2:], len(plan.insertion.q) - 1, -1)):
-        stated = replace(context, case=replace(context.case, stereo=replace(context.case.stereo, cameras_ct=pair)))
-        answer = camera_view(stated, plan)
+        stereo = replace(context.case.stereo, cameras_ct=pair, balls_mm=(80.0, 140.0, 160.0))
+        answer = camera_view(replace(context, case=replace(context.case, stereo=stereo)), plan)
         assert not answer.proposed and (answer.cameras_ct == pair).all()
         pieces = dict(arm_in_ct(plan, tool, row))
         tip = plan.target_ct + (plan.standoff_mm if row == 0 else 0.0) * plan.outward_ct
         about = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-        things = [(tip + 80.0 * plan.outward_ct + BALL_MM * about, 0.0, ())]
-        things += [(tip + 160.0 * plan.outward_ct + (BALL_MM + 15.0) * about, 0.0, ("holder",))]
+        balls = ((80.0, BALL_MM, ()), (140.0, BALL_MM, ()), (160.0, BALL_MM + 15.0, ("holder",)))
+        things = [(tip + mm * plan.outward_ct + radius * about, 0.0, but) for mm, radius, but in balls]
         things += [(marker[None], 5.0, ()) for marker in markers]
         for column, (points, near, but) in enumerate(things):
             solids = [*still, *(piece for name in pieces if name not in but for piece in pieces[name])]
@@ -168,7 +174,7 @@ def blocked(solid, points, camera, near):
 def test_proposed_cameras_see_the_needle_of_the_abdomen(abdomen, view):
     """During the whole insertion, with markers; nothing comes near them."""
     context, plan = abdomen
-    assert view.proposed and view.lost_mm is None and view.seen[:, :2].all()
+    assert view.proposed and view.clear and view.lost_mm is None and view.seen[:, :2].all()
     assert view.seen[:, 2:].all(axis=0).sum() >= 3
     assert view.names[:3] == ("ball 80 mm", "ball 160 mm", "marker M1") and view.balls == 2
     assert view.tip_to_target_mm[[0, -1]] == pytest.approx([plan.standoff_mm, 0.0], abs=1e-6)
@@ -190,6 +196,18 @@ def test_a_ball_in_the_body_is_lost_where_its_way_ends(stated):
     assert view.lost_mm == view.tip_to_target_mm[inside].max() and "patient" in view.sentence
 
 
+def test_a_ball_in_the_body_is_lost_though_the_skin_is_open_there(stated):
+    """Without the skin about the entry a camera over it looks into the body, and still sees no ball there."""
+    context, plan = stated("stereo", balls_mm=(30.0,), cameras_ct=LEFT_AND_RIGHT + [-700.0, -700.0, 50.0])
+    skin = context.anatomy.skin
+    kept = np.linalg.norm(skin.mesh.triangles.mean(axis=1) - plan.entry_ct, axis=1) > 80.0
+    mesh = TriangleMesh(skin.mesh.vertices, skin.mesh.faces[kept])
+    opened = replace(context.anatomy, skin=replace(skin, mesh=mesh, cut_faces=skin.cut_faces[kept]))
+    view = camera_view(replace(context, anatomy=opened), plan)
+    inside = view.tip_to_target_mm + 30.0 - BALL_MM < np.linalg.norm(plan.entry_ct - plan.target_ct)
+    assert not mesh.closed and inside[-1] and [row[0] == "patient" for row in view.hidden] == inside.tolist()
+
+
 def test_the_arm_that_hides_a_ball_is_named(stated, abdomen):
     """From behind the wrist, along the needle, the wrist hides what is in front of it."""
     _, plan = abdomen
@@ -198,6 +216,23 @@ def test_the_arm_that_hides_a_ball_is_named(stated, abdomen):
     view = camera_view(context, plan)
     assert {row[0] for row in view.hidden} <= {"wrist_3", "wrist_2", "wrist_1", "forearm", "holder"}
     assert view.lost_mm == view.tip_to_target_mm[0] and not view.seen[:, :2].any()
+    assert view.clear and "nearer" not in view.sentence
+    assert any(name not in ("", "patient") for row in view.hidden for name in row[2:])  # of markers
+
+
+def test_a_stated_camera_in_the_way_of_the_arm_is_named(stated, abdomen):
+    """Where the wrist will be at the end, and where it is at the standoff; one in the patient is refused."""
+    _, plan = abdomen
+    away = plan.target_ct + [0.0, -1200.0, 0.0]
+    wrist = plan.target_ct + (plan.needle_length_mm + 30.0) * plan.outward_ct
+    for place in (wrist, wrist + plan.standoff_mm * plan.outward_ct):
+        view = camera_view(*stated("stereo", cameras_ct=np.stack([away, place])))
+        assert not view.clear and "nearer than" in view.sentence
+    context, _ = abdomen
+    front = context.anatomy.skin.mesh.vertices[np.argmin(context.anatomy.skin.mesh.vertices[:, 1])]
+    assert not camera_view(*stated("stereo", cameras_ct=np.stack([away, front - [0.0, CAMERA_MM / 2, 0.0]]))).clear
+    with refused("camera_in_patient", "cameras_mm"):
+        camera_view(*stated("stereo", cameras_ct=np.stack([away, plan.target_ct])))
 
 
 def test_without_cameras_or_a_place_for_them_it_is_refused(stated, monkeypatch):

@@ -1,5 +1,6 @@
 """Where the probe goes: footprints and acoustic windows of simple bodies in closed form, and the embedded abdomen."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import fcl
@@ -13,6 +14,7 @@ from puncture_twin.planning.anatomy.skin import skin_from_mesh
 from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.anatomy.unseen import BEYOND_LABELS
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
+from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.collision.bodies import arm_bodies
 from puncture_twin.planning.collision.two_arms import handle_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
@@ -139,6 +141,10 @@ def test_air_in_the_ct_closes_the_window_that_names_leave_open(body):
     most = ends[:, :, 0].max(axis=1)
     assert ruled_by(feet, Ruled.AIR)[most > 36.0].all() and not ruled_by(feet, Ruled.AIR)[most < 30.0].any()
     assert (most > 36.0).any() and (most < 30.0).any()
+    around = SimpleNamespace(hu_at=lambda points: np.where(np.linalg.norm(points, axis=1) > 98.5, -950.0, 40.0))
+    feet = footprints(body, np.zeros(3), UP, 150.0)
+    passing(feet, {}, around, 60.0)  # the face's ends are 4 mm outside of the body
+    assert feet.counts == {"free": len(feet.ruled)}
 
 
 def test_names_decide_what_sound_passes():
@@ -242,6 +248,22 @@ def test_a_stated_place_is_taken_or_answered_no(stated, abdomen, view):
     assert "free" not in none.counts and none.counts["out_of_reach"] > 20
     assert f"{none.counts['out_of_reach']} of" in none.sentence and "[ultrasound.mount]" in none.sentence
     assert sum(none.counts.values()) == sum(view.counts.values()) == 24 * len(ASIDE)
+
+
+def test_an_obstacle_in_the_way_of_the_probes_arm_is_not_touched(stated, view):
+    """A box about the elbow of the arm that was found: this configuration is gone; one beside its head: so is this."""
+    context, plan = stated("ultrasound", T_base_ct_mount=view.T_base_ct)
+    elbow = (inverse(view.T_base_ct) @ link_poses(context.case.ultrasound.model, view.q_probe))[3, :3, 3]
+    obstacle = Obstacle("lamp", "ct", elbow, np.array([60.0, 60.0, 60.0]))
+    blocked = replace(context, case=replace(context.case, obstacles=(*context.case.obstacles, obstacle)))
+    other = probe_view(blocked, plan)
+    assert other.q_probe is None or np.abs(other.q_probe - view.q_probe).max() > 0.1
+    beside = apply(view.T_ct_image, np.array([context.case.ultrasound.width_mm / 2 + HEAD_MM[0] / 2 + 5.0, -15.0, 0.0]))
+    lamp = replace(context.anatomy.surroundings[-1], mesh=box(pose(np.eye(3), beside), (4.0, 4.0, 4.0)))
+    anatomy = replace(context.anatomy, surroundings=(*context.anatomy.surroundings, lamp))
+    other = probe_view(replace(context, anatomy=anatomy), plan)
+    assert other.counts["probe_arm_collision"] > view.counts.get("probe_arm_collision", 0)
+    assert other.T_ct_image is None or np.abs(other.T_ct_image - view.T_ct_image).max() > 1.0
 
 
 def test_what_cannot_be_asked_is_refused(stated, abdomen):
