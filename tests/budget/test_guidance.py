@@ -27,7 +27,7 @@ def planned(tmp_path_factory):
 def test_a_plan_says_what_the_rehearsal_predicts(planned):
     """Expected error and chance to hit of each way are those of its rooms, by the same line of sight."""
     context, plan = planned
-    q = plan.insertion.q[-1]
+    q, sight = plan.insertion.q[-1], sight_of(context, plan, "all")
     assert [one.way for one in plan.guidance] == [
         "ct",
         "stereo",
@@ -39,7 +39,7 @@ def test_a_plan_says_what_the_rehearsal_predicts(planned):
         "all",
     ]
     for one in plan.guidance:
-        found = rehearse_trials(context, plan.outward_ct, q, 1, 0, one.way, sight_of(context, plan, one.way))
+        found = rehearse_trials(context, plan.outward_ct, q, 1, 0, one.way, sight)
         assert found.predicted_rms_mm == pytest.approx(one.expected_error_mm, rel=1e-9), one.way
         assert found.p_hit == pytest.approx(one.p_hit, abs=1e-9)
 

@@ -160,7 +160,7 @@ class _Room:
         markers = self.cameras.read(apply(self.puncture.T_base_ct, self.puncture.points_ct + skin_ct[:, None]))
         balls = self.cameras.read(needle.tip_base[:, None] - behind * needle.R_base_needle[:, None, :, 2])
         expected = apply_each(self.T_base_ct, truths.read_ct)
-        T_base_cameras = fit_rigid(markers, expected)  # the frame is free: anywhere near will do
+        T_base_cameras = fit_rigid(markers, expected)  # where the belief is linear: the frame is free
         off = apply_each(T_base_cameras, balls) - (tip[:, None] - behind * axis[:, None])
         seen = {ball_name(mm): off[:, row] for row, mm in enumerate(self.cameras.device.balls_mm)}
         there = apply_each(T_base_cameras, markers) - expected

@@ -12,6 +12,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.budget.guidance import corridor_mm, declared_ways, guided_error, lost_sight
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
+from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.twin.jobs.patient.run import room_count
 from puncture_twin.twin.rehearsal import distribution
 from puncture_twin.twin.rehearsal.distribution import rehearse_trials
@@ -73,6 +74,23 @@ def test_rooms_that_breathe_err_as_predicted(tmp_path):
     resting, _, _ = prepared(tmp_path, DEVICES)
     still = rehearse_trials(resting, outward, q, 1, 3, "ct").predicted_rms_mm
     assert rehearse_trials(context, outward, q, 1, 3, "ct").predicted_rms_mm > still + 0.03
+
+
+@pytest.mark.parametrize("way", ["stereo", "us+tip", "all"])
+def test_a_needle_that_bends_is_seen_by_its_tip_alone(insertion, way):
+    """Tissue bends what is in it: balls outside stay on the straight line, the picture shows the bent tip."""
+    context, outward, q = insertion
+    bend, query = Bend(1.5, 150.0), distribution._query(context, outward, q)
+    believed, puncture = replace(query.believed, bend=bend), replace(query.puncture, bend=bend)
+    one, moving = distribution._way(context, query._replace(believed=believed, puncture=puncture), way)
+    truths = draw_truths(puncture, query.truth, ROOMS, np.random.default_rng(0), moving)
+    found = guided_trials(puncture, truths, query.truth, one, np.random.default_rng(1)).trials
+    realised = np.sqrt(np.mean(np.sum((found.tip_ct - found.target_ct) ** 2, axis=1)))
+    predicted = np.sqrt(np.trace(guided_error(one.model, way).tip_covariance(q[None])[0]))
+    assert predicted / realised == pytest.approx(1.0, abs=0.03)
+    straight = guided_error(replace(one.model, error=query.believed), way).tip_covariance(q[None])[0]
+    added = predicted**2 - np.trace(straight)
+    assert added == pytest.approx(bend.tip_mm**2, rel=0.01) if way == "stereo" else added < 0.3 * bend.tip_mm**2
 
 
 def test_no_correction_leaves_the_corridor(insertion):
