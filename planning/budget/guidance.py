@@ -40,6 +40,8 @@ from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.guided import (
     CAMERAS,
     WAYS,
+    WHOLLY,
+    Follows,
     GuidedError,
     GuidedModel,
     Look,
@@ -284,6 +286,17 @@ def explained_ways(context: CaseContext, explained: Explanation) -> Explanation:
     return replace(explained, guidance=way_chances(context, row.outward_ct[0], q))
 
 
+def followers(case: Case, anatomy: Anatomy) -> tuple[Follows, ...]:
+    """How each of ``anatomy.checked`` follows the target; what is outside of the body does not but with the breath."""
+    breath = np.ones(len(anatomy.checked))
+    if case.breathing is not None:
+        breath = moving_weights(case, case.breathing, anatomy).structures
+    return tuple(
+        Follows(0.0 if one.outside else 1.0, weight)
+        for one, weight in zip(anatomy.checked, breath.tolist(), strict=True)
+    )
+
+
 def lost_sight(model: GuidedModel, way: str) -> tuple[str, ...]:
     """What a way's devices do not see, where and why, a sentence each; that the tip is not yet in the body is none."""
     return tuple(
@@ -301,8 +314,8 @@ def _where(look: Look) -> str:
     return "at the target" if look.out_mm <= 0 else f"{look.out_mm:.0f} mm before the target"
 
 
-def guided_error(model: GuidedModel, way: str, weight: float = 1.0) -> GuidedError:
-    """The pose error that a way leaves, against anatomy that follows the target's breath by a weight.
+def guided_error(model: GuidedModel, way: str, follows: Follows = WHOLLY) -> GuidedError:
+    """The pose error that a way leaves, against anatomy that follows the target so.
 
     Raises:
         NoAnswerError: What is in sight does not determine the tip against the target.
@@ -311,7 +324,7 @@ def guided_error(model: GuidedModel, way: str, weight: float = 1.0) -> GuidedErr
     if found is None:
         lost = "; ".join(lost_sight(model, way)) or "its readings leave the needle's place against the CT open"
         raise NoAnswerError(f"guidance '{way}' does not see enough: {lost}", code="lost_sight")
-    found = found if weight == 1.0 else found._replace(cov=model.cov(found.gain, weight))
+    found = found if follows == WHOLLY else found._replace(cov=model.cov(found.gain, follows))
     return GuidedError(one.model, one.tip_mm, one.target_base, one.errors, one.fit, one.bend, found)
 
 

@@ -115,6 +115,16 @@ class Look(NamedTuple):
         return reading.name in self.hidden or (reading.device == CAMERAS and CAMERAS in self.hidden)
 
 
+class Follows(NamedTuple):
+    """By how much of the target's motion since the scan, and of its breath, something moves."""
+
+    motion: float
+    breath: float
+
+
+WHOLLY = Follows(1.0, 1.0)
+
+
 class Reading(NamedTuple):
     """Some rows of z."""
 
@@ -174,13 +184,9 @@ class GuidedModel:
         bend = self.error.bend
         return {} if bend is None else {"bend": max(inserted, 0.0) ** 2 * bend.sides(self.error.model, q)}
 
-    def anatomy(self, weight: float = 1.0) -> Rows:
-        """Deviation of anatomy at the target from where the registration puts it, 6 rows.
-
-        Args:
-            weight: By how much of the target's breath it moves.
-        """
-        moved = np.column_stack([_root(self.motion), weight * self.breath])
+    def anatomy(self, follows: Follows = WHOLLY) -> Rows:
+        """Deviation of anatomy at the target from where the registration puts it, 6 rows."""
+        moved = np.column_stack([follows.motion * _root(self.motion), follows.breath * self.breath])
         return {"pose": np.eye(6), "motion": np.vstack([moved, np.zeros((3, 4))])}
 
     @cached_property
@@ -287,10 +293,10 @@ class GuidedModel:
         tip = a + gain[:3] @ H
         return Guided(gain, self.cov(gain), tip @ tip.T, self._parts(tip))
 
-    def cov(self, gain: Floats, weight: float = 1.0) -> Floats:
-        """Sigma6, shape (6, 6), of the needle against anatomy of a weight (see `anatomy`), under a gain."""
+    def cov(self, gain: Floats, follows: Follows = WHOLLY) -> Floats:
+        """Sigma6, shape (6, 6), of the needle against anatomy that follows the target so, under a gain."""
         H, _, _ = self._stacked
-        E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(weight))))
+        E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(follows))))
         return np.asarray((E + gain @ H) @ (E + gain @ H).T)
 
     def _parts(self, tip: Floats) -> dict[str, float]:

@@ -18,6 +18,7 @@ from puncture_twin.planning.budget.guidance import (
     check_devices,
     check_way,
     corridor_mm,
+    followers,
     guided_error,
     guided_model,
     lost_sight,
@@ -31,8 +32,8 @@ from puncture_twin.planning.registration.fit_uncertainty import touches
 from puncture_twin.planning.registration.residuals import INTERVAL
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
-from puncture_twin.planning.search.phases import moving_weights
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding, refined_chances
+from puncture_twin.planning.uncertainty.guided import WHOLLY
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import not_modelled
@@ -321,16 +322,16 @@ def _measured(
 
 
 def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel, way: Way | None) -> Floats:
-    """Predicted chances to touch, shape (k,): under guidance each structure moves by its own weight of the breath."""
+    """Predicted chances to touch, shape (k,): under guidance each structure follows the target in its own way."""
     outward_ct, q = puncture.outward_ct[None], puncture.q_insertion[None]
     found = refined_chances(model, outward_ct, q, model.chances(outward_ct, q)).touch[0]
-    if way is None or context.case.breathing is None:
+    if way is None:
         return found
-    weights = moving_weights(context.case, context.case.breathing, context.anatomy).structures[model.columns]
-    for weight in np.unique(weights[weights != 1.0]).tolist():
-        other = replace(model, error=guided_error(way.model, way.name, weight))
+    follows = [followers(context.case, context.anatomy)[column] for column in model.columns]
+    for one in set(follows) - {WHOLLY}:
+        other = replace(model, error=guided_error(way.model, way.name, one))
         touch = refined_chances(other, outward_ct, q, other.chances(outward_ct, q)).touch[0]
-        found = np.where(weights == weight, touch, found)
+        found = np.where([its == one for its in follows], touch, found)
     return found
 
 
@@ -376,14 +377,13 @@ def _touches(context: CaseContext, puncture: Puncture, trials: Trials, off_mm: F
     columns, outward_ct = demanding(checked), puncture.outward_ct[None]
     lengths = case_axis_lengths(case, context.anatomy, outward_ct)[0]
     distance = context.engine.measure(case.target_ct, outward_ct, lengths).distance[0]
-    weights = np.ones(len(checked))
-    if case.breathing is not None:
-        weights = moving_weights(case, case.breathing, context.anatomy).structures
+    follows = followers(case, context.anatomy)
     turn = np.linalg.norm(trials.outward_ct - puncture.outward_ct, axis=1)
     touched = np.zeros((len(trials.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):
         length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], CONTACT_MM)
-        tip_ct = trials.tip_ct + (1 - weights[column]) * trials.breath_ct + checked[column].outside * trials.motion_ct
+        own = follows[column]
+        tip_ct = trials.tip_ct + (1 - own.motion) * trials.motion_ct + (1 - own.breath) * trials.breath_ct
         shift = np.linalg.norm(tip_ct - case.target_ct, axis=1)
         for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):  # others are surely clear
             touched[row, place] = context.engine.collides(
