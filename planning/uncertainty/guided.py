@@ -186,8 +186,9 @@ class GuidedModel:
 
     def anatomy(self, follows: Follows = WHOLLY) -> Rows:
         """Deviation of anatomy at the target from where the registration puts it, 6 rows."""
-        moved = np.column_stack([follows.motion * _root(self.motion), follows.breath * self.breath])
-        return {"pose": np.eye(6), "motion": np.vstack([moved, np.zeros((3, 4))])}
+        motion, breath = follows.motion * _root(self.motion), follows.breath * self.breath[:, None]
+        still = np.zeros((3, 3))
+        return {"pose": np.eye(6), "motion": np.vstack([motion, still]), "breath": np.vstack([breath, still[:, :1]])}
 
     @cached_property
     def target(self) -> Rows:
@@ -228,7 +229,7 @@ class GuidedModel:
             return []
         T, seen = flange_pose(self.error.model, look.q), dict[str, Rows]()
         tip, outward = T[:3, 3] + self.error.tip_mm * T[:3, 2], -T[:3, 2]
-        moved = {"motion": np.column_stack([np.zeros((3, 3)), self.skin_weight * self.breath])}
+        moved = {"breath": self.skin_weight * self.breath[:, None]}
         for row, (name, point) in enumerate(zip(self.markers, self.points_base, strict=True)):
             own = {source: part[3 * row : 3 * row + 3] for source, part in self._markers.items()}
             seen[marker_name(name)] = _sum(own, moved, {"frame": self._at(point[None])})
@@ -293,11 +294,21 @@ class GuidedModel:
         tip = a + gain[:3] @ H
         return Guided(gain, self.cov(gain), tip @ tip.T, self._parts(tip))
 
+    def _against(self, gain: Floats, follows: Follows) -> Floats:
+        """Needle against anatomy that follows the target so, under a gain, 6 rows of the sources."""
+        E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(follows))))
+        return np.asarray(E + gain @ self._stacked[0])
+
     def cov(self, gain: Floats, follows: Follows = WHOLLY) -> Floats:
         """Sigma6, shape (6, 6), of the needle against anatomy that follows the target so, under a gain."""
-        H, _, _ = self._stacked
-        E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(follows))))
-        return np.asarray((E + gain @ H) @ (E + gain @ H).T)
+        rows = self._against(gain, follows)
+        return np.asarray(rows @ rows.T)
+
+    def breath_shift(self, gain: Floats, follows: Follows) -> Floats:
+        """By how much the needle's tip moves against such anatomy while the target moves by ``breath``, shape (3,)."""
+        names = list(self._widths)
+        at = sum(self._widths[name] for name in names[: names.index("breath")])
+        return np.asarray(self._against(gain, follows)[:3, at])
 
     def _parts(self, tip: Floats) -> dict[str, float]:
         """Mean square of the tip's error by source, mm^2, named as in `SOURCES`."""
@@ -396,20 +407,21 @@ class GuidedError(PoseError):
     guided: Guided | None = None
 
     @property
-    def _known(self) -> Guided:
+    def known(self) -> Guided:
+        """What is there, of an error that is not blank."""
         assert self.guided is not None
         return self.guided
 
     def covariance(self, q: Floats) -> Floats:
         """Sigma6 after the last correction, the same for each of the configurations (n, 6)."""
-        return np.broadcast_to(self._known.cov, (len(q), 6, 6))
+        return np.broadcast_to(self.known.cov, (len(q), 6, 6))
 
     @property
     def target_covariance_ct(self) -> Floats:
         """What the true target adds, CT axes: less than nothing where a picture of it led the needle."""
         R = self.fit.R_base_ct
-        return np.asarray(R.T @ (self._known.tip_cov - self._known.cov[:3, :3]) @ R)
+        return np.asarray(R.T @ (self.known.tip_cov - self.known.cov[:3, :3]) @ R)
 
     def mean_squares(self, q: Floats) -> dict[str, float]:
         """By source, those of devices and motion too."""
-        return dict(self._known.parts)
+        return dict(self.known.parts)

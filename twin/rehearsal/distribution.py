@@ -11,6 +11,7 @@ from scipy.special import chdtri
 from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.breathing.breathing import position_at
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.budget.guidance import (
     Sight,
@@ -33,7 +34,7 @@ from puncture_twin.planning.registration.residuals import INTERVAL
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding, refined_chances
-from puncture_twin.planning.uncertainty.guided import WHOLLY
+from puncture_twin.planning.uncertainty.guided import Follows
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import not_modelled
@@ -324,15 +325,42 @@ def _measured(
 def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel, way: Way | None) -> Floats:
     """Predicted chances to touch, shape (k,): under guidance each structure follows the target in its own way."""
     outward_ct, q = puncture.outward_ct[None], puncture.q_insertion[None]
-    found = refined_chances(model, outward_ct, q, model.chances(outward_ct, q)).touch[0]
+
+    def touch(of: ChanceModel) -> Floats:
+        return refined_chances(of, outward_ct, q, of.chances(outward_ct, q)).touch[0]
+
     if way is None:
-        return found
+        return touch(model)
     follows = [followers(context.case, context.anatomy)[column] for column in model.columns]
-    for one in set(follows) - {WHOLLY}:
-        other = replace(model, error=guided_error(way.model, way.name, one))
-        touch = refined_chances(other, outward_ct, q, other.chances(outward_ct, q)).touch[0]
-        found = np.where([its == one for its in follows], touch, found)
+    found = np.zeros(len(follows))
+    for one in set(follows):
+        chances = np.mean([touch(of) for of in _at_phases(model, way, one)], axis=0)
+        found = np.where([its == one for its in follows], chances, found)
     return found
+
+
+PHASES = 8
+"""Positions of the breath, of equal chances, over which chances to touch are averaged: it goes to one side."""
+
+
+def _at_phases(model: ChanceModel, way: Way, follows: Follows) -> list[ChanceModel]:
+    """The chances at each position of the breath in the gate: the needle displaced by it, and no longer uncertain."""
+    error, breathing, known = (
+        guided_error(way.model, way.name, follows),
+        model.case.breathing,
+        way.model.guided(way.name),
+    )
+    if breathing is None or known is None or not way.model.breath.any():
+        return [replace(model, error=error)]
+    shift = way.model.breath_shift(known.gain, follows)
+    resting = np.array(error.known.cov)
+    resting[:3, :3] -= np.outer(shift, shift)
+    error = replace(error, guided=error.known._replace(cov=resting))
+    gate = 1.0 if breathing.gate is None else breathing.gate
+    s = position_at((np.arange(PHASES) + 0.5) / PHASES, gate, breathing.exponent)
+    moved = (s - breathing.scanned_at) * breathing.amplitude_mm / np.linalg.norm(way.model.breath)
+    targets = model.case.target_ct + moved[:, None] * (error.fit.R_base_ct.T @ shift)
+    return [replace(model, error=error, case=replace(model.case, target_ct=target)) for target in targets]
 
 
 def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floats:
