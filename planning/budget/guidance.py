@@ -1,10 +1,12 @@
 """The ways of guidance of a case along one direction: where the devices look, what has moved, how far to correct.
 
-A correction moves the needle parallel to itself, by c from where the plan puts it. As certificates do, it trusts the
-clearances of the plan's own needle: with slack_j = distance to structure j - radius - margin, no point of the needle
-moves by more than |c|, so that every needle with
+A correction moves the needle parallel to itself. Part of it takes back what registration and arm had wrong; the rest
+takes the needle to another place in the body than was planned, because the target has moved there, or is there. That
+part s is what touches and the way's readings together say of it, with the body at rest. As certificates do, the
+corridor trusts the clearances of the plan's own needle: with slack_j = distance to structure j - radius - margin, no
+point of the needle is displaced by more than |s|, so that every needle with
 
-    |c| <= min_j slack_j
+    |s| <= min_j slack_j
 
 keeps every margin in the anatomy as the CT shows it. What would go farther is not executed.
 """
@@ -329,7 +331,7 @@ def guided_error(model: GuidedModel, way: str, follows: Follows = WHOLLY) -> Gui
 
 
 def corridor_mm(case: Case, chance: ChanceModel, outward_ct: Floats) -> float:
-    """How far a correction may move the needle, mm; see the module."""
+    """How far from its plan a correction may take the needle in the body, mm; see the module."""
     lengths = case_axis_lengths(case, chance.anatomy, outward_ct[None])
     distance = chance.engine.measure(case.target_ct, outward_ct[None], lengths).distance[0][chance.columns]
     return float(max((distance - chance.breaking).min(initial=np.inf), 0.0))

@@ -292,7 +292,22 @@ class GuidedModel:
             gain[:3] = 0.0
             gain[:3, used] = -K
         tip = a + gain[:3] @ H
-        return Guided(gain, self.cov(gain), tip @ tip.T, self._parts(tip))
+        return Guided(gain, self.cov(gain), tip @ tip.T, self._parts(tip), gain[:3] + self._aside(way, last))
+
+    def _aside(self, way: str, last: int) -> Floats:
+        """The weights, shape (3, m), that estimate the needle's shift from its plan in the body at rest, uncorrected.
+
+        By the touches, whichever way it is, and by what the way reads up to a look.
+        """
+        H, F, rows = self._stacked
+        resting = _times(-np.eye(3), {"pose": np.eye(6)[:3]})
+        a, b = self.matrices(_sum(_times(np.eye(6)[:3], self.end), resting))
+        used = [one.look < 0 or (one.device in WAYS[way] and one.look <= last) for one, _ in rows]
+        weights = np.zeros((3, len(rows)))
+        K = _weights(H[used], F[used], a, b)
+        assert K is not None  # touches determine a pose
+        weights[:, used] = K
+        return weights
 
     def _against(self, gain: Floats, follows: Follows) -> Floats:
         """Needle against anatomy that follows the target so, under a gain, 6 rows of the sources."""
@@ -378,6 +393,8 @@ class Guided(NamedTuple):
     """Shape (3, 3), mm^2, of the tip about the true target."""
     parts: Mapping[str, float]
     """Mean square of the tip by source, mm^2."""
+    aside: Floats
+    """Shape (3, m): estimates from all readings how far the corrected needle is from its plan in the body at rest."""
 
 
 class WayChance(NamedTuple):
