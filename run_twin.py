@@ -206,6 +206,7 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Explain one candidate in full, or check a list. Without a choice, the best candidate is explained."""
+    from puncture_twin.planning.budget.guidance import explained_ways
     from puncture_twin.planning.search.choice import explain_choice
     from puncture_twin.planning.search.explain import NEAREST
     from puncture_twin.twin.jobs.choosing.list_job import check_list, lists_of
@@ -216,7 +217,7 @@ def check(
         finish("check", listed, listed.summary(), listed.text(), as_json)
         return
     with prepared(case, arm=arm) as context:
-        explained = explain_choice(context, choice)
+        explained = explained_ways(context, explain_choice(context, choice))
         if picture is not None:
             from puncture_twin.twin.jobs.patient.pictures import write_check_picture
 
@@ -274,6 +275,9 @@ def rehearse(
         int | None, typer.Option("--seeds", min=1, max=1_000_000, help="Trials, each with its own ground truth.")
     ] = None,
     physics: Annotated[int, typer.Option("--physics", min=0, max=MOST_SEEDS, help="Trials run in the simulator.")] = 0,
+    guidance: Annotated[
+        str | None, typer.Option("--guidance", metavar="WAY", help="What leads the needle in the trials: ct, us, ...")
+    ] = None,
     sweep: Annotated[bool, typer.Option("--sweep", help="Rotate the needle about the target, outside.")] = False,
     to: Annotated[
         str | None,
@@ -287,9 +291,9 @@ def rehearse(
     from puncture_twin.twin.jobs.patient import main_job
     from puncture_twin.twin.jobs.patient.run import room_count
 
-    rooms, folder = room_count(seeds, physics), out_folder(out_dir, source, "rehearse")
+    rooms, folder = room_count(seeds, physics, guidance), out_folder(out_dir, source, "rehearse")
     if sweep or to is not None:
-        end = sweep_end(source, to, sweep=sweep, alone=seeds is None and case is None)
+        end = sweep_end(source, to, sweep=sweep, alone=rooms is None and case is None)
         with prepared(source) as context:
             swept = sweep_case(context, folder, choice, end)
         finish("rehearse --sweep", swept, swept.summary(), sweep_text(swept), as_json)

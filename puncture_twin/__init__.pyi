@@ -1,6 +1,7 @@
 from .api import (
     batch as batch,
     calibrate as calibrate,
+    camera_view as camera_view,
     certify as certify,
     check as check,
     check_folder as check_folder,
@@ -12,6 +13,7 @@ from .api import (
     place as place,
     plan as plan,
     prepare as prepare,
+    probe_view as probe_view,
     read_certificate as read_certificate,
     read_mesh as read_mesh,
     read_plan as read_plan,

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from puncture_twin.planning.search.candidates import Candidates, Pick
     from puncture_twin.planning.search.context import CaseContext, EngineChoice
     from puncture_twin.planning.search.explain import Explanation
+    from puncture_twin.planning.sight.cameras import CameraView
+    from puncture_twin.planning.sight.probe import ProbeView
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
     from puncture_twin.twin.jobs.batch.jobs import Merged
@@ -173,9 +175,11 @@ def check(
         InputError: An angle outside of its range, two choices, or an entry from which no straight path enters there.
         NoAnswerError: Nothing is safe, so that nothing is the best.
     """
+    from puncture_twin.planning.budget.guidance import explained_ways
     from puncture_twin.planning.search.choice import explain_choice, stated_choice
 
-    return explain_choice(context, stated_choice("check", context, theta_deg, beta_deg, candidate, window, entry))
+    explained = explain_choice(context, stated_choice("check", context, theta_deg, beta_deg, candidate, window, entry))
+    return explained_ways(context, explained)
 
 
 @checked
@@ -300,11 +304,12 @@ def plan(
         InputError: The case does not say where the robot's base is, or there is nothing of what was chosen.
         NoAnswerError: Nothing is safe, what was chosen is rejected, or the arm finds no free approach to it.
     """
+    from puncture_twin.planning.budget.guidance import with_ways
     from puncture_twin.planning.plan.planner import make_plan
     from puncture_twin.planning.search.choice import stated_choice
 
     choice = stated_choice("plan", context, theta_deg, beta_deg, candidate, window, entry)
-    return make_plan(context, candidates, choice, seed=seed).plan
+    return with_ways(context, make_plan(context, candidates, choice, seed=seed).plan)
 
 
 @checked
@@ -442,7 +447,13 @@ def write_plan(plan: Plan, path: Path | str) -> None:
 
 @checked
 def rehearse(
-    context: CaseContext, plan: Plan, *, seed: int | None = None, seeds: int | None = None, physics: int = 0
+    context: CaseContext,
+    plan: Plan,
+    *,
+    seed: int | None = None,
+    seeds: int | None = None,
+    physics: int = 0,
+    guidance: str | None = None,
 ) -> Rehearsal:
     """Execute a plan in the twin, where the ground truth differs from the belief.
 
@@ -452,10 +463,12 @@ def rehearse(
         seed: What the ground truth is drawn from; the case's by default.
         seeds: Draw so many rooms: the median one is executed, and ``distribution`` holds all.
         physics: So many of them are executed in the simulator too.
+        guidance: How the needle is led in the rooms: ct, stereo, us, us+tip, ct+stereo, ct+us, ct+us+tip or all, by the
+            devices that the case declares, in bodies that move as it declares; None by the markers, in bodies at rest.
 
     Raises:
-        InputError: A plan that does not hold in this case, many rooms of a case without declared errors or markers, or
-            the extra ``twin`` is not installed.
+        InputError: A plan that does not hold in this case, many rooms of a case without declared errors or markers,
+            unknown guidance, one without its devices or without ``seeds``, or the extra ``twin`` is not installed.
         NoAnswerError: The arm reaches the target in none of the rooms.
     """
     from puncture_twin.planning.base.errors import require_extra
@@ -464,7 +477,41 @@ def rehearse(
     from puncture_twin.twin.jobs.patient.rehearsed import rehearse_once
     from puncture_twin.twin.jobs.patient.run import room_count
 
-    return rehearse_once(context, _own_plan(context, plan, "rehearse: plan"), room_count(seeds, physics), seed)
+    rooms = room_count(seeds, physics, guidance)
+    return rehearse_once(context, _own_plan(context, plan, "rehearse: plan"), rooms, seed)
+
+
+@checked
+def camera_view(context: CaseContext, plan: Plan) -> CameraView:
+    """Where two cameras look from, and what both see of the balls on the needle and of the markers at each depth.
+
+    Args:
+        context: From `prepare`, with the arm, of a case with ``[stereo]``.
+        plan: From `plan`.
+
+    Raises:
+        InputError: The case declares no cameras, or a plan that does not hold in it.
+        NoAnswerError: The surroundings leave no place for cameras that the case does not state.
+    """
+    from puncture_twin.planning.sight.cameras import camera_view
+
+    return camera_view(context, _own_plan(context, plan, "camera_view: plan"))
+
+
+@checked
+def probe_view(context: CaseContext, plan: Plan) -> ProbeView:
+    """Where an ultrasound probe on an arm of its own sees needle and target; or that it does not, why, and the way out.
+
+    Args:
+        context: From `prepare`, with the arm, of a case with ``[ultrasound]``.
+        plan: From `plan`.
+
+    Raises:
+        InputError: The case declares no probe, its arm would stand in the patient, or a plan that does not hold in it.
+    """
+    from puncture_twin.planning.sight.probe import probe_view
+
+    return probe_view(context, _own_plan(context, plan, "probe_view: plan"))
 
 
 @checked
@@ -660,7 +707,9 @@ def _own_plan(context: CaseContext, plan: Plan, where: str) -> Plan:
     Raises:
         InputError: It does not; see `read_plan`.
     """
+    from puncture_twin.planning.budget.guidance import check_ways
     from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
 
     check_plan(plan, context, Path(where))
+    check_ways(context, plan, where)
     return with_case_arm(plan, context.case)

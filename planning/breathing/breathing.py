@@ -60,6 +60,12 @@ class Breathing:
         """Displacement of something of a weight from where the CT shows it, at a position s; shape (3,), mm."""
         return np.asarray((s - self.scanned_at) * weight * self.amplitude_mm * self.direction_ct)
 
+    @property
+    def rms_ct(self) -> Floats:
+        """Root of the mean square displacement of the target in the gate's window, along its line, shape (3,), mm."""
+        square = mean_square_within(1.0 if self.gate is None else self.gate, self.exponent, self.scanned_at)
+        return np.asarray(np.sqrt(square) * self.amplitude_mm * self.direction_ct)
+
     def phase_text(self, s: float) -> str:
         """A position for people."""
         return f"s = {s:.2f}, {s * self.amplitude_mm:.1f} mm from exhale"
@@ -103,6 +109,21 @@ def fraction_within(position: float, exponent: int) -> float:
         position: s, 0 at exhale, 1 at full inhale.
     """
     return float(2 / np.pi * np.arcsin(np.clip(position, 0.0, 1.0) ** (1 / (2 * exponent))))
+
+
+def position_at(fraction: Floats, position: float, exponent: int) -> Floats:
+    """Positions s of the breath at fractions of the time that it is at a position or nearer to exhale.
+
+    Args:
+        fraction: Any shape, each in 0..1.
+        position: The greatest, such as the gate.
+        exponent: n of the curve.
+
+    >>> position_at(np.array([0.0, 1.0]), 0.25, 4).round(12).tolist()
+    [0.0, 0.25]
+    """
+    end = np.arcsin(np.clip(position, 0.0, 1.0) ** (1 / (2 * exponent)))
+    return np.asarray(np.sin(end * fraction) ** (2 * exponent))
 
 
 def mean_square_within(position: float, exponent: int, about: float) -> float:

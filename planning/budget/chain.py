@@ -10,7 +10,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.breathing.breathing import Breathing, mean_square_within
+from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
@@ -106,10 +106,8 @@ class Breath:
 
     def mean_square_base(self) -> Floats:
         """Shape (3, 3), mm^2, of the target against where the CT shows it, base axes."""
-        one = self.breathing
-        moved = self.R_base_ct @ (one.amplitude_mm * one.direction_ct)
-        gate = 1.0 if one.gate is None else one.gate
-        return np.asarray(mean_square_within(gate, one.exponent, one.scanned_at) * np.outer(moved, moved))
+        moved = self.R_base_ct @ self.breathing.rms_ct
+        return np.asarray(np.outer(moved, moved))
 
 
 @dataclass(frozen=True, eq=False)

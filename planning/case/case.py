@@ -32,18 +32,24 @@ from puncture_twin.planning.case.settings import (
     Axis,
     CtSettings,
     Gantry,
+    Motion,
     Needle,
     Obstacle,
     RobotSettings,
     SearchSettings,
+    Stereo,
+    Ultrasound,
     axes_frame,
     bending_of,
     breathing_of,
     ct_of,
     gantry_of,
+    motion_of,
     obstacle_of,
     robot_of,
     search_of,
+    stereo_of,
+    ultrasound_of,
 )
 from puncture_twin.planning.case.tables import (
     MarkerSection,
@@ -80,6 +86,9 @@ class Case(Shown):
         errors: What is declared to err, or None.
         truth_errors: From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`.
         breathing: How the body moves with the breath, or None where the case does not say.
+        stereo: The two cameras in the room, or None.
+        ultrasound: The probe on an arm of its own, or None.
+        motion: How the target has moved since the scan, or None where the case does not say.
         bending: How the needle bends, and in what, or None where the case does not say.
         own_target: Whether the target lies in no structure: its own is then the ball of the hit radius about it, which
             has its name.
@@ -115,6 +124,9 @@ class Case(Shown):
     errors: ErrorModel | None = None
     truth_errors: ErrorModel | None = None
     breathing: Breathing | None = None
+    stereo: Stereo | None = None
+    ultrasound: Ultrasound | None = None
+    motion: Motion | None = None
     bending: Bending | None = None
     own_target: bool = False
     tool: ToolBody | None = None
@@ -250,6 +262,9 @@ def case_of(
         errors=errors_of(content, content.errors, case_volumes, path),
         truth_errors=errors_of(content, content.rehearsal.errors, case_volumes, path, truth=True),
         breathing=breathing_of(content.breathing, space, path),
+        stereo=stereo_of(content.stereo, space, path),
+        ultrasound=ultrasound_of(content.ultrasound, space, path),
+        motion=motion_of(content.motion),
         bending=bending_of(content.needle, content.tissue, path),
     )
 

@@ -21,6 +21,7 @@ from puncture_twin.planning.case.tables import (
     CtSection,
     ErrorsSection,
     GantrySection,
+    MotionSection,
     NeedleSection,
     ObstacleSection,
     PlaceSection,
@@ -29,11 +30,13 @@ from puncture_twin.planning.case.tables import (
     RehearsalSection,
     RobotSection,
     SearchSection,
+    StereoSection,
     StructureSection,
     StructuresSection,
     TargetSection,
     TissueSection,
     ToolSection,
+    UltrasoundSection,
 )
 from puncture_twin.planning.case.toml_types import CaseName, Section, Text
 
@@ -104,6 +107,9 @@ class CaseFile(Section):
     place: PlaceSection = PlaceSection()
     errors: ErrorsSection | None = None
     breathing: BreathingSection | None = None
+    motion: MotionSection | None = None
+    stereo: StereoSection | None = None
+    ultrasound: UltrasoundSection | None = None
     tissue: Annotated[dict[Text, TissueSection], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
     rehearsal: RehearsalSection = RehearsalSection()
     end: EndSection | None = None
@@ -164,6 +170,10 @@ class CaseFile(Section):
         if self.errors is None and any(chance is not None for chance in chances):
             what = "search.min_hit and max_touch need [errors]: without declared errors there are no chances"
             raise SchemaError(what, "missing_errors")
+        if self.stereo is not None and self.stereo.balls_mm[-1] >= self.needle.length_mm:
+            far, length = self.stereo.balls_mm[-1], self.needle.length_mm
+            what = f"stereo.balls_mm: {far:g} is not on the needle, whose length_mm is {length:g}"
+            raise SchemaError(what, "out_of_range")
         if self.space == "local" and self.registration is not None and self.registration.transform is not None:
             what = 'registration.transform: a transform file is in patient space; space "local" has none'
             raise SchemaError(what, "local_space")

@@ -1,5 +1,7 @@
 """What a validated case holds beside its structures: needle, search, CT, obstacles, gantry and arm; mm and radians.
 
+The devices that see needle and target in the room, and how the target moves.
+
 Frames that a case states by two axes: where the arm's base stands, and which way a gantry or a bed looks.
 
 The robot that a case states (an arm of the table or of the user's own URDF, and where it is located), its needle that
@@ -35,6 +37,7 @@ from puncture_twin.planning.case.tables import (
     EntryAxes,
     GantrySection,
     LimitsSection,
+    MotionSection,
     MountSection,
     NeedleSection,
     ObstacleSection,
@@ -42,7 +45,9 @@ from puncture_twin.planning.case.tables import (
     RobotSection,
     SearchSection,
     Stated,
+    StereoSection,
     TissueSection,
+    UltrasoundSection,
     stated_base_ct,
 )
 from puncture_twin.planning.case.toml_types import Anatomical, Vector
@@ -194,6 +199,87 @@ class RobotSettings:
         return None if self.stated is None else self.stated.transform
 
 
+@dataclass(frozen=True, eq=False)
+class Stereo:
+    """Two cameras and the balls on the needle that they see.
+
+    Attributes:
+        cameras_ct: Shape (2, 3), mm: where the cameras are, or None where they are to be proposed.
+        balls_mm: Distances of the balls behind the needle's tip, ascending.
+        sd_mm: Standard deviation of a point that both see, per axis.
+    """
+
+    cameras_ct: Floats | None
+    balls_mm: tuple[float, ...]
+    sd_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Ultrasound:
+    """A probe on an arm of its own.
+
+    Attributes:
+        model: Of the probe's arm.
+        T_base_ct_mount: Shape (4, 4), mm, of that arm's base, or None where it is to be proposed.
+        target_sd_mm: Standard deviation of the target's reading per axis of the image plane, and across it.
+        tip_sd_mm: The same of the needle's tip.
+        calibration_sd_mm: Of the image's place on its arm, per axis.
+        depth_mm: How deep the probe sees.
+        width_mm: Of its footprint.
+    """
+
+    model: UrModel
+    T_base_ct_mount: Floats | None
+    target_sd_mm: tuple[float, float]
+    tip_sd_mm: tuple[float, float]
+    calibration_sd_mm: float
+    depth_mm: float
+    width_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How the target, and what surrounds it, has moved since the scan: ``target_cov_ct``, shape (3, 3), mm^2."""
+
+    target_cov_ct: Floats
+
+
+def stereo_of(section: StereoSection | None, space: Space, path: Path) -> Stereo | None:
+    """The cameras; None where the case declares none.
+
+    Raises:
+        InputError: A position that looks like metres.
+    """
+    if section is None:
+        return None
+    cameras = None
+    if section.cameras_mm is not None:
+        for position in section.cameras_mm:
+            if 0.0 < float(np.linalg.norm(position)) < LIKE_METRES:
+                what = f"stereo.cameras_mm: {list(position)} would be in the patient"
+                refuse(what, path, "millimetres (these look like metres)", "wrong_unit")
+        cameras = read_only(to_lps(np.asarray(section.cameras_mm), space))
+    return Stereo(cameras, section.balls_mm, section.sd_mm)
+
+
+def ultrasound_of(section: UltrasoundSection | None, space: Space, path: Path) -> Ultrasound | None:
+    """The probe and its arm; None where the case declares none.
+
+    Raises:
+        InputError: An unknown arm, or a mount that cannot be used.
+    """
+    if section is None:
+        return None
+    mount = None if section.mount is None else mount_pose(section.mount, space, path, key="ultrasound.mount")
+    stated = section.model_dump(exclude={"model", "mount"})
+    return Ultrasound(model=ur_model(section.model), T_base_ct_mount=mount, **stated)
+
+
+def motion_of(section: MotionSection | None) -> Motion | None:
+    """How the target moves; its covariance is diagonal, so LPS and RAS are the same. None where none is declared."""
+    return None if section is None else Motion(read_only(np.diag(np.square(section.target_sd_mm))))
+
+
 def ct_of(section: CtSection, *, trust_labels: bool) -> CtSettings:
     """The CT's table; ``beyond_mm = "all"`` is infinite."""
     beyond_mm = np.inf if section.beyond_mm == "all" else section.beyond_mm
@@ -242,7 +328,7 @@ another rotation than was meant, and 1 degree moves the needle's tip by 9 mm at 
 Axis = Anatomical | tuple[float, float, float]
 
 
-def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
+def mount_pose(mount: MountSection, space: Space, path: Path, *, key: str = "robot.mount") -> Floats:
     """T_base_ct, shape (4, 4), from the base's origin and axes, as a case states them in its own space.
 
     Raises:
@@ -251,14 +337,14 @@ def mount_pose(mount: MountSection, space: Space, path: Path) -> Floats:
     x, z = (to_lps(np.asarray([v], dtype=float), space)[0] for v in (mount.x_axis, mount.z_axis))
     lengths = np.linalg.norm(x), np.linalg.norm(z)
     if min(lengths) == 0 or abs(x @ z) > AXES_PARALLEL * lengths[0] * lengths[1]:
-        refuse("robot.mount: x_axis and z_axis are parallel or zero", path, "two axes", "axes_parallel")
+        refuse(f"{key}: x_axis and z_axis are parallel or zero", path, "two axes", "axes_parallel")
     angle = float(np.degrees(np.arccos(x @ z / (lengths[0] * lengths[1]))))
     if abs(angle - 90.0) > AXES_SQUARE_DEG:
         allowed = f"a right angle, to {AXES_SQUARE_DEG:g} degree"
-        refuse(f"robot.mount: x_axis and z_axis are {angle:.1f} degrees apart", path, allowed, "axes_not_square")
+        refuse(f"{key}: x_axis and z_axis are {angle:.1f} degrees apart", path, allowed, "axes_not_square")
     far = float(np.linalg.norm(mount.position_mm))
     if 0.0 < far < LIKE_METRES:
-        what = f"robot.mount: position_mm is {far:g} mm from the origin: the base would be in the patient"
+        what = f"{key}: position_mm is {far:g} mm from the origin: the base would be in the patient"
         refuse(what, path, "millimetres (these look like metres)", "wrong_unit")
     T_ct_base = pose(frame_of_axes(z, x), to_lps(np.asarray([mount.position_mm]), space)[0])
     return read_only(np.linalg.inv(T_ct_base))

@@ -14,6 +14,8 @@ Where the patient lies for the robot, as a case states it: by markers, or by a t
 
 The table ``[breathing]`` of a case. See docs/concepts/breathing.md.
 
+``[stereo]``, ``[ultrasound]`` and ``[motion]``: the devices that see needle and target in the room, and what moves.
+
 ``[[obstacle]]`` and ``[gantry]``: what is located around the patient.
 
 The body of the user's own that the flange carries beside the needle and its holder.
@@ -21,6 +23,7 @@ The body of the user's own that the flange carries beside the needle and its hol
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -599,6 +602,50 @@ class BreathingSection(Section):
             what = f"phases {self.phases}: must be 1, or an even number, so that full inhale is one of them"
             raise SchemaError(what, "out_of_range")
         return self
+
+
+Deviation = Annotated[Number, Field(gt=0, le=10)]
+"""Standard deviation of a device's reading, mm; no device reads without error."""
+
+Along = Annotated[Number, Field(gt=0, le=1000)]
+"""Along the needle, from its tip."""
+
+
+class StereoSection(Section):
+    """Two cameras, and balls on the needle and its holder that they see."""
+
+    cameras_mm: tuple[Vector, Vector] | None = None
+    balls_mm: Annotated[tuple[Along, ...], Field(min_length=1, max_length=4)] = (80.0, 160.0)
+    sd_mm: Deviation = 0.03
+
+    @model_validator(mode="after")
+    def _two_places_and_ascending(self) -> Self:
+        if self.cameras_mm is not None and self.cameras_mm[0] == self.cameras_mm[1]:
+            raise SchemaError("cameras_mm: both cameras are at one place, which shows no depth", "out_of_range")
+        if any(high <= low for low, high in pairwise(self.balls_mm)):
+            raise SchemaError(f"balls_mm {list(self.balls_mm)} does not ascend, from the tip on", "range_descends")
+        return self
+
+
+class UltrasoundSection(Section):
+    """A probe on an arm of its own: where that is located, how well its image is read, and what it sees.
+
+    ``target_sd_mm`` and ``tip_sd_mm`` are of readings in the image plane (per axis), and across it.
+    """
+
+    model: str = "ur3"
+    mount: MountSection | None = None
+    target_sd_mm: tuple[Deviation, Deviation] = (0.3, 0.5)
+    tip_sd_mm: tuple[Deviation, Deviation] = (0.08, 0.5)
+    calibration_sd_mm: Deviation = 0.07
+    depth_mm: Annotated[Number, Field(ge=20, le=400)] = 150.0
+    width_mm: Annotated[Number, Field(ge=10, le=200)] = 40.0
+
+
+class MotionSection(Section):
+    """How the target, and what surrounds it, has moved since the scan: standard deviation per axis, LPS."""
+
+    target_sd_mm: tuple[Millimetres, Millimetres, Millimetres]
 
 
 class ObstacleSection(Section):

@@ -19,7 +19,7 @@ from puncture_twin.planning.arm.kinematics import link_frames, link_poses
 from puncture_twin.planning.arm.links import collision_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.collision.bodies import BODY_NAMES
@@ -169,6 +169,19 @@ class SweptBodies:
         bounds = np.empty((len(path) - 1, 6))
         motion_bounds(link_poses(self.model, path), path, self.corners, self.longest_lever_mm, bounds)
         return bounds
+
+    def rows_within(self, q_path: Floats, mm: float) -> Ints:
+        """Rows of a path (m, 6), rad, its ends among them, at one of which no body is farther off than ``mm``.
+
+        That holds for every state on the path, between its rows too, if no step from row to row is longer than twice
+        that; where one is, both its ends are taken.
+        """
+        moved = np.concatenate([[0.0], np.cumsum(self.bounds_mm(q_path).max(axis=1))])
+        kept, last = [0], len(moved) - 1
+        for row in range(1, last):
+            if moved[row + 1] - moved[kept[-1]] > 2.0 * mm:
+                kept.append(row)
+        return np.unique([*kept, last])
 
     def moving(self, q_path: Floats) -> tuple[Floats, Floats, Floats]:
         """A path's frames, and how far bodies and joints may have moved since its first state.

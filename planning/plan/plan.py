@@ -22,6 +22,7 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, least_clearance
 from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.uncertainty.guided import WayChance
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,7 @@ class Plan(Shown):
         clearance_mm: Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder
             to patient and workcell, ``needle`` to the nearest structure with a margin.
         speeds: What it keeps: the case's.
+        guidance: What each way of guidance would leave; empty where the case declares no devices.
         warnings: Of its case when it was made, one sentence each.
     """
 
@@ -64,6 +66,7 @@ class Plan(Shown):
     clearance_mm: Mapping[str, float]
     warnings: tuple[str, ...]
     speeds: SpeedLimits = DEFAULT_SPEEDS
+    guidance: tuple[WayChance, ...] = ()
 
     @property
     def theta_deg(self) -> float:

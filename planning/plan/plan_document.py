@@ -32,6 +32,7 @@ from puncture_twin.planning.formats.guard import guard_transform
 from puncture_twin.planning.motion.trajectory import SAMPLE_S, Peaks, Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import arm_document, check_geometry, rate_limits, read_arm
+from puncture_twin.planning.uncertainty.guided import WayChance
 
 PLAN_VERSION = 3
 """Version of the file's layout. `arm` is absent for an arm of the table: its name gives its numbers."""
@@ -52,7 +53,7 @@ NAMES = (
         "beta_deg",
     ),
     *("entry_ct_mm", "target_ct_mm", "outward_ct", "roll_deg", "standoff_mm", "needle_length_mm", "limits"),
-    *("speed_limits", "approach", "insertion", "clearance_mm", "warnings"),
+    *("speed_limits", "approach", "insertion", "clearance_mm", "warnings", "guidance"),
 )
 PHASE_NAMES = ("times_s", "q_rad", "peaks")
 CLEARANCE_NAMES = ("approach", "insertion", "needle")
@@ -94,6 +95,7 @@ def write_plan(plan: Plan, path: Path) -> None:
         "insertion": _trajectory_document(plan.insertion),
         "clearance_mm": {phase: or_null(value) for phase, value in plan.clearance_mm.items()},
         "warnings": list(plan.warnings),
+        **({"guidance": [one.document() for one in plan.guidance]} if plan.guidance else {}),
     }
     with atomic(path) as temporary:
         temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -156,10 +158,11 @@ def _check_names(document: dict[str, Any], path: Path) -> None:
         ("approach.", document["approach"], PHASE_NAMES),
         ("insertion.", document["insertion"], PHASE_NAMES),
         ("clearance_mm.", document["clearance_mm"], CLEARANCE_NAMES),
+        *((f"guidance.{at}.", one, WayChance._fields) for at, one in enumerate(document.get("guidance", []))),
         *((f"inputs.{at}.", one, INPUT_NAMES) for at, one in enumerate(document["inputs"])),
     ):
         # a phase whose clearance is not stated is for whoever has the case to miss
-        optional = set(known) if part is document["clearance_mm"] else {"arm"}
+        optional = set(known) if part is document["clearance_mm"] else {"arm", "guidance"}
         for name in sorted(set(part) ^ set(known) - (optional - set(part))):
             what = "is not known" if name in part else "is missing"
             refuse(f"key '{where}{name}' {what}", path, ", ".join(known), "unknown_key")
@@ -191,7 +194,13 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
         clearance_mm=field(document, "clearance_mm", _clearances),
         speeds=field(document, "speed_limits", _speed_limits),
         warnings=field(document, "warnings", texts),
+        guidance=tuple(_way(one) for one in document.get("guidance", [])),
     )
+
+
+def _way(value: Any) -> WayChance:
+    error, chance = (field(value, name, number_or_nan) for name in ("expected_error_mm", "p_hit"))
+    return WayChance(field(value, "way", text), error, chance, field(value, "lost_sight", text))
 
 
 def _speed_limits(value: Any) -> SpeedLimits:

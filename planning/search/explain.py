@@ -19,7 +19,8 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.bending import Insertion, Stretch, insertion_along, stretches
 from puncture_twin.planning.search.candidates import Candidates
-from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown
+from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, way_cells
+from puncture_twin.planning.uncertainty.guided import WayChance
 
 NEAREST = 8
 """Structures listed by default: a case has a hundred, and those far away decide nothing."""
@@ -47,6 +48,7 @@ class Explanation(Shown):
         facts: The path as a person at the patient sees it.
         breakdown: How sure it is; None where the case declares no errors, or the candidate was rejected before.
         read: What was read besides the case to choose it.
+        guidance: What each way of guidance would leave, nothing hidden; empty where the case declares no devices.
     """
 
     case: Case
@@ -55,6 +57,7 @@ class Explanation(Shown):
     facts: EntryFacts
     breakdown: UncertaintyBreakdown | None = None
     read: tuple[Input, ...] = ()
+    guidance: tuple[WayChance, ...] = ()
 
     def _title(self) -> str:
         return self.head()[0]
@@ -132,6 +135,7 @@ class Explanation(Shown):
             **self._chances(),
             **self._needle(),
             **self._breathing(),
+            **({"guidance": [one.document() for one in self.guidance]} if self.guidance else {}),
         }
 
     def _breathing(self) -> dict[str, Any]:
@@ -195,7 +199,8 @@ class Explanation(Shown):
 
     def _breakdown(self) -> list[str]:
         if self.breakdown is not None:
-            return [f"  {line}" for line in self.breakdown.lines()]
+            led = (f"  by {way:10s} {mm} mm rms, hits {hit}" for way, mm, hit, _ in map(way_cells, self.guidance))
+            return [*(f"  {line}" for line in self.breakdown.lines()), *led]
         return [] if self.case.errors is None else [f"  {NO_CHANCES}"]
 
     def _path(self) -> list[str]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, refined_chances, touch_limit
+from puncture_twin.planning.uncertainty.guided import WayChance
 from puncture_twin.planning.uncertainty.hit import Proximity, hit_in_ball, hit_in_mesh, touch_chance
 from puncture_twin.planning.uncertainty.lines import Needles
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget, error_budget
@@ -176,6 +177,16 @@ def chance_text(chance: float) -> str:
         return ">0.9999"
     digits = 2 if 0.0095 <= chance <= 0.99 else 4
     return f"{chance:.{digits}f}"
+
+
+def way_cells(one: WayChance) -> tuple[str, str, str, str]:
+    """A way of guidance as a row of a table for a person, under `WAY_HEAD`."""
+    if np.isnan(one.p_hit):
+        return one.way, "-", "-", one.lost_sight
+    return one.way, f"{one.expected_error_mm:.2f}", chance_text(one.p_hit), one.lost_sight
+
+
+WAY_HEAD = ("guidance", "expected tip error (rms), mm", "chance to hit", "out of sight")
 
 
 def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown:

@@ -54,6 +54,24 @@ class Bend(NamedTuple):
     tip_mm: float
     clamped_mm: float
 
+    def sides(self, model: UrModel, q: Floats) -> Floats:
+        """S with S S' the covariance of a tip off by d to a uniform side, the shaft rotated about its clamp.
+
+        For the sides x and y of the needle, whose z points to the tip: the tip by d x with the shaft about y by d / h,
+        and by d y with the shaft about -x; each with half the variance.
+
+        Args:
+            model: The arm.
+            q: Shape (..., 6), rad.
+
+        Returns:
+            Shape (..., 6, 2), base axes.
+        """
+        R = flange_pose(model, q)[..., :3, :3]  # the needle lies along the flange's z
+        x, y, turn = R[..., 0], R[..., 1], 1 / self.clamped_mm
+        columns = [np.concatenate([x, turn * y], axis=-1), np.concatenate([y, -turn * x], axis=-1)]
+        return np.asarray(self.tip_mm / np.sqrt(2.0) * np.stack(columns, axis=-1))
+
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
@@ -126,6 +144,13 @@ class PoseError:
         parts = {source: self.fit.test.scale**2 * cov for source, cov in found.items()}
         return parts if self.bend is None else {**parts, "bend": _bend_covariance(self.model, q, self.bend)}
 
+    def mean_squares(self, q: Floats) -> dict[str, float]:
+        """Mean square of the tip by source at one configuration (6,), rad; mm^2."""
+        parts = {source: float(np.trace(cov[0, :3, :3])) for source, cov in self.parts(q[None]).items()}
+        parts["repeatability"] += parts.pop("arrival")  # one key states both
+        parts["target"] = float(np.trace(self.target_covariance))
+        return parts
+
     def _reading_parts(self, count: int) -> dict[str, Floats]:
         """Parts of the markers: CT reading, touch, and the arm's repeatability there; the same for all rows."""
         at, noise = self.fit.map_at(self.target_base), self.fit.noise
@@ -153,15 +178,9 @@ class PoseError:
 
 
 def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
-    """Covariance of a tip off by d to a uniform side, the shaft rotated about its clamp, (n, 6, 6), base axes.
-
-    For the sides x and y of the needle, whose z points to the tip: the tip by d x with the shaft about y by d / h, and
-    by d y with the shaft about -x; each with half the variance.
-    """
-    R = flange_pose(model, q)[..., :3, :3]  # the needle lies along the flange's z
-    x, y, turn = R[..., 0], R[..., 1], 1 / bend.clamped_mm
-    sides = np.stack([np.concatenate([x, turn * y], axis=-1), np.concatenate([y, -turn * x], axis=-1)], axis=-1)
-    return np.asarray(bend.tip_mm**2 / 2 * sides @ np.swapaxes(sides, -1, -2))
+    """Covariance of the bend, (n, 6, 6), base axes."""
+    sides = bend.sides(model, q)
+    return np.asarray(sides @ np.swapaxes(sides, -1, -2))
 
 
 def _outer(J: Floats, variances: Floats) -> Floats:
@@ -214,10 +233,7 @@ def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudg
         q: Shape (6,), rad, the tip on the target.
         outward_base: Shape (3,), unit, from the target along the needle.
     """
-    parts = {source: float(np.trace(cov[0, :3, :3])) for source, cov in error.parts(q[None]).items()}
-    parts["repeatability"] += parts.pop("arrival")  # one key states both
-    parts["target"] = float(np.trace(error.target_covariance))
-    whole = error.tip_covariance(q[None])[0]
+    parts, whole = error.mean_squares(q), error.tip_covariance(q[None])[0]
     variance, along = float(np.trace(whole)), float(outward_base @ whole @ outward_base)
     return ErrorBudget(
         rms_mm=float(np.sqrt(variance)),

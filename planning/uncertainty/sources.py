@@ -32,11 +32,12 @@ def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
 
     Args:
         case: The case.
-        counted: Of breathing and bending, what these chances count.
+        counted: Of breathing, bending and motion, what these chances count.
     """
     declared = {"breathing": case.breathing, "bending": case.bending}
     left_out = [texts[declared[name] is not None] for name, texts in NOT_MODELLED.items() if name not in counted]
-    return ", ".join([*left_out, "tissue motion", *_unknown_contours(case)])
+    moving = [] if "motion" in counted else ["tissue motion"]
+    return ", ".join([*left_out, *moving, *_unknown_contours(case)])
 
 
 def _unknown_contours(case: Case) -> list[str]:
@@ -78,6 +79,9 @@ SOURCES: Mapping[str, Source] = MappingProxyType(
         "needle_direction": Source("direction of the needle", "needle_direction_deg", "deg"),
         "bend": Source("bending of the needle", "bevel_deg", "deg"),
         "breathing": Source("breathing while it is inserted", "amplitude_mm", "mm"),
+        "motion": Source("motion of the target since the scan", "motion.target_sd_mm and [breathing]", "mm"),
+        "cameras": Source("points seen by the cameras", "stereo.sd_mm", "mm"),
+        "pictures": Source("ultrasound pictures", "ultrasound.target_sd_mm, tip_sd_mm, calibration_sd_mm", "mm"),
         "surface": Source("surfaces of the structures", "surface_mm", "mm"),
     }
 )

@@ -1,6 +1,6 @@
 """What the arm may touch: scenes whose answer is known by geometry, and the links' own shipped meshes as oracle."""
 
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import fcl
 import numpy as np
@@ -370,3 +370,18 @@ def test_no_body_point_leaves_the_sweep_bound() -> None:
                     off = np.minimum(*(np.linalg.norm(points - other[name], axis=1) for other in ends))
                     bound = bounds[LINK_NAMES.index(name) - 1] if name in LINK_NAMES else bounds[-1]
                     assert off.max() <= bound / 2.0 + 1e-9, name
+
+
+def test_rows_of_a_path_within_a_distance(rng: np.random.Generator) -> None:
+    """At the kept rows, every point of every body is within the distance of where it is at any state of the path."""
+    swept = SweptBodies.of(UR3, TOOL)
+    knots = rng.uniform(-1.0, 1.0, (4, 6))
+    path = np.concatenate([np.linspace(a, b, 400, endpoint=False) for a, b in pairwise(knots)])
+    rows = swept.rows_within(path, 30.0)
+    assert (rows[0], rows[-1]) == (0, len(path) - 1) and 10 < len(rows) < 200
+    corners = np.concatenate([swept.corners, np.ones((6, 8, 1))], axis=2)
+    at = np.einsum("nlij,lcj->nlci", link_poses(UR3, path)[:, 1:], corners)[..., :3]
+    far = np.linalg.norm(at[:, None] - at[rows][None], axis=-1).max(axis=(2, 3))
+    assert far.min(axis=1).max() <= 30.0
+    assert swept.rows_within(path[:1], 30.0).tolist() == [0]
+    assert swept.rows_within(path[[0, 400, 800]], 1.0).tolist() == [0, 1, 2]  # farther steps than twice that

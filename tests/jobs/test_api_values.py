@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from case_world import coarse_carton
+from case_world import changed, coarse_carton
 from cohort_world import write_cohort
 from refusals import refused
 from whole_html import Whole
@@ -36,7 +36,9 @@ def given(context, tmp_path_factory):
     tmp = tmp_path_factory.mktemp("values")
     recorded = simulate_recording(np.random.default_rng(1), 24)[0]
     write_recording(recorded, tmp / "recording.csv")
-    armed = pt.prepare(coarse_carton(tmp / "carton"))
+    carton = coarse_carton(tmp / "carton")
+    carton.write_text(changed(carton.read_text(), ("[end]", "[stereo]\n[ultrasound]\n[end]")))
+    armed = pt.prepare(carton)
     candidates = pt.search(context)
     plan = pt.plan(armed)
     pt.write_plan(plan, tmp / "plan.json")
@@ -74,6 +76,8 @@ def values(given):
         "rehearse": rehearsal,
         "place": PlaceSearch(np.eye(4), (), 0, 1.0, 1.0, 0, (0, 0), (), None),
         "touch": pt.touch(armed),
+        "camera_view": pt.camera_view(armed, plan),
+        "probe_view": pt.probe_view(armed, plan),
         "compare": pt.compare(context, candidates.best, candidates.pick(0), candidates=candidates),
         "export": pt.export(plan, "csv", tmp / "export"),
         "batch": pt.batch(write_cohort(tmp / "cohort"), tmp / "results"),
@@ -175,7 +179,9 @@ def test_no_foreign_exception_leaves_a_function(name, given, tmp_path, monkeypat
     """Whatever one argument is, beside good ones: an answer, or one line; never an error of NumPy's or Python's."""
     monkeypatch.chdir(tmp_path)  # a text is a folder too
     function, parameters = FUNCTIONS[name], inspect.signature(FUNCTIONS[name]).parameters
-    context = given["armed"] if name in ("touch", "rehearse", "read_plan") else given["context"]
+    context = (
+        given["armed"] if name in ("touch", "rehearse", "read_plan", "camera_view", "probe_view") else given["context"]
+    )
     good = given | {"context": context, **({"theta_deg": [10.0], "beta_deg": [20.0]} if name == "check_many" else {})}
     required = {key: good[key] for key, one in parameters.items() if one.default is inspect.Parameter.empty}
     for key, one in parameters.items():

@@ -16,7 +16,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import tangent_b
 from puncture_twin.twin.guidance.ultrasound.pose_choice import needle_flange
 from puncture_twin.twin.guidance.ultrasound.puncture import nearest_configuration
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import ErrorsSection, SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.two_arms import BetweenArms
+from puncture_twin.twin.guidance.ultrasound.two_arms import between_arms
 from puncture_twin.twin.plant.bmode_image import NeedleInImage, render
 from puncture_twin.twin.plant.truth import ArmErrors, TrueArm, draw_true_arm
 
@@ -118,7 +118,7 @@ class UltrasoundPlant:
 
     def __init__(self, case: SelfcalCase, truth: WorkcellTruth, rng: np.random.Generator) -> None:
         self._case, self._truth, self._rng = case, truth, rng
-        self._between = BetweenArms(case, truth.X, truth.Y, 0.0)
+        self._between = between_arms(case, truth.X, truth.Y, 0.0)
         self.probe_arm, self.needle_arm = PlantArm(truth.probe_arm, rng), PlantArm(truth.needle_arm, rng)
         self.shown: list[ShownNeedle] = []
         """What was true at each image."""

@@ -11,21 +11,35 @@ from scipy.special import chdtri
 from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.breathing.breathing import position_at
 from puncture_twin.planning.budget.chain import bent_path
+from puncture_twin.planning.budget.guidance import (
+    Sight,
+    as_rehearsed,
+    check_devices,
+    check_way,
+    corridor_mm,
+    followers,
+    guided_error,
+    guided_model,
+    lost_sight,
+)
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.clearance.engine import normals_of
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.reach.standoff import case_axis_lengths
-from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise, touches
-from puncture_twin.planning.registration.residuals import INTERVAL, NoiseTest
+from puncture_twin.planning.registration.fit_uncertainty import touches
+from puncture_twin.planning.registration.residuals import INTERVAL
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding, refined_chances
+from puncture_twin.planning.uncertainty.guided import Follows
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import not_modelled
-from puncture_twin.twin.rehearsal.trials import Puncture, Trials, draw_trials
+from puncture_twin.twin.rehearsal.guided_trials import Way, guided_trials
+from puncture_twin.twin.rehearsal.trials import Moving, Puncture, Trials, draw_trials, draw_truths
 
 CONTACT_MM = 1e-6
 """Distance of an axis from a surface that counts as contact."""
@@ -76,6 +90,9 @@ class Distribution:
         guessed_touches: Whether it is not stated how the arm touched the markers, so that a posture was assumed.
         not_modelled: What neither the trials nor the chances contain.
         physics: Some of the trials in the simulator, if any.
+        guidance: The way of guidance that led the needle, None where none was asked for.
+        stopped: Further trials, whose correction would have left the corridor.
+        hidden: What was out of sight, a sentence each.
     """
 
     seed: int
@@ -94,6 +111,9 @@ class Distribution:
     guessed_touches: bool
     not_modelled: str
     physics: PhysicsTrials | None = None
+    guidance: str | None = None
+    stopped: int = 0
+    hidden: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.trials.tip_ct)
@@ -121,8 +141,9 @@ class Distribution:
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {
-            "rooms": len(self) + self.unreached,
+            "rooms": len(self) + self.unreached + self.stopped,
             "unreached": self.unreached,
+            **({} if self.guidance is None else self._guided()),
             "seed": self.seed,
             "realised_rms_mm": finite(self.realised_rms_mm),
             "predicted_rms_mm": self.predicted_rms_mm,
@@ -144,13 +165,22 @@ class Distribution:
             **({} if self.physics is None else {"physics": self.physics.summary()}),
         }
 
+    def _guided(self) -> dict[str, Any]:
+        return {"guidance": self.guidance, "stopped": self.stopped, "lost_sight": list(self.hidden)}
+
 
 def _fraction(trials: Bools) -> float | None:
     return float(trials.mean()) if len(trials) else None
 
 
 def rehearse_trials(
-    context: CaseContext, outward_ct: Floats, q_insertion: Floats, count: int, seed: int
+    context: CaseContext,
+    outward_ct: Floats,
+    q_insertion: Floats,
+    count: int,
+    seed: int,
+    guidance: str | None = None,
+    sight: Sight | None = None,
 ) -> Distribution:
     """Rehearse one direction in many trials, each with a truth of its own.
 
@@ -160,15 +190,39 @@ def rehearse_trials(
         q_insertion: Shape (6,), rad, the tip on the target.
         count: Trials, at least 1.
         seed: Of all draws.
+        guidance: One of `WAYS`, in bodies that move as the case declares: every way has the same patients by a seed.
+            None is by registration, in bodies at rest.
+        sight: What its devices see of the insertion; None hides nothing.
 
     Raises:
-        InputError: The case declares no errors, or has no markers.
+        InputError: The case declares no errors, has no markers, or lacks a device of the way.
+        NoAnswerError: What the way's devices see does not determine the needle against the target.
     """
     query = _query(context, outward_ct, q_insertion)
     rng = np.random.default_rng(seed)
-    trials = draw_trials(query.puncture, query.truth, count, rng)
-    off = rng.normal(size=(count, len(context.anatomy.checked)))[trials.reached]
-    return _measured(context, query, trials, off, seed)
+    if guidance is None:
+        return _measured(context, query, draw_trials(query.puncture, query.truth, count, rng), rng, seed)
+    way, moving = _way(context, query, guidance, sight)
+    truths = draw_truths(query.puncture, query.truth, count, rng, moving)
+    done = guided_trials(query.puncture, truths, query.truth, way, np.random.default_rng([seed, 4]))
+    return _measured(context, query, done.trials, rng, seed, (way, done.stopped))
+
+
+def _way(context: CaseContext, query: _Query, name: str, sight: Sight | None = None) -> tuple[Way, Moving]:
+    """One way of guidance of a query's puncture, and what moves in the truth."""
+    case, puncture = context.case, query.puncture
+    check_way(name)
+    check_devices(case, name)
+    assert context.placement is not None and context.placement.registration is not None
+    registration = context.placement.registration
+    model = guided_model(
+        case, context.anatomy, query.believed, registration, puncture.outward_ct, puncture.q_insertion, sight
+    )
+    chance = chance_model(case, context.anatomy, context.engine, query.believed)
+    assert chance is not None
+    motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
+    corridor = corridor_mm(case, chance, puncture.outward_ct)
+    return Way(name, model, corridor), Moving(motion, case.breathing, model.skin_weight)
 
 
 def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats, seed: int) -> Floats:
@@ -198,7 +252,7 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
         refuse("no trials can be drawn", case.path, ALLOWED, "no_markers")
     q_touch = touches(case, registration.markers)
     bend = bend_along(context, outward_ct)
-    believed = replace(_as_rehearsed(error, q_touch), bend=bend)
+    believed = replace(as_rehearsed(error, q_touch), bend=bend)
     truth = (case.truth_errors or case.errors or error.errors).scaled(error.fit.test.scale)
     puncture = Puncture(
         case.robot.model, case.needle.length_mm, registration.method, believed.fit.noise,
@@ -219,28 +273,29 @@ def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
     return None if path is None else path.bend
 
 
-def _as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
-    """The pose error of trials: touches as the trials draw them, errors of the estimated size as if declared."""
-    errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
-    noise = reading_noise(errors, error.model, error.tip_mm, q_touch, known=True)
-    test = NoiseTest(fit.test.count, float(fit.test.freedom))
-    return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
-
-
-def _measured(context: CaseContext, query: _Query, trials: Trials, off: Floats, seed: int) -> Distribution:
-    """The distribution of trials; ``off`` has a normal number for each structure's surface in each trial."""
-    case, believed, puncture = context.case, query.believed, query.puncture
-    q = puncture.q_insertion[None]
-    unreached = int((~trials.reached).sum())
-    trials = trials.reached_alone()
+def _measured(
+    context: CaseContext,
+    query: _Query,
+    trials: Trials,
+    rng: np.random.Generator,
+    seed: int,
+    guided: tuple[Way, Bools] | None = None,
+) -> Distribution:
+    """The distribution of trials; of guided ones with their way, and which were stopped."""
+    case, puncture, q = context.case, query.puncture, query.puncture.q_insertion[None]
+    off = rng.normal(size=(len(trials.reached), len(context.anatomy.checked)))  # of each surface, in deviations
+    stopped = np.zeros(len(trials.reached), bool) if guided is None else guided[1]
+    went = trials.reached & ~stopped
+    unreached, trials = int((~trials.reached).sum()), trials.of(went)
+    believed = query.believed if guided is None else guided_error(guided[0].model, guided[0].name)
     cov_ct, error_ct = believed.tip_covariance_ct(q)[0], trials.tip_ct - trials.target_ct
     model = chance_model(case, context.anatomy, context.engine, believed)
     assert model is not None
-    chances = refined_chances(model, puncture.outward_ct[None], q, model.chances(puncture.outward_ct[None], q))
-    off_mm = off * _surfaces(model, puncture, query.truth)  # drawn in deviations
+    off_mm = off[went] * _surfaces(model, puncture, query.truth)
     inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
-    return Distribution(
+    counted = () if puncture.bend is None else ("bending",)
+    distribution = Distribution(
         seed=seed,
         unreached=unreached,
         puncture=puncture,
@@ -248,15 +303,64 @@ def _measured(context: CaseContext, query: _Query, trials: Trials, off: Floats, 
         cov_ct=cov_ct,
         in_region=square <= chdtri(3, 1 - INTERVAL),
         hit=_hits(context, trials, off_mm),
-        p_hit=float(chances.hit[0]),
-        structures=chances.structures,
+        p_hit=float(model.hit_chance(believed.covariance_ct(q))[0]),
+        structures=model.structures,
         touched=_touches(context, puncture, trials, off_mm),
-        p_touch=chances.touch[0],
+        p_touch=_touch_chances(context, puncture, model, None if guided is None else guided[0]),
         wrong_belief=case.truth_errors is not None,
         budget=error_budget(believed, q[0], puncture.T_base_ct[:3, :3] @ puncture.outward_ct),
         guessed_touches=query.guessed,
-        not_modelled=not_modelled(case, counted=() if puncture.bend is None else ("bending",)),
+        not_modelled=not_modelled(case, counted=counted),
     )
+    if guided is None:
+        return distribution
+    way = guided[0]
+    said = not_modelled(case, counted=(*counted, "breathing", *(() if case.motion is None else ("motion",))))
+    stops = len(went) - unreached - int(went.sum())
+    return replace(
+        distribution, guidance=way.name, stopped=stops, hidden=lost_sight(way.model, way.name), not_modelled=said
+    )
+
+
+def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel, way: Way | None) -> Floats:
+    """Predicted chances to touch, shape (k,): under guidance each structure follows the target in its own way."""
+    outward_ct, q = puncture.outward_ct[None], puncture.q_insertion[None]
+
+    def touch(of: ChanceModel) -> Floats:
+        return refined_chances(of, outward_ct, q, of.chances(outward_ct, q)).touch[0]
+
+    if way is None:
+        return touch(model)
+    follows = [followers(context.case, context.anatomy)[column] for column in model.columns]
+    found = np.zeros(len(follows))
+    for one in set(follows):
+        chances = np.mean([touch(of) for of in _at_phases(model, way, one)], axis=0)
+        found = np.where([its == one for its in follows], chances, found)
+    return found
+
+
+PHASES = 8
+"""Positions of the breath, of equal chances, over which chances to touch are averaged: it goes to one side."""
+
+
+def _at_phases(model: ChanceModel, way: Way, follows: Follows) -> list[ChanceModel]:
+    """The chances at each position of the breath in the gate: the needle displaced by it, and no longer uncertain."""
+    error, breathing, known = (
+        guided_error(way.model, way.name, follows),
+        model.case.breathing,
+        way.model.guided(way.name),
+    )
+    if breathing is None or known is None or not way.model.breath.any():
+        return [replace(model, error=error)]
+    shift = way.model.breath_shift(known.gain, follows)
+    resting = np.array(error.known.cov)
+    resting[:3, :3] -= np.outer(shift, shift)
+    error = replace(error, guided=error.known._replace(cov=resting))
+    gate = 1.0 if breathing.gate is None else breathing.gate
+    s = position_at((np.arange(PHASES) + 0.5) / PHASES, gate, breathing.exponent)
+    moved = (s - breathing.scanned_at) * breathing.amplitude_mm / np.linalg.norm(way.model.breath)
+    targets = model.case.target_ct + moved[:, None] * (error.fit.R_base_ct.T @ shift)
+    return [replace(model, error=error, case=replace(model.case, target_ct=target)) for target in targets]
 
 
 def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floats:
@@ -301,13 +405,16 @@ def _touches(context: CaseContext, puncture: Puncture, trials: Trials, off_mm: F
     columns, outward_ct = demanding(checked), puncture.outward_ct[None]
     lengths = case_axis_lengths(case, context.anatomy, outward_ct)[0]
     distance = context.engine.measure(case.target_ct, outward_ct, lengths).distance[0]
-    shift = np.linalg.norm(trials.tip_ct - case.target_ct, axis=1)
+    follows = followers(case, context.anatomy)
     turn = np.linalg.norm(trials.outward_ct - puncture.outward_ct, axis=1)
     touched = np.zeros((len(trials.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):
         length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], CONTACT_MM)
+        own = follows[column]
+        tip_ct = trials.tip_ct + (1 - own.motion) * trials.motion_ct + (1 - own.breath) * trials.breath_ct
+        shift = np.linalg.norm(tip_ct - case.target_ct, axis=1)
         for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):  # others are surely clear
             touched[row, place] = context.engine.collides(
-                int(column), trials.tip_ct[row], trials.outward_ct[row], length, float(radius[row])
+                int(column), tip_ct[row], trials.outward_ct[row], length, float(radius[row])
             )
     return touched

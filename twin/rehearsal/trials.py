@@ -1,8 +1,9 @@
 """Monte Carlo trials without physics, many at once: markers read and touched, registered, the needle at the target.
 
 Every trial draws its truth anew from one declaration of errors: what the CT shows of markers and target, the arm's 28
-parameters, its touches, what drifted since, and one arrival. The arm's motion is exact kinematics, not linearised;
-tissue does not move. A needle that bends ends off its straight line, its bevel pointing to a side drawn in each trial.
+parameters, its touches, what drifted since, and one arrival. The arm's motion is exact kinematics, not linearised.
+Under guidance tissue has moved too, and breathes; else it does not. A needle that bends ends off its straight line, its
+bevel pointing to a side drawn in each trial.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, wrap_to_pi
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.breathing.breathing import Breathing, position_at
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 from puncture_twin.planning.registration.fit_uncertainty import parameter_variances
@@ -79,6 +81,9 @@ class Trials(NamedTuple):
         R_ct_needle: Shape (n, 3, 3), the needle's axes as columns; z points to the tip.
         chi_squared: Shape (n,), of the weighted residuals of each trial's markers against the believed noise.
         bevel_side: Shape (n,), rad, whereto the bevel points about the needle's z; 0 where it has none.
+        motion_ct: Shape (n, 3), by how much the body about the target has moved since the scan: positions are
+            relative to it.
+        breath_ct: Shape (n, 3), and by how much the breath has moved the target.
     """
 
     tip_ct: Floats
@@ -89,6 +94,8 @@ class Trials(NamedTuple):
     R_ct_needle: Floats
     chi_squared: Floats
     bevel_side: Floats
+    motion_ct: Floats
+    breath_ct: Floats
 
     def of(self, rows: Bools | Ints) -> Trials:
         """The results of some trials."""
@@ -99,8 +106,70 @@ class Trials(NamedTuple):
         return self.of(self.reached)
 
 
+class Moving(NamedTuple):
+    """What moves between scan and insertion."""
+
+    cov_ct: Floats
+    """Shape (3, 3), mm^2, of the target and its surroundings."""
+    breathing: Breathing | None
+    skin_weight: float
+    """By how much of the target's breath the markers move."""
+
+
+class Truths(NamedTuple):
+    """Ground truth of n trials before the needle goes in, the same for every way of guidance; CT frame, mm, rad."""
+
+    eta: Floats
+    """Shape (n, 28), the arm's errors."""
+    read_ct: Floats
+    """Shape (n, N, 3), what the CT shows of the markers."""
+    touched_base: Floats
+    """Shape (n, N, 3), what the touches read."""
+    arrival: Floats
+    """Shape (n, 6), true joints less the encoders', drift since the touches included."""
+    target_ct: Floats
+    side: Floats
+    motion_ct: Floats
+    breath_ct: Floats
+
+
+def draw_truths(
+    puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator, moving: Moving | None = None
+) -> Truths:
+    """Draw the truth of trials from declared errors; what moves has a generator of its own.
+
+    Args:
+        puncture: Common part of all trials.
+        errors: What their truth is drawn from.
+        count: Trials.
+        rng: The source of all draws.
+        moving: None moves nothing.
+    """
+    motion, breath, skin = _moved(moving, count, rng)
+    eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))  # stays for all touches of a trial
+    read_ct, touched = _touched(puncture, errors, eta, skin, rng)
+    arrival = rng.normal(size=(count, 6)) * np.hypot(errors.arm.repeatability, errors.arm.drift)
+    target_ct = puncture.target_ct + _normal(rng, errors.target_cov_ct, (count,))
+    side = np.zeros(count) if puncture.bend is None else rng.uniform(0, 2 * np.pi, count)
+    return Truths(eta, read_ct, touched, arrival, target_ct, side, motion, breath)
+
+
+def _moved(moving: Moving | None, count: int, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
+    """Motion and breath of the target at the insertion, and of the markers at the touches, each (n, 3), CT frame."""
+    if moving is None:
+        return np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3))
+    own, breathing = rng.spawn(1)[0], moving.breathing
+    motion = _normal(own, moving.cov_ct, (count,))
+    if breathing is None:
+        return motion, np.zeros((count, 3)), np.zeros((count, 3))
+    gate = 1.0 if breathing.gate is None else breathing.gate
+    s = position_at(own.uniform(size=(2, count, 1)), gate, breathing.exponent)
+    inserted, touched = (s - breathing.scanned_at) * breathing.amplitude_mm * breathing.direction_ct
+    return motion, inserted, moving.skin_weight * touched
+
+
 def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Trials:
-    """Draw trials from declared errors and rehearse the puncture in each.
+    """Draw trials from declared errors and rehearse the puncture in each, by its registration.
 
     Args:
         puncture: Common part of all trials.
@@ -108,21 +177,39 @@ def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.rand
         count: Trials.
         rng: The source of all draws.
     """
-    eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))  # stays for all touches of a trial
-    T_base_ct, residuals = _registered(puncture, errors, eta, rng)
-    q, reached = _commanded(puncture, T_base_ct)
-    arrival = rng.normal(size=(count, 6)) * np.hypot(errors.arm.repeatability, errors.arm.drift)
-    needle = true_needle(puncture.model, q + arrival, eta, puncture.tip_mm)
+    return open_loop(puncture, draw_truths(puncture, errors, count, rng))
+
+
+def open_loop(puncture: Puncture, truths: Truths) -> Trials:
+    """Trials in which the needle goes where the registration puts the target."""
+    T_base_ct = registered(puncture, truths)
+    q, reached = commanded(puncture, T_base_ct)
+    needle = true_needle(puncture.model, q + truths.arrival, truths.eta, puncture.tip_mm)
+    return ended(puncture, truths, T_base_ct, needle, reached)
+
+
+def ended(puncture: Puncture, truths: Truths, T_base_ct: Floats, needle: TrueNeedle, reached: Bools) -> Trials:
+    """Trials whose straight needles ended so.
+
+    Args:
+        puncture: Common part of all trials.
+        truths: Of the n trials.
+        T_base_ct: Shape (n, 4, 4), as registered.
+        needle: Of each trial; it bends if the puncture's does.
+        reached: Shape (n,), whether the arm could reach what was commanded.
+    """
     T_ct_base = np.linalg.inv(puncture.T_base_ct)
-    target_ct = puncture.target_ct + _normal(rng, errors.target_cov_ct, (count,))
-    side = np.zeros(count)
     if puncture.bend is not None:
-        side = rng.uniform(0, 2 * np.pi, count)
-        needle = bent(needle, puncture.bend, side)
+        needle = bent(needle, puncture.bend, truths.side)
     outward_ct = -needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T  # z points to the tip, outward away from it
     R_ct_needle = T_ct_base[:3, :3] @ needle.R_base_needle
-    tip_ct, squares = apply(T_ct_base, needle.tip_base), _chi_squared(puncture, residuals)
-    return Trials(tip_ct, outward_ct, target_ct, T_base_ct, reached, R_ct_needle, squares, side)
+    there = apply_each(T_base_ct, truths.read_ct)
+    squares = _chi_squared(puncture, (truths.touched_base - there).reshape(len(there), -1))
+    tip_ct = apply(T_ct_base, needle.tip_base) - truths.motion_ct - truths.breath_ct
+    return Trials(
+        tip_ct, outward_ct, truths.target_ct, T_base_ct, reached, R_ct_needle, squares, truths.side, truths.motion_ct,
+        truths.breath_ct,
+    )  # fmt: skip
 
 
 def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
@@ -148,26 +235,29 @@ def _chi_squared(puncture: Puncture, residuals: Floats) -> Floats:
     return np.asarray(np.einsum("na,ab,nb->n", residuals, left, residuals, optimize=True))
 
 
-def _registered(puncture: Puncture, errors: ErrorModel, eta: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """T_base_ct of every trial, shape (n, 4, 4), and its residuals, shape (n, 3 N), mm, base axes.
-
-    Markers are read with errors, and touched by an arm that errs.
-    """
+def _touched(
+    puncture: Puncture, errors: ErrorModel, eta: Floats, moved_ct: Floats, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """Markers as read in the CT, with errors, and as touched by an arm that errs: each (n, N, 3)."""
     count, markers = len(eta), len(puncture.points_ct)
     eta_of = np.broadcast_to(eta[:, None], (count, markers, 28))
     read_ct = puncture.points_ct + _normal(rng, errors.marker_cov_ct, (count, markers))
-    there = np.broadcast_to(apply(puncture.T_base_ct, puncture.points_ct), (count, markers, 3))
+    there = apply(puncture.T_base_ct, puncture.points_ct + moved_ct[:, None])
     q_true = joints_at_points(puncture.model, there, puncture.q_touch, eta_of, puncture.tip_mm)
     q_encoder = q_true - rng.normal(size=q_true.shape) * errors.arm.repeatability  # true minus arrival
     flange = flange_pose(puncture.model, q_encoder)
     touched = flange[..., :3, 3] + puncture.tip_mm * flange[..., :3, 2]
-    touched = touched + rng.normal(size=touched.shape) * errors.touch_mm
-    T_base_ct = _fitted(puncture, read_ct, touched)
-    there = read_ct @ np.swapaxes(T_base_ct[:, :3, :3], 1, 2) + T_base_ct[:, None, :3, 3]
-    return T_base_ct, (touched - there).reshape(count, -1)
+    return read_ct, touched + rng.normal(size=touched.shape) * errors.touch_mm
 
 
-def _fitted(puncture: Puncture, read_ct: Floats, touched: Floats) -> Floats:
+def apply_each(T: Floats, points: Floats) -> Floats:
+    """Points (n, m, 3), those of each trial carried by its own T (n, 4, 4)."""
+    return np.asarray(points @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3])
+
+
+def registered(puncture: Puncture, truths: Truths) -> Floats:
+    """T_base_ct of every trial, shape (n, 4, 4), by the puncture's method."""
+    read_ct, touched = truths.read_ct, truths.touched_base
     if puncture.method == "triad":
         return fit_triad(read_ct, touched)
     fitted = fit_rigid(read_ct, touched)
@@ -177,19 +267,36 @@ def _fitted(puncture: Puncture, read_ct: Floats, touched: Floats) -> Floats:
     return fitted if weigh is None else weigh(read_ct, touched, puncture.noise, fitted)
 
 
-def _commanded(puncture: Puncture, T_base_ct: Floats) -> tuple[Floats, Bools]:
-    """The joints (n, 6) that the nominal arm takes to the target, in the planned branch and roll, and whether."""
-    planned = flange_pose(puncture.model, puncture.q_insertion)
+def commanded(
+    puncture: Puncture,
+    T_base_ct: Floats,
+    moved_base: Floats | float = 0.0,
+    out_mm: float = 0.0,
+    q_near: Floats | None = None,
+) -> tuple[Floats, Bools]:
+    """The joints (n, 6) that the nominal arm takes to the target, in the planned branch and roll, and whether.
+
+    Args:
+        puncture: Common part of all trials.
+        T_base_ct: Shape (n, 4, 4), as registered.
+        moved_base: Shape (n, 3), mm: by how much the needle is corrected.
+        out_mm: How far before the target.
+        q_near: Shape (6,), rad, as planned there; None at the target.
+    """
+    planned, q_near = (
+        flange_pose(puncture.model, puncture.q_insertion),
+        puncture.q_insertion if q_near is None else q_near,
+    )
     R_ct_flange = puncture.T_base_ct[:3, :3].T @ planned[:3, :3]
     poses = np.zeros((len(T_base_ct), 4, 4))
     poses[:, :3, :3] = T_base_ct[:, :3, :3] @ R_ct_flange
-    target_base = T_base_ct[:, :3, :3] @ puncture.target_ct + T_base_ct[:, :3, 3]
-    poses[:, :3, 3], poses[:, 3, 3] = target_base - puncture.tip_mm * poses[:, :3, 2], 1.0
-    turns = wrap_to_pi(inverse(puncture.model, poses) - puncture.q_insertion)
+    target_base = T_base_ct[:, :3, :3] @ puncture.target_ct + T_base_ct[:, :3, 3] + moved_base
+    poses[:, :3, 3], poses[:, 3, 3] = target_base - (puncture.tip_mm + out_mm) * poses[:, :3, 2], 1.0
+    turns = wrap_to_pi(inverse(puncture.model, poses) - q_near)
     far = np.where(np.isnan(turns).any(axis=2), np.inf, np.abs(turns).max(axis=2))
     branch = far.argmin(axis=1)  # the planned one moves least
     rows = np.arange(len(poses))
-    return puncture.q_insertion + turns[rows, branch], np.isfinite(far[rows, branch])
+    return q_near + turns[rows, branch], np.isfinite(far[rows, branch])
 
 
 def _normal(rng: np.random.Generator, cov: Floats, shape: tuple[int, ...]) -> Floats:

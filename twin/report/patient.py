@@ -18,7 +18,13 @@ from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.plan.plan import CLEARANCE_TEXT
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import deep_text
-from puncture_twin.planning.search.uncertainty_breakdown import LEAST_FRACTION, UncertaintyBreakdown, chance_text
+from puncture_twin.planning.search.uncertainty_breakdown import (
+    LEAST_FRACTION,
+    WAY_HEAD,
+    UncertaintyBreakdown,
+    chance_text,
+    way_cells,
+)
 from puncture_twin.planning.search.windows import MOST_WINDOWS, Window
 from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.report.numbers import (
@@ -158,7 +164,8 @@ def plan(
         (TIP_ERROR_TEXT if declared else TRE_TEXT, expected_text(plan.expected_target_error_mm)),
         ("seed", str(plan.seed)),
     ]
-    return [facts(rows), *notes]
+    led = [Table(WAY_HEAD, tuple(map(way_cells, plan.guidance)))] if plan.guidance else []
+    return [facts(rows), *led, *notes]
 
 
 def rehearsal(
@@ -224,7 +231,8 @@ def rooms(found: Mapping[str, Any] | None) -> list[Block]:
     )
     rows = [("tip error, rms, mm", f"{found['realised_rms_mm']:.3f}", f"{found['predicted_rms_mm']:.3f}")]
     rows += [(text, _percent(fraction), _percent(chance)) for text, fraction, chance in shares]
-    head = (f"{plural(found['rooms'], 'trial')}, seed {found['seed']}", "realised", "predicted")
+    led = f", guidance {found['guidance']}" if "guidance" in found else ""
+    head = (f"{plural(found['rooms'], 'trial')}, seed {found['seed']}{led}", "realised", "predicted")
     return [Table(head, tuple(rows)), Warn(tuple(_reserves(found))), *_sources(found)]
 
 
@@ -239,6 +247,10 @@ def _reserves(found: Mapping[str, Any]) -> list[str]:
         said.append("The trials were drawn from [rehearsal.errors]: the belief is wrong by design.")
     if found["unreached"]:
         said.append(f"In {found['unreached']:,} trials the arm did not reach the pose; they are not counted.")
+    if found.get("stopped"):
+        left = "a correction would have left the corridor, and the needle was stopped"
+        said.append(f"In {found['stopped']:,} trials {left}; they are not counted.")
+    said += [f"{one}." for one in found.get("lost_sight", ())]
     if found["guessed_touches"]:
         how = "a posture was assumed (touch.csv, q1_deg to q6_deg)"
         said.append(f"The arm's joints at the touches are not known: {how}.")

@@ -24,8 +24,8 @@ from puncture_twin.twin.guidance.ultrasound.pose_choice import (
 )
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.two_arms import (
-    BetweenArms,
     TwoArms,
+    between_arms,
     head_pose,
     inside_phantom,
     needle_tool,
@@ -80,7 +80,7 @@ def meshes_touch(surfaces, poses):
 
 def test_apart_against_the_links_own_meshes(case, room, candidates):
     """Arms that are apart have meshes that do not touch; meshes that touch belong to arms that are not apart."""
-    between = BetweenArms(case, case.T_end1_image, case.T_base1_base2, 0.0)
+    between = between_arms(case, case.T_end1_image, case.T_base1_base2, 0.0)
     head = box(head_pose(case, case.T_end1_image), case.content.probe.head_mm)
     surfaces = (
         arm_surfaces(room.probe_model, probe_tool(case), [(6, head)]),
@@ -100,7 +100,7 @@ def test_apart_against_the_links_own_meshes(case, room, candidates):
 
 def test_clearance_is_kept(case, room, candidates):
     """Where the arms are apart with a clearance, FCL's distance of their bodies is at least that."""
-    between = BetweenArms(case, case.T_end1_image, case.T_base1_base2, 0.0)
+    between = between_arms(case, case.T_end1_image, case.T_base1_base2, 0.0)
     for q_probe, q_needle in zip(candidates.q_probe[:6], candidates.q_needle[:6], strict=True):
         assert between.apart(q_probe, q_needle)
         pieces = [

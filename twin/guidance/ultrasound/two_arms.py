@@ -1,14 +1,14 @@
 """The ultrasound workcell: an arm with a probe and an arm with a needle about a block of tissue, and their contacts.
 
 Each arm alone is checked as everywhere (:class:`planning.collision.fast_checker.FastChecker`: itself, the table, the
-phantom); here the probe's head and the two arms against each other are added, with the same convex bodies and FCL.
+phantom); the two arms against each other as in :mod:`planning.collision.two_arms`.
 Everything is placed where the *drawing* has it; the clearance covers what the truth differs by.
 """
 
 from __future__ import annotations
 
 from enum import StrEnum
-from functools import cache, partial
+from functools import cache
 from itertools import product
 
 import fcl
@@ -16,11 +16,11 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.collision.bodies import Body, Shape, Solid, arm_bodies, surface, touch
+from puncture_twin.planning.collision.bodies import surface, touch
 from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.two_arms import BetweenArms, handle_tool, head_body
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import PhantomSection, SelfcalCase
@@ -28,12 +28,6 @@ from puncture_twin.twin.guidance.ultrasound.selfcal_case import PhantomSection, 
 TABLE_MM = (1800.0, 1200.0, 40.0)
 TABLE_GAP_MM = 0.5
 """The table ends so far below the bases' plane: the bases stand on it, and nothing else should."""
-
-STUB_MM = 1.0
-"""A tool ends in a needle; the probe's handle ends in one so short that it is none."""
-
-FAR_LINKS = 5
-"""The probe's head may touch the links from the base to wrist 1; the later ones turn behind it."""
 
 
 class Touching(StrEnum):
@@ -44,8 +38,8 @@ class Touching(StrEnum):
     BOTH = "arms_collide"
 
 
-class BetweenArms:
-    """Whether the two arms, with probe and needle, touch each other. Not for several threads at once.
+def between_arms(case: SelfcalCase, T_end1_image: Floats, T_base1_base2: Floats, clearance_mm: float) -> BetweenArms:
+    """Both arms of a case, with the probe's head and the needle's arm where they are.
 
     Args:
         case: Arms, probe and needle.
@@ -53,28 +47,9 @@ class BetweenArms:
         T_base1_base2: Where the needle's arm stands, shape (4, 4), mm.
         clearance_mm: How far apart they must stay.
     """
-
-    def __init__(self, case: SelfcalCase, T_end1_image: Floats, T_base1_base2: Floats, clearance_mm: float) -> None:
-        self.T_base1_base2 = T_base1_base2
-        self._models = case.models
-        head = _head_body(case, T_end1_image, clearance_mm)
-        self.probe_bodies = (*arm_bodies(self._models[0], probe_tool(case), clearance_mm), head)
-        self.needle_bodies = arm_bodies(self._models[1], needle_tool(case), 0.0)
-
-    def place_probe(self, q_probe: Floats) -> None:
-        """Move the probe's arm to ``q_probe`` (6,), rad."""
-        poses = link_poses(self._models[0], q_probe)
-        for body in self.probe_bodies:
-            body.place(poses)
-
-    def apart(self, q_probe: Floats, q_needle: Floats) -> bool:
-        """Whether the two arms keep their clearance."""
-        self.place_probe(q_probe)
-        moved = self.T_base1_base2 @ link_poses(self._models[1], q_needle)
-        for body in self.needle_bodies:
-            body.place(moved)
-        ends_first = product(reversed(self.probe_bodies), reversed(self.needle_bodies))  # they touch soonest
-        return not any(_touch(first, second) for first, second in ends_first)
+    head = head_body(head_pose(case, T_end1_image), np.array(case.content.probe.head_mm), clearance_mm)
+    tools = (probe_tool(case), needle_tool(case))
+    return BetweenArms(case.models, tools, head, T_base1_base2, clearance_mm)
 
 
 class TwoArms:
@@ -96,7 +71,7 @@ class TwoArms:
         self._needle = FastChecker(
             self.needle_model, tools[1], [moved], phantom.transformed(T_base2_base1), padding_mm=clearance
         )
-        self._between = BetweenArms(case, case.T_end1_image, case.T_base1_base2, clearance)
+        self._between = between_arms(case, case.T_end1_image, case.T_base1_base2, clearance)
         self._phantom = fcl.CollisionObject(surface(phantom))
         self._table = fcl.CollisionObject(
             fcl.Box(*table.size_mm), fcl.Transform(table.T_base_box[:3, :3], table.T_base_box[:3, 3])
@@ -107,10 +82,10 @@ class TwoArms:
         if self._probe.contact(q, needle_may_touch_patient=False) is not None:
             return False
         self._between.place_probe(q)
-        *links, head = self._between.probe_bodies
+        head = self._between.probe_bodies[-1]
         if touch(head.bare.surface.made, self._phantom) or touch(head.full.surface.made, self._table):
             return False
-        return not any(_touch(head, link) for link in links[:FAR_LINKS])
+        return not self._between.head_touches_own_arm(q)
 
     def needle_free(self, q: Floats) -> bool:
         """Whether the needle's arm touches neither itself, table nor, but for the needle, the phantom."""
@@ -129,20 +104,10 @@ class TwoArms:
         return None if self.apart(q_probe, q_needle) else Touching.BOTH
 
 
-def _touch(first: Body, second: Body) -> bool:
-    """Whether ``first``, with its clearance, touches ``second``; bounding spheres first."""
-    apart = np.linalg.norm(first.full.surface.pose.getTranslation() - second.bare.surface.pose.getTranslation())
-    reach = max(float(np.linalg.norm(hull, axis=1).max()) for hull in first.full.hulls)
-    if apart > reach + second.radius_mm:
-        return False
-    return any(touch(a.made, b.made) for a, b in product(first.full.solids, second.bare.solids))
-
-
 def probe_tool(case: SelfcalCase) -> Tool:
     """The probe's handle, as a tool of the arm: to the head's back."""
     probe = case.content.probe
-    length = probe.length_mm - probe.head_mm[1]
-    return Tool(length, STUB_MM, probe.handle_diameter_mm, probe.handle_diameter_mm)
+    return handle_tool(probe.length_mm - probe.head_mm[1], probe.handle_diameter_mm)
 
 
 def needle_tool(case: SelfcalCase) -> Tool:
@@ -157,18 +122,6 @@ def head_pose(case: SelfcalCase, T_end1_image: Floats) -> Floats:
     T = np.array(T_end1_image)
     T[:3, 3] += T[:3, :3] @ [0.5 * width, -0.5 * case.content.probe.head_mm[1], 0.0]
     return T
-
-
-def _head_body(case: SelfcalCase, T_end1_image: Floats, clearance_mm: float) -> Body:
-    size = np.array(case.content.probe.head_mm)
-    shapes = [_cuboid(size + 2.0 * grown) for grown in (0.0, clearance_mm)]
-    return Body("probe_head", 6, head_pose(case, T_end1_image), shapes[0], shapes[1], float(np.linalg.norm(size)) / 2.0)
-
-
-def _cuboid(size: Floats) -> Shape:
-    solid = Solid(partial(fcl.Box, *size))
-    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * size
-    return Shape((solid,), solid, (corners,))
 
 
 def table_box(phantom: PhantomSection) -> Box:

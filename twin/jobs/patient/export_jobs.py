@@ -28,6 +28,7 @@ from puncture_twin.planning.base.progress import Silent, Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.base.text import Shown
+from puncture_twin.planning.budget.guidance import check_ways
 from puncture_twin.planning.export.exporter import Exported, format_names
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
 from puncture_twin.planning.export.slicer import NAMES, SLICER, SceneContent, entry_area, slicer_files
@@ -206,6 +207,7 @@ def export_to_moveit(context: CaseContext, plan_path: Path, out: Path, *, seed: 
     note = context.watcher.note
     source, plan = read_noted_plan(plan_path, note)
     check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed if seed is None else seed)
+    check_ways(context, plan, plan_path)
     plan = with_case_arm(plan, context.case)
     names, inputs = moveit_names(plan_path.stem), (source, *plan.inputs)
     texts = moveit_files(plan, context.case, context.anatomy, source=plan_path)

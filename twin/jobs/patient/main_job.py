@@ -21,6 +21,7 @@ from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.output.publish import Draft
 from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.budget.guidance import check_ways, with_ways
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
@@ -28,7 +29,7 @@ from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.planning.search.choice import BEST, Choice, choose_stated, with_file_read
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
-from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
+from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run, check_rooms
 
 if TYPE_CHECKING:
     from puncture_twin.planning.export.exporter import Exported
@@ -122,6 +123,7 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal, two_stages
 
     context.require_arm()
+    check_rooms(context.case, rooms)
     choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names, read=choice.read) as draft, two_stages() as begin:
@@ -223,9 +225,11 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
+    check_rooms(context.case, rooms)
     source, plan = read_noted_plan(plan_path, context.watcher.note)
     with context.stages.time("plan"):
         candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
+        check_ways(context, plan, plan_path)
     plan = with_case_arm(plan, context.case)
     with _writing(out, "rehearse", context, ("rehearsal.json", FILM, ROOMS), source) as draft:
         run = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), rooms, partial).ended(draft.folder)
@@ -267,6 +271,7 @@ def export(
     source, plan = read_noted_plan(plan_path, note)
     if context is not None:
         check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed if seed is None else seed)
+        check_ways(context, plan, plan_path)
     checker = None if context is None or context.reach is None else context.reach.checker
     name = export_name(plan_path, format_name)
     inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
@@ -305,6 +310,7 @@ def _planned(run: Run, out: Path, choice: Choice) -> Run:
     try:
         with context.stages.time("plan"):
             plan, found, row = make_plan(context, run.candidates, choice)
+            plan = with_ways(context, plan)
     except NoAnswerError as error:
         return replace(run, refusal=str(error).removeprefix(NO_PLAN))
     write_plan(plan, out / "plan.json")

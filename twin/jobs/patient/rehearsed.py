@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from puncture_twin.planning.base.processes import process_pool, worker_count
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.budget.guidance import sight_of
 from puncture_twin.twin.jobs.patient.run import FILM, ROOMS, RoomCount, Run
 from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
 from puncture_twin.twin.jobs.terminal import write_json
@@ -142,7 +143,9 @@ def in_rooms(context: CaseContext, plan: Plan, count: RoomCount, seed: int | Non
     """
     seed = context.case.rehearsal.seed if seed is None else seed
     with context.stages.time("rooms"):
-        found = rehearse_trials(context, plan.outward_ct, plan.insertion.q[-1], count.rooms, seed)
+        q = plan.insertion.q[-1]
+        sight = None if count.guidance is None else sight_of(context, plan, count.guidance)
+        found = rehearse_trials(context, plan.outward_ct, q, count.rooms, seed, count.guidance, sight)
     if not (count.physics and len(found)):
         return found
     from puncture_twin.twin.rehearsal.plan_truth import physics_trials

@@ -11,6 +11,8 @@ import numpy as np
 from puncture_twin.planning.base.errors import Severity, refuse
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.text import plural
+from puncture_twin.planning.budget.guidance import check_devices, check_way
+from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
@@ -45,21 +47,37 @@ FILM, ROOMS = "rehearsal.mp4", "rooms.png"
 
 
 class RoomCount(NamedTuple):
-    """How many rooms are rehearsed, and how many of them in the simulator too."""
+    """How many rooms are rehearsed, how many of them in the simulator too, and the way of guidance, if one is asked."""
 
     rooms: int
     physics: int = 0
+    guidance: str | None = None
 
 
-def room_count(rooms: int | None, physics: int) -> RoomCount | None:
+def check_rooms(case: Case, count: RoomCount | None) -> None:
+    """Refuse guidance whose devices a case does not declare, before anything is searched.
+
+    Raises:
+        InputError: See `check_devices`.
+    """
+    if count is not None and count.guidance is not None:
+        check_devices(case, count.guidance)
+
+
+def room_count(rooms: int | None, physics: int, guidance: str | None = None) -> RoomCount | None:
     """How many rooms are wanted; None for none beside the one that is executed.
 
     Raises:
-        InputError: More in the simulator than there are.
+        InputError: More in the simulator than there are, or guidance that is unknown, or without trials.
     """
+    if guidance is not None:
+        check_way(guidance)
+        if rooms is None or physics:
+            what = "--guidance leads the needle in trials without physics"
+            refuse(what, "--guidance", "--guidance WAY --seeds N, without --physics", "conflicting_options")
     if physics > (rooms or 0):
         refuse("--physics runs some of the trials", "--physics", "--seeds N --physics K, K <= N", "conflicting_options")
-    return None if rooms is None else RoomCount(rooms, physics)
+    return None if rooms is None else RoomCount(rooms, physics, guidance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -105,6 +105,7 @@ def plan_summary(plan: Plan) -> dict[str, Any]:
         "approach_s": float(plan.approach.times_s[-1]),
         "insertion_s": float(plan.insertion.times_s[-1]),
         "clearance_mm": {phase: finite(value) for phase, value in plan.clearance_mm.items()},
+        **({"guidance": [one.document() for one in plan.guidance]} if plan.guidance else {}),
     }
 
 

@@ -1,0 +1,337 @@
+"""The ways of guidance of a case along one direction: where the devices look, what has moved, how far to correct.
+
+A correction moves the needle parallel to itself. Part of it takes back what registration and arm had wrong; the rest
+takes the needle to another place in the body than was planned, because the target has moved there, or is there. That
+part s is what touches and the way's readings together say of it, with the body at rest. As certificates do, the
+corridor trusts the clearances of the plan's own needle: with slack_j = distance to structure j - radius - margin, no
+point of the needle is displaced by more than |s|, so that every needle with
+
+    |s| <= min_j slack_j
+
+keeps every margin in the anatomy as the CT shows it. What would go farther is not executed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.budget.chain import bent_path
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.reach.standoff import case_axis_lengths, case_paths, standoffs
+from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise, touches
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
+from puncture_twin.planning.registration.registration import Registration
+from puncture_twin.planning.registration.residuals import NoiseTest
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import Explanation
+from puncture_twin.planning.search.phases import moving_weights
+from puncture_twin.planning.sight.cameras import CameraView, camera_view
+from puncture_twin.planning.sight.probe import ProbeView, probe_view
+from puncture_twin.planning.uncertainty.chance_model import ChanceModel
+from puncture_twin.planning.uncertainty.guided import (
+    CAMERAS,
+    WAYS,
+    WHOLLY,
+    Follows,
+    GuidedError,
+    GuidedModel,
+    Look,
+    WayChance,
+    device_of,
+)
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+
+LOOKS = 3
+"""One at the standoff, the others evenly on the way in, the last with the tip at the target."""
+
+
+def declared_ways(case: Case) -> tuple[str, ...]:
+    """The ways whose devices a case declares, ct first."""
+    lacking = {device for device, one in _DEVICES.items() if getattr(case, one) is None}
+    return tuple(way for way, used in WAYS.items() if not used & lacking)
+
+
+_DEVICES = MappingProxyType({"cameras": "stereo", "target": "ultrasound", "tip": "ultrasound"})
+"""Tables of a case that declare what a way reads."""
+
+
+def check_way(way: str) -> None:
+    """Refuse a way that there is not.
+
+    Raises:
+        InputError: Naming those that there are.
+    """
+    if way not in WAYS:
+        refuse(f"guidance '{way}' is not known", "--guidance", ", ".join(WAYS), "unknown_guidance")
+
+
+def check_devices(case: Case, way: str) -> None:
+    """Refuse a way whose devices a case does not declare.
+
+    Raises:
+        InputError: Naming their tables.
+    """
+    needed = dict.fromkeys(table for device, table in _DEVICES.items() if device in WAYS[way])
+    lacking = [f"[{table}]" for table in needed if getattr(case, table) is None]
+    if lacking:
+        what = f"guidance '{way}' needs {' and '.join(lacking)}, which the case does not declare"
+        allowed = f"{', '.join(lacking)} in the case, or {', '.join(declared_ways(case))}"
+        refuse(what, case.path, allowed, "no_device")
+
+
+def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
+    """The pose error of trials: touched in stated configurations, errors of the estimated size as if declared.
+
+    Args:
+        error: Of a case.
+        q_touch: Shape (N, 6), rad: known, or likely ones.
+    """
+    errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
+    noise = reading_noise(errors, error.model, error.tip_mm, q_touch, known=True)
+    test = NoiseTest(fit.test.count, float(fit.test.freedom))
+    return replace(error, errors=errors, fit=FitUncertainty(noise, fit.R_base_ct, fit.center_base, fit.fit_map, test))
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What the devices see during an insertion.
+
+    Attributes:
+        cameras: None where they are not asked about.
+        probe: None where it is not.
+        no_cameras: Why there is no place for cameras; empty where there is one.
+    """
+
+    cameras: CameraView | None = None
+    probe: ProbeView | None = None
+    no_cameras: str = ""
+
+    def hidden(self, out_mm: float) -> dict[str, str]:
+        """What is out of sight with the tip so far from the target, by the names of readings, and why."""
+        found = {}
+        if self.probe is not None and self.probe.T_ct_image is None:
+            found = dict.fromkeys(("target", "tip"), self.probe.sentence)
+        if self.no_cameras:
+            found[CAMERAS] = self.no_cameras
+        if self.cameras is not None:
+            row = int(np.abs(self.cameras.tip_to_target_mm - out_mm).argmin())
+            named = zip(self.cameras.names, self.cameras.hidden[row], strict=True)
+            behind = {name: f"behind the {by.replace('_', ' ')}" for name, by in named if by}
+            markers = [name for name in self.cameras.names[self.cameras.balls :] if name not in behind]
+            found |= behind if len(markers) >= MIN_MARKERS else {**behind, CAMERAS: FEW_MARKERS}
+        return found
+
+
+FEW_MARKERS = f"fewer than {MIN_MARKERS} markers are seen"
+
+
+def sight_of(context: CaseContext, plan: Plan, way: str) -> Sight:
+    """What those devices of a way that the case declares see during a plan's insertion.
+
+    Raises:
+        InputError: The case states a place for them that cannot be used.
+    """
+    used, cameras, probe, lost = WAYS[way], None, None, ""
+    if "cameras" in used and context.case.stereo is not None:
+        try:
+            cameras = camera_view(context, plan)
+        except NoAnswerError as error:
+            lost = str(error)
+    if used & {"target", "tip"} and context.case.ultrasound is not None:
+        probe = probe_view(context, plan)
+    return Sight(cameras, probe, lost)
+
+
+def guided_model(
+    case: Case,
+    anatomy: Anatomy,
+    error: PoseError,
+    registration: Registration,
+    outward_ct: Floats,
+    q: Floats,
+    sight: Sight | None = None,
+) -> GuidedModel:
+    """What guidance knows of one insertion.
+
+    Args:
+        case: Declares the devices, and what moves.
+        anatomy: Its structures.
+        error: Of the needle, as rehearsed.
+        registration: Of the case's markers.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q: Shape (6,), rad, the tip on the target.
+        sight: What the devices see of it; None hides nothing, and has the picture along the body.
+    """
+    R, breathing = registration.T_base_ct[:3, :3], case.breathing
+    breath, skin_weight = np.zeros(3), 0.0
+    if breathing is not None:
+        breath, skin_weight = breathing.rms_ct, moving_weights(case, breathing, anatomy).skin
+    motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
+    return GuidedModel(
+        error=error,
+        markers=registration.markers.names,
+        points_base=apply(registration.T_base_ct, registration.markers.points_ct),
+        q_insertion=q,
+        looks=_looks(case, anatomy, error, outward_ct, q, sight or Sight()),
+        motion=R @ motion @ R.T,
+        breath=R @ breath,
+        skin_weight=skin_weight,
+        stereo=case.stereo,
+        ultrasound=case.ultrasound,
+        across=R @ _across(outward_ct, sight or Sight()),
+    )
+
+
+def _looks(
+    case: Case, anatomy: Anatomy, error: PoseError, outward_ct: Floats, q: Floats, sight: Sight
+) -> tuple[Look, ...]:
+    paths = case_paths(case, anatomy.skin, outward_ct[None])
+    length = float(paths.path_length[0])
+    standoff = float(standoffs(case.needle, length, paths.skin_angle[0]))
+    outs = [standoff, *(length * (1 - step / (LOOKS - 1)) for step in range(1, LOOKS))]
+    T, looks = flange_pose(error.model, q), []
+    for out in outs:
+        at = T.copy()
+        at[:3, 3] -= out * T[:3, 2]
+        there = nearest_within_limits(error.model, inverse(error.model, at[None])[0], q)
+        off = np.where(np.isnan(there).any(axis=1), np.inf, np.abs(there - q).max(axis=1))
+        inserted = (length - out) / length
+        hidden = sight.hidden(out) | ({} if inserted > 0 else {"tip": OUTSIDE})
+        looks.append(Look(there[off.argmin()], out, inserted, hidden))
+    return tuple(looks)
+
+
+def _across(outward_ct: Floats, sight: Sight) -> Floats:
+    """Normal of the picture: the probe's, or of the plane of the needle that comes nearest to the body's long axis."""
+    if sight.probe is not None and sight.probe.T_ct_image is not None:
+        return sight.probe.T_ct_image[:3, 2]
+    along = np.array([0.0, 0.0, 1.0]) if abs(outward_ct[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    across = np.cross(outward_ct, along)
+    return np.asarray(across / np.linalg.norm(across))
+
+
+def way_chances(
+    context: CaseContext, outward_ct: Floats, q: Floats, sight: Sight | None = None
+) -> tuple[WayChance, ...]:
+    """What each way would leave of an insertion, ct first, by the devices of a case; nothing where it declares none.
+
+    Args:
+        context: The case.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q: Shape (6,), rad, the tip on the target.
+        sight: What the devices see; None hides nothing.
+    """
+    case, chance = context.case, context.chance
+    ways = declared_ways(case)
+    if len(ways) == 1 or chance is None or context.placement is None or context.placement.registration is None:
+        return ()
+    registration = context.placement.registration
+    path = bent_path(case, context.anatomy, outward_ct)
+    error = as_rehearsed(chance.error, touches(case, registration.markers))
+    error = replace(error, bend=None if path is None else path.bend)
+    model = guided_model(case, context.anatomy, error, registration, outward_ct, q, sight)
+    found = []
+    for way in ways:
+        lost = "; ".join(lost_sight(model, way))
+        try:
+            left = guided_error(model, way)
+        except NoAnswerError as refused:
+            found.append(WayChance(way, np.nan, np.nan, lost or str(refused)))
+            continue
+        p_hit = float(replace(chance, error=left).hit_chance(left.covariance_ct(q[None]))[0])
+        found.append(WayChance(way, float(np.sqrt(np.trace(left.tip_covariance(q[None])[0]))), p_hit, lost))
+    return tuple(found)
+
+
+def with_ways(context: CaseContext, plan: Plan) -> Plan:
+    """A plan with what each way of guidance would leave, the devices as the case's geometry lets them see."""
+    if len(declared_ways(context.case)) == 1 or context.chance is None:
+        return replace(plan, guidance=())
+    sight = sight_of(context, plan, "all")
+    return replace(plan, guidance=way_chances(context, plan.outward_ct, plan.insertion.q[-1], sight))
+
+
+def check_ways(context: CaseContext, plan: Plan, where: str | Path) -> None:
+    """Refuse a plan that states other chances by guidance than its case gives: people read them.
+
+    Raises:
+        InputError: It does.
+    """
+    known = with_ways(context, plan).guidance
+    same = len(known) == len(plan.guidance) and all(
+        a.way == b.way
+        and a.lost_sight == b.lost_sight
+        and np.allclose(a[1:3], b[1:3], rtol=0, atol=1e-6, equal_nan=True)
+        for a, b in zip(known, plan.guidance, strict=True)
+    )
+    if not same:
+        refuse("guidance is another than the case gives", where, "plan again", "plan_of_another")
+
+
+def explained_ways(context: CaseContext, explained: Explanation) -> Explanation:
+    """A checked direction with what each way of guidance would leave, nothing hidden: sight needs a plan."""
+    row = explained.candidates
+    q = row.arm.q_insertion[0]
+    if np.isnan(q).any() or np.isnan(row.path.length[0]):
+        return explained
+    return replace(explained, guidance=way_chances(context, row.outward_ct[0], q))
+
+
+def followers(case: Case, anatomy: Anatomy) -> tuple[Follows, ...]:
+    """How each of ``anatomy.checked`` follows the target; what is outside of the body does not but with the breath."""
+    breath = np.ones(len(anatomy.checked))
+    if case.breathing is not None:
+        breath = moving_weights(case, case.breathing, anatomy).structures
+    return tuple(
+        Follows(0.0 if one.outside else 1.0, weight)
+        for one, weight in zip(anatomy.checked, breath.tolist(), strict=True)
+    )
+
+
+def lost_sight(model: GuidedModel, way: str) -> tuple[str, ...]:
+    """What a way's devices do not see, where and why, a sentence each; that the tip is not yet in the body is none."""
+    return tuple(
+        f"{_where(look)}: {what} out of sight: {why}"
+        for look in model.looks
+        for what, why in look.hidden.items()
+        if device_of(what) in WAYS[way] and why != OUTSIDE
+    )
+
+
+OUTSIDE = "it is not in the body yet"
+
+
+def _where(look: Look) -> str:
+    return "at the target" if look.out_mm <= 0 else f"{look.out_mm:.0f} mm before the target"
+
+
+def guided_error(model: GuidedModel, way: str, follows: Follows = WHOLLY) -> GuidedError:
+    """The pose error that a way leaves, against anatomy that follows the target so.
+
+    Raises:
+        NoAnswerError: What is in sight does not determine the tip against the target.
+    """
+    found, one = model.guided(way), model.error
+    if found is None:
+        lost = "; ".join(lost_sight(model, way)) or "its readings leave the needle's place against the CT open"
+        raise NoAnswerError(f"guidance '{way}' does not see enough: {lost}", code="lost_sight")
+    found = found if follows == WHOLLY else found._replace(cov=model.cov(found.gain, follows))
+    return GuidedError(one.model, one.tip_mm, one.target_base, one.errors, one.fit, one.bend, found)
+
+
+def corridor_mm(case: Case, chance: ChanceModel, outward_ct: Floats) -> float:
+    """How far from its plan a correction may take the needle in the body, mm; see the module."""
+    lengths = case_axis_lengths(case, chance.anatomy, outward_ct[None])
+    distance = chance.engine.measure(case.target_ct, outward_ct[None], lengths).distance[0][chance.columns]
+    return float(max((distance - chance.breaking).min(initial=np.inf), 0.0))

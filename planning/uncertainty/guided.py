@@ -1,0 +1,444 @@
+"""The needle's error under each way of guidance: one linear model of all devices, and the best linear estimate in it.
+
+Everything that errs is a source, normal with deviation 1: x. Everything of which nothing is known beforehand is flat:
+u, the patient's pose and the cameras' frame. Needle (shift and rotation at the tip), anatomy, target and each reading
+are linear in both:
+
+    needle_k = J_k (eta + drift + arrival_k)             eta 28 parameters of arm and tool, k a look or the end
+    anatomy  = pose + motion + breath                    of the target and what surrounds it, since the scan
+    target   = anatomy + reading of the target in the CT
+    touch_i  = A_i pose - J_i eta - R r_i + w breath' + n       marker i: r its reading in the CT, w that of the skin
+    cameras  = A_i (pose + frame) - R r_i + w breath + n        markers, A_i = [I, -[p_i - f]x],
+               [I, -[b]x] needle_k + A_b frame + n              and balls b behind the tip
+    picture  = target + calibration + n                  ultrasound: the target,
+               needle_k + calibration + n                and the tip
+
+All readings stacked are z = H x + F u. A way uses some of them. What it estimates is t = tip - target = a x + b u;
+the tip is moved by -K z, with the weights K of the least error among those that no flat part enters:
+
+    min |a - K H|^2  with  K F = b:      K = K0 + M N',   K0 F = b,   N' F = 0,   M by least squares
+
+The flat parts are eliminated, not given a large variance. ct is the registration as it is, K = -X L. The needle keeps
+the direction that the registration gave it: in every way
+
+    e = needle - anatomy + G z,   G = [-K; (X L)_rotation],   Sigma6 = (E + G H)(E + G H)'.
+
+After the last look the arm arrives anew. Errors in reading an ultrasound picture last as long as its plane: looking
+again does not average them. Cameras err anew with each picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.strict_json import or_null
+from puncture_twin.planning.case.settings import Stereo, Ultrasound
+from puncture_twin.planning.registration.fits import design
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+
+WAYS: Mapping[str, frozenset[str]] = {
+    "ct": frozenset({"touch"}),
+    "stereo": frozenset({"cameras"}),
+    "us": frozenset({"target"}),
+    "us+tip": frozenset({"target", "tip"}),
+    "ct+stereo": frozenset({"touch", "cameras"}),
+    "ct+us": frozenset({"touch", "target"}),
+    "ct+us+tip": frozenset({"touch", "target", "tip"}),
+    "all": frozenset({"touch", "cameras", "target", "tip"}),
+}
+"""Ways of guidance, by the devices whose readings each uses; ultrasound reads a target and a tip."""
+
+LEVER_MM = 100.0
+"""Flat rotations are counted in mm at this distance, so that the columns of F are of one size."""
+
+RANK = 1e-9
+"""Relative size below which a singular value of F is 0."""
+
+ALIKE_MM = 1e-6
+"""Two readings that differ by less say the same."""
+
+FREE = 0.01
+"""mm that the tip's estimate may follow per mm of a flat part that no reading shows: more, and it is open. Cameras do
+not see a roll about the needle; where the registered target is .1 mm beside its line, that is .001."""
+
+CAMERAS = "cameras"
+
+FLAT = ("pose", "frame")
+"""The patient's pose and the cameras' frame: shift and rotation at the target, of which nothing is known beforehand."""
+
+Rows = dict[str, Floats]
+"""Values that are linear in the sources: by source the columns, shape (m, k)."""
+
+
+def _sum(*parts: Rows) -> Rows:
+    names = dict.fromkeys(name for part in parts for name in part)
+    return {name: np.sum([part[name] for part in parts if name in part], axis=0) for name in names}
+
+
+def _times(M: Floats, rows: Rows) -> Rows:
+    return {name: M @ part for name, part in rows.items()}
+
+
+def _root(cov: Floats) -> Floats:
+    """S with S S' = cov, of covariances (..., 3, 3) that may be singular."""
+    values, axes = np.linalg.eigh(cov)
+    return np.asarray(axes * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+
+
+def picture_root(sd_mm: tuple[float, float], across: Floats) -> Floats:
+    """S with S S' the covariance of a point read in a picture, shape (3, 3), in the axes of the plane's normal (3,)."""
+    return sd_mm[0] * np.eye(3) + (sd_mm[1] - sd_mm[0]) * np.outer(across, across)
+
+
+class Look(NamedTuple):
+    """One look of the devices on the way in."""
+
+    q: Floats
+    """Shape (6,), rad: the arm as it is planned there."""
+    out_mm: float
+    """Tip to target."""
+    inserted: float
+    """Fraction of the way: 1 at the target, 0 at the skin, below 0 before it."""
+    hidden: Mapping[str, str] = MappingProxyType({})
+    """What is out of sight, by the names of `Reading`, and why; `CAMERAS` is all of theirs."""
+
+    def hides(self, reading: Reading) -> bool:
+        """Whether a reading of this look is not there."""
+        return reading.name in self.hidden or (reading.device == CAMERAS and CAMERAS in self.hidden)
+
+
+class Follows(NamedTuple):
+    """By how much of the target's motion since the scan, and of its breath, something moves."""
+
+    motion: float
+    breath: float
+
+
+WHOLLY = Follows(1.0, 1.0)
+
+
+class Reading(NamedTuple):
+    """Some rows of z."""
+
+    device: str
+    """touch, cameras, target or tip."""
+    name: str
+    """touch, ``marker <name>``, ``ball <mm behind the tip> mm``, target or tip."""
+    look: int
+    """-1 for the touches, which precede all looks."""
+    rows: Rows
+
+
+@dataclass(frozen=True, eq=False)
+class GuidedModel:
+    """One insertion as guidance knows it; base axes.
+
+    Attributes:
+        error: Of the needle by its registration, the touches known or assumed.
+        markers: Their N names.
+        points_base: Shape (N, 3), mm, by the registration.
+        q_insertion: Shape (6,), rad, the tip on the target.
+        looks: In their order.
+        motion: Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan.
+        breath: Shape (3,), mm: rms displacement of the target by the breath, along its line; zero without breathing.
+        skin_weight: By how much of it the markers move.
+        stereo: The cameras, or None.
+        ultrasound: The probe, or None.
+        across: Shape (3,), unit: the normal of its picture.
+    """
+
+    error: PoseError
+    markers: tuple[str, ...]
+    points_base: Floats
+    q_insertion: Floats
+    looks: Sequence[Look]
+    motion: Floats
+    breath: Floats
+    skin_weight: float = 0.0
+    stereo: Stereo | None = None
+    ultrasound: Ultrasound | None = None
+    across: Floats | None = None
+
+    def _at(self, points_base: Floats) -> Floats:
+        """A, shape (3 m, 6): how a shift and rotation at the target move points (m, 3)."""
+        return design(points_base, self.error.target_base)
+
+    def needle(self, q: Floats, arrival: str) -> Rows:
+        """Deviation of the straight needle from where the nominal arm puts it, 6 rows."""
+        arm, scale = self.error.errors.arm, self.error.fit.test.scale
+        J = scale * error_jacobian(self.error.model, q, self.error.tip_mm)
+        Jq = J[:, PARAMETERS["joint"]]
+        own = J * np.sqrt(self.error.fit.noise.eta_variances)
+        return {"arm": own, "drift": arm.drift * Jq, arrival: arm.repeatability * Jq}
+
+    def _bent(self, q: Floats, inserted: float) -> Rows:
+        """What the bend adds to it: tissue bends the needle the more, the deeper it is."""
+        bend = self.error.bend
+        return {} if bend is None else {"bend": max(inserted, 0.0) ** 2 * bend.sides(self.error.model, q)}
+
+    def anatomy(self, follows: Follows = WHOLLY) -> Rows:
+        """Deviation of anatomy at the target from where the registration puts it, 6 rows."""
+        motion, breath = follows.motion * _root(self.motion), follows.breath * self.breath[:, None]
+        still = np.zeros((3, 3))
+        return {"pose": np.eye(6), "motion": np.vstack([motion, still]), "breath": np.vstack([breath, still[:, :1]])}
+
+    @cached_property
+    def target(self) -> Rows:
+        """Deviation of the true target, 3 rows."""
+        return _sum(_times(np.eye(6)[:3], self.anatomy()), {"target": _root(self.error.target_covariance)})
+
+    @cached_property
+    def readings(self) -> tuple[Reading, ...]:
+        """All readings, less what the registration expects of them: the touches, then look by look."""
+        found = [Reading("touch", "touch", -1, self._touches())]
+        for number, look in enumerate(self.looks):
+            needle = self.needle(look.q, f"arrival {number}")
+            found += self._seen_by_cameras(look, number, needle)
+            tip = _times(np.eye(6)[:3], _sum(needle, self._bent(look.q, look.inserted)))
+            found += self._in_pictures(number, tip)
+        return tuple(one for one in found if one.look < 0 or not self.looks[one.look].hides(one))
+
+    def _touches(self) -> Rows:
+        noise, scale, count = self.error.fit.noise, self.error.fit.test.scale, len(self.points_base)
+        touch = np.zeros((count, 3, count, 3))
+        touch[np.arange(count), :, np.arange(count)] = scale * _root(noise.cov_base)
+        own = {
+            "arm": -scale * noise.arm_jacobian * np.sqrt(noise.eta_variances),
+            "touch": touch.reshape(3 * count, 3 * count),
+            "breath at touch": np.tile(self.skin_weight * self.breath, count)[:, None],
+        }
+        return _sum(self._markers, own)
+
+    @cached_property
+    def _markers(self) -> Rows:
+        """Deviation of the markers from where their readings in the CT put them, 3 N rows, at no breath."""
+        R, count = self.error.fit.R_base_ct, len(self.points_base)
+        read = self.error.fit.test.scale * R @ _root(self.error.fit.noise.cov_ct)
+        return {"pose": self._at(self.points_base), "markers": np.asarray(-np.kron(np.eye(count), read))}
+
+    def _seen_by_cameras(self, look: Look, number: int, needle: Rows) -> list[Reading]:
+        if self.stereo is None:
+            return []
+        T, seen = flange_pose(self.error.model, look.q), dict[str, Rows]()
+        tip, outward = T[:3, 3] + self.error.tip_mm * T[:3, 2], -T[:3, 2]
+        moved = {"breath": self.skin_weight * self.breath[:, None]}
+        for row, (name, point) in enumerate(zip(self.markers, self.points_base, strict=True)):
+            own = {source: part[3 * row : 3 * row + 3] for source, part in self._markers.items()}
+            seen[marker_name(name)] = _sum(own, moved, {"frame": self._at(point[None])})
+        for behind in self.stereo.balls_mm:
+            ball = behind * outward[None]
+            seen[ball_name(behind)] = _sum(_times(design(ball, np.zeros(3)), needle), {"frame": self._at(tip + ball)})
+        noise = self.stereo.sd_mm * np.eye(3)
+        return [
+            Reading("cameras", name, number, {**rows, f"seen {name} {number}": noise}) for name, rows in seen.items()
+        ]
+
+    def _in_pictures(self, number: int, tip: Rows) -> list[Reading]:
+        if self.ultrasound is None or self.across is None:
+            return []
+        one, found = self.ultrasound, []
+        for name, rows, sd_mm in (("target", self.target, one.target_sd_mm), ("tip", tip, one.tip_sd_mm)):
+            own = {
+                "calibration": one.calibration_sd_mm * np.eye(3),
+                f"pictured {name}": picture_root(sd_mm, self.across),
+            }
+            found.append(Reading(name, name, number, _sum(rows, own)))
+        return found
+
+    @cached_property
+    def end(self) -> Rows:
+        """The needle after the last correction, 6 rows."""
+        return _sum(self.needle(self.q_insertion, "arrival"), self._bent(self.q_insertion, 1.0))
+
+    @cached_property
+    def _widths(self) -> dict[str, int]:
+        every = [self.end, self.anatomy(), self.target, *(one.rows for one in self.readings)]
+        return {name: part.shape[1] for rows in every for name, part in rows.items() if name not in FLAT}
+
+    def matrices(self, rows: Rows) -> tuple[Floats, Floats]:
+        """H, shape (m, n), and F, shape (m, 12), of m rows."""
+        count = len(next(iter(rows.values())))
+        H = [rows.get(name, np.zeros((count, width))) for name, width in self._widths.items()]
+        F = [rows.get(name, np.zeros((count, 6))) * np.repeat([1.0, 1.0 / LEVER_MM], 3) for name in FLAT]
+        return np.hstack(H), np.hstack(F)
+
+    @cached_property
+    def _stacked(self) -> tuple[Floats, Floats, list[tuple[Reading, int]]]:
+        """H and F of all readings, and the reading of each row."""
+        parts = [self.matrices(one.rows) for one in self.readings]
+        rows = [(one, row) for one, (H, _) in zip(self.readings, parts, strict=True) for row in range(len(H))]
+        return np.vstack([H for H, _ in parts]), np.vstack([F for _, F in parts]), rows
+
+    def guided(self, way: str, last: int | None = None) -> Guided | None:
+        """The estimate of a way after a look, by default the last; None where its readings do not determine the tip."""
+        H, F, rows = self._stacked
+        a, b = self.matrices(_sum(_times(np.eye(6)[:3], self.end), _times(-np.eye(3), self.target)))
+        last = len(self.looks) - 1 if last is None else last
+        used = np.flatnonzero([one.device in WAYS[way] and one.look <= last for one, _ in rows])
+        gain = np.zeros((6, len(rows)))
+        gain[:, [one.device == "touch" for one, _ in rows]] = self.error.fit.map_at(self.error.target_base)
+        if way != "ct":
+            K = _weights(H[used], F[used], a, b)
+            if K is None:
+                return None
+            gain[:3] = 0.0
+            gain[:3, used] = -K
+        tip = a + gain[:3] @ H
+        return Guided(gain, self.cov(gain), tip @ tip.T, self._parts(tip), gain[:3] + self._aside(way, last))
+
+    def _aside(self, way: str, last: int) -> Floats:
+        """The weights, shape (3, m), that estimate the needle's shift from its plan in the body at rest, uncorrected.
+
+        By the touches, whichever way it is, and by what the way reads up to a look.
+        """
+        H, F, rows = self._stacked
+        resting = _times(-np.eye(3), {"pose": np.eye(6)[:3]})
+        a, b = self.matrices(_sum(_times(np.eye(6)[:3], self.end), resting))
+        used = [one.look < 0 or (one.device in WAYS[way] and one.look <= last) for one, _ in rows]
+        weights = np.zeros((3, len(rows)))
+        K = _weights(H[used], F[used], a, b)
+        assert K is not None  # touches determine a pose
+        weights[:, used] = K
+        return weights
+
+    def _against(self, gain: Floats, follows: Follows) -> Floats:
+        """Needle against anatomy that follows the target so, under a gain, 6 rows of the sources."""
+        E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(follows))))
+        return np.asarray(E + gain @ self._stacked[0])
+
+    def cov(self, gain: Floats, follows: Follows = WHOLLY) -> Floats:
+        """Sigma6, shape (6, 6), of the needle against anatomy that follows the target so, under a gain."""
+        rows = self._against(gain, follows)
+        return np.asarray(rows @ rows.T)
+
+    def breath_shift(self, gain: Floats, follows: Follows) -> Floats:
+        """By how much the needle's tip moves against such anatomy while the target moves by ``breath``, shape (3,)."""
+        names = list(self._widths)
+        at = sum(self._widths[name] for name in names[: names.index("breath")])
+        return np.asarray(self._against(gain, follows)[:3, at])
+
+    def _parts(self, tip: Floats) -> dict[str, float]:
+        """Mean square of the tip's error by source, mm^2, named as in `SOURCES`."""
+        squares, parts = np.sum(tip**2, axis=0), dict[str, float]()
+        start = 0
+        for name, width in self._widths.items():
+            cut = {name: squares[start : start + width]}
+            if name == "arm":
+                cut = {kind: squares[start : start + width][part] for kind, part in PARAMETERS.items()}
+            for one, own in cut.items():
+                source = _SOURCE_OF.get(one.split(" ")[0], one)
+                parts[source] = parts.get(source, 0.0) + float(own.sum())
+            start += width
+        return {source: part for source, part in parts.items() if part > 0.0}
+
+
+_SOURCE_OF = {
+    "arrival": "repeatability",
+    "markers": "markers_ct",
+    "breath": "motion",
+    "seen": "cameras",
+    "pictured": "pictures",
+    "calibration": "pictures",
+}
+"""Sources by the first word of a row's: those of all looks together."""
+
+
+def device_of(name: str) -> str:
+    """The device that gives a look's reading of a name."""
+    return name if name in ("target", "tip") else "cameras"
+
+
+def ball_name(behind_mm: float) -> str:
+    """Name of a ball's reading."""
+    return f"ball {behind_mm:g} mm"
+
+
+def marker_name(name: str) -> str:
+    """Name of a marker's reading by the cameras."""
+    return f"marker {name}"
+
+
+def _weights(H: Floats, F: Floats, a: Floats, b: Floats) -> Floats | None:
+    """K, shape (3, m), of the least error without a flat part; None where there is none."""
+    if not len(H):
+        return None
+    U, sizes, Vt = np.linalg.svd(F)
+    rank = int(np.sum(sizes > RANK * sizes[0]))
+    anyhow = (b @ Vt[:rank].T / sizes[:rank]) @ U[:, :rank].T
+    if np.abs(anyhow @ F - b).max() > FREE:
+        return None
+    N = U[:, rank:]
+    free, left = (N.T @ H).T, (a - anyhow @ H).T
+    eye = ALIKE_MM * np.eye(N.shape[1])  # rows of readings that say the same twice are zero
+    M = np.linalg.lstsq(np.vstack([free, eye]), np.vstack([left, np.zeros((len(eye), 3))]))[0].T
+    return np.asarray(anyhow + M @ N.T)
+
+
+class Guided(NamedTuple):
+    """The estimate of one way, and the errors that it leaves; base axes."""
+
+    gain: Floats
+    """G, shape (6, m): how the command follows all readings; 0 for those that the way does not use."""
+    cov: Floats
+    """Sigma6, shape (6, 6), of the needle against the CT's anatomy about the target."""
+    tip_cov: Floats
+    """Shape (3, 3), mm^2, of the tip about the true target."""
+    parts: Mapping[str, float]
+    """Mean square of the tip by source, mm^2."""
+    aside: Floats
+    """Shape (3, m): estimates from all readings how far the corrected needle is from its plan in the body at rest."""
+
+
+class WayChance(NamedTuple):
+    """What one way of guidance is expected to leave of one insertion."""
+
+    way: str
+    expected_error_mm: float
+    """Rms of the tip about the target; NaN where the way does not see enough."""
+    p_hit: float
+    lost_sight: str
+    """What is not seen, and why; empty where all is."""
+
+    def document(self) -> dict[str, Any]:
+        """Plain values for JSON; null where there is no number."""
+        numbers = {name: or_null(getattr(self, name)) for name in ("expected_error_mm", "p_hit")}
+        return {"way": self.way, **numbers, "lost_sight": self.lost_sight}
+
+
+@dataclass(frozen=True, eq=False)
+class GuidedError(PoseError):
+    """The pose error of one direction's needle under one way of guidance, for whatever asks a `PoseError`.
+
+    Attributes:
+        guided: What the way leaves; ``cov`` is of the anatomy that is asked about.
+    """
+
+    guided: Guided | None = None
+
+    @property
+    def known(self) -> Guided:
+        """What is there, of an error that is not blank."""
+        assert self.guided is not None
+        return self.guided
+
+    def covariance(self, q: Floats) -> Floats:
+        """Sigma6 after the last correction, the same for each of the configurations (n, 6)."""
+        return np.broadcast_to(self.known.cov, (len(q), 6, 6))
+
+    @property
+    def target_covariance_ct(self) -> Floats:
+        """What the true target adds, CT axes: less than nothing where a picture of it led the needle."""
+        R = self.fit.R_base_ct
+        return np.asarray(R.T @ (self.known.tip_cov - self.known.cov[:3, :3]) @ R)
+
+    def mean_squares(self, q: Floats) -> dict[str, float]:
+        """By source, those of devices and motion too."""
+        return dict(self.known.parts)

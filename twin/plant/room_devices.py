@@ -1,0 +1,73 @@
+"""Devices in the rooms of many trials at once, at the level of positions: cameras, and a probe on an arm of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.case.settings import Stereo, Ultrasound
+from puncture_twin.planning.geometry.rigid import exp_rotation, pose
+from puncture_twin.planning.uncertainty.guided import picture_root
+
+FAR_MM = 1500.0
+"""Of the cameras from the arm's base, per axis: their frame is of their own, and nobody knows it."""
+
+
+@dataclass(frozen=True, eq=False)
+class RoomCameras:
+    """Two cameras, calibrated to each other, anywhere in each of n rooms.
+
+    Attributes:
+        device: As declared.
+        T_cameras_base: Shape (n, 4, 4), mm.
+        rng: Of the readings.
+    """
+
+    device: Stereo
+    T_cameras_base: Floats
+    rng: np.random.Generator
+
+    @classmethod
+    def placed(cls, device: Stereo, count: int, rng: np.random.Generator) -> RoomCameras:
+        """Cameras in so many rooms."""
+        return cls(device, pose(exp_rotation(rng.normal(size=(count, 3))), FAR_MM * rng.normal(size=(count, 3))), rng)
+
+    def read(self, points_base: Floats) -> Floats:
+        """Points (n, m, 3), or (m, 3) in all rooms, as the cameras give them in their own frame: (n, m, 3), mm."""
+        R, t = self.T_cameras_base[:, :3, :3], self.T_cameras_base[:, None, :3, 3]
+        seen = points_base @ np.swapaxes(R, 1, 2) + t
+        return np.asarray(seen + self.rng.normal(size=seen.shape) * self.device.sd_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class RoomProbe:
+    """A probe on its arm in each of n rooms; errors of calibration and of reading a picture last all the way in.
+
+    Attributes:
+        target_off: Shape (n, 3), mm, base axes: what target readings are off by.
+        tip_off: Shape (n, 3), those of the tip.
+    """
+
+    target_off: Floats
+    tip_off: Floats
+
+    @classmethod
+    def placed(cls, device: Ultrasound, across: Floats, count: int, rng: np.random.Generator) -> RoomProbe:
+        """Probes in so many rooms, whose pictures have this normal (3,), base axes."""
+        calibration, target, tip = rng.normal(size=(3, count, 3))
+        shift = device.calibration_sd_mm * calibration
+        read = (
+            shift + off @ picture_root(sd, across)
+            for off, sd in ((target, device.target_sd_mm), (tip, device.tip_sd_mm))
+        )
+        return cls(*read)
+
+    def target(self, points_base: Floats) -> Floats:
+        """Targets (n, 3) as the pictures show them, mm, base axes."""
+        return points_base + self.target_off
+
+    def tip(self, points_base: Floats) -> Floats:
+        """Tips (n, 3) as the pictures show them."""
+        return points_base + self.tip_off

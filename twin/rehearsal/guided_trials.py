@@ -1,0 +1,170 @@
+"""Trials under guidance: look, correct, go on. The devices are the plant's; the correction knows readings and belief.
+
+The belief is linear (`planning.uncertainty.guided`), the truth is not: an erring arm's kinematics, cameras anywhere in
+the room, a probe whose calibration is off. After each look the needle is moved parallel to itself by what all readings
+so far call for, as long as it stays in the corridor; what would leave it is not executed, and the trial is stopped.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.uncertainty.guided import GuidedModel, Look, ball_name, marker_name
+from puncture_twin.twin.plant.room_devices import RoomCameras, RoomProbe
+from puncture_twin.twin.plant.true_needle import TrueNeedle, true_needle
+from puncture_twin.twin.rehearsal.trials import (
+    Puncture,
+    Trials,
+    Truths,
+    apply_each,
+    bent,
+    commanded,
+    ended,
+    open_loop,
+    registered,
+)
+
+Readings = dict[tuple[str, int], Floats]
+"""By name and look, less what the belief expects: shape (n, m)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """A way of guidance, as it corrects.
+
+    Attributes:
+        name: As in `WAYS`.
+        model: What is believed.
+        corridor_mm: How far from its plan a correction may take the needle, by what is believed.
+    """
+
+    name: str
+    model: GuidedModel
+    corridor_mm: float
+
+
+class GuidedTrials(NamedTuple):
+    """Trials, which of them were stopped: shape (n,), and how far from its plan each believes to be: (n, 3), mm."""
+
+    trials: Trials
+    stopped: Bools
+    aside_base: Floats
+
+
+def guided_trials(
+    puncture: Puncture, truths: Truths, errors: ErrorModel, way: Way, rng: np.random.Generator
+) -> GuidedTrials:
+    """Rehearse the puncture in each trial, by one way of guidance.
+
+    Args:
+        puncture: Common part of all trials.
+        truths: Of the n trials, as every way has them.
+        errors: What they were drawn from.
+        way: Of guidance.
+        rng: Of the devices, and of the arrivals after the first.
+    """
+    count, model = len(truths.eta), way.model
+    if way.name == "ct":
+        return GuidedTrials(open_loop(puncture, truths), np.zeros(count, bool), np.zeros((count, 3)))
+    T_base_ct = registered(puncture, truths)
+    room = _Room(puncture, truths, model, T_base_ct, *_devices(puncture, truths, model, rng))
+    drift = _drift(errors, truths.arrival, rng)
+    moved, aside = np.zeros((count, 3)), np.zeros((count, 3))
+    stopped, reached = np.zeros(count, bool), np.ones(count, bool)
+    found: Readings = {("touch", -1): (truths.touched_base - apply_each(T_base_ct, truths.read_ct)).reshape(count, -1)}
+    for number, look in enumerate(model.looks):
+        q, there = commanded(puncture, T_base_ct, moved, look.out_mm, look.q)
+        arrival = rng.normal(size=(count, 6)) * errors.arm.repeatability
+        found |= room.look(
+            look, number, q, true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
+        )
+        reached &= there
+        if (known := model.guided(way.name, number)) is not None:
+            z = np.hstack([found[one.name, one.look] for one in model.readings if one.look <= number])
+            wanted, off = (z @ rows[:, : z.shape[1]].T for rows in (known.gain[:3], known.aside))
+            stopped |= np.linalg.norm(off, axis=1) > way.corridor_mm
+            moved, aside = np.where(stopped[:, None], (moved, aside), (wanted, off))
+    q, there = commanded(puncture, T_base_ct, moved)
+    arrival = rng.normal(size=(count, 6)) * errors.arm.repeatability
+    needle = true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
+    return GuidedTrials(ended(puncture, truths, T_base_ct, needle, reached & there), stopped, aside)
+
+
+def _drift(errors: ErrorModel, first: Floats, rng: np.random.Generator) -> Floats:
+    """What drifted since the touches, given drift and first arrival together, shape (n, 6), rad."""
+    drift, anew = errors.arm.drift, errors.arm.repeatability
+    whole = np.hypot(drift, anew)
+    if whole == 0.0:
+        return np.zeros_like(first)
+    return np.asarray(first * (drift / whole) ** 2 + rng.normal(size=first.shape) * drift * anew / whole)
+
+
+def _devices(
+    puncture: Puncture, truths: Truths, model: GuidedModel, rng: np.random.Generator
+) -> tuple[RoomCameras | None, RoomProbe | None]:
+    """The devices of each trial's room, in their true places."""
+    count = len(truths.eta)
+    cameras = None if model.stereo is None else RoomCameras.placed(model.stereo, count, rng)
+    if model.ultrasound is None or model.across is None:
+        return cameras, None
+    return cameras, RoomProbe.placed(model.ultrasound, model.across, count, rng)
+
+
+@dataclass(frozen=True, eq=False)
+class _Room:
+    """Every trial's patient, arm and devices, and what is believed of them."""
+
+    puncture: Puncture
+    truths: Truths
+    model: GuidedModel
+    T_base_ct: Floats
+    cameras: RoomCameras | None
+    probe: RoomProbe | None
+
+    def look(self, look: Look, number: int, q: Floats, needle: TrueNeedle) -> Readings:
+        """What the devices read, less what is expected with the arm commanded to q (n, 6).
+
+        Args:
+            look: Where.
+            number: Of it.
+            q: Shape (n, 6), rad.
+            needle: The straight needles that are really there.
+        """
+        nominal = flange_pose(self.puncture.model, q)
+        axis = nominal[:, :3, 2]
+        tip = nominal[:, :3, 3] + self.puncture.tip_mm * axis
+        found = {**self._by_cameras(needle, tip, axis), **self._by_probe(look, needle, tip)}
+        return {(name, number): value for name, value in found.items() if name not in look.hidden}
+
+    def _by_cameras(self, needle: TrueNeedle, tip: Floats, axis: Floats) -> dict[str, Floats]:
+        if self.cameras is None:
+            return {}
+        truths, behind = self.truths, np.array(self.cameras.device.balls_mm)[:, None]
+        skin_ct = self.model.skin_weight * truths.breath_ct
+        markers = self.cameras.read(apply(self.puncture.T_base_ct, self.puncture.points_ct + skin_ct[:, None]))
+        balls = self.cameras.read(needle.tip_base[:, None] - behind * needle.R_base_needle[:, None, :, 2])
+        expected = apply_each(self.T_base_ct, truths.read_ct)
+        T_base_cameras = fit_rigid(markers, expected)  # where the belief is linear: the frame is free
+        off = apply_each(T_base_cameras, balls) - (tip[:, None] - behind * axis[:, None])
+        seen = {ball_name(mm): off[:, row] for row, mm in enumerate(self.cameras.device.balls_mm)}
+        there = apply_each(T_base_cameras, markers) - expected
+        return {**{marker_name(name): there[:, row] for row, name in enumerate(self.model.markers)}, **seen}
+
+    def _by_probe(self, look: Look, needle: TrueNeedle, tip: Floats) -> dict[str, Floats]:
+        if self.probe is None:
+            return {}
+        puncture, truths = self.puncture, self.truths
+        target = apply(puncture.T_base_ct, truths.target_ct + truths.motion_ct + truths.breath_ct)
+        expected = self.T_base_ct[:, :3, :3] @ puncture.target_ct + self.T_base_ct[:, :3, 3]
+        if puncture.bend is not None:
+            grown = max(look.inserted, 0.0) ** 2
+            needle = bent(needle, puncture.bend._replace(tip_mm=grown * puncture.bend.tip_mm), truths.side)
+        return {"target": self.probe.target(target) - expected, "tip": self.probe.tip(needle.tip_base) - tip}
