@@ -465,19 +465,24 @@ def register(
 @app.command()
 def selfcal(
     case: Annotated[Path | None, typer.Argument(metavar="[CASE]", help="selfcal.toml or its folder.")] = None,
-    recording: Annotated[Path | None, typer.Option("--recording", help="Recording: a CSV, or its folder.")] = None,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Recording: a CSV, or its folder with pictures or without.")
+    ] = None,
     seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Number of trials.")] = 3,
     out_dir: OutOption = Path("out/selfcal"),
+    record: Annotated[
+        Path | None,
+        typer.Option("--record", metavar="FOLDER", help="Keep the first trial's pictures in this new folder."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate two arms by ultrasound, AXP = YBQ. Then send the needle to targets in the image."""
     require_extra("twin", "selfcal")
-    from puncture_twin.twin.jobs.selfcal.job import run_selfcal
-    from puncture_twin.twin.jobs.selfcal.report import selfcal_facts, selfcal_text
+    from puncture_twin.twin.jobs.selfcal.report import run_selfcal, selfcal_facts, selfcal_text
 
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:
-        facts = selfcal_facts(run_selfcal(case, recording, seeds, out_dir, progress))
+        facts = selfcal_facts(run_selfcal(case, recording, seeds, out_dir, progress, record))
     finish("selfcal", facts, facts, selfcal_text(facts), as_json)
 
 

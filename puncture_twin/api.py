@@ -395,7 +395,7 @@ def read_volume(path: Path | str) -> Volume:
 
 @checked
 def read_recording(path: Path | str) -> Recording:
-    """What two arms and a probe's image said, pose by pose, from ``recording.csv`` or its folder; see `calibrate`.
+    """What two arms and a probe's pictures said, pose by pose, from ``recording.csv`` or its folder; see `calibrate`.
 
     Raises:
         InputError: It cannot be read, or a row is no pair of rigid motions with a point.

@@ -103,6 +103,13 @@ def _read(recording: Recording, A: Floats, B: Floats, P: Floats) -> Recording:
     return Recording(A, B, P, None, recording.names, recording.pixels)
 
 
+def _later(recording: Recording, rows: int) -> Recording:
+    """The poses with the tip of the row that follows so many rows later."""
+    first, last = (slice(0, -rows), slice(rows, None)) if rows > 0 else (slice(-rows, None), slice(0, rows))
+    names = recording.names[first]
+    return Recording(recording.A[first], recording.B[first], recording.P[last], None, names, recording.pixels)
+
+
 def _transposed(T: Floats) -> Floats:
     found = np.array(T)
     found[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
@@ -128,6 +135,8 @@ SLIPS: Mapping[str, Reading] = MappingProxyType(
         "A and B are in cm": lambda r: _read(r, _longer(r.A, 10), _longer(r.B, 10), r.P),
         "P is in metres": lambda r: _read(r, r.A, r.B, r.P * 1000),
         "P is in cm": lambda r: _read(r, r.A, r.B, r.P * 10),
+        "each picture belongs to the row before it": lambda r: _later(r, 1),
+        "each picture belongs to the row behind it": lambda r: _later(r, -1),
     }
 )
 """What people write instead of `ALLOWED`, in words, and how it is undone."""

@@ -117,7 +117,8 @@ def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: E
         least = len(active_columns(tip=known_tip is None, scale=scale, direction=False)) // 3 + 1
     if len(recording) < least:
         allowed = f"{least} or more" + (f", preferably {ADVISED_POSES}" if least == LEAST_POSES else "")
-        refuse(plural(len(recording), "pose"), "recording", allowed, "too_few_poses")
+        missed = f" (and {plural(len(recording.missed), 'picture')} without a needle)" if recording.missed else ""
+        refuse(plural(len(recording), "pose") + missed, "recording", allowed, "too_few_poses")
 
 
 def _solve(

@@ -113,6 +113,10 @@ SHAFT_MM = 8.0
 NEAR_TIP_MM = 1.0
 """Length of shaft that is left out of its level: the tip is brighter."""
 
+TIP_MM = 0.6
+"""How far before the end of the greys the tip is looked for: a display that is no logarithm makes lumps of a shaft
+larger than they are, and one of them alone no end."""
+
 TIP_ROUNDS = 3
 """Rounds of the shaft's level and end in turn."""
 
@@ -309,7 +313,8 @@ def _shaft_only(relative: Floats, imager: Imager, line: _Line) -> _Line:
 def _tip(relative: Floats, imager: Imager, line: _Line) -> _Tip:
     """The end of the shaft: where its amplitude has fallen half way to the background's, for good.
 
-    For good: where the sum of what exceeds the half-way level is largest. A blurred step passes its half at the step.
+    For good: where the sum of what exceeds the half-way level is largest, first in greys (logarithms), which tell shaft
+    from background, then near there in amplitudes. A blurred step passes its half at the step.
     """
     s = np.arange(-SHAFT_MM - 2.0 * SEEK_MM, 2.0 * SEEK_MM, STEP_MM)
     profile = _profile(relative, imager, line, s)
@@ -320,7 +325,9 @@ def _tip(relative: Floats, imager: Imager, line: _Line) -> _Tip:
             return _Tip(end, 0.0)
         shaft = float(np.median(profile[last]))
         half = 0.5 * (1.0 + shaft)
-        here = np.flatnonzero(s > end - SHAFT_MM)[:-1]
+        near = np.flatnonzero(s > end - SHAFT_MM)[:-1]
+        greys = np.cumsum(np.log(np.maximum(profile[near], 1e-3)) - 0.5 * np.log(max(shaft, 1.0)))
+        here = near[s[near] > s[near[int(np.argmax(greys))]] - TIP_MM]
         at = int(here[np.argmax(np.cumsum(profile[here] - half))])
         fall = max(profile[at] - profile[at + 1], 1e-9)
         end = float(s[at] + STEP_MM * np.clip((profile[at] - half) / fall, 0.0, 1.0))

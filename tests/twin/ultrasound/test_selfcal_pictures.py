@@ -1,0 +1,302 @@
+"""``selfcal --recording`` of pictures: PNG and DICOM by a renderer that the detector does not know, and refusals."""
+
+import csv
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from other_bmode import logarithm, picture, power_law
+from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage, generate_uid
+from refusals import refused, refused_command
+from selfcal_world import as_estimate
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.formats.pose_table import pose_columns, pose_values, table_text
+from puncture_twin.run_twin import main
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
+from puncture_twin.twin.guidance.ultrasound.recording_file import open_recording, read_recording
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
+from puncture_twin.twin.jobs.exit_codes import OK
+from puncture_twin.twin.pictures import read_frames
+from puncture_twin.twin.plant.simulated_recording import (
+    PoseRanges,
+    draw_image_poses,
+    draw_probe_poses,
+    draw_truth,
+    exact_recording,
+    with_noise,
+)
+
+COUNT, SIZE, PIXEL_MM = 30, (220, 200), 0.22
+EMPTY, FOREIGN = (4, 11), 17
+"""Rows whose picture shows no needle, and one whose picture is of another pose."""
+RANGES = PoseRanges(u_mm=(9.0, 35.0), v_mm=(12.0, 42.0))
+ARMS = Noise(robot_mm=0.05, robot_rad=float(np.radians(0.01)), image_mm=0.0, direction_rad=0.0)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    """Truth, exact poses and folder, with greys as a logarithm."""
+    return filled(tmp_path_factory.mktemp("pictures"), logarithm)
+
+
+def filled(folder, display):
+    """Exact poses, and a folder with a picture of each by the other renderer: two without a needle, one foreign."""
+    rng = np.random.default_rng(5)
+    truth = draw_truth(rng)
+    exact = exact_recording(truth, draw_probe_poses(rng, truth, COUNT), draw_image_poses(rng, COUNT, RANGES))
+    for row in range(COUNT):
+        shown = (FOREIGN + 1) % COUNT if row == FOREIGN else row
+        needle, off = row not in EMPTY, rng.normal(0.0, 0.1)
+        look = {"off_mm": off, "size": SIZE, "pixel_mm": PIXEL_MM, "display": display, "needle": needle}
+        grey = picture(rng, exact.P[shown], exact.v[shown], **look)
+        cv2.imwrite(str(folder / f"{row}.png"), grey)
+    read = with_noise(rng, exact, ARMS)
+    poses = np.column_stack([pose_values(read.A), pose_values(read.B)]).tolist()
+    rows = [(f"p{row}", *poses[row], f"{row}.png", PIXEL_MM) for row in range(COUNT)]
+    header = ("name", *pose_columns("A"), *pose_columns("B"), "picture", "pixel_mm")
+    (folder / "recording.csv").write_text(table_text(header, rows))
+    return truth, exact, folder
+
+
+@pytest.mark.parametrize(("display", "scatter_mm"), [(logarithm, 0.1), (power_law, 0.2)])
+def test_unknown_pictures_calibrate_to_a_tenth_of_a_millimetre(world, tmp_path, display, scatter_mm):
+    """Tips scatter by .1 mm about one shift along the shaft, which a known length finds; more where no logarithm is."""
+    truth, exact, folder = world if display is logarithm else filled(tmp_path, display)
+    recording = read_recording(folder)
+    assert [name for name, _ in recording.missed] == [f"p{row}" for row in EMPTY]
+    rows = np.array([int(name[1:]) for name in recording.names])
+    length = float(truth.tip_end2 @ truth.direction_end2)
+    found = calibrate(recording, needle_length_mm=length)
+    assert f"p{FOREIGN}" in found.outliers
+    used = found.weights > 0
+    e, v = (recording.P - exact.P[rows])[used], exact.v[rows][used]
+    along, across = (e * v).sum(axis=1), e[:, 0] * v[:, 1] - e[:, 1] * v[:, 0]
+    assert along.std() <= scatter_mm and np.sqrt(np.mean(across**2)) <= 0.01
+    assert abs(found.tip_bias_mm - along.mean()) <= 0.05
+    assert np.linalg.norm(found.tip_end2 - truth.tip_end2) <= 0.1
+    rng = np.random.default_rng(6)
+    unseen = exact_recording(truth, draw_probe_poses(rng, truth, 100), draw_image_poses(rng, 100, RANGES))
+    errors = np.linalg.norm(tip_residuals(found.estimate, unseen), axis=1)
+    assert np.sqrt(np.mean(errors**2)) <= 0.1
+    assert np.abs(tip_residuals(as_estimate(truth), unseen)).max() < 1e-9  # what the errors are measured against
+
+
+def rewritten(change):
+    """A change of the table's rows: a list of dictionaries, in place."""
+
+    def apply(folder):
+        path = folder / "recording.csv"
+        with path.open() as stream:
+            rows = list(csv.DictReader(stream))
+        change(rows)
+        path.write_text(table_text(list(rows[0]), [list(row.values()) for row in rows]))
+
+    return apply
+
+
+def set_all(key, value):
+    """A column with one value in every row."""
+    return rewritten(lambda rows: [row.update({key: value}) for row in rows])
+
+
+def moved_by(count):
+    """Each picture beside the row so many before its own."""
+
+    def change(rows):
+        names = [row["picture"] for row in rows]
+        for row, name in zip(rows, names[count:] + names[:count], strict=True):
+            row["picture"] = name
+
+    return rewritten(change)
+
+
+def on_file(change, name="3.png"):
+    """A change of the bytes of one picture."""
+    return lambda folder: (folder / name).write_bytes(change((folder / name).read_bytes()))
+
+
+def as_png(grey):
+    """A picture's file."""
+    return cv2.imencode(".png", grey)[1].tobytes()
+
+
+WRONG = {
+    "a PNG cut in its middle": (on_file(lambda data: data[: len(data) // 2]), "file_cut", "3.png"),
+    "a PNG with another byte": (on_file(lambda data: data[:900] + bytes([data[900] ^ 1]) + data[901:]), "file_damaged"),
+    "a PNG in colour": (on_file(lambda _: as_png(np.zeros((*SIZE, 3), np.uint8))), "not_grey", "3.png"),
+    "a PNG of 16 bits": (on_file(lambda _: as_png(np.zeros(SIZE, np.uint16))), "not_grey", "3.png"),
+    "neither PNG nor DICOM": (on_file(lambda _: b"P5 2 2 255 abcd"), "wrong_format", "3.png"),
+    "a picture of another size": (on_file(lambda _: as_png(np.zeros((100, 90), np.uint8))), "wrong_size", "90 x 100"),
+    "no picture": (lambda folder: (folder / "3.png").unlink(), "no_such_file", "3.png"),
+    "a picture twice": (rewritten(lambda rows: rows[3].update(picture="2.png")), "duplicate_name", "2.png"),
+    "a picture elsewhere": (rewritten(lambda rows: rows[3].update(picture="../3.png")), "bad_value", "../3.png"),
+    "a pixel of no size": (set_all("pixel_mm", "0"), "pixel_size"),
+    "one pixel of another size": (rewritten(lambda rows: rows[9].update(pixel_mm="0.3")), "wrong_size", "9.png"),
+    "each picture a row too early": (moved_by(1), "recording_slip"),
+    "each picture a row too late": (moved_by(-1), "recording_slip"),
+    "pictures of anywhere": (moved_by(7), "directions_scattered"),
+    "too few with a needle": (
+        rewritten(lambda rows: rows.__delitem__(slice(17, None))),
+        "too_few_poses",
+        "15 poses",
+        "2 ",
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_is_wrong_in_a_folder_is_one_line(world, tmp_path, capfd, wrong):
+    """Exit code 2, its code, and the file where one is to blame."""
+    change, code, *values = WRONG[wrong]
+    shutil.copytree(world[2], tmp_path / "pictures")
+    change(tmp_path / "pictures")
+    command = ["selfcal", "--recording", tmp_path / "pictures", "--out", tmp_path / "out"]
+    refused_command(command, capfd, code, *values)
+    assert not (tmp_path / "out" / "calibration.json").exists()
+
+
+def test_two_swapped_pictures_are_named(world, tmp_path, capfd):
+    """Neither fits where it lies; the others calibrate as before."""
+    folder = tmp_path / "pictures"
+    shutil.copytree(world[2], folder)
+    (folder / "8.png").rename(folder / "x.png")
+    (folder / "20.png").rename(folder / "8.png")
+    (folder / "x.png").rename(folder / "20.png")
+    assert main(["selfcal", "--recording", str(folder), "--out", str(tmp_path / "out"), "--json"]) == OK
+    facts = json.loads(capfd.readouterr().out)
+    assert {"p8", "p20", f"p{FOREIGN}"} <= set(facts["set_aside"])
+    assert list(facts["without_needle"]) == [f"p{row}" for row in EMPTY]
+    assert len(facts["inputs"]) == COUNT + 1
+
+
+def test_a_case_that_states_another_pixel_is_refused(world, tmp_path):
+    """Column and case must agree; a case that does not state it has no say."""
+    for key, code in (("pixel_mm = 0.2", "pixel_size"), ("slice_fwhm_mm = 1.0", None)):
+        (tmp_path / "selfcal.toml").write_text(f'schema = 1\nname = "a"\n[image]\n{key}\n')
+        case = load_selfcal_case(tmp_path)
+        if code is None:
+            assert len(open_recording(world[2], case).recording) == COUNT - len(EMPTY)
+        else:
+            with refused(code, "0.png"):
+                open_recording(world[2], case)
+
+
+def test_without_a_size_of_the_pixel_nothing_is_read(world, tmp_path):
+    """No default stands in for it."""
+    shutil.copytree(world[2], tmp_path / "pictures")
+    rewritten(lambda rows: [row.pop("pixel_mm") for row in rows])(tmp_path / "pictures")
+    with refused("pixel_size", "0.png"):
+        read_recording(tmp_path / "pictures")
+
+
+def dicom(frames, *, delta_cm=None, spacing=None, box=None, **others):
+    """A multi-frame ultrasound picture, grey or RGB, whose region of tissue is a box (x0, y0, x1, y1)."""
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = UltrasoundMultiFrameImageStorage, generate_uid()
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    data = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
+    data.SOPClassUID, data.SOPInstanceUID = meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID
+    data.Modality, data.NumberOfFrames = "US", len(frames)
+    data.Rows, data.Columns = frames.shape[1:3]
+    data.SamplesPerPixel = 3 if frames.ndim == 4 else 1
+    data.PhotometricInterpretation = "RGB" if frames.ndim == 4 else "MONOCHROME2"
+    if frames.ndim == 4:
+        data.PlanarConfiguration = 0
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 8, 8, 7, 0
+    if delta_cm:
+        region = Dataset()
+        region.RegionSpatialFormat, region.RegionDataType, region.RegionFlags = 1, 1, 0
+        (
+            region.RegionLocationMinX0,
+            region.RegionLocationMinY0,
+            region.RegionLocationMaxX1,
+            region.RegionLocationMaxY1,
+        ) = box
+        region.PhysicalUnitsXDirection = region.PhysicalUnitsYDirection = 3
+        region.PhysicalDeltaX, region.PhysicalDeltaY = delta_cm
+        data.SequenceOfUltrasoundRegions = [region]
+    if spacing:
+        data.PixelSpacing = list(spacing)
+    data.PixelData = frames.tobytes()
+    for key, value in others.items():
+        setattr(data, key, value)
+    return data
+
+
+def saved(data, path):
+    """Its file."""
+    data.save_as(path, enforce_file_format=True)
+    return path
+
+
+@pytest.mark.parametrize("colour", [False, True])
+def test_a_region_of_tissue_is_cut_out_with_its_pixel(rng, tmp_path, colour):
+    """What lies about it is text, and may be coloured; grey in three channels is grey; width and height apart."""
+    frames = np.asarray(rng.integers(0, 256, (3, 60, 80)), np.uint8)
+    cells = np.repeat(frames[..., None], 3, axis=3) if colour else frames
+    if colour:
+        cells[:, 0, 0] = (255, 0, 0)
+    read = read_frames(saved(dicom(cells, delta_cm=(0.02, 0.025), box=(10, 5, 69, 54)), tmp_path / "a.dcm"))
+    np.testing.assert_array_equal(read.grey, frames[:, 5:55, 10:70])
+    assert read.pixel_mm == pytest.approx((0.2, 0.25))
+
+
+@pytest.mark.parametrize(
+    ("others", "code"),
+    [
+        ({"spacing": (0.3, 0.2)}, "pixel_size"),
+        ({"box": (10, 5, 80, 54)}, "bad_tag"),
+        ({"box": (40, 5, 40, 54)}, "bad_tag"),
+        ({"Rows": 61}, "size_mismatch"),
+        ({"PixelData": b"abcd"}, "size_mismatch"),
+        ({"BitsStored": 7, "HighBit": 6}, "not_grey"),
+        ({"PhotometricInterpretation": "YBR_FULL_422"}, "unsupported_feature"),
+    ],
+)
+def test_a_dicom_that_contradicts_itself_is_refused(tmp_path, others, code):
+    """With the tag that is to blame."""
+    parts = {"delta_cm": (0.02, 0.02), "box": (10, 5, 69, 54), **others}
+    with refused(code, "a.dcm"):
+        read_frames(saved(dicom(np.zeros((2, 60, 80), np.uint8), **parts), tmp_path / "a.dcm"))
+
+
+def test_every_truncation_of_a_dicom_is_refused(tmp_path):
+    """Wherever it is cut."""
+    path = saved(dicom(np.zeros((2, 20, 30), np.uint8), spacing=(0.2, 0.2)), tmp_path / "a.dcm")
+    whole = path.read_bytes()
+    assert read_frames(path).pixel_mm == (0.2, 0.2)
+    for length in range(1, len(whole), 37):
+        path.write_bytes(whole[:length])
+        with pytest.raises(InputError):
+            read_frames(path)
+
+
+def test_frames_of_one_file_are_as_many_pictures(world, tmp_path):
+    """The same tips, from one DICOM with a frame a row; a pixel twice as high as wide is read as it lies."""
+    folder, (_, _, pictures) = tmp_path, world
+    greys = np.stack([cv2.imread(str(pictures / f"{row}.png"), cv2.IMREAD_UNCHANGED) for row in range(COUNT)])
+    shutil.copy(pictures / "recording.csv", folder / "recording.csv")
+    with (folder / "recording.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    for number, row in enumerate(rows):
+        row.pop("pixel_mm")
+        row |= {"picture": "all.dcm", "frame": str(number + 1)}
+    (folder / "recording.csv").write_text(table_text(list(rows[0]), [list(row.values()) for row in rows]))
+    saved(dicom(greys, spacing=(PIXEL_MM, PIXEL_MM)), folder / "all.dcm")
+    single, many = read_recording(pictures), read_recording(folder)
+    np.testing.assert_array_equal(single.P, many.P)
+    assert many.missed == single.missed
+    low = greys[:, ::2]
+    saved(dicom(np.ascontiguousarray(low), spacing=(2 * PIXEL_MM, PIXEL_MM)), folder / "all.dcm")
+    coarse = read_recording(folder)
+    assert np.median(np.linalg.norm(coarse.P - many.P, axis=1)) < 0.15
+    rows[0]["frame"] = str(COUNT + 1)
+    (folder / "recording.csv").write_text(table_text(list(rows[0]), [list(row.values()) for row in rows]))
+    with refused("out_of_range", "all.dcm"):
+        read_recording(folder)
