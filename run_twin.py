@@ -474,6 +474,10 @@ def selfcal(
         Path | None,
         typer.Option("--record", metavar="FOLDER", help="Keep the first trial's pictures in this new folder."),
     ] = None,
+    shots: Annotated[
+        Path | None,
+        typer.Option("--shots", help="Recording of what was seen afterwards: each pose updates the answer."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate two arms by ultrasound, AXP = YBQ. Then send the needle to targets in the image."""
@@ -482,7 +486,7 @@ def selfcal(
 
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:
-        facts = selfcal_facts(run_selfcal(case, recording, seeds, out_dir, progress, record))
+        facts = selfcal_facts(run_selfcal(case, recording, seeds, out_dir, progress, record, shots))
     finish("selfcal", facts, facts, selfcal_text(facts), as_json)
 
 

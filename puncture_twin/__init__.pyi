@@ -23,6 +23,7 @@ from .api import (
     report as report,
     rerank as rerank,
     search as search,
+    shot_by_shot as shot_by_shot,
     touch as touch,
     verify as verify,
     write_plan as write_plan,

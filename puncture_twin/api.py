@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from puncture_twin.planning.search.explain import Explanation
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
     from puncture_twin.twin.jobs.batch.jobs import Merged
     from puncture_twin.twin.jobs.choosing.compare_job import Comparison
     from puncture_twin.twin.jobs.experiment.touch_job import TouchRun
@@ -419,6 +420,20 @@ def calibrate(recording: Recording, *, needle_length_mm: float | None = None) ->
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 
     return calibrate(recording, needle_length_mm=needle_length_mm)
+
+
+@checked
+def shot_by_shot(calibration: Calibration) -> ShotByShot:
+    """A calibration that further shots update, one pose at a time: ``after = before.with_shot(pose)``.
+
+    ``after.shots[-1]`` says whether it fits, and ``after.calibration()`` is the calibration with it.
+
+    Raises:
+        InputError: The calibration holds a needle length; state it to ``calibration()`` instead.
+    """
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
+
+    return ShotByShot.of(calibration)
 
 
 @checked

@@ -97,6 +97,7 @@ def run_selfcal(
     out: Path,
     watcher: Watcher,
     record: Path | None = None,
+    shots: Path | None = None,
 ) -> SelfcalRun:
     """Simulate a case, or calibrate a recording, and write everything into a folder.
 
@@ -107,19 +108,21 @@ def run_selfcal(
         out: Where files go.
         watcher: Shows progress.
         record: A folder that is not there yet, for the first seed's pictures and joints; None for none.
+        shots: A recording of what was seen after ``recording``; None for none.
 
     Raises:
         InputError: Something that cannot be used, or poses that cannot show every unknown.
         NoAnswerError: Not enough poses can be taken or show the needle.
     """
-    if recording is not None and record is not None:
-        refuse("--record", "selfcal --recording", "one of the two", "conflicting_options")
+    if (recording is not None and record is not None) or (recording is None and shots is not None):
+        allowed = "--record without --recording, and --shots with it"
+        refuse("--record or --shots", "selfcal", allowed, "conflicting_options")
     case = None if case_path is None else load_selfcal_case(case_path)
     names = ANSWERS if recording is not None else (*ANSWERS, *PICTURES, FILE_NAME)
     try:
         with new_folder(record) as kept, writing(out, COMMAND, names=names, note=watcher.note) as draft:
             if recording is not None:
-                run = _calibrated(case, recording, draft)
+                run = _calibrated(case, recording, shots, draft)
             else:
                 assert case is not None  # the command line gives one of the two
                 run = _simulated(case, seeds, draft, watcher)
@@ -132,9 +135,9 @@ def run_selfcal(
     return replace(run, files=draft.final(run.files))
 
 
-def _calibrated(case: SelfcalCase | None, recording: Path, draft: Draft) -> SelfcalRun:
+def _calibrated(case: SelfcalCase | None, recording: Path, shots: Path | None, draft: Draft) -> SelfcalRun:
     """Calibrate a recording. One that an earlier run wrote into the folder stays there: it may be this one."""
-    run = write_run(selfcal_recording(recording, case), draft.folder)
+    run = write_run(selfcal_recording(recording, case, shots), draft.folder)
     draft.keep(FILE_NAME)
     return run.with_files(write_page(run, None, None, draft.folder / "report.html"))
 
@@ -172,6 +175,7 @@ def calibration_file(run: SelfcalRun) -> dict[str, Any]:
         "parameters": list(found.parameters),
         "covariance": found.covariance_counts.tolist(),
         "region_limit_95": found.region_limit(),
+        "shots": [shot._asdict() for shot in run.shots],
     }
 
 
@@ -183,6 +187,7 @@ def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
         "inputs": inputs_document(run.inputs),
         "candidates": None if run.candidates is None else run.candidates.counts,
         "choice": None if run.choice is None else choice_summary(run.choice),
+        "shots": [shot._asdict() for shot in run.shots],
         "trials": [trial_summary(trial) for trial in run.trials],
         "punctures": puncture_summary(run.punctures),
         "seconds": {stage: round(seconds, 3) for stage, seconds in run.stages.seconds.items()},
@@ -232,6 +237,9 @@ def sections(found: Facts) -> list[Section]:
         Section("what the data cannot determine", [Warn(tuple(found["cannot_show"]))]),
         Section("calibration", [facts_table([*CALIBRATION, *_if_known(found)], found)]),
     ]
+    if found["shots"]:
+        words = "Each updated the calibration where it fits; residuals above are those of the recording."
+        shown.append(Section("shots after the recording", [words, grid(SHOT, found["shots"])]))
     if found["trials"]:
         shown += [
             Section("insertions to targets in the image", _punctures(found)),
@@ -264,6 +272,12 @@ TRIAL = (
     Field("true contacts", "true_contacts"),
     Field("not used", lambda one: "; ".join(f"{count} {why}" for why, count in one["missed"].items()) or "none"),
     Field("set aside", lambda one: ", ".join(one["set_aside"]) or "none"),
+)
+SHOT = (
+    Field("shot", "name"),
+    Field("χ²", "chi_squared", 1),
+    Field("fits below", "limit", 1),
+    Field("", lambda one: "used" if one["used"] else "does not fit: left out"),
 )
 PUNCTURES = (
     Field("targets", "targets"),

@@ -14,11 +14,12 @@ from puncture_twin.planning.base.provenance import Input
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, choice_noise
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import Shot, ShotByShot
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, drawing, expected_tre_mm, find_candidates
 from puncture_twin.twin.guidance.ultrasound.puncture import predicted_tre
 from puncture_twin.twin.guidance.ultrasound.recording_file import open_recording, recording_file
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
+from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration, held_length_mm
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 from puncture_twin.twin.rehearsal.selfcal_trial import Puncture, SelfcalTrial, run_trial
 
@@ -60,6 +61,7 @@ class SelfcalRun:
         stages: Seconds.
         files: What was written.
         warnings: What the recording leaves open, one sentence each.
+        shots: What came of each shot after the recording.
     """
 
     name: str
@@ -73,6 +75,7 @@ class SelfcalRun:
     stages: Stages = field(default_factory=Stages)
     files: tuple[Path, ...] = ()
     warnings: tuple[str, ...] = ()
+    shots: tuple[Shot, ...] = ()
 
     @property
     def punctures(self) -> tuple[Puncture, ...]:
@@ -116,8 +119,13 @@ def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
     )
 
 
-def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
+def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None = None) -> SelfcalRun:
     """Calibrate from a recording's CSV, or a folder with ``recording.csv``; a case says noise and needle length.
+
+    Args:
+        path: The recording.
+        case: What it was recorded with.
+        shots: A recording of what was seen afterwards: each of its poses updates the calibration; None for none.
 
     Raises:
         InputError: A recording that cannot be used, or that fits only in another reading (inverse, swapped, metres).
@@ -128,14 +136,25 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
     with stages.time("read"):
         recording, inputs, warnings = open_recording(path, case)
     with stages.time("calibrate"):
-        calibration = checked_calibration(recording, case, file)
+        calibration = checked_calibration(recording, case, file, hold=shots is None)
+    tried: tuple[Shot, ...] = ()
+    if shots is not None:
+        with stages.time("shots"):
+            following = ShotByShot.of(calibration)
+            more, files, notes = open_recording(shots, case)
+            for row in range(len(more)):
+                following = following.with_shot(more.subset(slice(row, row + 1)))
+            calibration = following.calibration(needle_length_mm=held_length_mm(case))
+        tried, inputs, warnings = following.shots, (*inputs, *files), (*warnings, *notes)
     inputs = (*inputs, *(() if case is None else case.inputs))
     warnings = (*warnings, *calibration.warnings())
     if len(recording.missed) > len(recording):
         warnings += (MOST_MISSED.format(file=file.name, missed=len(recording.missed), shown=len(recording)),)
     if case is not None and calibration.arms is None:
         warnings += (NO_JOINTS.format(file=file.name),)
-    return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings)
+    return SelfcalRun(
+        file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings, shots=tried
+    )
 
 
 def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisition) -> Choice:

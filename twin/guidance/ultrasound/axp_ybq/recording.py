@@ -129,8 +129,19 @@ class Recording(Shown):
         """Each direction's standard deviation over all directions' rms, shape (n,)."""
         if self.shaft_mm is None:
             return np.ones(len(self))
-        spread = self.shaft_mm**-SHAFT_POWER
-        return np.asarray(spread / np.sqrt(np.mean(spread**2)))
+        return np.asarray(self.shaft_mm**-SHAFT_POWER / self.shaft_unit)
+
+    @property
+    def shaft_unit(self) -> float:
+        """Root mean square of what the shafts' lengths say of the directions' spreads; 1 where nothing does."""
+        return 1.0 if self.shaft_mm is None else float(np.sqrt(np.mean(self.shaft_mm ** (-2 * SHAFT_POWER))))
+
+    def points_image(self, scale: Floats) -> Floats:
+        """The tips, shape (n, 3), mm, by the mm per unit of P along u and v, shape (2,); a plane has z = 0."""
+        points = np.zeros((len(self), 3))
+        points[:, : self.P.shape[1]] = self.P
+        points[:, :2] *= scale
+        return points
 
     def __len__(self) -> int:
         return len(self.names)
