@@ -1,6 +1,7 @@
 from .api import (
     batch as batch,
     calibrate as calibrate,
+    calibrate_hand_eye as calibrate_hand_eye,
     certify as certify,
     check as check,
     check_folder as check_folder,
@@ -16,6 +17,7 @@ from .api import (
     read_mesh as read_mesh,
     read_plan as read_plan,
     read_points as read_points,
+    read_pose_pairs as read_pose_pairs,
     read_recording as read_recording,
     read_volume as read_volume,
     register as register,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from case_world import coarse_carton
 from cohort_world import write_cohort
+from hand_eye_world import hand_eye_problem, write_pairs
 from refusals import refused
 from whole_html import Whole
 
@@ -36,6 +37,7 @@ def given(context, tmp_path_factory):
     tmp = tmp_path_factory.mktemp("values")
     recorded = simulate_recording(np.random.default_rng(1), 24)[0]
     write_recording(recorded, tmp / "recording.csv")
+    write_pairs(tmp / "pairs.csv", hand_eye_problem(np.random.default_rng(1), 8)[0])
     armed = pt.prepare(coarse_carton(tmp / "carton"))
     candidates = pt.search(context)
     plan = pt.plan(armed)
@@ -45,7 +47,8 @@ def given(context, tmp_path_factory):
     return {
         "tmp": tmp, "armed": armed, "context": context, "candidates": candidates, "plan": plan,
         "certificate": certificate, "markers_ct": markers[0], "markers_base": markers[1], "points": markers[0],
-        "recording": pt.read_recording(tmp), "calibration": pt.calibrate(pt.read_recording(tmp)),
+        "recording": pt.read_recording(tmp), "pairs": pt.read_pose_pairs(tmp / "pairs.csv"),
+        "calibration": pt.calibrate(pt.read_recording(tmp)),
         "case": CARTON / "case_m.toml", "cost": candidates.path.length,
         "theta_deg": 10.0, "beta_deg": 20.0, "one": candidates.best, "other": candidates.pick(0),
         "target_ct": TARGET, "format_name": "csv", "source": plan, "folder": tmp / "folder", "path": tmp / "nothing",
@@ -82,6 +85,8 @@ def values(given):
         "read_mesh": pt.read_mesh(CARTON / "skin.ply"),
         "read_recording": given["recording"],
         "calibrate": given["calibration"],
+        "read_pose_pairs": given["pairs"],
+        "calibrate_hand_eye": pt.calibrate_hand_eye(given["pairs"]),
         "shot_by_shot": pt.shot_by_shot(given["calibration"]).with_shot(given["recording"].subset(slice(0, 1))),
         "report": pt.report(armed, found, tmp / "report", plan=plan, rehearsal=rehearsal),
         "check_folder": pt.check_folder(tmp / "report"),
