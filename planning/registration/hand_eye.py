@@ -34,7 +34,7 @@ from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.text import Shown, brief
 from puncture_twin.planning.formats.pose_table import parse_table, pose_columns, pose_names, poses_of, rigid_poses
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
-from puncture_twin.planning.geometry.rigid import exp_rotation, inverse, log_rotation, pose, skew
+from puncture_twin.planning.geometry.rigid import exp_rotation, inverse, log_rotation, nearest_rotation, pose, skew
 
 LENGTH_MM = 100.0
 """Lengths are counted in this unit where columns are compared."""
@@ -267,18 +267,13 @@ def _start(pairs: PosePairs) -> _Value:
     else:
         U, _, Vt = np.linalg.svd(K)
         vectors = [Vt[0], U[:, 0]]
-    R_X, R_Z = (_nearest_rotation(one.reshape(3, 3).T) for one in vectors)  # column-major vec
+    matrices = [one.reshape(3, 3).T for one in vectors]  # column-major vec, of either sign
+    R_X, R_Z = (nearest_rotation(M * np.sign(np.linalg.det(M) or 1.0)) for M in matrices)
     right = B[:, :3, 3] @ R_Z.T - A[:, :3, 3]
     columns = [A[:, :3, :3], np.tile(-np.eye(3), (n, 1, 1))]
     system = columns[0] + columns[1] if pairs.motions else np.concatenate(columns, axis=2)
     z = np.linalg.lstsq(system.reshape(3 * n, -1), right.ravel(), rcond=None)[0]
     return _Value(pose(R_X, z[:3]), pose(R_Z, z[-3:]))
-
-
-def _nearest_rotation(M: Floats) -> Floats:
-    """The rotation nearest to a multiple of M (3, 3), of either sign."""
-    U, _, Vt = np.linalg.svd(M * np.sign(np.linalg.det(M) or 1.0))
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def _residuals(pairs: PosePairs, value: _Value) -> Floats:
@@ -390,7 +385,7 @@ def _require_observable(pairs: PosePairs, value: _Value) -> float:
 def _refuse_rotations(pairs: PosePairs) -> NoReturn:
     """Refuse poses that cannot show every unknown, by what their rotations lack."""
     R = pairs.A[:, :3, :3]
-    turns = log_rotation(R if pairs.motions else _nearest_rotation(R.mean(axis=0)).T @ R)
+    turns = log_rotation(R if pairs.motions else nearest_rotation(R.mean(axis=0)).T @ R)
     sizes, axes = np.linalg.svd(turns / np.sqrt(len(turns)), full_matrices=False)[1:]
     allowed = "rotations of 10 degrees or more about two axes of the flange that are not parallel"
     if sizes[0] < LEAST_TURN:

@@ -7,9 +7,8 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+from dicom_world import ultrasound, write
 from other_bmode import logarithm, picture, power_law
-from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
-from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage, generate_uid
 from refusals import refused, refused_command
 from selfcal_world import as_estimate
 
@@ -195,46 +194,6 @@ def test_without_a_size_of_the_pixel_nothing_is_read(world, tmp_path):
         read_recording(tmp_path / "pictures")
 
 
-def dicom(frames, *, delta_cm=None, spacing=None, box=None, **others):
-    """A multi-frame ultrasound picture, grey or RGB, whose region of tissue is a box (x0, y0, x1, y1)."""
-    meta = FileMetaDataset()
-    meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = UltrasoundMultiFrameImageStorage, generate_uid()
-    meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    data = FileDataset("", {}, file_meta=meta, preamble=b"\0" * 128)
-    data.SOPClassUID, data.SOPInstanceUID = meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID
-    data.Modality, data.NumberOfFrames = "US", len(frames)
-    data.Rows, data.Columns = frames.shape[1:3]
-    data.SamplesPerPixel = 3 if frames.ndim == 4 else 1
-    data.PhotometricInterpretation = "RGB" if frames.ndim == 4 else "MONOCHROME2"
-    if frames.ndim == 4:
-        data.PlanarConfiguration = 0
-    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 8, 8, 7, 0
-    if delta_cm:
-        region = Dataset()
-        region.RegionSpatialFormat, region.RegionDataType, region.RegionFlags = 1, 1, 0
-        (
-            region.RegionLocationMinX0,
-            region.RegionLocationMinY0,
-            region.RegionLocationMaxX1,
-            region.RegionLocationMaxY1,
-        ) = box
-        region.PhysicalUnitsXDirection = region.PhysicalUnitsYDirection = 3
-        region.PhysicalDeltaX, region.PhysicalDeltaY = delta_cm
-        data.SequenceOfUltrasoundRegions = [region]
-    if spacing:
-        data.PixelSpacing = list(spacing)
-    data.PixelData = frames.tobytes()
-    for key, value in others.items():
-        setattr(data, key, value)
-    return data
-
-
-def saved(data, path):
-    """Its file."""
-    data.save_as(path, enforce_file_format=True)
-    return path
-
-
 @pytest.mark.parametrize("colour", [False, True])
 def test_a_region_of_tissue_is_cut_out_with_its_pixel(rng, tmp_path, colour):
     """What lies about it is text, and may be coloured; grey in three channels is grey; width and height apart."""
@@ -242,7 +201,7 @@ def test_a_region_of_tissue_is_cut_out_with_its_pixel(rng, tmp_path, colour):
     cells = np.repeat(frames[..., None], 3, axis=3) if colour else frames
     if colour:
         cells[:, 0, 0] = (255, 0, 0)
-    read = read_frames(saved(dicom(cells, delta_cm=(0.02, 0.025), box=(10, 5, 69, 54)), tmp_path / "a.dcm"))
+    read = read_frames(write(ultrasound(cells, delta_cm=(0.02, 0.025), box=(10, 5, 69, 54)), tmp_path / "a.dcm"))
     np.testing.assert_array_equal(read.grey, frames[:, 5:55, 10:70])
     assert read.pixel_mm == pytest.approx((0.2, 0.25))
 
@@ -263,12 +222,12 @@ def test_a_dicom_that_contradicts_itself_is_refused(tmp_path, others, code):
     """With the tag that is to blame."""
     parts = {"delta_cm": (0.02, 0.02), "box": (10, 5, 69, 54), **others}
     with refused(code, "a.dcm"):
-        read_frames(saved(dicom(np.zeros((2, 60, 80), np.uint8), **parts), tmp_path / "a.dcm"))
+        read_frames(write(ultrasound(np.zeros((2, 60, 80), np.uint8), **parts), tmp_path / "a.dcm"))
 
 
 def test_every_truncation_of_a_dicom_is_refused(tmp_path):
     """Wherever it is cut."""
-    path = saved(dicom(np.zeros((2, 20, 30), np.uint8), spacing=(0.2, 0.2)), tmp_path / "a.dcm")
+    path = write(ultrasound(np.zeros((2, 20, 30), np.uint8), spacing=(0.2, 0.2)), tmp_path / "a.dcm")
     whole = path.read_bytes()
     assert read_frames(path).pixel_mm == (0.2, 0.2)
     for length in range(1, len(whole), 37):
@@ -288,12 +247,12 @@ def test_frames_of_one_file_are_as_many_pictures(world, tmp_path):
         row.pop("pixel_mm")
         row |= {"picture": "all.dcm", "frame": str(number + 1)}
     (folder / "recording.csv").write_text(table_text(list(rows[0]), [list(row.values()) for row in rows]))
-    saved(dicom(greys, spacing=(PIXEL_MM, PIXEL_MM)), folder / "all.dcm")
+    write(ultrasound(greys, spacing=(PIXEL_MM, PIXEL_MM)), folder / "all.dcm")
     single, many = read_recording(pictures), read_recording(folder)
     np.testing.assert_array_equal(single.P, many.P)
     assert many.missed == single.missed
     low = greys[:, ::2]
-    saved(dicom(np.ascontiguousarray(low), spacing=(2 * PIXEL_MM, PIXEL_MM)), folder / "all.dcm")
+    write(ultrasound(np.ascontiguousarray(low), spacing=(2 * PIXEL_MM, PIXEL_MM)), folder / "all.dcm")
     coarse = read_recording(folder)
     assert np.median(np.linalg.norm(coarse.P - many.P, axis=1)) < 0.15
     rows[0]["frame"] = str(COUNT + 1)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import exp_rotation, skew
+from puncture_twin.planning.geometry.rigid import exp_rotation, nearest_rotation, skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 PARAMETERS = (
@@ -135,12 +135,6 @@ def closed_form(recording: Recording, *, known_tip: Floats | None = None, scale:
     unit = sizes * LENGTH_MM / np.abs(recording.P).max() if scale else np.ones(2)
     t_X, t_Y, t_Q = _translations(recording, R_X, R_Y, unit, known_tip)
     return Estimate(R_X, t_X, R_Y, t_Y, t_Q, unit, np.array([0.0, 0.0, 1.0]))
-
-
-def nearest_rotation(M: Floats) -> Floats:
-    """The rotation nearest to a matrix (3, 3), in the Frobenius norm; for -M the same as for M where det M < 0."""
-    U, _, Vt = np.linalg.svd(M)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def _probe_columns(A: Floats, p: Floats) -> Floats:

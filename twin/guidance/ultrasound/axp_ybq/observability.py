@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, skew
+from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, nearest_rotation, skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
     LENGTH_MM,
     T_Q,
@@ -32,7 +32,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
     W_X,
     W_Y,
     Estimate,
-    nearest_rotation,
     parameter_units,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import linearised_tip, needle_in_image, tip_points
