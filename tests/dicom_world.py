@@ -1,11 +1,14 @@
 """DICOM files written by pydicom from known arrays: series, multi-frame images, segmentations, structure sets."""
 
+import io
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.encaps import encapsulate
 from pydicom.sequence import Sequence
-from pydicom.uid import UID, ExplicitVRLittleEndian
+from pydicom.uid import UID, ExplicitVRLittleEndian, JPEGBaseline8Bit, RLELossless
 
 CT_CLASS = "1.2.840.10008.5.1.4.1.1.2"
 ENHANCED_CLASS = "1.2.840.10008.5.1.4.1.1.2.1"
@@ -197,6 +200,22 @@ def structure_set(regions, frame=FRAME):
             drawn.ContourSequence = Sequence(made)
         contours.append(drawn)
     data.StructureSetROISequence, data.ROIContourSequence = Sequence(rows), Sequence(contours)
+    return data
+
+
+def encoded(data, syntax, frames=()):
+    """An image in another transfer syntax: RLE by pydicom, JPEG of these frames (rows, columns[, 3]) by Pillow."""
+    if syntax == RLELossless:
+        data.compress(RLELossless, generate_instance_uid=False)
+        return data
+    data.file_meta.TransferSyntaxUID = syntax
+    streams = []
+    for frame in frames:
+        kind, more = ("JPEG", {"quality": 95}) if syntax == JPEGBaseline8Bit else ("JPEG2000", {"irreversible": True})
+        Image.fromarray(frame).save(stream := io.BytesIO(), kind, **more)
+        streams.append(stream.getvalue())
+    data.PixelData = encapsulate(streams)
+    data["PixelData"].is_undefined_length = True
     return data
 
 

@@ -2,7 +2,8 @@
 
 A picture library shows what is left of a PNG that was cut, and fills the rest with black. So its chunks are checked
 first (PNG specification, third edition, chapter 5). A DICOM picture of ultrasound says by its regions what a pixel
-measures (PS3.3, C.8.5.5); the one region of tissue is cut out, for its surroundings are text.
+measures (PS3.3, C.8.5.5); the one region of tissue is cut out, for its surroundings are text. Colour is what machines
+store greys in; what is coloured within the region (flow, rulers) is no tissue, and made known.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import struct
 import zlib
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,16 +23,25 @@ from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.formats.dicom.dicom_file import items, number, numbers, parse_dicom, text, value, whole
-from puncture_twin.planning.formats.dicom.pixels import MAX_SIDE, check_length, pixel_layout, sizes, stored_values
-from puncture_twin.planning.formats.dicom.storage import META_START, PLAIN, is_dicom
+from puncture_twin.planning.formats.dicom.pixels import MAX_SIDE, check_length, decoded_frames, pixel_layout, sizes
+from puncture_twin.planning.formats.dicom.storage import META_START, is_dicom
 
 MAX_BYTES = 1_000_000_000
 """Of one file: 2,000 frames of 800 x 600."""
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 MINMAX = ("Min", "Max")
-CENTIMETRES, TISSUE_2D = 3, 1
-"""Codes of a region's unit and format."""
+TWO_D, TISSUE, CENTIMETRES = 1, 1, 3
+"""Codes of a region's format, content and unit: a box of colour flow lies within one of tissue."""
+
+COLOURS = ("RGB", "YBR_FULL", "YBR_FULL_422", "YBR_ICT", "YBR_RCT")
+LUMINANCE = (0.299, 0.587, 0.114)
+
+NEARLY_GREY = 24
+"""Greatest difference between a grey pixel's channels: JPEG keeps brightness and colour apart, and rounds both."""
+
+MOST_COLOURED = 0.5
+"""Fraction of coloured pixels above which colour is no drawing on a grey picture."""
 
 SAME_SIZE = 1e-3
 """Sizes of a pixel that differ by a smaller fraction are one: headers keep four digits."""
@@ -42,6 +52,8 @@ class GreyFrames(NamedTuple):
 
     grey: NDArray[np.uint8]
     """Shape (frames, rows, columns)."""
+    coloured: NDArray[np.bool_] | None
+    """Pixels in which something coloured was drawn, of the same shape; None where there are none."""
     pixel_mm: tuple[float, float] | None
     """Width and height of a pixel, where the file says it."""
     source: Input
@@ -51,13 +63,13 @@ def read_frames(path: Path) -> GreyFrames:
     """The pictures of a PNG or DICOM file; which of both it is, its first bytes say.
 
     Raises:
-        InputError: It is neither, cut short, in colour or of more than 8 bits, or contradicts itself.
+        InputError: It is neither, cut short, in colour, of more than 8 bits, contradicts itself, or cannot be decoded.
     """
     content = read_input(path, max_bytes=MAX_BYTES, where=str(path))
     source = content_input("picture", path.name, content)
     if is_dicom(content[:META_START]):
         return GreyFrames(*_dicom_frames(parse_dicom(content, path), str(path)), source)
-    return GreyFrames(parse_png(content, path)[None], None, source)
+    return GreyFrames(parse_png(content, path)[None], None, None, source)
 
 
 def parse_png(content: bytes, path: Path) -> Pixels:
@@ -108,26 +120,60 @@ def _check_chunks(content: bytes, path: Path) -> None:
         refuse("cut short: its pixels have no end", path, allowed, "file_cut")
 
 
-def _dicom_frames(data: Dataset, where: str) -> tuple[NDArray[np.uint8], tuple[float, float] | None]:
-    """All frames, cut to the region of tissue where one is named, and the size of a pixel."""
-    cells, region = _cells(data, where), _region(data, where)
-    spacing, size = None, None
+def _dicom_frames(
+    data: Dataset, where: str
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None, tuple[float, float] | None]:
+    """All frames, cut to the region of tissue where one is named, their coloured pixels, and the size of a pixel."""
+    count, box, region_size = _layout(data, where)
+    spacing = None
     if value(data, "PixelSpacing", where=where) is not None:
         down, along = numbers(data, "PixelSpacing", 2, where=where)
         spacing = (along, down)
-    if region is not None:
-        cells, size = _cut_out(cells, region, where)
-    if spacing is not None and size is not None and not np.allclose(spacing, size, rtol=SAME_SIZE):
-        what = f"PixelSpacing {spacing[0]:g} x {spacing[1]:g} mm, but its region {size[0]:g} x {size[1]:g} mm"
+    if spacing is not None and region_size is not None and not np.allclose(spacing, region_size, rtol=SAME_SIZE):
+        width, height = region_size
+        what = f"PixelSpacing {spacing[0]:g} x {spacing[1]:g} mm, but its region {width:g} x {height:g} mm"
         refuse(what, where, "one size of a pixel", "pixel_size")
-    if not (cells == cells[..., :1]).all():
-        refuse("is in colour", where, "grey pictures", "not_grey")
-    return np.ascontiguousarray(cells[..., 0]), size or spacing
+    found = [_grey(cells[box]) for cells in decoded_frames(data, where, raw=False)]
+    grey = np.stack([one[0] for one in found]) if found else np.zeros((0, 1, 1), np.uint8)
+    coloured = np.stack([one[1] for one in found]) if found else np.zeros((0, 1, 1), bool)
+    if len(grey) != count or grey.dtype != np.uint8:
+        refuse(f"{len(grey)} frames of {grey.dtype}", where, f"{count} of 8 bits, as in its header", "size_mismatch")
+    if coloured.mean() > MOST_COLOURED:
+        what = f"is in colour: {100 * coloured.mean():.0f} % of its pixels"
+        refuse(what, where, "grey pictures; coloured drawings on them, but no colour map of the tissue", "not_grey")
+    return grey, coloured if coloured.any() else None, region_size or spacing
 
 
-def _cut_out(cells: NDArray[np.uint8], region: Dataset, where: str) -> tuple[NDArray[np.uint8], tuple[float, float]]:
-    """The region of all frames (frames, rows, columns, channels), and the size of its pixel, mm."""
-    rows, columns = cells.shape[1:3]
+def _grey(cells: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """A frame's luminance (ITU-R BT.601), and which pixels are in colour; those get the median of all others."""
+    if cells.ndim == 2:
+        return cells, np.zeros(cells.shape, bool)
+    coloured = np.ptp(cells, axis=2) > NEARLY_GREY
+    grey = np.round(cells @ LUMINANCE).astype(cells.dtype)
+    if coloured.any() and not coloured.all():
+        grey[coloured] = np.median(grey[~coloured])
+    return grey, coloured
+
+
+def _layout(data: Dataset, where: str) -> tuple[int, tuple[slice, slice], tuple[float, float] | None]:
+    """Number of frames, rows and columns of the region of tissue, and its pixel, of an image of 8 bits a sample."""
+    rows, columns, frames = sizes(data, where)
+    if rows * columns * frames > MAX_BYTES:
+        what = f"{frames} frames of {columns} x {rows} pixels"
+        refuse(what, where, f"at most {MAX_BYTES:,} pixels a file", "file_size")
+    meaning = text(data, "PhotometricInterpretation", where=where)
+    if meaning in COLOURS:
+        keys = ("SamplesPerPixel", "BitsAllocated", "BitsStored")
+        bits = tuple(whole(data, key, low=0, high=64, where=where) for key in keys)
+        check_length(data, frames * rows * columns * (2 if meaning == "YBR_FULL_422" else 3), where)
+    else:
+        layout = pixel_layout(data, where)
+        bits = (3 * (not layout.signed), layout.allocated, layout.stored)
+    if bits != (3, 8, 8):
+        refuse(f"samples of {bits[2]} bits", where, "8 bits without sign, 3 a coloured pixel", "not_grey")
+    region = _region(data, where)
+    if region is None:
+        return frames, (slice(None), slice(None)), None
     x0, x1 = (
         whole(region, f"RegionLocation{key}X{i}", low=0, high=columns - 1, where=where) for i, key in enumerate(MINMAX)
     )
@@ -137,7 +183,7 @@ def _cut_out(cells: NDArray[np.uint8], region: Dataset, where: str) -> tuple[NDA
     if x1 <= x0 or y1 <= y0:
         refuse(f"a region from {x0}, {y0} to {x1}, {y1}", where, "a region with an area", "bad_tag")
     width, height = (10.0 * number(region, f"PhysicalDelta{axis}", where=where) for axis in "XY")
-    return cells[:, y0 : y1 + 1, x0 : x1 + 1], (width, height)
+    return frames, (slice(y0, y1 + 1), slice(x0, x1 + 1)), (width, height)
 
 
 def _region(data: Dataset, where: str) -> Dataset | None:
@@ -145,28 +191,11 @@ def _region(data: Dataset, where: str) -> Dataset | None:
     regions = items(data, "SequenceOfUltrasoundRegions", where=where)
 
     def is_slice(one: Dataset) -> bool:
-        keys = ("RegionSpatialFormat", "PhysicalUnitsXDirection", "PhysicalUnitsYDirection")
-        return [whole(one, key, low=0, high=1 << 16, where=where) for key in keys] == [TISSUE_2D, *[CENTIMETRES] * 2]
+        keys = ("RegionSpatialFormat", "RegionDataType", "PhysicalUnitsXDirection", "PhysicalUnitsYDirection")
+        codes = [whole(one, key, low=0, high=1 << 16, where=where) for key in keys]
+        return codes == [TWO_D, TISSUE, CENTIMETRES, CENTIMETRES]
 
     slices = [one for one in regions if is_slice(one)]
     if regions and len(slices) != 1:
         refuse(f"{len(slices)} regions of tissue in cm", where, "one region", "unsupported_feature")
     return slices[0] if slices else None
-
-
-def _cells(data: Dataset, where: str) -> NDArray[np.uint8]:
-    """All frames, shape (frames, rows, columns, channels)."""
-    if text(data, "PhotometricInterpretation", where=where) != "RGB":
-        layout = pixel_layout(data, where)
-        if layout.signed or layout.stored != 8 or layout.allocated != 8:
-            refuse(f"greys of {layout.stored} bits", where, "8 bits without sign", "not_grey")
-        return np.asarray(stored_values(data, layout, where), dtype=np.uint8)[..., None]
-    rows, columns, frames = sizes(data, where)
-    keys = ("SamplesPerPixel", "BitsAllocated", "BitsStored", "PlanarConfiguration")
-    samples, allocated, stored, planar = (whole(data, key, low=0, high=64, where=where) for key in keys)
-    if (samples, allocated, stored) != (3, 8, 8) or data.file_meta.TransferSyntaxUID not in PLAIN:
-        refuse("RGB that is compressed or not 3 x 8 bits", where, "RGB without compression", "unsupported_feature")
-    check_length(data, 3 * frames * rows * columns, where)
-    shape = (frames, 3, rows, columns) if planar else (frames, rows, columns, 3)
-    cells = np.frombuffer(data.PixelData, np.uint8, int(np.prod(shape))).reshape(shape)
-    return np.moveaxis(cells, 1, -1) if planar else cells

@@ -1,5 +1,6 @@
 """``selfcal --recording`` of pictures: PNG and DICOM by a renderer that the detector does not know, and refusals."""
 
+import copy
 import csv
 import json
 import shutil
@@ -7,8 +8,10 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from dicom_world import ultrasound, write
+from dicom_world import encoded, ultrasound, write
 from other_bmode import logarithm, picture, power_law
+from pydicom.encaps import encapsulate
+from pydicom.uid import JPEG2000, JPEGBaseline8Bit, RLELossless
 from refusals import refused, refused_command
 from selfcal_world import as_estimate
 
@@ -18,6 +21,8 @@ from puncture_twin.run_twin import main
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
+from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
+from puncture_twin.twin.guidance.ultrasound.image.needle_detector import detect
 from puncture_twin.twin.guidance.ultrasound.recording_file import open_recording, read_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
 from puncture_twin.twin.jobs.exit_codes import OK
@@ -203,7 +208,127 @@ def test_a_region_of_tissue_is_cut_out_with_its_pixel(rng, tmp_path, colour):
         cells[:, 0, 0] = (255, 0, 0)
     read = read_frames(write(ultrasound(cells, delta_cm=(0.02, 0.025), box=(10, 5, 69, 54)), tmp_path / "a.dcm"))
     np.testing.assert_array_equal(read.grey, frames[:, 5:55, 10:70])
-    assert read.pixel_mm == pytest.approx((0.2, 0.25))
+    assert read.pixel_mm == pytest.approx((0.2, 0.25)) and read.coloured is None
+
+
+def ycc(cells):
+    """JFIF's luminance and chrominance of RGB, by its equations."""
+    r, g, b = np.moveaxis(cells.astype(float), -1, 0)
+    luminance = 0.299 * r + 0.587 * g + 0.114 * b
+    parts = (luminance, 128 + (b - luminance) / 1.772, 128 + (r - luminance) / 1.402)
+    return np.clip(np.round(np.stack(parts, axis=-1)), 0, 255).astype(np.uint8)
+
+
+def halved(cells):
+    """As YBR_FULL_422 stores it: two luminances, then the chrominances of the first (rows of even length)."""
+    Y, chrominance = cells[..., 0], cells[..., ::2, 1:]
+    parts = (Y[..., ::2], Y[..., 1::2], chrominance[..., 0], chrominance[..., 1])
+    return np.stack(parts, axis=-1)
+
+
+def stored(kind, cells):
+    """One of the forms in which machines write greys, of RGB cells (frames, rows, columns, 3)."""
+    if kind == "RGB by planes":
+        planes = np.ascontiguousarray(np.moveaxis(cells, -1, 1))
+        return ultrasound(cells, spacing=(0.2, 0.2), PlanarConfiguration=1, PixelData=planes.tobytes())
+    meaning, _, syntax = kind.partition(", ")
+    data = ultrasound(cells, spacing=(0.2, 0.2), PhotometricInterpretation=meaning)
+    if meaning == "MONOCHROME2":
+        cells = np.ascontiguousarray(cells[..., 1])
+        data = ultrasound(cells, spacing=(0.2, 0.2))
+    if meaning.startswith("YBR_FULL") and syntax != "JPEG":
+        data.PixelData = (halved(ycc(cells)) if meaning.endswith("422") else ycc(cells)).tobytes()
+    found = {"RLE": RLELossless, "JPEG": JPEGBaseline8Bit, "JPEG 2000": JPEG2000}
+    return encoded(data, found[syntax], cells) if syntax else data
+
+
+@pytest.mark.parametrize(
+    ("kind", "rounding"),
+    [
+        ("MONOCHROME2, RLE", 0),
+        ("MONOCHROME2, JPEG", 3),
+        ("RGB by planes", 0),
+        ("RGB, RLE", 0),
+        ("YBR_FULL", 1),
+        ("YBR_FULL, RLE", 1),
+        ("YBR_FULL_422", 1),
+        ("YBR_FULL_422, JPEG", 3),
+        ("YBR_ICT, JPEG 2000", 3),
+    ],
+)
+def test_greys_are_read_however_a_machine_stores_them(world, tmp_path, kind, rounding):
+    """The picture, and what is coloured on it, from every form; a needle shows as in the PNG."""
+    greys = np.stack([cv2.imread(str(world[2] / f"{row}.png"), cv2.IMREAD_UNCHANGED) for row in (0, 1)])
+    cells = np.repeat(greys[..., None], 3, axis=3)
+    box = np.s_[1, 8:40, 8:40]
+    cells[box] = (220, 180, 20)
+    read = read_frames(write(stored(kind, cells), tmp_path / "a.dcm"))
+    plain = np.ones(greys.shape, bool)
+    plain[1, :56, :56] = False  # chrominance is stored in blocks of 16 pixels
+    errors = read.grey.astype(int) - greys
+    assert np.abs(errors[plain]).mean() <= rounding / 2 and np.abs(errors[plain]).max() <= 4 * rounding
+    if kind.startswith("MONOCHROME2"):
+        assert read.coloured is None
+        return
+    assert read.coloured[box].mean() > 0.95 and not read.coloured[plain].any()
+    imager = Imager(rows=SIZE[0], columns=SIZE[1], pixel_mm=PIXEL_MM)
+    tips = [detect(grey, imager).tip_image for grey in (greys[0], read.grey[0])]
+    assert np.linalg.norm(tips[0] - tips[1]) < 0.02
+
+
+def test_a_tinted_picture_is_refused(rng, tmp_path):
+    """A colour map of the tissue is no drawing on it; nor is luminance that is called red."""
+    grey = np.asarray(rng.integers(0, 200, (1, 40, 50)), np.uint8)
+    sepia = np.stack([grey + 40, grey + 20, grey], axis=-1).astype(np.uint8)
+    cells = np.repeat(grey[..., None], 3, axis=3)
+    for data in (ultrasound(sepia, spacing=(0.2, 0.2)), ultrasound(ycc(cells), spacing=(0.2, 0.2))):
+        with refused("not_grey", "a.dcm"):
+            read_frames(write(data, tmp_path / "a.dcm"))
+
+
+def test_of_a_box_of_flow_the_tissue_about_it_is_read(rng, tmp_path):
+    """A second region with another content is no second picture; two of tissue are."""
+    data = ultrasound(np.zeros((1, 60, 80), np.uint8), delta_cm=(0.02, 0.02), box=(10, 5, 69, 54))
+    regions = data.SequenceOfUltrasoundRegions
+    regions.append(copy.deepcopy(regions[0]))
+    regions[1].RegionDataType, regions[1].RegionLocationMinX0 = 2, 30
+    assert read_frames(write(data, tmp_path / "a.dcm")).grey.shape == (1, 50, 60)
+    regions[1].RegionDataType = 1
+    with refused("unsupported_feature", "a.dcm"):
+        read_frames(write(data, tmp_path / "a.dcm"))
+
+
+def test_what_no_decoder_reads_names_its_transfer_syntax(tmp_path):
+    """With a way out, and so do compressed pixels that are damaged."""
+    data = ultrasound(np.zeros((1, 60, 80), np.uint8), spacing=(0.2, 0.2))
+    data.PixelData = encapsulate([b"abcd" * 8])
+    data["PixelData"].is_undefined_length = True
+    for syntax, code in (("1.2.840.10008.1.2.4.102", "transfer_syntax"), (JPEGBaseline8Bit, "not_decoded")):
+        data.file_meta.TransferSyntaxUID = syntax
+        with refused(code, "a.dcm", syntax, "gdcmconv"):
+            read_frames(write(data, tmp_path / "a.dcm"))
+
+
+def test_drawings_are_said_and_cover_a_needle_only_at_its_tip(world, tmp_path):
+    """A line through the tip leaves its picture out, with the reason; a ruler in a corner changes nothing."""
+    _, exact, pictures = world
+    whole = read_recording(pictures)
+    shutil.copytree(pictures, tmp_path / "pictures")
+    with (tmp_path / "pictures" / "recording.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    for row in (0, 1):
+        grey = cv2.imread(str(pictures / f"{row}.png"), cv2.IMREAD_UNCHANGED)
+        cells = np.repeat(grey[..., None], 3, axis=2)
+        column = round(exact.P[0, 0] / PIXEL_MM) if row == 0 else 2
+        cells[5:, column : column + 2] = (250, 220, 0)
+        write(ultrasound(cells[None], spacing=(PIXEL_MM, PIXEL_MM)), tmp_path / "pictures" / f"{row}.dcm")
+        rows[row]["picture"] = f"{row}.dcm"
+    (tmp_path / "pictures" / "recording.csv").write_text(table_text(list(rows[0]), [list(r.values()) for r in rows]))
+    found = open_recording(tmp_path / "pictures", None)
+    assert [name for name, _ in found.recording.missed] == ["p0", *(f"p{row}" for row in EMPTY)]
+    np.testing.assert_allclose(found.recording.P[0], whole.P[1], atol=0.02)
+    (warning,) = found.warnings
+    assert "2 pictures" in warning and "p0" in warning
 
 
 @pytest.mark.parametrize(
@@ -215,7 +340,8 @@ def test_a_region_of_tissue_is_cut_out_with_its_pixel(rng, tmp_path, colour):
         ({"Rows": 61}, "size_mismatch"),
         ({"PixelData": b"abcd"}, "size_mismatch"),
         ({"BitsStored": 7, "HighBit": 6}, "not_grey"),
-        ({"PhotometricInterpretation": "YBR_FULL_422"}, "unsupported_feature"),
+        ({"PhotometricInterpretation": "MONOCHROME1"}, "unsupported_feature"),
+        ({"PhotometricInterpretation": "YBR_FULL", "SamplesPerPixel": 3}, "size_mismatch"),
     ],
 )
 def test_a_dicom_that_contradicts_itself_is_refused(tmp_path, others, code):

@@ -31,7 +31,13 @@ from puncture_twin.planning.formats.pose_table import (
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import OPTIONAL, Recording
 from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
-from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, detect
+from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
+    RIDGE_MM,
+    SEEK_MM,
+    SHAFT_MM,
+    Detection,
+    detect,
+)
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.pictures import SAME_SIZE, read_frames
 
@@ -64,6 +70,8 @@ NEEDS = MappingProxyType(
     {"P_w": "P_mm", "v_z": "v", "shaft": "v", "frame": "picture", "pixel": "picture", "turn": "q", "A": "B", "B": "A"}
 )
 """A group that only stands beside another one."""
+
+COVERED = "something coloured covers the needle's tip"
 
 PIXEL_MM = (0.01, 2.0)
 """Least and largest size of a pixel."""
@@ -108,7 +116,8 @@ def open_recording(path: Path, case: SelfcalCase | None) -> ReadRecording:
         recording = _recording(table, seen, case)
     except InputError as error:
         raise error.at(f"{file}: {error.where}") from error
-    return ReadRecording(recording, tuple(inputs), unfinished_warnings(content, file.name))
+    warnings = () if seen is None else seen.warnings
+    return ReadRecording(recording, tuple(inputs), (*unfinished_warnings(content, file.name), *warnings))
 
 
 def _fits(found: frozenset[str]) -> bool:
@@ -128,6 +137,7 @@ class _Seen(NamedTuple):
     """Shape (n,)."""
     missed: tuple[str, ...]
     """Why there is no needle; empty where there is one."""
+    warnings: tuple[str, ...]
 
 
 def _recording(table: GroupedTable, seen: _Seen | None, case: SelfcalCase | None) -> Recording:
@@ -167,6 +177,7 @@ def _seen(table: GroupedTable, file: Path, case: SelfcalCase | None, inputs: lis
         twice = next(pair for i, pair in enumerate(pairs) if pair in pairs[:i])
         refuse(f"picture {twice[0]}, frame {twice[1]:g} twice", file, "each picture once", "duplicate_name")
     P, v, shaft, missed = np.full((n, 2), np.nan), np.full((n, 2), np.nan), np.full(n, np.nan), [""] * n
+    coloured: dict[str, float] = {}
     imager: Imager | None = None
     by_file: dict[str, list[int]] = {}
     for row, name in enumerate(files):
@@ -181,18 +192,40 @@ def _seen(table: GroupedTable, file: Path, case: SelfcalCase | None, inputs: lis
             if frames[row] not in range(1, len(read.grey) + 1):
                 refuse(f"frame {frames[row]:g} of {path.name}", file, f"1 to {len(read.grey)}", "out_of_range")
             size = _pixel_mm(table, row, read.pixel_mm, case, path)
-            grey = _squared(read.grey[int(frames[row]) - 1], size)
+            shown = int(frames[row]) - 1
+            grey = _squared(read.grey[shown], size)
+            colour = None if read.coloured is None else np.argwhere(read.coloured[shown])[:, ::-1] * np.array(size)
+            if colour is not None and len(colour):
+                coloured[table.names[row]] = len(colour) / read.grey[shown].size
             own = _imager(case, grey, min(size))
             if imager is not None and own != imager:
                 what = f"{own.columns} x {own.rows} pixels of {own.pixel_mm:g} mm"
                 first = f"{imager.columns} x {imager.rows} of {imager.pixel_mm:g} mm, as {files[0]}"
                 refuse(what, path, first, "wrong_size")
             imager, found = own, detect(grey, own)
-            if isinstance(found, Detection):
+            if isinstance(found, Detection) and colour is not None and _covers(colour, found):
+                missed[row] = COVERED
+            elif isinstance(found, Detection):
                 P[row], v[row], shaft[row] = found.tip_image, found.direction_image, found.shaft_mm
             else:
                 missed[row] = found.value
-    return _Seen(P, v, shaft, tuple(missed))
+    return _Seen(P, v, shaft, tuple(missed), _colour_warning(coloured))
+
+
+def _covers(colour: Floats, found: Detection) -> bool:
+    """Whether something coloured lies at the needle's tip; pixels (n, 2), mm."""
+    offset, (along_u, along_v) = colour - found.tip_image, found.direction_image
+    along, across = offset @ found.direction_image, offset @ np.array([-along_v, along_u])
+    return bool(np.any((np.abs(across) < RIDGE_MM) & (along > -SHAFT_MM) & (along < SEEK_MM)))
+
+
+def _colour_warning(coloured: dict[str, float]) -> tuple[str, ...]:
+    """One line for all pictures in which something coloured was drawn."""
+    if not coloured:
+        return ()
+    most = max(coloured, key=lambda name: coloured[name])
+    covered = f"at most {100 * coloured[most]:.1f} % of one, {most}"
+    return (f"colour in {len(coloured)} pictures ({covered}): not searched for the needle",)
 
 
 def _pixel_mm(
