@@ -22,7 +22,9 @@ def logarithm(amplitude):
     return 255.0 * (1.0 + (20.0 * np.log10(np.maximum(amplitude, 1e-9)) - 28.0) / 50.0)
 
 
-def picture(rng, tip_mm, direction, *, off_mm=0.0, size=(300, 250), pixel_mm=0.2, display=logarithm, needle=True):
+def picture(
+    rng, tip_mm, direction, *, off_mm=0.0, size=(300, 250), pixel_mm=0.2, display=logarithm, needle=True, beaded=False
+):
     """One picture, 8-bit grey.
 
     Args:
@@ -34,6 +36,7 @@ def picture(rng, tip_mm, direction, *, off_mm=0.0, size=(300, 250), pixel_mm=0.2
         pixel_mm: Edge of a pixel.
         display: Grey of an amplitude.
         needle: Whether there is one.
+        beaded: Its echo is a row of beads on facets of unequal brightness, not one tube.
     """
     deep, wide = size[0] * pixel_mm, size[1] * pixel_mm
     shape = (round((deep + 4.0) / STEP_MM), round((wide + 4.0) / BEAM_MM))
@@ -44,7 +47,7 @@ def picture(rng, tip_mm, direction, *, off_mm=0.0, size=(300, 250), pixel_mm=0.2
     speckle = np.abs(hilbert(fftconvolve(field, np.outer(_pulse(), _beam()), mode="same"), axis=0))
     echo = speckle / np.mean(speckle)
     if needle:
-        echo = np.hypot(echo, _needle(rng, shape, np.asarray(tip_mm), np.asarray(direction), off_mm))
+        echo = np.hypot(echo, _needle(rng, shape, np.asarray(tip_mm), np.asarray(direction), off_mm, beaded))
     rows, columns = np.arange(size[0]) * pixel_mm + 2.0, np.arange(size[1]) * pixel_mm + 2.0
     sampled = _interpolated(_interpolated(echo, rows / STEP_MM).T, columns / BEAM_MM).T
     return np.clip(np.round(display(sampled)), 0, 255).astype(np.uint8)
@@ -61,17 +64,29 @@ def _beam():
     return np.sinc(np.arange(-8, 9) * BEAM_MM / 0.9) ** 2
 
 
-def _needle(rng, shape, tip_mm, direction, off_mm):
+def _needle(rng, shape, tip_mm, direction, off_mm, beaded):
     """Amplitude of a tube: two walls .5 mm apart, each a Hann window wide, in lumps of 2 mm, cut off square."""
     depth, across = np.meshgrid(np.arange(shape[0]) * STEP_MM - 2.0, np.arange(shape[1]) * BEAM_MM - 2.0, indexing="ij")
     back = (tip_mm[0] - across) * direction[0] + (tip_mm[1] - depth) * direction[1]
     aside = (across - tip_mm[0]) * direction[1] - (depth - tip_mm[1]) * direction[0]
-    lumps = 1.0 + 0.2 * np.interp(back, np.arange(-10.0, 90.0, 2.0), rng.normal(size=50))
+    if beaded:
+        lumps = _beads(rng, back)
+    else:
+        lumps = 1.0 + 0.2 * np.interp(back, np.arange(-10.0, 90.0, 2.0), rng.normal(size=50))
     walls = sum(
         np.where(np.abs(aside + side) < 0.5, np.cos(np.pi * (aside + side)) ** 2, 0.0) for side in (-0.25, 0.25)
     )
     tube = walls * lumps * np.clip(back / 0.25 + 0.5, 0.0, 1.0)  # the beam's resolution at its end
     return 16.0 * np.exp(-0.5 * (off_mm / 0.47) ** 2) * tube
+
+
+def _beads(rng, back):
+    """Amplitude at distances behind the tip: beads 1 to 2.5 mm apart on a faint shaft, on facets of 4 mm."""
+    edges = np.concatenate([[0.4], 0.4 + np.cumsum(rng.uniform(1.0, 2.5, 60))])
+    nearest = np.clip(np.searchsorted(0.5 * (edges[1:] + edges[:-1]), back), 0, len(edges) - 1)
+    bead = np.exp(-0.5 * ((back - edges[nearest]) / 0.3) ** 2) * np.exp(rng.normal(0.0, 0.4, len(edges)))[nearest]
+    facets = np.exp(rng.normal(0.0, 0.4, 40))[np.clip((back / 4.0).astype(int), 0, 39)]
+    return (0.2 + 1.1 * bead) * facets
 
 
 def _add(field, points, strength):

@@ -32,8 +32,8 @@ from puncture_twin.planning.formats.pose_table import (
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import OPTIONAL, Recording
 from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
+    ENDS_AGREE_MM,
     RIDGE_MM,
-    SEEK_MM,
     SHAFT_MM,
     Detection,
     detect,
@@ -216,7 +216,7 @@ def _covers(colour: Floats, found: Detection) -> bool:
     """Whether something coloured lies at the needle's tip; pixels (n, 2), mm."""
     offset, (along_u, along_v) = colour - found.tip_image, found.direction_image
     along, across = offset @ found.direction_image, offset @ np.array([-along_v, along_u])
-    return bool(np.any((np.abs(across) < RIDGE_MM) & (along > -SHAFT_MM) & (along < SEEK_MM)))
+    return bool(np.any((np.abs(across) < RIDGE_MM) & (along > -SHAFT_MM) & (along < ENDS_AGREE_MM)))
 
 
 def _colour_warning(coloured: dict[str, float]) -> tuple[str, ...]:
