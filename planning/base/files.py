@@ -122,6 +122,25 @@ def check_writable(folder: Path | str) -> Path:
     return folder
 
 
+@contextmanager
+def new_folder(path: Path | None) -> Iterator[Path | None]:
+    """A folder that appears whole or not at all; None for none.
+
+    Raises:
+        InputError: Something is there already, or it cannot be made.
+    """
+    if path is None:
+        yield None
+        return
+    if path.exists():
+        refuse("is there already", path, "a new folder", "output_exists")
+    with tempfile.TemporaryDirectory(dir=check_writable(path.parent), prefix=".") as beside:
+        kept = Path(beside) / path.name
+        kept.mkdir()
+        yield kept
+        kept.replace(path)
+
+
 def _names_fit(nearest: Path, folder: Path) -> bool:
     """Whether every part of the name fits the file system, and no folder of a file's name is in the way."""
     longest = os.pathconf(nearest, "PC_NAME_MAX")

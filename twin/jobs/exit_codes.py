@@ -84,6 +84,7 @@ RULES: Mapping[str, Rule] = MappingProxyType(
         "export": Rule("there is no plan to write, or the case now rejects it"),
         "register": Rule("never: markers that contradict each other are refused"),
         "selfcal": Rule("never: a recording that does not determine the calibration is refused"),
+        "calibrate hand-eye": Rule("never: poses that do not determine the calibration, or contradict it, are refused"),
         "servo": Rule("a servo did not converge", _unless(lambda job: job.passed)),
         "scan": Rule(NEVER),
         "reproduce": Rule("one of the paper's numbers is outside its limits", _unless(lambda result: result.passed)),

@@ -15,17 +15,15 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom, text
+from puncture_twin.planning.formats.dicom.pixels import PixelLayout, pixel_layout, stored_values
 from puncture_twin.planning.formats.dicom.recognise import choose_series, described
 from puncture_twin.planning.formats.dicom.slices import (
-    PixelLayout,
     Slice,
     Stack,
     StraightGrid,
     moved,
-    pixel_layout,
     slices_of,
     stack_of,
-    stored_values,
     straight_grid,
 )
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES, Content, Volume

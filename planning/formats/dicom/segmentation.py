@@ -31,16 +31,15 @@ from puncture_twin.planning.formats.dicom.named_masks import (
     check_frame_of_reference,
     unique_names,
 )
+from puncture_twin.planning.formats.dicom.pixels import check_length, sizes
 from puncture_twin.planning.formats.dicom.slices import (
     AXES_TOLERANCE,
     PLACE_TOLERANCE,
     SPACING_TOLERANCE,
     Groups,
     Plane,
-    check_length,
     frame_groups,
     plane_of,
-    sizes,
 )
 from puncture_twin.planning.formats.dicom.storage import PLAIN, SEGMENTATION
 from puncture_twin.planning.formats.volumes.volume_files import Content

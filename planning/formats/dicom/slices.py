@@ -4,8 +4,6 @@ A classic file holds one slice; an enhanced one holds many, each with functional
 (DICOM PS3.3, C.7.6.16). Here both are the same. Order and steps come from each slice's own position and orientation.
 Names, instance numbers and slice locations are not used: they are often wrong, and nothing in the patient depends on
 them.
-
-Stored values have as many bits as the header says, no more and no fewer bytes.
 """
 
 from __future__ import annotations
@@ -13,161 +11,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydicom.dataset import Dataset
-from pydicom.pixels.decoders.base import get_decoder
-from pydicom.uid import UID
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.formats.dicom.dicom_file import (
-    has,
-    how_to_convert,
-    items,
-    name,
-    number,
-    numbers,
-    refused_if_damaged,
-    sop_class_of,
-    text,
-    texts,
-    value,
-    whole,
-)
+from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.formats.dicom.dicom_file import has, items, name, number, numbers, sop_class_of, text, texts
 from puncture_twin.planning.formats.dicom.recognise import NO_SLICES
-from puncture_twin.planning.formats.dicom.storage import CLASSIC_CT, PLAIN
+from puncture_twin.planning.formats.dicom.storage import CLASSIC_CT
 from puncture_twin.planning.formats.volumes.volume_header import MAX_ORIGIN_MM, MAX_SPACING_MM, MIN_SPACING_MM
-
-MAX_SIDE = 4096
-"""Pixels along a row or a column: twice the finest scanner's."""
-MAX_FRAMES = 20_000
-"""In one file."""
-
-
-@dataclass(frozen=True)
-class PixelLayout:
-    """Storage of an image's values.
-
-    Attributes:
-        stored: Bits of a value: the lowest of those allocated.
-        signed: Whether values are two's complements.
-        padding: Stored values, lowest and highest, that were not measured; None where the header names none.
-    """
-
-    frames: int
-    rows: int
-    columns: int
-    allocated: int
-    stored: int
-    signed: bool
-    padding: tuple[int, int] | None
-
-
-def pixel_layout(data: Dataset, where: str) -> PixelLayout:
-    """Storage of an image's values; plain pixels must have the length that follows from it.
-
-    Raises:
-        InputError: A colour image, an unusual layout, no pixels, or pixels of another length.
-    """
-    if (meaning := text(data, "PhotometricInterpretation", where=where)) != "MONOCHROME2":
-        what = f"{name('PhotometricInterpretation')} is {meaning or 'missing'}"
-        refuse(what, where, "MONOCHROME2", "unsupported_feature")
-    whole(data, "SamplesPerPixel", low=1, high=1, where=where)
-    allocated = whole(data, "BitsAllocated", low=8, high=32, where=where)
-    if allocated % 8 or allocated == 24:
-        refuse(f"{name('BitsAllocated')} is {allocated}", where, "8, 16 or 32", "unsupported_feature")
-    stored = whole(data, "BitsStored", low=1, high=allocated, where=where)
-    whole(data, "HighBit", low=stored - 1, high=stored - 1, where=where)
-    signed = bool(whole(data, "PixelRepresentation", low=0, high=1, where=where))
-    rows, columns, frames = sizes(data, where)
-    layout = PixelLayout(frames, rows, columns, allocated, stored, signed, _padding(data, stored, signed, where))
-    check_length(data, frames * rows * columns * allocated // 8, where)
-    return layout
-
-
-def sizes(data: Dataset, where: str) -> tuple[int, int, int]:
-    """Rows, columns and frames of an image.
-
-    Raises:
-        InputError: Missing or implausible.
-    """
-    rows, columns = (whole(data, keyword, low=1, high=MAX_SIDE, where=where) for keyword in ("Rows", "Columns"))
-    several = has(data, "NumberOfFrames")
-    return rows, columns, whole(data, "NumberOfFrames", low=1, high=MAX_FRAMES, where=where) if several else 1
-
-
-def check_length(data: Dataset, promised: int, where: str) -> None:
-    """Whether plain pixels have the length that their header promises, and one byte more where that is odd.
-
-    Raises:
-        InputError: They have not, or there are none.
-    """
-    pixels = value(data, "PixelData", where=where)
-    if not isinstance(pixels, bytes):
-        refuse(f"{name('PixelData')} is missing", where, "an image with pixels", "missing_tag")
-    if data.file_meta.TransferSyntaxUID in PLAIN and len(pixels) != promised + promised % 2:
-        what = f"{name('PixelData')} has {len(pixels)} bytes, but the header states {promised}"
-        refuse(what, where, "a complete file", "size_mismatch")
-
-
-def stored_values(data: Dataset, layout: PixelLayout, where: str) -> NDArray[Any]:
-    """The stored values of every frame, shape (frames, rows, columns), without the bits above them.
-
-    Raises:
-        InputError: A transfer syntax that no installed decoder reads, or pixels that are damaged.
-    """
-    shape = (layout.frames, layout.rows, layout.columns)
-    if data.file_meta.TransferSyntaxUID in PLAIN:
-        cells = np.frombuffer(data.PixelData, f"<u{layout.allocated // 8}", int(np.prod(shape)))
-    else:
-        cells = _decompressed(data, data.file_meta.TransferSyntaxUID, where)
-    if cells.size != np.prod(shape) or cells.dtype.itemsize * 8 != layout.allocated:
-        what = f"the compressed pixels hold {cells.size} values of {cells.dtype}, but the header states {shape}"
-        refuse(what, where, "a complete file", "size_mismatch")
-    above = layout.allocated - layout.stored
-    typed = cells.reshape(shape).view(f"{'i' if layout.signed else 'u'}{layout.allocated // 8}")
-    return typed if above == 0 else (typed << above) >> above
-
-
-def _decompressed(data: Dataset, syntax: UID, where: str) -> NDArray[Any]:
-    with refused_if_damaged(where):
-        named = f"transfer syntax {syntax.name} ({syntax})"
-        if not syntax.is_transfer_syntax or not syntax.is_compressed:
-            refuse(named, where, how_to_convert(), "transfer_syntax")
-        try:
-            decoder = get_decoder(syntax)
-        except NotImplementedError:
-            raise InputError(named, where=where, allowed=how_to_convert(), code="transfer_syntax") from None
-        if not decoder.is_available:
-            what = f"{named} needs a decoder that is not installed"
-            refuse(what, where, f"{how_to_convert()}; or pip install python-gdcm", "no_decoder")
-        try:
-            cells, _ = decoder.as_array(data, raw=True)
-        except Exception as error:  # the decoders promise no kind of error
-            what = f"{named}: its pixels cannot be decoded ({str(error)[:150]})"
-            raise InputError(what, where=where, allowed=how_to_convert(), code="not_decoded") from error
-        return np.ascontiguousarray(cells)
-
-
-def _padding(data: Dataset, stored: int, signed: bool, where: str) -> tuple[int, int] | None:
-    """The range of stored values that mean "not measured"."""
-    if value(data, "PixelPaddingValue", where=where) is None:
-        return None
-    ends = [number(data, "PixelPaddingValue", where=where)]
-    if value(data, "PixelPaddingRangeLimit", where=where) is not None:
-        ends.append(number(data, "PixelPaddingRangeLimit", where=where))
-    plain = [_as_stored(int(end), stored, signed) for end in ends]
-    return min(plain), max(plain)
-
-
-def _as_stored(number: int, stored: int, signed: bool) -> int:
-    """A number as so many bits hold it: writers state a padding with the sign of another type."""
-    number %= 1 << stored
-    return number - (1 << stored) if signed and number >= 1 << (stored - 1) else number
-
 
 UNIT_TOLERANCE = 1e-3
 """Tolerance of an axis' length, and of the cosine between two: positions are written with six digits, some with
@@ -208,6 +62,7 @@ class Slice:
         file: The file's key in ``content``.
         frame: Its number in the file, from 0.
         label: How a person finds it.
+        plane: Where it lies.
         slope: What a stored value is multiplied with.
         intercept: What is added then; the sum is in Hounsfield units.
     """
@@ -223,6 +78,11 @@ class Slice:
 def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     """The slices of a CT file; scouts among the frames of an enhanced one are left out.
 
+    Args:
+        data: The file's data set.
+        file: Its name.
+        frames: How many images it holds.
+
     Raises:
         InputError: A position, an axis, a spacing or a rescaling is missing, contradictory or not in Hounsfield units.
     """
@@ -234,8 +94,7 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     found = []
     for frame, groups in enumerate(frame_groups(data, frames, where=file)):
         label = f"{file}, frame {frame + 1}"
-        frame_types = groups.find("CTImageFrameTypeSequence", label)
-        kinds = [part.upper() for one in frame_types for part in texts(one, "FrameType", where=label)]
+        kinds = [part.upper() for one in groups.find("CTImageFrameTypeSequence", label) for part in _types(one, label)]
         if not set(kinds) & NO_SLICES:
             found.append(_slice(file, frame, label, groups))
     return found
@@ -323,6 +182,10 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
         what = f"rescaling by {slope:g} and {intercept:g}"
         refuse(what, label, "a slope other than 0, both within a million", "out_of_range")
     return Slice(file, frame, label, plane_of(groups, label), slope, intercept)
+
+
+def _types(item: Dataset, label: str) -> tuple[str, ...]:
+    return texts(item, "FrameType", where=label)
 
 
 AXES_TOLERANCE = 1e-3
@@ -492,6 +355,7 @@ def moved(image: NDArray[np.float32], shift: Floats, shape: tuple[int, int]) -> 
     Args:
         image: Shape (columns, rows), NaN where nothing was measured.
         shift: Where its pixel (0, 0) lies in the larger one, along each axis; 0 or more.
+        shape: Of the larger one.
     """
     for axis in (0, 1):
         image = _moved(image, float(shift[axis]), shape[axis], axis)
