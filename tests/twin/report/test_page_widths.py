@@ -3,7 +3,10 @@
 What its script cuts out of the page's block of the CT is what ``slices.png`` shows.
 """
 
+import base64
+import io
 import re
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +14,12 @@ import pytest
 import report_world as world
 import scipy
 from page_browser import GREYS, SHOWN, at_pixel, chromium, drawn, opened, picture, row_of, serious_findings
+from PIL import Image
 
 from puncture_twin.planning.search.candidates import Pick
+from puncture_twin.twin.report.page import page_slices
+from puncture_twin.twin.report.page.page import Shown, write_page
+from puncture_twin.twin.report.page.page_slices import ct_block
 from puncture_twin.twin.report.slices.panel import PIXELS, TONES, draw_panel
 from puncture_twin.twin.report.slices.planes import needle_planes
 from puncture_twin.twin.report.slices.sheet import flat
@@ -220,3 +227,61 @@ def test_a_path_of_ones_own_has_no_verdict_of_its_own(page, patient):
     page.locator("#slices-keep").click()
     page.locator("[data-mode=point]").click()
     assert drawn(page, row)
+
+
+@pytest.fixture(scope="module")
+def lossy(browser, tmp_path_factory):
+    """A page whose CT is packed with loss, open, and its block."""
+    path, case, anatomy = tmp_path_factory.mktemp("lossy") / "report.html", world.make_case(), world.make_anatomy()
+    anatomy.scan = world.make_noisy_scan()
+    blocks = []
+
+    def small(hu, T_ct_index, box_ct):
+        blocks.append(ct_block(hu, T_ct_index, box_ct, world.NOISY_BYTES))
+        return blocks[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page_slices, "ct_block", small)
+        write_page(Shown(case, anatomy, world.make_candidates(case)), path)
+    with opened(browser, path.as_uri(), 1000) as page:
+        drawn(page)
+        yield page, path, blocks[0]
+
+
+def test_a_browser_decodes_what_the_program_measured(lossy, browser):
+    """Every byte of a CT with loss as Pillow has it, to 1; the page states the loss; a browser that alters is told."""
+    page, path, block = lossy
+    shown = page.evaluate("""() => unpacked.then(({ ct }) => new Promise((done) => {
+        const reader = new FileReader();
+        reader.onload = () => done(reader.result);
+        reader.readAsDataURL(new Blob([ct]));
+    }))""")
+    nx, ny, nz = block.facts["shape"]
+    found = np.frombuffer(base64.b64decode(shown.partition(",")[2]), np.uint8).reshape(nz, ny, nx)
+    at, wanted = 0, []
+    for size, count, _ in block.facts["strips"]:
+        rows = np.asarray(Image.open(io.BytesIO(block.content[at : at + size])))
+        wanted.append(rows.reshape(count, block.facts["rows"], nx)[:, :ny])
+        at += size
+    assert np.abs(found.astype(int) - np.concatenate(wanted)).max() <= 1
+    notes = page.locator("#slices-notes").inner_text()
+    assert "packed with loss" in notes and f"off by {np.ceil(block.facts['rms_hu']):.0f} HU" in notes
+    with altered(browser, path) as page:
+        assert "alters pictures" in page.locator("#slices-notes").inner_text()
+
+
+@contextmanager
+def altered(browser, path):
+    """The page in a browser that answers a large canvas with noise, as some do against fingerprints."""
+    context = browser.new_context(viewport={"width": 1000, "height": 900})
+    page = context.new_page()
+    page.add_init_script("""const read = CanvasRenderingContext2D.prototype.getImageData;
+        CanvasRenderingContext2D.prototype.getImageData = function (...box) {
+            const found = read.apply(this, box);
+            if (found.height > 1000) for (let k = 0; k < found.data.length; k++) found.data[k] = 255 * Math.random();
+            return found;
+        };""")
+    page.goto(path.as_uri())
+    drawn(page)
+    yield page
+    context.close()

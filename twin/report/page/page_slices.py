@@ -6,12 +6,14 @@ A script of the page (``slices.js``) cuts both in any plane, as `slices.panel` d
 from __future__ import annotations
 
 import gzip
+import io
 import itertools
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import css
@@ -28,10 +30,28 @@ AROUND_MM = 60.0
 """What the block holds beyond target and entries, to every side."""
 
 FINE_MM = 1.0
-"""Voxels finer than this are averaged up to it: their noise would take most of the page."""
+"""Where the CT's own voxels do not fit the page, finer ones become means over this."""
 
 MOST_CT, MOST_TRIANGLES = 1_600_000, 250_000
 """Bytes of the packed CT, and triangles of the surfaces: in base64 they take 2.1 and at most 0.9 MB of the page."""
+
+MOST_VOXELS = 30_000_000
+"""A browser holds a byte for each; more of them are not tried as they are."""
+
+SAMPLE = 16
+"""Slices by which it is seen at once that all will not fit."""
+
+WORST, BEST = 15, 95
+"""Qualities of a JPEG. Below the first, edges ring; then voxels grow by a quarter."""
+
+STRIP = 4096
+"""Rows of a JPEG at most: browsers on phones read no larger canvas."""
+
+JPEG_BLOCK = 8
+"""Rows of a slice are filled up to a multiple, so that no block of the JPEG holds two slices."""
+
+SOFT_HU = (-160.0, 240.0)
+"""Where the page states the error of a lossy CT."""
 
 LEAST_UNIT_MM = 1 / 16
 """To which the surfaces' corners are rounded; the unit is doubled until there are no more triangles than that."""
@@ -127,13 +147,15 @@ def block_box(target_ct: Floats, candidates: Candidates) -> Floats:
 
 
 def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = MOST_CT) -> Packed:
-    """The CT in a box, in bytes of `stored`, packed: its own voxels, or where they are too many means of some.
+    """The CT in a box, in bytes of `stored`: its own voxels without loss, or where these are too many as JPEG.
+
+    Voxels of a JPEG are means over at least `FINE_MM`; its quality is the best that fits.
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         box_ct: Shape (2, 3), mm.
-        most: Bytes; the voxels grow until the block takes no more.
+        most: Bytes.
     """
     corners = np.array(list(itertools.product(*box_ct.T)))
     index = apply(np.linalg.inv(T_ct_index), corners)
@@ -141,18 +163,21 @@ def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = M
     high = np.clip(np.ceil(index.max(axis=0)) + 1, 0, hu.shape).astype(int)
     part = hu[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     spacing = np.linalg.norm(T_ct_index[:3, :3], axis=0)
-    factor = np.maximum(1, np.floor(FINE_MM / spacing + 1e-6)).astype(int)
-    while True:
-        values = _means(part, np.minimum(factor, np.maximum(1, part.shape)))
-        content = gzip.compress(_differences(stored(values)), LEVEL, mtime=0)
-        if len(content) <= most:
-            break
-        factor[np.argmin(spacing * factor)] += 1
-    T_index_block = np.diag([*factor.astype(float), 1.0])
+    factor, packed = np.ones(3), None
+    middle = max(0, part.shape[2] - SAMPLE) // 2
+    sample = _exact(stored(part[:, :, middle : middle + SAMPLE])).content
+    if part.size <= MOST_VOXELS and len(sample) * part.shape[2] < 2 * SAMPLE * most:
+        packed = _exact(stored(part))
+    grain = FINE_MM
+    while packed is None or len(packed.content) > most:
+        factor = np.clip(grain / spacing, 1.0, np.maximum(1, part.shape))
+        packed = _lossy(stored(_means(part, factor)), most)
+        grain *= 1.25
+    T_index_block = np.diag([*factor, 1.0])
     T_index_block[:3, 3] = low + (factor - 1) / 2
     T = T_ct_index @ T_index_block
     facts = {
-        "shape": values.shape,
+        **packed.facts,
         "T": T[:3].ravel().tolist(),
         "image": [
             ((edge - T_index_block[:3, 3]) / factor).tolist() for edge in (np.full(3, -0.5), np.array(hu.shape) - 0.5)
@@ -160,18 +185,60 @@ def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = M
         "voxel_mm": np.round(spacing, 3).tolist(),
         "shown_mm": np.round(spacing * factor, 3).tolist(),
     }
-    return Packed(facts, content)
+    return Packed(facts, packed.content)
 
 
-def _means(values: NDArray[Any], factor: NDArray[np.int64]) -> NDArray[Any]:
-    """Means of blocks of voxels; what does not fill one at the end is left out."""
-    if np.all(factor == 1):
-        return values
-    count = np.array(values.shape) // factor
-    total = np.zeros(count, np.float32)
-    for first in itertools.product(*(range(n) for n in factor)):
-        total += values[tuple(slice(f, f + n * s, s) for f, n, s in zip(first, count, factor, strict=True))]
-    return total / np.float32(factor.prod())
+def _exact(values: NDArray[np.uint8]) -> Packed:
+    return Packed({"shape": values.shape}, gzip.compress(_differences(values), LEVEL, mtime=0))
+
+
+def _means(values: NDArray[Any], factor: Floats) -> NDArray[Any]:
+    """Means over so many voxels along each axis, also parts of voxels; a rest at the end is left out."""
+    for axis, (step, count) in enumerate(zip(factor, values.shape, strict=True)):
+        if step > 1.0:
+            start, voxel = step * np.arange(int(count / step + 1e-9))[:, None], np.arange(count)
+            shared = np.minimum(start + step, voxel + 1) - np.maximum(start, voxel)
+            weights = (np.maximum(shared, 0.0) / step).astype(np.float32)
+            values = np.moveaxis(np.tensordot(weights, values.astype(np.float32), (1, axis)), 0, axis)
+    return values
+
+
+def _lossy(values: NDArray[np.uint8], most: int) -> Packed:
+    """Slices below one another as grey JPEGs, of the best quality that takes no more than so many bytes.
+
+    The facts hold each JPEG's bytes, slices and mean, by which a browser that alters pictures is found out, and the
+    errors: rms in bytes; rms and greatest where the CT has `SOFT_HU`.
+    """
+    slices = np.pad(values.transpose(2, 1, 0), ((0, 0), (0, -values.shape[1] % JPEG_BLOCK), (0, 0)), mode="edge")
+    each = max(1, STRIP // slices.shape[1])
+    strips = [slices[k : k + each].reshape(-1, slices.shape[2]) for k in range(0, len(slices), each)]
+    low, high = WORST, BEST
+    while low < high:
+        middle = (low + high + 1) // 2
+        fits = sum(len(_jpeg(one, middle)) for one in strips) <= most
+        low, high = (middle, high) if fits else (low, middle - 1)
+    packed = [_jpeg(one, low) for one in strips]
+    shown = [np.asarray(Image.open(io.BytesIO(one))) for one in packed]
+    found = np.concatenate(shown).reshape(slices.shape)[:, : values.shape[1]].transpose(2, 1, 0)
+    true, seen = (np.interp(one, KNOTS_BYTE, KNOTS_HU) for one in (values, found))
+    soft = (seen - true)[(true > SOFT_HU[0]) & (true < SOFT_HU[1])]
+    facts = {
+        "shape": values.shape,
+        "strips": [
+            [len(one), len(rows) // slices.shape[1], rows.mean()] for one, rows in zip(packed, shown, strict=True)
+        ],
+        "rows": slices.shape[1],
+        "rms_bytes": float(np.sqrt(np.square(found - values.astype(float)).mean())),
+        "rms_hu": float(np.sqrt(np.square(soft).mean())) if len(soft) else 0.0,
+        "worst_hu": float(np.abs(soft).max(initial=0.0)),
+    }
+    return Packed(facts, b"".join(packed))
+
+
+def _jpeg(rows: NDArray[np.uint8], quality: int) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(rows).save(stream, "JPEG", quality=quality, optimize=True)
+    return stream.getvalue()
 
 
 def _differences(values: NDArray[np.uint8]) -> bytes:

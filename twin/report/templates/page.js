@@ -199,7 +199,7 @@
       margin: Math.max(0, ...strong.map((name) => slices.margins[name])), region: slices.regions[row], bent: slices.bent[row], title: anglesOf(row),
     };
   }
-  const readout = (text) => { byId("cursor").textContent = text || `Point at a slice: ${slices.ct ? "Hounsfield units, " : ""}structure, place.`; };
+  const readout = (text) => { byId("cursor").textContent = text || `Point at a slice: ${data.ct ? "Hounsfield units, " : ""}structure, place.`; };
   const view = new slicing.View(byId("slices-a"), { readout, moved: moveNeedle });
   let beside = null, kept = null, own = null;
   const saidOf = (needle) => needle.verdict ?? verdictOf(needle.row);

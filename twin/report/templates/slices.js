@@ -49,11 +49,13 @@ const slicing = (() => {
   };
   const [knotsHu, knotsByte] = facts.knots;
   const huOf = Float64Array.from({ length: 256 }, (_, byte) => interpolated(byte, knotsByte, knotsHu));
-  const doubtOf = (byte) => Math.max(huOf[byte] - huOf[Math.max(byte - 1, 0)], huOf[Math.min(byte + 1, 255)] - huOf[byte]) / 2;
-  const ct = facts.ct && (() => {
-    const differences = new Uint8Array(data.ct), values = new Uint8Array(differences.length);
+  const lossy = facts.ct?.strips, off = lossy ? 2 * facts.ct.rms_bytes : 0.5; // of a byte: half a step, or two standard deviations
+  const huAt = (byte) => interpolated(Math.min(255, Math.max(0, byte)), knotsByte, knotsHu);
+  const doubtOf = (byte) => Math.max(huOf[byte] - huAt(byte - off), huAt(byte + off) - huOf[byte]);
+  const ct = facts.ct && data.ct && (() => {
+    const differences = new Uint8Array(data.ct), values = lossy ? differences : new Uint8Array(differences.length);
     const [nx, ny, nz] = facts.ct.shape, row = nx, slab = nx * ny;
-    for (let k = 0, at = 0; k < nz; k++)
+    if (!lossy) for (let k = 0, at = 0; k < nz; k++)
       for (let j = 0; j < ny; j++)
         for (let i = 0; i < nx; i++, at++) {
           const before = (i ? values[at - 1] : 0) + (j ? values[at - row] : 0) + (k ? values[at - slab] : 0);
@@ -591,11 +593,18 @@ const slicing = (() => {
     write(narrow ? "mm from the target (right: deeper)" : "mm from the target along the needle (left: outside; right of the target: deeper)", (left + right) / 2, bottom + 32, "center");
   }
 
+  function voxelNote() {
+    if (!facts.ct) return "The case has no CT: only the outlines of the structures.";
+    if (!ct) return "This browser alters pictures that a page reads, so no CT is shown: only the outlines of the structures. Allow the page to read its canvas, or see slices.png.";
+    const size = (mm) => `${mm.map((one) => +one.toFixed(2)).join(" × ")} mm`, { shown_mm, voxel_mm, rms_hu, worst_hu } = facts.ct;
+    const means = shown_mm.some((mm, axis) => mm !== voxel_mm[axis]) ? `means over ${size(shown_mm)} (its voxels: ${size(voxel_mm)})` : `its own voxels, ${size(voxel_mm)}`;
+    return lossy ? `CT: ${means}, packed with loss so that it fits this page: soft tissue is off by ${Math.ceil(rms_hu)} HU (rms), at edges by up to ${Math.ceil(worst_hu)} HU. The cursor's ± is two standard deviations.`
+      : "The CT's nearest voxels, not smoothed; HU rounded as the cursor says.";
+  }
+
   return {
     View, drawUnits, pathFrom, placeText, lengthText, shared, parts, NEAR_MM,
-    voxelNote: !ct ? "The case has no CT: only the outlines of the structures." : facts.ct.shown_mm.some((mm, axis) => mm !== facts.ct.voxel_mm[axis])
-      ? `CT: means over ${facts.ct.shown_mm.map((mm) => +mm.toFixed(2)).join(" × ")} mm (its voxels: ${facts.ct.voxel_mm.map((mm) => +mm.toFixed(2)).join(" × ")} mm), so that it fits this page; HU rounded as the cursor says.`
-      : "The CT's nearest voxels, not smoothed; HU rounded as the cursor says.",
+    voxelNote: voxelNote(),
     surfaceNote: `Outlines: the checked surfaces to ${(0.87 * facts.surfaces.unit_mm).toFixed(2)} mm. Hatched: not on this page.`,
     halfVoxel: facts.ct ? Math.max(...facts.ct.voxel_mm) / 2 : null,
     setTone(name) { tone = name; },
