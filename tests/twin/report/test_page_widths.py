@@ -107,6 +107,48 @@ def test_axe_finds_nothing_serious(page):
     assert serious_findings(page) == []
 
 
+COLOURS = """() => {
+    const shown = [], channels = (colour) => colour.match(/[\\d.]+/g).map(Number);
+    const groundOf = (one) => {
+        const colour = channels(getComputedStyle(one).backgroundColor);
+        return (colour[3] ?? 1) === 1 ? colour : groundOf(one.parentElement);
+    };
+    for (const one of document.querySelectorAll("body *")) {
+        if (one.closest("svg, #scene, .slice, script, [hidden]") || !one.getClientRects().length) continue;
+        const style = getComputedStyle(one), name = `${one.tagName} ${one.textContent.slice(0, 30)}`;
+        if ([...one.childNodes].some((node) => node.nodeType === 3 && node.data.trim()))
+            shown.push([name, 4.5, channels(style.color), groundOf(one)]);
+        if (one.tagName === "BUTTON") shown.push([name, 3, channels(style.borderColor), groundOf(one.parentElement)]);
+    }
+    return shown;
+}"""
+"""Texts and edges of buttons with their colours and grounds; 4.5 and 3 are what WCAG 2.1 AA demands of them."""
+
+
+def luminance(colour):
+    """WCAG's relative luminance of sRGB."""
+    part = np.array(colour[:3]) / 255
+    return np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4) @ [0.2126, 0.7152, 0.0722]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_colour_has_contrast(page, scheme):
+    """All text 4.5 and all buttons' edges 3 to 1 in both styles; what is drawn stays, and paper is light."""
+    drawn_colours = page.evaluate(SHOWN)
+    page.emulate_media(color_scheme=scheme)
+    found = page.evaluate(COLOURS)
+    assert len(found) > 150
+    for text, least, *colours in found:
+        dark, light = sorted(map(luminance, colours))
+        assert (light + 0.05) / (dark + 0.05) >= least, (text, colours)
+    ground = "getComputedStyle(document.body).backgroundColor"
+    assert (page.evaluate(ground) == "rgb(255, 255, 255)") == (scheme == "light")
+    assert page.evaluate(SHOWN) == drawn_colours
+    page.emulate_media(color_scheme=scheme, media="print")
+    assert page.evaluate(ground) == "rgb(255, 255, 255)"
+    page.emulate_media(color_scheme="light", media="screen")
+
+
 def test_a_click_chooses_and_everything_follows(page):
     """On the map, in the table, by the keyboard; the page never grows wider than its window."""
     command = page.locator("#command")

@@ -403,7 +403,7 @@ const slicing = (() => {
   function leaning(plane, needle) {
     const lean = dot(needle.outward, plane.normal), tip = dot(plus(needle.at, plane.at, -1), plane.normal) - plane.offset;
     const far = tip + (Math.abs(lean) <= IN_PLANE ? 0 : lean * needle.path), side = towardText(scaled(plane.normal, Math.sign(far)));
-    if (Math.abs(lean) <= IN_PLANE) return Math.abs(far) < 0.5 ? "Holds the needle." : `The needle is ${lengthText(Math.abs(far))} from this plane, ${side}.`;
+    if (Math.abs(lean) <= IN_PLANE) return Math.abs(far) < 0.5 ? "The needle lies in this plane." : `The needle is ${lengthText(Math.abs(far))} from this plane, ${side}.`;
     return Number.isFinite(far) ? `The skin entry is ${lengthText(Math.abs(far))} from this plane, ${side}.` : "";
   }
 
