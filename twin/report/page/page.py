@@ -28,6 +28,7 @@ from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.map_view import step_of
 from puncture_twin.twin.report.numbers import (
     TRUTH_IS_BELIEF,
+    carried_mm,
     demanding,
     expected_text,
     nearest_text,
@@ -142,7 +143,7 @@ def write_page(shown: Shown, path: Path) -> None:
         refused=_refused(found),
         cards=_cards(shown),
         counts=blocks_html(patient.counts(found)),
-        best=blocks_html(patient.windows(found)),
+        best=blocks_html(patient.windows(found, shown.anatomy.scan)),
         plan=blocks_html(patient.plan(plan, at_patient, shown.refusal, declared=declared, notes=shown.notes)),
         planned="Plan" if plan is not None or shown.refusal else "The best path at the patient",
         registration=blocks_html(patient.registration(shown.registration)) if shown.registration else "",
@@ -229,7 +230,7 @@ def _cards(shown: Shown) -> list[Card]:
     cards = [] if breakdown is None or shown.chosen is None else [chance_card(breakdown, _angles(*shown.chosen))]
     cards.append(_window_card(candidates))
     if shown.chosen is not None:
-        cards.append(_direction_card(*shown.chosen, best=shown.chosen == candidates.best))
+        cards.append(_direction_card(*shown.chosen, shown.anatomy.scan, best=shown.chosen == candidates.best))
     if not candidates.arm_checked:
         cards.append(Card("arm", "not checked", candidates.arm_note.removeprefix("not checked: ")))
     if shown.plan is None:
@@ -264,8 +265,10 @@ def _location(case: Any) -> str:
     return f"Case {case.name}; target {target_text(case)} at ({point}) mm {case.space};"
 
 
-def _direction_card(candidates: Candidates, row: int, *, best: bool) -> Card:
-    detail = f"{number(float(candidates.path.length[row]), 1, 'mm')} in the body; {nearest_text(candidates, row)}"
+def _direction_card(candidates: Candidates, row: int, scan: Any | None, *, best: bool) -> Card:
+    digits, told = carried_mm(scan)
+    path = number(float(candidates.path.length[row]), digits, f"{told} mm".strip())
+    detail = f"{path} in the body; {nearest_text(candidates, row, scan)}"
     return Card("best direction" if best else "chosen direction", _angles(candidates, row), detail)
 
 
