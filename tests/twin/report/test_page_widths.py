@@ -5,6 +5,7 @@ What its script cuts out of the page's block of the CT is what ``slices.png`` sh
 
 import base64
 import io
+import json
 import re
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,10 +16,13 @@ import report_world as world
 import scipy
 from page_browser import GREYS, SHOWN, at_pixel, chromium, drawn, opened, picture, row_of, serious_findings
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report.page import page_slices
 from puncture_twin.twin.report.page.page import Shown, write_page
+from puncture_twin.twin.report.page.page_scene import scene_figure
 from puncture_twin.twin.report.page.page_slices import ct_block
 from puncture_twin.twin.report.slices.panel import PIXELS, TONES, draw_panel
 from puncture_twin.twin.report.slices.planes import needle_planes
@@ -327,3 +331,57 @@ def altered(browser, path):
     drawn(page)
     yield page
     context.close()
+
+
+def test_the_arm_follows_what_is_chosen(browser, tmp_path):
+    """Links, needle and holder of a chosen row lie where Python's link poses have them, to 0.1 mm; else the first's."""
+    case, anatomy = world.make_case(), world.make_anatomy()
+    found = world.make_candidates(case)
+    q = np.random.default_rng(3).uniform(-3, 3, (len(found), 6))
+    q[found.verdict.reason != ""] = np.nan
+    found = replace(found, arm=replace(found.arm, q_insertion=q))
+    T_base_ct = random_pose(np.random.default_rng(4))
+    first, path = found.best, tmp_path / "report.html"
+    write_page(Shown(case, anatomy, found, pick=first, T_base_ct=T_base_ct), path)
+    drawn_first = scene_figure(case, anatomy, found, None, pick=first, T_base_ct=T_base_ct)["data"]
+    before = [unpacked(one) for one in drawn_first if one.get("meta", {}).get("frame")]
+    with opened(browser, path.as_uri(), 1000) as page:
+        drawn(page)
+        if page.evaluate("document.getElementById('scene').hidden"):
+            pytest.skip("this browser has no WebGL")
+        follow_rows(page, found, before, case.robot.model, (q, first.row, T_base_ct))
+
+
+def follow_rows(page, found, before, model, arm):
+    """Choose rows by the slider and compare every link."""
+    q, first, T_base_ct = arm
+    page.evaluate("document.getElementById('scene').scrollIntoView()")
+    links = "document.getElementById('scene').data.filter(t => t.meta && t.meta.frame)"
+    places = f"JSON.stringify({links}.map(t => ['x', 'y', 'z'].map(a => [...t[a]].filter((_, k) => k % 50 === 0))))"
+    frames = page.evaluate(f"{links}.map(t => t.meta.frame)")
+    assert {1, 2, 3, 4, 5, 6} <= set(frames)
+    for theta, beta, follows in ((30, 200, True), (80, 200, False)):
+        choose = f"document.getElementById('theta').value = {theta}; document.getElementById('beta').value = {beta};"
+        page.evaluate(choose + "document.getElementById('theta').dispatchEvent(new Event('input'))")
+        row = row_of(found, theta, beta)
+        end = world.TARGET + 210 * found.outward_ct[row]
+        last = "document.getElementById('scene').data.at(-1)"
+        page.wait_for_function(f"{last}.x.length === 2 && Math.abs({last}.x[1] - {end[0]}) < 0.01")
+        moves = [np.linalg.inv(T_base_ct) @ link_poses(model, one) for one in (q[first], q[row])]
+        for mine, frame, points in zip(json.loads(page.evaluate(places)), frames, before, strict=True):
+            T = moves[1][frame] @ np.linalg.inv(moves[0][frame]) if follows else np.eye(4)
+            assert np.abs(np.array(mine).T - (points[::50] @ T[:3, :3].T + T[:3, 3])).max() < 0.1, (row, frame)
+        assert page.evaluate("document.querySelector('.of-scene').hidden") == follows
+
+
+def unpacked(trace):
+    """The corners of a trace, shape (n, 3)."""
+    return np.stack([np.frombuffer(base64.b64decode(trace[axis]["bdata"]), "<f4") for axis in "xyz"], axis=1)
+
+
+def random_pose(rng):
+    """Any."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
+    T[:3, 3] = rng.uniform(-300, 300, 3)
+    return T

@@ -37,7 +37,7 @@ from puncture_twin.twin.report.numbers import (
     target_text,
 )
 from puncture_twin.twin.report.page.page_map import map_data, picked_row
-from puncture_twin.twin.report.page.page_scene import scene_figure
+from puncture_twin.twin.report.page.page_scene import arm_data, scene_figure
 from puncture_twin.twin.report.page.page_slices import slices_data
 from puncture_twin.twin.report.page.template import (
     Card,
@@ -166,6 +166,7 @@ def _drawn(shown: Shown) -> dict[str, Any]:
     data = {
         "map": map_data(case, found, pick, shown.raster),
         "scene": scene_figure(case, shown.anatomy, found, shown.plan, user_cache(), pick, shown.T_base_ct),
+        "arm": arm_data(case, found, shown.plan, pick, shown.T_base_ct),
         "slices": slices,
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),
