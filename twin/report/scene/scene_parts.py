@@ -178,12 +178,8 @@ def chosen_direction(pick: Pick | None, plan: Any | None) -> Floats | None:
 
 def arm_bodies(case: Any, plan: Any | None, pick: Pick | None, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
     """The arm with the needle on the target: as it is planned, else as the search reaches it; nothing where unknown."""
-    q = joints_on_target(plan, pick)
-    if plan is not None:
-        return ArmPicture(plan.model, plan.T_base_ct, case.tool).bodies(q)
-    if q is None or T_base_ct is None:
-        return ()
-    return ArmPicture(case.robot.model, T_base_ct, case.tool).bodies(q)
+    q, base = joints_on_target(plan, pick), T_base_ct if plan is None else plan.T_base_ct
+    return () if q is None or base is None else ArmPicture(case.robot.model, base, case.tool).bodies(q)
 
 
 def joints_on_target(plan: Any | None, pick: Pick | None) -> Floats | None:
