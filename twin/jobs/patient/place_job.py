@@ -136,7 +136,11 @@ def refuse_none(found: PlaceSearch) -> None:
     """
     if not any(one.verdict.reached for one in found.rated):
         what = f"the arm reaches no organ-safe direction from any placement ({plural(found.checked[0], 'check')})"
-        what += "" if found.complete else ", as far as was searched; --full searches to the end"
+        what += (
+            ""
+            if found.complete
+            else ", as far as was searched; to search to the end: --full, or quick_s=None in Python"
+        )
         raise NoAnswerError(what, code="no_placement")
 
 
