@@ -220,15 +220,16 @@ def _lossy(values: NDArray[np.uint8], most: int) -> Packed:
     packed = [_jpeg(one, low) for one in strips]
     shown = [np.asarray(Image.open(io.BytesIO(one))) for one in packed]
     found = np.concatenate(shown).reshape(slices.shape)[:, : values.shape[1]].transpose(2, 1, 0)
-    true, seen = (np.interp(one, KNOTS_BYTE, KNOTS_HU) for one in (values, found))
-    soft = (seen - true)[(true > SOFT_HU[0]) & (true < SOFT_HU[1])]
+    hu_of = np.interp(np.arange(256), KNOTS_BYTE, KNOTS_HU).astype(np.float32)
+    true = hu_of[values]
+    soft = (hu_of[found] - true)[(true > SOFT_HU[0]) & (true < SOFT_HU[1])]
     facts = {
         "shape": values.shape,
         "strips": [
             [len(one), len(rows) // slices.shape[1], rows.mean()] for one, rows in zip(packed, shown, strict=True)
         ],
         "rows": slices.shape[1],
-        "rms_bytes": float(np.sqrt(np.square(found - values.astype(float)).mean())),
+        "rms_bytes": float(np.sqrt(np.square(found - values.astype(np.float32)).mean())),
         "rms_hu": float(np.sqrt(np.square(soft).mean())) if len(soft) else 0.0,
         "worst_hu": float(np.abs(soft).max(initial=0.0)),
     }
