@@ -227,7 +227,7 @@
       slicing.voxelNote, slicing.surfaceNote,
       `Needle as thick as it is; dashed: with the greatest margin near it${needle.margin ? `, ${needle.margin} mm` : ""}. Beads: the edge of what is unknown.`,
       Object.keys(slices.bent).length && !needle.bent ? "The range of bending by the bevel is drawn only for the planned or best direction." : "",
-    ].filter(Boolean).map((note) => make("div", {}, note)));
+    ].filter(Boolean).map((note) => make("div", slicing.coarse && note === slicing.surfaceNote ? { class: "bad" } : {}, note)));
   }
   const { halfVoxel } = slicing; // lengths have the digits that a voxel can carry
   const doubted = (mm) => halfVoxel === null ? `${mm.toFixed(1)} mm` : halfVoxel < 1 ? `${mm.toFixed(1)} ± ${halfVoxel.toFixed(1)} mm` : `${mm.toFixed(0)} ± ${Math.ceil(halfVoxel)} mm`;

@@ -593,6 +593,7 @@ const slicing = (() => {
     write(narrow ? "mm from the target (right: deeper)" : "mm from the target along the needle (left: outside; right of the target: deeper)", (left + right) / 2, bottom + 32, "center");
   }
 
+  const coarse = facts.surfaces.unit_mm > 1;
   function voxelNote() {
     if (!facts.ct) return "The case has no CT: only the outlines of the structures.";
     if (!ct) return "This browser alters pictures that a page reads, so no CT is shown: only the outlines of the structures. Allow the page to read its canvas, or see slices.png.";
@@ -605,7 +606,8 @@ const slicing = (() => {
   return {
     View, drawUnits, pathFrom, placeText, lengthText, shared, parts, NEAR_MM,
     voxelNote: voxelNote(),
-    surfaceNote: `Outlines: the checked surfaces to ${(0.87 * facts.surfaces.unit_mm).toFixed(2)} mm. Hatched: not on this page.`,
+    surfaceNote: `Outlines: the checked surfaces to ${(0.87 * facts.surfaces.unit_mm).toFixed(2)} mm${coarse ? ", coarser than they were checked, so that they fit this page; slices.png has them as they are" : ""}. Hatched: not on this page.`,
+    coarse,
     halfVoxel: facts.ct ? Math.max(...facts.ct.voxel_mm) / 2 : null,
     setTone(name) { tone = name; },
   };
