@@ -1,6 +1,6 @@
-"""The page's slices: one block of the CT about target and entries, the surfaces in it, and how to draw a needle there.
+"""The page's slices: one block of the CT about target and entries, and how to draw a needle there.
 
-A script of the page (``slices.js``) cuts both in any plane, as `slices.panel` does for ``slices.png``.
+A script of the page (``slices.js``) cuts it and the surfaces in any plane, as `slices.panel` does for ``slices.png``.
 """
 
 from __future__ import annotations
@@ -8,8 +8,7 @@ from __future__ import annotations
 import gzip
 import io
 import itertools
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,10 @@ from PIL import Image
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import css
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.bedside import slice_numbers
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report.page.page_surfaces import LEVEL, Packed, surfaces
 from puncture_twin.twin.report.palette import SKIN
 from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, TONES, stored
 from puncture_twin.twin.report.slices.planes import letters, toward_text
@@ -32,8 +31,8 @@ AROUND_MM = 60.0
 FINE_MM = 1.0
 """Where the CT's own voxels do not fit the page, finer ones become means over this."""
 
-MOST_CT, MOST_TRIANGLES = 1_600_000, 250_000
-"""Bytes of the packed CT, and triangles of the surfaces: in base64 they take 2.1 and at most 0.9 MB of the page."""
+MOST_CT, MOST_TOGETHER = 1_600_000, 2_800_000
+"""Bytes of the packed CT, and of CT and surfaces: in base64 2.1 and 3.7 MB of the page."""
 
 MOST_VOXELS = 30_000_000
 """A browser holds a byte for each; more of them are not tried as they are."""
@@ -53,25 +52,6 @@ JPEG_BLOCK = 8
 SOFT_HU = (-160.0, 240.0)
 """Where the page states the error of a lossy CT."""
 
-LEAST_UNIT_MM = 1 / 16
-"""To which the surfaces' corners are rounded; the unit is doubled until there are no more triangles than that."""
-
-MOST_UNITS = 32_000
-"""A corner's coordinates fit 16 bits."""
-
-COARSE_MM = 32.0
-"""How coarse surfaces beyond the box are, and how far beyond: they are not drawn."""
-
-LEVEL = 6
-"""Of gzip's."""
-
-
-class Packed(NamedTuple):
-    """What the page carries: facts as plain values, and bytes that are unpacked by a script."""
-
-    facts: dict[str, Any]
-    content: bytes
-
 
 def slices_data(
     subject: Subject, candidates: Candidates, picked: int, regions_ct: Floats | None
@@ -86,12 +66,12 @@ def slices_data(
     """
     case, anatomy = subject.case, subject.anatomy
     box = block_box(case.target_ct, candidates)
+    skin = ("skin", "skin", anatomy.skin.mesh)
+    shapes = surfaces([*((one.name, str(one.role), one.mesh) for one in anatomy.checked), skin], case.target_ct, box)
     ct = None
     if anatomy.scan is not None:
         hu, T_ct_index = anatomy.scan.measured
-        ct = ct_block(hu, T_ct_index, box)
-    skin = ("skin", "skin", anatomy.skin.mesh)
-    shapes = surfaces([*((one.name, str(one.role), one.mesh) for one in anatomy.checked), skin], case.target_ct, box)
+        ct = ct_block(hu, T_ct_index, box, min(MOST_CT, MOST_TOGETHER - len(shapes.content)))
     colours = {**subject.colours, "skin": SKIN}
     for one in shapes.facts["parts"]:
         one |= {"colour": css(colours[one["name"]]), "target": one["name"] == case.target_structure}
@@ -247,81 +227,3 @@ def _differences(values: NDArray[np.uint8]) -> bytes:
     wide = np.pad(values, ((1, 0),) * 3).astype(np.int16)
     before = (wide[:-1, 1:, 1:] + wide[1:, :-1, 1:] + wide[1:, 1:, :-1]) // 3
     return (values - before).astype(np.uint8).transpose(2, 1, 0).tobytes()
-
-
-def surfaces(parts: Iterable[tuple[str, str, TriangleMesh]], target_ct: Floats, box_ct: Floats) -> Packed:
-    """Surfaces in a box; corners from the target, in whole units, as differences.
-
-    Corners that round to one are one: so surfaces grow coarser, each of its points by less than 0.87 units, and none
-    of them vanishes but what is smaller than a unit. What lies beyond the box is only kept as far as it tells what is
-    inside of a closed surface; the first triangles of each, ``drawn`` of them, are those that reach the box.
-
-    Args:
-        parts: Name, role and mesh.
-        target_ct: Shape (3,), mm.
-        box_ct: Shape (2, 3), mm.
-    """
-    box = box_ct - target_ct
-    boxed = [
-        (name, role, mesh.closed, *_boxed(mesh.vertices - target_ct, mesh.faces, box)) for name, role, mesh in parts
-    ]
-    farthest = max((float(np.abs(one[3]).max(initial=0.0)) for one in boxed), default=0.0)
-    unit = LEAST_UNIT_MM
-    while farthest / unit > MOST_UNITS:
-        unit *= 2
-    while True:
-        rounded = [_rounded(vertices / unit, faces, drawn) for *_, vertices, faces, drawn in boxed]
-        if sum(len(faces) for _, faces, _ in rounded) <= MOST_TRIANGLES:
-            break
-        unit *= 2
-    found = zip(boxed, rounded, strict=True)
-    kept = [(one, v, f, drawn) for one, (v, f, drawn) in found if drawn or (one[2] and len(f))]
-    corners = [np.diff(v, axis=0, prepend=0).astype("<i2").T.tobytes() for _, v, _, _ in kept]
-    triangles = [np.diff(f.ravel(), prepend=0).astype("<i4").tobytes() for _, _, f, _ in kept]
-    facts = [
-        {"name": one[0], "role": one[1], "closed": one[2], "corners": len(v), "triangles": len(f), "drawn": drawn}
-        for one, v, f, drawn in kept
-    ]
-    content = gzip.compress(b"".join([*corners, *triangles]), LEVEL, mtime=0)
-    return Packed({"unit_mm": unit, "parts": facts}, content)
-
-
-def _boxed(vertices: Floats, faces: NDArray[np.int32], box: Floats) -> tuple[Floats, NDArray[np.int32], int]:
-    """Triangles that reach a box first, and their number; the corners of all others drawn near, and coarse.
-
-    Each of these others lies beyond one face of the box with all of its corners, before and after: what is inside of a
-    closed surface, for a point in the box, stays so.
-    """
-    corner = vertices[faces]
-    reach = ((corner.max(axis=1) >= box[0]) & (corner.min(axis=1) <= box[1])).all(axis=1)
-    exact = np.zeros(len(vertices), bool)
-    exact[faces[reach]] = True
-    coarse = np.clip(np.round(vertices / COARSE_MM) * COARSE_MM, *box)
-    beyond = np.where(vertices > box[1], box[1] + COARSE_MM, np.where(vertices < box[0], box[0] - COARSE_MM, coarse))
-    moved = np.where(exact[:, None], vertices, beyond)
-    return moved, np.concatenate([faces[reach], faces[~reach]]), int(reach.sum())
-
-
-def _rounded(
-    vertices: Floats, faces: NDArray[np.int32], drawn: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Whole corners, each once and in the order of first use; the triangles left of these, and of those to be drawn.
-
-    Of the others two in one place cancel out.
-    """
-    used, index = np.unique(faces, return_inverse=True)
-    whole = np.round(vertices[used]).astype(np.int64)
-    key = ((whole + MOST_UNITS) << np.array([32, 16, 0])).sum(axis=1)  # one number a corner: 16 bits an axis
-    _, same = np.unique(key, return_inverse=True)
-    found = same[index.reshape(-1, 3)]
-    apart = (found != np.roll(found, 1, axis=1)).all(axis=1)
-    near, others = found[:drawn][apart[:drawn]], found[drawn:][apart[drawn:]]
-    _, one, count = np.unique(np.sort(others, axis=1), axis=0, return_index=True, return_counts=True)
-    left = np.concatenate([near, others[np.sort(one[count % 2 == 1])]])
-    used, first = np.unique(left, return_index=True)
-    order = np.argsort(first)
-    place = np.zeros(len(whole), np.int64)
-    place[used[order]] = np.arange(len(order))
-    corner = np.zeros((len(whole), 3), np.int64)
-    corner[same] = whole
-    return corner[used[order]], place[left], len(near)

@@ -78,11 +78,15 @@ const slicing = (() => {
 
   // ---- the surfaces ------------------------------------------------------------------------------------------
   const parts = (() => {
-    const unit = facts.surfaces.unit_mm, found = [];
+    const unit = facts.surfaces.unit_mm, bytes = new Uint8Array(data.surfaces), found = [];
     let at = 0;
+    const planes = (count, width) => { // the lowest byte of all, then the next of all
+      const values = new Int32Array(count);
+      for (let shift = 0; shift < 8 * width; shift += 8) for (let i = 0; i < count; i++) values[i] |= bytes[at++] << shift;
+      return values;
+    };
     for (const part of facts.surfaces.parts) {
-      const steps = new Int16Array(data.surfaces.slice(at, at + 6 * part.corners)), n = part.corners;
-      at += 6 * n;
+      const n = part.corners, steps = planes(3 * n, 2);
       const corner = new Float32Array(3 * n), low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
       for (let axis = 0; axis < 3; axis++)
         for (let v = 0, whole = 0; v < n; v++) {
@@ -94,10 +98,8 @@ const slicing = (() => {
       found.push({ ...part, corner, low, high, height: new Float32Array(n) });
     }
     for (const part of found) {
-      const steps = new Int32Array(data.surfaces.slice(at, at + 12 * part.triangles));
-      at += 12 * part.triangles;
-      part.faces = new Int32Array(steps.length);
-      for (let i = 0, corner = 0; i < steps.length; i++) part.faces[i] = corner += steps[i];
+      let newest = 0;
+      part.faces = planes(3 * part.triangles, 3).map((below) => below ? newest - below : newest++);
     }
     return found;
   })();
@@ -593,7 +595,7 @@ const slicing = (() => {
     write(narrow ? "mm from the target (right: deeper)" : "mm from the target along the needle (left: outside; right of the target: deeper)", (left + right) / 2, bottom + 32, "center");
   }
 
-  const coarse = facts.surfaces.unit_mm > 1;
+  const coarse = facts.surfaces.off_mm > 0.5;
   function voxelNote() {
     if (!facts.ct) return "The case has no CT: only the outlines of the structures.";
     if (!ct) return "This browser alters pictures that a page reads, so no CT is shown: only the outlines of the structures. Allow the page to read its canvas, or see slices.png.";
@@ -606,7 +608,7 @@ const slicing = (() => {
   return {
     View, drawUnits, pathFrom, placeText, lengthText, shared, parts, NEAR_MM,
     voxelNote: voxelNote(),
-    surfaceNote: `Outlines: the checked surfaces to ${(0.87 * facts.surfaces.unit_mm).toFixed(2)} mm${coarse ? ", coarser than they were checked, so that they fit this page; slices.png has them as they are" : ""}. Hatched: not on this page.`,
+    surfaceNote: `Outlines: the checked surfaces to ${facts.surfaces.off_mm.toFixed(2)} mm${coarse ? ", coarser than they were checked, so that they fit this page; slices.png has them as they are" : ""}. Hatched: not on this page.`,
     coarse,
     halfVoxel: facts.ct ? Math.max(...facts.ct.voxel_mm) / 2 : null,
     setTone(name) { tone = name; },
