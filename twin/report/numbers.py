@@ -95,14 +95,19 @@ def carried_mm(scan: Any | None) -> tuple[int, str]:
     return (1, f" ± {half:.1f}") if half < 1.0 else (0, f" ± {math.ceil(half)}")
 
 
+def length_text(mm: float, scan: Any | None) -> str:
+    """A length in the digits that the CT carries, as "93 ± 3 mm"."""
+    digits, told = carried_mm(scan)
+    return number(mm, digits, f"{told} mm".strip())
+
+
 def nearest_text(candidates: Candidates, row: int, scan: Any | None = None) -> str:
     """The nearest structure and its clearance, in digits that the CT carries, or that the needle crosses it."""
     name, clearance = nearest_structure(candidates, row)
-    digits, told = carried_mm(scan)
     if not name:
         return "no structure has a margin"
     spoken = name.replace("_", " ")
-    return f"crosses {spoken}" if clearance < 0 else f"nearest: {spoken}, {clearance:.{digits}f}{told} mm"
+    return f"crosses {spoken}" if clearance < 0 else f"nearest: {spoken}, {length_text(clearance, scan)}"
 
 
 def needle_text(case: Any) -> str:

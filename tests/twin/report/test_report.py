@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import report_world as world
 import trimesh
+from matplotlib.text import Text
 from PIL import Image, ImageDraw
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -26,10 +27,10 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.mounts import ring_weights
 from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report import annotate, patient as patient_blocks
-from puncture_twin.twin.report.map.map_picture import DISC, draw_map
+from puncture_twin.twin.report.map.map_picture import DISC, draw_map, map_figure
 from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
-from puncture_twin.twin.report.numbers import nearest_text, reason_counts
+from puncture_twin.twin.report.numbers import length_text, nearest_text, reason_counts
 from puncture_twin.twin.report.page import page_scene
 from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.page.page_map import map_data
@@ -861,3 +862,7 @@ def test_lengths_have_the_digits_of_the_voxels():
         column = list(table.head).index(head)
         assert table.rows[0][column] == clearance
         assert nearest_text(candidates, 0, scan).startswith(f"nearest: rib right 9, {clearance}")
+        drawn = " ".join(text.get_text() for text in map_figure(candidates, world.make_case(), scan=scan).findobj(Text))
+        path = length_text(float(candidates.path.length[candidates.best.row]), scan)
+        told = head.removeprefix("clearance").removesuffix(", mm")
+        assert f"path in the body {path}, " in drawn and path.endswith(f"{told} mm")

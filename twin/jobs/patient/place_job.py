@@ -201,7 +201,8 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: f
 
         with stages.time("map"):
             reached = ranked(case, with_answers(case, candidates, best.answers))
-            draw_map(reached, replace(case, name=f"{case.name}, arm at the best place"), out / "map_best_place.png")
+            shown = replace(case, name=f"{case.name}, arm at the best place")
+            draw_map(reached, shown, out / "map_best_place.png", scan=context.anatomy.scan)
             files.append(out / "map_best_place.png")
     return PlaceRun(context, found, document, tuple(files))
 

@@ -28,9 +28,9 @@ from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.map_view import step_of
 from puncture_twin.twin.report.numbers import (
     TRUTH_IS_BELIEF,
-    carried_mm,
     demanding,
     expected_text,
+    length_text,
     nearest_text,
     needle_text,
     reason_counts,
@@ -267,8 +267,7 @@ def _location(case: Any) -> str:
 
 
 def _direction_card(candidates: Candidates, row: int, scan: Any | None, *, best: bool) -> Card:
-    digits, told = carried_mm(scan)
-    path = number(float(candidates.path.length[row]), digits, f"{told} mm".strip())
+    path = length_text(float(candidates.path.length[row]), scan)
     detail = f"{path} in the body; {nearest_text(candidates, row, scan)}"
     return Card("best direction" if best else "chosen direction", _angles(candidates, row), detail)
 
