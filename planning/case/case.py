@@ -153,8 +153,17 @@ class Case(Shown):
                 and replaces an earlier ``add_mm``.
 
         Raises:
-            InputError: A kind of option, a key or a value that the file could not have, or a file that has changed.
+            InputError: A kind of option, a key or a value that the file could not have, a table without any, or a
+                file that has changed.
         """
+        for kind, values in options.items():
+            if isinstance(values, Mapping) and not values:
+                refuse(
+                    f"option '{kind}' has no keys, and changes nothing",
+                    "replace",
+                    "keys and values, as in the case",
+                    "empty",
+                )
         if target_ct is not None:
             point = guard_points([target_ct], (self.target_name,), where="replace: target_ct")
             options = {**options, "target": {"position_mm": to_lps(point, self.space)[0]}}

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import report_world as world
 import trimesh
+from matplotlib.text import Text
 from PIL import Image, ImageDraw
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -25,11 +26,11 @@ from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.mounts import ring_weights
 from puncture_twin.planning.search.candidates import Pick
-from puncture_twin.twin.report import annotate
-from puncture_twin.twin.report.map.map_picture import DISC, draw_map
+from puncture_twin.twin.report import annotate, patient as patient_blocks
+from puncture_twin.twin.report.map.map_picture import DISC, draw_map, map_figure
 from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
-from puncture_twin.twin.report.numbers import reason_counts
+from puncture_twin.twin.report.numbers import length_text, nearest_text, reason_counts
 from puncture_twin.twin.report.page import page_scene
 from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.page.page_map import map_data
@@ -848,3 +849,22 @@ def test_what_holds_the_target_is_see_through_whatever_its_role(anatomy, case, r
     body = SimpleNamespace(structures=structures, surroundings=(), skin=anatomy.skin)
     alpha = {one.name: one.alpha for one in patient(body, case)}
     assert alpha["holder"] < 0.5 and alpha["beside"] == 1.0
+
+
+def test_lengths_have_the_digits_of_the_voxels():
+    """Half the longest side of a voxel as ±; of 2 mm and more no tenths; meshes alone have tenths."""
+    candidates = world.make_candidates(world.make_case())
+    for spacing, head, clearance in (
+        ((0.7, 0.7, 0.9), "clearance ± 0.5, mm", "5.0"),
+        ((0.8, 0.8, 5.0), "clearance ± 3, mm", "5"),
+        (None, "clearance, mm", "5.0"),
+    ):
+        scan = spacing and SimpleNamespace(grid=SimpleNamespace(T_ct_index=np.diag([*spacing, 1.0])))
+        table = patient_blocks.windows(candidates, scan)[0]
+        column = list(table.head).index(head)
+        assert table.rows[0][column] == clearance
+        assert nearest_text(candidates, 0, scan).startswith(f"nearest: rib right 9, {clearance}")
+        drawn = " ".join(text.get_text() for text in map_figure(candidates, world.make_case(), scan=scan).findobj(Text))
+        path = length_text(float(candidates.path.length[candidates.best.row]), scan)
+        told = head.removeprefix("clearance").removesuffix(", mm")
+        assert f"path in the body {path}, " in drawn and path.endswith(f"{told} mm")

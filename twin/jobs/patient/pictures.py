@@ -49,7 +49,7 @@ def draw_pictures(run: Run, out: Path) -> Drawn:
     case, anatomy, stages = context.case, context.anatomy, context.stages
     with stages.time("map"):
         raster = map_raster(found, map_view(case, found))
-        draw_map(found, case, out / "map.png", run.pick, raster)
+        draw_map(found, case, out / "map.png", run.pick, raster, anatomy.scan)
     with stages.time("scene"):
         T_base_ct = _checked_base(run)
         draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick, T_base_ct, failed=bool(run.refusal))

@@ -129,7 +129,11 @@ def refuse_none(found: PlaceSearch) -> None:
     """Refuse a search in which no placement reaches a direction: its best is none."""
     if not any(one.verdict.reached for one in found.rated):
         what = f"the arm reaches no organ-safe direction from any placement ({plural(found.checked[0], 'check')})"
-        what += "" if found.complete else ", as far as was searched; --full searches to the end"
+        what += (
+            ""
+            if found.complete
+            else ", as far as was searched; to search to the end: --full, or quick_s=None in Python"
+        )
         raise NoAnswerError(what, code="no_placement")
 
 
@@ -189,7 +193,8 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: f
 
         with stages.time("map"):
             reached = ranked(case, with_answers(case, candidates, best.answers))
-            draw_map(reached, replace(case, name=f"{case.name}, arm at the best place"), out / "map_best_place.png")
+            shown = replace(case, name=f"{case.name}, arm at the best place")
+            draw_map(reached, shown, out / "map_best_place.png", scan=context.anatomy.scan)
             files.append(out / "map_best_place.png")
     return PlaceRun(context, found, document, tuple(files))
 

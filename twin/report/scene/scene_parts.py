@@ -174,6 +174,7 @@ class SceneBody:
         group: "organ", "skin", "safe", "needle", "arm", "room" or "target".
         mesh: CT frame, mm.
         alpha: 1 for opaque; less for see-through.
+        frame: Of an arm's link: with which of ``link_poses`` it moves.
     """
 
     name: str
@@ -182,6 +183,7 @@ class SceneBody:
     colour: Rgb
     alpha: float = 1.0
     solid: bool = False
+    frame: int = 0
 
     @property
     def surface(self) -> Surface:
@@ -282,12 +284,16 @@ def chosen_direction(pick: Pick | None, plan: Any | None) -> Floats | None:
 
 def arm_bodies(case: Any, plan: Any | None, pick: Pick | None, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
     """The arm with the needle on the target: as it is planned, else as the search reaches it; nothing where unknown."""
+    q, base = joints_on_target(plan, pick), T_base_ct if plan is None else plan.T_base_ct
+    return () if q is None or base is None else ArmPicture(case.robot.model, base, case.tool).bodies(q)
+
+
+def joints_on_target(plan: Any | None, pick: Pick | None) -> Floats | None:
+    """Joints (6,), rad, with the needle on the target: of the plan, else of the pick; None where it is not reached."""
     if plan is not None:
-        return ArmPicture(plan.model, plan.T_base_ct, case.tool).bodies(plan.insertion.q[-1])
+        return np.asarray(plan.insertion.q[-1])
     q = None if pick is None else pick.candidates.arm.q_insertion[pick.row]
-    if q is None or T_base_ct is None or not np.isfinite(q).all():
-        return ()
-    return ArmPicture(case.robot.model, T_base_ct, case.tool).bodies(q)
+    return q if q is not None and np.isfinite(q).all() else None
 
 
 def needle_text(needle: Any) -> str:
@@ -337,6 +343,7 @@ class ArmPicture:
                 link.mesh.transformed(T),
                 palette.HOLDER if link.name == "tool" else palette.ARM,
                 solid=self._is_solid(link),
+                frame=link.frame,
             )
             for link, T in zip(self._links, poses, strict=True)
         )

@@ -230,7 +230,7 @@ def leaning(subject: Subject, plane: Plane) -> str:
         return ""
     lean = float(subject.outward_ct @ plane.normal)
     if abs(lean) <= IN_PLANE:
-        return "Holds the needle."
+        return "The needle lies in this plane."
     side = toward_text(subject.case.space, np.sign(lean) * plane.normal)
     return f"The skin entry is {abs(lean) * subject.path_mm:.0f} mm from it, {side}."
 
