@@ -278,7 +278,10 @@ def rehearse(
     ] = None,
     physics: Annotated[int, typer.Option("--physics", min=0, max=MOST_SEEDS, help="Trials run in the simulator.")] = 0,
     guidance: Annotated[
-        str | None, typer.Option("--guidance", metavar="WAY", help="What leads the needle in the trials: ct, us, ...")
+        str | None,
+        typer.Option(
+            "--guidance", metavar="WAY", help="What leads the needle in the trials: ct, us, ...; a list compares."
+        ),
     ] = None,
     sweep: Annotated[bool, typer.Option("--sweep", help="Rotate the needle about the target, outside.")] = False,
     to: Annotated[
@@ -289,11 +292,14 @@ def rehearse(
 ) -> None:
     """Execute a plan in the twin; report where the tip ended. The ground truth differs from the belief."""
     require_extra("twin", "rehearse")
+    from puncture_twin.planning.budget.guidance import ways_of
     from puncture_twin.twin.jobs.experiment.sweep_job import sweep_case, sweep_end, sweep_text
     from puncture_twin.twin.jobs.patient import main_job
     from puncture_twin.twin.jobs.patient.run import room_count
 
-    rooms, folder = room_count(seeds, physics, guidance), out_folder(out_dir, source, "rehearse")
+    ways = () if guidance is None else ways_of(guidance)
+    rooms = room_count(seeds, physics, ways[0] if ways else None)
+    folder = out_folder(out_dir, source, "rehearse")
     if sweep or to is not None:
         end = sweep_end(source, to, sweep=sweep, alone=rooms is None and case is None)
         with prepared(source) as context:
@@ -301,6 +307,12 @@ def rehearse(
         finish("rehearse --sweep", swept, swept.summary(), sweep_text(swept), as_json)
         return
     with prepared(main_job.rehearsed_case(source, case, choice)) as context:
+        if rooms is not None and len(ways) > 1:
+            from puncture_twin.twin.jobs.patient.ways_job import ways_job
+
+            compared = ways_job(context, source, folder, ways, rooms.rooms, choice)
+            finish("rehearse --guidance A,B", compared, compared.summary(), compared.text(), as_json)
+            return
         if main_job.is_plan(source):
             run = main_job.rehearse_plan(context, source, folder, rooms)
         else:

@@ -18,13 +18,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 
 from benchmarks.shared import REPOSITORY
 from puncture_twin import api as pt
 from puncture_twin.meshes import folder
-from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.budget.guidance import sight_of
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Motion, Stereo, Ultrasound
@@ -35,10 +32,12 @@ from puncture_twin.planning.uncertainty.chance_model import chance_model
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import pose_error
+from puncture_twin.twin.jobs.patient.ways_job import COLOURS, rated
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
+from puncture_twin.twin.report.error_pictures import draw_clouds
 
-HIT_MM, SHOWN_MM = 2.0, 4.0
-"""Radius of a hit, and half the side of a picture's panel."""
+HIT_MM = 2.0
+"""Radius of a hit."""
 
 DIRECTION_DEG = (64.0, 98.0)
 RADII_MM = np.geomspace(0.25, 4.0, 9)
@@ -108,26 +107,6 @@ def rows(context: CaseContext, plan: Plan, rooms: int, seed: int = 7) -> Iterato
             yield Row(name, way, rehearse_trials(there, plan.outward_ct, q, rooms, seed, way, sight))
 
 
-def draw(shown: dict[str, Distribution], outward_ct: Floats, path: Path) -> None:
-    """The error clouds of the ways in the needle's axes, each with its predicted 95 % ellipse, and the hit's circle."""
-    across = np.array([0.0, 0.0, 1.0]) - outward_ct[2] * outward_ct
-    R = np.stack([across / np.linalg.norm(across), outward_ct], axis=1)
-    figure = Figure(figsize=(11, 6.2), layout="constrained")
-    for axis, (way, found) in zip(figure.subplots(2, 4, sharex=True, sharey=True).flat, shown.items(), strict=True):
-        axis.scatter(*(found.error_ct @ R).T, s=5, color="#0072B2", alpha=0.5, linewidths=0)
-        values, axes = np.linalg.eigh(R.T @ found.cov_ct @ R)
-        width, height = 2.0 * np.sqrt(5.991 * values)  # chi-squared of two degrees, 95 %
-        lean = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
-        axis.add_patch(Ellipse((0, 0), width, height, angle=lean, fill=False, edgecolor="#D55E00", linewidth=1.6))
-        axis.add_patch(Ellipse((0, 0), 2 * HIT_MM, 2 * HIT_MM, fill=False, edgecolor="#666666", linestyle=":"))
-        axis.set(xlim=(-SHOWN_MM, SHOWN_MM), ylim=(-SHOWN_MM, SHOWN_MM), aspect="equal")
-        hits = f"{100 * found.hit.mean():.1f} % within {HIT_MM:g} mm"
-        axis.set_title(f"{way}: {found.realised_rms_mm:.2f} mm rms\n{hits}", fontsize=10)
-    figure.supxlabel("across the needle, toward the head, mm")
-    figure.supylabel("out along the needle, mm")
-    figure.savefig(path, dpi=110)
-
-
 def main() -> None:
     """Rehearse, print, draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -155,7 +134,8 @@ def main() -> None:
         print(f"{way:10s} {', '.join(f'{name} {100 * part:.0f} %' for name, part in parts if part >= 0.05)}")
         for lost in found.hidden:
             print(f"{'':10s} {lost}")
-    draw(shown, plan.outward_ct, options.picture)
+    drawn = [(one.found, one.rating, COLOURS[one.rating]) for one in rated(list(shown.values()))]
+    draw_clouds(drawn, plan.outward_ct, options.picture, HIT_MM)
 
 
 if __name__ == "__main__":

@@ -76,6 +76,20 @@ def check_way(way: str) -> None:
         refuse(f"guidance '{way}' is not known", "--guidance", ", ".join(WAYS), "unknown_guidance")
 
 
+def ways_of(text: str) -> tuple[str, ...]:
+    """Ways of guidance in a list with commas between them.
+
+    Raises:
+        InputError: One that there is not, or the same twice.
+    """
+    ways = tuple(part.strip() for part in text.split(","))
+    for row, way in enumerate(ways):
+        check_way(way)
+        if way in ways[:row]:
+            refuse(f"guidance '{way}' is listed twice", "--guidance", "each way once", "stated_twice")
+    return ways
+
+
 def check_devices(case: Case, way: str) -> None:
     """Refuse a way whose devices a case does not declare.
 
@@ -136,13 +150,13 @@ class Sight:
 FEW_MARKERS = f"fewer than {MIN_MARKERS} markers are seen"
 
 
-def sight_of(context: CaseContext, plan: Plan, way: str) -> Sight:
-    """What those devices of a way that the case declares see during a plan's insertion.
+def sight_of(context: CaseContext, plan: Plan, *ways: str) -> Sight:
+    """What those devices of some ways that the case declares see during a plan's insertion.
 
     Raises:
         InputError: The case states a place for them that cannot be used.
     """
-    used, cameras, probe, lost = WAYS[way], None, None, ""
+    used, cameras, probe, lost = frozenset[str]().union(*(WAYS[way] for way in ways)), None, None, ""
     if "cameras" in used and context.case.stereo is not None:
         try:
             cameras = camera_view(context, plan)

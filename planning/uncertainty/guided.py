@@ -253,6 +253,17 @@ class GuidedModel:
             found.append(Reading(name, name, number, _sum(rows, own)))
         return found
 
+    def looks_of(self, way: str) -> dict[str, int]:
+        """How often a way reads each kind of device: touches, pairs of camera pictures, ultrasound pictures."""
+        taken = {
+            (one.device if one.device in ("touch", CAMERAS) else "picture", one.look)
+            for one in self.readings
+            if one.device in WAYS[way]
+        }  # target and tip are read in one picture
+        kinds = [kind for kind, _ in taken]
+        return {"touches": len(self.markers) * kinds.count("touch"), "camera_pairs": kinds.count(CAMERAS),
+                "pictures": kinds.count("picture")}  # fmt: skip
+
     @cached_property
     def end(self) -> Rows:
         """The needle after the last correction, 6 rows."""

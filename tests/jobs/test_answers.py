@@ -44,6 +44,7 @@ CASES = {
     "demo": (SimpleNamespace(failures=()), SimpleNamespace(failures=("missed",))),
     "rehearse": (SimpleNamespace(failures=()), SimpleNamespace(failures=("missed",))),
     "rehearse --sweep": (SimpleNamespace(whole=True), SimpleNamespace(whole=False)),
+    "rehearse --guidance A,B": (SimpleNamespace(passed=True), SimpleNamespace(passed=False)),
     "search": tuple(
         SimpleNamespace(candidates=SimpleNamespace(safe=np.array(safe))) for safe in ([False, True], [False])
     ),

@@ -77,6 +77,10 @@ RULES: Mapping[str, Rule] = MappingProxyType(
         "plan": Rule("nothing is safe, the named direction is rejected, or no approach to it was found"),
         "rehearse": Rule(f"there is no plan; {REHEARSED}", _unless(lambda run: not run.failures)),
         "rehearse --sweep": Rule("the sweep stops before its end", _unless(lambda run: run.whole)),
+        "rehearse --guidance A,B": Rule(
+            "by none of the ways the trials keep to what `search.min_hit`, `max_touch`, `max_touch_of` allow",
+            _unless(lambda found: found.passed),
+        ),
         "touch": Rule("too few markers were touched for a registration", _unless(lambda run: run.suffices)),
         "pivot": Rule("the touches contradict each other", _unless(lambda found: not found.pivot.large)),
         "place": Rule("no direction is safe for the organs, or no placement reaches one"),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -93,6 +94,7 @@ class Distribution:
         guidance: The way of guidance that led the needle, None where none was asked for.
         stopped: Further trials, whose correction would have left the corridor.
         hidden: What was out of sight, a sentence each.
+        looks: How often the way reads each kind of device.
     """
 
     seed: int
@@ -114,6 +116,7 @@ class Distribution:
     guidance: str | None = None
     stopped: int = 0
     hidden: tuple[str, ...] = ()
+    looks: Mapping[str, int] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.trials.tip_ct)
@@ -166,7 +169,8 @@ class Distribution:
         }
 
     def _guided(self) -> dict[str, Any]:
-        return {"guidance": self.guidance, "stopped": self.stopped, "lost_sight": list(self.hidden)}
+        seen = {"lost_sight": list(self.hidden), "looks": dict(self.looks)}
+        return {"guidance": self.guidance, "stopped": self.stopped, **seen}
 
 
 def _fraction(trials: Bools) -> float | None:
@@ -317,9 +321,8 @@ def _measured(
     way = guided[0]
     said = not_modelled(case, counted=(*counted, "breathing", *(() if case.motion is None else ("motion",))))
     stops = len(went) - unreached - int(went.sum())
-    return replace(
-        distribution, guidance=way.name, stopped=stops, hidden=lost_sight(way.model, way.name), not_modelled=said
-    )
+    hidden, looks = lost_sight(way.model, way.name), way.model.looks_of(way.name)
+    return replace(distribution, guidance=way.name, stopped=stops, hidden=hidden, looks=looks, not_modelled=said)
 
 
 def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel, way: Way | None) -> Floats:

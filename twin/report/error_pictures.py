@@ -6,7 +6,7 @@ far tip and needle were from target and structures over time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from scipy.special import chdtri
 
 from puncture_twin.planning.base.arrays import Floats
@@ -170,7 +171,7 @@ def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int,
     ring = vectors @ (np.sqrt(chdtri(3, 1 - REGION) * np.maximum(values, 0))[:, None] * [np.cos(turns), np.sin(turns)])
     axes.plot(*ring, color=PREDICTED, lw=1.6, label="predicted 95 % ellipsoid")
     axes.plot([0], [0], marker="+", color=PREDICTED, ms=11, mew=1.6, ls="none", label="true target")
-    reach = (1 + CROWDED) * max(float(np.abs(ring).max()), float(np.abs(error[:, list(pair)]).max()) / (1 + CROWDED))
+    reach = max((1 + CROWDED) * float(np.abs(ring).max()), float(np.abs(error[:, list(pair)]).max(initial=0.0)))
     axes.set_xlim(-reach, reach)
     axes.set_ylim(-reach, reach)
     axes.set_aspect("equal")
@@ -178,6 +179,44 @@ def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int,
     axes.set_ylabel(names[1])
     axes.grid(visible=True, color="0.9")
     axes.set_axisbelow(True)
+
+
+PANEL_INCHES = (3.0, 3.5)
+
+
+def draw_clouds(
+    ways: Sequence[tuple[Any, str, str]], outward_ct: Floats, path: Path, hit_mm: float | None = None
+) -> None:
+    """Error clouds of ways of guidance, all to one scale, in the plane of the needle where they are widest.
+
+    Args:
+        ways: The trials of each, a word beside its name, and its colour.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        path: The PNG to write; it appears whole or not at all.
+        hit_mm: Radius of a hit, drawn as a ring.
+    """
+    R, reach = needle_frame(outward_ct), 0.0
+    widest = np.sum([R[:2] @ found.cov_ct @ R[:2].T for found, _, _ in ways], axis=0)
+    R[:2] = np.linalg.eigh(widest)[1].T[::-1] @ R[:2]
+    columns = 2 if len(ways) <= 4 else 4  # two can still be read on a telephone
+    rows = -(-len(ways) // columns)
+    size = (PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows)
+    figure = Figure(figsize=size, dpi=DPI, facecolor="white", layout="compressed")
+    panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
+    for axes, (found, word, colour) in zip(panels, ways, strict=False):
+        _cloud(axes, found.error_ct @ R.T, R @ found.cov_ct @ R.T, found.in_region, (0, 2), ("", ""))
+        reach = max(reach, axes.get_xlim()[1])
+        if hit_mm is not None:
+            axes.add_patch(Circle((0, 0), hit_mm, fill=False, linestyle=":", edgecolor="0.3"))
+        said = f"{found.realised_rms_mm:.2f} mm rms, {100 * found.hit.mean():.1f} % hit" if len(found) else "none ended"
+        axes.set_title(f"{found.guidance}: {word}\n{said}", fontsize=10, color=colour)
+        axes.spines[:].set(color=colour, linewidth=2.0)
+    panels[0].set(xlim=(-reach, reach), ylim=(reach, -reach))
+    for axes in panels[len(ways) :]:
+        axes.remove()
+    figure.supxlabel("across the needle, where errors are widest, mm", fontsize=10)
+    figure.supylabel("depth, mm (down: too deep)", fontsize=10)
+    write_png(figure, path)
 
 
 def _histogram(axes: Axes, found: Any) -> None:

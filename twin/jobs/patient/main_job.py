@@ -25,7 +25,7 @@ from puncture_twin.planning.budget.guidance import check_ways, with_ways
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_document import MAX_PLAN_BYTES, parse_plan, write_plan
-from puncture_twin.planning.search.candidates import Pick
+from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.choice import BEST, Choice, choose_stated, with_file_read
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
@@ -221,16 +221,11 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     Raises:
         InputError: A plan that does not belong to the case or does not hold any more.
     """
-    from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
     check_rooms(context.case, rooms)
-    source, plan = read_noted_plan(plan_path, context.watcher.note)
-    with context.stages.time("plan"):
-        candidates = check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed)
-        check_ways(context, plan, plan_path)
-    plan = with_case_arm(plan, context.case)
+    source, plan, candidates = checked_plan(context, plan_path)
     with _writing(out, "rehearse", context, ("rehearsal.json", FILM, ROOMS), source) as draft:
         run = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), rooms, partial).ended(draft.folder)
         if not draft.source_has("scene.png"):
@@ -238,6 +233,21 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
                 draw_scene(context.case, context.anatomy, candidates, plan, draft.folder / "scene.png")
             run = run.with_files(draft.folder / "scene.png")
     return _final(run, draft)
+
+
+def checked_plan(context: CaseContext, path: Path) -> tuple[Input, Plan, Candidates]:
+    """A plan as its case moves the arm, where it comes from, and its direction, checked again.
+
+    Raises:
+        InputError: It does not belong to the case or does not hold any more.
+    """
+    from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
+
+    source, plan = read_noted_plan(path, context.watcher.note)
+    with context.stages.time("plan"):
+        candidates = check_plan(plan, context, path, seed=context.case.rehearsal.seed)
+        check_ways(context, plan, path)
+    return source, with_case_arm(plan, context.case), candidates
 
 
 def read_noted_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Plan]:
