@@ -21,6 +21,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import apply, inverse, pose
 from puncture_twin.planning.sight.probe import (
     ASIDE,
+    BASES_APART_MM,
     CLEARANCE_MM,
     HANDLE_MM,
     HEAD_MM,
@@ -81,6 +82,8 @@ def test_what_is_too_deep_or_too_tilted_is_ruled_out(body):
     assert 0 < deep.sum() < len(deep) and (leans & ~deep).any() and (~leans & ~deep).any()
     np.testing.assert_array_equal(ruled_by(feet, Ruled.TOO_DEEP)[clear], deep[clear])
     np.testing.assert_array_equal(ruled_by(feet, Ruled.TILTED)[clear], (leans & ~deep)[clear])
+    nearest_first = feet.depth[feet.left]
+    assert (np.diff(nearest_first.round(6)) >= 0.0).all() and np.ptp(nearest_first) > 5.0
 
 
 def test_where_the_image_cuts_the_body_there_is_no_skin(box):
@@ -264,6 +267,20 @@ def test_an_obstacle_in_the_way_of_the_probes_arm_is_not_touched(stated, view):
     other = probe_view(replace(context, anatomy=anatomy), plan)
     assert other.counts["probe_arm_collision"] > view.counts.get("probe_arm_collision", 0)
     assert other.T_ct_image is None or np.abs(other.T_ct_image - view.T_ct_image).max() > 1.0
+
+
+def test_an_assumed_place_that_is_taken_is_left_for_another(abdomen, view):
+    """Where something is about the base that was found, the arm is assumed elsewhere; never next to the needle's."""
+    context, plan = abdomen
+    base = inverse(view.T_base_ct)[:3, 3]
+    pillar = replace(context.anatomy.surroundings[-1], mesh=box(pose(np.eye(3), base), (80.0, 80.0, 80.0)))
+    anatomy = replace(context.anatomy, surroundings=(*context.anatomy.surroundings, pillar))
+    other = probe_view(replace(context, anatomy=anatomy), plan)
+    assert other.T_base_ct is None or np.abs(inverse(other.T_base_ct)[:3, 3] - base).max() > 40.0
+    for one in (view, other):
+        if one.T_base_ct is not None:
+            apart = inverse(one.T_base_ct)[:3, 3] - inverse(plan.T_base_ct)[:3, 3]
+            assert np.linalg.norm(apart) >= BASES_APART_MM
 
 
 def test_what_cannot_be_asked_is_refused(stated, abdomen):
