@@ -6,7 +6,8 @@ moves by more than |c|, so that every needle with
 
     |c| <= min_j slack_j
 
-keeps every margin in the anatomy as the CT shows it. What would go farther is not executed.
+keeps every margin in the anatomy as the CT shows it. What would go farther is not executed: the needle is stopped, and
+does not hit.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.settings import stereo_of, ultrasound_of
+from puncture_twin.planning.case.tables import StereoSection, UltrasoundSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.reach.standoff import case_axis_lengths, case_paths, standoffs
@@ -72,18 +75,30 @@ def check_way(way: str) -> None:
         refuse(f"guidance '{way}' is not known", "--guidance", ", ".join(WAYS), "unknown_guidance")
 
 
-def check_devices(case: Case, way: str) -> None:
-    """Refuse a way whose devices a case does not declare.
+def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
+    """A case with all devices of a way: undeclared ones have the reference's defaults, and a sentence each.
 
-    Raises:
-        InputError: Naming their tables.
+    Balls that do not fit on the needle are assumed at half of its shaft and at its hub.
     """
-    needed = dict.fromkeys(table for device, table in _DEVICES.items() if device in WAYS[way])
-    lacking = [f"[{table}]" for table in needed if getattr(case, table) is None]
-    if lacking:
-        what = f"guidance '{way}' needs {' and '.join(lacking)}, which the case does not declare"
-        allowed = f"{', '.join(lacking)} in the case, or {', '.join(declared_ways(case))}"
-        refuse(what, case.path, allowed, "no_device")
+    needed, said = {_DEVICES[device] for device in WAYS[way] if device in _DEVICES}, []
+    if "stereo" in needed and case.stereo is None:
+        cameras = stereo_of(StereoSection(), case.space, case.path)
+        assert cameras is not None
+        short, shaft_mm = cameras.balls_mm[-1] >= case.needle.length_mm, case.needle.shaft_mm
+        cameras = replace(cameras, balls_mm=(shaft_mm / 2.0, shaft_mm)) if short else cameras
+        where = " and ".join(f"{mm:g}" for mm in cameras.balls_mm)
+        why = f" (half of the shaft and the hub: the needle is {case.needle.length_mm:g} mm long)" if short else ""
+        said.append(f"[stereo] balls {where} mm behind the tip{why}, seen to {cameras.sd_mm:g} mm")
+        case = replace(case, stereo=cameras)
+    if "ultrasound" in needed and case.ultrasound is None:
+        probe = ultrasound_of(UltrasoundSection(), case.space, case.path)
+        assert probe is not None
+        target, tip = (
+            "{:g} mm in the picture and {:g} mm across".format(*sd) for sd in (probe.target_sd_mm, probe.tip_sd_mm)
+        )
+        said.append(f"[ultrasound] target read to {target}, tip to {tip}, calibrated to {probe.calibration_sd_mm:g} mm")
+        case = replace(case, ultrasound=probe)
+    return case, tuple(f"assumed: {one}" for one in said)
 
 
 def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
@@ -170,9 +185,9 @@ def guided_model(
         sight: What the devices see of it; None hides nothing, and has the picture along the body.
     """
     R, breathing = registration.T_base_ct[:3, :3], case.breathing
-    breath, skin_weight = np.zeros(3), 0.0
+    breath, skin_weight = np.zeros((3, 2)), 0.0
     if breathing is not None:
-        breath, skin_weight = breathing.rms_ct, moving_weights(case, breathing, anatomy).skin
+        breath, skin_weight = breathing.spread_ct, moving_weights(case, breathing, anatomy).skin
     motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
     return GuidedModel(
         error=error,
@@ -237,16 +252,17 @@ def way_chances(
     error = as_rehearsed(chance.error, touches(case, registration.markers))
     error = replace(error, bend=None if path is None else path.bend)
     model = guided_model(case, context.anatomy, error, registration, outward_ct, q, sight)
-    found = []
+    corridor, found = corridor_mm(case, chance, outward_ct), []
     for way in ways:
         lost = "; ".join(lost_sight(model, way))
         try:
             left = guided_error(model, way)
         except NoAnswerError as refused:
-            found.append(WayChance(way, np.nan, np.nan, lost or str(refused)))
+            found.append(WayChance(way, np.nan, np.nan, np.nan, lost or str(refused)))
             continue
-        p_hit = float(replace(chance, error=left).hit_chance(left.covariance_ct(q[None]))[0])
-        found.append(WayChance(way, float(np.sqrt(np.trace(left.tip_covariance(q[None])[0]))), p_hit, lost))
+        p_stop = model.stop_chance(way, corridor)
+        p_hit = (1.0 - p_stop) * float(replace(chance, error=left).hit_chance(left.covariance_ct(q[None]))[0])
+        found.append(WayChance(way, float(np.sqrt(np.trace(left.tip_covariance(q[None])[0]))), p_hit, p_stop, lost))
     return tuple(found)
 
 
@@ -268,7 +284,7 @@ def check_ways(context: CaseContext, plan: Plan, where: str | Path) -> None:
     same = len(known) == len(plan.guidance) and all(
         a.way == b.way
         and a.lost_sight == b.lost_sight
-        and np.allclose(a[1:3], b[1:3], rtol=0, atol=1e-6, equal_nan=True)
+        and np.allclose(a[1:4], b[1:4], rtol=0, atol=1e-6, equal_nan=True)
         for a, b in zip(known, plan.guidance, strict=True)
     )
     if not same:

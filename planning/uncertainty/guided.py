@@ -7,7 +7,7 @@ are linear in both:
     needle_k = J_k (eta + drift + arrival_k)             eta 28 parameters of arm and tool, k a look or the end
     anatomy  = pose + motion + breath                    of the target and what surrounds it, since the scan
     target   = anatomy + reading of the target in the CT
-    touch_i  = A_i pose - J_i eta - R r_i + w breath' + n       marker i: r its reading in the CT, w that of the skin
+    touch_i  = A_i pose - J_i eta - R r_i + w breath' + n       marker i: r its reading in the CT, w the skin's weight
     cameras  = A_i (pose + frame) - R r_i + w breath + n        markers, A_i = [I, -[p_i - f]x],
                [I, -[b]x] needle_k + A_b frame + n              and balls b behind the tip
     picture  = target + calibration + n                  ultrasound: the target,
@@ -17,6 +17,8 @@ All readings stacked are z = H x + F u. A way uses some of them. What it estimat
 the tip is moved by -K z, with the weights K of the least error among those that no flat part enters:
 
     min |a - K H|^2  with  K F = b:      K = K0 + M N',   K0 F = b,   N' F = 0,   M by least squares
+
+The breath at the touches and later have their mean in common; about it each has a deviation of its own.
 
 The flat parts are eliminated, not given a large variance. ct is the registration as it is, K = -X L. The needle keeps
 the direction that the registration gave it: in every way
@@ -69,6 +71,9 @@ FREE = 0.01
 """mm that the tip's estimate may follow per mm of a flat part that no reading shows: more, and it is open. Cameras do
 not see a roll about the needle; where the registered target is .1 mm beside its line, that is .001."""
 
+STOP_DRAWS = 20_000
+"""Draws of the corrections of all looks together: a chance to be stopped is known to .004."""
+
 CAMERAS = "cameras"
 
 FLAT = ("pose", "frame")
@@ -88,7 +93,7 @@ def _times(M: Floats, rows: Rows) -> Rows:
 
 
 def _root(cov: Floats) -> Floats:
-    """S with S S' = cov, of covariances (..., 3, 3) that may be singular."""
+    """S with S S' = cov, of covariances (..., k, k) that may be singular."""
     values, axes = np.linalg.eigh(cov)
     return np.asarray(axes * np.sqrt(np.maximum(values, 0.0))[..., None, :])
 
@@ -138,7 +143,7 @@ class GuidedModel:
         q_insertion: Shape (6,), rad, the tip on the target.
         looks: In their order.
         motion: Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan.
-        breath: Shape (3,), mm: rms displacement of the target by the breath, along its line; zero without breathing.
+        breath: Shape (3, 2), mm: mean and deviation of the target's displacement by the breath; 0 without breathing.
         skin_weight: By how much of it the markers move.
         stereo: The cameras, or None.
         ultrasound: The probe, or None.
@@ -181,7 +186,7 @@ class GuidedModel:
             weight: By how much of the target's breath it moves.
         """
         moved = np.column_stack([_root(self.motion), weight * self.breath])
-        return {"pose": np.eye(6), "motion": np.vstack([moved, np.zeros((3, 4))])}
+        return {"pose": np.eye(6), "motion": np.vstack([moved, np.zeros((3, 5))])}
 
     @cached_property
     def target(self) -> Rows:
@@ -206,9 +211,14 @@ class GuidedModel:
         own = {
             "arm": -scale * noise.arm_jacobian * np.sqrt(noise.eta_variances),
             "touch": touch.reshape(3 * count, 3 * count),
-            "breath at touch": np.tile(self.skin_weight * self.breath, count)[:, None],
+            "breath at touch": np.tile(self.skin_weight * self.breath[:, 1], count)[:, None],
+            "motion": np.tile(self._moved(self.skin_weight, mean_alone=True), (count, 1)),
         }
         return _sum(self._markers, own)
+
+    def _moved(self, weight: float, *, mean_alone: bool = False) -> Floats:
+        """The source "motion" of what the breath alone moves, shape (3, 5): its mean, and what is about it."""
+        return np.column_stack([np.zeros((3, 3)), weight * self.breath * [1.0, not mean_alone]])
 
     @cached_property
     def _markers(self) -> Rows:
@@ -222,7 +232,7 @@ class GuidedModel:
             return []
         T, seen = flange_pose(self.error.model, look.q), dict[str, Rows]()
         tip, outward = T[:3, 3] + self.error.tip_mm * T[:3, 2], -T[:3, 2]
-        moved = {"motion": np.column_stack([np.zeros((3, 3)), self.skin_weight * self.breath])}
+        moved = {"motion": self._moved(self.skin_weight)}
         for row, (name, point) in enumerate(zip(self.markers, self.points_base, strict=True)):
             own = {source: part[3 * row : 3 * row + 3] for source, part in self._markers.items()}
             seen[marker_name(name)] = _sum(own, moved, {"frame": self._at(point[None])})
@@ -292,6 +302,23 @@ class GuidedModel:
         H, _, _ = self._stacked
         E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(weight))))
         return np.asarray((E + gain @ H) @ (E + gain @ H).T)
+
+    def stop_chance(self, way: str, corridor_mm: float) -> float:
+        """The chance that a correction of a way is longer than a corridor, after any of its looks.
+
+        The touches are those that the registration fitted: of z = H x + F u it left X L z_touch = 0, which is the pose.
+        """
+        if way == "ct":
+            return 0.0
+        H, F, rows = self._stacked
+        touch = [one.device == "touch" for one, _ in rows]
+        pose = -self.error.fit.map_at(self.error.target_base) @ H[touch]
+        z = H + F[:, :6] * np.repeat([1.0, LEVER_MM], 3) @ pose
+        looked = [found for last in range(len(self.looks)) if (found := self.guided(way, last)) is not None]
+        moved = np.concatenate([one.gain[:3] @ z for one in looked])
+        drawn = np.random.default_rng(0).normal(size=(STOP_DRAWS, len(moved))) @ _root(moved @ moved.T).T
+        far = np.linalg.norm(drawn.reshape(STOP_DRAWS, -1, 3), axis=2).max(axis=1)
+        return float(np.mean(far > corridor_mm))
 
     def _parts(self, tip: Floats) -> dict[str, float]:
         """Mean square of the tip's error by source, mm^2, named as in `SOURCES`."""
@@ -370,12 +397,15 @@ class WayChance(NamedTuple):
     expected_error_mm: float
     """Rms of the tip about the target; NaN where the way does not see enough."""
     p_hit: float
+    """That it is not stopped, and hits."""
+    p_stop: float
+    """That a correction would leave the corridor: it is not executed, and the needle is stopped."""
     lost_sight: str
     """What is not seen, and why; empty where all is."""
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON; null where there is no number."""
-        numbers = {name: or_null(getattr(self, name)) for name in ("expected_error_mm", "p_hit")}
+        numbers = {name: or_null(getattr(self, name)) for name in ("expected_error_mm", "p_hit", "p_stop")}
         return {"way": self.way, **numbers, "lost_sight": self.lost_sight}
 
 

@@ -28,6 +28,7 @@ DECLARED = CASE.errors
 NOMINAL = replace(DECLARED, arm=replace(DECLARED.arm, link_mm=0.5, twist=np.radians(0.05), joint=np.radians(0.1)))
 SLICES = np.diag([0.7**2, 0.7**2, 5.0**2]) / 12
 THICK = replace(DECLARED, marker_cov_ct=SLICES, target_cov_ct=SLICES)
+NO_BREATH = np.zeros((3, 2))
 STILL, FEET, ANYWHERE = (0.0, 0.0, 0.0), (0.0, 0.0, 1.1), (3.0 / 3**0.5,) * 3
 
 TABLE = {
@@ -47,7 +48,7 @@ def model(
     looks=(1.0,),
     hidden=None,
     stereo=STEREO,
-    breath=(0.0, 0.0, 0.0),
+    breath=NO_BREATH,
     skin=0.0,
 ):
     """One insertion along the case's plan, the picture in the plane of needle and bed axis."""

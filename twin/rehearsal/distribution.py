@@ -15,9 +15,9 @@ from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.budget.guidance import (
     Sight,
     as_rehearsed,
-    check_devices,
     check_way,
     corridor_mm,
+    equipped,
     guided_error,
     guided_model,
     lost_sight,
@@ -79,7 +79,7 @@ class Distribution:
         cov_ct: Shape (3, 3), predicted of it, mm^2.
         in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid.
         hit: Shape (n,).
-        p_hit: Predicted.
+        p_hit: Predicted; of a guided needle that it is not stopped, and hits.
         structures: The k structures that must not be touched.
         touched: Shape (n, k).
         p_touch: Shape (k,), predicted.
@@ -89,8 +89,10 @@ class Distribution:
         not_modelled: What neither the trials nor the chances contain.
         physics: Some of the trials in the simulator, if any.
         guidance: The way of guidance that led the needle, None where none was asked for.
-        stopped: Further trials, whose correction would have left the corridor.
+        stopped: Further trials, whose correction would have left the corridor: they do not hit.
+        p_stop: Predicted.
         hidden: What was out of sight, a sentence each.
+        assumed: Devices of the way that the case does not declare, a sentence each.
     """
 
     seed: int
@@ -111,7 +113,9 @@ class Distribution:
     physics: PhysicsTrials | None = None
     guidance: str | None = None
     stopped: int = 0
+    p_stop: float = 0.0
     hidden: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.trials.tip_ct)
@@ -125,6 +129,12 @@ class Distribution:
     def tip_error_mm(self) -> Floats:
         """Distance of true tip and true target, shape (n,), mm."""
         return np.asarray(np.linalg.norm(self.error_ct, axis=1))
+
+    @property
+    def hit_share(self) -> float | None:
+        """Of the trials that the arm could reach, the fraction that hit; None of none."""
+        tried = len(self) + self.stopped
+        return float(self.hit.sum() / tried) if tried else None
 
     @property
     def realised_rms_mm(self) -> float:
@@ -147,7 +157,7 @@ class Distribution:
             "predicted_rms_mm": self.predicted_rms_mm,
             "median_mm": finite(np.median(self.tip_error_mm) if len(self) else np.nan),
             "coverage_95": _fraction(self.in_region),
-            "hit_share": _fraction(self.hit),
+            "hit_share": self.hit_share,
             "mean_p_hit": self.p_hit,
             "touch_share": _fraction(np.asarray(self.touched.any(axis=1))),
             "mean_p_touch": float(min(1.0, self.p_touch.sum())),
@@ -164,7 +174,8 @@ class Distribution:
         }
 
     def _guided(self) -> dict[str, Any]:
-        return {"guidance": self.guidance, "stopped": self.stopped, "lost_sight": list(self.hidden)}
+        said = {"lost_sight": list(self.hidden), "assumed": list(self.assumed)}
+        return {"guidance": self.guidance, "stopped": self.stopped, "p_stop": self.p_stop, **said}
 
 
 def _fraction(trials: Bools) -> float | None:
@@ -189,28 +200,29 @@ def rehearse_trials(
         count: Trials, at least 1.
         seed: Of all draws.
         guidance: One of `WAYS`, in bodies that move as the case declares: every way has the same patients by a seed.
-            None is by registration, in bodies at rest.
+            None is by registration, in bodies at rest. Devices that the case does not declare are assumed.
         sight: What its devices see of the insertion; None hides nothing.
 
     Raises:
-        InputError: The case declares no errors, has no markers, or lacks a device of the way.
+        InputError: The case declares no errors, has no markers, or the way is unknown.
         NoAnswerError: What the way's devices see does not determine the needle against the target.
     """
     query = _query(context, outward_ct, q_insertion)
     rng = np.random.default_rng(seed)
     if guidance is None:
         return _measured(context, query, draw_trials(query.puncture, query.truth, count, rng), rng, seed)
+    check_way(guidance)
+    case, assumed = equipped(context.case, guidance)
+    context = replace(context, case=case)
     way, moving = _way(context, query, guidance, sight)
     truths = draw_truths(query.puncture, query.truth, count, rng, moving)
     done = guided_trials(query.puncture, truths, query.truth, way, np.random.default_rng([seed, 4]))
-    return _measured(context, query, done.trials, rng, seed, (way, done.stopped))
+    return replace(_measured(context, query, done.trials, rng, seed, (way, done.stopped)), assumed=assumed)
 
 
 def _way(context: CaseContext, query: _Query, name: str, sight: Sight | None = None) -> tuple[Way, Moving]:
     """One way of guidance of a query's puncture, and what moves in the truth."""
     case, puncture = context.case, query.puncture
-    check_way(name)
-    check_devices(case, name)
     assert context.placement is not None and context.placement.registration is not None
     registration = context.placement.registration
     model = guided_model(
@@ -314,9 +326,15 @@ def _measured(
         return distribution
     way = guided[0]
     said = not_modelled(case, counted=(*counted, "breathing", *(() if case.motion is None else ("motion",))))
-    stops = len(went) - unreached - int(went.sum())
+    p_stop, hidden = way.model.stop_chance(way.name, way.corridor_mm), lost_sight(way.model, way.name)
     return replace(
-        distribution, guidance=way.name, stopped=stops, hidden=lost_sight(way.model, way.name), not_modelled=said
+        distribution,
+        guidance=way.name,
+        stopped=len(went) - unreached - int(went.sum()),
+        p_stop=p_stop,
+        p_hit=(1.0 - p_stop) * distribution.p_hit,
+        hidden=hidden,
+        not_modelled=said,
     )
 
 
