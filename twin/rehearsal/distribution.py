@@ -325,7 +325,8 @@ def _measured(
     if guided is None:
         return distribution
     way = guided[0]
-    said = not_modelled(case, counted=(*counted, "breathing", *(() if case.motion is None else ("motion",))))
+    moving = {"breathing": case.breathing, "motion": case.motion}
+    said = not_modelled(case, counted=(*counted, *(name for name, one in moving.items() if one is not None)))
     p_stop, hidden = way.model.stop_chance(way.name, way.corridor_mm), lost_sight(way.model, way.name)
     return replace(
         distribution,

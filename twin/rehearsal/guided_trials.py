@@ -17,7 +17,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.planning.uncertainty.guided import GuidedModel, Look, ball_name, marker_name
+from puncture_twin.planning.uncertainty.guided import CAMERAS, GuidedModel, Look, ball_name, marker_name
 from puncture_twin.twin.plant.room_devices import RoomCameras, RoomProbe
 from puncture_twin.twin.plant.true_needle import TrueNeedle, true_needle
 from puncture_twin.twin.rehearsal.trials import (
@@ -85,7 +85,7 @@ def guided_trials(
         found |= room.look(
             look, number, q, true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
         )
-        wanted = _correction(way, found, number)
+        wanted = _correction(way, found, number, T_base_ct)
         reached &= there
         if wanted is not None:
             stopped |= np.linalg.norm(wanted, axis=1) > way.corridor_mm
@@ -105,14 +105,18 @@ def _drift(errors: ErrorModel, first: Floats, rng: np.random.Generator) -> Float
     return np.asarray(first * (drift / whole) ** 2 + rng.normal(size=first.shape) * drift * anew / whole)
 
 
-def _correction(way: Way, found: Readings, last: int) -> Floats | None:
-    """By how much to move the needle from where the registration puts it, (n, 3), after a look; None: not known."""
+def _correction(way: Way, found: Readings, last: int, T_base_ct: Floats) -> Floats | None:
+    """By how much to move the needle from where the registration puts it, (n, 3), after a look; None: not known.
+
+    The gain is of the nominal patient; what each trial registered (n, 4, 4) is rotated against it.
+    """
     guided = way.model.guided(way.name, last)
     if guided is None:
         return None
     so_far = [found[one.name, one.look] for one in way.model.readings if one.look <= last]  # in the order of the gain
-    z = np.hstack(so_far)
-    return np.asarray(z @ guided.gain[:3, : z.shape[1]].T)
+    turned = T_base_ct[:, :3, :3] @ way.model.error.fit.R_base_ct.T
+    z = (np.hstack(so_far).reshape(len(turned), -1, 3) @ turned).reshape(len(turned), -1)
+    return np.asarray(np.einsum("nab,nb->na", turned, z @ guided.gain[:3, : z.shape[1]].T))
 
 
 def _devices(
@@ -149,22 +153,25 @@ class _Room:
         nominal = flange_pose(self.puncture.model, q)
         axis = nominal[:, :3, 2]
         tip = nominal[:, :3, 3] + self.puncture.tip_mm * axis
-        found = {**self._by_cameras(needle, tip, axis), **self._by_probe(look, needle, tip)}
+        found = {**self._by_cameras(look, needle, tip, axis), **self._by_probe(look, needle, tip)}
         return {(name, number): value for name, value in found.items() if name not in look.hidden}
 
-    def _by_cameras(self, needle: TrueNeedle, tip: Floats, axis: Floats) -> dict[str, Floats]:
-        if self.cameras is None:
+    def _by_cameras(self, look: Look, needle: TrueNeedle, tip: Floats, axis: Floats) -> dict[str, Floats]:
+        if self.cameras is None or CAMERAS in look.hidden:
             return {}
-        truths, behind = self.truths, np.array(self.cameras.device.balls_mm)[:, None]
+        names = [marker_name(name) for name in self.model.markers]
+        shown = [name not in look.hidden for name in names]
+        behind = np.array([mm for mm in self.cameras.device.balls_mm if ball_name(mm) not in look.hidden])[:, None]
+        truths = self.truths
         skin_ct = self.model.skin_weight * truths.breath_ct
         markers = self.cameras.read(apply(self.puncture.T_base_ct, self.puncture.points_ct + skin_ct[:, None]))
         balls = self.cameras.read(needle.tip_base[:, None] - behind * needle.R_base_needle[:, None, :, 2])
         expected = apply_each(self.T_base_ct, truths.read_ct)
-        T_base_cameras = fit_rigid(markers, expected)  # the frame is free: anywhere near will do
+        T_base_cameras = fit_rigid(markers[:, shown], expected[:, shown])  # the frame is free: anywhere near will do
         off = apply_each(T_base_cameras, balls) - (tip[:, None] - behind * axis[:, None])
-        seen = {ball_name(mm): off[:, row] for row, mm in enumerate(self.cameras.device.balls_mm)}
+        seen = {ball_name(mm): off[:, row] for row, mm in enumerate(behind[:, 0].tolist())}
         there = apply_each(T_base_cameras, markers) - expected
-        return {**{marker_name(name): there[:, row] for row, name in enumerate(self.model.markers)}, **seen}
+        return {**{name: there[:, row] for row, name in enumerate(names)}, **seen}
 
     def _by_probe(self, look: Look, needle: TrueNeedle, tip: Floats) -> dict[str, Floats]:
         if self.probe is None:
