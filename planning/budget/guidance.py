@@ -261,7 +261,8 @@ def way_chances(
             found.append(WayChance(way, np.nan, np.nan, np.nan, lost or str(refused)))
             continue
         p_stop = model.stop_chance(way, corridor)
-        p_hit = (1.0 - p_stop) * float(replace(chance, error=left).hit_chance(left.covariance_ct(q[None]))[0])
+        about = left.about_mean
+        p_hit = (1.0 - p_stop) * float(chance.led(about, left.mean_ct).hit_chance(about.covariance_ct(q[None]))[0])
         found.append(WayChance(way, float(np.sqrt(np.trace(left.tip_covariance(q[None])[0]))), p_hit, p_stop, lost))
     return tuple(found)
 
@@ -327,7 +328,9 @@ def guided_error(model: GuidedModel, way: str, weight: float = 1.0) -> GuidedErr
     if found is None:
         lost = "; ".join(lost_sight(model, way)) or "its readings leave the needle's place against the CT open"
         raise NoAnswerError(f"guidance '{way}' does not see enough: {lost}", code="lost_sight")
-    found = found if weight == 1.0 else found._replace(cov=model.cov(found.gain, weight))
+    if weight != 1.0:
+        cov, mean = model.left(found.gain, weight)
+        found = found._replace(cov=cov, mean=mean, tip_cov=cov[:3, :3])  # no picture shows this anatomy
     return GuidedError(one.model, one.tip_mm, one.target_base, one.errors, one.fit, one.bend, found)
 
 

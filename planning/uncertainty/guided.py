@@ -32,7 +32,7 @@ again does not average them. Cameras err anew with each picture.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -295,13 +295,20 @@ class GuidedModel:
             gain[:3] = 0.0
             gain[:3, used] = -K
         tip = a + gain[:3] @ H
-        return Guided(gain, self.cov(gain), tip @ tip.T, self._parts(tip))
+        return Guided(gain, *self.left(gain), tip @ tip.T, self._parts(tip))
 
-    def cov(self, gain: Floats, weight: float = 1.0) -> Floats:
-        """Sigma6, shape (6, 6), of the needle against anatomy of a weight (see `anatomy`), under a gain."""
+    def left(self, gain: Floats, weight: float = 1.0) -> tuple[Floats, Floats]:
+        """What a gain leaves of the needle against anatomy of a weight (see `anatomy`): `Guided.cov` and its mean."""
         H, _, _ = self._stacked
         E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(weight))))
-        return np.asarray((E + gain @ H) @ (E + gain @ H).T)
+        left = E + gain @ H
+        return left @ left.T, self._split(left)[0]
+
+    def _split(self, rows: Floats) -> tuple[Floats, Floats]:
+        """Values linear in the sources (m, n): what the mean of the breath gives, (m,), and the rest, (m, n - 1)."""
+        before = list(self._widths).index("motion")
+        at = sum(list(self._widths.values())[:before]) + 3
+        return rows[:, at], np.delete(rows, at, axis=1)
 
     def stop_chance(self, way: str, corridor_mm: float) -> float:
         """The chance that a correction of a way is longer than a corridor, after any of its looks.
@@ -316,7 +323,8 @@ class GuidedModel:
         z = H + F[:, :6] * np.repeat([1.0, LEVER_MM], 3) @ pose
         looked = [found for last in range(len(self.looks)) if (found := self.guided(way, last)) is not None]
         moved = np.concatenate([one.gain[:3] @ z for one in looked])
-        drawn = np.random.default_rng(0).normal(size=(STOP_DRAWS, len(moved))) @ _root(moved @ moved.T).T
+        mean, about = self._split(moved)
+        drawn = mean + np.random.default_rng(0).normal(size=(STOP_DRAWS, len(moved))) @ _root(about @ about.T).T
         far = np.linalg.norm(drawn.reshape(STOP_DRAWS, -1, 3), axis=2).max(axis=1)
         return float(np.mean(far > corridor_mm))
 
@@ -383,7 +391,9 @@ class Guided(NamedTuple):
     gain: Floats
     """G, shape (6, m): how the command follows all readings; 0 for those that the way does not use."""
     cov: Floats
-    """Sigma6, shape (6, 6), of the needle against the CT's anatomy about the target."""
+    """Sigma6, shape (6, 6), of the needle against the CT's anatomy about the target, what is known of it included."""
+    mean: Floats
+    """Shape (6,): what is known of it, by the breath's mean; no correction of the way takes it out."""
     tip_cov: Floats
     """Shape (3, 3), mm^2, of the tip about the true target."""
     parts: Mapping[str, float]
@@ -433,6 +443,18 @@ class GuidedError(PoseError):
         """What the true target adds, CT axes: less than nothing where a picture of it led the needle."""
         R = self.fit.R_base_ct
         return np.asarray(R.T @ (self._known.tip_cov - self._known.cov[:3, :3]) @ R)
+
+    @property
+    def about_mean(self) -> GuidedError:
+        """The error about its mean, which is no chance."""
+        one, mean = self._known, self._known.mean
+        cov, tip_cov = one.cov - np.outer(mean, mean), one.tip_cov - np.outer(mean[:3], mean[:3])
+        return replace(self, guided=one._replace(cov=cov, tip_cov=tip_cov, mean=np.zeros(6)))
+
+    @property
+    def mean_ct(self) -> Floats:
+        """Where the tip ends on average, from where it is meant to, shape (3,), mm, CT axes."""
+        return np.asarray(self.fit.R_base_ct.T @ self._known.mean[:3])
 
     def mean_squares(self, q: Floats) -> dict[str, float]:
         """By source, those of devices and motion too."""

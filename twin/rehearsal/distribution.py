@@ -77,7 +77,7 @@ class Distribution:
         puncture: Common part of all trials.
         trials: The n trials.
         cov_ct: Shape (3, 3), predicted of it, mm^2.
-        in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid.
+        in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid, about the mean where one is known.
         hit: Shape (n,).
         p_hit: Predicted; of a guided needle that it is not stopped, and hits.
         structures: The k structures that must not be touched.
@@ -297,12 +297,15 @@ def _measured(
     stopped = np.zeros(len(trials.reached), bool) if guided is None else guided[1]
     went = trials.reached & ~stopped
     unreached, trials = int((~trials.reached).sum()), trials.of(went)
-    believed = query.believed if guided is None else guided_error(guided[0].model, guided[0].name)
-    cov_ct, error_ct = believed.tip_covariance_ct(q)[0], trials.tip_ct - trials.target_ct
-    model = chance_model(case, context.anatomy, context.engine, believed)
+    believed = about = query.believed
+    model, mean_ct = chance_model(case, context.anatomy, context.engine, believed), np.zeros(3)
     assert model is not None
+    if guided is not None:
+        believed = left = guided_error(guided[0].model, guided[0].name)
+        about, mean_ct = left.about_mean, left.mean_ct
     off_mm = off[went] * _surfaces(model, puncture, query.truth)
-    inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
+    error_ct = trials.tip_ct - trials.target_ct - mean_ct
+    inverse = np.linalg.inv(about.tip_covariance_ct(q)[0] + LEAST_VARIANCE * np.eye(3))
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
     counted = () if puncture.bend is None else ("bending",)
     distribution = Distribution(
@@ -310,10 +313,10 @@ def _measured(
         unreached=unreached,
         puncture=puncture,
         trials=trials,
-        cov_ct=cov_ct,
+        cov_ct=believed.tip_covariance_ct(q)[0],
         in_region=square <= chdtri(3, 1 - INTERVAL),
         hit=_hits(context, trials, off_mm),
-        p_hit=float(model.hit_chance(believed.covariance_ct(q))[0]),
+        p_hit=float(model.led(about, mean_ct).hit_chance(about.covariance_ct(q))[0]),
         structures=model.structures,
         touched=_touches(context, puncture, trials, off_mm),
         p_touch=_touch_chances(context, puncture, model, None if guided is None else guided[0]),
@@ -342,12 +345,14 @@ def _measured(
 def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel, way: Way | None) -> Floats:
     """Predicted chances to touch, shape (k,): under guidance each structure moves by its own weight of the breath."""
     outward_ct, q = puncture.outward_ct[None], puncture.q_insertion[None]
-    found = refined_chances(model, outward_ct, q, model.chances(outward_ct, q)).touch[0]
-    if way is None or context.case.breathing is None:
-        return found
-    weights = moving_weights(context.case, context.case.breathing, context.anatomy).structures[model.columns]
-    for weight in np.unique(weights[weights != 1.0]).tolist():
-        other = replace(model, error=guided_error(way.model, way.name, weight))
+    if way is None:
+        return refined_chances(model, outward_ct, q, model.chances(outward_ct, q)).touch[0]
+    weights, found = np.ones(len(model.columns)), np.zeros(len(model.columns))
+    if context.case.breathing is not None:
+        weights = moving_weights(context.case, context.case.breathing, context.anatomy).structures[model.columns]
+    for weight in np.unique(weights).tolist():
+        left = guided_error(way.model, way.name, weight)
+        other = model.led(left.about_mean, left.mean_ct)
         touch = refined_chances(other, outward_ct, q, other.chances(outward_ct, q)).touch[0]
         found = np.where(weights == weight, touch, found)
     return found
