@@ -160,6 +160,7 @@ def make_plan(case, candidates):
         insertion=Trajectory(np.linspace(0, 1, len(q)), q),
         clearance_mm={"approach": 12.0, "insertion": 9.0, "needle": 5.0},
         warnings=(),
+        guidance=(),
     )
 
 

@@ -93,9 +93,9 @@ def _times(M: Floats, rows: Rows) -> Rows:
 
 
 def _root(cov: Floats) -> Floats:
-    """S with S S' = cov, of covariances (..., k, k) that may be singular."""
+    """The symmetric S with S S = cov, of covariances (..., k, k) that may be singular; no machine has another."""
     values, axes = np.linalg.eigh(cov)
-    return np.asarray(axes * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+    return np.asarray(axes * np.sqrt(np.maximum(values, 0.0))[..., None, :] @ np.swapaxes(axes, -1, -2))
 
 
 def picture_root(sd_mm: tuple[float, float], across: Floats) -> Floats:

@@ -13,7 +13,8 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty, reading_noise
 from puncture_twin.planning.registration.fits import fit_triad
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.uncertainty.guided import WAYS, GuidedError, GuidedModel, Look
+from puncture_twin.planning.uncertainty.guided import WAYS, GuidedError, GuidedModel, Look, _root
+from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 CASE = load_case(ROOT / "meshes/abdomen/case.toml")
@@ -88,6 +89,19 @@ def test_every_way_errs_as_an_independent_prototype_found(situation):
     for way, figure in zip(WAYS, expected, strict=True):
         if figure is not None:  # without the cancellation that a self-calibration has
             assert rms(made.guided(way)) == pytest.approx(figure, rel=0.05), way
+
+
+def test_chances_to_be_stopped_are_those_of_the_corrections():
+    """By one look: beyond a ball, of the Gaussian whose readings are conditioned; and no other by the axes' signs."""
+    made, corridor = model(motion_mm=ANYWHERE), 4.0
+    guided = made.guided("us")
+    left = guided.tip_cov  # what is corrected is what an uncorrected needle would have, less what is left
+    open_loop = made.guided("ct").tip_cov
+    found = made.stop_chance("us", corridor)
+    assert found == pytest.approx(1.0 - hit_in_ball((open_loop + left)[None], corridor)[0], abs=0.03)
+    assert made.stop_chance("ct", 0.0) == 0.0 and made.stop_chance("us", 0.0) == 1.0
+    root = _root(np.diag([4.0, 1.0, 0.0]))
+    np.testing.assert_allclose(root, np.diag([2.0, 1.0, 0.0]), atol=1e-12)
 
 
 def test_ct_is_the_registration_as_it_is():
