@@ -147,9 +147,7 @@ def test_a_truth_that_equals_the_belief_is_said_above_all(shown, tmp_path):
 def test_rooms_without_any_that_was_reached_say_nothing():
     """There is no table of nothing."""
     said = text([Section("many trials", rooms({**ROOMS, "realised_rms_mm": None}))])
-    assert (
-        "the needle reached the target in none" in said and "realised" not in said and rooms(None) == []
-    )
+    assert "the needle reached the target in none" in said and "realised" not in said and rooms(None) == []
 
 
 def test_the_cloud_is_drawn_in_the_needles_frame(tmp_path):
