@@ -48,6 +48,8 @@ MOST_SEEDS = 10_000
 app = typer.Typer(no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 """Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
 app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
+calibrate_app = typer.Typer(no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+app.add_typer(calibrate_app, name="calibrate", help="Calibrate what an arm holds: hand-eye.")
 
 
 @app.callback(invoke_without_command=True, epilog="Terms in the output: docs/words.md.")
@@ -469,20 +471,58 @@ def register(
 @app.command()
 def selfcal(
     case: Annotated[Path | None, typer.Argument(metavar="[CASE]", help="selfcal.toml or its folder.")] = None,
-    recording: Annotated[Path | None, typer.Option("--recording", help="Recording: a CSV, or its folder.")] = None,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Recording: a CSV, or its folder with pictures or without.")
+    ] = None,
     seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Number of trials.")] = 3,
     out_dir: OutOption = Path("out/selfcal"),
+    record: Annotated[
+        Path | None,
+        typer.Option("--record", metavar="FOLDER", help="Keep the first trial's pictures in this new folder."),
+    ] = None,
+    shots: Annotated[
+        Path | None,
+        typer.Option("--shots", help="Recording of what was seen afterwards: each pose updates the answer."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Calibrate two arms by ultrasound, AXP = YBQ. Then send the needle to targets in the image."""
     require_extra("twin", "selfcal")
-    from puncture_twin.twin.jobs.selfcal.job import run_selfcal
-    from puncture_twin.twin.jobs.selfcal.report import selfcal_facts, selfcal_text
+    from puncture_twin.twin.jobs.selfcal.report import run_selfcal, selfcal_facts, selfcal_text
 
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:
-        facts = selfcal_facts(run_selfcal(case, recording, seeds, out_dir, progress))
+        facts = selfcal_facts(run_selfcal(case, recording, seeds, out_dir, progress, record, shots))
     finish("selfcal", facts, facts, selfcal_text(facts), as_json)
+
+
+@calibrate_app.callback()
+def _calibrate() -> None:
+    """Calibrate what an arm holds."""
+
+
+@calibrate_app.command("hand-eye")
+def _hand_eye(
+    recording: Annotated[
+        Path, typer.Option("--recording", metavar="FILE", help="CSV with a pair of poses a row: flange and camera.")
+    ],
+    motions: Annotated[
+        bool, typer.Option("--motions", help="Rows are motions from pose to pose (AX = XB), not poses (AX = ZB).")
+    ] = False,
+    noise: Annotated[
+        str | None,
+        typer.Option("--noise", metavar="MM,DEG,MM,DEG", help="Known noise of flange and camera; default: found."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find where a camera is on the flange, from pairs of poses: AX = ZB or AX = XB. It only reports."""
+    from puncture_twin.planning.registration.hand_eye import calibrate_hand_eye, read_pose_pairs
+    from puncture_twin.twin.jobs.robot.calibrate_job import hand_eye_summary, hand_eye_text, parse_noise
+
+    pairs = read_pose_pairs(recording, motions=motions)
+    found = calibrate_hand_eye(pairs, parse_noise(noise))
+    summary = hand_eye_summary(found)
+    finish("calibrate hand-eye", found, summary, hand_eye_text(summary), as_json)
 
 
 @app.command()

@@ -48,8 +48,8 @@ STAGES = {
     "planning.anatomy.body.body_mask": {"ct_image": "CT in order", "find_unscanned": "unscanned", "body_mask": "body"},
     "planning.anatomy.body.cut_ends": {"content_of": "ends", "cut_ends": "ends"},
     "planning.anatomy.skin": {"skin_of_image": "skin", "skin_from_label": "skin"},
-    "planning.formats.labels.label_surface": {"label_mesh": "label surfaces"},
-    "planning.init.outlines": {"carved_notes": "what goes round"},
+    "planning.formats.labels.labelmaps": {"label_mesh": "label surfaces"},
+    "planning.init.segmentation": {"carved_notes": "what goes round"},
     "planning.anatomy.scan": {
         "Scan.outside": "outside",
         "Scan.attached_limbs": "limbs",

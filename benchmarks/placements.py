@@ -22,7 +22,7 @@ import scipy
 
 from puncture_twin.planning.evidence.edges import edge_image
 from puncture_twin.planning.evidence.label_placement import Source, assess
-from puncture_twin.planning.formats.labels.label_surface import mask_surface
+from puncture_twin.planning.formats.labels.labelmaps import mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical, read_volume
 
 COUNTS = (1, 3, 6, 15, 60)

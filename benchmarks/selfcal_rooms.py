@@ -28,6 +28,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, find_candidates
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
@@ -246,6 +247,22 @@ def row_text(name: str, outcomes: list[Outcome]) -> str:
     )
 
 
+def shot_ms(kind: Kind) -> float:
+    """Milliseconds by which one shot updates a calibration: the median of 100."""
+    case, _, candidates, chosen = room_of(kind.play_deg)
+    rng = np.random.default_rng(SEED)
+    recording, _ = recorded(case, candidates, draw_workcell(case, rng), chosen, rng, noise=True)
+    noise = Noise(0.0, 0.0, IMAGE_MM, DIRECTION_RAD, off_plane_mm=case.content.truth.off_plane_mm)
+    following = ShotByShot.of(calibrate(recording, noise=noise, arms=case.declared_arms if kind.arms else None))
+    shots = [recording.subset(slice(row, row + 1)) for row in range(20)] * 5
+    taken = []
+    for shot in shots:
+        start = time.perf_counter()
+        following = following.with_shot(shot)
+        taken.append(time.perf_counter() - start)
+    return float(np.median(taken)) * 1e3
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -264,6 +281,8 @@ def main() -> None:
         ("chi2/f", 8),
         ("lost", 6),
     )
+    for words, kind in (("arms not declared", Kind(arms=0.0)), ("arms declared", Kind())):
+        print(f"one shot, {words}: {shot_ms(kind):.2f} ms")
     print(" " * 41, *(name.rjust(width) for name, width in head))
     for name, kind in ROWS.items():
         if arguments.only in name:

@@ -19,7 +19,7 @@ is the skin, if it holds the others.
 
 **What is crossed is told by every word of its name.** `traverse` becomes a structure that holds the target beside a
 lesion, or a muscle or fat, only if each word of its name is known as that of an organ of solid tissue, a bone, a soft
-tissue, a lesion, a side or a part (`planning/anatomy/crossed_names.py`): `lung_upper_lobe_left`, "liver tumour 2".
+tissue, a lesion, a side or a part (`planning/anatomy/default_roles.py`): `lung_upper_lobe_left`, "liver tumour 2".
 An adjective may stand for a vessel or a nerve ("superior thyroid"): beside an organ a position needs a part
 (`superior thyroid lobe`), and a `rectus`, `oblique` or `levator` what it belongs to, since some move the eye.
 Vessels, nerves, spinal cord, brainstem and heart that hold the target too stay avoided, and `init` refuses. Whatever

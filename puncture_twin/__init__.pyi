@@ -1,6 +1,7 @@
 from .api import (
     batch as batch,
     calibrate as calibrate,
+    calibrate_hand_eye as calibrate_hand_eye,
     camera_view as camera_view,
     certify as certify,
     check as check,
@@ -18,6 +19,7 @@ from .api import (
     read_mesh as read_mesh,
     read_plan as read_plan,
     read_points as read_points,
+    read_pose_pairs as read_pose_pairs,
     read_recording as read_recording,
     read_volume as read_volume,
     register as register,
@@ -25,6 +27,7 @@ from .api import (
     report as report,
     rerank as rerank,
     search as search,
+    shot_by_shot as shot_by_shot,
     touch as touch,
     verify as verify,
     write_plan as write_plan,

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from puncture_twin.planning.geometry.mesh import TriangleMesh
     from puncture_twin.planning.place.search import PlaceSearch
     from puncture_twin.planning.plan.plan import Plan
+    from puncture_twin.planning.registration.hand_eye import HandEye, PosePairs
     from puncture_twin.planning.registration.method import Method
     from puncture_twin.planning.registration.registration import Registration
     from puncture_twin.planning.search.candidates import Candidates, Pick
@@ -37,11 +38,11 @@ if TYPE_CHECKING:
     from puncture_twin.planning.sight.probe import ProbeView
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
     from puncture_twin.twin.jobs.batch.jobs import Merged
     from puncture_twin.twin.jobs.choosing.compare_job import Comparison
     from puncture_twin.twin.jobs.experiment.touch_job import TouchRun
-    from puncture_twin.twin.jobs.patient.candidates_export import ExportedTable
-    from puncture_twin.twin.jobs.patient.export_jobs import SlicerExport
+    from puncture_twin.twin.jobs.patient.export_jobs import ExportedTable, SlicerExport
     from puncture_twin.twin.rehearsal.result import Rehearsal
 
     Points = NamedPoints | Mapping[str, ArrayLike]
@@ -400,7 +401,7 @@ def read_volume(path: Path | str) -> Volume:
 
 @checked
 def read_recording(path: Path | str) -> Recording:
-    """What two arms and a probe's image said, pose by pose, from ``recording.csv`` or its folder; see `calibrate`.
+    """What two arms and a probe's pictures said, pose by pose, from ``recording.csv`` or its folder; see `calibrate`.
 
     Raises:
         InputError: It cannot be read, or a row is no pair of rigid motions with a point.
@@ -424,6 +425,62 @@ def calibrate(recording: Recording, *, needle_length_mm: float | None = None) ->
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 
     return calibrate(recording, needle_length_mm=needle_length_mm)
+
+
+@checked
+def read_pose_pairs(path: Path | str, *, motions: bool = False) -> PosePairs:
+    """What an arm and the camera on its flange said, pose by pose, from a CSV; see `calibrate_hand_eye`.
+
+    Args:
+        path: Columns ``name``, ``A_r11 .. A_z_mm`` (T_base_flange) and ``B_r11 .. B_z_mm`` (T_board_camera).
+        motions: Whether rows are motions from pose to pose.
+
+    Raises:
+        InputError: It cannot be read, or a row is no pair of rigid motions.
+    """
+    from puncture_twin.planning.registration.hand_eye import read_pose_pairs
+
+    return read_pose_pairs(Path(path), motions=motions)
+
+
+@checked
+def calibrate_hand_eye(
+    pairs: PosePairs,
+    *,
+    robot_mm: float | None = None,
+    robot_deg: float | None = None,
+    camera_mm: float | None = None,
+    camera_deg: float | None = None,
+) -> HandEye:
+    """Where a camera is on an arm's flange: A X = Z B of poses, A X = X B of motions.
+
+    Args:
+        pairs: At least three poses or two motions, from `read_pose_pairs`.
+        robot_mm: Standard deviation of the flange's place, per axis; all four, or none to find the noise.
+        robot_deg: Of its rotation.
+        camera_mm: Of the camera's place.
+        camera_deg: Of its rotation.
+
+    Raises:
+        InputError: Too few pairs, rotations about one axis alone, or poses that do not belong together.
+    """
+    from puncture_twin.planning.registration.hand_eye import calibrate_hand_eye, noise_of
+
+    return calibrate_hand_eye(pairs, noise_of((robot_mm, robot_deg, camera_mm, camera_deg)))
+
+
+@checked
+def shot_by_shot(calibration: Calibration) -> ShotByShot:
+    """A calibration that further shots update, one pose at a time: ``after = before.with_shot(pose)``.
+
+    ``after.shots[-1]`` says whether it fits, and ``after.calibration()`` is the calibration with it.
+
+    Raises:
+        InputError: The calibration holds a needle length; state it to ``calibration()`` instead.
+    """
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
+
+    return ShotByShot.of(calibration)
 
 
 @checked
@@ -710,8 +767,7 @@ def _own_plan(context: CaseContext, plan: Plan, where: str) -> Plan:
         InputError: It does not; see `read_plan`.
     """
     from puncture_twin.planning.budget.guidance import check_ways
-    from puncture_twin.planning.plan.plan_check import with_case_arm
-    from puncture_twin.planning.plan.recheck import check_plan
+    from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
 
     check_plan(plan, context, Path(where))
     check_ways(context, plan, where)

@@ -1,7 +1,5 @@
 """What a UR3 reaches in Chen 2019's setup and about a target: the specification's numbers, and ours beside them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple

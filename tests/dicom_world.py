@@ -1,16 +1,20 @@
 """DICOM files written by pydicom from known arrays: series, multi-frame images, segmentations, structure sets."""
 
+import io
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.encaps import encapsulate
 from pydicom.sequence import Sequence
-from pydicom.uid import UID, ExplicitVRLittleEndian
+from pydicom.uid import UID, ExplicitVRLittleEndian, JPEGBaseline8Bit, RLELossless
 
 CT_CLASS = "1.2.840.10008.5.1.4.1.1.2"
 ENHANCED_CLASS = "1.2.840.10008.5.1.4.1.1.2.1"
 SEG_CLASS = "1.2.840.10008.5.1.4.1.1.66.4"
 RT_CLASS = "1.2.840.10008.5.1.4.1.1.481.3"
+ULTRASOUND_CLASS = "1.2.840.10008.5.1.4.1.1.3.1"
 CAPTURE_CLASS = "1.2.840.10008.5.1.4.1.1.7"
 ROOT = "1.2.826.0.1.3680043.8.498.7."
 STUDY, SERIES, FRAME = ROOT + "1", ROOT + "2", ROOT + "3"
@@ -189,11 +193,59 @@ def structure_set(regions, frame=FRAME):
         made = []
         for one in listed:
             kind, points = one if isinstance(one, tuple) else ("CLOSED_PLANAR", one)
-            made.append(
-                item(ContourGeometricType=kind, NumberOfContourPoints=len(points), ContourData=ds(points)),
-            )
+            made.append(item(ContourGeometricType=kind, NumberOfContourPoints=len(points), ContourData=ds(points)))
         if made:
             drawn.ContourSequence = Sequence(made)
         contours.append(drawn)
     data.StructureSetROISequence, data.ROIContourSequence = Sequence(rows), Sequence(contours)
+    return data
+
+
+def encoded(data, syntax, frames=()):
+    """An image in another transfer syntax: RLE by pydicom, JPEG of these frames (rows, columns[, 3]) by Pillow."""
+    if syntax == RLELossless:
+        data.compress(RLELossless, generate_instance_uid=False)
+        return data
+    data.file_meta.TransferSyntaxUID = syntax
+    streams = []
+    for frame in frames:
+        kind, more = ("JPEG", {"quality": 95}) if syntax == JPEGBaseline8Bit else ("JPEG2000", {"irreversible": True})
+        Image.fromarray(frame).save(stream := io.BytesIO(), kind, **more)
+        streams.append(stream.getvalue())
+    data.PixelData = encapsulate(streams)
+    data["PixelData"].is_undefined_length = True
+    return data
+
+
+def ultrasound(frames, *, delta_cm=None, spacing=None, box=None, **others):
+    """A multi-frame ultrasound picture.
+
+    Args:
+        frames: Shape (frames, rows, columns), 8 bits; RGB with three channels behind.
+        delta_cm: Width and height of a pixel in the region of tissue; None for no region.
+        spacing: Of pixels, mm, rows first.
+        box: The region's first column, first row, last column and last row.
+        others: More elements, or others.
+    """
+    data = base(ULTRASOUND_CLASS, ROOT + "9")
+    data.Modality, data.NumberOfFrames = "US", len(frames)
+    data.Rows, data.Columns = frames.shape[1:3]
+    colour = frames.ndim == 4
+    data.SamplesPerPixel, data.PhotometricInterpretation = (3, "RGB") if colour else (1, "MONOCHROME2")
+    if colour:
+        data.PlanarConfiguration = 0
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 8, 8, 7, 0
+    if delta_cm:
+        ends = dict(zip(("MinX0", "MinY0", "MaxX1", "MaxY1"), box, strict=True))
+        region = item(RegionSpatialFormat=1, RegionDataType=1, RegionFlags=0)
+        for key, value in ends.items():
+            setattr(region, f"RegionLocation{key}", value)
+        region.PhysicalUnitsXDirection = region.PhysicalUnitsYDirection = 3
+        region.PhysicalDeltaX, region.PhysicalDeltaY = delta_cm
+        data.SequenceOfUltrasoundRegions = Sequence([region])
+    if spacing:
+        data.PixelSpacing = ds(spacing)
+    data.PixelData = frames.tobytes()
+    for key, value in others.items():
+        setattr(data, key, value)
     return data

@@ -6,8 +6,6 @@ numbers: the two axes in mm per pixel, with their lengths and the angle between 
 is linear in the unknowns, so that the least squares of the distances need no start.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ Each view gives a homography. Its columns are orthogonal and equally long once t
 the start; the bundle adjustment then frees intrinsics, distortion, the boards' poses, and the cameras' relative poses.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

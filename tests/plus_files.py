@@ -1,7 +1,5 @@
 """What the PLUS toolkit writes about a wire calibration: the phantom and its place, the frames, the matrix found."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree

@@ -18,7 +18,7 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
 from puncture_twin.twin.report.page.page import Shown, write_page
-from puncture_twin.twin.report.slices.subject import Subject
+from puncture_twin.twin.report.slices.panel import Subject
 
 TARGET = np.array([10.0, -20.0, 30.0])
 SKIN_RADIUS = 100.0
@@ -270,6 +270,27 @@ def make_scan(*, spacing=(2.0, 2.5, 3.0), axes=((1, 0, 0), (0, 1, 0), (0, 0, 1))
         return nearest(hu, np.linalg.inv(T), points)
 
     return SimpleNamespace(hu_at=hu_at, measured=(hu, T), grid=SimpleNamespace(shape=hu.shape, T_ct_index=T))
+
+
+NOISY_BYTES = 104_000
+"""For `make_noisy_scan`: a byte for 7 voxels of a millimetre, as a page has it for a box of 230 mm."""
+
+
+def make_noisy_scan():
+    """A CT of 0.7 mm with 20 HU of noise: soft tissue in shells of 40 HU more and less, 10 mm each, and air."""
+    shape, T = (130, 130, 88), np.diag([0.7, 0.7, 1.0, 1.0])
+    T[:3, 3] = TARGET - [45.5, 45.5, 44.0]
+
+    def quiet(points):
+        far = np.linalg.norm(points - TARGET, axis=-1)
+        return np.where(far < SKIN_RADIUS, 40.0 + 40.0 * (far // 10 % 2), -1000.0)
+
+    index = np.stack(np.indices(shape), axis=-1)
+    noise = np.random.default_rng(0).normal(0.0, 20.0, shape)
+    hu = np.round(quiet(index @ T[:3, :3].T + T[:3, 3]) + noise).astype(np.int16)
+    grid = SimpleNamespace(shape=hu.shape, T_ct_index=T)
+    back = np.linalg.inv(T)
+    return SimpleNamespace(hu_at=lambda points: nearest(hu, back, points), measured=(hu, T), grid=grid, quiet=quiet)
 
 
 def _ball(radius, centre, subdivisions=3):

@@ -5,8 +5,6 @@ Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". A package is i
 its content, all numbers big-endian.
 """
 
-from __future__ import annotations
-
 import json
 import selectors
 import socket

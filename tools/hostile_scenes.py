@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.formats.mesh_guard import guard_mesh
+from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Floats = NDArray[np.float64]

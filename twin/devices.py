@@ -39,7 +39,6 @@ class Cameras(Protocol):
         Args:
             number: Of the camera, from 0.
             about_px: Shape (2,), a pixel; the image shows at least what is within reach of it.
-            reach_px: How far.
         """
 
 

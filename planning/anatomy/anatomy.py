@@ -24,7 +24,7 @@ from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.case_file import count_difference
-from puncture_twin.planning.formats.labels.label_surface import frame, framed_surface
+from puncture_twin.planning.formats.labels.labelmaps import frame, framed_surface
 from puncture_twin.planning.formats.meshes.mesh_files import cached_mesh_warnings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
@@ -56,8 +56,6 @@ class Anatomy:
 
     Attributes:
         structures: All structures of the body but the skin; the CT's unnamed dense components and gas among them.
-        skin: The body's surface.
-        warnings: One sentence each.
         surroundings: Solids outside of the body: what the CT shows there, obstacles, the gantry.
         scan: The CT of the case, or None.
         findings: The warnings again, and what is said besides, with code and numbers.
@@ -97,9 +95,7 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     """Read every structure of a case. What they say of each other and of the target: `planning.evidence.checks`.
 
     Args:
-        case: The validated case.
         progress: Called with the name of each structure as it is read.
-        cache: Where surfaces of volumes are kept.
 
     Raises:
         InputError: A file that cannot be trusted, or a label that no rule names.
@@ -144,10 +140,6 @@ def guessed(code: str, what: str, volume: float, side: str, overrule: str) -> Fi
 
     Args:
         code: Of the finding; the structure that paths would pass through, where there is one.
-        what: The guess.
-        volume: Of what it takes, ml.
-        side: Of the body, as `body_side` names it.
-        overrule: The line of the case.
     """
     said = (
         f"{what}: {volume / 1000:.1f} l at its {side} side (see slices.png); paths through it are unknown_region "
@@ -260,7 +252,6 @@ def ball(middle_ct: Floats, radius_mm: float) -> TriangleMesh:
 
     Args:
         middle_ct: Shape (3,), mm.
-        radius_mm: Its radius.
     """
     cell = 2.0 * radius_mm / CELLS
     count = CELLS + 3

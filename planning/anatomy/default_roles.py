@@ -4,6 +4,12 @@ Names are those of TotalSegmentator's tasks and of Slicer's segments, in any spe
 ``lung_upper_lobe_left``, "Left Lung". Of several lines that match a name the most specific holds, as in a case; but
 what may be hurt is not crossed because its name holds a muscle's too, as in ``thigh_artery``. Margins are a start to be
 looked at for each patient, not a rule of any society.
+
+A needle may cross what a name names by every one of its words as an organ of solid tissue (`named_as_crossed`). A
+word that is not in these lists may be anything: "liver veins", ``A. pulmonalis`` and ``Lungenvene`` are named after
+organs that a needle crosses, and are none. So what is not told wholly is not crossed. And vessels and nerves are
+often named by adjectives alone: "superior thyroid" leaves out the artery, so a position needs a part or a noun of its
+own.
 """
 
 from __future__ import annotations
@@ -26,12 +32,10 @@ class DefaultRole(NamedTuple):
     """One line of the table.
 
     Attributes:
-        group: What a person reads.
         patterns: Shell patterns of names in lower case with underscores.
         kind: What it means to a needle: ``ignore`` for outlines of the body, which the skin is; ``unknown`` for what
             nobody looked at.
         margin_mm: The clearance that it demands; 0 where it demands none.
-        reason: Why.
     """
 
     group: str
@@ -193,12 +197,7 @@ VESSEL_WORDS = frozenset(
 
 @cache
 def default_role(name: str, region: str) -> DefaultRole | None:
-    """The line of the table that a name belongs to, or None.
-
-    Args:
-        name: A structure's, in any spelling.
-        region: As a case states it.
-    """
+    """The line of the table that a name belongs to, or None."""
     plain = plain_name(name)
     own, general = (list(_matching(plain, lines)) for lines in (BY_REGION.get(region, ()), GENERAL))
     lesion = list(_matching(plain.replace(LATERAL_MASS, ""), (LESION,)))
@@ -247,3 +246,111 @@ def _matching(plain: str, lines: tuple[DefaultRole, ...]) -> Iterator[tuple[floa
         close = [specificity(pattern, plain) for pattern in line.patterns if _matches(plain, pattern)]
         if close:
             yield max(close), line
+
+
+def words(text: str) -> frozenset[str]:
+    """The words of a text."""
+    return frozenset(text.split())
+
+
+ORGANS = words("""
+    liver spleen pancreas kidney kidneys lung lungs adrenal adrenals thyroid parotid submandibular thymus prostate
+    uterus ovary testis breast breasts gland glands node nodes brain cerebrum cerebellum hemisphere matter
+""")
+"""Organs of solid tissue: a lesion lies in them, and a path to it leads through them."""
+
+LESIONS = words("""
+    lesion lesions laesion lasion tumor tumors tumour tumours tumeur nodule nodules metastasis metastases metastase
+    metastasen carcinoma neoplasm neoplasia cancer mass gtv ctv itv ptv hcc
+""")
+"""Lesions, as whole words: a ``Tumorvene`` is none."""
+
+BONES = words("""
+    bone bones rib ribs vertebra vertebrae sternum hip ilium ischium pubis sacrum femur tibia fibula patella humerus
+    radius ulna scapula clavicle clavicula skull cranium mandible maxilla
+""")
+"""Bones; of the spine the vertebrae alone, since a spine may hold its cord."""
+
+SOFT_TISSUES = words("""
+    muscle muscles gluteus autochthon iliopsoas psoas pectoralis quadriceps rectus oblique latissimus trapezius
+    deltoid serratus erector sartorius thigh levator sternocleidomastoid platysma scalenus scalene digastric
+    masseter temporalis fat adipose subcutaneous
+""")
+"""Muscles and fat, which needles pass."""
+
+WALLS = frozenset(("internal", "external", "internus", "externus"))
+"""Of muscles of a wall (``external_oblique``); beside a bone they are a vessel's: "internal iliac"."""
+
+LEVELS_OF_CORD = frozenset(("cervical", "thoracic", "lumbar"))
+
+POSITIONS = (
+    WALLS | LEVELS_OF_CORD | words("middle superior inferior anterior posterior medial lateral intermediate medius")
+)
+"""Said of vessels and nerves, which are then named after an organ without a noun of their own: "superior thyroid"."""
+
+PARTS = words("lobe lobes segment segments section cortex parenchyma tissue hemisphere gland glands node nodes")
+"""Parts of an organ: beside one of them a position is its own, as in ``lung_upper_lobe``."""
+
+QUALIFIERS = (
+    POSITIONS
+    | PARTS
+    | words("""
+    left right l r upper lower major minor maximus minimus cerebral cerebellar lymph abdominis femoris spinae ani
+    white grey gray head neck body tail whole of the and costal skeletal torso visceral intermuscular compartment
+    dorsi scapulae
+""")
+) - ORGANS
+"""What is said of an organ besides: a side, a part, a kind. Alone it may be said of a vessel: ``middle cerebral``."""
+
+NEEDS: Mapping[str, frozenset[str]] = MappingProxyType(
+    {
+        "rectus": frozenset(("abdominis", "femoris")),
+        "oblique": WALLS | {"abdominis"},
+        "levator": frozenset(("ani", "scapulae")),
+    }
+)
+"""Muscles of which some move the eye: which one it is must be said."""
+
+DIGITS = "0123456789"
+LEVEL = re.compile(r"[clst]?\d+")
+"""A number, or a vertebra's."""
+
+
+def named_as_crossed(name: str) -> bool:
+    """Whether every word of a name is known, and one of them is an organ, a bone, a soft tissue or a lesion.
+
+    >>> named_as_crossed("Left Lung"), named_as_crossed("vertebrae_L1"), named_as_crossed("liver tumour 2")
+    (True, True, True)
+    >>> named_as_crossed("liver veins"), named_as_crossed("Tumorvene"), named_as_crossed("left middle cerebral")
+    (False, False, False)
+    >>> named_as_crossed("superior thyroid"), named_as_crossed("superior thyroid lobe")
+    (False, True)
+    """
+    spoken = _words(name)
+    nouns = [word for word in spoken if word not in QUALIFIERS and not LEVEL.fullmatch(word)]
+    lesion = any(_is_lesion(word) for word in nouns)
+    known = all(word in ORGANS | BONES | SOFT_TISSUES or _is_lesion(word) for word in nouns)
+    return bool(nouns) and known and (lesion or not _may_lack_its_noun(spoken))
+
+
+def named_as_lesion(name: str) -> bool:
+    """Whether every word of a name is known, and one of them is a lesion: a ``Tumorvene`` is none."""
+    return named_as_crossed(name) and any(_is_lesion(word) for word in _words(name))
+
+
+def _words(name: str) -> frozenset[str]:
+    """A name's words; a vertebra's lateral mass is one of its own, which is not known."""
+    return frozenset(plain_name(name).replace(LATERAL_MASS, LATERAL_MASS.replace("_", "")).split("_"))
+
+
+def _is_lesion(word: str) -> bool:
+    return word.rstrip(DIGITS) in LESIONS
+
+
+def _may_lack_its_noun(spoken: frozenset[str]) -> bool:
+    """Whether known words may be said of a vessel, a nerve, the cord or a muscle of the eye."""
+    placed = spoken & POSITIONS
+    of_organ = bool(placed and spoken & ORGANS and not spoken & PARTS)
+    of_bone = bool(spoken & WALLS and spoken & BONES)
+    of_cord = "matter" in spoken and any(word in POSITIONS or LEVEL.fullmatch(word) for word in spoken)
+    return of_organ or of_bone or of_cord or any(noun in spoken and not spoken & NEEDS[noun] for noun in NEEDS)

@@ -16,7 +16,6 @@ class Organ(NamedTuple):
     """One usual organ.
 
     Attributes:
-        name: What a person reads.
         words: What a structure's name may hold, in lower case without spaces and signs; one is enough.
         paired: Whether there is one on each side.
         conduit: Whether it is itself a vessel or a nerve.
@@ -126,7 +125,6 @@ def absent_organs(region: str, names: Iterable[str]) -> list[str]:
     """The usual organs of a region that no name is like, in the order of its list.
 
     Args:
-        region: A key of `USUAL`.
         names: Of the case's structures, also of those that it ignores on purpose.
     """
     known = [_Name.of(name) for name in names]

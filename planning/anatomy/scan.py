@@ -18,12 +18,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
 from puncture_twin.planning.anatomy.body.limbs import LimbSearch, limb_search
-from puncture_twin.planning.anatomy.body.outside_body import (
-    BEYOND_LONG_MM,
-    OutsideImage,
-    outside_mask,
-    outside_surface,
-)
+from puncture_twin.planning.anatomy.body.outside_body import BEYOND_LONG_MM, OutsideImage, outside_mask, outside_surface
 from puncture_twin.planning.anatomy.body.tables import FACES, Face, TableSide, find_support
 from puncture_twin.planning.anatomy.skin import Skin, field_of_view
 from puncture_twin.planning.anatomy.surfaces import Imaged, cached_mesh, mesh_arrays
@@ -31,13 +26,13 @@ from puncture_twin.planning.anatomy.unnamed import Named, Unnamed, unnamed_surfa
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.formats.labels.label_surface import mask_surface
-from puncture_twin.planning.formats.mesh_guard import fits
+from puncture_twin.planning.formats.guard import fits
+from puncture_twin.planning.formats.labels.labelmaps import mask_surface
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.parts import voxels_inside
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.voxelize import voxels_inside
 
 SKIN_TOLERANCE_MM = 3.0
 """A skin from elsewhere (a label, a mesh) is off the CT's by so much, or by one voxel and a half: nearer to it what is
@@ -68,7 +63,6 @@ class Scan:
     """A CT beside the skin of its case. Its voxels are decoded only if something is not in the cache.
 
     Attributes:
-        name: As the case writes it.
         source: What the scanner saw, in its file.
         skin: The skin, where it does not come from this CT.
     """
@@ -161,7 +155,6 @@ class Scan:
         """Surfaces of what is dense, or gas, inside the body and in no structure.
 
         Args:
-            structures: Every structure of the case but the skin.
             dense_hu: From here on a voxel is dense.
         """
 

@@ -16,17 +16,10 @@ from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, BodyMask, CtI
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, WIDE, Box, FieldOfView, shifted, spacing_of
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.formats.labels.label_surface import (
-    box_in,
-    frame,
-    framed_surface,
-    mask_surface,
-)
-from puncture_twin.planning.formats.labels.labelmaps import LabelMap
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, box_in, frame, framed_surface, mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical
 from puncture_twin.planning.geometry.containment import settled_crossings
-from puncture_twin.planning.geometry.creases import smooth_normals, split_at_creases
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, smooth_normals, split_at_creases
 from puncture_twin.planning.geometry.rigid import pose
 
 HU_RANGE = 500.0
@@ -73,9 +66,6 @@ def skin_of_image(image: CtImage) -> Skin:
     Every vertex lies between the centres of a voxel inside the body mask and one outside, so the surface is
     never more than half a voxel (along any axis) from the mask's boundary, like that of a label.
 
-    Args:
-        image: A CT, without what was laid around it.
-
     Raises:
         InputError: If no body is found, or no air around it.
     """
@@ -95,8 +85,6 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
     """The outer surface of one label, holes filled in each axial slice (a label may be a shell of skin only).
 
     Args:
-        labelmap: The map.
-        label: Its body or skin label.
         box: The part of it without what was laid around it.
 
     Raises:
@@ -228,7 +216,6 @@ def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, farthest: floa
     """Follow every path from the target outward.
 
     Args:
-        skin: The body's surface.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
         farthest: How far skin matters, mm: to where the flange can be while the tip waits.

@@ -128,7 +128,6 @@ class StructureSources:
         """The body's surface, from whatever the case names.
 
         Args:
-            section: Of the skin.
             structures: What lies in the body, as far as it was read: where it is cut, the body is too.
         """
         self._progress(section.name)

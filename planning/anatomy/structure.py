@@ -32,7 +32,6 @@ class Structure:
     """A named surface with a role.
 
     Attributes:
-        name: Unique in the case.
         role: What it means to the needle.
         margin_mm: The clearance that it demands, where its role demands one.
         mesh: In the CT frame, mm.
@@ -67,8 +66,6 @@ class LabelGrid:
 
     Attributes:
         name: The file or folder, as the case writes it.
-        files: The map, or the masks.
-        voxels: Where they lie.
     """
 
     name: str

@@ -26,10 +26,9 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
+from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.labels.label_sources import refuse_label_map
-from puncture_twin.planning.formats.labels.label_surface import label_mesh
-from puncture_twin.planning.formats.labels.labelmaps import ROUNDED_BY, LabelMap, labelmap_of, segment_names
-from puncture_twin.planning.formats.mesh_guard import guard_mesh
+from puncture_twin.planning.formats.labels.labelmaps import ROUNDED_BY, LabelMap, label_mesh, labelmap_of, segment_names
 from puncture_twin.planning.formats.volumes.volume_files import Volume, VolumeSource, canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -69,8 +68,6 @@ class VolumeSurfaces:
 
     Attributes:
         source: The volume's file or files.
-        sha256: Of these.
-        cache: Where surfaces are kept.
     """
 
     source: VolumeSource
@@ -147,7 +144,6 @@ class VolumeSurfaces:
 
         Args:
             label: Of the body, in a label map; None where this is a CT.
-            organs: See `cut_ends`.
             shown: What a person says of the image; for a phantom see `cut_ends`.
             stated: The sides at which the body was cut, where a person says so.
         """
@@ -186,7 +182,6 @@ class Imaged:
     """A scanner's image of a body: a CT, or a body's label, without padding around it.
 
     Attributes:
-        surfaces: Of the whole file.
         box: The part that was seen, voxels of the canonical order.
         label: Of the body; None where this is a CT.
         notes: What was left out, one sentence each.

@@ -15,10 +15,9 @@ import scipy
 
 from puncture_twin.planning.anatomy.body.body_mask import CtImage
 from puncture_twin.planning.base.arrays import Bools, grown, widened
-from puncture_twin.planning.formats.labels.label_surface import box_in, mask_surface
+from puncture_twin.planning.formats.labels.labelmaps import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.parts import parts_of
-from puncture_twin.planning.geometry.voxelize import mark_inside
+from puncture_twin.planning.geometry.parts import mark_inside, parts_of
 
 GAS_HU = -300.0
 """Half way between fat (-100) and a voxel that is half gas, half tissue (-500)."""
@@ -61,9 +60,7 @@ def unnamed_surfaces(
     """Find dense components and gas inside the body outside of all structures grown by one voxel.
 
     Args:
-        ct: The CT.
-        body: Its body, shape (nx, ny, nz).
-        structures: Every structure of the case but the skin.
+        body: The CT's body, shape (nx, ny, nz).
         dense_hu: From here on a voxel is dense.
         slack_mm: So deep below the body's surface there may still be the ambient air, because the surface is from
             elsewhere and was widened.

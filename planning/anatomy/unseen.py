@@ -27,11 +27,11 @@ from puncture_twin.planning.base.arrays import Floats, widened
 from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.formats.labels.label_surface import mask_surface
+from puncture_twin.planning.formats.labels.labelmaps import mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.geometry.parts import voxels_inside
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.voxelize import voxels_inside
 
 BEYOND_IMAGE = "beyond_image"
 """Its name among the structures."""
@@ -226,7 +226,6 @@ class _Extent:
     """A map against the body, both in the map's voxels, which may be oblique to the patient.
 
     Attributes:
-        grid: The map.
         low, high: Shape (3,), of the body within the needle's reach.
     """
 
@@ -254,10 +253,7 @@ def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure], memor
     face has its edges cut off by so much there.
 
     Args:
-        case: The case.
-        skin: Its skin; where it is open, a map that ends is refused.
-        structures: What was read of the maps.
-        memory: Holds the body's box in each map.
+        skin: The case's skin; where it is open, a map that ends is refused.
 
     Raises:
         InputError: A map that does not hold the target, or one that ends in a body whose skin is open.

@@ -86,7 +86,6 @@ def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop
     """First sample at which a path is not feasible: out of reach, singular, or a joint jumps; None if none.
 
     Args:
-        model: The arm.
         path: Shape (m, 6), rad, one branch of `every_branch`.
         depths_mm: Shape (m,), rising, mm.
     """
@@ -108,10 +107,8 @@ def _first_stop_at(lengths, path, depths, at_least, fastest):  # type: ignore[no
     """Index at which a path ends: no solution, too near a singularity, or a joint faster than it may; -1: nowhere.
 
     Args:
-        lengths: The arm.
         path: Shape (m, 6), rad.
         depths: Shape (m,), mm, rising.
-        at_least: Least of the singular terms.
         fastest: rad/mm.
     """
     last = len(path) - 1
@@ -129,7 +126,6 @@ def reach_margin(model: UrModel, q: Floats) -> float:
     """Margin of a motion: least of each joint's distance to its limits over a quarter turn, and the singularity terms.
 
     Args:
-        model: The arm.
         q: Shape (m, 6), rad.
 
     Returns:

@@ -36,7 +36,6 @@ def inverse(model: UrModel, T_base_flange: Floats) -> Floats:
     """All joint configurations that put the flange at each pose.
 
     Args:
-        model: The arm.
         T_base_flange: Shape (n, 4, 4) or (4, 4), mm, rigid.
 
     Returns:
@@ -170,7 +169,6 @@ def nearest_within_limits(model: UrModel, q: Floats, q_reference: Floats) -> Flo
     """The whole turns added to each joint that bring it nearest to a reference without leaving its limits.
 
     Args:
-        model: The arm.
         q: Shape (..., 6), rad.
         q_reference: Broadcasts against ``q``, rad.
 
@@ -190,7 +188,6 @@ def wrapped_solutions(model: UrModel, q: Floats) -> Floats:
     """Every configuration within the limits that differs from one by whole turns.
 
     Args:
-        model: The arm.
         q: Shape (6,), rad, finite.
 
     Returns:

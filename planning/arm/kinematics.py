@@ -33,7 +33,6 @@ def link_poses(model: UrModel, q: Floats) -> Floats:
     """Frames of the base and the six links.
 
     Args:
-        model: The arm.
         q: Shape (..., 6), rad.
 
     Returns:
@@ -86,7 +85,6 @@ def jacobian(model: UrModel, q: Floats) -> Floats:
     """The geometric Jacobian of the flange, base frame.
 
     Args:
-        model: The arm.
         q: Shape (..., 6), rad.
 
     Returns:
@@ -143,7 +141,6 @@ def error_jacobian(model: UrModel, q: Floats, tip_mm: float) -> Floats:
     d2 is left out: axes 2 and 3 are parallel, and d3 moves the arm alike.
 
     Args:
-        model: The nominal arm.
         q: Shape (..., 6), rad.
         tip_mm: Flange to tip, along the flange's z.
 
@@ -258,7 +255,6 @@ def singularity(model: UrModel, q: Floats) -> Singularity:
     term a2 cos q2 + a3 cos q23 + d5 sin q234 (tests hold this).
 
     Args:
-        model: The arm.
         q: Shape (..., 6), rad.
     """
     rows = np.array(q, dtype=np.float64, order="C").reshape(-1, 6)  # a copy: read-only ones would be compiled for too
@@ -279,7 +275,6 @@ def farthest_from_singular(model: UrModel, q: Floats, elbow_towards: Floats) -> 
     among them by the last bit differs between machines.
 
     Args:
-        model: The arm.
         q: Shape (n, 6), rad; rows may be NaN, not all of them.
         elbow_towards: Shape (3,), base frame: where there is space for the elbow.
 
@@ -361,7 +356,6 @@ def tip_rates(model: UrModel, q: Floats, directions: Floats, tip_mm: float) -> F
     """How fast the tip moves while the joints move at given speeds: |J_v u + (J_w u) x l z|, l from flange to tip.
 
     Args:
-        model: The arm.
         q: Shape (m, 6), rad.
         directions: Shape (m, 6) or (6,), u: joint speeds, rad/s; or per whatever else the tip's speed is then per.
         tip_mm: Flange to tip, along the flange's z.
@@ -378,7 +372,6 @@ def tip_speeds(model: UrModel, q: Floats, times_s: Floats, tip_mm: float) -> Flo
     """The tip's mean speed between the samples of a motion, mm/s.
 
     Args:
-        model: The arm.
         q: Shape (m, 6), rad.
         times_s: Shape (m,), s, rising.
         tip_mm: Flange to tip, along the flange's z.
@@ -418,12 +411,9 @@ def check_arm(
     both must agree, up to what a controller's own calibration moves.
 
     Args:
-        model: The case's arm.
         q: Shape (n, 6), rad.
         points_base: Shape (n, 3), mm: where the tool was.
         tools_flange: What the tool may be: points (3,) of the flange, mm.
-        names: Of the n rows.
-        where: What the error names.
         any_tool: Whether it may also be any other point, the same in all rows.
 
     Raises:
@@ -456,13 +446,7 @@ def check_recording(model: UrModel, tip_mm: float, recording: JointRecording, *,
     """Refuse a recording whose controller had its tool where this arm's joints do not put one; without a tool, nothing.
 
     Args:
-        model: The case's arm.
-        tip_mm: Flange to tip of its needle.
         recording: Joints, and where the controller had its tool: flange, tip, or another point that all rows share.
-        where: What the error names.
-
-    Raises:
-        InputError: As `check_arm`.
     """
     if recording.tool_base is None:
         return
@@ -472,11 +456,7 @@ def check_recording(model: UrModel, tip_mm: float, recording: JointRecording, *,
 
 
 def check_flanges(model: UrModel, q: Floats, T_base_flange: Floats, *, names: Sequence[str], where: str | Path) -> None:
-    """Refuse joints (n, 6), rad, that do not belong to flanges (n, 4, 4), mm, in place and axes.
-
-    Raises:
-        InputError: As `check_arm`.
-    """
+    """Refuse joints (n, 6), rad, that do not belong to flanges (n, 4, 4), mm, in place and axes."""
     for tool in (np.zeros(3), *(LEVER_MM * np.eye(3)[:2])):
         points = T_base_flange[:, :3, 3] + T_base_flange[:, :3, :3] @ tool
         check_arm(model, q, points, [tool], names=names, where=where)

@@ -144,7 +144,6 @@ def convex_pieces(mesh: TriangleMesh, count: int) -> tuple[TriangleMesh, ...]:
     """The hulls of the surface's parts in equal slabs across the longest side. Their union contains the surface.
 
     Args:
-        mesh: The surface.
         count: Slabs; one hull of all is made where a slab's part of the surface is flat.
 
     Returns:

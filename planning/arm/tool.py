@@ -26,7 +26,6 @@ class ToolBody:
 
     Attributes:
         mesh: Its surface, mm, in the flange's frame.
-        file: The mesh's file.
         unit_mm: How many millimetres one unit of the file is.
         T_flange_file: Shape (4, 4), mm: the file's frame in the flange's.
         key: Where it is stated, for errors.
@@ -70,10 +69,7 @@ class Tool:
     """Needle and holder. The holder is a cylinder from the flange along +z; the needle goes on from it to the tip.
 
     Attributes:
-        needle_length_mm: Flange to tip.
         shaft_mm: Usable length: from the holder's end to the tip.
-        needle_diameter_mm: Diameter of the needle.
-        holder_diameter_mm: Diameter of the holder.
         body: What the flange carries besides them, or None.
 
     Raises:
@@ -116,7 +112,6 @@ class Box:
     """A solid cuboid in the workcell, such as the table.
 
     Attributes:
-        name: What contacts call it.
         T_base_box: Shape (4, 4), mm: the box's centre and axes in the base frame.
         size_mm: Full edge lengths along its axes.
 
@@ -163,9 +158,7 @@ def gantry_boxes(
 
     Args:
         T_base_gantry: Shape (4, 4), mm: the bore's centre; its axis is z, so a tilt is a turn about x.
-        bore_diameter_mm: Of the bore.
         wall_mm: How far the wall reaches outward from the bore; the housing beyond does not count.
-        depth_mm: Along the bore.
 
     Returns:
         Boxes named ``gantry_0`` ...: every point of the wall is in one of them, and every point nearer to the axis than

@@ -52,7 +52,6 @@ class UrModel:
         max_speeds: Shape (6,), rad/s.
         max_torques: Shape (6,), N m: what each joint's motor can give.
         max_acceleration: rad/s^2, for every joint.
-        joint_names: As ROS has them.
         shipped: Whether its shapes are those that ship under its name.
         urdf: Its own URDF, if it has one; an arm that neither ships nor has one is known by its numbers alone.
     """

@@ -47,9 +47,7 @@ class InputError(PlanningError):
     """Input that cannot be used. The command line prints it as one line and exits with code 2.
 
     Args:
-        what: What is wrong, with the offending value.
         where: The file, and the place in it (key, line, marker name).
-        allowed: What would have been accepted.
         code: What kind of mistake it is, in snake_case: the same kind has one code, wherever it is found.
         numbers: What was measured, by name with its unit.
     """
@@ -108,7 +106,6 @@ class NoAnswerError(PlanningError):
     Args:
         message: What was not found.
         code: Why not, as an `InputError` has it.
-        counts: How many candidates fell to which reason.
     """
 
     def __init__(self, message: str, *, code: str, counts: Mapping[str, int] = MappingProxyType({})) -> None:
@@ -166,7 +163,6 @@ def one_line(text: str, most: int = MOST_MESSAGE) -> str:
     """A text as one printable line.
 
     Args:
-        text: Any text.
         most: Characters, from 3 on; a longer text loses its middle.
     """
     line = " ".join(text.split())
@@ -191,7 +187,6 @@ class Finding:
     Attributes:
         code: What kind of thing it is, in one word.
         severity: A refusal stops the work, a warning stands in every result, a note is for those who look.
-        sentence: For a person.
         numbers: What was measured, by name with its unit.
         way_out: Of a refusal, what would be accepted.
     """
@@ -231,11 +226,6 @@ NO_WHEEL_FROM: Mapping[str, tuple[str, tuple[int, int]]] = MappingProxyType(
 
 def require_extra(extra: str, where: str, *, else_allowed: str = "") -> None:
     """Refuse what needs a missing part of the installation, before it works for minutes.
-
-    Args:
-        extra: A key of `MODULES`.
-        where: The command or file that needs it.
-        else_allowed: Another way out.
 
     Raises:
         InputError: A module of the extra is not installed.

@@ -122,6 +122,25 @@ def check_writable(folder: Path | str) -> Path:
     return folder
 
 
+@contextmanager
+def new_folder(path: Path | None) -> Iterator[Path | None]:
+    """A folder that appears whole or not at all; None for none.
+
+    Raises:
+        InputError: Something is there already, or it cannot be made.
+    """
+    if path is None:
+        yield None
+        return
+    if path.exists():
+        refuse("is there already", path, "a new folder", "output_exists")
+    with tempfile.TemporaryDirectory(dir=check_writable(path.parent), prefix=".") as beside:
+        kept = Path(beside) / path.name
+        kept.mkdir()
+        yield kept
+        kept.replace(path)
+
+
 def _names_fit(nearest: Path, folder: Path) -> bool:
     """Whether every part of the name fits the file system, and no folder of a file's name is in the way."""
     longest = os.pathconf(nearest, "PC_NAME_MAX")
@@ -137,10 +156,7 @@ def read_input(path: Path, *, max_bytes: int, where: str, allowed: str = "") -> 
     """Read all bytes of a file.
 
     Args:
-        path: The file.
         max_bytes: A larger one is refused before it is read.
-        where: How the error names it.
-        allowed: What is wanted there; empty for any file.
 
     Raises:
         InputError: If it is missing, no regular file, empty, too large, or not readable.
@@ -188,12 +204,7 @@ def _other_case(path: Path) -> str:
 
 
 def unfinished_warnings(content: bytes, name: str) -> tuple[str, ...]:
-    """What to say of a list whose last line does not end with a line break; spaces after it are no line.
-
-    Args:
-        content: The whole file.
-        name: What the warning calls it.
-    """
+    """What to say of a list whose last line does not end with a line break; spaces after it are no line."""
     if content.rstrip(b" \t").endswith((b"\n", b"\r")):
         return ()
     return (f"{name}: its last line has no line break at its end; was the file cut?",)

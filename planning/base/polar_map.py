@@ -99,8 +99,6 @@ def polar_map(cells: Sectors, legend: Sequence[Entry], bin_rad: float = FINEST) 
     """The map with its legend; empty without cells.
 
     Args:
-        cells: What is mapped.
-        legend: From the best to the most cautious.
         bin_rad: Wanted size of a bin; it is made no smaller than `FINEST`.
     """
     rim = float(cells.theta.max(initial=0.0))

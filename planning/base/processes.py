@@ -28,10 +28,6 @@ copyreg.pickle(MappingProxyType, lambda mapping: (_mapping, (dict(mapping),)))
 def worker_count(wanted: int, pieces: int) -> int:
     """Processes for some pieces of work: no more than wanted, than the processor's cores, or than pieces.
 
-    Args:
-        wanted: What the caller wants; any number.
-        pieces: Of the work.
-
     Returns:
         At least 1.
     """
@@ -58,12 +54,7 @@ def _end_with(command: Any) -> None:
 
 @contextmanager
 def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of `worker_count` spawned processes; where the block ends early, as by Ctrl-C, nothing more begins.
-
-    Args:
-        jobs: What the caller wants; any number.
-        pieces: Of the work.
-    """
+    """A pool of `worker_count` spawned processes; where the block ends early, as by Ctrl-C, nothing more begins."""
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(worker_count(jobs, pieces), mp_context=context, initializer=_begin_worker)
     try:
@@ -78,7 +69,6 @@ def working(jobs: int, pieces: int) -> Iterator[Callable[..., Iterable[Any]]]:
 
     Args:
         jobs: Processes, at most one a core; 1 computes in this one, each piece when its result is taken.
-        pieces: Of the work.
     """
     if worker_count(jobs, pieces) == 1:
         yield map
@@ -92,8 +82,6 @@ def on_threads(work: Callable[[int], None], pieces: int, threads: int) -> Iterat
 
     Args:
         work: Called with the number of a piece.
-        pieces: How many there are.
-        threads: What the caller wants; see `worker_count`.
     """
     threads = worker_count(threads, pieces)
     if threads == 1:

@@ -81,11 +81,7 @@ def content_input(role: str, name: str, content: bytes) -> Input:
 
 
 class InputFiles:
-    """The files of one folder that a result is made from: each is read once, and hashed as it was read.
-
-    Args:
-        folder: What names are relative to.
-    """
+    """The files of one folder that a result is made from: each is read once, and hashed as it was read."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -124,11 +120,9 @@ class InputFiles:
         """The content of a file, which is read where no role has wanted it before.
 
         Args:
-            role: What the file is to the result.
             name: As ``where`` states it.
             max_bytes: A larger file is refused before it is read.
             key: Of ``where``, for errors.
-            where: The file that names this one.
 
         Raises:
             InputError: It is missing, no plain file, empty, too large or not readable.

@@ -39,11 +39,6 @@ def read_json(path: Path, *, max_bytes: int, allowed: str) -> Any:
 def parse_json(data: bytes, *, where: str | Path, allowed: str) -> Any:
     """The tree that some bytes hold: UTF-8 (a byte order mark is passed over), every key once, every number finite.
 
-    Args:
-        data: The whole file.
-        where: Its name, for the error.
-        allowed: What is wanted there, for the error.
-
     Raises:
         InputError: Not such JSON, or nested without end.
     """
@@ -56,12 +51,6 @@ def parse_json(data: bytes, *, where: str | Path, allowed: str) -> Any:
 
 def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str) -> dict[str, Any]:
     """A JSON object whose ``version`` is this one.
-
-    Args:
-        data: The whole file.
-        version: Of its layout.
-        where: Its name, for the error.
-        allowed: What is wanted there, for the error.
 
     Raises:
         InputError: Another version, no object, or see `parse_json`.
@@ -76,10 +65,6 @@ def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str
 @contextmanager
 def fitting(where: str | Path, allowed: str) -> Iterator[None]:
     """Whatever a value of the wrong kind raises within, as one line about its file.
-
-    Args:
-        where: The file.
-        allowed: What is wanted there.
 
     Raises:
         InputError: A key that is missing, or a value of another type, shape or size.

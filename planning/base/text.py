@@ -29,9 +29,7 @@ def check_name(name: str, what: str, *, where: str | Path) -> str:
     """Check a name that is printed as it is, and return it.
 
     Args:
-        name: The name as the file states it.
         what: What it names, for the error: "label 3", "point 2".
-        where: The file, for the error.
 
     Raises:
         InputError: An empty name, one of more than `MAX_NAME` characters, or one with a control or format character.
@@ -139,8 +137,6 @@ def card(title: str, facts: Facts, picture: str = "") -> str:
     """A title, a table of facts and, beside it, a picture.
 
     Args:
-        title: Plain text.
-        facts: Names and values, plain text.
         picture: HTML, such as an image; "" for none.
     """
     rows = "".join(

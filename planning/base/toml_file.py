@@ -93,11 +93,6 @@ def parse_toml(
     """Validate the bytes of such a file; it is not opened again.
 
     Args:
-        content: What was read.
-        path: The file, for errors.
-        model: Its schema.
-        allowed: What would have been accepted in its place.
-        keys: Where its keys are described.
         change: States some values otherwise, before any is looked at.
 
     Raises:
@@ -148,12 +143,7 @@ def check_toml_bounds(text: str, where: Path | str, allowed: str) -> None:
     """Refuse a text that is nested too deep, or has a key, a number or a line too long; it need not be TOML.
 
     Args:
-        text: The whole file.
-        where: The file, for the error.
         allowed: What would have been accepted in its place, for the error.
-
-    Raises:
-        InputError: Says which line goes beyond which bound.
     """
     tables = 0
     for number, line in enumerate(text.split("\n"), start=1):

@@ -38,7 +38,6 @@ class CohortCase:
     """One case with its options.
 
     Attributes:
-        stated: As the cohort writes it.
         path: The case file, or the folder that holds ``case.toml``.
         name: What people call it; "" leaves it to the case.
         options: What is stated in place of what the case states.
@@ -132,10 +131,6 @@ LONGEST_CELL = 20_000
 
 def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
     """The cases that a CSV lists.
-
-    Args:
-        content: The whole file.
-        path: Its name; cases are relative to its folder.
 
     Raises:
         InputError: No column ``case``, an unknown column, or a line that cannot be used; names the line.
@@ -251,10 +246,6 @@ class _Choice(NamedTuple):
 
 def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
     """The cases that a cohort file describes: every match of its patterns with every combination of its options.
-
-    Args:
-        content: The whole file.
-        path: Its name; patterns are relative to its folder.
 
     Raises:
         InputError: Not of this schema, a pattern that matches nothing, or too many combinations.

@@ -55,12 +55,6 @@ def write_dataset(rows: Sequence[dict[str, Any]], out: Path, folder: Path, progr
     Every part has the union of all columns: readers take the first part's for the whole, and drop an organ that only
     later cases have, or stop.
 
-    Args:
-        rows: Of `merged_rows`.
-        out: The cohort's folder.
-        folder: The dataset's.
-        progress: Called with (parts written, parts).
-
     Raises:
         InputError: Two cases give a column of one name two types.
     """
@@ -188,9 +182,7 @@ class CaseChange(NamedTuple):
     """One case in two cohorts.
 
     Attributes:
-        case: As written.
-        options: As JSON.
-        before: Its row in the first; None where it is not there.
+        before: The case's row in the first; None where it is not there.
         after: The second cohort's row of the case.
     """
 

@@ -55,11 +55,7 @@ class PlannedCase:
     """A row of the plan.
 
     Attributes:
-        case: As the cohort writes it.
         id: Hash of inputs, options and version; also the name of its result's folder.
-        name: What people call it.
-        path: The case file, absolute.
-        options: As JSON, see `CaseOptions`.
         arm: False leaves the arm out; None checks it where the case says where its base is.
         inputs: Role, path and SHA-256 of each file, as JSON.
         refusal: Why the case cannot be read, or "".
@@ -94,8 +90,6 @@ class Plan:
     """A cohort's plan.
 
     Attributes:
-        cases: In the cohort's order.
-        sha256: Of the file.
         version: Of this package, when it was made.
     """
 
@@ -108,9 +102,6 @@ def case_id(options: str, arm: bool | None, inputs: Sequence[Input], refusal: st
     """The id of a case: the same bytes, options and version give the same id, wherever the files lie.
 
     Args:
-        options: As JSON.
-        arm: Of `PlannedCase`.
-        inputs: Every file, with its hash.
         refusal: Why it cannot be read, or "".
     """
     stated = [(one.role, "" if one.role == CASE_ROLE else one.path, one.sha256) for one in inputs]
@@ -209,9 +200,6 @@ def commit(draft: Path, out: Path, case_id: str, inputs: Sequence[Input], timing
 
     Args:
         draft: Of `new_draft`, on the file system of ``out``, with all its files.
-        out: The cohort's folder.
-        case_id: The name of the result.
-        inputs: Every file that decided it.
         timings: What differs from run to run: seconds, attempts.
 
     Returns:

@@ -40,8 +40,17 @@ from puncture_twin.planning.batch.plan import (
     read_plan_table,
     read_row,
 )
-from puncture_twin.planning.batch.run_case import CaseEnd, CaseTask, WritePage, commit_failure, ended, run_case
-from puncture_twin.planning.batch.workers import NO_LIMITS, WORKER_DIED, Limits, run_tasks
+from puncture_twin.planning.batch.run_case import (
+    NO_LIMITS,
+    WORKER_DIED,
+    CaseEnd,
+    CaseTask,
+    Limits,
+    WritePage,
+    failed,
+    run_case,
+    run_tasks,
+)
 
 Item = TypeVar("Item")
 
@@ -113,9 +122,7 @@ class Request:
     """Cases to be run, and how.
 
     Attributes:
-        part: Of the plan.
         jobs: Processes of this machine, at most one a core.
-        limits: Of each case.
         write_page: Writes a page for each case that is searched, or None.
     """
 
@@ -130,8 +137,7 @@ class RunCounts:
     """Counts of one run.
 
     Attributes:
-        planned: Cases of the part.
-        same: Of them the same as others, to the byte: they are run once.
+        same: Planned cases that are others to the byte: they are run once.
         before: Others that had their rows.
         refused_before: Of these, cases whose inputs were refused.
         ended: Exit code of a row to how many rows.
@@ -171,9 +177,6 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     """Run what has no final row yet.
 
     Args:
-        out: The cohort's folder, with its plan.
-        request: Which part, and how.
-        watcher: Shows progress, in cases.
         elsewhere: Runs the cases; None runs them in processes of this machine.
 
     Raises:
@@ -275,7 +278,6 @@ class Estimate:
     """Estimated time, memory and disk of a cohort.
 
     Attributes:
-        cases: In all.
         refused: That cannot be read.
         sample: The case that was measured, as the cohort writes it; None where none can be read.
         seconds: A case, in a worker that is warm.
@@ -312,13 +314,9 @@ class CohortState:
     """State of a cohort's cases, each counted once: done, failed, missing or stale.
 
     Attributes:
-        planned: Cases in all.
         safe: Done, with a safe direction.
-        no_safe: Done, without one.
         reasons: Failed, by reason: refused inputs, and failures of the program.
-        missing: Not run.
-        stale: Their inputs have changed since the plan: `batch plan` again.
-        stale_cases: As the cohort writes them.
+        stale: Cases whose inputs have changed since the plan: `batch plan` again.
     """
 
     planned: int = 0
@@ -375,10 +373,6 @@ class CohortState:
 
 def cohort_state(out: Path, progress: Count) -> CohortState:
     """The state of every case of a plan.
-
-    Args:
-        out: The cohort's folder.
-        progress: Called with (cases looked at, cases).
 
     Raises:
         InputError: The folder has no plan.
@@ -449,17 +443,12 @@ def _dask_ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Gene
             if error is None:
                 yield future.result()
             elif isinstance(error, distributed.KilledWorker):
-                yield _killed(task)
+                yield failed(task, WORKER_DIED)  # it killed its workers
             else:
                 raise error
             future.release()
     finally:
         client.cancel(list(futures))
-
-
-def _killed(task: CaseTask) -> CaseEnd:
-    """The row of a case that killed its workers; or the result that was there before."""
-    return ended(task) or commit_failure(task, WORKER_DIED)
 
 
 def run_on_worker(task: CaseTask) -> CaseEnd:

@@ -28,7 +28,6 @@ class Breathing:
         amplitude_mm: b, of the target, from exhale to full inhale.
         direction_ct: Shape (3,), unit: whereto inhaling moves it.
         weights: Of everything else.
-        phases: Of one period.
         exponent: n of Lujan's curve.
         scanned_at: The position s in which the CT shows the body.
         gate: The needle goes in while s is at most this; None for any time.
@@ -98,7 +97,6 @@ def positions(phases: int, exponent: int) -> Floats:
 
     Args:
         phases: Of one period. An even number holds full inhale.
-        exponent: n of the curve.
 
     >>> positions(8, 2).round(3).tolist()
     [0.0, 0.021, 0.25, 0.729, 1.0]
@@ -112,7 +110,6 @@ def fraction_within(position: float, exponent: int) -> float:
 
     Args:
         position: s, 0 at exhale, 1 at full inhale.
-        exponent: n of the curve.
     """
     return float(2 / np.pi * np.arcsin(np.clip(position, 0.0, 1.0) ** (1 / (2 * exponent))))
 
@@ -139,7 +136,6 @@ def mean_square_within(position: float, exponent: int, about: float) -> float:
 
     Args:
         position: s, 0 at exhale, 1 at full inhale.
-        exponent: n of the curve.
         about: s of the place that is compared with.
 
     >>> round(12 * mean_square_within(1.0, 4, 0.0) ** 0.5, 1)

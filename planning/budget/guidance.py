@@ -1,10 +1,12 @@
 """The ways of guidance of a case along one direction: where the devices look, what has moved, how far to correct.
 
-A correction moves the needle parallel to itself, by c from where the plan puts it. As certificates do, it trusts the
-clearances of the plan's own needle: with slack_j = distance to structure j - radius - margin, no point of the needle
-moves by more than |c|, so that every needle with
+A correction moves the needle parallel to itself. Part of it takes back what registration and arm had wrong; the rest
+takes the needle to another place in the body than was planned, because the target has moved there, or is there. That
+part s is what touches and the way's readings together say of it, with the body at rest. As certificates do, the
+corridor trusts the clearances of the plan's own needle: with slack_j = distance to structure j - radius - margin, no
+point of the needle is displaced by more than |s|, so that every needle with
 
-    |c| <= min_j slack_j
+    |s| <= min_j slack_j
 
 keeps every margin in the anatomy as the CT shows it. What would go farther is not executed: the needle is stopped, and
 does not hit.
@@ -23,6 +25,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.breathing.breathing import position_at
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import stereo_of, ultrasound_of
@@ -41,8 +44,11 @@ from puncture_twin.planning.sight.cameras import CameraView, camera_view
 from puncture_twin.planning.sight.probe import ProbeView, probe_view
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.guided import (
+    ALIKE_MM,
     CAMERAS,
     WAYS,
+    WHOLLY,
+    Follows,
     GuidedError,
     GuidedModel,
     Look,
@@ -260,10 +266,8 @@ def way_chances(
         except NoAnswerError as refused:
             found.append(WayChance(way, np.nan, np.nan, np.nan, lost or str(refused)))
             continue
-        p_stop = model.stop_chance(way, corridor)
-        about = left.about_mean
-        p_hit = (1.0 - p_stop) * float(chance.led(about, left.mean_ct).hit_chance(about.covariance_ct(q[None]))[0])
-        found.append(WayChance(way, float(np.sqrt(np.trace(left.tip_covariance(q[None])[0]))), p_hit, p_stop, lost))
+        rms_mm = float(np.sqrt(np.trace(left.tip_covariance(q[None])[0])))
+        found.append(WayChance(way, rms_mm, *guided_chances(model, way, chance, corridor), lost))
     return tuple(found)
 
 
@@ -301,6 +305,17 @@ def explained_ways(context: CaseContext, explained: Explanation) -> Explanation:
     return replace(explained, guidance=way_chances(context, row.outward_ct[0], q))
 
 
+def followers(case: Case, anatomy: Anatomy) -> tuple[Follows, ...]:
+    """How each of ``anatomy.checked`` follows the target; what is outside of the body does not but with the breath."""
+    breath = np.ones(len(anatomy.checked))
+    if case.breathing is not None:
+        breath = moving_weights(case, case.breathing, anatomy).structures
+    return tuple(
+        Follows(0.0 if one.outside else 1.0, weight)
+        for one, weight in zip(anatomy.checked, breath.tolist(), strict=True)
+    )
+
+
 def lost_sight(model: GuidedModel, way: str) -> tuple[str, ...]:
     """What a way's devices do not see, where and why, a sentence each; that the tip is not yet in the body is none."""
     return tuple(
@@ -318,8 +333,8 @@ def _where(look: Look) -> str:
     return "at the target" if look.out_mm <= 0 else f"{look.out_mm:.0f} mm before the target"
 
 
-def guided_error(model: GuidedModel, way: str, weight: float = 1.0) -> GuidedError:
-    """The pose error that a way leaves, against anatomy that follows the target's breath by a weight.
+def guided_error(model: GuidedModel, way: str, follows: Follows = WHOLLY) -> GuidedError:
+    """The pose error that a way leaves, against anatomy that follows the target so.
 
     Raises:
         NoAnswerError: What is in sight does not determine the tip against the target.
@@ -328,14 +343,45 @@ def guided_error(model: GuidedModel, way: str, weight: float = 1.0) -> GuidedErr
     if found is None:
         lost = "; ".join(lost_sight(model, way)) or "its readings leave the needle's place against the CT open"
         raise NoAnswerError(f"guidance '{way}' does not see enough: {lost}", code="lost_sight")
-    if weight != 1.0:
-        cov, mean = model.left(found.gain, weight)
-        found = found._replace(cov=cov, mean=mean, tip_cov=cov[:3, :3])  # no picture shows this anatomy
+    if follows != WHOLLY:
+        cov, breath = model.left(found.gain, follows)
+        found = found._replace(cov=cov, breath=breath, tip_cov=cov[:3, :3])  # no picture shows this anatomy
     return GuidedError(one.model, one.tip_mm, one.target_base, one.errors, one.fit, one.bend, found)
 
 
+PHASES = 8
+"""Positions of the breath, of equal chances, over which chances are averaged: it is neither about 0 nor normal."""
+
+
+def at_phases(model: GuidedModel, way: str, chance: ChanceModel, follows: Follows = WHOLLY) -> list[ChanceModel]:
+    """The chances of a way's needle against such anatomy at each position of the breath in the gate, known there.
+
+    Raises:
+        NoAnswerError: As `guided_error`.
+    """
+    error, breathing, deviations = guided_error(model, way, follows), chance.case.breathing, np.zeros(1)
+    if breathing is not None:
+        gate = 1.0 if breathing.gate is None else breathing.gate
+        s = position_at((np.arange(PHASES) + 0.5) / PHASES, gate, breathing.exponent)
+        mean_mm, deviation_mm = breathing.direction_ct @ breathing.spread_ct
+        moved_mm = (s - breathing.scanned_at) * breathing.amplitude_mm
+        deviations = (moved_mm - mean_mm) / max(deviation_mm, ALIKE_MM)
+    return [chance.led(*error.about_breath(deviation)) for deviation in deviations.tolist()]
+
+
+def guided_chances(model: GuidedModel, way: str, chance: ChanceModel, corridor_mm: float) -> tuple[float, float]:
+    """The chance that a way's needle is not stopped, and hits, and the chance that it is stopped.
+
+    Raises:
+        NoAnswerError: As `guided_error`.
+    """
+    q, p_stop = model.q_insertion[None], model.stop_chance(way, corridor_mm)
+    hit = [one.hit_chance(one.error.covariance_ct(q))[0] for one in at_phases(model, way, chance)]
+    return (1.0 - p_stop) * float(np.mean(hit)), p_stop
+
+
 def corridor_mm(case: Case, chance: ChanceModel, outward_ct: Floats) -> float:
-    """How far a correction may move the needle, mm; see the module."""
+    """How far from its plan a correction may take the needle in the body, mm; see the module."""
     lengths = case_axis_lengths(case, chance.anatomy, outward_ct[None])
     distance = chance.engine.measure(case.target_ct, outward_ct[None], lengths).distance[0][chance.columns]
     return float(max((distance - chance.breaking).min(initial=np.inf), 0.0))

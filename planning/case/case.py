@@ -28,7 +28,6 @@ from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direct
 from puncture_twin.planning.case.errors import ErrorModel, errors_of
 from puncture_twin.planning.case.named_files import MASK_ROLE, CaseVolumes, read_named_files, robot_warnings
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
-from puncture_twin.planning.case.sections import bending_of, breathing_of, robot_of
 from puncture_twin.planning.case.settings import (
     Axis,
     CtSettings,
@@ -41,10 +40,13 @@ from puncture_twin.planning.case.settings import (
     Stereo,
     Ultrasound,
     axes_frame,
+    bending_of,
+    breathing_of,
     ct_of,
     gantry_of,
     motion_of,
     obstacle_of,
+    robot_of,
     search_of,
     stereo_of,
     ultrasound_of,
@@ -151,8 +153,17 @@ class Case(Shown):
                 and replaces an earlier ``add_mm``.
 
         Raises:
-            InputError: A kind of option, a key or a value that the file could not have, or a file that has changed.
+            InputError: A kind of option, a key or a value that the file could not have, a table without any, or a
+                file that has changed.
         """
+        for kind, values in options.items():
+            if isinstance(values, Mapping) and not values:
+                refuse(
+                    f"option '{kind}' has no keys, and changes nothing",
+                    "replace",
+                    "keys and values, as in the case",
+                    "empty",
+                )
         if target_ct is not None:
             point = guard_points([target_ct], (self.target_name,), where="replace: target_ct")
             options = {**options, "target": {"position_mm": to_lps(point, self.space)[0]}}
@@ -200,7 +211,6 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
     """Read and validate a case file, or a folder that holds ``case.toml``.
 
     Args:
-        path: The file or the folder.
         options: What is stated in place of what the file states; they are an input of their own.
 
     Raises:
@@ -270,12 +280,6 @@ def case_of(
 
 def _target_of(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Floats:
     """The point to reach, shape (3,), LPS (or the case's local frame) mm, read-only.
-
-    Args:
-        content: The case file.
-        path: Where it is, for errors.
-        space: The case's.
-        files: What it names, read.
 
     Raises:
         InputError: A list of points that cannot be read, or that lacks the target's name.

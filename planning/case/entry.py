@@ -71,7 +71,6 @@ def entry_frame(frame: str | EntryAxes | None, space: Space, *, where: str | Pat
         frame: ``"ct"`` (axes of the case's space), ``"bed"`` (x to the head, z to the front), explicit axes, or
             None for the space's default: ``"ct"`` for a local space, ``"bed"`` for a patient.
         space: The case's space; explicit vectors are given in it.
-        where: What an error names.
 
     Returns:
         Shape (3, 3), columns x, y = z × x and z in LPS (or the local frame).
@@ -137,12 +136,7 @@ def direction(theta: Floats | float, beta: Floats | float, R_ct_entry: Floats) -
     return _directions(one, other, R_ct_entry)
 
 
-def grid(
-    theta: tuple[float, float],
-    beta: tuple[float, float],
-    step: float,
-    R_ct_entry: Floats,
-) -> Directions:
+def grid(theta: tuple[float, float], beta: tuple[float, float], step: float, R_ct_entry: Floats) -> Directions:
     """Every (θ, β) of a regular grid, θ outermost; β = 360° is left out where the range is the full circle.
 
     Args:
@@ -183,7 +177,6 @@ class AngleGrid:
     Attributes:
         theta: Shape (m,), ascending.
         beta: Shape (k,), ascending.
-        step: Between neighbours, of both.
         full_circle: The last azimuth's next neighbour is the first.
     """
 

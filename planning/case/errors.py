@@ -162,11 +162,9 @@ def error_model(
     """The declaration in mm and radians, with the defaults filled in.
 
     Args:
-        section: As the case states it.
         space: Of the case, in which ``bed_axis`` is meant.
         cells: Of the case's own CT, which give pixel, spacing and bed axis where the section does not.
         fle_mm: ``registration.fle_mm``, the short form: rms length of a marker's whole error, touch included.
-        where: What errors name.
 
     Raises:
         InputError: One error declared twice, or slices that differ from pixels without a bed axis.

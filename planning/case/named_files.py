@@ -144,7 +144,6 @@ class CaseVolumes:
     """The CT and the label maps of a case.
 
     Args:
-        files: Reads and hashes the files.
         path: The case file, to whose folder names are relative.
     """
 
@@ -160,8 +159,6 @@ class CaseVolumes:
 
         Args:
             role: One of ``VOLUME_ROLES``.
-            name: As the case states it.
-            key: Of the case, for errors.
 
         Raises:
             InputError: A file that is missing, too large or not readable, or a header that is damaged.
@@ -272,16 +269,12 @@ def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tupl
     Raises:
         InputError: A list whose last line does not end.
     """
-    for name in _line_files(files):
+    for name in dict.fromkeys(one.path for one in files.inputs if one.path.lower().endswith(LINE_FILES)):
         for said in unfinished_warnings(files.content(name), name):
             refuse(said, path, "files in which every line ends with a line break", "file_cut")
     if content.end is None:
         return (TOP_COUNT_NOTE,)
     return () if ends_with_end(files.content(path.name).decode("utf-8")) else (NOT_LAST_NOTE,)
-
-
-def _line_files(files: InputFiles) -> list[str]:
-    return list(dict.fromkeys(one.path for one in files.inputs if one.path.lower().endswith(LINE_FILES)))
 
 
 def ends_with_end(text: str) -> bool:

@@ -64,10 +64,6 @@ class CaseOptions:
     def applied(self, data: dict[str, Any], *, where: Path | str) -> dict[str, Any]:
         """A case file's tables with the options in place; nothing is validated yet.
 
-        Args:
-            data: As TOML gives them; stays as it is.
-            where: The case file, for errors.
-
         Raises:
             InputError: A margin of what the case has no margin for.
         """
@@ -115,7 +111,6 @@ def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
 
     Args:
         sections: Kind of option to a table of keys and values.
-        where: What states them, for errors.
 
     Raises:
         InputError: An unknown kind, something that is no table, or a value that is no number, text or list of them.

@@ -84,7 +84,6 @@ class Certificate(Shown):
     """A certified map: directions proven safe, proven rejected, and cells too small to decide.
 
     Attributes:
-        question: What it answers.
         size: No undecided cell has a larger angular diameter, rad.
         tree: Level by level, a letter for each cell of the level: a split, or a leaf's verdict. The parts of a level's
             split cells, in order, are the next level.

@@ -108,8 +108,6 @@ def narrowed(zone: Zones, lists: Lists, parent: Ints, centres: Floats, radius: F
     """Keep of each parent's list what matters to its part.
 
     Args:
-        zone: Of all m triangles.
-        lists: Of the parents.
         parent: Shape (n,), row of each cell's parent.
         centres: Shape (n, 3), unit.
         radius: Shape (n,), rad, at most π/2.

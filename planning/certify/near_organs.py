@@ -70,11 +70,8 @@ def organ_facts(
     """Evaluate cells against the triangles that matter to their parents.
 
     Args:
-        organs: All triangles.
-        lists: Those that matter to each parent.
         parent: Shape (n,), row of each cell's parent.
         witness: Shape (n,), the triangle that nearly rejected each parent, or -1.
-        cones: The n cells.
         lengths: Shape (n, 2), how far their axes are checked, at least and at most, mm.
         wide: Cells with a larger radius are only narrowed, rad.
         pad: Kept from every limit, mm.

@@ -55,8 +55,6 @@ class PlainSkin:
             u: Shape (3,), unit.
             rho: Less than π/2.
             ray: Shape (3,), a direction inside the cell.
-            length: Needle, tip to flange.
-            longest: The longest path.
         """
         rho = rho + CONE_PAD_RAD
         near, far = _depths(self.corners[rows], u, rho)

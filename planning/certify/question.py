@@ -25,17 +25,13 @@ class Question:
     """The question of a certificate: everything but the surfaces that a verdict depends on; mm and rad.
 
     Attributes:
-        case_name: The case.
         inputs: Every file of that case, with role and hash.
         target_ct: Shape (3,).
         R_ct_entry: Shape (3, 3).
         theta, beta: The cap: lowest and highest angle.
-        length: Needle, tip to flange.
         standoff: Distance tip to target before the insertion where the case states one, else None.
         skin_gap: The least distance from the waiting tip to the skin, along the needle.
         farthest: The flange's greatest distance from the target while the tip waits: how far skin matters.
-        radius: Needle radius.
-        longest: The longest path.
         max_skin_angle: The largest angle at the skin.
         structures: Names of the k structures that demand a margin.
         margins: Shape (k,), their margins; with ``touch`` at least so wide that the chance is kept.

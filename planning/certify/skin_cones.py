@@ -59,8 +59,6 @@ def skin_bounds(
     """Bound the skin's crossings over cones.
 
     Args:
-        skin: From the target.
-        lists: Of the n cells.
         centres: Shape (n, 3), unit.
         radius: Shape (n,), less than π/2.
         test_rays: Shape (n, 3), a ray inside each cell.

@@ -66,8 +66,6 @@ def certify(
     """Certify a cap of directions.
 
     Args:
-        case: The validated case.
-        anatomy: Its structures.
         size: Cells of a smaller angular diameter stay undecided, rad.
         theta: The cap's puncture angles, rad; the case's own for None.
         beta: The cap's azimuths, rad; the case's own for None.

@@ -101,8 +101,6 @@ def too_near(
     """Whether axes come nearer to a structure's surface than a limit, shape (n,); FCL decides ties.
 
     Args:
-        engine: Which measured the distances.
-        structure: Its column in the engine.
         target_ct: Shape (3,), mm.
         outward_ct: Shape (n, 3), unit vectors.
         length: Of the axes, one number or shape (n,), mm.
@@ -148,7 +146,6 @@ def measure(
 
     Args:
         engine: Prepared for the meshes of ``structures``, in that order.
-        structures: The k structures.
         target_ct: Shape (3,), mm.
         outward_ct: Shape (n, 3), unit vectors.
         length: Of the needle's axis from the target, one number, shape (k,) or (n, k), mm.
@@ -205,7 +202,6 @@ def axis_normals(triangles, nearest, distance, depth, target, outward, normal): 
         depth: Shape (n,), of the nearest axis point, mm.
         target: Shape (3,), where the axes start, mm.
         outward: Shape (n, 3), unit vectors.
-        normal: Filled.
     """
     for i in range(len(outward)):
         if distance[i] <= 0.0:

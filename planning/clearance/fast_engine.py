@@ -65,7 +65,6 @@ class FastEngine:
 
     Args:
         meshes: The k surfaces, in the CT frame, mm.
-        progress: Called with (structures done in all directions, structures).
         cache: Of the order of each surface's triangles; its memory holds packed surfaces.
         threads: Threads at most, one a core; the answer does not depend on them, to the bit.
 
@@ -200,9 +199,7 @@ def measure_structure(
 
     Args:
         target: Shape (3,), mm: where every axis starts.
-        bundles: All or some of the n directions.
-        blocks: The structure, packed.
-        placed: The same structure, placed about the target.
+        placed: The structure of the blocks, placed about the target.
         lengths: Shape (n,), of the axes in the caller's order, mm.
         answer: Arrays of shape (n,) in the caller's order; the rows that ``bundles`` holds are filled.
         counts: Shape (7,), added to: see `surface_search.COUNTED`.
@@ -329,9 +326,7 @@ def block_orders(meshes: Sequence[TriangleMesh], cache: Cache, threads: int) -> 
     and take less time to fill than to read.
 
     Args:
-        meshes: The surfaces.
         cache: Holds the orders of all surfaces in one entry.
-        threads: How many are computed at once.
     """
     made_from = {"what": "block orders", "meshes": [mesh.digest for mesh in meshes]}
     make = partial(_computed_orders, meshes, threads)
@@ -435,7 +430,6 @@ def near_faces(
     """Select all faces within reach of an axis, and the others of their blocks.
 
     Args:
-        blocks: The packed surface.
         origin_ct: Shape (3,), where the axis starts, mm.
         outward_ct: Shape (3,), unit.
         length: Of the axis, mm.

@@ -33,7 +33,6 @@ class FclEngine:
 
     Args:
         meshes: The k surfaces, in the CT frame, mm.
-        progress: Called with (directions done, directions in all).
     """
 
     def __init__(self, meshes: Sequence[TriangleMesh], progress: Count | None = None) -> None:
@@ -137,7 +136,6 @@ class HeldEngine:
     """An engine of one's own, held to an exact one: it may measure less than there is, and never more.
 
     Attributes:
-        own: Whose distances count.
         exact: Measures the same axes again, and answers all else.
     """
 
@@ -217,12 +215,10 @@ def cross_check(
 
     Args:
         found: What an engine measured, n directions and k structures.
-        meshes: The k surfaces.
         target_ct: Shape (3,).
         outward_ct: Shape (n, 3), unit vectors.
         length: Of the axes, one number, shape (k,) or (n, k), mm.
         count: How many directions to measure again; all of them if there are fewer.
-        rng: Chooses them.
 
     Raises:
         CrossCheckError: A distance differs by more than rounding.

@@ -82,7 +82,6 @@ class Body:
         name: One of ``BODY_NAMES``.
         frame: Index of its frame among ``link_poses``.
         T_frame_body: Shape (4, 4), mm: its shapes in that frame.
-        bare: The body as it is.
         full: The body grown by the padding; ``bare`` itself where there is none.
         radius_mm: Every point of ``bare`` lies within this distance of the shapes' origin.
     """
@@ -155,8 +154,6 @@ def arm_bodies(model: UrModel, tool: Tool, padding_mm: float) -> tuple[Body, ...
     """All bodies, in the order of ``BODY_NAMES``, at the zero configuration of their own frames.
 
     Args:
-        model: The arm.
-        tool: What its flange carries.
         padding_mm: How much fuller ``full`` is than ``bare``.
 
     Raises:
@@ -190,10 +187,6 @@ class Solid:
 
     Args:
         make: Makes its geometry, mm.
-        pose: Its first pose.
-
-    Attributes:
-        pose: Its new pose.
     """
 
     def __init__(self, make: Callable[[], fcl.CollisionGeometry], pose: fcl.Transform | None = None) -> None:

@@ -56,7 +56,6 @@ class CellChecker:
 
     Args:
         model: The arm; its meshes must ship (UR3, UR5, UR10).
-        tool: What the flange carries.
         boxes: Solids of the workcell, base frame. The base link is not tested against them: it is bolted to one.
         patient: The skin, base frame, mm; None for an empty workcell.
         outside: What is not to be touched besides (a table), likewise: the base may touch it, and contacts with it are
@@ -153,7 +152,6 @@ class CellChecker:
 
         Args:
             q_path: Shape (m, 6), rad.
-            needle_may_touch_patient: See :meth:`contact`.
 
         Raises:
             InputError: If a state is not finite.
@@ -281,9 +279,6 @@ def joined_pieces(model: UrModel) -> Mapping[tuple[str, str], Bools]:
 
     These are built into one another and never tested. Any other two of neighbouring links touch at some angles alone,
     as a camera on wrist 3 may touch wrist 2, or a folded forearm the upper arm: for these each state is tested.
-
-    Args:
-        model: An arm with a URDF of its own.
 
     Returns:
         For the names of each link and the next, shape (pieces of the one, pieces of the other).

@@ -51,8 +51,6 @@ class FastChecker(CellChecker):
     contact that is named (docs/concepts/arm-collisions.md). Distances are FCL's. Not for several threads at once.
 
     Args:
-        model: See :class:`CellChecker`.
-        tool: Needle and holder.
         boxes: Obstacles, base frame.
         patient: The body's surface, base frame.
         outside: Surfaces outside of the body, such as a table, base frame.
@@ -167,10 +165,7 @@ class FastChecker(CellChecker):
         The bounds are of the padded body: every plane and every sphere stands off the bare one by the padding.
 
         Args:
-            motion: Of :meth:`motion`.
-            begin: Index of a state.
             pair: One of ``DISTANCE_PAIRS``.
-            body: One of its bodies.
             mm: The distance, of the body without its padding, that is to be exceeded.
         """
         of_body = [check.contact.body == body and check.first_body is None for check in self._tested]
@@ -213,9 +208,6 @@ class SegmentChecker:
     segment is free: each segment's proof begins anew.
 
     Args:
-        model: The arm.
-        checks: The questions that may find a contact.
-        proofs: These checks, packed.
         scratch: For them; several may share it, one after the other.
         clear_mm: What the padded arm is to keep from patient and boxes besides; of each body and obstacle that are
             nearer to one another at an end of the segment, most of their distance there. What is not proven to be kept

@@ -297,7 +297,6 @@ class TriangleTree:
         """The tree of a mesh that has been checked: finite, not empty.
 
         Args:
-            mesh: The surface.
             cache: Where its leaves are kept. What costs little to make from them is not: it is six times as large.
         """
         made_from = {"what": "leaves", "surface": mesh.digest}
@@ -367,8 +366,6 @@ def packed_skin(patient: TriangleMesh | None, skin_triangles: int, cache: Cache)
 
     Args:
         patient: The skin, and behind it what the CT shows besides.
-        skin_triangles: How many of the triangles are skin.
-        cache: Where the tree is kept.
     """
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))

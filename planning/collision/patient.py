@@ -50,7 +50,6 @@ class FclSkin:
 
     Args:
         mesh: The surface, mm.
-        name: Of it, for messages about it.
 
     Raises:
         InputError: FCL calls a NaN vertex free and dies of an index out of range: so that is looked for first.
@@ -67,7 +66,6 @@ class FclSkin:
         """Whether a body touches the surface where it is.
 
         Args:
-            solid: The body.
             box: Shape (2, 3), mm: lowest and highest corner of a box about it, in its own frame.
         """
         return any(touch(self._tree(part), solid.made) for part in self._near(solid.pose, box))
@@ -189,14 +187,8 @@ def refuse_base_in(
     """Refuse a base that is in the patient, or in what the CT shows outside of the body.
 
     Args:
-        model: The arm.
-        base: Its first body.
-        placed: Both surfaces for FCL.
         patient: The skin, base frame, mm.
         surface: The skin, and behind it what the CT shows besides, likewise; the same where that is nothing.
-
-    Raises:
-        InputError: It does; its code begins with ``base_in``.
     """
     centre = collision_links(model)[0].mesh.bounds.mean(axis=0)
     hit = placed.skin.touches(base.bare.surface, base.box) or placed.skin.has_part_within(base)
@@ -228,7 +220,6 @@ def check_hanging(tool: ToolBody, bodies: Sequence[Body]) -> None:
     """Refuse a tool of which a part touches neither wrist, holder nor needle, nor a part that does.
 
     Args:
-        tool: The tool.
         bodies: Of the arm; those of the flange all move with one frame.
 
     Raises:

@@ -66,11 +66,7 @@ class Proofs:
     ``joint_spans`` (k, 3) says of each check whether it is between two bodies of the arm, and the frames of both.
 
     Args:
-        model: The arm.
-        checks: The questions, in order.
-        boxes: The workcell's boxes.
         patient: The skin, and behind it what the CT shows besides; or None.
-        skin_triangles: How many of its triangles are skin.
         cache: Where enclosures are kept: they depend on arm and tool alone.
     """
 
@@ -127,7 +123,6 @@ class Proofs:
         """The states of a path, in order, each with the checks, in order, that are not proven clear there.
 
         Args:
-            motion: The states, in order.
             tested: Shape (k,): which checks.
             clear_mm: What the distance must exceed.
         """
@@ -184,9 +179,6 @@ def without_neighbours(model: UrModel, checks: Sequence[Check], proofs: Proofs, 
     """The checks without pairs that touch at no angle; the proofs are made to test these.
 
     Args:
-        model: The arm.
-        checks: Of a cell.
-        proofs: These checks, packed.
         cache: Where the answer is kept: it depends on arm and tool alone.
     """
     between = proofs.joint_spans[:, 0] > 0
@@ -211,8 +203,6 @@ def never_touching(model: UrModel, proofs: Proofs, touches: Touches) -> Bools:
     """Which checks of a cell (k,) are proven clear at every angle: squares of angles, quartered until each is proven.
 
     Args:
-        model: The arm.
-        proofs: Its checks, packed.
         touches: Called where enclosures overlap: whether a check's bodies do, at frames (7, 4, 4).
     """
     never = np.zeros(len(proofs), np.bool_)

@@ -117,11 +117,7 @@ class StateChecker(Protocol):
 
 
 def require_finite(q: Floats) -> None:
-    """Refuse joint angles that are not finite: FCL would call them free.
-
-    Raises:
-        InputError: If one is not.
-    """
+    """Refuse joint angles that are not finite: FCL would call them free."""
     if not np.isfinite(q).all():
         refuse(f"joint angles {q} are not finite", "collision check", "six angles in rad", "not_finite")
 
@@ -131,8 +127,6 @@ class SweptBodies:
     """Boxes about the moving bodies, to bound their motion.
 
     Attributes:
-        model: The arm.
-        tool: What its flange carries.
         corners: Shape (6, 8, 3), mm: a box about each moving link in its frame, the last with all on the flange.
         longest_lever_mm: No body point is ever farther from a joint's axis than this.
     """

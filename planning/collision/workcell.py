@@ -174,9 +174,6 @@ def check_gantry(case: Case, skin: TriangleMesh) -> None:
 
     The skin alone is tested against it. What the CT shows outside of the skin is not: a bed goes through the bore, and
     beyond the image its surface goes on by assumption.
-
-    Raises:
-        InputError: Its wall cuts the patient.
     """
     deep = 0.0 if case.gantry is None else gantry_in_patient_mm(case.gantry, skin)
     if deep > 0.0:
@@ -206,7 +203,6 @@ def surroundings(case: Case, T_base_ct: Floats | None) -> tuple[Structure, ...]:
     """Obstacles and gantry as structures of role ``avoid`` without a margin, CT frame.
 
     Args:
-        case: The case.
         T_base_ct: Shape (4, 4); None where nothing says where the arm is: obstacles of the frame ``base`` are then
             nowhere, and are left out.
     """

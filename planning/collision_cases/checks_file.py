@@ -174,7 +174,6 @@ def line_of(text: str, place: Sequence[str | int]) -> int | None:
     """The line of a place such as ("check", 2, "verdict"), counted from 1; that of its table where it has no own.
 
     Args:
-        text: A valid TOML file.
         place: The array's name, the number of the table from 0 on, and keys; or keys of the file.
 
     Returns:

@@ -33,8 +33,8 @@ from puncture_twin.planning.collision_cases.session import (
     session_of,
     updating,
 )
+from puncture_twin.planning.plan.plan_check import check_plan
 from puncture_twin.planning.plan.plan_document import read_plan
-from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, reason_text
@@ -116,13 +116,7 @@ MOST_SHOWN = 6
 
 
 def window_finding(window: WindowSection, direction: Candidates, search: Candidates) -> Finding:
-    """Differences of one window from what is expected.
-
-    Args:
-        window: What is expected.
-        direction: The direction alone, checked.
-        search: The search of the case's grid.
-    """
+    """Differences of one window from what is expected."""
     windows = search.windows
     differences = tuple(_differences(window, direction, search, windows))
     return Finding(differences, tuple(_listed(search, windows))) if differences else Finding()
@@ -176,8 +170,6 @@ class Table:
         kind: ``check``, ``window`` or ``plan``.
         at: Its number among those, from 0 on.
         line: Where it begins, from 1 on; None where nothing tells.
-        case: The case's file.
-        expected: What it holds.
         data: The whole file's bytes.
     """
 
@@ -327,12 +319,7 @@ def unique_names(wanted: Iterable[str]) -> list[str]:
 
 
 def plan_finding(path: Path, context: CaseContext) -> Finding:
-    """Differences of a plan: inputs, its direction's verdict, contacts of its motion, its numbers.
-
-    Args:
-        path: The plan's file.
-        context: Its case, with the arm.
-    """
+    """Differences of a plan: inputs, its direction's verdict, contacts of its motion, its numbers."""
     try:
         check_plan(read_plan(path), context, path)
     except InputError as error:

@@ -56,10 +56,10 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
         for line in notes:
             terminalreporter.line(line)
     if updating(config):
-        from puncture_twin.planning.collision_cases.session import rewritten_lines
+        from puncture_twin.planning.collision_cases.session import session_of
 
         terminalreporter.section("collision files")
-        for line in rewritten_lines(config) or ["no number was rewritten"]:
+        for line in session_of(config).lines or ["no number was rewritten"]:
             terminalreporter.line(line)
 
 

@@ -85,11 +85,6 @@ def write_changes(config: pytest.Config) -> bool:
     return whole
 
 
-def rewritten_lines(config: pytest.Config) -> list[str]:
-    """Lines on the rewritten numbers, one a number."""
-    return session_of(config).lines
-
-
 ARM_PROPERTY = "arm"
 """Name of a property of a test's report: it comes back from other processes too, and into JUnit's file."""
 
@@ -139,7 +134,6 @@ class Change:
     Attributes:
         kind: The array of the table, such as ``check``.
         at: Its number in the array, from 0 on.
-        test: Its name, for a person.
         number: What is to be written.
     """
 
@@ -151,11 +145,6 @@ class Change:
 
 def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
     """Rewrite a file, whole or not at all.
-
-    Args:
-        path: The file.
-        data: What it held when it was read.
-        changes: The numbers.
 
     Returns:
         One line a number: where, old and new.
@@ -209,8 +198,6 @@ class NewNumber:
     """The found number of a key that expects another.
 
     Attributes:
-        keys: From the table inward.
-        value: As computed.
         within: By how much the written number may differ.
         rounding: `ROUND_FLOOR` for a least value, `ROUND_CEILING` for a largest one: what is written must be satisfied.
     """
@@ -240,7 +227,6 @@ class Difference:
     """One difference from an expectation.
 
     Attributes:
-        line: What a person reads.
         number: What the file would have to expect; None where only a person may change it.
     """
 

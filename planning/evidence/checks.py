@@ -18,10 +18,9 @@ from puncture_twin.planning.base.errors import Finding, InputError, InputListErr
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
-from puncture_twin.planning.evidence.inside_skin import outside_skin
+from puncture_twin.planning.evidence.inside_skin import odd_units, outside_skin, overlaps
 from puncture_twin.planning.evidence.label_placement import label_placement
 from puncture_twin.planning.evidence.named_places import densities, order_of_organs
-from puncture_twin.planning.evidence.neighbours import odd_units, overlaps
 from puncture_twin.planning.evidence.target import (
     needle_too_short,
     open_around_target,
@@ -41,10 +40,7 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
     """Hold the inputs of a case against each other.
 
     Args:
-        case: The validated case.
-        anatomy: What was read of its structures.
         placement: Where the patient lies for the robot, or None.
-        cache: Where what takes long is kept.
 
     Returns:
         Warnings and notes, in the order in which they are shown.

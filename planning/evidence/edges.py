@@ -80,7 +80,6 @@ class Fit(NamedTuple):
     """How a placement compares with the surfaces as they are.
 
     Attributes:
-        placement: The other place.
         z: Of the paired differences; above 0 where the other place lies better on the edges.
         ratio: A(T) / A(1) on the points that both have in the image.
     """
@@ -298,7 +297,6 @@ class Compared(NamedTuple):
     """All placements that were tried, and how each structure by itself takes them.
 
     Attributes:
-        fits: One a placement.
         own_z: Shape (placements, structures), z over the patches of one structure; -inf where it is not seen.
         own_ratio: The same shape, its A(T) / A(1).
     """
@@ -377,9 +375,6 @@ def refined(image: EdgeImage, sample: Sample, start: Placement, most_mm: float =
     Nelder-Mead over shift (mm), turn and scale, about the middle of the surfaces.
 
     Args:
-        image: The CT.
-        sample: Of the surfaces.
-        start: Near which it is looked for.
         most_mm: No point of the surfaces moves farther from there, to first order.
     """
     some = sample.thinned(REFINING_POINTS)

@@ -122,7 +122,6 @@ class Source:
 
     Attributes:
         name: The file or folder, or "the meshes".
-        meshes: Name to surface.
         axes: Shape (3, 3), unit columns: of its grid, or of the patient.
         middles: Places (3,) about which it may be mirrored or turned: the middle of its grid, or of the image, and the
             origin.
@@ -168,7 +167,6 @@ class Assessed(NamedTuple):
     Attributes:
         z: The largest over all placements that were tried; -inf where the image shows none of the surfaces.
         ratio: Of the edge strength there to that as it is.
-        kind: Of that placement; see `Placement`.
         slip: How far it is, rms over the surfaces, in shifts of the least that counts.
         T: Shape (4, 4), LPS mm: the refined place where one is named, else None.
         middle_ct: Shape (3,), of the surfaces as they are.
@@ -278,8 +276,6 @@ class Alone(NamedTuple):
     """How each structure by itself takes other places.
 
     Attributes:
-        names: Of the structures.
-        compared: All placements.
         uneven: Shape (placements, structures), unevenness there to that as it is; NaN where nobody asks, or sees it.
     """
 

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OWN_TARGET, Anatomy
-from puncture_twin.planning.anatomy.crossed_names import BONES, LEVEL, QUALIFIERS
-from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
+from puncture_twin.planning.anatomy.default_roles import BONES, LEVEL, QUALIFIERS, default_role, plain_name
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Floats
@@ -63,7 +62,6 @@ class Tissue(NamedTuple):
     """Organs whose Hounsfield units are known: measured .83 to .95 of bones, .97 of lungs where labels lie right.
 
     Attributes:
-        name: In words.
         words: Of which one is in an organ's name.
         low, high: HU.
         least: Of the points within them; a smaller fraction is a warning.

@@ -9,8 +9,13 @@ from functools import partial
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import OWN_TARGET, Anatomy, surface_distance
-from puncture_twin.planning.anatomy.crossed_names import named_as_crossed
-from puncture_twin.planning.anatomy.default_roles import LESION, NEVER_CROSSED, default_role, never_crossed
+from puncture_twin.planning.anatomy.default_roles import (
+    LESION,
+    NEVER_CROSSED,
+    default_role,
+    named_as_crossed,
+    never_crossed,
+)
 from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import Finding, Severity
@@ -93,9 +98,7 @@ def readings_inside(
 
     Args:
         point_ct: Shape (3,), LPS (or local) mm, as it was read.
-        space: In which it was stated.
         inside: Whether a point (3,) lies there.
-        place: In words.
     """
     found = [text for text, point in _readings(point_ct, space) if inside(point)]
     return f" (read {' or '.join(found)} it lies {place})" if found else ""

@@ -24,8 +24,14 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.collision.state_checker import StateChecker
-from puncture_twin.planning.export.program import SampledMotion, check_sampled, heading, program_of, waypoint_rows
-from puncture_twin.planning.export.program_check import check_program
+from puncture_twin.planning.export.program import (
+    SampledMotion,
+    check_program,
+    check_sampled,
+    heading,
+    program_of,
+    waypoint_rows,
+)
 from puncture_twin.planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
 from puncture_twin.planning.motion.path_check import MAX_SWEEP_MM
@@ -159,11 +165,7 @@ class Exported(Shown):
     """A published file.
 
     Attributes:
-        path: Where it lies.
-        format_name: One of `format_names`.
         notes: What whoever runs it should know, one sentence each.
-        inputs: Every file that decided it.
-        plan: What it holds.
     """
 
     path: Path
@@ -187,7 +189,6 @@ def export_plan(
 
     Args:
         plan: A plan that has been read (and so checked), or made.
-        format_name: One of `format_names`.
         folder: Where the file goes, under the plan file's name.
         source: The plan's file, for its name and for errors.
         checker: Of the plan's own case, against which the plan has been checked (``plan_check``); without it nothing is
@@ -208,11 +209,7 @@ def export_plan(
 
 
 def export_name(source: Path, format_name: str) -> str:
-    """Name of an export: that of the plan's file, with the format's ending.
-
-    Raises:
-        InputError: See `format_of`.
-    """
+    """Name of an export: that of the plan's file, with the format's ending."""
     return f"{source.stem}{format_of(format_name)[0]}"
 
 

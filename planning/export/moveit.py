@@ -31,13 +31,7 @@ PATIENT, NEEDLE, HOLDER = "patient", "needle", "needle_holder"
 
 
 def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
-    """The scene as a difference to what MoveIt knows: all that the plan was checked against, and its first state.
-
-    Args:
-        case: The plan's case.
-        anatomy: Its structures and skin.
-        plan: The plan; its registration places the patient.
-    """
+    """The scene as a difference to what MoveIt knows: all that the plan was checked against, and its first state."""
     frames = RosFrames.of(model_urdf(plan.model))
     solids = [_solid(box, frames) for box in case_boxes(case, plan.T_base_ct)]
     start = {"name": list(plan.model.joint_names), "position": [float(angle) for angle in plan.approach.q[0]]}
@@ -45,11 +39,7 @@ def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
     return {
         "name": "puncture",
         "is_diff": True,
-        "robot_state": {
-            "is_diff": True,
-            "joint_state": start,
-            "attached_collision_objects": carried,
-        },
+        "robot_state": {"is_diff": True, "joint_state": start, "attached_collision_objects": carried},
         "world": {"collision_objects": [_patient(anatomy, plan, frames), *solids]},
     }
 
@@ -114,19 +104,11 @@ def _goal(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
 
 def _point(time_s: float, q: Floats, speeds: Floats) -> dict[str, Any]:
     sec, nanosec = divmod(round(float(time_s) * NANOSECONDS), NANOSECONDS)
-    return {
-        "positions": q.tolist(),
-        "velocities": speeds.tolist(),
-        "time_from_start": {"sec": sec, "nanosec": nanosec},
-    }
+    return {"positions": q.tolist(), "velocities": speeds.tolist(), "time_from_start": {"sec": sec, "nanosec": nanosec}}
 
 
 def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:
-    """Refuse goals that were read back and are not the plan's, or break a limit of the arm.
-
-    Raises:
-        InputError: Says what differs.
-    """
+    """Refuse goals that were read back and are not the plan's, or break a limit of the arm."""
     parts = {}
     for phase in SampledMotion._fields:
         trajectory = goals[phase]["trajectory"]
@@ -172,9 +154,6 @@ def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> M
     """Name to text of the MoveIt files.
 
     Args:
-        plan: A plan that was checked against its case.
-        case: The plan's.
-        anatomy: The case's.
         source: The plan's file, for the names and for errors.
 
     Raises:

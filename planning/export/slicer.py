@@ -55,7 +55,6 @@ class SceneNode:
 
     Attributes:
         kind: Of the node, by Slicer's name.
-        name: As Slicer lists it.
         file: Where it is stored, next to the scene.
     """
 
@@ -136,10 +135,6 @@ class SlicerFiles:
 def slicer_files(case: Case, drawn: SceneContent) -> SlicerFiles:
     """The files of a case and a path.
 
-    Args:
-        case: Its target and space.
-        drawn: The path, and what is next to it.
-
     Raises:
         InputError: A case in a frame of its own, which Slicer has no name for.
     """
@@ -202,8 +197,6 @@ def markups_text(kind: Literal["Fiducial", "Line"], name: str, labels: Sequence[
 
     Args:
         kind: ``Line`` has two points.
-        name: Of the markup.
-        labels: Of its points.
         points_ct: Shape (n, 3), LPS mm.
     """
     points = [

@@ -61,7 +61,6 @@ class Entry(NamedTuple):
     """One entry of a folder.
 
     Attributes:
-        name: In the folder.
         what: `FILE`, `FOLDER`, `HIDDEN` (either, by its name), or why it is neither.
     """
 
@@ -106,10 +105,7 @@ def unaccounted(folder: Path, found: tuple[Entry, ...], known: Callable[[Path], 
     A folder in it is accounted for if it is passed over, or if all that it holds is accounted for.
 
     Args:
-        folder: Where they lie.
-        found: What lies there.
         known: Whether a path is read, by whoever asks or by someone else.
-        depth: How many folders have been entered.
     """
     names = {one.name for one in found}
     return [

@@ -2,7 +2,7 @@
 
 Collision libraries answer "free" for a mesh with a NaN vertex, and end the process for an index out of range
 or an empty one; a registration that mirrors would put every organ on the wrong side. So every transform and set of
-points goes through here, every mesh through `mesh_guard`, once, and inner code trusts what it gets.
+points, and every mesh, goes through here once, and inner code trusts what it gets.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from puncture_twin.planning.base.arrays import any_masked, is_frozen
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.text import check_name
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.spaces import Space
 
 Many = ArrayLike | Sequence[ArrayLike]
 """An array, or a list of them."""
@@ -66,7 +69,6 @@ def guard_points(points: Many, names: Sequence[str], *, where: str | Path) -> ND
     Args:
         points: Shape (n, 3), mm, any frame.
         names: One per point: unique, not empty.
-        where: The file, for the error.
 
     Returns:
         Shape (n, 3), float64, mm, read-only.
@@ -137,3 +139,180 @@ def _check_rotation(R: NDArray[np.float64], *, where: str | Path) -> None:
 
 MAX_ROTATION_ENTRY = 1e3
 """Far above 1, so that what is a scaled or sheared matrix is named by its error; far below what overflows."""
+
+
+MIN_DIAGONAL_MM = 0.5
+"""Smallest bounding box diagonal of a structure: less than any vessel. An organ in metres is below."""
+MAX_DIAGONAL_MM = 5_000.0
+"""Largest one: a body and its table fit. A body in mm that is declared as cm or m does not."""
+FIRST = 16
+"""Triangles that nearly always answer whether any has an area, without a kernel."""
+MAX_TRIANGLES = 20_000_000
+"""Fifty times our finest whole body; more would only exhaust the memory (1.4 GB of corner coordinates)."""
+
+_EXTENT_ALLOWED = (
+    f"bounding box diagonal from {MIN_DIAGONAL_MM:g} to {MAX_DIAGONAL_MM:g} mm, "
+    f"coordinates within {MAX_COORDINATE_MM:g} mm"
+)
+
+
+def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> TriangleMesh:
+    """Check a mesh: finite, indices in range, of a plausible size, with an area; and return it.
+
+    Triangles of zero area are all kept: their corners still belong to the surface, and dropping them would
+    change counts; ``mesh_files.mesh_warnings`` counts them. Only a mesh without any area is refused.
+    Vertices that no triangle uses are left out, after they were checked like the others, so that the bounds
+    are those of the surface; the order of the rest, and of the triangles, stays.
+
+    Args:
+        vertices: Shape (n, 3), mm, any frame.
+        faces: Shape (m, 3), whole numbers, indices into ``vertices``.
+        where: The file and the place in it, for the error.
+
+    Raises:
+        InputError: If it is empty, not finite, out of range, without area, or of an implausible size.
+    """
+    points = points_array(vertices, [], what="vertex", where=where)
+    indices = _index_array(faces, len(points), where=where)
+    _check_not_huge(points, where=where)
+    mesh = _without_unused(points, indices)
+    _check_not_tiny(mesh.vertices, where=where)
+    if not (_areas(mesh.vertices[mesh.faces[:FIRST]]).any() or mesh.areas.any()):
+        what = f"none of the {len(indices)} triangles has an area"
+        refuse(what, where, "at least one triangle with an area", "no_area")
+    return mesh
+
+
+def fits(mesh: TriangleMesh) -> bool:
+    """Whether a mesh, mm, is no larger than one that `guard_mesh` accepts."""
+    return _diagonal(mesh.vertices) <= MAX_DIAGONAL_MM
+
+
+def _areas(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Twice those of a few triangles, shape (m, 3, 3), mm."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+
+
+def _index_array(faces: ArrayLike, n_vertices: int, *, where: str | Path) -> NDArray[np.int32]:
+    allowed = f"three whole numbers from 0 to {n_vertices - 1} per triangle, 1 to {MAX_TRIANGLES} triangles"
+    try:
+        raw = np.asarray(faces)
+    except ValueError as error:  # what numpy raises for rows of different length
+        raise InputError(f"face list is ragged ({error})", where=where, allowed=allowed, code="wrong_shape") from error
+    if raw.size == 0:
+        refuse("no triangle", where, allowed, "empty")
+    if raw.ndim != 2 or raw.shape[1] != 3:
+        refuse(f"face list has shape {raw.shape}", where, allowed, "wrong_shape")
+    if len(raw) > MAX_TRIANGLES:
+        refuse(f"{len(raw)} triangles", where, allowed, "too_many")
+    whole = raw.dtype.kind in "iu" or (raw.dtype.kind == "f" and np.array_equal(raw, np.trunc(raw)))
+    if not whole:  # NaN differs from itself and infinity is out of range, so neither passes
+        refuse("a vertex index is not a whole number", where, allowed, "not_whole")
+    low, high = raw.min(), raw.max()
+    if low < 0 or high >= n_vertices:
+        bad = low if low < 0 else high
+        row = int(np.argmax((raw == bad).any(axis=1)))
+        refuse(f"triangle {row} uses vertex {bad:g}, which is out of range", where, allowed, "index_out_of_range")
+    return np.ascontiguousarray(raw, dtype=np.int32)
+
+
+def _without_unused(points: NDArray[np.float64], indices: NDArray[np.int32]) -> TriangleMesh:
+    used = np.zeros(len(points), dtype=bool)
+    used[indices.reshape(-1)] = True
+    if not used.all():
+        points, indices = points[used], (np.cumsum(used, dtype=np.int32) - np.int32(1))[indices]
+    points.setflags(write=False)  # nobody else has it: it is taken as it is
+    return TriangleMesh(points, indices)
+
+
+def _diagonal(points: NDArray[np.float64]) -> float:
+    columns = (points[:, axis] for axis in range(3))  # one by one: numpy is five times slower with axis=0
+    return float(np.linalg.norm([np.ptp(column) for column in columns]))
+
+
+def _check_not_huge(points: NDArray[np.float64], *, where: str | Path) -> None:
+    farthest = float(max(-points.min(), points.max()))
+    if farthest > MAX_COORDINATE_MM:
+        refuse(f"a coordinate lies {farthest:.6g} mm from the origin", where, _EXTENT_ALLOWED, "too_far")
+    diagonal = _diagonal(points)
+    if diagonal > MAX_DIAGONAL_MM:
+        hint = "looks like mm declared as cm or m, or an outlier vertex"
+        refuse(f"bounding box diagonal of {diagonal:.6g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
+
+
+def _check_not_tiny(used: NDArray[np.float64], *, where: str | Path) -> None:
+    diagonal = _diagonal(used)
+    if diagonal < MIN_DIAGONAL_MM:
+        hint = "looks like metres declared as mm" if diagonal > 0.0 else "all corners in one place"
+        refuse(f"bounding box diagonal of {diagonal:.4g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
+
+
+MAX_TOKEN_LENGTH = 64
+"""Longer than a double with all of its digits and exponent (24)."""
+MAX_VERTICES = 3 * MAX_TRIANGLES
+"""As many as the most triangles have corners."""
+
+
+class RawMesh(NamedTuple):
+    """One surface as its file states it; the guard has not seen it yet.
+
+    Attributes:
+        vertices: Shape (n, 3), in the file's unit and space.
+        faces: Shape (m, 3), indices into ``vertices``.
+        space: What the file says of its axes, None if nothing.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    space: Space | None = None
+
+
+def token_array(tokens: list[str], where: str) -> NDArray[np.str_]:
+    """Tokens as an array of their widest one's width, shape (n,), which one endless token must not blow up.
+
+    Raises:
+        InputError: If a token is longer than any number or keyword.
+    """
+    longest = max(tokens, key=len, default="")
+    if len(longest) > MAX_TOKEN_LENGTH:
+        refuse(f"a word of {len(longest)} characters", where, f"numbers of at most {MAX_TOKEN_LENGTH}", "word_too_long")
+    return np.array(tokens, dtype=np.str_)
+
+
+def triangulate(corners: NDArray[np.int64], counts: NDArray[np.int64], where: str) -> NDArray[np.int64]:
+    """Triangles of polygons: each a fan from its first corner, which is exact for convex ones.
+
+    Args:
+        corners: Shape (k,), the vertex indices of all polygons, one after the other.
+        counts: Shape (p,), how many of them each polygon has; they sum to k.
+
+    Returns:
+        Shape (m, 3): count - 2 triangles per polygon, in the order of the polygons.
+
+    Raises:
+        InputError: If a polygon has fewer than three corners, or the triangles are too many.
+    """
+    if len(counts) == 0:
+        refuse("no face", where, "at least one triangle", "empty")
+    if counts.min() < 3:
+        what = f"face {int(np.argmin(counts))} has {counts.min()} corners"
+        refuse(what, where, "3 or more corners per face", "wrong_count")
+    if (counts == 3).all():
+        return corners.reshape(-1, 3)
+    total = int(counts.sum() - 2 * len(counts))
+    if total > MAX_TRIANGLES:
+        refuse(f"{total} triangles", where, f"at most {MAX_TRIANGLES}", "too_many")
+    first = np.cumsum(counts) - counts
+    triangle_first = np.cumsum(counts - 2) - (counts - 2)
+    polygon = np.repeat(np.arange(len(counts)), counts - 2)
+    step = np.arange(total) - triangle_first[polygon]
+    start = first[polygon]
+    return np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
+
+
+def join(parts: list[RawMesh]) -> RawMesh:
+    """Several parts as one surface, in their order; nothing is welded."""
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    faces = [part.faces + offset for part, offset in zip(parts, offsets, strict=True)]
+    return RawMesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))

@@ -320,7 +320,6 @@ def heap_text(content: bytes, offset: int | None) -> str:
     """A text of variable length, from the collection of the global heap that holds it.
 
     Args:
-        content: The whole file.
         offset: Where the element stands: length (4 bytes), the collection's address (8), the object's number (4).
 
     Raises:

@@ -77,16 +77,10 @@ MOST_NAMED = 8
 """Points that a line about a list names."""
 
 
-def read_points(
-    path: Path,
-    *,
-    default_space: Space | None = None,
-    default_unit: Unit | None = None,
-) -> NamedPoints:
+def read_points(path: Path, *, default_space: Space | None = None, default_unit: Unit | None = None) -> NamedPoints:
     """The points of one file, in mm; in LPS where the file or the caller names a patient space.
 
     Args:
-        path: A .csv, .mrk.json or .fcsv file.
         default_space: The space of a file that states none: the case's, or None for a robot's base.
         default_unit: The unit of a file that states none; None refuses such a file.
 
@@ -99,19 +93,9 @@ def read_points(
 
 
 def parse_points(
-    data: bytes,
-    path: Path,
-    *,
-    default_space: Space | None = None,
-    default_unit: Unit | None = None,
+    data: bytes, path: Path, *, default_space: Space | None = None, default_unit: Unit | None = None
 ) -> NamedPoints:
     """Parse a points file that has been read, like `read_points`; it is not opened again.
-
-    Args:
-        data: The whole file.
-        path: Its name, whose ending says the format.
-        default_space: As in `read_points`.
-        default_unit: As in `read_points`.
 
     Raises:
         InputError: As `read_points`, but for reading.
@@ -176,7 +160,6 @@ class RawPoints(NamedTuple):
     """Points as their file states them; the guard has not seen them yet.
 
     Attributes:
-        names: One per point.
         points: Three coordinates per point, in ``unit`` and ``space``.
         unit: None if the file states none.
         space: None if the file states none.
@@ -466,9 +449,6 @@ def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, nam
 
     Args:
         values: Shape (n, 6), in the unit.
-        unit: That the file states.
-        where: The file, for the error.
-        names: Of the rows; none: their numbers.
 
     Raises:
         InputError: Not six finite angles each, beyond what a joint can read, or plainly in the other unit.
@@ -502,11 +482,7 @@ def plainly_radians(angles_deg: ArrayLike) -> bool:
 
 
 def check_times(time_s: Floats, *, where: str | Path) -> None:
-    """Refuse times (n,) that run backwards.
-
-    Raises:
-        InputError: Names the row.
-    """
+    """Refuse times (n,) that run backwards."""
     back = np.flatnonzero(np.diff(time_s) < 0.0)
     if len(back):
         row = int(back[0])
@@ -520,8 +496,6 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     Separated by commas, or by spaces as RTDE's own client writes it.
 
     Args:
-        data: The whole file.
-        path: Its name, for errors.
         timed: Whether it must hold times.
 
     Raises:

@@ -224,7 +224,6 @@ def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: fl
     """All crossings of rays with a surface.
 
     Args:
-        mesh: The surface.
         origin: Shape (3,), where every ray starts, mm.
         directions: Shape (n, 3), unit vectors.
         length: Crossings beyond are left out, mm.

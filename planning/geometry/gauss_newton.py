@@ -82,11 +82,8 @@ def gauss_newton(
     """The estimate of least squares near a start.
 
     Args:
-        start: Where to begin.
-        linearised: The problem at an estimate.
         moved: An estimate with a step (p,) added.
         arrived: Whether a step (p,) of a system is so small that the next would not matter.
-        most_steps: The most steps taken.
 
     Raises:
         numpy.linalg.LinAlgError: The system holds what is no number.

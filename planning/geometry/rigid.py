@@ -123,6 +123,12 @@ def rotation_angle(R: Floats) -> float:
     return math.atan2(twice_sine, float(np.trace(R)) - 1.0)
 
 
+def nearest_rotation(M: Floats) -> Floats:
+    """The rotation nearest to a matrix (3, 3), in the Frobenius norm; for -M the same as for M where det M < 0."""
+    U, _, Vt = np.linalg.svd(M)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
 def left_jacobian(w: Floats) -> Floats:
     """J_l(ω) with Exp(ω + δ) ≈ Exp(J_l(ω) δ) Exp(ω), shape (3, 3), of one rotation vector (3,), rad."""
     angle = float(np.linalg.norm(w))

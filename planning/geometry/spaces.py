@@ -37,7 +37,6 @@ def to_lps(points: Floats, space: Space) -> Floats:
 
     Args:
         points: Shape (n, 3), any unit, in ``space``.
-        space: Where the coordinates come from.
 
     Returns:
         Shape (n, 3), same unit. RAS has x and y negated, which is its own inverse.

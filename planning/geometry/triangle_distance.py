@@ -116,3 +116,18 @@ def farthest_from(triangles, points):  # type: ignore[no-untyped-def]  # numba i
             nearest = min(nearest, to_triangle(triangles[k], points[i, 0], points[i, 1], points[i, 2]))
         farthest = max(farthest, nearest)
     return math.sqrt(farthest)
+
+
+@allocation_free()
+def lower_squares(triangles, places, starts, order, points, squares):  # type: ignore[no-untyped-def]  # numba infers
+    """Lower squared distances (n,) of points (n, 3) to those from the triangles (m, 3, 3) at their place.
+
+    A triangle is at three places (m, 3); the points of place k are ``order[starts[k] : starts[k + 1]]``.
+    """
+    for k in range(len(triangles)):
+        for corner in range(3):
+            place = places[k, corner]
+            for row in range(starts[place], starts[place + 1]):
+                i = order[row]
+                square = to_triangle(triangles[k], points[i, 0], points[i, 1], points[i, 2])
+                squares[i] = min(squares[i], square)

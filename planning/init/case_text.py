@@ -81,8 +81,6 @@ class CaseParts:
     """What a new case is made of.
 
     Attributes:
-        name: Of the folder.
-        space: Of its coordinates.
         region: Which part of the body it shows.
         target_ct: Shape (3,), LPS mm.
         structure: Which holds the target, or None.
@@ -90,7 +88,6 @@ class CaseParts:
         ct: The CT, or None.
         skin: What the skin is, for a person: the CT, or a structure.
         sources: Each segmentation with what the case says of its structures.
-        markers: Lists of points.
         left_out: The files that a person states to be left out.
         keys: Key of the case to its value, where a person states it.
     """

@@ -34,8 +34,7 @@ from puncture_twin.planning.formats.labels.label_sources import (
     refuse_one_name,
     structure_name,
 )
-from puncture_twin.planning.formats.labels.labelmaps import labelmap_of, whole_labels
-from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS
+from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, labelmap_of, whole_labels
 from puncture_twin.planning.formats.points import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
@@ -72,7 +71,6 @@ class Wanted:
     Attributes:
         space: Of meshes, and of lists that do not say theirs.
         naming: Of label maps without names.
-        unit: Of meshes.
         up: The axis of meshes that is up.
         ct: The CT, where there are several.
         segmentation: The label map or folder, where there are several.
@@ -116,8 +114,6 @@ class Found:
     """What a folder holds.
 
     Attributes:
-        cts: CTs.
-        segmentations: Label maps, masks, meshes.
         markers: Lists of at least three points.
         problems: What could not be read or told, one line each.
         passed: What was not read, with the reason.
@@ -134,10 +130,6 @@ class Found:
 
 def find(place: Place, wanted: Wanted) -> Found:
     """Look through a folder and the folders below it, `DEPTH` levels deep.
-
-    Args:
-        place: The case's folder.
-        wanted: What the user says of the files.
 
     Raises:
         InputError: A folder that cannot be read, or is no patient's.

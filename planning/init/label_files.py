@@ -30,8 +30,7 @@ from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.tables import StructuresSection
 from puncture_twin.planning.formats.folder import entries
 from puncture_twin.planning.formats.labels.label_sources import MAX_ENTRIES, structure_name
-from puncture_twin.planning.formats.labels.labelmaps import Box, LabelMap
-from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
+from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, Box, LabelMap, parse_names
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES, names_for
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
@@ -48,11 +47,8 @@ class LabelFile:
     """A label map in one file.
 
     Attributes:
-        source: The file.
         naming: As the case states it; None for names inside the file.
         names: Label to name, of the labels present.
-        notes: How the naming was found.
-        surfaces: Of its labels.
     """
 
     source: str
@@ -92,8 +88,6 @@ class Mask:
 
     Attributes:
         file: Relative to the case's folder.
-        label: The value of its voxels.
-        box: Of these, in voxels.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
     """
 
@@ -108,10 +102,7 @@ class Masks:
     """Masks of one folder, one file a structure.
 
     Attributes:
-        place: Where the files are.
-        source: The folder.
         masks: By number, those that are not empty.
-        notes: Which are empty.
         whole_folder: Whether the folder holds nothing else, so that the case can name it.
     """
 
@@ -178,9 +169,6 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
     """A label map with the names of its labels: stated, inside the file, in a table beside it, or TotalSegmentator's.
 
     Args:
-        place: The case's folder.
-        source: The file.
-        surfaces: What was read of it.
         naming: As the user states it, or None.
 
     Raises:
@@ -217,8 +205,6 @@ def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool
     """Whether a table beside a map of one label names that: not one with the file's own name in it.
 
     Args:
-        place: The case's folder.
-        source: The file.
         label: The only one in it.
         only: Whether no other map or mask lies beside it, so that the table may have any name.
 
@@ -297,10 +283,8 @@ class FileMasks:
     """The structures of one file.
 
     Attributes:
-        source: The file.
         key: Of the case: ``seg`` or ``rtstruct``.
         parts: Name to its mask and the value of its voxels, of those that are not empty.
-        notes: How the file was read.
     """
 
     source: str
@@ -345,8 +329,6 @@ def file_masks(place: Place, source: str, key: str, ct: str | None) -> FileMasks
     """The structures of a file: of DICOM on the slices of the CT, or segments of Slicer, of which some overlap.
 
     Args:
-        place: The case's folder.
-        source: The file.
         key: Of the case: ``seg`` or ``rtstruct``.
         ct: The CT of the case, read before, or None.
 
@@ -435,7 +417,6 @@ def plausibility(table: Mapping[int, str], centres: Mapping[int, Floats]) -> Pla
     """Check the order of organs from right to left and from head to feet.
 
     Args:
-        table: Label to name.
         centres: Label to its middle, LPS mm.
     """
     at = {table[label]: centre for label, centre in centres.items() if label in table}

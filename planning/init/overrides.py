@@ -106,8 +106,6 @@ def with_keys(text: str, keys: Mapping[str, str], reasons: Mapping[str, str] = R
 
     Args:
         text: Of the case; every table but ``[end]`` may be missing.
-        keys: As `Overrides.keys`.
-        reasons: What stands beside some of them.
     """
     for key, value in keys.items():
         table, _, name = key.rpartition(".")

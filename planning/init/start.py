@@ -19,18 +19,26 @@ from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.init.case_text import CaseParts, case_text
 from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Ct, Found, Markers, Wanted, find
-from puncture_twin.planning.init.outlines import (
+from puncture_twin.planning.init.segmentation import (
     ALL_ROUND,
     Outlines,
+    Place,
+    Segmentation,
     SkinOf,
     bordering,
     carved_notes,
     skin_of,
     skin_problems,
 )
-from puncture_twin.planning.init.roles import assign, likely_region, role_notes
-from puncture_twin.planning.init.segmentation import Place, Segmentation
-from puncture_twin.planning.init.target import Target, label_target, parse_point, typed_target
+from puncture_twin.planning.init.target import (
+    Target,
+    assign,
+    label_target,
+    likely_region,
+    parse_point,
+    role_notes,
+    typed_target,
+)
 
 ALLOWED = (
     "a folder with a segmentation, and a CT (NIfTI, NRRD or a DICOM series) or a structure named skin or body, see "
@@ -52,7 +60,6 @@ class Request:
     Attributes:
         folder: Where the files are, and the case will be.
         target: ``X,Y,Z`` in mm, or None for ``target_label``.
-        target_label: The name of a structure.
         region: As a case states it, or None to be told by the structures.
         space_stated: Whether the user said in which space the target is.
         hit_radius_mm: Of the ball that the target is, if the user says that it lies in no structure; else None.
@@ -73,8 +80,6 @@ class Start:
     """A new case, not yet written.
 
     Attributes:
-        text: The file.
-        parts: What it was made of.
         notes: What a person should look at, one sentence each.
     """
 
@@ -87,8 +92,6 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     """Find the files of a folder, and write the text of a case with them.
 
     Args:
-        request: What the user wants.
-        cache: Where surfaces are kept.
         progress: Called with the name of each file that is read.
 
     Raises:

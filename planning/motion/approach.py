@@ -60,7 +60,6 @@ class Approach:
         goal_index: Which of the goals it ends at.
         checked_q: Shape (m, 6), rad: the states that FCL found free, in order; no body moves more than
             ``MAX_SWEEP_MM`` between two of them. For :func:`least_clearance`.
-        seed: The seed that gave it.
         attempts: How many paths were planned.
     """
 
@@ -89,7 +88,6 @@ def plan_approach(
     """Plan the shortest path that is found from home to any of the goals, and its motion in time.
 
     Args:
-        checker: Checks contacts.
         q_home: Shape (6,), rad, within the joint limits.
         q_goals: Shape (6,) or (g, 6), rad, within the joint limits.
         seed: Of OMPL's generator. Same seed, same motion.

@@ -260,7 +260,6 @@ def follow_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_spe
     ``max_tip_speed_mm_s``.
 
     Args:
-        model: The arm.
         q: Shape (m, 6), rad, m >= 2.
         depths_mm: Shape (m,), strictly rising, mm inserted at each row.
         max_tip_speed_mm_s: mm/s.
@@ -357,8 +356,6 @@ def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: f
 
     Args:
         length: Above 0.
-        rates: The limits.
-        start_speed: At most the speed limit.
         end_speed: Speed at the end, reachable (:func:`reachable_speed`).
 
     Raises:

@@ -44,7 +44,6 @@ def dense_states(checker: StateChecker, waypoints: Floats, step_rad: float) -> F
     """States along a path, so close that neither joint distance nor any body's motion exceeds its bound.
 
     Args:
-        checker: Knows the bodies.
         waypoints: Shape (k, 6), rad.
         step_rad: Largest joint distance between two states; ``MAX_SWEEP_MM`` bounds the bodies.
 
@@ -82,7 +81,6 @@ def least_clearance(checker: StateChecker, q_path: Floats) -> Distances:
     """The least of each distance over states along a path, to ``CLEARANCE_STEP_MM``.
 
     Args:
-        checker: Measures distances.
         q_path: Shape (m, 6), rad.
     """
     path = _Path(checker, np.asarray(q_path, dtype=np.float64))

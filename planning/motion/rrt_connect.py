@@ -79,11 +79,8 @@ def connect(
     """Plan from home to any of several goals, and shorten what was found.
 
     Args:
-        contact_of: Checks a segment.
         home: Shape (6,), rad, free.
         goals: Shape (g, 6), rad, free.
-        limits: Where, and how long.
-        seed: Of OMPL's generator.
         clear_of: Checks a shortcut; ``contact_of`` unless stated.
 
     Raises:
@@ -127,12 +124,7 @@ class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without
     """
 
     def __init__(
-        self,
-        information: ob.SpaceInformation,
-        contact_of: SegmentContact,
-        home: Floats,
-        goals: Floats,
-        limits: Limits,
+        self, information: ob.SpaceInformation, contact_of: SegmentContact, home: Floats, goals: Floats, limits: Limits
     ) -> None:
         super().__init__(information)  # and not kept: it keeps the validator, and no one would free the two
         self._contact_of, self._limits = contact_of, limits
@@ -215,7 +207,7 @@ class JointSpace:
         space = ob.RealVectorStateSpace(6)
         space.setBounds(box)
         self.information = ob.SpaceInformation(space)
-        self.information.setStateValidityChecker(_everything)  # a segment is checked with its end
+        self.information.setStateValidityChecker(lambda _: True)  # a segment is checked with its end
 
     def set_up(self, validator: ob.MotionValidator) -> None:
         """Have segments checked by a validator."""
@@ -234,10 +226,6 @@ def angles_of(state: ob.State, wrist_divisor: float = WRIST_DIVISOR) -> Angles:
     """The angles of a state, rad. Beyond six coordinates OMPL reads garbage."""
     wrist = wrist_divisor * state[3], wrist_divisor * state[4], wrist_divisor * state[5]
     return state[0], state[1], state[2], *wrist
-
-
-def _everything(state: ob.State) -> bool:
-    return True
 
 
 @contextmanager
@@ -271,7 +259,6 @@ def shortened(joint_limits: Floats, contact_of: SegmentContact, waypoints: Float
 
     Args:
         joint_limits: Shape (6, 2), rad.
-        contact_of: Checks a shortcut.
         waypoints: Shape (k, 6), rad: straight free segments.
 
     Returns:

@@ -80,7 +80,6 @@ def direct_path(contact_of: SegmentContact, home: Floats, goals: Floats) -> Path
     It ends where its check has found no contact: whether goals are free need not be known.
 
     Args:
-        contact_of: Checks a segment.
         home: Shape (6,), rad, free.
         goals: Shape (g, 6), rad.
     """
@@ -96,8 +95,6 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
     sought.
 
     Args:
-        task: What is sought.
-        seed: Of OMPL's generator.
         max_samples: Of the planner, in each of its runs.
     """
     away = _distances(task.home, task.goals)
@@ -181,8 +178,6 @@ class Cut:
     """Which goals are cut off from home, and by which boxes; found when it is first needed.
 
     Args:
-        model: The arm.
-        boxes: The solids of its workcell.
         points: Shape (p, 3), mm: points within the upper arm, in its frame.
         home: Shape (6,), rad.
         goals: Shape (g, 6), rad.

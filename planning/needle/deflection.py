@@ -73,10 +73,7 @@ def deflection_bound(shaft: Shaft, alpha: float, tissues: Iterable[Tissue], long
     """The bound of a needle in a case's tissues.
 
     Args:
-        shaft: The needle's.
-        alpha: Of its bevel, rad.
-        tissues: All that it may pass.
-        longest_mm: The longest path.
+        alpha: Of the needle's bevel, rad.
     """
     stiffest = max((tissue.stiffness_n_mm2 for tissue in tissues), default=0.0)
     step = step_for(shaft, stiffest)
@@ -139,7 +136,6 @@ class Beam:
     Attributes:
         stiffness: EI, N mm^2.
         step: Length of an element, mm.
-        elements: Their number.
     """
 
     stiffness: float
@@ -236,7 +232,6 @@ def step_for(shaft: Shaft, stiffest: float) -> float:
     """Step of an insertion's simulation, mm.
 
     Args:
-        shaft: The needle's.
         stiffest: The largest k on its path, N/mm^2; rate = (k / 4 EI)^(1/4).
     """
     rate = (stiffest / (4 * shaft.bending_stiffness)) ** 0.25
@@ -346,7 +341,6 @@ class Shaft:
 
     Attributes:
         length_mm: From the holder to the tip.
-        outer_mm: Diameter.
         inner_mm: Of the bore; 0 for a solid shaft.
         modulus_gpa: Young's.
     """

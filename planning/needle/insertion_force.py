@@ -68,7 +68,6 @@ def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> Inse
 
     Args:
         layers: From the skin on, each beginning where the one before ends.
-        step_mm: Between two samples.
     """
     end = layers[-1].end_mm if layers else 0.0
     depth = np.linspace(0.0, end, round(end / step_mm) + 1) if end > 0 else np.zeros(1)

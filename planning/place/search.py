@@ -38,7 +38,6 @@ from puncture_twin.planning.collision.workcell import (
 )
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.place.arm_spheres import Boxes, SkinField, Surroundings
 from puncture_twin.planning.place.check import (
     Checked,
     PlacementCheck,
@@ -47,7 +46,7 @@ from puncture_twin.planning.place.check import (
     needle_can_start,
     placement_check,
 )
-from puncture_twin.planning.place.estimate import Estimator, ReachEstimate
+from puncture_twin.planning.place.estimate import Boxes, Estimator, ReachEstimate, SkinField, Surroundings
 from puncture_twin.planning.place.mounts import (
     Site,
     WantedDirections,
@@ -69,8 +68,8 @@ COARSE_DIRECTIONS = 64
 FINE_DIRECTIONS = 128
 """Directions that sites near the best are estimated with."""
 
-SEEDS = 10
-"""Sites that are refined; each mount's best is among them."""
+SEEDS, OF_MOUNT = 12, 3
+"""Sites that are refined; so many of each mount are among them: the best estimate is not always of the best site."""
 
 HALVINGS = 3
 """How often the step is halved: from 150 mm to 19 mm, about as exactly as a base is set up."""
@@ -81,8 +80,8 @@ FIRST, SECOND = 64, 512
 PIECE = 256
 """Directions checked in one piece: some tenths of a second to some seconds."""
 
-FINALISTS = 8
-"""Placements that are checked in all directions; each mount's best is among them."""
+FINALISTS = 10
+"""Placements that are checked in all directions; each mount's best two are among them."""
 
 FRACTION_DIGITS = 3
 """Fractions that agree to so many digits are equal; then the expected error decides, then the margin."""
@@ -208,7 +207,7 @@ def search_placements(
         for region in regions(case, T_ct_bed)
         for site in (Site(region, (float(x), float(y), float(z))) for x, y, z in region.lattice(step_mm))
     )
-    seeds = _best_apart(coarse, 1.5 * step_mm, SEEDS)
+    seeds = _best_apart(coarse, 1.5 * step_mm, SEEDS, OF_MOUNT)
     race = _Race(case, T_ct_bed, check, goes_on)
     contenders = [race.contender(*pair) for pair in seeds[:1]]
     going = race.further(map, contenders, FIRST)
@@ -217,7 +216,7 @@ def search_placements(
     # 3. The best walk to better places, by ever shorter steps; 4. where they end is checked, the best further.
     fine = replace(estimator, wanted=startable.spread(FINE_DIRECTIONS))
     walk = _walked(fine, seeds, step_mm, race.goes_on) if going else _Walk(seeds, 0, step_mm)
-    ends = [end for end in _best_apart(walk.ends, step_mm / 2, SEEDS) if end not in seeds[:1]]
+    ends = [end for end in _best_apart(walk.ends, step_mm / 2, SEEDS, OF_MOUNT) if end not in seeds[:1]]
     contenders += [race.contender(*end) for end in ends]
     own = None if placement is None else race.own(placement)
     if going:
@@ -330,7 +329,7 @@ class _Race:
             if not self.further(work, everyone, FIRST):
                 return
             scores = [(one.site, self.verdict(one)) for one in contenders if one.site is not None]
-            chosen = [site for site, _ in _best_apart(scores, 0.0, FINALISTS)]
+            chosen = [site for site, _ in _best_apart(scores, 0.0, FINALISTS, 2)]
             left = [one for one in contenders if one.site in chosen]
             self._total = few * len(everyone) + (self._all - few) * (len(left) + len(others))
             while left or others:
@@ -427,26 +426,26 @@ def _order(estimate: ReachEstimate | Verdict) -> tuple[float, float]:
     return -fraction, -margin
 
 
-def _best_apart(pairs: Sequence[tuple[Site, Scored]], distance_mm: float, count: int) -> list[tuple[Site, Scored]]:
-    """Each mount's best, then the best of the others, as far as they reach any direction.
+def _best_apart(
+    pairs: Sequence[tuple[Site, Scored]], distance_mm: float, count: int, of_mount: int
+) -> list[tuple[Site, Scored]]:
+    """The best of each mount, then the best of the others, as far as they reach any direction.
 
     Args:
         pairs: Sites with their estimates.
         distance_mm: Two of the same region are at least so far apart.
-        count: So many, or as many as there are mounts.
+        count: So many, or as many as those of the mounts.
+        of_mount: How many of each mount, where it has as many.
     """
-    holding = [pair for pair in pairs if pair[1].fraction > 0.0]
-    mounts = {site.region.mount for site, _ in holding}
     firsts: list[tuple[Site, Scored]] = []
     others: list[tuple[Site, Scored]] = []
-    for pair in sorted(holding, key=lambda pair: _order(pair[1])):
-        is_first = pair[0].region.mount not in {site.region.mount for site, _ in firsts}
-        if is_first:
-            firsts.append(pair)
-        elif len(firsts) + len(others) < count and all(_far(pair[0], k, distance_mm) for k, _ in firsts + others):
-            others.append(pair)
-        if len(firsts) == len(mounts) and len(firsts) + len(others) >= count:
-            break
+    mounts: Counter[str] = Counter()
+    for pair in sorted((pair for pair in pairs if pair[1].fraction > 0.0), key=lambda pair: _order(pair[1])):
+        mount = pair[0].region.mount
+        chosen = firsts if mounts[mount] < of_mount else others
+        if (chosen is firsts or len(others) < count) and all(_far(pair[0], k, distance_mm) for k, _ in firsts + others):
+            chosen.append(pair)
+            mounts[mount] += 1
     return firsts + others[: max(0, count - len(firsts))]
 
 

@@ -32,20 +32,13 @@ class Plan(Shown):
     Attributes:
         case_name: The case that it was made for.
         inputs: Every file of that case, with role and hash.
-        seed: Of the approach's planner.
-        model: The arm.
         T_base_ct: Shape (4, 4), the belief of where the patient is.
         expected_target_error_mm: Expected tip error (rms), in the insertion's configuration of the arm; without
             ``[errors]`` the registration's TRE alone; NaN for a stated mount or transform.
-        theta: Puncture angle.
-        beta: Azimuth.
         entry_ct: Shape (3,), skin entry.
         target_ct: Shape (3,).
         outward_ct: Shape (3,), unit, from the target along the needle.
-        roll: About the needle.
         standoff_mm: Tip to target before the insertion.
-        needle_length_mm: Tip to flange.
-        approach: From home to standoff.
         insertion: From standoff to the target.
         clearance_mm: Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder
             to patient and workcell, ``needle`` to the nearest structure with a margin.
@@ -117,10 +110,7 @@ def _facts(plan: Plan) -> Facts:
     yield "depth, skin to target", f"{np.linalg.norm(plan.entry_ct - plan.target_ct):.1f} mm"
     yield "standoff", f"{plan.standoff_mm:g} mm, tip to target"
     error = plan.expected_target_error_mm
-    yield (
-        "expected tip error",
-        f"{error:.2f} mm (rms)" if np.isfinite(error) else "unknown: no markers",
-    )
+    yield ("expected tip error", f"{error:.2f} mm (rms)" if np.isfinite(error) else "unknown: no markers")
     yield "robot", plan.model.name
     for name in ("approach", "insertion"):
         phase = getattr(plan, name)

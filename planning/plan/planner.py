@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import slowed
-from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.workcell import home_configuration
@@ -21,7 +20,6 @@ from puncture_twin.planning.motion.follow import follow_smoothly
 from puncture_twin.planning.plan.plan import Plan, motion_contact, phase_clearances
 from puncture_twin.planning.reach.reach import approach_goals
 from puncture_twin.planning.reach.survey import ReachAnswer
-from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import BEST, Choice, choose
 from puncture_twin.planning.search.constraints import reach_request
@@ -49,9 +47,7 @@ def make_plan(
     """Plan to the best candidate of a choice for which an approach is found.
 
     Args:
-        context: The case, with the arm.
-        candidates: Its search result, which a choice by angles or by entry does not need; None searches.
-        choice: What is planned.
+        candidates: The case's search result, which a choice by angles or by entry does not need; None searches.
         seed: Of the approach's planner; None takes the case's.
 
     Raises:
@@ -100,6 +96,9 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     goals = _within_limits(context, candidates, row, approach_goals(checker, request, home))
     approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed, speeds=speeds)
     answer = goals[approach.goal_index]
+    # The tip's error is that of all declared errors, else of the markers alone.
+    chance, q_end = context.chance, answer.insertion_q[-1]
+    error_mm = context.placement.target_error_mm if chance is None else expected_error_mm(chance.error, q_end)
     # 2. The plan, with the insertion from that configuration in time.
     plan = Plan(
         case_name=case.name,
@@ -107,7 +106,7 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
         seed=seed,
         model=case.robot.model,
         T_base_ct=context.placement.T_base_ct,
-        expected_target_error_mm=_target_error_mm(context, context.placement, answer.insertion_q[-1]),
+        expected_target_error_mm=error_mm,
         theta=float(candidates.theta[row]),
         beta=float(candidates.beta[row]),
         entry_ct=candidates.path.entry_ct[row],
@@ -132,11 +131,6 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     if touched is not None:
         raise NoAnswerError(touched, code="motion_touches")
     return replace(plan, clearance_mm={**phase_clearances(plan, checker), **plan.clearance_mm})
-
-
-def _target_error_mm(context: CaseContext, placement: Placement, q: Floats) -> float:
-    """Expected (rms) tip error in configuration q (6,), rad: by all declared errors, else by the markers alone."""
-    return placement.target_error_mm if context.chance is None else expected_error_mm(context.chance.error, q)
 
 
 def _within_limits(

@@ -43,8 +43,6 @@ def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAn
     """The refusal of a request without a clear motion: that of the motion that came farthest.
 
     Args:
-        model: The arm.
-        found: What kinematics says of the request.
         deepest: What blocked the motion that came farthest of those that it allows; None if it allows none.
     """
     if deepest is None:
@@ -80,11 +78,7 @@ CHUNK = 256
 
 
 def assess_reach_all(
-    checker: StateChecker,
-    requests: Sequence[ReachRequest],
-    progress: Count | None = None,
-    *,
-    n_rolls: int = ROLLS,
+    checker: StateChecker, requests: Sequence[ReachRequest], progress: Count | None = None, *, n_rolls: int = ROLLS
 ) -> list[ReachAnswer]:
     """Find, for each direction, a roll and a branch that reach the standoff pose and insert straight, untouched.
 
@@ -93,8 +87,6 @@ def assess_reach_all(
 
     Args:
         checker: Checks contacts, in the base frame.
-        requests: The directions.
-        progress: Called with (answered, to answer).
         n_rolls: How many rolls, evenly over the turn.
 
     Raises:
@@ -113,13 +105,9 @@ def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswe
 
     Args:
         checker: Checks contacts, in the base frame.
-        request: The direction.
 
     Returns:
         Empty where there is none.
-
-    Raises:
-        InputError: See :func:`assess_reach_all`.
     """
     found = _surveyed(checker, [request], ROLLS)[0]
     tried = tried_all(checker, [(found, insertion) for insertion in found.insertions()])
@@ -269,7 +257,6 @@ def tried_all(checker: StateChecker, motions: Sequence[tuple[Surveyed, Insertion
 
     Args:
         checker: Checks contacts, in the base frame.
-        motions: Each with the survey that it comes from.
 
     Returns:
         For each motion: that the arm reaches the direction by it, or where it ends.
@@ -327,7 +314,6 @@ def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
     """Length by which upper arm and forearm are too short (or too long, folded) for each flange pose.
 
     Args:
-        model: The arm.
         T_base_flange: Shape (n, 4, 4), mm.
 
     Returns:
@@ -372,11 +358,7 @@ def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats)
 
     Args:
         checker: Checks contacts, in the base frame.
-        request: The direction.
         q_home: Shape (6,), rad.
-
-    Raises:
-        InputError: See :func:`every_reach`.
     """
     reached = every_reach(checker, request)
     least = MARGIN_FRACTION * max((answer.margin for answer in reached), default=0.0)

@@ -25,7 +25,6 @@ def standoffs(needle: Needle, path_length: Floats | float, skin_angle: Floats | 
     """Distance of the waiting tip from the target, mm: what the case states, or the skin's distance and `skin_gaps`.
 
     Args:
-        needle: The needle.
         path_length: Target to skin, mm; NaN without a skin entry.
         skin_angle: Shape of ``path_length``, rad.
     """

@@ -31,7 +31,6 @@ class ReachRequest:
     Attributes:
         target_base: Shape (3,), mm: the lesion, base frame.
         outward_base: Shape (3,), unit: from the target out of the body, base frame.
-        needle_length_mm: Flange to tip.
         standoff_mm: Tip to target before the insertion starts.
 
     Raises:
@@ -65,7 +64,6 @@ class ReachAnswer:
     """Whether and how the arm reaches along one direction.
 
     Attributes:
-        reachable: The verdict.
         reason: ``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``.
         depth_mm: How far the needle was inserted from standoff when it was blocked; None for other reasons.
         detail: One sentence for people: what touched what, or what was missing; empty when reachable.
@@ -154,9 +152,6 @@ def surveyed(
     """Kinematics of each request.
 
     Args:
-        model: The arm.
-        requests: The n directions.
-        lines: The needle's line of each.
         rolls: Shape (r,), rad.
     """
     depths = [_depths(request.standoff_mm) for request in requests]
@@ -198,8 +193,6 @@ def survey(
     """Every branch and roll of many straight insertions, by whole turns as far from the joint limits as possible.
 
     Args:
-        model: The arm.
-        lines: The n directions.
         distances_mm: For each direction, shape (m,): target to flange at the samples of the path.
         depths_mm: Shape (m,), the distances as depths of insertion, rising.
         rolls: Shape (r,), rad.
@@ -224,7 +217,6 @@ def _survey_line(lengths, limits, R, target, outward, distances, depths, rolls, 
     """Every branch and roll of one direction, by kinematics alone.
 
     Args:
-        lengths: The arm.
         limits: Shape (6, 2), rad.
         R: Shape (3, 3): the flange's rotation at roll 0.
         target: Shape (3,), mm.
@@ -319,8 +311,6 @@ def every_branch(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Float
     """Every branch's path along the needle at roll 0. A roll adds to q6 and to nothing else.
 
     Args:
-        model: The arm.
-        line: The needle's line.
         distance_mm: Shape (m,): target to flange along the path.
 
     Returns:
@@ -356,10 +346,7 @@ def fill_branch_path(lengths, R, target, outward, distances, branch, turn, q):  
     """The path of one branch along the needle, without jumps of whole turns; NaN from where it first does not exist.
 
     Args:
-        lengths: The arm.
-        R: As in :class:`NeedleLine`.
         target: As in :class:`NeedleLine`, mm.
-        outward: As in :class:`NeedleLine`.
         distances: Shape (m,), mm: target to flange along the path.
         branch: Index among the eight of ``inverse``.
         turn: Shape (6,), rad: added to every row, such as a roll and whole turns.
@@ -396,8 +383,6 @@ def sampled(
     """The motion of one branch along a needle, sampled so that no body moves more than so far from state to state.
 
     Args:
-        swept: The arm's bodies.
-        line: The needle's line.
         branch: Index among the eight of ``inverse``.
         turn: Shape (6,), rad: added to every state.
         lengths_mm: Flange to tip, and tip to target at the standoff.

@@ -43,7 +43,6 @@ class FitUncertainty:
     """The declared errors of the markers, and the map from them to the pose; base axes, mm and rad.
 
     Attributes:
-        noise: Of the markers.
         R_base_ct: Shape (3, 3), as registered.
         center_base: Shape (3,), the markers' centroid, about which `fit_map` turns.
         fit_map: L, shape (6, 3 N), from the stacked reading errors to shift and rotation.
@@ -101,7 +100,6 @@ def fit_uncertainty(
         T_base_ct: Shape (4, 4), what it gave.
         points_ct: Shape (N, 3), mm.
         points_base: Shape (N, 3), mm.
-        noise: Of the markers.
         found: Whether the residuals give the errors' size.
     """
     R, center = T_base_ct[:3, :3], points_base.mean(axis=0)
@@ -136,9 +134,6 @@ def reading_noise(errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Fl
     """The noise of markers that were touched in given configurations.
 
     Args:
-        errors: As declared.
-        model: The arm.
-        tip_mm: Flange to tip.
         q_touch: Shape (N, 6), rad.
         known: Whether these are the real ones.
     """
@@ -165,7 +160,6 @@ def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, ne
     Of equals the one with its elbow on the side from which the needle comes: mirrored branches are equal.
 
     Args:
-        model: The arm.
         tip_mm: Flange to tip, along the flange's z.
         point_base: Shape (3,), mm.
         needle_base: Shape (3,), unit: the wished direction from the needle's top to its tip.

@@ -262,7 +262,6 @@ def distortion(
 
     Args:
         T_base_ct: Shape (4, 4), near the least-squares fit.
-        markers: Three or more.
         noise: What is declared of the readings; None weighs all alike.
         target_ct: Shape (3,), mm, where the error matters.
     """

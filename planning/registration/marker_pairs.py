@@ -54,16 +54,12 @@ def match(
         markers_ct: Markers in the CT frame.
         markers_base: Markers in the base frame.
         use: The names to use, in this order; None demands the same names on both sides.
-        where: What errors name.
 
     Raises:
         InputError: A name that one side lacks, or fewer than three markers.
     """
     names = markers_ct.names if use is None else use
-    for side, points, other in (
-        ("CT", markers_ct, markers_base),
-        ("base", markers_base, markers_ct),
-    ):
+    for side, points, other in (("CT", markers_ct, markers_base), ("base", markers_base, markers_ct)):
         wanted = set(names) if use is not None else set(other.names)
         missing = sorted(wanted - set(points.names))
         if missing:

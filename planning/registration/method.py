@@ -54,11 +54,7 @@ def checked_fit(
     """The fit of a method, which the declared noise has passed.
 
     Args:
-        markers: To be fitted.
-        method: Its name.
-        noise: What is declared of each marker.
         found_in_mm: The FRE, where the noise's size is to be found in it.
-        where: What errors name.
 
     Raises:
         InputError: ``affine``, ``weighted`` or ``joint`` without noise, or noise that cannot be weighed.
@@ -119,10 +115,8 @@ def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, 
     """Refuse a fit that is far better mirrored, or that a marker misses by far.
 
     Args:
-        markers: As fitted.
         residuals: Shape (n, 3), mm.
         target_ct: Shape (3,), mm.
-        where: What errors name.
 
     Raises:
         InputError: Naming the markers, and the permutations of their names that would fit.
@@ -286,9 +280,7 @@ def better_names(markers: MarkerPairs, target_ct: Floats, fre_mm: float) -> str:
     """Sentence on permutations of the names that fit where the given ones do not, the best first; empty for none.
 
     Args:
-        markers: As the user named them.
         target_ct: Shape (3,), mm.
-        fre_mm: Of their rigid fit.
     """
     found = renamings(markers, target_ct, min(fre_mm / BETTER, MAX_FRE_MM), moving_mm=0.0).found
     if not found:

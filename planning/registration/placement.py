@@ -183,11 +183,9 @@ def aimed_uncertainty(
     """The uncertainty of a joint fit whose pose was corrected.
 
     Args:
-        fit: Of the joint fit.
         points_ct: Shape (N, 3), mm, its markers.
         T_base_ct: Shape (4, 4), the corrected pose.
         target_base: Shape (3,), mm, where the pose was turned about.
-        aim: What it was corrected for.
     """
     A = design(apply(T_base_ct, points_ct), fit.center_base)
     M = np.eye(len(A)) - A @ fit.fit_map
@@ -206,7 +204,6 @@ class WithoutMarker:
     """A registration without one of its markers.
 
     Attributes:
-        name: The one left out.
         rms_mm: Expected error at the target by the readings of the others, scaled as the registration's is.
         probability: Of residuals as large as those of the others, if the declaration holds; NaN where three are left
             and two are not enough.

@@ -68,9 +68,7 @@ class Registration(Shown):
     """T_base_ct from markers, and what is known of its error.
 
     Attributes:
-        method: How it was fitted.
         T_base_ct: Shape (4, 4), rigid, mm.
-        markers: The matched markers.
         residuals: Shape (n, 3), T_base_ct markers_ct - markers_base, mm.
         residual_test: The residuals of the rigid fit against the noise.
         conditioning: The three flags of a weak set, for the target given.
@@ -206,7 +204,6 @@ def register(
     """Fit T_base_ct, and test its residuals against the noise.
 
     Args:
-        markers: At least three, matched.
         method: ``triad`` (Chen 2019, Eq. 1-9, three markers in the order given), ``rigid`` (least squares),
             ``weighted`` (by the declared noise) or ``joint`` (by that and what the arm does wrong at all markers).
         target_ct: Shape (3,), where the error matters.
@@ -214,7 +211,6 @@ def register(
         noise: What is declared of each marker, in the order of ``markers``.
         noise_found: Whether ``noise`` is a shape alone, its size to be found from the residuals.
         accept_residuals: Whether residuals beyond the noise are accepted, and the noise is scaled to them.
-        where: What errors name.
 
     Raises:
         InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, ``affine``,

@@ -183,9 +183,7 @@ class OutlierMarker(NamedTuple):
     """A marker that does not fit the others.
 
     Attributes:
-        name: Its name.
         miss_mm: How far off its reading the others place it.
-        others: How many they are.
         others_fre_mm: How well they fit each other, root mean square.
     """
 
@@ -228,7 +226,6 @@ def outlier_marker(
 
     Args:
         fit: Makes T_base_ct of two sets of points by least squares.
-        names: Of the markers.
         points_ct: Shape (n, 3), mm.
         points_base: Shape (n, 3), the same as they were touched.
         fle_mm: Their noise (rms length, both sides together) where it is declared: no less is taken.

@@ -79,8 +79,7 @@ class ScannedEntry(NamedTuple):
 
     Attributes:
         slice: Its slice, 1 at the feet; 0 or beyond ``slices`` outside of the image.
-        slices: How many there are.
-        table_mm: Its z, as DICOM has it: a console's slice location or, with its own sign, table position.
+        table_mm: The slice's z, as DICOM has it: a console's slice location or, with its own sign, table position.
         sagittal_mm: From the sagittal laser's line, positive to the patient's left, if x = 0 is the isocentre.
         coronal_mm: From the coronal laser's line, positive toward the back, if y = 0 is the isocentre.
     """
@@ -129,11 +128,8 @@ def entry_facts(
     """Skin entry, nearest landmark and scanner angles of one path.
 
     Args:
-        case: Its space and target.
-        markers: Those of its registration; may be none.
         entry_ct: Shape (3,), mm; NaN without a skin entry.
         outward_ct: Shape (3,), unit, from the target outward.
-        grid: Of its CT, where there is one.
     """
     landmarks = markers or (Landmark("the target", np.asarray(case.target_ct)),)
     planes = None if case.space is Space.LOCAL else needle_planes(outward_ct)

@@ -41,7 +41,6 @@ def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBoun
 
     Args:
         anatomy: The structures of ``candidates``.
-        candidates: Checked for a straight needle.
         bound: How far the needle may bend; None bends nothing.
     """
     if bound is None:
@@ -55,8 +54,6 @@ def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance:
     """A verdict with candidates rejected whose clearance is less than margin + deflection; others keep theirs.
 
     Args:
-        verdict: Of n candidates.
-        structures: The k structures.
         clearance: Shape (n, k), of the straight needle, mm.
         deflection: Shape (n,), the greatest, mm.
     """
@@ -89,11 +86,7 @@ class Insertion(NamedTuple):
         return float(self.path.cut_mm[-1])
 
     def lines(self, greatest_mm: float) -> list[str]:
-        """Lines of text for a person.
-
-        Args:
-            greatest_mm: The bound that the search keeps.
-        """
+        """Lines of text for a person."""
         peak, free, pinned = self.force.peak_n, self.buckling_free_n, self.buckling_pinned_n
         kept = f"{greatest_mm:.2f} mm are added to the margins"
         return [
@@ -108,8 +101,6 @@ def insertion_along(
     """Deflection, forces and buckling of the insertion along one direction.
 
     Args:
-        bending: Of the case.
-        anatomy: Its structures.
         end_ct: Shape (3,), mm, where the path ends: the target.
         outward_ct: Shape (3,), unit.
         path_length: From there to the skin, mm.
@@ -131,11 +122,7 @@ STEP_MM = 0.5
 
 
 def check_tissues(case: Case, anatomy: Anatomy) -> None:
-    """Refuse tissues that match no structure, contradict each other, or are too stiff for so thin a needle.
-
-    Raises:
-        InputError: One of them.
-    """
+    """Refuse tissues that match no structure, contradict each other, or are too stiff for so thin a needle."""
     if case.bending is None:
         return
     tissues, most = case.bending.tissues, stiffest_resolved(case.bending.shaft)
@@ -156,8 +143,7 @@ def path_layers(
     A surface is a capsule where it is entered. That of the rest is the skin: coming out of an organ there is none.
 
     Args:
-        bending: Of the case.
-        anatomy: Its structures; only closed ones have an inside.
+        anatomy: The case's structures; only closed ones have an inside.
         target_ct: Shape (3,), mm.
         outward_ct: Shape (3,), unit.
         path_length: Target to skin, mm.
@@ -195,12 +181,8 @@ class Stretch(NamedTuple):
     """A part of a path along which the same structures are.
 
     Attributes:
-        start_mm: From the target.
-        end_mm: From the target.
         structures: Names of the closed structures that hold it.
         hu_low: Least Hounsfield units of its samples, NaN where the image does not reach.
-        hu_median: Their median.
-        hu_high: Their greatest.
     """
 
     start_mm: float
@@ -215,7 +197,6 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
     """Follow a path from the target to ``BEYOND_SKIN_MM`` outside of the skin; empty without a CT.
 
     Args:
-        anatomy: With its scan.
         target_ct: Shape (3,), LPS mm.
         outward_ct: Shape (3,), unit.
         path_length: Target to skin, mm; NaN without an entry: nothing is followed.
@@ -240,7 +221,6 @@ def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depth
     """Which depths of a path are inside a closed structure, by the parity of the crossings before.
 
     Args:
-        structure: Closed.
         target_ct: Shape (3,), mm.
         outward_ct: Shape (3,), unit.
         depths: Shape (n,), from the target outward, mm.

@@ -30,18 +30,12 @@ from puncture_twin.planning.uncertainty.hit import Proximity, touch_bound
 
 
 def with_chances(
-    case: Case,
-    anatomy: Anatomy,
-    candidates: Candidates,
-    model: ChanceModel | None,
-    axes: AxisDistances | None = None,
+    case: Case, anatomy: Anatomy, candidates: Candidates, model: ChanceModel | None, axes: AxisDistances | None = None
 ) -> Candidates:
     """Compute the chances of all candidates that are safe so far, and reject those beyond the case's limits.
 
     Args:
         case: Declares errors; else nothing is computed.
-        anatomy: Its structures.
-        candidates: Checked against organs and arm.
         model: None where the pose's error is not known: the chances are blank.
         axes: Distances of the candidates' axes; None measures those of the safe ones again.
 
@@ -141,10 +135,6 @@ def with_best_refined(candidates: Candidates, model: ChanceModel | None) -> Cand
     """Refine the candidates that people are shown: the best of all, and the best of every window.
 
     Those that break a limit then are rejected, and the rest ranked again, until no new one is among them.
-
-    Args:
-        candidates: Ranked, with chances.
-        model: As in `with_chances`.
     """
     if model is None or candidates.chances is None:
         return candidates
@@ -178,10 +168,8 @@ def joint_touch_chance(
     """P that a needle comes nearer to any structure than its threshold, all linearised together, shape (n,).
 
     Args:
-        near: Of needles and structures.
         cov_ct: Shape (n, 6, 6), covariance of each needle's pose, CT axes, twist order.
         threshold_mm: One number or shape (k,).
-        freedom: As in `touch_chance`.
         surface_mm: As in `proximity`: every structure's surface lies off by a normal number of its own.
     """
     rng = np.random.default_rng(DRAWS_SEED)

@@ -95,7 +95,6 @@ class Clearance(Columns):
     """How far the needle's surface stays from each of k structures, mm.
 
     Attributes:
-        structures: The k names.
         margins: Shape (k,), what each structure demands; NaN for one that demands nothing.
         distance: Shape (n, k), axis distance minus needle radius.
         least: Shape (n,), smallest over the structures with a margin.
@@ -174,9 +173,7 @@ class Candidates(Columns, Shown):
         theta: Shape (n,), puncture angle.
         beta: Shape (n,), azimuth.
         outward_ct: Shape (n, 3), unit vectors from the target outward.
-        verdict: Safe, or why not.
         path: From the skin to the target.
-        clearance: To every structure.
         arm: Whether the arm reaches it.
         ranking: Which of the safe ones to prefer.
         safe_cone: Shape (n,), by how much one may be off in any direction and still be safe for the organs, rad; NaN

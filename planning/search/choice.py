@@ -219,11 +219,7 @@ def _refuse_beyond(number: int, count: int, where: str, what: str) -> None:
 
 
 def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
-    """Refuse a point from which a straight path enters the skin somewhere else.
-
-    Raises:
-        InputError: Says where it does.
-    """
+    """Refuse a point from which a straight path enters the skin somewhere else."""
     real = checked.path.entry_ct[0]
     if choice.entry_mm is None or not np.isfinite(real).all():
         return
@@ -280,11 +276,7 @@ def read_entries(path: Path, case: Case) -> ReadList:
 
 
 def read_targets(path: Path, case: Case, choice: Choice) -> ReadList:
-    """Targets as points, in the case's space or in the file's own; the same choice for each.
-
-    Raises:
-        InputError: See `read_entries`.
-    """
+    """Targets as points, in the case's space or in the file's own; the same choice for each."""
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     rows = tuple(one._replace(choice=choice) for one in _points(data, path, case))
     return ReadList(rows, content_input("targets", str(path), data), _unfinished(data, path))

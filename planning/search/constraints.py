@@ -47,10 +47,6 @@ def first_broken(
     last: some matter only to a tip that waits at its standoff, so only on paths that satisfy the others.
 
     Args:
-        paths: The skin along the n paths.
-        clearances: To the k structures.
-        structures: The k structures.
-        needle: For the longest path.
         max_skin_angle: rad.
     """
     count = len(paths.path_length)

@@ -243,8 +243,6 @@ def prepare(
     Args:
         case: A case, its file, or the folder that holds ``case.toml``.
         arm: Whether the arm is checked too; None checks it where the case says where its base is.
-        engine: Who measures clearance.
-        watcher: Shows progress.
         memory: What this process keeps from one case to the next; the answer is the same.
 
     Raises:

@@ -43,13 +43,8 @@ def with_breathing(
 
     Args:
         case: The case; nothing is done where it declares no breathing.
-        anatomy: Its structures.
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        candidates: Checked where the CT shows the body.
         bound: How far the needle may bend; None bends nothing.
-
-    Raises:
-        InputError: See `moving_weights`.
     """
     breathing = case.breathing
     if breathing is None:
@@ -78,9 +73,7 @@ def with_breathing_reach(case: Case, anatomy: Anatomy, candidates: Candidates, r
 
     Args:
         case: The case; nothing is done where it declares no breathing.
-        anatomy: Its structures.
         candidates: Checked with the arm where the CT shows the body.
-        reach: The checker of the arm.
     """
     breathing = case.breathing
     if breathing is None:
@@ -158,11 +151,7 @@ class BreathingBody:
     """A case that breathes, measured at any position of the breath.
 
     Attributes:
-        case: The case.
-        breathing: Of the case.
-        anatomy: Its structures.
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        weights: Of skin and structures.
         bound: How far the needle may bend; None bends nothing.
         candidates: The candidates, checked where the CT shows the body.
     """
@@ -226,7 +215,6 @@ class BreathingBody:
 
         Args:
             rows: Shape (m,), which candidates.
-            s: The position.
             columns: Shape (c,), which of the structures with a margin.
         """
         case, which = self.case, self.demanding[columns]
@@ -258,9 +246,7 @@ class Phase:
     """Verdict and clearances of some candidates at one position of the breath.
 
     Attributes:
-        s: The position.
         rows: Shape (m,), which candidates.
-        verdict: Of these m.
         clearance: Shape (m, k), to the k structures with a margin, mm.
         excess: Shape (m, k), the same less the margins.
         deflection: Shape (m,), how far the needle may bend, mm; 0 where it does not.
@@ -299,11 +285,7 @@ def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Brea
     """A verdict with candidates rejected that are unsafe at one phase; those rejected already keep their reason.
 
     Args:
-        verdict: Of n candidates.
         rows: Shape (m,), those that were checked at the phase.
-        at_phase: Of these m.
-        breathing: For the words.
-        s: The phase's position.
     """
     new = (at_phase.reason != Reason.NONE.value) & (verdict.reason[rows] == Reason.NONE.value)
     arrays = {field.name: getattr(verdict, field.name).copy() for field in fields(verdict)}
@@ -323,10 +305,7 @@ def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Pha
     (low + high - m) / 2. Where that does not suffice, the interval is halved and measured in the middle (`_checked`).
 
     Args:
-        body: The case.
         verdict: Of the candidates, with what is rejected at the two positions.
-        low: The one position.
-        high: The other, of the same candidates.
     """
     deflection = np.fmax(low.deflection, high.deflection)
     columns = np.arange(len(body.demanding))
@@ -443,11 +422,7 @@ OUTSIDE_GATE = "breathing: the CT shows the body at s = {s:g}, outside the gate 
 
 
 def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
-    """Warnings about what a breathing case's verdicts mean; none where it declares no breathing.
-
-    Raises:
-        InputError: See `moving_weights`.
-    """
+    """Warnings about what a breathing case's verdicts mean; none where it declares no breathing."""
     breathing = case.breathing
     if breathing is None:
         return ()

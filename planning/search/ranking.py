@@ -76,7 +76,6 @@ def ranked_by(candidates: Candidates, cost: Floats) -> Candidates:
     """The safe candidates ranked by a cost of the caller's, smaller is better; equal costs keep their order.
 
     Args:
-        candidates: Candidates.
         cost: Shape (n,); rejected candidates' entries are not looked at.
 
     Raises:
@@ -185,7 +184,6 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
     certificate excludes that.
 
     Args:
-        grid: The directions.
         safe: Shape (n,), row by row.
     """
     theta, beta = np.repeat(grid.theta, len(grid.beta)), np.tile(grid.beta, len(grid.theta))

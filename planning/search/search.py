@@ -42,10 +42,7 @@ def search(
     stage before it accepted.
 
     Args:
-        case: The validated case.
-        anatomy: Its structures.
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        directions: What to check.
         reach: Checks the arm; None leaves ``reachable`` unknown.
         chance: Model of the case's declared errors; None leaves the chances to hit and to touch blank.
         progress: Called with (candidates checked, candidates to check) while the arm is checked.
@@ -69,20 +66,13 @@ def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, direc
 
 
 def organ_candidates(
-    case: Case,
-    anatomy: Anatomy,
-    engine: ClearanceEngine,
-    directions: Directions,
-    axes: AxisDistances | None = None,
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions, axes: AxisDistances | None = None
 ) -> Candidates:
     """Check every direction against skin and organs, needle bending and breathing included; without arm and ranks.
 
     Args:
-        case: The validated case.
-        anatomy: Its structures.
         engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        directions: What to check.
-        axes: Their `organ_distances`; None measures them here.
+        axes: `organ_distances` of the directions; None measures them here.
     """
     needle, outward, checked = case.needle, directions.outward_ct, anatomy.checked
     paths = case_paths(case, anatomy.skin, outward)  # where each path crosses the skin, and at which angle

@@ -41,8 +41,7 @@ class Side(NamedTuple):
     """The open directions nearest to one axis of the body, seen from the target.
 
     Attributes:
-        name: For a person.
-        open: Of its solid angle, the fraction from where a needle can come, whatever organs are in its path.
+        open: Fraction of its solid angle from where a needle can come, whatever organs are in its path.
         searched: The fraction that the case's grid holds.
         nearest_mm: The shortest path to its skin; NaN where none is known.
         why: What closes most of it; "" where it is open.
@@ -76,7 +75,6 @@ def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
 
     Args:
         case: The validated case; none of a patient has no sides.
-        anatomy: Its structures.
     """
     if case.space is Space.LOCAL:
         return ()
@@ -145,7 +143,6 @@ def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:
     """The open sides in words, and why the others are closed.
 
     Args:
-        sides: As `sides_of` found them.
         searched: Whether the case's grid counts: what it does not hold is named.
     """
     reported = [side for side in sides if side.name in ROUND_ABOUT]

@@ -94,13 +94,11 @@ class UncertaintyBreakdown:
     """Chances, error budget and unmet limits of one candidate.
 
     Attributes:
-        p_hit: Chance to hit.
         p_touch: Structure to chance to touch it.
         p_touch_any: Of any, min(1, sum).
         budget: The tip's expected error and its sources.
         declaration: Whether the markers' residuals agree with the declared errors, in one sentence.
         goals: Limits that are not satisfied: the case's, or `WISHED_HIT` where it demands no chance to hit.
-        not_modelled: What these chances leave out.
     """
 
     p_hit: float
@@ -185,7 +183,7 @@ def way_cells(one: WayChance) -> tuple[str, str, str, str, str]:
     """A way of guidance as a row of a table for a person, under `WAY_HEAD`."""
     if np.isnan(one.p_hit):
         return one.way, "-", "-", "-", one.lost_sight
-    return one.way, f"{one.expected_error_mm:.2f}", *map(chance_text, (one.p_hit, one.p_stop)), one.lost_sight
+    return one.way, f"{one.expected_error_mm:.2f}", chance_text(one.p_hit), chance_text(one.p_stop), one.lost_sight
 
 
 WAY_HEAD = ("guidance", "expected tip error (rms), mm", "chance to hit", "to be stopped", "out of sight")
@@ -195,7 +193,6 @@ def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> 
     """The uncertainty breakdown of one candidate, its chances line-sampled as those of the table's best are.
 
     Args:
-        model: Of the case.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
     """
@@ -280,8 +277,6 @@ def shrinkable(model: ChanceModel, needles: Needles, q: Floats) -> ShrinkableNee
     """Split one candidate's error into sources that can be shrunk.
 
     Args:
-        model: Of the case.
-        needles: The candidate alone.
         q: Shape (6,), rad, the tip on the target.
     """
     return ShrinkableNeedle(model, needles, _parts(model, q))

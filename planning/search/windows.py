@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.text import Shown
+from puncture_twin.planning.base.text import Facts, Shown
 from puncture_twin.planning.case.entry import AngleGrid
 
 SQUARE_DEGREES = float(np.degrees(1.0) ** 2)
@@ -84,6 +84,10 @@ class Windows(Shown):
         if one is None:
             return "no window: nothing is safe"
         return f"the largest window: {one.text}, {one.number} of {len(self.windows)}"
+
+    def _facts(self) -> Facts:
+        yield "count", str(len(self.windows))
+        yield "largest", "–" if self.largest is None else self.largest.text
 
     def rows(self, number: int) -> Ints:
         """The candidates of one window."""

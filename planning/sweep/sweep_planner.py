@@ -37,14 +37,10 @@ class SweepPlan:
     """A motion about the virtual TCP (Chen 2019): the point on the needle's axis, a standoff before its tip.
 
     Attributes:
-        model: The arm.
-        needle_length_mm: Flange to tip.
-        standoff_mm: Tip to virtual TCP.
         point_base: Shape (3,), mm: where the virtual TCP stays, the target.
         angles: Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less.
         wanted: Theta and beta, rad, where it should have ended.
         approach: From home to the first direction.
-        sweep: Through all of them.
         stopped: Where and why it ends before; empty where it does not.
     """
 
@@ -84,8 +80,6 @@ def plan_sweep(
         context: Of a case that says where the arm's base is.
         start: Theta and beta, rad.
         end: (theta, beta) of the end; beta takes the shorter arc.
-        seed: Of the approach's planner.
-        progress: Called with directions checked and all of them.
 
     Raises:
         InputError: The case does not say where the robot stands, or both directions are one.

@@ -45,7 +45,6 @@ class Touch:
     """The touch of one marker.
 
     Attributes:
-        name: The marker's.
         point_base: Shape (3,), mm: where it is believed to be.
         q_touch: Shape (6,), rad: the tip on it.
         come: From the last standoff, or home, to this one.
@@ -62,8 +61,6 @@ class TouchTour:
     """Touches one after another.
 
     Attributes:
-        model: The arm.
-        tip_mm: Flange to tip.
         touches: In the order in which they are touched.
         leave: From the last standoff home.
     """
@@ -113,10 +110,7 @@ def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Cou
     """Plan the motions of a tour through stops.
 
     Args:
-        context: Of a case with an arm.
         stops: Each with a straight line to it that the arm can follow.
-        seed: Of the planner.
-        progress: Called with motions done and all of them.
 
     Raises:
         NoMotionError: None to a stop.
@@ -196,7 +190,6 @@ class ApproachCheckers:
     """Two views of one workcell.
 
     Attributes:
-        whole: The arm with its needle.
         blunted: The checker of a needle that is `TIP_MM` shorter.
     """
 
@@ -208,11 +201,8 @@ def line_to(model: UrModel, tip_mm: float, q_touch: Floats, from_mm: float, to_m
     """Joints along the needle's line through a touch, shape (m, 6), rad; None where the arm cannot follow it.
 
     Args:
-        model: The arm.
-        tip_mm: Flange to tip.
         q_touch: Shape (6,), rad, the tip on the marker.
         from_mm: Where the tip starts, mm before the marker; negative beyond it.
-        to_mm: Where it ends.
     """
     count = max(2, int(np.ceil(abs(from_mm - to_mm) / STEP_MM)) + 1)
     distances = np.linspace(from_mm, to_mm, count)
@@ -236,8 +226,6 @@ def why_not(checkers: ApproachCheckers, tip_mm: float, q_touch: Floats) -> str:
     """Reason that the arm cannot approach straight, in words; empty where it can.
 
     Args:
-        checkers: Of the workcell.
-        tip_mm: Flange to tip.
         q_touch: Shape (6,), rad, the tip on the marker.
     """
     whole = checkers.whole
@@ -272,8 +260,6 @@ def registered_joints(
     """Joints that put the needle as planned in the CT, by a new registration.
 
     Args:
-        model: The arm.
-        tip_mm: Flange to tip.
         q_insertion: Shape (6,), rad, the tip on the target as it was planned.
         target_ct: Shape (3,), mm.
         T_base_ct: The belief of that plan and the new one, shape (4, 4) each, mm.
@@ -302,7 +288,6 @@ def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
         context: The case; what it believes of patient and arm is what the touches were planned by.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q_insertion: Shape (6,), rad, the tip on the target as the touches were planned for.
-        registration: Of the touches.
 
     Raises:
         NoAnswerError: The arm does not reach there, or not without contact.

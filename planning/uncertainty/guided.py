@@ -18,7 +18,7 @@ the tip is moved by -K z, with the weights K of the least error among those that
 
     min |a - K H|^2  with  K F = b:      K = K0 + M N',   K0 F = b,   N' F = 0,   M by least squares
 
-The breath at the touches and later have their mean in common; about it each has a deviation of its own.
+The breath at the touches (breath') and later have their mean in common; about it each has a deviation of its own.
 
 The flat parts are eliminated, not given a large variance. ct is the registration as it is, K = -X L. The needle keeps
 the direction that the registration gave it: in every way
@@ -72,7 +72,7 @@ FREE = 0.01
 not see a roll about the needle; where the registered target is .1 mm beside its line, that is .001."""
 
 STOP_DRAWS = 20_000
-"""Draws of the corrections of all looks together: a chance to be stopped is known to .004."""
+"""Draws of the estimates after all looks together: a chance to be stopped is known to .004."""
 
 CAMERAS = "cameras"
 
@@ -118,6 +118,16 @@ class Look(NamedTuple):
     def hides(self, reading: Reading) -> bool:
         """Whether a reading of this look is not there."""
         return reading.name in self.hidden or (reading.device == CAMERAS and CAMERAS in self.hidden)
+
+
+class Follows(NamedTuple):
+    """By how much of the target's motion since the scan, and of its breath, something moves."""
+
+    motion: float
+    breath: float
+
+
+WHOLLY = Follows(1.0, 1.0)
 
 
 class Reading(NamedTuple):
@@ -179,14 +189,11 @@ class GuidedModel:
         bend = self.error.bend
         return {} if bend is None else {"bend": max(inserted, 0.0) ** 2 * bend.sides(self.error.model, q)}
 
-    def anatomy(self, weight: float = 1.0) -> Rows:
-        """Deviation of anatomy at the target from where the registration puts it, 6 rows.
-
-        Args:
-            weight: By how much of the target's breath it moves.
-        """
-        moved = np.column_stack([_root(self.motion), weight * self.breath])
-        return {"pose": np.eye(6), "motion": np.vstack([moved, np.zeros((3, 5))])}
+    def anatomy(self, follows: Follows = WHOLLY) -> Rows:
+        """Deviation of anatomy at the target from where the registration puts it, 6 rows."""
+        motion, breath = follows.motion * _root(self.motion), follows.breath * self.breath
+        still = np.zeros((3, 3))
+        return {"pose": np.eye(6), "motion": np.vstack([motion, still]), "breath": np.vstack([breath, still[:, :2]])}
 
     @cached_property
     def target(self) -> Rows:
@@ -212,13 +219,9 @@ class GuidedModel:
             "arm": -scale * noise.arm_jacobian * np.sqrt(noise.eta_variances),
             "touch": touch.reshape(3 * count, 3 * count),
             "breath at touch": np.tile(self.skin_weight * self.breath[:, 1], count)[:, None],
-            "motion": np.tile(self._moved(self.skin_weight, mean_alone=True), (count, 1)),
+            "breath": np.tile(self.skin_weight * self.breath * [1.0, 0.0], (count, 1)),
         }
         return _sum(self._markers, own)
-
-    def _moved(self, weight: float, *, mean_alone: bool = False) -> Floats:
-        """The source "motion" of what the breath alone moves, shape (3, 5): its mean, and what is about it."""
-        return np.column_stack([np.zeros((3, 3)), weight * self.breath * [1.0, not mean_alone]])
 
     @cached_property
     def _markers(self) -> Rows:
@@ -232,7 +235,7 @@ class GuidedModel:
             return []
         T, seen = flange_pose(self.error.model, look.q), dict[str, Rows]()
         tip, outward = T[:3, 3] + self.error.tip_mm * T[:3, 2], -T[:3, 2]
-        moved = {"motion": self._moved(self.skin_weight)}
+        moved = {"breath": self.skin_weight * self.breath}
         for row, (name, point) in enumerate(zip(self.markers, self.points_base, strict=True)):
             own = {source: part[3 * row : 3 * row + 3] for source, part in self._markers.items()}
             seen[marker_name(name)] = _sum(own, moved, {"frame": self._at(point[None])})
@@ -295,36 +298,47 @@ class GuidedModel:
             gain[:3] = 0.0
             gain[:3, used] = -K
         tip = a + gain[:3] @ H
-        return Guided(gain, *self.left(gain), tip @ tip.T, self._parts(tip))
+        return Guided(gain, *self.left(gain), tip @ tip.T, self._parts(tip), gain[:3] + self._aside(way, last))
 
-    def left(self, gain: Floats, weight: float = 1.0) -> tuple[Floats, Floats]:
-        """What a gain leaves of the needle against anatomy of a weight (see `anatomy`): `Guided.cov` and its mean."""
-        H, _, _ = self._stacked
-        E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(weight))))
-        left = E + gain @ H
-        return left @ left.T, self._split(left)[0]
+    def _aside(self, way: str, last: int) -> Floats:
+        """The weights, shape (3, m), that estimate the needle's shift from its plan in the body at rest, uncorrected.
 
-    def _split(self, rows: Floats) -> tuple[Floats, Floats]:
-        """Values linear in the sources (m, n): what the mean of the breath gives, (m,), and the rest, (m, n - 1)."""
-        before = list(self._widths).index("motion")
-        at = sum(list(self._widths.values())[:before]) + 3
-        return rows[:, at], np.delete(rows, at, axis=1)
+        By the touches, whichever way it is, and by what the way reads up to a look.
+        """
+        H, F, rows = self._stacked
+        resting = _times(-np.eye(3), {"pose": np.eye(6)[:3]})
+        a, b = self.matrices(_sum(_times(np.eye(6)[:3], self.end), resting))
+        used = [one.look < 0 or (one.device in WAYS[way] and one.look <= last) for one, _ in rows]
+        weights = np.zeros((3, len(rows)))
+        K = _weights(H[used], F[used], a, b)
+        assert K is not None  # touches determine a pose
+        weights[:, used] = K
+        return weights
+
+    def left(self, gain: Floats, follows: Follows = WHOLLY) -> tuple[Floats, Floats]:
+        """`Guided.cov` and `Guided.breath` of the needle against anatomy that follows the target so, under a gain."""
+        E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(follows))))
+        rows = E + gain @ self._stacked[0]
+        return rows @ rows.T, self._breath_of(rows)
+
+    def _breath_of(self, rows: Floats) -> Floats:
+        """Of values linear in the sources, shape (m, n), what the breath's mean and one deviation give: (m, 2)."""
+        names = list(self._widths)
+        at = sum(self._widths[name] for name in names[: names.index("breath")])
+        return rows[:, at : at + 2]
 
     def stop_chance(self, way: str, corridor_mm: float) -> float:
-        """The chance that a correction of a way is longer than a corridor, after any of its looks.
+        """The chance that, after any of its looks, a way estimates its needle farther from the plan than a corridor.
 
-        The touches are those that the registration fitted: of z = H x + F u it left X L z_touch = 0, which is the pose.
+        No flat part enters those estimates. ct corrects nothing, and is never stopped.
         """
         if way == "ct":
             return 0.0
-        H, F, rows = self._stacked
-        touch = [one.device == "touch" for one, _ in rows]
-        pose = -self.error.fit.map_at(self.error.target_base) @ H[touch]
-        z = H + F[:, :6] * np.repeat([1.0, LEVER_MM], 3) @ pose
         looked = [found for last in range(len(self.looks)) if (found := self.guided(way, last)) is not None]
-        moved = np.concatenate([one.gain[:3] @ z for one in looked])
-        mean, about = self._split(moved)
-        drawn = mean + np.random.default_rng(0).normal(size=(STOP_DRAWS, len(moved))) @ _root(about @ about.T).T
+        aside = np.concatenate([one.aside @ self._stacked[0] for one in looked])
+        mean = self._breath_of(aside)[:, 0]
+        root = _root(aside @ aside.T - np.outer(mean, mean))
+        drawn = mean + np.random.default_rng(0).normal(size=(STOP_DRAWS, len(mean))) @ root.T
         far = np.linalg.norm(drawn.reshape(STOP_DRAWS, -1, 3), axis=2).max(axis=1)
         return float(np.mean(far > corridor_mm))
 
@@ -392,12 +406,14 @@ class Guided(NamedTuple):
     """G, shape (6, m): how the command follows all readings; 0 for those that the way does not use."""
     cov: Floats
     """Sigma6, shape (6, 6), of the needle against the CT's anatomy about the target, what is known of it included."""
-    mean: Floats
-    """Shape (6,): what is known of it, by the breath's mean; no correction of the way takes it out."""
+    breath: Floats
+    """Shape (6, 2): what the breath's mean and one deviation add to it; no correction of the way takes them out."""
     tip_cov: Floats
     """Shape (3, 3), mm^2, of the tip about the true target."""
     parts: Mapping[str, float]
     """Mean square of the tip by source, mm^2."""
+    aside: Floats
+    """Shape (3, m): estimates from all readings how far the corrected needle is from its plan in the body at rest."""
 
 
 class WayChance(NamedTuple):
@@ -409,7 +425,7 @@ class WayChance(NamedTuple):
     p_hit: float
     """That it is not stopped, and hits."""
     p_stop: float
-    """That a correction would leave the corridor: it is not executed, and the needle is stopped."""
+    """That a correction would lead out of the corridor: it is not executed, and the needle is stopped."""
     lost_sight: str
     """What is not seen, and why; empty where all is."""
 
@@ -430,32 +446,33 @@ class GuidedError(PoseError):
     guided: Guided | None = None
 
     @property
-    def _known(self) -> Guided:
+    def known(self) -> Guided:
+        """What is there, of an error that is not blank."""
         assert self.guided is not None
         return self.guided
 
     def covariance(self, q: Floats) -> Floats:
         """Sigma6 after the last correction, the same for each of the configurations (n, 6)."""
-        return np.broadcast_to(self._known.cov, (len(q), 6, 6))
+        return np.broadcast_to(self.known.cov, (len(q), 6, 6))
 
     @property
     def target_covariance_ct(self) -> Floats:
         """What the true target adds, CT axes: less than nothing where a picture of it led the needle."""
         R = self.fit.R_base_ct
-        return np.asarray(R.T @ (self._known.tip_cov - self._known.cov[:3, :3]) @ R)
+        return np.asarray(R.T @ (self.known.tip_cov - self.known.cov[:3, :3]) @ R)
 
-    @property
-    def about_mean(self) -> GuidedError:
-        """The error about its mean, which is no chance."""
-        one, mean = self._known, self._known.mean
-        cov, tip_cov = one.cov - np.outer(mean, mean), one.tip_cov - np.outer(mean[:3], mean[:3])
-        return replace(self, guided=one._replace(cov=cov, tip_cov=tip_cov, mean=np.zeros(6)))
+    def about_breath(self, deviations: float | None = None) -> tuple[GuidedError, Floats]:
+        """The error about what is known of the breath, and where the tip ends by that: shape (3,), mm, CT axes.
 
-    @property
-    def mean_ct(self) -> Floats:
-        """Where the tip ends on average, from where it is meant to, shape (3,), mm, CT axes."""
-        return np.asarray(self.fit.R_base_ct.T @ self._known.mean[:3])
+        Args:
+            deviations: So far from its mean the breath is; None where its mean alone is known, which is no chance.
+        """
+        one = self.known
+        known = one.breath[:, :1] if deviations is None else one.breath
+        cov, shift = known @ known.T, known[:3] @ np.array([1.0, deviations or 0.0])[: known.shape[1]]
+        left = one._replace(cov=one.cov - cov, tip_cov=one.tip_cov - cov[:3, :3], breath=np.zeros((6, 2)))
+        return replace(self, guided=left), self.fit.R_base_ct.T @ shift
 
     def mean_squares(self, q: Floats) -> dict[str, float]:
         """By source, those of devices and motion too."""
-        return dict(self._known.parts)
+        return dict(self.known.parts)

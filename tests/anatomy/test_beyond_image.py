@@ -1,7 +1,5 @@
 """What lies beyond an image that cuts the body, against closed forms and the voxels of a body that goes on."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

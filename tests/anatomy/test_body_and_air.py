@@ -22,7 +22,7 @@ from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.certify.checker import verify
 from puncture_twin.planning.certify.subdivision import certify
-from puncture_twin.planning.formats.volumes import voxels
+from puncture_twin.planning.formats.volumes import volume_header
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import prepare
@@ -201,13 +201,13 @@ def test_a_search_inflates_each_file_once(scene, monkeypatch, tmp_path):
     The second search finds all surfaces kept: it inflates a file only where it needs voxels, and at most once.
     """
     monkeypatch.setenv("PUNCTURE_TWIN_CACHE", str(tmp_path))
-    read, inflated = Counter(), voxels.inflated
+    read, inflated = Counter(), volume_header.inflated
 
     def counted(content, promised, *, where):
         read[where.name] += 1
         return inflated(content, promised, where=where)
 
-    monkeypatch.setattr(voxels, "inflated", counted)
+    monkeypatch.setattr(volume_header, "inflated", counted)
     folder, _ = scene("arms")
     for most in ({"ct.nii.gz": 1, "labels.nii.gz": 1}, {"ct.nii.gz": 1}):
         read.clear()

@@ -2,17 +2,18 @@
 
 import pytest
 
-from puncture_twin.planning.anatomy.crossed_names import (
+from puncture_twin.planning.anatomy.default_roles import (
     BONES,
     NEEDS,
     ORGANS,
     POSITIONS,
     QUALIFIERS,
     SOFT_TISSUES,
+    UNKNOWN_NAME,
     named_as_crossed,
+    never_crossed,
 )
-from puncture_twin.planning.anatomy.default_roles import UNKNOWN_NAME, never_crossed
-from puncture_twin.planning.init.roles import Holding, assign, chosen_target
+from puncture_twin.planning.init.target import Holding, assign, chosen_target
 
 DANGERS = {
     "abbreviations": ["AAA", "ICA", "SMA", "SMV", "CBD", "A. hepatica", "V. renalis", "hepatic a.", "Aa. renales"],

@@ -1,7 +1,5 @@
 """An image that was cut through the body and filled up with air: the face at which it was cut is no skin."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +10,7 @@ from case_world import skin_from_ct
 from puncture_twin.planning.anatomy.body.body_mask import ct_image
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, content_of, cut_ends, end_warnings, stated_ends
 from puncture_twin.planning.anatomy.skin import skin_from_label, skin_of_image, skin_paths
-from puncture_twin.planning.formats.labels.label_surface import label_mesh
-from puncture_twin.planning.formats.labels.labelmaps import LabelMap
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, label_mesh
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.search.context import prepare
 

@@ -1,7 +1,5 @@
 """Whether a surface is closed is kept beside it: the same answer from a full, a damaged, another's and no cache."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the border of an image cuts goes on beyond it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -152,22 +150,21 @@ def test_no_triangle_near_the_image_is_long(name, request):
 
 @pytest.mark.parametrize("shape", [(61, 48, 37), (60, 47, 38)])
 def test_of_fine_voxels_it_is_drawn_about_blocks(shape):
-    """Never nearer than all voxels that are dense, but at their edges; never farther from them than a block."""
+    """It holds every voxel that is dense, also a wire of one, and lies never farther from them than two blocks."""
     rng, spacing_mm = np.random.default_rng(5), np.array([0.8, 0.6, 1.0])
     mask = np.zeros(shape, bool)
     for low in rng.integers(0, np.array(shape) - 12, (6, 3)):
         mask[tuple(slice(a, a + 12) for a in low)] = True
     mask[:10, :, -9:] = True  # at two faces of the image and in a corner
+    for place in rng.integers(1, np.array(shape) - 1, (20, 3)):
+        mask[tuple(place)] = mask[place[0], place[1], :] = True
     nothing = np.zeros(shape, bool)
     image = OutsideImage(mask, nothing, nothing, np.diag([*spacing_mm, 1.0]), spacing_mm, beyond_mm=(5.0, 5.0, 500.0))
     surface = outside_surface(image, mask, where="fine")
     assert surface is not None and surface.closed
-    index = rng.integers(0, shape, (600, 3))
-    gap_mm = scipy.ndimage.distance_transform_edt(~mask, sampling=spacing_mm)[tuple(index.T)]
-    deep_mm = scipy.ndimage.distance_transform_edt(mask, sampling=spacing_mm)[tuple(index.T)]
-    inside = inside_each(surface, index * spacing_mm)
-    assert inside[deep_mm > BLOCK_MM].all() and (deep_mm > BLOCK_MM).any()
-    assert inside[deep_mm > 0.0].mean() > 0.97
-    assert not inside[gap_mm > 3.0**0.5 * BLOCK_MM].any()
+    assert inside_each(surface, np.argwhere(mask) * spacing_mm).all()
+    gap_mm = scipy.ndimage.distance_transform_edt(~mask, sampling=spacing_mm)
+    far = np.argwhere(gap_mm > 3.0**0.5 * 1.5 * BLOCK_MM)
+    assert len(far) > 1000 and not inside_each(surface, far * spacing_mm).any()
     finest = outside_surface(replace(image, spacing_mm=np.full(3, BLOCK_MM)), mask, where="coarse")
-    assert finest is not None and len(surface.faces) < 0.4 * len(finest.faces)
+    assert finest is not None and len(surface.faces) < 0.5 * len(finest.faces)

@@ -1,7 +1,5 @@
 """The skin from a CT, a label and a mesh; where the field of view cuts the body."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from pathlib import Path

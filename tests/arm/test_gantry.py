@@ -1,7 +1,5 @@
 """The bore of a CT gantry as boxes: nothing of the wall is missing, and almost all of the bore is free."""
 
-from __future__ import annotations
-
 import shutil
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The compiled ways along a needle against the plain inverse, and the survey against its parts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

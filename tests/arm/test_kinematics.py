@@ -1,7 +1,5 @@
 """Kinematics of the UR family: laws, the ur-analytic-ik package as oracle, and the URDF's own joint chain."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -297,8 +297,8 @@ def test_the_libraries_of_every_maker_are_in_the_key(maker):
 def test_the_code_that_makes_a_surface_is_in_its_stamp():
     """From reading a file to the surface: each of these modules decides what is kept."""
     names = closure([f"{PROJECT}/planning/anatomy/surfaces.py"])
-    volumes = (f"formats/volumes/{name}" for name in ("nifti_header", "voxels"))
-    wanted = ("anatomy/skin", "anatomy/body/body_mask", "formats/labels/label_surface", *volumes)
+    volumes = (f"formats/volumes/{name}" for name in ("nifti_header", "volume_header"))
+    wanted = ("anatomy/skin", "anatomy/body/body_mask", "formats/labels/labelmaps", *volumes)
     assert {f"{PROJECT}/planning/{name}.py" for name in wanted} <= names
 
 

@@ -1,7 +1,5 @@
 """A cache that is another user's, or that others may write, is refused before anything in it is read."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from contextlib import nullcontext

@@ -1,7 +1,5 @@
 """Whatever lies in the caches, a command gives the same answer and says in one line what it made anew."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """What a result was made from: each file read once, hashed as it was read, and listed with its role."""
 
-from __future__ import annotations
-
 import hashlib
 import pickle
 from pathlib import Path

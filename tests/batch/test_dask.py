@@ -15,7 +15,7 @@ from refusals import refused
 from puncture_twin.planning.base.progress import Silent
 from puncture_twin.planning.batch.plan import read_plan_table
 from puncture_twin.planning.batch.run import Request, on_scheduler, run_cohort
-from puncture_twin.planning.batch.workers import Limits
+from puncture_twin.planning.batch.run_case import Limits
 from puncture_twin.run_twin import main
 
 TIME_LIMIT_S = 300.0

@@ -8,7 +8,7 @@ from refusals import refused
 from puncture_twin.planning.base.progress import Silent
 from puncture_twin.planning.batch.plan import read_plan_table
 from puncture_twin.planning.batch.run import Part, Request, run_cohort, running
-from puncture_twin.planning.batch.workers import NO_LIMITS, Limits
+from puncture_twin.planning.batch.run_case import NO_LIMITS, Limits
 from puncture_twin.run_twin import main
 
 
@@ -55,7 +55,7 @@ def test_a_worker_that_dies_once_costs_nothing_but_time(planned):
 @pytest.mark.parametrize(
     ("page", "limits", "reason"),
     [
-        (cohort_world.sleep, Limits(timeout_s=2.0), "timed_out"),
+        (cohort_world.sleep, Limits(timeout_s=4.0), "timed_out"),
         (cohort_world.eat, Limits(memory_mb=1500), "out_of_memory"),
     ],
 )

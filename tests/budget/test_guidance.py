@@ -11,8 +11,11 @@ from uncertainty_world import ball
 from puncture_twin import api as pt
 from puncture_twin.planning.budget.guidance import Sight, check_ways, sight_of, way_chances, with_ways
 from puncture_twin.planning.plan.plan_document import parse_plan, write_plan
+from puncture_twin.planning.search.uncertainty_breakdown import WAY_HEAD
 from puncture_twin.planning.sight.probe import ProbeView
 from puncture_twin.twin.rehearsal.distribution import rehearse_trials
+from puncture_twin.twin.report import patient
+from puncture_twin.twin.report.present import Table
 
 DEVICES = "touch_mm = 0.2\n[motion]\ntarget_sd_mm = [0.4, 0.4, 1.0]\n[stereo]\n[ultrasound]\n"
 
@@ -27,7 +30,7 @@ def planned(tmp_path_factory):
 def test_a_plan_says_what_the_rehearsal_predicts(planned):
     """Expected error and chance to hit of each way are those of its rooms, by the same line of sight."""
     context, plan = planned
-    q = plan.insertion.q[-1]
+    q, sight = plan.insertion.q[-1], sight_of(context, plan, "all")
     assert [one.way for one in plan.guidance] == [
         "ct",
         "stereo",
@@ -39,7 +42,7 @@ def test_a_plan_says_what_the_rehearsal_predicts(planned):
         "all",
     ]
     for one in plan.guidance:
-        found = rehearse_trials(context, plan.outward_ct, q, 1, 0, one.way, sight_of(context, plan, one.way))
+        found = rehearse_trials(context, plan.outward_ct, q, 1, 0, one.way, sight)
         assert found.predicted_rms_mm == pytest.approx(one.expected_error_mm, rel=1e-9), one.way
         assert found.p_hit == pytest.approx(one.p_hit, abs=1e-9)
 
@@ -84,3 +87,15 @@ def test_a_checked_direction_says_it_too(planned):
     assert with_ways(bare, plan).guidance == ()
     with refused("plan_of_another"):
         check_ways(bare, plan, "plan.json")
+
+
+def test_terminal_and_page_show_one_table(planned):
+    """A row a way; a way that does not see enough has no numbers but its reason."""
+    _, plan = planned
+    blind = plan.guidance[1]._replace(expected_error_mm=np.nan, p_hit=np.nan, lost_sight="behind the arm")
+    shown = patient.plan(replace(plan, guidance=(plan.guidance[0], blind)), (), declared=True)
+    (table,) = [block for block in shown if isinstance(block, Table) and block.head == WAY_HEAD]
+    assert table.rows[0][:2] == ("ct", f"{plan.guidance[0].expected_error_mm:.2f}")
+    assert table.rows[1] == ("stereo", "-", "-", "-", "behind the arm")
+    bare = patient.plan(replace(plan, guidance=()), ())
+    assert not [block for block in bare if isinstance(block, Table) and block.head == WAY_HEAD]

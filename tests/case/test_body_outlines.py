@@ -6,7 +6,7 @@ from case_world import ball
 from round_body import BODY, X, Z, inside, roles, run_init, write_ct, write_mask
 
 from puncture_twin.planning.anatomy.skin import skin_from_mesh
-from puncture_twin.planning.init.outlines import MOST_OF_SKIN, PART_OF_SKIN, agreement
+from puncture_twin.planning.init.segmentation import MOST_OF_SKIN, PART_OF_SKIN, agreement
 from puncture_twin.planning.search.context import prepare
 
 TARGET = (-40.0, 0.0, 10.0)

@@ -1,5 +1,6 @@
 """`init`: from a folder of files to a case that a search takes, on a round patient with known organs."""
 
+import hashlib
 import json
 import re
 
@@ -211,7 +212,10 @@ def test_the_middle_of_a_label_is_a_target(tmp_path, capfd):
     assert np.linalg.norm(np.subtract(told["target_mm"], ORGANS["right lung"][0])) < 3.0
     assert told["target_structure"] == "right lung"
     assert told["structures"] == {"target": 1, "avoid": 2}
-    assert {one["role"] for one in told["inputs"]} >= {"case", "ct", "mask aorta", "mask spleen"}
+    inputs = {one["role"]: one for one in told["inputs"]}
+    assert inputs.keys() >= {"case", "ct", "mask aorta", "mask spleen"}
+    written = hashlib.sha256((tmp_path / "case.toml").read_bytes()).hexdigest()
+    assert (inputs["case"]["path"], inputs["case"]["sha256"]) == ("case.toml", written)
     assert any("deepest point" in line for line in told["warnings"])
     code, _, said = init(capfd, tmp_path, "--target-label", "liver", "--force")
     assert code == 2 and "no structure is named 'liver'" in said[0] and "right lung" in said[0]

@@ -9,7 +9,7 @@ from case_world import SKIN, ball, case_text, structure
 from round_body import inside, run_init, write_ct, write_mask
 
 from puncture_twin.planning.anatomy.default_roles import default_role
-from puncture_twin.planning.init.roles import likely_region
+from puncture_twin.planning.init.target import likely_region
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 

@@ -1,7 +1,5 @@
 """What is kept of the packing: the same blocks to the bit, of these surfaces, or found anew."""
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

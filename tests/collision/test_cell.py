@@ -1,7 +1,5 @@
 """What the arm may touch: scenes whose answer is known by geometry, and the links' own shipped meshes as oracle."""
 
-from __future__ import annotations
-
 from itertools import combinations, pairwise
 
 import fcl

@@ -1,7 +1,5 @@
 """The fast checker: bounds that never exceed the distance, balls that enclose, and verdicts that are FCL's."""
 
-from __future__ import annotations
-
 import shutil
 from itertools import pairwise
 from pathlib import Path

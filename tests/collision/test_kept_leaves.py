@@ -1,7 +1,5 @@
 """What is kept of the skin's tree: its leaves, of which no triangle may be missing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A surface in parts touches what the whole touches; what is never near is never built."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import fcl

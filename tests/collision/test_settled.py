@@ -1,7 +1,5 @@
 """What is settled without the reference, as FCL has it: a round body against triangles, and overlaps that are deep."""
 
-from __future__ import annotations
-
 import fcl
 import numpy as np
 import trimesh

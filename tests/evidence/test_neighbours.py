@@ -7,7 +7,7 @@ import pytest
 
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE
-from puncture_twin.planning.evidence.neighbours import odd_units, overlaps, shared
+from puncture_twin.planning.evidence.inside_skin import odd_units, overlaps, shared
 
 CASE = SimpleNamespace(region="abdomen")
 

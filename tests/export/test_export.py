@@ -27,6 +27,7 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.export.exporter import FORMATS, GROUP, blend_radii_mm, csv_text, export_plan, read_csv
 from puncture_twin.planning.export.program import (
     PLAIN,
+    check_program,
     check_sampled,
     check_trajectory,
     corner_rows,
@@ -34,7 +35,6 @@ from puncture_twin.planning.export.program import (
     rests_at,
     waypoint_rows,
 )
-from puncture_twin.planning.export.program_check import check_program
 from puncture_twin.planning.export.ros2 import read_ros2, ros2_text, velocities
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
 from puncture_twin.planning.motion.follow import follow, follow_smoothly
@@ -682,10 +682,7 @@ DOUBT = "markers_ct with x and y negated, as LPS and RAS differ, would lie on th
 @pytest.mark.parametrize("name", FORMATS)
 def test_warnings_stand_whole_in_every_file(plan, name, tmp_path):
     """Their words, in comments; a plan without any says that there are none."""
-    said = {
-        (DOUBT, "a\nb"): "2 warnings when this was planned:",
-        (): "warnings when this was planned: none",
-    }
+    said = {(DOUBT, "a\nb"): "2 warnings when this was planned:", (): "warnings when this was planned: none"}
     bodies = []
     for number, (warnings, line) in enumerate(said.items()):
         path = export_plan(replace(plan, warnings=warnings), name, tmp_path / str(number), source=SOURCE).path

@@ -7,8 +7,15 @@ from numpy.typing import ArrayLike
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
-from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE, guard_points, guard_transform
-from puncture_twin.planning.formats.mesh_guard import MAX_DIAGONAL_MM, MIN_DIAGONAL_MM, guard_mesh
+from puncture_twin.planning.formats.guard import (
+    MAX_COORDINATE_MM,
+    MAX_DIAGONAL_MM,
+    MIN_DIAGONAL_MM,
+    ROTATION_TOLERANCE,
+    guard_mesh,
+    guard_points,
+    guard_transform,
+)
 from puncture_twin.planning.geometry.spaces import Space, Unit, parse_space, parse_unit, to_lps
 
 SQUARE = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [10.0, 10.0, 0.0], [0.0, 10.0, 0.0]]

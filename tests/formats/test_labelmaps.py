@@ -1,7 +1,5 @@
 """Label maps and the surfaces made of them."""
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections.abc import Callable
@@ -18,8 +16,7 @@ from scipy.spatial import cKDTree
 
 from puncture_twin.planning.anatomy.surfaces import VolumeSurfaces
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE
-from puncture_twin.planning.formats.labels.label_surface import label_mesh
-from puncture_twin.planning.formats.labels.labelmaps import LabelMap, labelmap_of
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, label_mesh, labelmap_of
 from puncture_twin.planning.formats.volumes.volume_files import VolumeFile, read_volume
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -161,8 +158,7 @@ def test_labels_are_read_from_integers_and_from_whole_floats(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("value", "match"),
-    [(0.5, "no_labels"), (-1.0, "no_labels"), (70000.0, "no_labels"), (0.0, "empty")],
+    ("value", "match"), [(0.5, "no_labels"), (-1.0, "no_labels"), (70000.0, "no_labels"), (0.0, "empty")]
 )
 def test_values_that_are_no_labels_are_refused(tmp_path: Path, value: float, match: str) -> None:
     """Fractions, negative and too large values, and a map with nothing in it."""

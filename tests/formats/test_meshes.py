@@ -20,7 +20,7 @@ from slicer_files import vtk_model
 
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.formats.mesh_guard import guard_mesh
+from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.meshes.mesh_files import cached_mesh_warnings, mesh_warnings, read_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
@@ -95,10 +95,7 @@ def gltf_document(**changes: Any) -> dict[str, Any]:
             {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
             {"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"},
         ],
-        "bufferViews": [
-            {"buffer": 0, "byteLength": 36},
-            {"buffer": 0, "byteOffset": 36, "byteLength": 6},
-        ],
+        "bufferViews": [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 6}],
         "buffers": [{"byteLength": 42}],
     }
     return document | changes

@@ -1,13 +1,11 @@
 """Tables of names as programs and people write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 from refusals import refused
 
-from puncture_twin.planning.formats.labels.name_tables import parse_names
+from puncture_twin.planning.formats.labels.labelmaps import parse_names
 
 NAMES = {1: "right lung", 7: "vein, portal"}
 

@@ -1,7 +1,5 @@
 """Names of labels, and the rules that patterns give them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

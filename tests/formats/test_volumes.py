@@ -1,7 +1,5 @@
 """Volumes: where voxels lie in LPS, and that no damaged or hostile file gets through."""
 
-from __future__ import annotations
-
 import gzip
 import itertools
 import struct

@@ -8,7 +8,7 @@ from fuzz.mutate import NUMBERS, pick
 COMMANDS = [
     *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "export", "register"],
     *["touch", "pivot"],
-    *["batch", "batch run", "batch status", "batch merge", "batch compare"],
+    *["calibrate", "calibrate hand-eye", "batch", "batch run", "batch status", "batch merge", "batch compare"],
     *["schema", "init", "selfcal", "servo", "reproduce", "scan", "", "serch", "x" * 3000, "--help", "-h", "--version"],
 ]
 """Not ``demo``, which needs nothing and takes a minute, nor ``batch plan``, which takes any folder."""
@@ -24,6 +24,8 @@ OPTIONS = {
     "--case": "path",
     "--from": "path",
     "--recording": "path",
+    "--shots": "path",
+    "--noise": "word",
     "--out": "out",
     "--picture": "out",
     "--jobs": "number",

@@ -31,6 +31,7 @@ from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.registration.placement import load_placement
+from puncture_twin.twin.pictures import png_bytes
 
 REGISTRATION = registration_section()
 TABLE = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 160.0, 0.0]\nsize_mm = [600.0, 40.0, 2000.0]\n'
@@ -217,6 +218,10 @@ def make_dicom(folder):
         if element.VR == "SQ":
             element.is_undefined_length = True
     world.write(data, folder / "rt.dcm")
+    grey = np.arange(2 * 9 * 8, dtype=np.uint8).reshape(2, 9, 8)
+    seen = world.ultrasound(grey, delta_cm=(0.02, 0.02), box=(1, 1, 6, 7), spacing=(0.2, 0.2))
+    world.write(seen, folder / "seen.dcm")
+    (folder / "seen.png").write_bytes(png_bytes(grey[0]))
 
 
 def make_points(folder):

@@ -28,6 +28,7 @@ from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
 from puncture_twin.twin.jobs.robot.mirror import RecordedJoints
+from puncture_twin.twin.pictures import read_frames
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,12 @@ def whole_transform(T):
 def whole_names(names):
     """Each label has a name of its own."""
     assert names and len(set(names.values())) == len(names) and all(0 < label <= 65535 for label in names)
+
+
+def whole_frames(read):
+    """Pictures with a pixel of some size."""
+    assert read.grey.dtype == np.uint8 and read.grey.ndim == 3 and read.grey.size
+    assert read.pixel_mm is None or np.isfinite(read.pixel_mm).all()
 
 
 def whole_recording(recording):
@@ -252,6 +259,7 @@ TARGETS = [
     Target("plan", {"plan.json": "tree"}, read_plan, whole_plan),
     Target("output set", {"set.json": "tree"}, rewritten_set, whole_set),
     Target("recording", {"recording.csv": "table"}, read_recording, whole_recording),
+    Target("pictures", {"seen.png": "text", "seen.dcm": "dicom"}, read_frames, whole_frames),
     Target("joints", {"joints.csv": "table"}, lambda path: list(RecordedJoints.read(path).states()), whole_states),
     Target("times", {"times.csv": "table"}, read_times, whole_motion),
 ]

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from puncture_twin.planning.geometry.creases import smooth_normals, split_at_creases
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, smooth_normals, split_at_creases
 
 
 def both_ways(faces, rng):

@@ -1,13 +1,11 @@
 """A mesh holds arrays that nobody writes to, copies what somebody might, and joins with others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from puncture_twin.planning.formats.mesh_guard import guard_mesh
+from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined, spread_on
 
 VERTICES = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy
 
-from puncture_twin.planning.formats.labels.label_surface import frame, framed_surface, mask_surface
-from puncture_twin.planning.geometry.voxelize import mark_inside, voxels_inside
+from puncture_twin.planning.formats.labels.labelmaps import frame, framed_surface, mask_surface
+from puncture_twin.planning.geometry.parts import mark_inside, voxels_inside
 
 WHERE = Path("made")
 T_CT_INDEX = np.array([[0.8, 0.0, 0.0, -31.0], [0.0, 1.1, 0.0, 12.0], [0.0, 0.0, 2.5, -7.0], [0.0, 0.0, 0.0, 1.0]])

@@ -1,7 +1,5 @@
 """Done, and the answer is no: one rule for each command, and where a rehearsal has it."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from pathlib import Path

@@ -509,6 +509,14 @@ def test_masked_values_are_no_numbers(context):
     assert len(pt.check_many(context, whole, whole)) == 2
 
 
+def test_an_option_without_keys_is_refused():
+    """It changed nothing, and said nothing."""
+    case = pt.load_case(folder() / "abdomen")
+    for options in ({"mount": {}}, {"needle": {"diameter_mm": 1.0}, "search": {}}):
+        with refused("empty"):
+            case.replace(**options)
+
+
 def test_candidates_of_another_case_are_not_planned_nor_shown(context, arm_context, tmp_path):
     """What is safe there says nothing here: a target 0.4 mm aside is another case."""
     other = pt.search(pt.prepare(context.case.replace(target_ct=context.case.target_ct + (0.4, 0.0, 0.0)), arm=False))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from case_world import changed, coarse_carton
 from cohort_world import write_cohort
+from hand_eye_world import hand_eye_problem, write_pairs
 from refusals import refused
 from whole_html import Whole
 
@@ -39,6 +40,7 @@ def given(context, tmp_path_factory):
     carton = coarse_carton(tmp / "carton")
     carton.write_text(changed(carton.read_text(), ("[end]", "[stereo]\n[ultrasound]\n[end]")))
     armed = pt.prepare(carton)
+    write_pairs(tmp / "pairs.csv", hand_eye_problem(np.random.default_rng(1), 8)[0])
     candidates = pt.search(context)
     plan = pt.plan(armed)
     pt.write_plan(plan, tmp / "plan.json")
@@ -47,7 +49,9 @@ def given(context, tmp_path_factory):
     return {
         "tmp": tmp, "armed": armed, "context": context, "candidates": candidates, "plan": plan,
         "certificate": certificate, "markers_ct": markers[0], "markers_base": markers[1], "points": markers[0],
-        "recording": pt.read_recording(tmp), "case": CARTON / "case_m.toml", "cost": candidates.path.length,
+        "recording": pt.read_recording(tmp), "pairs": pt.read_pose_pairs(tmp / "pairs.csv"),
+        "calibration": pt.calibrate(pt.read_recording(tmp)),
+        "case": CARTON / "case_m.toml", "cost": candidates.path.length,
         "theta_deg": 10.0, "beta_deg": 20.0, "one": candidates.best, "other": candidates.pick(0),
         "target_ct": TARGET, "format_name": "csv", "source": plan, "folder": tmp / "folder", "path": tmp / "nothing",
         "cohort": tmp / "no_cohort", "target": TARGET,
@@ -84,7 +88,10 @@ def values(given):
         "read_points": given["points"],
         "read_mesh": pt.read_mesh(CARTON / "skin.ply"),
         "read_recording": given["recording"],
-        "calibrate": pt.calibrate(given["recording"]),
+        "calibrate": given["calibration"],
+        "read_pose_pairs": given["pairs"],
+        "calibrate_hand_eye": pt.calibrate_hand_eye(given["pairs"]),
+        "shot_by_shot": pt.shot_by_shot(given["calibration"]).with_shot(given["recording"].subset(slice(0, 1))),
         "report": pt.report(armed, found, tmp / "report", plan=plan, rehearsal=rehearsal),
         "check_folder": pt.check_folder(tmp / "report"),
         "windows": candidates.windows,

@@ -11,17 +11,7 @@ import time
 from collections import Counter
 
 import pytest
-from kill_world import (
-    PLACE,
-    SELFCAL,
-    coarse_cases,
-    generator,
-    kill_while_writing,
-    said,
-    start,
-    state_of,
-    temporaries,
-)
+from kill_world import PLACE, SELFCAL, coarse_cases, generator, kill_while_writing, said, start, state_of, temporaries
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.files import sha256

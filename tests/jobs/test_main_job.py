@@ -265,7 +265,7 @@ def test_the_page_links_the_film_that_there_is(carton, rehearsed, tmp_path, monk
     def no_encoder(*arguments, **options):
         raise RuntimeError("no ffmpeg")
 
-    monkeypatch.setattr("puncture_twin.twin.report.scene.film_file.imageio_ffmpeg.write_frames", no_encoder)
+    monkeypatch.setattr("puncture_twin.twin.report.scene.film_text.imageio_ffmpeg.write_frames", no_encoder)
     monkeypatch.setattr(
         "puncture_twin.twin.report.scene.film.film_times", lambda total: FilmTimes((0.0, total), 1.0, 1)
     )

@@ -1,7 +1,5 @@
 """The mirror of a running arm: what it shows, what it refuses, and that it never sends anything."""
 
-from __future__ import annotations
-
 import importlib.util
 import itertools
 import json

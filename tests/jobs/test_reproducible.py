@@ -11,10 +11,7 @@ from places import ROOT
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.output.manifest import TIMINGS_NAME
 
-COMMANDS = {
-    "search": ["--no-arm", "--certify", "--certify-size", "4"],
-    "rehearse": [],
-}
+COMMANDS = {"search": ["--no-arm", "--certify", "--certify-size", "4"], "rehearse": []}
 """To rehearse a case is to plan it first, into the same folder."""
 
 ANGLES = ["--theta", "18", "--beta", "232"]

@@ -1,7 +1,5 @@
 """The command ``scan``: a set of files that `init` and `search` take, and what it says of the truth."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -93,8 +93,7 @@ def _joined(point):
 
 
 @pytest.mark.parametrize(
-    ("flags", "said"),
-    [(("--bed", "flat"), "two_beds table"), (("--lines", "13"), "command_line --lines")],
+    ("flags", "said"), [(("--bed", "flat"), "two_beds table"), (("--lines", "13"), "command_line --lines")]
 )
 def test_what_cannot_lie_beside_is_refused_and_leaves_nothing(flags, said, tmp_path, capsys):
     """One line, exit code 2; a case with a table has one already."""

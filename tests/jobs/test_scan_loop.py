@@ -1,7 +1,5 @@
 """The loop: a case of meshes is scanned, `init` makes a case of it, and `search` gives the verdicts of the meshes."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From home to standoff: paths checked by brute force, refusals with their reason, and the law of time."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The proof that the upper arm cannot get by: blocked cells are in contact for FCL, and what it cuts no path joins."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from kept_checkers import built

@@ -5,8 +5,8 @@ import numpy as np
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.plan.plan_check import check_plan
 from puncture_twin.planning.plan.planner import make_plan
-from puncture_twin.planning.plan.recheck import check_plan
 from puncture_twin.planning.search.context import prepare
 
 

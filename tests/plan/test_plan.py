@@ -14,9 +14,9 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.plan.plan import motion_contact
+from puncture_twin.planning.plan.plan_check import _check_limits, check_plan
 from puncture_twin.planning.plan.plan_document import read_plan, write_plan
 from puncture_twin.planning.plan.planner import make_plan
-from puncture_twin.planning.plan.recheck import _check_limits, check_plan
 from puncture_twin.planning.search.candidates import Ranking
 from puncture_twin.planning.search.context import prepare
 

@@ -20,7 +20,7 @@ from puncture_twin.planning.collision.bodies import arm_bodies, touch
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.place.arm_spheres import ArmSpheres
+from puncture_twin.planning.place.estimate import ArmSpheres
 from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.twin.world.arm import load_arm

@@ -1,7 +1,5 @@
 """Which directions the arm reaches: the windows and shares of the specification, laws of a drive, and known scenes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

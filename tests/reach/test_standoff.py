@@ -1,7 +1,5 @@
 """Where the tip waits before the insertion: never nearer than the case says, and clear of the skin."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import fcl

@@ -1,7 +1,5 @@
 """What keeps every branch from a flange pose."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

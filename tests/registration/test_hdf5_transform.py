@@ -107,8 +107,7 @@ def replace(group, name, value):
 
 
 @pytest.mark.parametrize(
-    ("kind", "change"),
-    [(kind, in_single_precision) for kind in KINDS] + [("euler", as_itk_4), ("versor", as_itk_4)],
+    ("kind", "change"), [(kind, in_single_precision) for kind in KINDS] + [("euler", as_itk_4), ("versor", as_itk_4)]
 )
 def test_single_precision_and_older_files(tmp_path, kind, change):
     """ITK reads both; so do we, and put points where it puts them."""

@@ -1,7 +1,5 @@
 """Where the patient truly lies: from a file of true positions, drawn from marker errors, or as believed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -140,7 +140,5 @@ def test_the_needle_to_take_is_the_shortest_that_reaches(path, length):
 
 
 CASE = SimpleNamespace(
-    space=Space.LPS,
-    target_ct=np.zeros(3),
-    needle=Needle(200.0, 150.0, 1.2, None, 10.0, 30.0, (200.0, 120.0, 150.0)),
+    space=Space.LPS, target_ct=np.zeros(3), needle=Needle(200.0, 150.0, 1.2, None, 10.0, 30.0, (200.0, 120.0, 150.0))
 )

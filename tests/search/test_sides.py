@@ -49,8 +49,7 @@ SHAFT, DEEP = "shaft_mm = 150.0", "position_mm = [0.0, 0.0, 0.0]"
 
 
 @pytest.mark.parametrize(
-    ("place", "near"),
-    [((0.0, 70.0, 0.0), {"back"}), ((0.0, -70.0, 0.0), {"front"}), ((70.0, 0.0, 0.0), {"left"})],
+    ("place", "near"), [((0.0, 70.0, 0.0), {"back"}), ((0.0, -70.0, 0.0), {"front"}), ((70.0, 0.0, 0.0), {"left"})]
 )
 def test_a_side_is_open_as_far_as_the_needle_reaches(tmp_path, place, near):
     """A ball of 90 mm and a shaft of 24: of a target 20 mm below its skin only that side is within reach."""

@@ -171,5 +171,6 @@ def test_a_window_is_as_wide_as_a_cone_of_its_solid_angle():
     both = find_windows(with_safe(found, far | (np.degrees(found.theta) < 20.5)))
     largest = max(both.windows, key=lambda one: one.entry_cm2)
     assert both.largest == largest and both.headline.startswith("the largest window: ")
+    assert f"count {len(both)}" in repr(both)
     assert f"{largest.entry_cm2:.1f} cm2 on the skin, {largest.wide_deg:.0f} deg wide" in both.headline
     assert find_windows(with_safe(found, np.zeros(len(found), bool))).headline == "no window: nothing is safe"

@@ -1,7 +1,5 @@
 """The needle turned about the target from outside: never off its point, never where the planner says no."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

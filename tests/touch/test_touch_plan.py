@@ -1,7 +1,5 @@
 """How markers are touched: in which order, along which lines, and never through the patient."""
 
-from __future__ import annotations
-
 from itertools import pairwise, permutations
 
 import numpy as np

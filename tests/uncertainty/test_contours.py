@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from uncertainty_world import declared
 
-from puncture_twin.planning.formats.labels.label_surface import label_mesh
-from puncture_twin.planning.formats.labels.labelmaps import LabelMap
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, label_mesh
 
 PIXEL_MM, PARTS = 0.8, (np.arange(5) + 0.5) / 5 - 0.5
 """Of a voxel that is averaged over."""

@@ -13,7 +13,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty, reading_noise
 from puncture_twin.planning.registration.fits import fit_triad
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.uncertainty.guided import WAYS, GuidedError, GuidedModel, Look, _root
+from puncture_twin.planning.uncertainty.guided import WAYS, Follows, GuidedError, GuidedModel, Look, _root
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
@@ -91,14 +91,16 @@ def test_every_way_errs_as_an_independent_prototype_found(situation):
             assert rms(made.guided(way)) == pytest.approx(figure, rel=0.05), way
 
 
-def test_chances_to_be_stopped_are_those_of_the_corrections():
-    """By one look: beyond a ball, of the Gaussian whose readings are conditioned; and no other by the axes' signs."""
-    made, corridor = model(motion_mm=ANYWHERE), 4.0
-    guided = made.guided("us")
-    left = guided.tip_cov  # what is corrected is what an uncorrected needle would have, less what is left
-    open_loop = made.guided("ct").tip_cov
+def test_chances_to_be_stopped_are_those_of_the_places_in_the_body():
+    """By one look: beyond a ball, of the Gaussian of what is known of the needle in the body at rest.
+
+    That is where a led needle is there, less what touches leave unknown of it; and no other by the axes' signs.
+    """
+    made, corridor, rest = model(motion_mm=ANYWHERE), 4.0, Follows(0.0, 0.0)
+    led, unknown = (made.left(made.guided(way).gain, rest)[0][:3, :3] for way in ("us", "ct"))
     found = made.stop_chance("us", corridor)
-    assert found == pytest.approx(1.0 - hit_in_ball((open_loop + left)[None], corridor)[0], abs=0.03)
+    assert found == pytest.approx(1.0 - hit_in_ball((led - unknown)[None], corridor)[0], abs=0.01)
+    assert 0.1 < found < 0.9
     assert made.stop_chance("ct", 0.0) == 0.0 and made.stop_chance("us", 0.0) == 1.0
     root = _root(np.diag([4.0, 1.0, 0.0]))
     np.testing.assert_allclose(root, np.diag([2.0, 1.0, 0.0]), atol=1e-12)

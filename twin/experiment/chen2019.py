@@ -210,11 +210,9 @@ class DrawnRank:
     """Percentile of a number of the paper among draws of it.
 
     Attributes:
-        name: Of the number.
         paper: The paper's, by its own points.
         percentile: Of the draws below it, 0 to 100.
         low: 5th percentile of the draws.
-        median: Of the draws.
         high: 95th percentile of the draws.
     """
 
@@ -235,8 +233,6 @@ class Experiment:
     """The paper's experiment under one declaration.
 
     Attributes:
-        declaration: What was drawn from.
-        draws: So many.
         printed: Each printed error, mm.
         joint: Sums of squares per axis of the CT (mm^2), and chi-squared, over all points of both setups.
         probability: Of a chi-squared as large as the paper's, by the law with 24 degrees.
@@ -313,7 +309,6 @@ class LesionErrors:
     """Errors of the paper's triads at a lesion, mm.
 
     Attributes:
-        name: Lesion, markers and setup.
         as_read: As the paper prints it.
         square: With the skew taken off the CT's readings.
     """

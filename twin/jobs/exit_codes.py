@@ -84,6 +84,7 @@ RULES: Mapping[str, Rule] = MappingProxyType(
         "export": Rule("there is no plan to write, or the case now rejects it"),
         "register": Rule("never: markers that contradict each other are refused"),
         "selfcal": Rule("never: a recording that does not determine the calibration is refused"),
+        "calibrate hand-eye": Rule("never: poses that do not determine the calibration, or contradict it, are refused"),
         "servo": Rule("a servo did not converge", _unless(lambda job: job.passed)),
         "scan": Rule(NEVER),
         "reproduce": Rule("one of the paper's numbers is outside its limits", _unless(lambda result: result.passed)),
@@ -99,13 +100,6 @@ RULES: Mapping[str, Rule] = MappingProxyType(
 
 def finish(command: str, found: Any, summary: dict[str, Any], text: str, as_json: bool) -> None:
     """Print what a command found, and end it with the code that its rule gives.
-
-    Args:
-        command: Its name in `RULES`.
-        found: What its rule is about.
-        summary: For ``--json``.
-        text: For a person.
-        as_json: Which of them is printed.
 
     Raises:
         typer.Exit: The code is not 0.

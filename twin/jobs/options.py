@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
 SourceArgument = Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json.")]
 OutOption = Annotated[Path, typer.Option("--out", help="Output folder.", callback=check_writable)]
-OutOfCaseOption = Annotated[
-    Path | None,
-    typer.Option("--out", help="Output folder.", show_default="out/CASE-COMMAND"),
-]
+OutOfCaseOption = Annotated[Path | None, typer.Option("--out", help="Output folder.", show_default="out/CASE-COMMAND")]
 CohortOption = Annotated[
     Path, typer.Option("--out", metavar="DIR", help="Folder of the cohort.", callback=check_writable)
 ]

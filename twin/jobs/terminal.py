@@ -40,7 +40,6 @@ def default_out(source: Path, command: str) -> Path:
 
     Args:
         source: What the command reads: a case, its folder, or a plan.
-        command: Its name.
     """
     place = source.absolute()
     if place.suffix.lower() not in {".toml", ".json"}:
@@ -236,8 +235,6 @@ def write_result(summary: Mapping[str, Any], path: Path, out: Path) -> None:
 
     Args:
         summary: With ``files``, where they lie in the end.
-        path: The JSON to write.
-        out: The folder in which they lie.
     """
     write_json({**summary, "files": [os.path.relpath(file, out) for file in summary["files"]]}, path)
 

@@ -15,9 +15,12 @@ from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.budget.guidance import (
     Sight,
     as_rehearsed,
+    at_phases,
     check_way,
     corridor_mm,
     equipped,
+    followers,
+    guided_chances,
     guided_error,
     guided_model,
     lost_sight,
@@ -31,7 +34,6 @@ from puncture_twin.planning.registration.fit_uncertainty import touches
 from puncture_twin.planning.registration.residuals import INTERVAL
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
-from puncture_twin.planning.search.phases import moving_weights
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding, refined_chances
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
@@ -302,7 +304,7 @@ def _measured(
     assert model is not None
     if guided is not None:
         believed = left = guided_error(guided[0].model, guided[0].name)
-        about, mean_ct = left.about_mean, left.mean_ct
+        about, mean_ct = left.about_breath()
     off_mm = off[went] * _surfaces(model, puncture, query.truth)
     error_ct = trials.tip_ct - trials.target_ct - mean_ct
     inverse = np.linalg.inv(about.tip_covariance_ct(q)[0] + LEAST_VARIANCE * np.eye(3))
@@ -316,7 +318,7 @@ def _measured(
         cov_ct=believed.tip_covariance_ct(q)[0],
         in_region=square <= chdtri(3, 1 - INTERVAL),
         hit=_hits(context, trials, off_mm),
-        p_hit=float(model.led(about, mean_ct).hit_chance(about.covariance_ct(q))[0]),
+        p_hit=float(model.hit_chance(believed.covariance_ct(q))[0]),
         structures=model.structures,
         touched=_touches(context, puncture, trials, off_mm),
         p_touch=_touch_chances(context, puncture, model, None if guided is None else guided[0]),
@@ -330,31 +332,32 @@ def _measured(
     way = guided[0]
     moving = {"breathing": case.breathing, "motion": case.motion}
     said = not_modelled(case, counted=(*counted, *(name for name, one in moving.items() if one is not None)))
-    p_stop, hidden = way.model.stop_chance(way.name, way.corridor_mm), lost_sight(way.model, way.name)
+    p_hit, p_stop = guided_chances(way.model, way.name, model, way.corridor_mm)
     return replace(
         distribution,
         guidance=way.name,
         stopped=len(went) - unreached - int(went.sum()),
         p_stop=p_stop,
-        p_hit=(1.0 - p_stop) * distribution.p_hit,
-        hidden=hidden,
+        p_hit=p_hit,
+        hidden=lost_sight(way.model, way.name),
         not_modelled=said,
     )
 
 
 def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel, way: Way | None) -> Floats:
-    """Predicted chances to touch, shape (k,): under guidance each structure moves by its own weight of the breath."""
+    """Predicted chances to touch, shape (k,): under guidance each structure follows the target in its own way."""
     outward_ct, q = puncture.outward_ct[None], puncture.q_insertion[None]
+
+    def touch(of: ChanceModel) -> Floats:
+        return refined_chances(of, outward_ct, q, of.chances(outward_ct, q)).touch[0]
+
     if way is None:
-        return refined_chances(model, outward_ct, q, model.chances(outward_ct, q)).touch[0]
-    weights, found = np.ones(len(model.columns)), np.zeros(len(model.columns))
-    if context.case.breathing is not None:
-        weights = moving_weights(context.case, context.case.breathing, context.anatomy).structures[model.columns]
-    for weight in np.unique(weights).tolist():
-        left = guided_error(way.model, way.name, weight)
-        other = model.led(left.about_mean, left.mean_ct)
-        touch = refined_chances(other, outward_ct, q, other.chances(outward_ct, q)).touch[0]
-        found = np.where(weights == weight, touch, found)
+        return touch(model)
+    follows = [followers(context.case, context.anatomy)[column] for column in model.columns]
+    found = np.zeros(len(follows))
+    for one in set(follows):
+        chances = np.mean([touch(of) for of in at_phases(way.model, way.name, model, one)], axis=0)
+        found = np.where([its == one for its in follows], chances, found)
     return found
 
 
@@ -400,14 +403,13 @@ def _touches(context: CaseContext, puncture: Puncture, trials: Trials, off_mm: F
     columns, outward_ct = demanding(checked), puncture.outward_ct[None]
     lengths = case_axis_lengths(case, context.anatomy, outward_ct)[0]
     distance = context.engine.measure(case.target_ct, outward_ct, lengths).distance[0]
-    weights = np.ones(len(checked))
-    if case.breathing is not None:
-        weights = moving_weights(case, case.breathing, context.anatomy).structures
+    follows = followers(case, context.anatomy)
     turn = np.linalg.norm(trials.outward_ct - puncture.outward_ct, axis=1)
     touched = np.zeros((len(trials.tip_ct), len(columns)), bool)
     for place, column in enumerate(columns):
         length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], CONTACT_MM)
-        tip_ct = trials.tip_ct + (1 - weights[column]) * trials.breath_ct + checked[column].outside * trials.motion_ct
+        own = follows[column]
+        tip_ct = trials.tip_ct + (1 - own.motion) * trials.motion_ct + (1 - own.breath) * trials.breath_ct
         shift = np.linalg.norm(tip_ct - case.target_ct, axis=1)
         for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):  # others are surely clear
             touched[row, place] = context.engine.collides(

@@ -43,7 +43,7 @@ class Way:
     Attributes:
         name: As in `WAYS`.
         model: What is believed.
-        corridor_mm: How far a correction may move the needle.
+        corridor_mm: How far from its plan a correction may take the needle, by what is believed.
     """
 
     name: str
@@ -52,11 +52,11 @@ class Way:
 
 
 class GuidedTrials(NamedTuple):
-    """Trials, and which of them were stopped: shape (n,), and by how much each was corrected: (n, 3), mm, base axes."""
+    """Trials, which of them were stopped: shape (n,), and how far from its plan each believes to be: (n, 3), mm."""
 
     trials: Trials
     stopped: Bools
-    moved_base: Floats
+    aside_base: Floats
 
 
 def guided_trials(
@@ -75,9 +75,11 @@ def guided_trials(
     if way.name == "ct":
         return GuidedTrials(open_loop(puncture, truths), np.zeros(count, bool), np.zeros((count, 3)))
     T_base_ct = registered(puncture, truths)
+    turned = T_base_ct[:, :3, :3] @ model.error.fit.R_base_ct.T  # the gain is of the nominal patient's axes
     room = _Room(puncture, truths, model, T_base_ct, *_devices(puncture, truths, model, rng))
     drift = _drift(errors, truths.arrival, rng)
-    moved, stopped, reached = np.zeros((count, 3)), np.zeros(count, bool), np.ones(count, bool)
+    moved, aside = np.zeros((count, 3)), np.zeros((count, 3))
+    stopped, reached = np.zeros(count, bool), np.ones(count, bool)
     found: Readings = {("touch", -1): (truths.touched_base - apply_each(T_base_ct, truths.read_ct)).reshape(count, -1)}
     for number, look in enumerate(model.looks):
         q, there = commanded(puncture, T_base_ct, moved, look.out_mm, look.q)
@@ -85,15 +87,19 @@ def guided_trials(
         found |= room.look(
             look, number, q, true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
         )
-        wanted = _correction(way, found, number, T_base_ct)
         reached &= there
-        if wanted is not None:
-            stopped |= np.linalg.norm(wanted, axis=1) > way.corridor_mm
-            moved = np.where(stopped[:, None], moved, wanted)
+        if (known := model.guided(way.name, number)) is not None:
+            z = np.hstack([found[one.name, one.look] for one in model.readings if one.look <= number])
+            z = (z.reshape(count, -1, 3) @ turned).reshape(count, -1)
+            wanted, off = (
+                np.einsum("nab,nb->na", turned, z @ rows[:, : z.shape[1]].T) for rows in (known.gain[:3], known.aside)
+            )
+            stopped |= np.linalg.norm(off, axis=1) > way.corridor_mm
+            moved, aside = np.where(stopped[:, None], (moved, aside), (wanted, off))
     q, there = commanded(puncture, T_base_ct, moved)
     arrival = rng.normal(size=(count, 6)) * errors.arm.repeatability
     needle = true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
-    return GuidedTrials(ended(puncture, truths, T_base_ct, needle, reached & there), stopped, moved)
+    return GuidedTrials(ended(puncture, truths, T_base_ct, needle, reached & there), stopped, aside)
 
 
 def _drift(errors: ErrorModel, first: Floats, rng: np.random.Generator) -> Floats:
@@ -103,20 +109,6 @@ def _drift(errors: ErrorModel, first: Floats, rng: np.random.Generator) -> Float
     if whole == 0.0:
         return np.zeros_like(first)
     return np.asarray(first * (drift / whole) ** 2 + rng.normal(size=first.shape) * drift * anew / whole)
-
-
-def _correction(way: Way, found: Readings, last: int, T_base_ct: Floats) -> Floats | None:
-    """By how much to move the needle from where the registration puts it, (n, 3), after a look; None: not known.
-
-    The gain is of the nominal patient; what each trial registered (n, 4, 4) is rotated against it.
-    """
-    guided = way.model.guided(way.name, last)
-    if guided is None:
-        return None
-    so_far = [found[one.name, one.look] for one in way.model.readings if one.look <= last]  # in the order of the gain
-    turned = T_base_ct[:, :3, :3] @ way.model.error.fit.R_base_ct.T
-    z = (np.hstack(so_far).reshape(len(turned), -1, 3) @ turned).reshape(len(turned), -1)
-    return np.asarray(np.einsum("nab,nb->na", turned, z @ guided.gain[:3, : z.shape[1]].T))
 
 
 def _devices(
@@ -167,7 +159,7 @@ class _Room:
         markers = self.cameras.read(apply(self.puncture.T_base_ct, self.puncture.points_ct + skin_ct[:, None]))
         balls = self.cameras.read(needle.tip_base[:, None] - behind * needle.R_base_needle[:, None, :, 2])
         expected = apply_each(self.T_base_ct, truths.read_ct)
-        T_base_cameras = fit_rigid(markers[:, shown], expected[:, shown])  # the frame is free: anywhere near will do
+        T_base_cameras = fit_rigid(markers[:, shown], expected[:, shown])  # where the belief is linear: frame is free
         off = apply_each(T_base_cameras, balls) - (tip[:, None] - behind * axis[:, None])
         seen = {ball_name(mm): off[:, row] for row, mm in enumerate(behind[:, 0].tolist())}
         there = apply_each(T_base_cameras, markers) - expected

@@ -81,12 +81,7 @@ def body_axes(
     """A small cross of the body's directions as they lie in this view; the far ends are pale.
 
     Args:
-        draw: Where to draw.
-        camera: The view.
-        space: The case's space; names the directions.
-        centre: Pixel where the axes cross.
         length: Pixels of an axis that lies in the picture plane.
-        size: Of the words.
     """
     reach = length + 3.6 * size
     disc = [centre[0] - reach, centre[1] - reach, centre[0] + reach, centre[1] + reach]
@@ -135,13 +130,8 @@ def scale_bar(
     """A bar of a round length, true at the depth of one point (perspective: nearer things look larger).
 
     Args:
-        draw: Where to draw.
-        camera: The view.
         at_ct: The point whose depth counts, shape (3,).
-        left: Pixel column where the bar begins.
-        bottom: Pixel row of the bar.
         width_px: Greatest length in pixels.
-        note: What follows the length.
     """
     depth = float(camera.project(at_ct)[0, 2])
     per_mm = camera.scale / depth

@@ -133,7 +133,6 @@ def draw_rooms_picture(found: Any, path: Path) -> None:
     """Write the picture.
 
     Args:
-        found: A `Distribution` of one room or more.
         path: The PNG to write; it appears whole or not at all.
     """
     R = needle_frame(found.puncture.outward_ct)

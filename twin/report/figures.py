@@ -37,7 +37,6 @@ def halo(width: float, colour: str = "white") -> list[Any]:
 
     Args:
         width: Of the rim on both sides together, and of the line itself, points.
-        colour: Of the rim.
     """
     return [withStroke(linewidth=width, foreground=colour)]
 
@@ -48,7 +47,6 @@ def picture_axes(
     """Axes in an image's own pixels (right, down; 0 is its upper left corner) that hold it.
 
     Args:
-        figure: Where.
         image: Shape (h, w) or (h, w, 3).
         at: Left, lower edge, width and height, of the figure's.
     """

@@ -38,10 +38,7 @@ class ReasonCount:
     """One line of the legend.
 
     Attributes:
-        text: What a person reads.
         code: The reason's code, "safe" for safe.
-        colour: Its colour.
-        count: How many directions.
         fraction: Of the grid's directions, 0..1.
         solid_angle: Of the searched solid angle, 0..1; the grid is denser near θ = 0, this is not.
     """
@@ -84,13 +81,30 @@ def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:
     return candidates.clearance.structures[best], float(candidates.clearance.distance[row, best])
 
 
-def nearest_text(candidates: Candidates, row: int) -> str:
-    """The nearest structure and its clearance, or that the needle crosses it."""
+def carried_mm(scan: Any | None) -> tuple[int, str]:
+    """How many digits of a mm the voxels of a case's CT carry, and half the longest side of one as " ± 0.4".
+
+    A case of meshes alone has one digit and "".
+    """
+    if scan is None:
+        return 1, ""
+    half = float(np.linalg.norm(scan.grid.T_ct_index[:3, :3], axis=0).max()) / 2
+    return (1, f" ± {half:.1f}") if half < 1.0 else (0, f" ± {math.ceil(half)}")
+
+
+def length_text(mm: float, scan: Any | None) -> str:
+    """A length in the digits that the CT carries, as "93 ± 3 mm"."""
+    digits, told = carried_mm(scan)
+    return number(mm, digits, f"{told} mm".strip())
+
+
+def nearest_text(candidates: Candidates, row: int, scan: Any | None = None) -> str:
+    """The nearest structure and its clearance, in digits that the CT carries, or that the needle crosses it."""
     name, clearance = nearest_structure(candidates, row)
     if not name:
         return "no structure has a margin"
     spoken = name.replace("_", " ")
-    return f"crosses {spoken}" if clearance < 0 else f"nearest: {spoken}, {number(clearance, 1, 'mm')}"
+    return f"crosses {spoken}" if clearance < 0 else f"nearest: {spoken}, {length_text(clearance, scan)}"
 
 
 def needle_text(case: Any) -> str:
@@ -137,7 +151,6 @@ def direction_text(direction_ct: Floats, space: str) -> str:
 
     Args:
         direction_ct: Shape (3,), unit.
-        space: The case's.
     """
     for name, vector in body_directions(space).items():
         if float(vector @ direction_ct) > NEARLY:

@@ -30,6 +30,7 @@ from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.report.numbers import (
     ReasonCount,
     arm_text,
+    carried_mm,
     clearance_text,
     expected_text,
     nearest_structure,
@@ -86,15 +87,18 @@ def _hatches(line: ReasonCount) -> str:
     return "hatched air" if line.colour == UNSEEN_AIR else "hatched"
 
 
-def windows(candidates: Candidates) -> list[Block]:
-    """The best candidate of each window, with the window's size."""
+def windows(candidates: Candidates, scan: Any | None) -> list[Block]:
+    """The best candidate of each window, with the window's size, in digits that the voxels of the CT carry."""
     found = candidates.windows.windows
     if not found:
         return ["No direction is safe, so there is nothing to rank."]
-    return [grid(_window_fields(candidates), found[:MOST_WINDOWS]), _windows_text(candidates, len(found))]
+    return [
+        grid(_window_fields(candidates, *carried_mm(scan)), found[:MOST_WINDOWS]),
+        _windows_text(candidates, len(found)),
+    ]
 
 
-def _window_fields(candidates: Candidates) -> list[Field]:
+def _window_fields(candidates: Candidates, digits: int, told: str) -> list[Field]:
     button = Markup('<button type="button" class="pick" data-row="{}">{}</button>')
 
     def best(values: Any) -> Any:
@@ -110,14 +114,14 @@ def _window_fields(candidates: Candidates) -> list[Field]:
         Field("θ °", lambda window: f"{np.degrees(candidates.theta[window.best]):.4g}"),
         Field("β °", lambda window: f"{np.degrees(candidates.beta[window.best]):.4g}"),
         Field("cost", best(ranking.cost), 3),
-        Field("clearance", lambda window: nearest(window)[1], 1, "mm"),
+        Field(f"clearance{told}", lambda window: nearest(window)[1], digits, "mm"),
         Field("nearest structure", lambda window: nearest(window)[0].replace("_", " ") or None),
-        Field("path", best(path.length), 1, "mm"),
-        Field("skin angle", best(np.degrees(path.skin_angle)), 1, "°"),
+        Field(f"path{told}", best(path.length), digits, "mm"),
+        Field("skin angle", best(np.degrees(path.skin_angle)), 0, "°"),
         Field("reach margin", best(candidates.arm.margin), 2),
         Field("safe cone", best(np.degrees(candidates.safe_cone)), 1, "°"),
         Field("window's area", lambda window: window.square_deg, 0, "deg²"),
-        Field("on the skin", lambda window: window.entry_cm2, 1, "cm²"),
+        Field("on the skin, cm²", lambda window: f"{window.entry_cm2:.{int(window.entry_cm2 < 10)}f}"),
     ]
 
 
@@ -214,11 +218,7 @@ def _true_needle(least: Sequence[tuple[str, float]]) -> str:
 
 
 def rooms(found: Mapping[str, Any] | None) -> list[Block]:
-    """What happened in many rooms, beside what was predicted; nothing without rooms.
-
-    Args:
-        found: A `Distribution` as plain values.
-    """
+    """What happened in many rooms, beside what was predicted; nothing without rooms."""
     if found is None:
         return []
     if found["realised_rms_mm"] is None:

@@ -66,10 +66,8 @@ class Field(NamedTuple):
     """One fact of a row.
 
     Attributes:
-        name: What it is called.
-        value: Its key, with dots for keys within (of which each may be missing or None), or what finds it in a row.
+        value: A key, with dots for keys within (of which each may be missing or None), or what finds it in a row.
         digits: Of a number; None shows the value as it is.
-        unit: Of a number.
     """
 
     name: str
@@ -229,12 +227,6 @@ def write_page(path: Path, title: str, under: str, cards: Sequence[Card], sectio
     """Write a job's page: cards, sections, inputs; it appears whole or not at all.
 
     Args:
-        path: The HTML to write.
-        title: Of the page.
-        under: What stands below it.
-        cards: In short.
-        sections: What the terminal shows too.
-        inputs: Every file that decided it.
         parts: What the page has beyond: ``origin``, and ``data``, ``plotly`` and ``script``.
     """
     from puncture_twin.twin.report.page.template import write_html

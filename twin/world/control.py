@@ -59,10 +59,7 @@ class Insertion:
     """A straight motion of the tip.
 
     Attributes:
-        model: The arm.
-        tool: What its flange carries.
         down_base: Shape (3,), unit vector of gravity, base frame.
-        trajectory: From rest to rest.
         hold_s: How long its end is kept.
     """
 
@@ -93,10 +90,7 @@ def insert(
 
     Args:
         workcell: An open workcell, its arm at rest at the trajectory's start.
-        insertion: The insertion to run.
-        control: How the tip follows it.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
-        start_s: Time of its first step.
         resistance: Of tissue; None for none.
 
     Raises:
@@ -142,9 +136,6 @@ class Admittance:
     """The controller: it keeps the virtual mass's place and speed, shape (3,) each, m and m/s, base frame.
 
     Args:
-        model: The arm, nominal.
-        tip_m: Flange to tip.
-        virtual: The mass.
         dt: Its step, s.
 
     Raises:
@@ -185,8 +176,6 @@ class Impedance:
     """The controller: it keeps the integral of its error and the damping of its pose.
 
     Args:
-        model: Of the arm's masses.
-        stiffness: At the tip.
         dt: Its step, s.
         keep_compliance: Whether the integral stops while contact is measured.
     """
@@ -245,7 +234,6 @@ class Stiffness:
     Attributes:
         translation_n_m: K across and along the needle, N/m.
         rotation_nm_rad: Of the needle's direction and roll, N m/rad.
-        damping_ratio: zeta of every mode.
         integral_per_s: K_i: what is left of an error is gone after so many times 1/K_i; 0 keeps the compliance.
     """
 
@@ -301,7 +289,6 @@ def refuse_unstable(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> No
     """Refuse a stiffness that this time step cannot carry at this pose.
 
     Args:
-        stiffness: At the tip.
         J: Jacobian of the tip, shape (6, 6).
         M: Mass matrix of the joints, shape (6, 6).
         dt: Time step, s.
@@ -346,11 +333,7 @@ def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float
     """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then constant.
 
     Args:
-        model: The arm.
-        tip_m: Flange to tip.
-        trajectory: From rest to rest.
         dt: The controller's step, s.
-        hold_s: How long its end is kept.
     """
     moving = int(np.ceil(trajectory.duration_s / dt)) + 1
     times = np.minimum(dt * np.arange(moving + round(hold_s / dt)), trajectory.duration_s)
@@ -384,7 +367,6 @@ def tips(model: UrModel, tip_m: float, q: Floats) -> Tip:
     """The tip and its Jacobian.
 
     Args:
-        model: The arm, nominal.
         tip_m: Flange to tip, along the flange's z.
         q: Shape (n, 6), rad.
     """
@@ -480,7 +462,6 @@ class Surroundings:
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
         resistance: Of tissue; None for none.
         stop: Ends the run where it says so; None never does.
-        watch: Called after each step.
     """
 
     joint_offsets: Floats
@@ -498,7 +479,6 @@ def run(
         arm: Of an open workcell whose world is the base frame.
         controller: Its step becomes that of the physics.
         reference: The motion to follow, a row a step.
-        tip_of: The true tip of true joints.
         around: What else acts.
     """
     set_time_step(arm.client, controller.dt)
@@ -551,7 +531,6 @@ class RigidModel:
     that was rotated instead: g_urdf = R_urdf_base g_base.
 
     Attributes:
-        kinematics: Lengths of the arm.
         tip_m: Flange to tip, along the flange's z.
         arm: The body that is evaluated, alone in a client of its own.
     """
@@ -579,8 +558,6 @@ def rigid_model(model: UrModel, tool: Tool, down_base: Floats) -> Iterator[Rigid
     """Open the model of an arm, and close it again.
 
     Args:
-        model: The arm.
-        tool: What its flange carries.
         down_base: Shape (3,), unit vector of gravity in the controller's base frame: any mount is a direction.
 
     Raises:

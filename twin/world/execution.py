@@ -50,11 +50,9 @@ class Recorder:
     """Records the arm after physics steps: `RECORD_S` apart, and at the end.
 
     Args:
-        workcell: An open workcell.
         q_command: Shape (n, 6), rad, one row a physics step.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
         dt: The physics step, s.
-        start_s: Time of the first row.
     """
 
     def __init__(
@@ -93,7 +91,6 @@ def execute(workcell: SimulatedWorkcell, q_command: Floats, joint_offsets: Float
     """Move the arm by its position motors from rest at the first command through all of them, one a physics step.
 
     Args:
-        workcell: An open workcell.
         q_command: Shape (n, 6), rad, spaced by the physics time step.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
     """

@@ -30,7 +30,6 @@ class SimulatedWorkcell:
     """An open simulated workcell.
 
     Attributes:
-        client: Physics client id.
         arm: The arm; its base frame is the world frame.
         bodies: Body id to name, the arm not among them.
     """
@@ -42,13 +41,7 @@ class SimulatedWorkcell:
 
 @contextmanager
 def open_workcell(
-    model: UrModel,
-    tool: Tool,
-    skin: TriangleMesh,
-    T_base_ct: Floats,
-    boxes: Sequence[Box] = (),
-    *,
-    down_ct: Floats,
+    model: UrModel, tool: Tool, skin: TriangleMesh, T_base_ct: Floats, boxes: Sequence[Box] = (), *, down_ct: Floats
 ) -> Iterator[SimulatedWorkcell]:
     """Build the workcell, yield it, and take it down.
 
@@ -56,10 +49,8 @@ def open_workcell(
 
     Args:
         model: A UR3, UR5 or UR10.
-        tool: Holder and needle.
         skin: The patient's surface, CT frame, mm.
         T_base_ct: Where the patient lies, shape (4, 4), mm.
-        boxes: Table and the like.
         down_ct: Unit vector of gravity in the CT frame, shape (3,).
 
     Raises:
@@ -91,17 +82,11 @@ CONTACT_DAMPING_NS_M = 100.0
 
 
 def load_surface(
-    client: int,
-    mesh: TriangleMesh,
-    T_world_mesh: Floats,
-    *,
-    solid: bool,
-    max_faces: int = MAX_PHYSICS_FACES,
+    client: int, mesh: TriangleMesh, T_world_mesh: Floats, *, solid: bool, max_faces: int = MAX_PHYSICS_FACES
 ) -> int:
     """A surface that does not move: triangle by triangle, hollows included.
 
     Args:
-        client: Physics client id.
         mesh: The surface, mm; thinned to ``max_faces``.
         T_world_mesh: Its pose, shape (4, 4), mm.
         solid: Whether bodies collide with it, or it is only seen.
@@ -190,8 +175,6 @@ class SimulatedCamera:
         eye_mm: Shape (3,), world frame.
         look_at_mm: Shape (3,), the middle of the image.
         up: Shape (3,), what is up in the image, world frame.
-        width: Pixels.
-        height: Pixels.
     """
 
     eye_mm: NDArray[np.float64]
@@ -220,8 +203,6 @@ def pinhole_picture(
     For looking at, not for measuring: the renderer samples pixel corners and has no anti-aliasing.
 
     Args:
-        client: Physics client id.
-        size: Width and height, px.
         K: Intrinsic matrix, shape (3, 3), px; pixel centres at integers.
         T_camera_world: Shape (4, 4), mm; the camera's x right, y down, z forward.
     """

@@ -139,7 +139,6 @@ class BodyMask:
     Attributes:
         body: Shape (nx, ny, nz), the solid body: the trunk, and parts of the patient that do not touch it.
         unscanned: Same shape, voxels that the scanner did not measure.
-        warnings: What the user should know.
         tables: Where the body ends as a table, cradle or board does that touches it.
     """
 
@@ -157,7 +156,6 @@ class CtImage:
         hu: Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head; of 16 bits
             where the file has such, else of single precision.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
-        where: The file.
         shown: What a person says that it shows.
         as_stored: Shape of ``hu``, as the file has them, where that differs.
         not_measured: Shape of ``hu``, what was not, where that is known.
@@ -182,11 +180,7 @@ class CtImage:
 
     @cached_property
     def found(self) -> BodyMask:
-        """The body.
-
-        Raises:
-            InputError: See `body_mask`.
-        """
+        """The body."""
         return body_mask(self.hu, self.spacing_mm, where=self.where, shown=self.shown, unscanned=self.unscanned)
 
     @cached_property
@@ -227,8 +221,6 @@ def body_mask(
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
         spacing_mm: Shape (3,).
-        where: For messages.
-        shown: What a person says of the image.
         unscanned: What was not measured, where that is known.
 
     Raises:
@@ -352,7 +344,6 @@ def detached_limbs(hu: NDArray[np.float32], parts: Iterable[Piece], spacing_mm: 
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the bed.
-        parts: As `thick_parts` finds them.
         spacing_mm: Shape (3,).
     """
     limbs = []

@@ -87,7 +87,6 @@ class Content:
     """What an image holds that is denser than air, by the slices across each axis.
 
     Attributes:
-        shape: Of the image, voxels.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         last: Shape (3, 2), the outermost slice that holds something at the low and the high end of each axis.
         area_mm2: Shape (3, 2), how much that is.
@@ -158,7 +157,6 @@ def cut_ends(content: Content, organs: Iterable[tuple[TriangleMesh, float]], *, 
     but not of a whole phantom, in the middle of its image.
 
     Args:
-        content: Of the image.
         organs: Structures inside the body, LPS mm, and the longest side of the voxels that they were made of.
         whole: Whether the body may end flat by itself, and what runs through it too, as phantoms do.
     """

@@ -26,8 +26,7 @@ from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, 
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
 from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
-from puncture_twin.planning.geometry.parts import in_blocks
-from puncture_twin.planning.geometry.voxelize import voxels_inside
+from puncture_twin.planning.geometry.parts import in_blocks, voxels_inside
 
 SAMPLING_MM = 4.0
 """Spacing of the grid on which limbs are looked for."""
@@ -69,7 +68,6 @@ class Piece(NamedTuple):
 
     Attributes:
         near: Alone a limb's where the target lies in ``whole``.
-        whole: All that may be one.
         ml: Of a part beyond a neck: if neither it nor what holds the target is as small as a limb, it is none. Else 0.
     """
 
@@ -183,7 +181,6 @@ class LimbSearch(NamedTuple):
     Attributes:
         parts: Shape (nx, ny, nz), from 1 the number of the part that a block belongs to, 0 outside.
         T_ct_index: Shape (4, 4), LPS mm.
-        part: By its number.
     """
 
     parts: Ints32
@@ -205,13 +202,7 @@ class LimbSearch(NamedTuple):
 
 
 def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> LimbSearch:
-    """Sample a CT and its body.
-
-    Args:
-        image: The CT.
-        body: Its voxels that are body.
-        structures: Which explain bones.
-    """
+    """Sample a CT and its body."""
     stride = np.maximum(1, (SAMPLING_MM / image.spacing_mm).astype(int))
     T = image.T_ct_index.copy()
     T[:3, 3] += T[:3, :3] @ ((stride - 1) / 2.0)

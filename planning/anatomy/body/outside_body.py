@@ -18,7 +18,7 @@ from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.anatomy.body.tables import FACES, Face
 from puncture_twin.planning.base.arrays import Bools, Floats, widened
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.formats.labels.label_surface import box_in, mask_surface
+from puncture_twin.planning.formats.labels.labelmaps import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.parts import in_blocks, parts_of
 from puncture_twin.planning.geometry.rigid import apply, pose
@@ -46,8 +46,9 @@ CUT_AT_MM = (30.0, 120.0, 480.0)
 """What goes on along the bed is cut across so far beyond the image: a triangle as long as all of it would lie near
 every needle, and the search would measure most axes from most of them."""
 BLOCK_MM = 2.0
-"""The surface is drawn about blocks of voxels of at most this edge that hold any of it: what is found by means over
-``SMOOTH_MM`` has no finer shape, and a table of .8 mm voxels has a million triangles."""
+"""The surface is drawn about blocks of voxels of at most this edge that hold any of it, or are less than half a block
+beside it: what is found by means over ``SMOOTH_MM`` has no finer shape, and a table of .8 mm voxels has a million
+triangles."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
@@ -82,7 +83,6 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     half of both counts.
 
     Args:
-        image: The CT and its body.
         air_hu: Voxels whose surroundings are denser than this are not air.
     """
     hu, body, unscanned = image.hu, image.body, image.unscanned
@@ -131,17 +131,12 @@ def outside_surface(
 
     Where the border of the image cuts it, it goes on beyond: every cut section is drawn out by ``beyond_mm``, and of
     bulky pieces also what lies between cut sections at one side. So does all that lies beyond an open face.
-
-    Args:
-        image: The CT and its body.
-        mask: Of `outside_mask`.
-        open_faces: Beyond which nothing is known.
-        where: The file, for messages.
     """
     edge = np.maximum(1, (BLOCK_MM / image.spacing_mm).astype(int))
-    blocks, pads = in_blocks(mask, edge) > 0, [(len(layers), len(layers)) for layers in _layers_mm(image)]
+    # A surface bevels the corners of its blocks. So what it holds lies half a block deep: no voxel in a corner is lost.
+    blocks, pads = in_blocks(widened(mask, edge // 2), edge) > 0, [(len(layers),) * 2 for layers in _layers_mm(image)]
     layered = np.pad(blocks, pads, mode="edge")
-    seen = in_blocks(mask & ~image.unscanned, edge) > 0 if image.unscanned.any() else blocks
+    seen = in_blocks(mask & ~image.unscanned, edge) > 0
     bulky = _bulky(seen, edge * image.spacing_mm)
     for axis, end in FACES:
         cut: Bools = np.asarray(bulky.take(end, axis=axis))

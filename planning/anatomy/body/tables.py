@@ -137,7 +137,6 @@ class Touching(NamedTuple):
     Attributes:
         cut_off: Shape of the body, what of it is a table whose thickness is seen beside the body.
         sides: At which the body ends as a table does, which could not be cut off.
-        warnings: One sentence each.
     """
 
     cut_off: Bools
@@ -190,7 +189,6 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
 
     Args:
         dense: Shape (nx, ny, nz).
-        side: Its far side.
         spacing_mm: Shape (3,).
     """
     axis, end = side.face
@@ -264,7 +262,6 @@ class _View(NamedTuple):
     """Where lines of sight end at one side of a body.
 
     Attributes:
-        face: The side.
         ends: Shape (n, nz), voxels along its axis, NaN where they end at nothing.
         counts: Shape (n, nz), which of them count.
         spacing_mm: Shape (3,).

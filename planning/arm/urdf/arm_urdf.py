@@ -117,8 +117,7 @@ class ArmUrdf:
 
     Attributes:
         text: The file's bytes.
-        document: What it says.
-        chain: Its six joints and seven bodies.
+        chain: The document's six joints and seven bodies.
         lengths_mm: d1, a2, a3, d4, d5, d6.
         T_base_root: Shape (4, 4), mm: the URDF's root in the controller's base frame.
         shapes: Of each of the seven bodies, in its own frame.
@@ -164,7 +163,6 @@ def read_arm_urdf(data: bytes, where: Path, *, flange: str, read: Read, T_base_r
 
     Args:
         data: The file's bytes.
-        where: The file.
         flange: Name of the link that carries the needle.
         read: Reads a mesh file by its address in the URDF.
         T_base_root: Shape (4, 4), mm: the root in the controller's base frame, where the URDF does not say it.

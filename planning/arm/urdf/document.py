@@ -74,7 +74,6 @@ class UrdfLink:
     """One link.
 
     Attributes:
-        name: As the URDF has it.
         collisions: What it is made of for contacts.
         drawn: Whether it has a visual shape.
         weighs: Whether it states a mass and a tensor of inertia that physics can use.
@@ -91,7 +90,6 @@ class UrdfJoint:
     """One joint.
 
     Attributes:
-        name: As the URDF has it.
         kind: One of ``JOINTS``.
         parent: Name of the link before it.
         child: Name of the link that it moves.
@@ -114,10 +112,8 @@ class UrdfDocument:
     """A whole URDF.
 
     Attributes:
-        name: The robot's.
         links: By name, in the file's order.
         joints: In the file's order.
-        where: The file, for errors.
     """
 
     name: str

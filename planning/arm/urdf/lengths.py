@@ -75,8 +75,6 @@ def ur_lengths(chain: ArmChain, document: UrdfDocument, T_base_root: Floats | No
     """The Denavit-Hartenberg lengths of a chain, and where its root is in the controller's base frame.
 
     Args:
-        chain: The arm.
-        document: Its URDF, for names.
         T_base_root: Where its root is, if another source says it: shape (4, 4), mm.
 
     Raises:
@@ -289,7 +287,6 @@ class Member:
     """A link of one of the arm's seven rigid bodies, with what is fixed to it.
 
     Attributes:
-        link: The link.
         T_body_link: Shape (4, 4), mm, in the frame of the body's first link.
     """
 
@@ -329,7 +326,6 @@ def arm_chain(document: UrdfDocument, flange: str) -> ArmChain:
     """The chain from the URDF's root to the flange.
 
     Args:
-        document: The URDF.
         flange: Name of the link that carries the needle.
 
     Raises:

@@ -5,6 +5,8 @@ of all inputs, the parameters, the source of the module that makes it with all t
 libraries. Anything else is made anew and replaced, and a `CacheWarning` says so.
 
 What one process keeps of values that cost time to make, from one case to the next.
+
+The folder is bounded in size: the least recently used goes first, and nothing of older versions stays.
 """
 
 from __future__ import annotations
@@ -13,15 +15,17 @@ import hashlib
 import json
 import os
 import platform
+import re
+import shutil
+import time
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
-from puncture_twin.planning.base.cache.cache_folder import StoredFile, store, touch
 from puncture_twin.planning.base.cache.entry_file import (
     Arrays,
     DamagedError,
@@ -32,6 +36,108 @@ from puncture_twin.planning.base.cache.entry_file import (
 )
 from puncture_twin.planning.base.cache.source_stamp import library_versions, module_unedited, source_stamp
 from puncture_twin.planning.base.errors import CacheWarning, InputError, refuse
+from puncture_twin.planning.base.files import atomic
+
+SUFFIX = ".arrays"
+ENTRY = re.compile(r"(?P<maker>[\w.]+)\.(?P<generation>[0-9a-f]{16})\.[0-9a-f]{64}\.arrays")
+OF_LAYOUT_1 = re.compile(r"[0-9a-f]{64}\.npz")
+TEMPORARY = re.compile(r"\..+\.arrays|\.[0-9a-f]{64}-\w+\.npz")
+DEAD_AFTER_S = 24 * 3600.0
+"""A temporary file of this age belongs to a process that was killed."""
+
+
+class StoredFile(NamedTuple):
+    """The name of an entry.
+
+    Attributes:
+        generation: 16 hexadecimal digits of its source and the libraries' versions.
+        key: 64 of all that decides its content.
+    """
+
+    maker: str
+    generation: str
+    key: str
+
+    @property
+    def file(self) -> str:
+        """The name of its file."""
+        return f"{self.maker}.{self.generation}.{self.key}{SUFFIX}"
+
+
+class _Kept(NamedTuple):
+    used_ns: int
+    size: int
+    path: Path
+
+
+def store(folder: Path, entry: StoredFile, content: bytes, most_bytes: int) -> None:
+    """Write an entry, whole or not at all; then make the folder fit again.
+
+    Raises:
+        OSError, InputError: The folder cannot be written to.
+    """
+    if len(content) > most_bytes:
+        return
+    path = folder / entry.file
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    with atomic(path) as temporary:
+        temporary.write_bytes(content)
+    tidy(folder, entry, most_bytes)
+
+
+def touch(path: Path) -> None:
+    """Note that an entry was used."""
+    try:
+        os.utime(path)
+    except OSError:  # another process has removed it, or it is another user's
+        return
+
+
+def tidy(folder: Path, entry: StoredFile, most_bytes: int) -> None:
+    """Remove what this version of the maker cannot use, what the dead have left, and the oldest beyond the bound."""
+    kept = []
+    for one in _files(folder):
+        if _outlived(one, entry):
+            _remove(one.path)
+        elif ENTRY.fullmatch(one.path.name):
+            kept.append(one)
+    total = sum(one.size for one in kept)
+    for one in sorted(kept):
+        if total <= most_bytes:
+            break
+        _remove(one.path)
+        total -= one.size
+
+
+def _outlived(one: _Kept, entry: StoredFile) -> bool:
+    name = one.path.name
+    if TEMPORARY.fullmatch(name):
+        return time.time() - one.used_ns / 1e9 > DEAD_AFTER_S
+    found = ENTRY.fullmatch(name)
+    if found is None:
+        return OF_LAYOUT_1.fullmatch(name) is not None
+    return found["maker"] == entry.maker and found["generation"] != entry.generation
+
+
+def _files(folder: Path) -> Iterator[_Kept]:
+    """The plain files of the folder; one that another process removes meanwhile is passed over."""
+    with os.scandir(folder) as found:
+        for one in found:
+            try:
+                if one.is_file(follow_symlinks=False):
+                    seen = one.stat(follow_symlinks=False)
+                    yield _Kept(seen.st_mtime_ns, seen.st_size, Path(one.path))
+            except OSError:
+                continue
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:  # not ours to remove
+        return
+
 
 Value = TypeVar("Value")
 
@@ -63,8 +169,6 @@ class Memory:
         """The value of a key, made where it is not there.
 
         Args:
-            key: All that decides the value.
-            make: Makes it.
             size: About how many bytes it holds.
         """
         if key in self._kept:
@@ -123,7 +227,6 @@ class Cache:
 
     Attributes:
         folder: Where; None makes everything anew each time.
-        most_bytes: What it may hold.
         memory: What this process keeps beside it.
     """
 
@@ -143,7 +246,6 @@ class Cache:
 
         Args:
             made_from: Everything that decides the result: hashes of inputs, labels, options. Plain values.
-            make: Makes the arrays.
             by: The module whose code makes them, such as ``puncture_twin.planning.anatomy.surfaces``.
             check: Raises ValueError, KeyError, TypeError or InputError for arrays that cannot be what ``make`` gives.
         """
@@ -161,10 +263,7 @@ class Cache:
         """The value that ``read`` makes of `arrays`; reading is their check too, so a mesh is guarded once.
 
         Args:
-            made_from: See `arrays`.
-            make: Makes the arrays.
             read: Raises ValueError, KeyError, TypeError or InputError for arrays that cannot be what ``make`` gives.
-            by: See `arrays`.
         """
         if self.memory is NO_MEMORY:
             if self.folder is None:
@@ -240,11 +339,7 @@ def _entry(made_from: Mapping[str, Any], by: str) -> StoredFile:
 @cache
 def _generation(by: str) -> str:
     """Hash of all code that a module's results depend on; it takes milliseconds, so it is made once a process."""
-    parts = {
-        "source": source_stamp(by),
-        "python": platform.python_version(),
-        **library_versions(LIBRARIES),
-    }
+    parts = {"source": source_stamp(by), "python": platform.python_version(), **library_versions(LIBRARIES)}
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

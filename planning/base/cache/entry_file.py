@@ -34,12 +34,7 @@ class DamagedError(Exception):
 
 
 def packed(arrays: Arrays, key: str) -> bytes:
-    """The file that holds these arrays.
-
-    Args:
-        arrays: Of numbers, truth values or text.
-        key: What they were made from.
-    """
+    """The file that holds these arrays."""
     whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     header = json.dumps([[name, array.dtype.str, array.shape] for name, array in whole.items()]).encode() + b"\n"
     body = bytearray(header)
@@ -70,9 +65,6 @@ def check_own(path: Path) -> None:
     Folders are followed to the root, or to one of which the user lets nobody in: what lies below is out of reach. In
     one that all may write to, as ``/tmp``, nobody can replace what is another's if its sticky bit is set. Where users
     have no numbers (Windows) nothing is refused.
-
-    Raises:
-        InputError: With the code ``cache_not_own``.
     """
     if not hasattr(os, "geteuid"):
         return
@@ -87,11 +79,7 @@ def check_own(path: Path) -> None:
 
 
 def check_own_folder(folder: Path) -> None:
-    """Refuse a folder of compiled code that is a link, another user's, or that others may write: see `check_own`.
-
-    Raises:
-        InputError: With the code ``cache_not_own``.
-    """
+    """Refuse a folder of compiled code that is a link, another user's, or that others may write: see `check_own`."""
     check_own(folder)  # and those around it, where others could lay another in its place
     status = folder.lstat()
     if stat.S_ISLNK(status.st_mode):

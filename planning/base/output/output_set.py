@@ -44,8 +44,6 @@ def writing(
 
     Args:
         out: The output folder; made where it is missing.
-        command: Name of the entry.
-        inputs: Every file that decides the result.
         seconds: How long each stage took; read when the block ends.
         names: Files that will be written, as far as they are known: one that is somebody else's is refused at once.
         made_from: Name to SHA-256 of outputs of earlier commands that this one starts from. Where the folder's set has
@@ -75,7 +73,6 @@ def withdraw(out: Path, command: str, *, keep: Iterable[str] = ()) -> None:
 
     Args:
         out: The output folder; untouched where no command has written into it.
-        command: Name of the entry.
         keep: Files of the entry that stay: they may be the input.
     """
     if out.is_dir() and read_manifest(out):
@@ -154,7 +151,6 @@ def locked(folder: Path) -> Iterator[None]:
 
     Raises:
         InputError: Another process holds it, or the file system knows no locks.
-        OSError: The lock file cannot be made.
     """
     path = folder / LOCK_NAME
     handle = _locked(path)

@@ -179,11 +179,7 @@ def with_timings(
     """The folder's timings with those of a command put in.
 
     Args:
-        folder: The output folder.
         kept: Commands whose entries stay, and so their timings.
-        command: The one that ran.
-        started: When, with its time zone.
-        seconds: How long each stage took.
     """
     before = _read(folder / TIMINGS_NAME)
     timings = {name: before[name] for name in kept if name in before}
@@ -213,13 +209,10 @@ class Draft:
 
     Attributes:
         command: Whose; the name of its entry.
-        out: The output folder.
-        folder: Where the files are written.
         depends_on: Entries of the output folder that these files are made from.
         parts: Files that go to an entry of another name than the command's.
         seconds: How long each stage took, for ``timings.json``; read at the end.
         note: Told what was removed that nobody might expect.
-        old: What the output folder holds.
     """
 
     command: str

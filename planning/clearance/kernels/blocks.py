@@ -56,8 +56,7 @@ def pack(mesh: TriangleMesh, known: NDArray[np.int32] | None = None) -> Blocks:
     """Pack a surface.
 
     Args:
-        mesh: The surface.
-        known: Its `block_order`, where that has been found before.
+        known: The mesh's `block_order`, where that has been found before.
     """
     order = np.array(block_order(mesh) if known is None else known, np.int64)
     blocks = -(-len(order) // LANES)

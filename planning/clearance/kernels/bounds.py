@@ -58,7 +58,6 @@ def disc_bounds(  # type: ignore[no-untyped-def]  # numba's own types
         typing_context: Numba's; not given by the caller.
         nodes: Shape (groups, 10, 16), float32: centre c from the target, normal, rho, h, their hypotenuse, and
             |c| + hypotenuse.
-        group: Which.
         u: Three float32 numbers, the cone's axis.
         chord: Largest |u - axis| of the cone's members; 0 for a single direction.
         length: Of the needle, mm.
@@ -100,7 +99,6 @@ def line_distances(  # type: ignore[no-untyped-def]  # as above
     Args:
         typing_context: Numba's; not given by the caller.
         local: Shape (b, 9, 16), float32, corners from the block's centre.
-        block: Which.
         e: Three float32 numbers, first unit vector across the line.
         f: Three float32 numbers, the second.
         ox: The block's centre along e, from the line, mm.
@@ -149,8 +147,6 @@ def correct_for_ends(local, block, lanes, u, depth, length, slack, squares, firs
     A triangle wholly beyond the top is farther away by that; one wholly behind the target is not measured.
 
     Args:
-        local: See `line_distances`.
-        block: Row of the block.
         lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
         u: Three float32 numbers, the direction of the line.
         depth: The block's centre along u, mm.
@@ -183,7 +179,6 @@ def tighten_upper_bounds(frames, lanes, corners, length, error, upper):  # type:
 
     Args:
         frames: Shape (9, 16), float32, each member's direction u, and e and f that complete it to a frame.
-        lanes: `LANES`, as in `correct_for_ends`.
         corners: Nine float32 numbers, from the target, mm.
         length: Of the axes, mm.
         error: Added to a distance for the rounding to float32, mm.

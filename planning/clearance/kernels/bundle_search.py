@@ -44,14 +44,9 @@ def measure_bundle(surface, needle, count, low, high, lanes, scratch, answer, se
 
     Args:
         surface: `Blocks.triangles` and ``local``.
-        needle: `NeedleAxes`.
         count: How many blocks were collected; their nodes are in ``scratch.chosen``.
-        low: First direction of the bundle.
-        high: One past its last.
         lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
-        scratch: `Scratch`.
         answer: `SearchOutput`; rows ``low`` to ``high`` are lowered.
-        seed: Returned where nothing nearer is found.
 
     Returns:
         The row of a triangle that is nearest to one of the axes: the next bundle begins with its distance.

@@ -35,8 +35,6 @@ def axis_triangle(u, length, a, b, c):  # type: ignore[no-untyped-def]  # numba 
         u: Unit direction, three numbers; the axis starts at the origin.
         length: Length of the axis, mm.
         a: Corner, three numbers, mm.
-        b: Corner.
-        c: Corner.
     """
     ux, uy, uz = u
     ax, ay, az = a
@@ -154,9 +152,6 @@ def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-
     """Distance of the target from a surface, mm, and the row of the nearest triangle: branch and bound over its tree.
 
     Args:
-        triangles: See `Blocks`.
-        nodes: See `bounds.disc_bounds`, made for this target.
-        base: See `Blocks`.
         target: Shape (3,), mm.
         slack: Rounding of a node's coordinate, mm.
     """
@@ -259,7 +254,6 @@ def blocks_near(center, disc, count, origin, outward, length, reach):  # type: i
     Args:
         center: Shape (nodes, 3), of `Blocks`, mm; the first are the blocks.
         disc: Shape (5, nodes), of `Blocks`.
-        count: How many blocks there are.
         origin: Shape (3,), where the axis starts, mm.
         outward: Shape (3,), unit.
         length: Of the axis, mm.

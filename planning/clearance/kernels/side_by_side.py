@@ -43,7 +43,6 @@ def measure_lateral(pairs, count):  # type: ignore[no-untyped-def]  # numba infe
     Args:
         pairs: Shape (12, m); rows 0 to 8 as `bring_into_frame` writes them, row 11 the axes' lengths; rows 9
             and 10 are written: squared distance (or `UNDECIDED`, `BEYOND`), and the depth of the axis' nearest point.
-        count: Pairs there are.
     """
     for k in range(count):  # selects, no branches: the compiler makes vectors of it
         ax, ay, ta, bx, by, tb = pairs[0, k], pairs[1, k], pairs[2, k], pairs[3, k], pairs[4, k], pairs[5, k]

@@ -29,14 +29,12 @@ def search_bundles(  # type: ignore[no-untyped-def]  # numba infers
 
     Args:
         surface: `Blocks.triangles`, ``local`` and ``base``.
-        all_nodes: See `bounds.disc_bounds`, made for this target.
         slack: Rounding of a node's coordinate, mm.
         origin: Shape (3,), the target, where the axes start, mm.
         lengths: Shape (n,), of the axes, in the bundles' order, mm.
         at_target: Distance of the target itself from the surface, mm: an upper bound of every axis' distance.
         nearest: Row of the triangle that is nearest to the target.
         bundles: `Bundles.outward`, ``starts``, ``middle`` and ``chord``.
-        scratch: `Scratch`, for this structure's groups.
         found: `SearchOutput`, written in the bundles' order; the counts are raised.
         lanes: `LANES`, as an argument: a constant would be unrolled to scalar code.
     """

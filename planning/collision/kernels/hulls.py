@@ -175,7 +175,6 @@ def distance_bounds(corners, starts, ends, M, axis, at, needed, S):
     Args:
         corners: Shape (n, 3), mm: of many hulls, each in its own frame.
         starts: Shape (n + 1,): where in ``ends`` each corner's neighbours begin.
-        ends: Rows of the neighbours.
         M: Shape (3, 4), mm: the second hull's frame in that of the first.
         axis: Shape (3,), unit, in the frame of the first, toward the second: where to begin; replaced by the direction
             of the lower bound.
@@ -300,14 +299,7 @@ def hull_gap(hulls, first, second, M, axis, at, needed, S):
     Where it is not above ``needed`` it is at least near to the distance; 0 where nothing is known.
 
     Args:
-        hulls: See :class:`Hulls`.
-        first: The one.
-        second: The other.
-        M: See :func:`distance_bounds`.
         axis: See :func:`distance_bounds`; zero begins the search anew.
-        at: See :func:`distance_bounds`.
-        needed: See :func:`distance_bounds`.
-        S: See :func:`distance_bounds`.
     """
     if axis[0] == 0.0 and axis[1] == 0.0 and axis[2] == 0.0:
         at[0], at[1] = hulls.starts[first], hulls.starts[second]

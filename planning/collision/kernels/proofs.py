@@ -215,13 +215,11 @@ def first_unproven(scene, levers, motion, work, due, tested, clear_mm):
     further call goes on from there.
 
     Args:
-        scene: See :class:`ProofScene`.
         levers: Shape (k, 6), mm: how far a radian of each joint may move the two bodies of a PAIR.
         motion: (frames, moved, rotated), with
             frames: Shape (m, 7, 4, 4), mm: the states;
             moved: Shape (m, 7), mm: how far each frame's bodies may have moved since the first state; rising;
             rotated: Shape (m, 6), rad: how far each joint has rotated since the first state; rising.
-        work: See :class:`ProofScratch`.
         due: Shape (k,): the state at which each check is due; 0 at the beginning.
         tested: Shape (k,): which checks.
         clear_mm: ``MIN_GAP_MM``, or any other distance that is wanted.
@@ -271,11 +269,8 @@ def clear_about(scene, movers, frames, rotations, work, gaps, unproven):
     """Prove checks clear in boxes of joint angles: wherever each joint is within ``rotations`` of some states.
 
     Args:
-        scene: See :class:`ProofScene`.
-        movers: See :class:`Movers`.
         frames: Shape (m, 7, 4, 4), mm: the states.
         rotations: Shape (6,), rad.
-        work: See :class:`ProofScratch`.
         gaps: Shape (m, k): filled, for what is tested, with the bound at the state itself, or ``TOUCHING``.
         unproven: Shape (m, k): True where a check is to be tested; set to False where it is proven clear.
     """

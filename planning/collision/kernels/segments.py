@@ -124,8 +124,6 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
     """Check a straight joint segment, and fill ``answer``.
 
     Args:
-        scene: See :class:`ProofScene`.
-        movers: See :class:`Movers`.
         lengths: Of the arm, see :mod:`puncture_twin.planning.arm.kinematics`.
         start: Shape (6,), rad.
         end: Shape (6,), rad.
@@ -134,8 +132,6 @@ def check_segment(scene, movers, lengths, start, end, answered, halvings, fine_m
         fine_mm: Where the bodies of a check move no farther than this within a part, its middle decides.
         clear_mm: Clearance from skin and boxes to keep where both ends do, see :func:`_keep`; 0 for none.
         order: Shape (k,): the checks in the order in which they are tested.
-        scratch: See :class:`SegmentScratch`.
-        answer: See :class:`Answer`.
     """
     step, frames = end - start, np.empty((1, 7, 4, 4))
     segment = Segment(lengths, start, step, np.abs(step), np.empty((1, 6)), frames)
@@ -195,15 +191,9 @@ def left_of(scene, movers, segment, part, span, into, scratch, answered, answer)
     robots in complex environments".
 
     Args:
-        scene: See :class:`ProofScene`.
-        movers: See :class:`Movers`.
-        segment: See :class:`Segment`.
-        part: Its middle and half its width, fractions of the segment.
+        part: The part's middle and half its width, fractions of the segment.
         span: Which list of ``scratch.lists`` holds the checks to clear, and its first and last (excluded) index.
         into: Index in the other list at which the checks that are left are written.
-        scratch: See :class:`SegmentScratch`.
-        answered: See :func:`check_segment`.
-        answer: See :class:`Answer`.
 
     Returns:
         The index in the other list after the last check that is left; -1 where the search has ended.

@@ -177,12 +177,8 @@ def against_triangle(hulls, hull, M, triangle, line, scratch):
     """Whether the round body in a hull touches a triangle: ``CLEAR``, ``TOUCHES``, or ``OPEN`` if undecided.
 
     Args:
-        hulls: See :class:`Hulls`.
-        hull: Row of the body's prism.
         M: Shape (3, 4) or (4, 4), mm: pose of its frame.
         triangle: Shape (3, 3), mm: its corners.
-        line: The body's axis, see :func:`_far`.
-        scratch: See :class:`Triangle`.
     """
     count, axis, at = len(hulls.corners), scratch.axis, scratch.at
     (mx, my, mz), (ux, uy, uz), half = line
@@ -270,10 +266,7 @@ def first_not_clear(scene, frames, work, scratch, tested, of_state, begins, foun
     """Find the first check that is not proven clear at each of some independent states.
 
     Args:
-        scene: See :class:`ProofScene`.
         frames: Shape (m, 7, 4, 4), mm: the states.
-        work: See :class:`ProofScratch`.
-        scratch: See :class:`Triangle`.
         tested: Shape (t, k): t selections of checks.
         of_state: Shape (m,): which selection holds at each state.
         begins: Shape (m,): the check to begin with at each state; k skips the state.

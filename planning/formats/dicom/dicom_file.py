@@ -22,7 +22,6 @@ from pydicom.datadict import dictionary_VR, tag_for_keyword
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.filereader import read_dataset
 from pydicom.multival import MultiValue
-from pydicom.tag import BaseTag
 from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError, refuse
@@ -77,13 +76,9 @@ def parse_dicom(content: bytes, path: Path) -> Dataset:
 def read_meta(stream: BinaryIO) -> FileMetaDataset:
     """The meta information of a DICOM file, whose data set begins where the stream then is; its syntax may be empty."""
     stream.seek(META_START)
-    meta = FileMetaDataset(read_dataset(stream, False, True, stop_when=_behind_meta))
+    meta = FileMetaDataset(read_dataset(stream, False, True, stop_when=lambda tag, *_: tag.group != 2))
     meta.TransferSyntaxUID = UID(str(meta.get("TransferSyntaxUID", "")).strip(" \0"))
     return meta
-
-
-def _behind_meta(tag: BaseTag, vr: str | None, length: int) -> bool:
-    return tag.group != 2
 
 
 def _body(data: memoryview, syntax: UID, path: Path) -> memoryview:
@@ -143,12 +138,7 @@ def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[flo
         plain = tuple(float(one) for one in listed)
     if len(plain) != count or not all(map(math.isfinite, plain)):
         what = f"{name(keyword)} is missing" if found is None else f"{name(keyword)} is {str(found)[:100]}"
-        refuse(
-            what,
-            where,
-            f"{plural(count, 'finite number')}",
-            "missing_tag" if found is None else "bad_tag",
-        )
+        refuse(what, where, f"{plural(count, 'finite number')}", "missing_tag" if found is None else "bad_tag")
     return plain
 
 
@@ -216,9 +206,7 @@ ITEM, ITEM_END, SEQUENCE_END = 0xFFFEE000, 0xFFFEE00D, 0xFFFEE0DD
 PIXEL_DATA = 0x7FE00010
 LONG_FORM = frozenset((b"OB", b"OD", b"OF", b"OL", b"OV", b"OW", b"SQ", b"SV", b"UC", b"UN", b"UR", b"UT", b"UV"))
 """Value representations whose length has four bytes."""
-SHORT_FORM = frozenset(
-    b"AE AS AT CS DA DS DT FD FL IS LO LT PN SH SL SS ST TM UI UL US".split(),
-)
+SHORT_FORM = frozenset(b"AE AS AT CS DA DS DT FD FL IS LO LT PN SH SL SS ST TM UI UL US".split())
 MAX_DEPTH = 16
 """Sequences in sequences; structured reports go deeper, images and contours do not reach half of it."""
 MAX_ELEMENTS = 3_000_000
@@ -231,7 +219,6 @@ def whole_length(data: memoryview, *, implicit: bool, where: Path) -> int:
     Args:
         data: The data set, behind its file's meta information, little endian.
         implicit: Whether value representations are left out.
-        where: The file, for the message.
 
     Raises:
         InputError: An element that ends outside of its parent, a sequence without an end, elements out of order, or
@@ -252,10 +239,8 @@ class _Walk:
         """Offset at which a data set ends that begins at an offset.
 
         Args:
-            at: Its first byte.
             end: The first byte behind it, or behind all that may hold it.
             implicit: Whether value representations are left out.
-            depth: How many sequences it lies in.
             closed: Whether a delimiter ends it, and not its length.
         """
         if depth > MAX_DEPTH:

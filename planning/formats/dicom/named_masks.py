@@ -25,7 +25,6 @@ class MaskVolume:
     """One structure as a volume of 0 and 1, whose voxels are made at each call.
 
     Attributes:
-        path: The file that holds it.
         files: Every file that decides it, by its key in ``content``: also the CT's, where it lies on its grid.
         part: Which structure of the file it is.
         grid: Where the voxels lie, LPS mm; sheared where the CT's gantry was tilted.
@@ -49,7 +48,6 @@ class NamedMasks:
     """Named structures of one file as masks.
 
     Attributes:
-        masks: Name to mask.
         notes: Notes for a person, one sentence each.
     """
 

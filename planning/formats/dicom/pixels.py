@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydicom.dataset import Dataset
-from pydicom.pixels.decoders.base import get_decoder
+from pydicom.pixels.decoders.base import Decoder, get_decoder
 from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError, refuse
@@ -110,7 +111,7 @@ def stored_values(data: Dataset, layout: PixelLayout, where: str) -> NDArray[Any
     if data.file_meta.TransferSyntaxUID in PLAIN:
         cells = np.frombuffer(data.PixelData, f"<u{layout.allocated // 8}", int(np.prod(shape)))
     else:
-        cells = _decompressed(data, data.file_meta.TransferSyntaxUID, where)
+        cells = np.concatenate([one.ravel() for one in decoded_frames(data, where, raw=True)])
     if cells.size != np.prod(shape) or cells.dtype.itemsize * 8 != layout.allocated:
         what = f"the compressed pixels hold {cells.size} values of {cells.dtype}, but the header states {shape}"
         refuse(what, where, "a complete file", "size_mismatch")
@@ -119,24 +120,53 @@ def stored_values(data: Dataset, layout: PixelLayout, where: str) -> NDArray[Any
     return typed if above == 0 else (typed << above) >> above
 
 
-def _decompressed(data: Dataset, syntax: UID, where: str) -> NDArray[Any]:
+def decoded_frames(data: Dataset, where: str, *, raw: bool) -> Iterator[NDArray[Any]]:
+    """The frames one by one, each of shape (rows, columns) or (rows, columns, samples), plain or compressed.
+
+    Args:
+        data: An image whose sizes have been checked.
+        where: The file.
+        raw: Stored values as they are; else luminance and chrominance become RGB.
+
+    Raises:
+        InputError: A transfer syntax that no installed decoder reads, or pixels that are damaged.
+    """
+    syntax = data.file_meta.TransferSyntaxUID
+    decoder = _decoder(syntax, where)
+    frames: Iterator[tuple[NDArray[Any], object]]
+    if syntax in PLAIN:  # one by one: the library's own loop takes frames behind the first of YBR_FULL_422 for longer
+        frames = (decoder.as_array(data, raw=raw, index=k) for k in range(sizes(data, where)[2]))
+    else:
+        frames = decoder.iter_array(data, raw=raw)
+    while True:
+        with refused_if_damaged(where):
+            try:
+                frame = next(frames, None)
+            except Exception as error:  # the decoders promise no kind of error
+                what = f"{_named(syntax)}: its pixels cannot be decoded ({str(error)[:150]})"
+                raise InputError(what, where=where, allowed=how_to_convert(), code="not_decoded") from error
+        if frame is None:
+            return
+        yield np.ascontiguousarray(frame[0])
+
+
+def _decoder(syntax: UID, where: str) -> Decoder:
+    """The decoder of a transfer syntax, one that is installed."""
     with refused_if_damaged(where):
-        named = f"transfer syntax {syntax.name} ({syntax})"
-        if not syntax.is_transfer_syntax or not syntax.is_compressed:
-            refuse(named, where, how_to_convert(), "transfer_syntax")
+        if not syntax.is_transfer_syntax or not (syntax.is_compressed or syntax in PLAIN):
+            refuse(_named(syntax), where, how_to_convert(), "transfer_syntax")
         try:
             decoder = get_decoder(syntax)
         except NotImplementedError:
-            raise InputError(named, where=where, allowed=how_to_convert(), code="transfer_syntax") from None
+            raise InputError(_named(syntax), where=where, allowed=how_to_convert(), code="transfer_syntax") from None
         if not decoder.is_available:
-            what = f"{named} needs a decoder that is not installed"
+            what = f"{_named(syntax)} needs a decoder that is not installed"
             refuse(what, where, f"{how_to_convert()}; or pip install python-gdcm", "no_decoder")
-        try:
-            cells, _ = decoder.as_array(data, raw=True)
-        except Exception as error:  # the decoders promise no kind of error
-            what = f"{named}: its pixels cannot be decoded ({str(error)[:150]})"
-            raise InputError(what, where=where, allowed=how_to_convert(), code="not_decoded") from error
-        return np.ascontiguousarray(cells)
+        return decoder
+
+
+def _named(syntax: UID) -> str:
+    return f"transfer syntax {syntax.name} ({syntax})"
 
 
 def _padding(data: Dataset, stored: int, signed: bool, where: str) -> tuple[int, int] | None:

@@ -11,7 +11,6 @@ from typing import BinaryIO
 from pydicom.datadict import tag_for_keyword
 from pydicom.dataset import Dataset, FileMetaDataset
 from pydicom.filereader import read_dataset
-from pydicom.tag import BaseTag
 from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError, refuse
@@ -63,7 +62,6 @@ class DicomFile:
 
     Attributes:
         name: The file's name in its folder.
-        kind: By its SOP class.
         sop_class: What the standard calls this class.
         series_uid: The series that it belongs to.
         series: Its number and description, as a person knows it.
@@ -170,11 +168,7 @@ def list_folder(folder: Path) -> tuple[tuple[DicomFile, ...], tuple[Entry, ...]]
 
 
 def _header(stream: BinaryIO, *, implicit: bool) -> Dataset:
-    return read_dataset(stream, implicit, True, stop_when=_is_enough, specific_tags=list(_TAGS))
-
-
-def _is_enough(tag: BaseTag, vr: str | None, length: int) -> bool:
-    return tag > _LAST_TAG
+    return read_dataset(stream, implicit, True, stop_when=lambda tag, *_: tag > _LAST_TAG, specific_tags=list(_TAGS))
 
 
 SHOWN, LOOKED_AT = 6, 100
@@ -186,9 +180,6 @@ class SeriesFiles:
     """The files of one CT series.
 
     Attributes:
-        folder: Where they are.
-        names: Their names there, sorted.
-        series_uid: The series.
         notes: What else lies in the folder and was left out, one sentence.
     """
 

@@ -61,7 +61,6 @@ class _Frames:
         segments: Shape (n,), the segment of each frame.
         slices: Shape (n,), where it lies, in steps from the first.
         T_ct_index: Shape (4, 4), maps (column, row, slice) to LPS mm.
-        rows, columns: Of each.
     """
 
     segments: NDArray[np.int64]
@@ -83,8 +82,7 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
     """The segments of a DICOM SEG, each by its label.
 
     Args:
-        path: Its name.
-        file: Its key in ``content``.
+        file: The file's key in ``content``.
         content: Gives its bytes.
         ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
 

@@ -78,10 +78,8 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     the pixels along it. Both are noted.
 
     Args:
-        path: Its name.
-        file: Its key in ``content``.
+        file: The file's key in ``content``.
         content: Gives its bytes.
-        ct: The CT on which it was drawn.
 
     Raises:
         InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that

@@ -24,8 +24,7 @@ from puncture_twin.planning.formats.folder import FILE, Entry, entries, unaccoun
 from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL, LabelMap
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_layered_header
 from puncture_twin.planning.formats.volumes.volume_files import Content
-from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, VolumeHeader, corner_deviation_mm
-from puncture_twin.planning.formats.volumes.voxels import decoded
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, VolumeHeader, corner_deviation_mm, decoded
 
 MASK_ENDINGS = (".nii.gz", ".nii", ".seg.nrrd", ".nrrd")
 """Endings of files that are masks."""
@@ -50,7 +49,6 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
     """The names of the masks in a folder, sorted; nothing else may lie in it that could be an organ.
 
     Args:
-        folder: Where they are.
         known: Whether a path in it is something else that the case names.
         where: The file and key that name the folder, for errors.
 
@@ -141,7 +139,6 @@ class Segment(NamedTuple):
 
     Attributes:
         layer: From 0.
-        label: Their value there.
     """
 
     layer: int
@@ -174,7 +171,6 @@ def listed_segments(remarks: Mapping[str, str], layers: int, path: Path) -> dict
     Args:
         remarks: The header's ``key:=value`` lines.
         layers: How many the file holds; the layer of a segment may be left out where it is one.
-        path: The file, for errors.
 
     Raises:
         InputError: No segment, or some that share a name or a voxel value of one layer, or lie in no layer.

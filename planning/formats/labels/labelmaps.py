@@ -1,19 +1,46 @@
-"""Label maps: a whole number per voxel that says which structure it belongs to."""
+"""Label maps: a whole number per voxel that says which structure it belongs to.
+
+A label's voxels become a closed surface in LPS mm by marching cubes on its 0/1 mask at 0.5, padded by background.
+Every vertex then lies in the middle between the centres of a voxel inside and one outside, that is on the face that
+they share; and every cell of eight voxel centres that the surface enters also holds a piece of the voxels' boundary,
+through its middle. So surface and boundary are never more than half a voxel apart along any axis (the larger of the
+three index differences), in both directions.
+
+The table of Lorensen and Cline (1987) in scikit-image decides each cell by signs alone and came out closed for
+every mask tried; its default (Lewiner 2003) compares products that are all equal in a 0/1 mask, and its ties
+left holes in random masks.
+
+Tables that say which label is which structure, as programs and people write them: CSV with any common naming of its
+columns, JSON (``{"1": "liver"}``, ``{"liver": 1}``, nnU-Net's ``labels``), label descriptions of ITK-SNAP and colour
+tables of 3D Slicer.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import re
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from skimage.measure import marching_cubes
 
-from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.base.arrays import Bools
+from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.base.files import decode_text
+from puncture_twin.planning.base.strict_json import parse_json
+from puncture_twin.planning.formats.guard import guard_mesh
+from puncture_twin.planning.formats.volumes.volume_files import Volume, canonical
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 
 MAX_LABEL = 65_535
 """Label maps are 8 or 16 bit; a larger value means that an image was given instead."""
@@ -37,7 +64,6 @@ class LabelMap:
         labels: Shape (ni, nj, nk), of the file's own type where that is whole numbers, read-only; 0 is background.
         T_ct_index: Shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm.
         names: Label to name, as a .seg.nrrd states it, or None.
-        path: Where it came from.
         rounded_by: How far the file's values are off whole numbers, at most.
     """
 
@@ -67,7 +93,6 @@ def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
     """The label map that a volume is, in LPS mm.
 
     Args:
-        volume: The volume.
         may_be_empty: Whether a map with background only is one: the mask of an organ that is not there.
 
     Raises:
@@ -125,3 +150,220 @@ def segment_names(fields: dict[str, str], path: Path) -> dict[int, str] | None:
             refuse(what, path, "one label per segment", "duplicate_label")
         names[int(value)] = name
     return names or None
+
+
+def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> TriangleMesh:
+    """The surface of one label, closed, normals outward, in LPS mm.
+
+    A label that touches the border of the volume is closed there, on the outer face of its border voxels. The
+    result does not depend on the axis order or the flips in which the map is stored.
+
+    Raises:
+        InputError: If no voxel has this label.
+    """
+    box = labelmap.boxes.get(label)
+    if box is None:
+        named = labelmap.names or {}
+        shown = ", ".join(f"{n} {named[n]}" if n in named else str(n) for n in labelmap.labels_present())
+        refuse(f"no voxel has label {label}", where, f"the labels present: {shown}", "label_absent")
+    mask = labelmap.labels[box] == label
+    T_ct_box = labelmap.T_ct_index.copy()
+    T_ct_box[:3, 3] += labelmap.T_ct_index[:3, :3] @ [axis.start for axis in box]
+    oriented = canonical(mask, T_ct_box)
+    return mask_surface(oriented.values, oriented.T_ct_index, where=where)
+
+
+def mask_surface(mask: Bools, T_ct_index: NDArray[np.float64], *, where: str | Path) -> TriangleMesh:
+    """The closed surface of a mask's voxels, as `framed_surface` of a field that is 1/2 inside and -1/2 outside.
+
+    Args:
+        mask: Shape (ni, nj, nk), somewhere True; only the box of what is True is looked at.
+        T_ct_index: Shape (4, 4), determinant positive.
+    """
+    box = box_in(mask)
+    framed, field = frame([axis.stop - axis.start for axis in box])
+    np.subtract(mask[box], np.float32(0.5), out=field)
+    return framed_surface(framed, T_ct_index, where=where, first=[axis.start for axis in box])
+
+
+def box_in(mask: Bools, margin: ArrayLike = 0) -> Box:
+    """The smallest index box about the True voxels of a mask, and ``margin`` voxels more along each axis."""
+    i = np.flatnonzero([plane.any() for plane in mask])
+    seen: Bools = np.asarray(mask[i[0] : i[-1] + 1].any(axis=0))
+    j, k = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    x, y, z = np.broadcast_to(margin, 3).tolist()
+    ends = ((i, x, 0), (j, y, 1), (k, z, 2))
+    a, b, c = (slice(max(0, n[0] - m), min(n[-1] + 1 + m, mask.shape[axis])) for n, m, axis in ends)
+    return a, b, c
+
+
+def frame(shape: Sequence[int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """An array for `framed_surface`, not filled, and the view of it within the frame, of a shape (3,)."""
+    framed = np.empty([count + 2 for count in shape], np.float32)
+    return framed, framed[1:-1, 1:-1, 1:-1]
+
+
+def framed_surface(
+    framed: NDArray[np.float32], T_ct_index: NDArray[np.float64], *, where: str | Path, first: ArrayLike = 0
+) -> TriangleMesh:
+    """The closed surface around where a field is positive, in LPS mm, normals outward.
+
+    Along the border the field is continued with its sign flipped, so the surface closes on the outer faces of
+    the border voxels.
+
+    Args:
+        framed: Of `frame`: within, the field, never 0, positive inside, somewhere positive; its frame is written here.
+        T_ct_index: Shape (4, 4), determinant positive.
+        first: Shape (3,), index of the field's first voxel, where it is part of a larger one.
+    """
+    for axis in range(3):
+        planes = np.moveaxis(framed, axis, 0)
+        planes[0], planes[-1] = -np.abs(planes[1]), -np.abs(planes[-2])
+    found = marching_cubes(framed, level=0.0, method="lorensen", gradient_direction="ascent")
+    index, faces = found[0].astype(np.float64) - 1.0 + first, found[1]
+    return guard_mesh(apply(T_ct_index, index), faces, where=where)
+
+
+NAME_COLUMNS = (
+    "name", "structurename", "labelname", "classname", "organname", "segmentname", "structure", "organ", "segment",
+    "class", "anatomy", "description", "text", "label",
+)  # fmt: skip
+"""Headers of a column of names, the surest first; without spaces and signs."""
+NUMBER_COLUMNS = (
+    "id", "labelid", "classid", "segmentid", "structureid", "labelvalue", "value", "index", "idx", "number",
+    "labelnumber", "label", "class", "key",
+)  # fmt: skip
+"""Headers of a column of numbers, the surest first."""
+BACKGROUND = frozenset({"", "background", "clearlabel", "clear", "none", "unlabelled", "unlabeled", "air"})
+"""Names of the background."""
+
+ALLOWED_CSV = "a CSV with a header such as id,name or label,name, and one label per line"
+ALLOWED_JSON = 'JSON such as {"1": "liver"}, {"liver": 1} or {"labels": {...}}'
+ALLOWED_LIST = 'lines of ITK-SNAP (1 255 0 0 1 1 1 "liver") or of a colour table (1 liver 255 0 0 255)'
+
+
+class _Entry(NamedTuple):
+    number: str
+    name: str
+    where: str
+
+
+def parse_names(data: bytes, path: Path) -> dict[int, str]:
+    """The names of a table, by label.
+
+    Raises:
+        InputError: Not such a table, a label that stands twice, or none at all; names the line where there is one.
+    """
+    reader, allowed = _READERS[path.suffix.lower()]
+    names: dict[int, str] = {}
+    for entry in reader(data, path):
+        label = _label(entry, allowed)
+        if label is None:
+            continue
+        if label in names:
+            refuse(f"id {label} appears twice", entry.where, "each id once", "duplicate_label")
+        names[label] = entry.name.strip()
+    if not names:
+        refuse("the naming has no label", path, allowed, "empty")
+    return names
+
+
+def _label(entry: _Entry, allowed: str) -> int | None:
+    """The number of an entry; None for the background."""
+    text = entry.number.strip()
+    if not (text.isascii() and text.isdigit() and len(text) < 7 and int(text) <= MAX_LABEL):
+        refuse(f"label {text[:40]!r} of {entry.name[:60]!r}", entry.where, allowed, "bad_label")
+    if int(text) == 0:
+        if _plain(entry.name) not in BACKGROUND:
+            refuse(f"label 0 is {entry.name[:60]!r}", entry.where, "0 for the background only", "bad_label")
+        return None
+    return int(text)
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", text.lower())
+
+
+def _csv_entries(data: bytes, path: Path) -> Iterator[_Entry]:
+    rows = _rows(data, path)
+    number, name = _columns(rows[0] if rows else [], path)
+    for line, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        where = f"{path}, line {line}"
+        if len(row) != len(rows[0]):
+            refuse(f"{len(row)} fields, not {len(rows[0])}: {row}", where, ALLOWED_CSV, "ragged_row")
+        yield _Entry(row[number], row[name], where)
+
+
+def _rows(data: bytes, path: Path) -> list[list[str]]:
+    text = decode_text(data, str(path))
+    try:
+        first = text.partition("\n")[0]
+        separator = max((",", ";", "\t"), key=first.count)
+        return list(csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator))
+    except csv.Error as error:
+        raise InputError(f"is not a CSV file ({error})", where=path, allowed=ALLOWED_CSV, code="not_csv") from error
+
+
+def _columns(header: Sequence[str], path: Path) -> tuple[int, int]:
+    """Columns of numbers and names: ``label`` is a name next to an id, and a number next to a name."""
+    plain = [_plain(cell) for cell in header]
+    name = next((plain.index(one) for one in NAME_COLUMNS if one in plain), None)
+    number = next((plain.index(one) for one in NUMBER_COLUMNS if one in plain and plain.index(one) != name), None)
+    if name is None or number is None:
+        shown = ",".join(header)[:100] or "missing"
+        refuse(f"header {shown!r} has no column of labels and names", path, ALLOWED_CSV, "wrong_columns")
+    return number, name
+
+
+def _json_entries(data: bytes, path: Path) -> Iterator[_Entry]:
+    tree = parse_json(data, where=path, allowed=ALLOWED_JSON)
+    table = tree.get("labels", tree) if isinstance(tree, dict) else None
+    if not isinstance(table, dict):
+        refuse("not an object of labels", path, ALLOWED_JSON, "wrong_format")
+    for key, value in table.items():
+        number, name = (key, value) if isinstance(value, str) else (value, key)
+        if isinstance(value, list):
+            what = f"{str(key)[:60]!r} is a list of labels (a region): list its labels one by one"
+            refuse(what, path, ALLOWED_JSON, "labels_of_regions")
+        if isinstance(number, bool) or not isinstance(number, str | int) or not isinstance(name, str):
+            refuse(f"entry {str(key)[:60]!r} is not a pair of a number and a name", path, ALLOWED_JSON, "wrong_format")
+        yield _Entry(str(number), name, str(path))
+
+
+def _list_entries(data: bytes, path: Path) -> Iterator[_Entry]:
+    for line, text in enumerate(decode_text(data, str(path)).splitlines(), start=1):
+        if text.strip() and not text.lstrip().startswith("#"):
+            yield _list_entry(text, f"{path}, line {line}")
+
+
+def _list_entry(text: str, where: str) -> _Entry:
+    try:
+        fields = shlex.split(text)
+    except ValueError as error:
+        raise InputError(f"{text[:60]!r} ({error})", where=where, allowed=ALLOWED_LIST, code="unknown_line") from error
+    if len(fields) == 8 and all(_is_number(one) for one in fields[:7]):
+        return _Entry(fields[0], fields[7], where)
+    if len(fields) == 6 and all(_is_number(one) for one in fields[2:]):
+        return _Entry(fields[0], fields[1], where)
+    raise InputError(f"{text[:60]!r}", where=where, allowed=ALLOWED_LIST, code="unknown_line")
+
+
+def _is_number(text: str) -> bool:
+    return re.fullmatch(r"\d+(\.\d*)?|\.\d+", text) is not None
+
+
+_Reader = Callable[[bytes, Path], Iterator[_Entry]]
+
+_READERS: Mapping[str, tuple[_Reader, str]] = MappingProxyType(
+    {
+        ".csv": (_csv_entries, ALLOWED_CSV),
+        ".tsv": (_csv_entries, ALLOWED_CSV),
+        ".json": (_json_entries, ALLOWED_JSON),
+        ".txt": (_list_entries, ALLOWED_LIST),
+        ".ctbl": (_list_entries, ALLOWED_LIST),
+    }
+)
+NAME_ENDINGS: tuple[str, ...] = tuple(_READERS)
+"""Endings of files that may be such a table."""

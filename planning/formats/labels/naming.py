@@ -20,7 +20,7 @@ from typing import Generic, Protocol, TypeVar
 
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.text import check_name, did_you_mean, first_few
-from puncture_twin.planning.formats.labels.name_tables import NAME_ENDINGS, parse_names
+from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, parse_names
 
 _ABDOMEN = "spleen kidney_right kidney_left gallbladder liver stomach"
 _LUNGS = "lung_upper_lobe_left lung_lower_lobe_left lung_upper_lobe_right lung_middle_lobe_right lung_lower_lobe_right"
@@ -79,10 +79,7 @@ V2: Mapping[int, str] = _numbered(
 """Version 2, task ``total``."""
 
 
-BUILT_IN: Mapping[str, Mapping[int, str]] = {
-    "totalsegmentator-v1": V1,
-    "totalsegmentator-v2": V2,
-}
+BUILT_IN: Mapping[str, Mapping[int, str]] = {"totalsegmentator-v1": V1, "totalsegmentator-v2": V2}
 OWN_NAMES = "seg.nrrd"
 """The naming that takes the names inside a .seg.nrrd."""
 REST = "*"
@@ -112,11 +109,8 @@ class LabelRule:
     """Rule of one label that is present.
 
     Attributes:
-        label: Its number in the map.
-        name: Its name.
         kind: What the case wants of it.
         margin_mm: The clearance that an avoided or unknown structure demands; 0 for the other kinds.
-        pattern: The pattern that said so.
     """
 
     label: int
@@ -162,9 +156,7 @@ def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes],
     Args:
         naming: ``"totalsegmentator-v1"``, ``"totalsegmentator-v2"``, the path of a table of names (CSV,
             JSON, ITK-SNAP's or Slicer's list), or None or ``"seg.nrrd"`` for the names that a .seg.nrrd holds.
-        folder: What a table's path is relative to.
         content: Gives the bytes of a table by its path.
-        labelmap: The map, for its own names.
 
     Raises:
         InputError: An unknown naming, a map without names of its own, or a table that cannot be used.
@@ -202,15 +194,10 @@ def select(
     Of equally specific ``avoid`` patterns the largest margin holds, and of ``unknown`` ones.
 
     Args:
-        names: Label to name.
-        present: The labels of the map.
         avoid: Pattern to margin in mm.
         unknown: Patterns of structures of which it is unknown whether a path may cross them.
-        traverse: Patterns of what may be crossed.
-        target: Patterns of what holds the lesion.
         ignore: Patterns of what does not count.
         all_named: Whether ``names`` holds every name that can occur, so that a pattern of none is a slip.
-        where: The case file and entry, for messages.
 
     Raises:
         InputError: A label present that has no name or that no pattern names, one that two equally specific patterns
@@ -335,12 +322,7 @@ class ByName(Generic[T]):
 
         Args:
             names: All that a pattern must match.
-            key: Of the case file, for errors.
-            where: For errors.
             others: What needs none, and may be named all the same.
-
-        Raises:
-            InputError: One of the three.
         """
         names, known = list(names), [*names, *others]
         if missing := [name for name in names if self.of(name) is None]:

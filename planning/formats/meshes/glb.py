@@ -19,8 +19,7 @@ from pydantic.alias_generators import to_camel
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import InputError, refuse, schema_words
 from puncture_twin.planning.base.strict_json import parse_json
-from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
-from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join
+from puncture_twin.planning.formats.guard import MAX_TRIANGLES, MAX_VERTICES, RawMesh, join
 
 _GLB_ALLOWED = "glTF, version 2: its length, then a JSON chunk and at most one BIN chunk, of the stated lengths"
 _DOCUMENT_ALLOWED = "a glTF 2.0 document in JSON"

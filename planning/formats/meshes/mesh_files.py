@@ -5,12 +5,20 @@ the byte. General loaders are made to show something. trimesh 5.2, measured on a
 loads as 6, one misspelt ``vertex`` as 11, an ASCII PLY without its last line as 11, and relative OBJ indices put every
 face on the last vertices; none with an exception. The tests compare our readers with trimesh on whole files.
 `mesh_warnings` names triangles without area, open surfaces and inverted normals.
+
+STL: the binary form states its number of facets, so its size must fit to the byte. The ASCII form states nothing: every
+facet must be complete and the one solid must be closed by ``endsolid``.
+
+OBJ states no counts and has no end mark, so that a file cut between two face lines is itself a valid OBJ. What can be
+detected is refused: a last line without its end, a vertex that no face uses, fewer faces than a comment counts. What
+remains shows as an open mesh, of which ``mesh_warnings`` tells. Material files are never opened.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -21,16 +29,175 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.base.files import read_input
-from puncture_twin.planning.formats.mesh_guard import guard_mesh
-from puncture_twin.planning.formats.meshes.obj import read_obj
+from puncture_twin.planning.base.files import decode_text, read_input
+from puncture_twin.planning.formats.guard import RawMesh, guard_mesh, triangulate
 from puncture_twin.planning.formats.meshes.ply import read_ply
-from puncture_twin.planning.formats.meshes.stl import read_stl
 from puncture_twin.planning.formats.meshes.vtk_legacy import read_vtk
 from puncture_twin.planning.formats.meshes.vtp import read_vtp
-from puncture_twin.planning.formats.raw_mesh import RawMesh
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up, to_lps
+
+_IGNORED = frozenset({"vt", "vn", "vp", "o", "g", "s", "mg", "usemtl", "mtllib", "l", "p", "usemap", "maplib"})
+"""Lines without a surface in them: texture, normals, names, groups, materials, polylines, points."""
+_ALLOWED = "lines v, f, and " + ", ".join(sorted(_IGNORED))
+_STATED_COUNT = re.compile(r"#\s*faces\s*:\s*(\d+)|#\s*(\d+)\s+(?:faces|triangles)\b", re.IGNORECASE)
+
+
+@dataclass
+class _Content:
+    vertices: list[tuple[float, float, float]] = field(default_factory=list)
+    corners: list[int] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
+
+
+def read_obj(data: bytes, where: str) -> RawMesh:
+    """The faces of an OBJ file, of all its objects and groups; polygons are cut into fans.
+
+    Raises:
+        InputError: If a line is not understood, an index is out of range, or the file shows that it was cut.
+    """
+    text = decode_text(data, where)
+    if not text.endswith("\n"):
+        refuse(
+            "the last line has no line end: the file may be truncated", where, "a line end after every line", "file_cut"
+        )
+    content = _Content()
+    text = text.replace("\\\r\n", " ").replace("\\\n", " ")
+    for number, line in enumerate(text.split("\n"), start=1):
+        _read_line(line, content, f"{where}, line {number}")
+    faces = triangulate(np.array(content.corners, dtype=np.int64), np.array(content.counts, np.int64), where)
+    _check_complete(content, text, where)
+    return RawMesh(np.array(content.vertices, dtype=np.float64), faces)
+
+
+def _read_line(line: str, content: _Content, where: str) -> None:
+    tokens = line.split("#", 1)[0].split()
+    if not tokens or tokens[0] in _IGNORED:
+        return
+    if tokens[0] == "v":
+        content.vertices.append(_vertex(tokens[1:], where))
+    elif tokens[0] == "f":
+        content.corners.extend(_corner(token, len(content.vertices), where) for token in tokens[1:])
+        content.counts.append(len(tokens) - 1)
+    else:
+        refuse(f"line starts with {tokens[0][:20]!r}", where, _ALLOWED, "unknown_line")
+
+
+def _vertex(tokens: list[str], where: str) -> tuple[float, float, float]:
+    allowed = "v x y z, then nothing, a weight of 1, or a colour of three numbers"
+    try:
+        numbers = [float(token) for token in tokens]
+    except ValueError:
+        refuse(f"vertex {' '.join(tokens)[:60]!r}", where, allowed, "not_a_number")
+    if len(numbers) not in (3, 4, 6, 7) or (len(numbers) in (4, 7) and numbers[3] != 1.0):
+        refuse(f"vertex of {len(numbers)} numbers {tokens[:7]}", where, allowed, "wrong_count")
+    return numbers[0], numbers[1], numbers[2]
+
+
+def _corner(token: str, n_vertices: int, where: str) -> int:
+    """The vertex of ``v``, ``v/vt``, ``v/vt/vn`` or ``v//vn``, from 0; negative ones count back from this line."""
+    allowed = "v, v/vt, v/vt/vn or v//vn of a vertex above this line, counted from 1, or back from -1"
+    if not re.fullmatch(r"-?\d{1,18}(/(-?\d{1,18})?){0,2}", token, re.ASCII):
+        refuse(f"face corner {token[:40]!r}", where, allowed, "not_a_number")
+    index = int(token.split("/")[0])
+    if index == 0 or abs(index) > n_vertices:
+        refuse(f"face uses vertex {index} of {n_vertices}, out of range", where, allowed, "index_out_of_range")
+    return index - 1 if index > 0 else n_vertices + index
+
+
+def _check_complete(content: _Content, text: str, where: str) -> None:
+    unused = len(content.vertices) - len(set(content.corners))
+    if unused:
+        what = f"{unused} vertices are not used by any face: the face list may be truncated"
+        allowed = "an OBJ whose faces use every vertex, or a format that states its counts"
+        refuse(what, where, allowed, "unused_vertices")
+    stated = sum(int(first or second) for first, second in _STATED_COUNT.findall(text))
+    if stated > len(content.counts):
+        what = f"comments state {stated} faces, but there are {len(content.counts)}"
+        refuse(what, where, "as many as stated", "size_mismatch")
+
+
+_HEADER_BYTES = 84
+_FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_BINARY_ALLOWED = "a binary STL of 84 + 50 n bytes, n as its header states it, at least 1"
+_ASCII_ALLOWED = "one solid of complete facets, closed by endsolid"
+_KEYWORDS = {0: "facet", 1: "normal", 5: "outer", 6: "loop", 7: "vertex", 11: "vertex", 15: "vertex"} | {
+    19: "endloop",
+    20: "endfacet",
+}
+_TOKENS_PER_FACET = 21
+_COORDINATE_TOKENS = [8, 9, 10, 12, 13, 14, 16, 17, 18]
+
+
+def read_stl(data: bytes, where: str) -> RawMesh:
+    """The triangles of an STL file, three vertices of their own each.
+
+    Raises:
+        InputError: If it is cut, has a false count, or is not STL.
+    """
+    looks_ascii = data[:512].lstrip().lower().startswith(b"solid") and b"facet" in data[:2048].lower()
+    if looks_ascii and not _binary_size_fits(data):
+        return _read_ascii(data, where)
+    return _read_binary(data, where)
+
+
+def _binary_size_fits(data: bytes) -> bool:
+    return len(data) >= _HEADER_BYTES and len(data) == _HEADER_BYTES + 50 * _stated_count(data)
+
+
+def _stated_count(data: bytes) -> int:
+    return int.from_bytes(data[80:84], "little")
+
+
+def _read_binary(data: bytes, where: str) -> RawMesh:
+    if len(data) < _HEADER_BYTES:
+        refuse(f"STL of {len(data)} bytes is shorter than its header", where, _BINARY_ALLOWED, "file_cut")
+    count = _stated_count(data)
+    if not _binary_size_fits(data) or count == 0:
+        needed = _HEADER_BYTES + 50 * count
+        what = f"header states {count} triangles, which take {needed} bytes, but the file has {len(data)}"
+        refuse(what, where, _BINARY_ALLOWED, "size_mismatch")
+    facets = np.frombuffer(data, dtype=_FACET, offset=_HEADER_BYTES)
+    return _from_corners(facets["corners"].astype(np.float64))
+
+
+def _read_ascii(data: bytes, where: str) -> RawMesh:
+    lines = decode_text(data, where).strip().splitlines()
+    if lines[-1].split()[0].lower() != "endsolid":
+        refuse(f"the last line is {lines[-1][:40]!r}: the file is cut", where, _ASCII_ALLOWED, "file_cut")
+    tokens = " ".join(lines[1:-1]).lower().split()
+    if "endsolid" in tokens:
+        refuse("several solids: a truncated file could lose some", where, _ASCII_ALLOWED, "several_solids")
+    if len(tokens) == 0:
+        refuse("the solid has no facet", where, _ASCII_ALLOWED, "empty")
+    _check_keywords(tokens, where)
+    if len(tokens) % _TOKENS_PER_FACET:
+        refuse(f"facet {len(tokens) // _TOKENS_PER_FACET} is not complete", where, _ASCII_ALLOWED, "file_cut")
+    columns = [tokens[column::_TOKENS_PER_FACET] for column in _COORDINATE_TOKENS]
+    try:
+        corners = np.array([[float(token) for token in column] for column in columns])
+    except ValueError as error:
+        what = f"a coordinate is not a number ({error})"
+        raise InputError(what, where=where, allowed=_ASCII_ALLOWED, code="not_a_number") from error
+    return _from_corners(corners.T.reshape(-1, 3, 3))
+
+
+def _check_keywords(tokens: list[str], where: str) -> None:
+    """Every facet has the same words at the same places; the first that has not is named."""
+    wrong = [
+        (facet, place, found, keyword)
+        for place, keyword in _KEYWORDS.items()
+        for facet, found in enumerate(tokens[place::_TOKENS_PER_FACET])
+        if found != keyword
+    ]
+    if wrong:
+        facet, _, found, keyword = min(wrong)
+        refuse(f"facet {facet}: {found[:20]!r} instead of {keyword!r}", where, _ASCII_ALLOWED, "unknown_line")
+
+
+def _from_corners(corners: NDArray[np.float64]) -> RawMesh:
+    return RawMesh(corners.reshape(-1, 3), np.arange(3 * len(corners), dtype=np.int64).reshape(-1, 3))
+
 
 MAX_FILE_BYTES = 2_000_000_000
 """Twenty million triangles of binary STL are 1 GB; a file beyond twice that is refused before it is read."""
@@ -70,7 +237,6 @@ def read_mesh(
     Args:
         path: An STL, OBJ, PLY, GLB, VTP or VTK file.
         unit: The unit of its coordinates.
-        space: Their space.
         space_is_default: Whether a patient space that the file states holds instead of ``space``.
         up: Its axis that is up in the file; without it, z of all but GLB.
 
@@ -95,12 +261,7 @@ def parse_mesh(
     """Parse a mesh file that has been read, like `read_mesh`; it is not opened again.
 
     Args:
-        data: The whole file.
-        path: Its name, whose ending says the format.
         unit: The unit of its coordinates.
-        space: Their space.
-        space_is_default: As in `read_mesh`.
-        up: As in `read_mesh`.
         stretch: Shape (3,): factors of the file's axes on top of its unit, as a URDF states them.
 
     Raises:
@@ -181,7 +342,6 @@ def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
 
     Args:
         mesh: The structure's surface, mm.
-        name: Its name, for the text.
     """
     warnings = []
     flat = np.count_nonzero(mesh.areas == 0.0)

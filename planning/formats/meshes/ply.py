@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import decode_text
-from puncture_twin.planning.formats.raw_mesh import RawMesh, token_array, triangulate
+from puncture_twin.planning.formats.guard import RawMesh, token_array, triangulate
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 _TYPES = {

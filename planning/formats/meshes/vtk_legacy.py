@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
-from puncture_twin.planning.formats.raw_mesh import MAX_TOKEN_LENGTH, MAX_VERTICES, RawMesh, triangulate
+from puncture_twin.planning.formats.guard import MAX_TOKEN_LENGTH, MAX_TRIANGLES, MAX_VERTICES, RawMesh, triangulate
 
 _ALLOWED = "a legacy VTK file, ASCII or BINARY, of DATASET POLYDATA whose points and polygons are as many as it states"
 _VERSION = re.compile(rb"# vtk DataFile Version ([1-5])\.\d\s*")

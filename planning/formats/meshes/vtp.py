@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.formats.mesh_guard import MAX_TRIANGLES
-from puncture_twin.planning.formats.raw_mesh import MAX_VERTICES, RawMesh, join, token_array, triangulate
+from puncture_twin.planning.formats.guard import MAX_TRIANGLES, MAX_VERTICES, RawMesh, join, token_array, triangulate
 from puncture_twin.planning.geometry.spaces import Space
 
 _ALLOWED = "a complete VTKFile of type PolyData whose arrays are as long as it states"
@@ -166,7 +165,6 @@ class Encoding(NamedTuple):
     """Encoding of a file's arrays.
 
     Attributes:
-        byte_order: "<" or ">".
         header_type: The type of the sizes before each array.
         compressed: Whether binary arrays are blocks of zlib.
         appended: The bytes after the underscore of the appended section.
@@ -182,12 +180,6 @@ class Encoding(NamedTuple):
 
 def array_values(element: ElementTree.Element, count: int, encoding: Encoding, where: str) -> NDArray[Any]:
     """The numbers of an array.
-
-    Args:
-        element: The DataArray.
-        count: How many the file states elsewhere.
-        encoding: How binary arrays are written.
-        where: The file and the array, for the error.
 
     Returns:
         Shape (count,), of the array's own type.

@@ -20,23 +20,12 @@ from puncture_twin.planning.formats.volumes.volume_header import (
     check_affine,
     check_shape,
     corner_deviation_mm,
+    first_bytes,
 )
-from puncture_twin.planning.formats.volumes.voxels import first_bytes
 
 HEADER_BYTES = 348
 FIRST_VOXEL_BYTE = 352
-TYPES = {
-    2: "u1",
-    4: "i2",
-    8: "i4",
-    16: "f4",
-    64: "f8",
-    256: "i1",
-    512: "u2",
-    768: "u4",
-    1024: "i8",
-    1280: "u8",
-}
+TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8", 1280: "u8"}
 """Datatype code to type: signed and unsigned integers and floats; no colour, no complex numbers."""
 BITS_OF_DATATYPE = {code: 8 * np.dtype(name).itemsize for code, name in TYPES.items()}
 """Datatype code to bits per voxel."""

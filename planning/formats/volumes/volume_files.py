@@ -27,8 +27,13 @@ from puncture_twin.planning.base.text import Shown, brief
 from puncture_twin.planning.formats.volumes import nrrd_header
 from puncture_twin.planning.formats.volumes.nifti_header import parse_nifti_header
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_nrrd_header
-from puncture_twin.planning.formats.volumes.volume_header import MAX_VOXELS, VolumeGrid, VolumeHeader, VoxelLayout
-from puncture_twin.planning.formats.volumes.voxels import decoded
+from puncture_twin.planning.formats.volumes.volume_header import (
+    MAX_VOXELS,
+    VolumeGrid,
+    VolumeHeader,
+    VoxelLayout,
+    decoded,
+)
 
 NIFTI_ENDINGS = (".nii", ".nii.gz")
 NRRD_ENDINGS = (".nrrd", ".nhdr")
@@ -46,7 +51,6 @@ class Volume(Shown):
         values: Shape (ni, nj, nk), read-only; Hounsfield units for a CT.
         T_ct_index: Shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm. Its determinant
             may have either sign: index axes can be left-handed, the patient's axes are not touched by that.
-        path: Where it came from.
         fields: The file's own key/value remarks.
     """
 
@@ -107,8 +111,6 @@ def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volum
     """Parse a volume file that has been read; it is not opened again.
 
     Args:
-        content: The file that was named.
-        path: Its name.
         data: The file that `data_file` names, where it names one.
 
     Raises:
@@ -156,7 +158,6 @@ class VolumeSource(Protocol):
     """A volume in one file, in two, or in a folder of slices.
 
     Attributes:
-        path: What was named.
         files: Every file that decides a voxel or its place, as the content is wanted it.
         part: Which part of these files it is, where they hold several volumes.
         notes: What a person should be told of how it was read, one sentence each.
@@ -183,7 +184,6 @@ class VolumeFile:
     """A volume in one file, or in a header and a file of voxels beside it.
 
     Attributes:
-        path: What was named.
         files: That file, and the one beside it.
         content: Gives the bytes of both.
     """
@@ -236,7 +236,6 @@ def in_order(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
 
     Args:
         values: Shape (nx, ny, nz), in any order, such as a view of a file that runs the other way.
-        dtype: Of the copy.
     """
     found = np.empty(values.shape, dtype)
     for k in range(0, values.shape[2], TILE[0]):

@@ -99,11 +99,7 @@ class Reading:
 
 
 def marker_registration(case: Case, stated: RegistrationSection) -> Registration | None:
-    """The registration by the markers that a case states besides a transform; None without them.
-
-    Raises:
-        InputError: As `registered`.
-    """
+    """The registration by the markers that a case states besides a transform; None without them."""
     return None if stated.markers_ct is None else registered(case, MarkerSection(**stated.model_dump()))
 
 
@@ -223,8 +219,6 @@ class Apart:
     """Where markers and a stated transform differ most, over the error expected of the markers there.
 
     Attributes:
-        where: The target or a marker.
-        apart_mm: How far.
         expected_mm: The expected (rms) error of the markers there.
         contradicts: Whether some point differs by more than both errors explain, and by more than `MAX_APART_MM`.
     """
@@ -285,9 +279,6 @@ def placement_findings(
 
     Markers that agree with a transform are checked as those that place the robot are: who made the transform from the
     same two lists has the slip of a list in both.
-
-    Raises:
-        InputError: As `check_markers` and `check_transform`.
     """
     skin = around.skin
     if placement.registration is not None:

@@ -68,7 +68,6 @@ def skin_fit(points_ct: Floats, skin: Skin) -> SkinFit:
 
     Args:
         points_ct: Shape (n, 3), mm.
-        skin: Of the case.
     """
     triangles = skin.mesh.triangles[~skin.cut_faces]
     centres = triangles.mean(axis=1)
@@ -280,8 +279,6 @@ def _worse(fit: SkinFit, other: SkinFit, *, level: float) -> bool:
     """Whether the same markers scatter more in one list than in another beyond chance, by an F-test.
 
     Args:
-        fit: Of one list.
-        other: Of the same markers, read in other axes.
         level: How often two lists of one scatter would seem so different.
     """
     freedom = len(fit.gaps_mm) - 1

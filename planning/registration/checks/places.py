@@ -53,7 +53,6 @@ def in_box(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
     box lies in the patient.
 
     Args:
-        case: For its obstacles.
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm.
     """
@@ -131,7 +130,6 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
     than links and needle span.
 
     Args:
-        case: For arm, needle, target and obstacles.
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm.
     """
@@ -177,7 +175,6 @@ def untouchable(
     """Which points no needle can have touched: a box of the CT frame, or its couch, lies before them on all sides.
 
     Args:
-        case: For needle and obstacles.
         points_ct: Shape (n, 3), mm.
         normals_ct: Shape (n, 3), unit vectors out of the skin there.
         couch: What lies beyond what the patient lies on, closed, or None.
@@ -212,7 +209,6 @@ def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Float
     """Where on the skin a marker could sit and be touched straight: no box before it, within reach, shape (n, 3), mm.
 
     Args:
-        case: For arm, needle and obstacles.
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm.
     """
@@ -245,10 +241,8 @@ def _intersects(box: Obstacle, points: Floats, directions: Floats, length_mm: fl
     """Which segments from points intersect a box with axes parallel to the frame's (slabs).
 
     Args:
-        box: The box.
         points: Shape (..., 3), mm.
         directions: Shape (..., 3), unit.
-        length_mm: Of every segment.
     """
     with np.errstate(divide="ignore", invalid="ignore"):  # along a slab: from -inf to inf, or nowhere
         one, other = ((box.center_mm + side * box.size_mm / 2 - points) / directions for side in (-1.0, 1.0))
@@ -281,7 +275,6 @@ def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> BasePlace:
     """Check a position of the base for plausibility.
 
     Args:
-        case: For arm, needle, target and obstacles.
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm.
     """
@@ -304,10 +297,8 @@ def place_warnings(case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str)
     an arm the verdicts are about the organs alone, and with one nothing is reached from there.
 
     Args:
-        case: For arm, needle, target and obstacles.
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm.
-        text: `OF_MOUNT` or `OF_MARKERS`.
     """
     place = base_place(case, skin, T_base_ct)
     if what := place.impossible or place.unlikely:

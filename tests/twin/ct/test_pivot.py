@@ -1,7 +1,5 @@
 """The tip from poses that share its place: found exactly, with the spread and the residual that the noise leaves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from places import ROOT

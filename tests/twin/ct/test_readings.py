@@ -1,7 +1,5 @@
 """Markers, a lesion and a needle read off scans whose truth is known."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A pivot calibration executed in the twin: the tip is found back, with the error and residual that are declared."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from itertools import combinations
@@ -16,7 +14,7 @@ from puncture_twin.planning.arm.kinematics import PARAMETERS, flange_pose
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.touch.pivot_planner import plan_pivot, spread_poses
+from puncture_twin.planning.touch.touch_planner import plan_pivot, spread_poses
 from puncture_twin.run_twin import app
 from puncture_twin.twin.jobs.experiment.pivot_job import calibrated, pivot_case, pivot_tour, pivot_tour_text
 from puncture_twin.twin.plant import true_needle

@@ -13,6 +13,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.budget.guidance import corridor_mm, declared_ways, equipped, guided_error, lost_sight
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
+from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.twin.jobs.patient.run import room_count
 from puncture_twin.twin.plant.room_devices import RoomCameras
 from puncture_twin.twin.rehearsal import distribution
@@ -32,7 +33,7 @@ def insertion(tmp_path_factory):
     return prepared(tmp_path_factory.mktemp("ball"), DEVICES)
 
 
-def prepared(folder, tables, touch_mm=0.2, length_mm=210.0):
+def prepared(folder, tables, touch_mm=0.2, length_mm=210.0, nearest=False):
     """The round patient with more tables in its case, one direction, and the joints there."""
     file = ball(folder, errors=f"touch_mm = {touch_mm}\n" + tables)
     needle = "length_mm = {}\nshaft_mm = {}"
@@ -41,7 +42,9 @@ def prepared(folder, tables, touch_mm=0.2, length_mm=210.0):
     context = pt.prepare(file)
     found = context.search()
     rows = np.flatnonzero(found.safe)
-    row = max(rows, key=lambda row: corridor_mm(context.case, context.chance, found.outward_ct[row]))
+    row = (min if nearest else max)(
+        rows, key=lambda row: corridor_mm(context.case, context.chance, found.outward_ct[row])
+    )
     return context, found.outward_ct[row], found.arm.q_insertion[row]
 
 
@@ -140,8 +143,8 @@ def test_touches_and_insertion_share_the_mean_of_the_breath(tmp_path):
 def test_a_known_mean_of_the_breath_is_no_chance(tmp_path):
     """Scanned at inhale, inserted near exhale: the target is 4 mm off each time, which a normal error rarely is.
 
-    Chances of the same mean square would say .1 to .2 more than the hits within 4 mm. What is left is the skew of the
-    breath within the gate.
+    Chances of the same mean square would say .1 to .2 more than the hits within 4 mm, and normal errors about that mean
+    .04 more or less: within the gate the breath is skew.
     """
     inhale = 'amplitude_mm = 6.0\nscanned_at = 1.0\ngate = 0.4\ndirection = [0.0, 0.6, 0.8]\nweights = { "*" = 0.3 }\n'
     context, outward, q = prepared(tmp_path, "[stereo]\n[breathing]\n" + inhale, touch_mm=0.4)
@@ -149,7 +152,7 @@ def test_a_known_mean_of_the_breath_is_no_chance(tmp_path):
     for way in ("ct", "stereo"):
         for one in (context, near):
             found = rehearse_trials(one, outward, q, 2000, 3, way)
-            assert found.p_hit == pytest.approx(found.hit_share, abs=0.05), way
+            assert found.p_hit == pytest.approx(found.hit_share, abs=0.025), way
         assert 0.2 < found.hit_share < hit_in_ball(found.cov_ct[None], 4.0)[0] - 0.08
         assert found.in_region.mean() == pytest.approx(0.95, abs=0.02)
 
@@ -168,16 +171,56 @@ def test_a_stopped_needle_does_not_hit(tmp_path):
     assert (ct["stopped"], ct["p_stop"]) == (0, 0.0)
 
 
+@pytest.mark.parametrize("way", ["stereo", "us+tip", "all"])
+def test_a_needle_that_bends_is_seen_by_its_tip_alone(insertion, way):
+    """Tissue bends what is in it: balls outside stay on the straight line, the picture shows the bent tip."""
+    context, outward, q = insertion
+    bend, query = Bend(1.5, 150.0), distribution._query(context, outward, q)
+    believed, puncture = replace(query.believed, bend=bend), replace(query.puncture, bend=bend)
+    one, moving = distribution._way(context, query._replace(believed=believed, puncture=puncture), way)
+    truths = draw_truths(puncture, query.truth, ROOMS, np.random.default_rng(0), moving)
+    found = guided_trials(puncture, truths, query.truth, one, np.random.default_rng(1)).trials
+    realised = np.sqrt(np.mean(np.sum((found.tip_ct - found.target_ct) ** 2, axis=1)))
+    predicted = np.sqrt(np.trace(guided_error(one.model, way).tip_covariance(q[None])[0]))
+    assert predicted / realised == pytest.approx(1.0, abs=0.03)
+    straight = guided_error(replace(one.model, error=query.believed), way).tip_covariance(q[None])[0]
+    added = predicted**2 - np.trace(straight)
+    assert added == pytest.approx(bend.tip_mm**2, rel=0.01) if way == "stereo" else added < 0.3 * bend.tip_mm**2
+
+
+@pytest.mark.parametrize("way", ["ct", "us"])
+def test_what_rests_while_the_target_breathes_is_touched_as_often_as_predicted(tmp_path, way):
+    """A rib beside the needle, which a registration leaves there, and a picture leads away.
+
+    The breath goes to one side: taken as a symmetric error, the picture's chance would be twice too large.
+    """
+    resting = BREATH.replace("4.0", "9.0").replace("0.5", "0.0").replace("[0.0, 0.6, 0.8]", "[-1.0, 0.0, 0.0]")
+    context, outward, q = prepared(tmp_path, "arm = 'nominal'\n" + DEVICES + resting, nearest=True)
+    query = distribution._query(context, outward, q)
+    one, moving = distribution._way(context, query, way)
+    truths = draw_truths(query.puncture, query.truth, ROOMS, np.random.default_rng(0), moving)
+    done = guided_trials(
+        query.puncture, truths, query.truth, replace(one, corridor_mm=np.inf), np.random.default_rng(1)
+    )
+    found = distribution._measured(context, query, done.trials, np.random.default_rng(2), 0, (one, done.stopped))
+    assert found.touched.mean(axis=0) == pytest.approx(found.p_touch, abs=0.006)
+    assert found.p_touch[0] > 0.01
+
+
 def test_no_correction_leaves_the_corridor(insertion):
-    """In a narrow one most trials are stopped; of what was executed nothing went farther."""
+    """In a narrow one many trials are stopped; of what was executed nothing went farther from the plan."""
     context, outward, q = insertion
     query = distribution._query(context, outward, q)
-    way, moving = distribution._way(context, query, "us")
+    way, moving = distribution._way(context, query, "ct+us")
     narrow = replace(way, corridor_mm=0.8)
     truths = draw_truths(query.puncture, query.truth, 10_000, np.random.default_rng(0), moving)
     done = guided_trials(query.puncture, truths, query.truth, narrow, np.random.default_rng(1))
-    assert np.linalg.norm(done.moved_base, axis=1).max() <= narrow.corridor_mm
-    assert 0.5 < done.stopped.mean() < 1.0
+    assert np.linalg.norm(done.aside_base, axis=1).max() <= narrow.corridor_mm
+    assert 0.2 < done.stopped.mean() < 1.0
+    cameras = guided_trials(
+        query.puncture, truths, query.truth, replace(narrow, name="stereo"), np.random.default_rng(1)
+    )
+    assert cameras.stopped.mean() < 0.05  # they correct what registration and arm had wrong, and go nowhere else
 
 
 def test_what_is_hidden_is_missing_and_named(insertion):

@@ -19,9 +19,8 @@ from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.page.page_slices import block_box
 from puncture_twin.twin.report.palette import organ_colours
-from puncture_twin.twin.report.slices.panel import PIXELS, TONES
+from puncture_twin.twin.report.slices.panel import PIXELS, TONES, Subject
 from puncture_twin.twin.report.slices.planes import needle_planes
-from puncture_twin.twin.report.slices.subject import Subject
 
 TILTED = ((-1.0, 0.0, 0.0), (0.0, 0.9, -0.3), (0.0, 0.3, 0.95))
 GROUND, HATCH = (44, 47, 54), (106, 113, 122)

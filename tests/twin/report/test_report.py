@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import report_world as world
 import trimesh
+from matplotlib.text import Text
 from PIL import Image, ImageDraw
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -25,11 +26,11 @@ from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.place.mounts import ring_weights
 from puncture_twin.planning.search.candidates import Pick
-from puncture_twin.twin.report import annotate
-from puncture_twin.twin.report.map.map_picture import DISC, draw_map
+from puncture_twin.twin.report import annotate, patient as patient_blocks
+from puncture_twin.twin.report.map.map_picture import DISC, draw_map, map_figure
 from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import MapCells, map_view, step_of
-from puncture_twin.twin.report.numbers import reason_counts
+from puncture_twin.twin.report.numbers import length_text, nearest_text, reason_counts
 from puncture_twin.twin.report.page import page_scene
 from puncture_twin.twin.report.page.page import Shown, write_page
 from puncture_twin.twin.report.page.page_map import map_data
@@ -38,12 +39,18 @@ from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.compositing import RasterShot, Shells, compose
 from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface, opaque_shot, shells_of
-from puncture_twin.twin.report.scene import film, film_file, scene_picture
+from puncture_twin.twin.report.scene import film, film_text, scene_picture
 from puncture_twin.twin.report.scene.film import draw_film
 from puncture_twin.twin.report.scene.film_text import model_note
-from puncture_twin.twin.report.scene.scene_parts import SceneBody, needle_bodies, patient
+from puncture_twin.twin.report.scene.scene_parts import (
+    LIFT_MM,
+    SceneBody,
+    corridor_mouth,
+    corridor_walls,
+    needle_bodies,
+    patient,
+)
 from puncture_twin.twin.report.scene.scene_picture import draw_scene, families, render_bodies
-from puncture_twin.twin.report.scene.shapes import LIFT_MM, corridor_mouth, corridor_walls
 from puncture_twin.twin.report.scene.views import outermost, overview, up_ct
 
 FRAMES = {
@@ -469,8 +476,8 @@ def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
     try:
         for count in (1, len(cores)):
             os.sched_setaffinity(0, sorted(cores)[:count])
-            whole = ((film_file.Part(0, 0, frame),) for frame in frames)
-            film_file.write_mp4(frames[0], whole, tmp_path / f"{count}.mp4", film.FRAMES_PER_SECOND)
+            whole = ((film_text.Part(0, 0, frame),) for frame in frames)
+            film_text.write_mp4(frames[0], whole, tmp_path / f"{count}.mp4", film.FRAMES_PER_SECOND)
     finally:
         os.sched_setaffinity(0, cores)
     assert (tmp_path / "1.mp4").read_bytes() == (tmp_path / f"{len(cores)}.mp4").read_bytes()
@@ -479,30 +486,26 @@ def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
 def test_a_frame_is_its_ground_with_the_parts_put_on(rng):
     """As a picture, and as the encoder takes it: parts converted alone are those of the whole, converted."""
     ground = rng.integers(0, 256, (32, 48, 3), dtype=np.uint8)
-    parts = [film_file.Part(4, 6, ground[:10, :20] ^ 255), film_file.Part(40, 0, ground[:32, :8] // 2)]
-    whole = film_file.put_on(ground, parts)
+    parts = [film_text.Part(4, 6, ground[:10, :20] ^ 255), film_text.Part(40, 0, ground[:32, :8] // 2)]
+    whole = film_text.put_on(ground, parts)
     assert np.array_equal(whole[6:16, 4:24], parts[0].pixels) and np.array_equal(whole[:, 40:], parts[1].pixels)
 
 
 def test_frames_of_a_film_cut_off_are_not_counted(tmp_path, rng):
     """An encoder on a full disk ends without a word: what it left must not pass for the film."""
     ground, path = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8), tmp_path / "film.mp4"
-    film_file.write_mp4(ground, [()] * 7, path, 15)
+    film_text.write_mp4(ground, [()] * 7, path, 15)
     written = path.read_bytes()
-    assert film_file.frames_in(written) == 7 == imageio_ffmpeg.count_frames_and_secs(str(path))[0]
-    assert [film_file.frames_in(written[:n]) for n in (0, 7, 100, len(written) // 2, len(written) - 1)] == [0] * 5
-    assert film_file.frames_in(b"no film " * 100) == 0
+    assert film_text.frames_in(written) == 7 == imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+    assert [film_text.frames_in(written[:n]) for n in (0, 7, 100, len(written) // 2, len(written) - 1)] == [0] * 5
+    assert film_text.frames_in(b"no film " * 100) == 0
 
 
 @pytest.mark.parametrize(
     ("bending", "breathing", "said"),
     [
         (None, None, "needle and tissue are rigid; nothing breathes; "),
-        (
-            "declared",
-            None,
-            "tissue pushes on the needle: its end is bent, the drawing is straight; nothing breathes; ",
-        ),
+        ("declared", None, "tissue pushes on the needle: its end is bent, the drawing is straight; nothing breathes; "),
         (None, "declared", "needle and tissue are rigid; the body is drawn still, as in the CT; "),
     ],
 )
@@ -587,7 +590,7 @@ def test_without_an_encoder_there_is_a_gif(anatomy, case, plan, tmp_path, monkey
     def no_encoder(*args, **options):
         raise RuntimeError("no ffmpeg")
 
-    monkeypatch.setattr(film_file.imageio_ffmpeg, "write_frames", no_encoder)
+    monkeypatch.setattr(film_text.imageio_ffmpeg, "write_frames", no_encoder)
     monkeypatch.setattr(film, "film_times", lambda total: film.FilmTimes((0.0, total), 1.0, 1))
     written = draw_film(world.make_rehearsal(plan), plan, case, anatomy, tmp_path / "film.mp4")
     assert [p.name for p in tmp_path.iterdir()] == ["film.gif"] == [written.name]
@@ -846,3 +849,22 @@ def test_what_holds_the_target_is_see_through_whatever_its_role(anatomy, case, r
     body = SimpleNamespace(structures=structures, surroundings=(), skin=anatomy.skin)
     alpha = {one.name: one.alpha for one in patient(body, case)}
     assert alpha["holder"] < 0.5 and alpha["beside"] == 1.0
+
+
+def test_lengths_have_the_digits_of_the_voxels():
+    """Half the longest side of a voxel as ±; of 2 mm and more no tenths; meshes alone have tenths."""
+    candidates = world.make_candidates(world.make_case())
+    for spacing, head, clearance in (
+        ((0.7, 0.7, 0.9), "clearance ± 0.5, mm", "5.0"),
+        ((0.8, 0.8, 5.0), "clearance ± 3, mm", "5"),
+        (None, "clearance, mm", "5.0"),
+    ):
+        scan = spacing and SimpleNamespace(grid=SimpleNamespace(T_ct_index=np.diag([*spacing, 1.0])))
+        table = patient_blocks.windows(candidates, scan)[0]
+        column = list(table.head).index(head)
+        assert table.rows[0][column] == clearance
+        assert nearest_text(candidates, 0, scan).startswith(f"nearest: rib right 9, {clearance}")
+        drawn = " ".join(text.get_text() for text in map_figure(candidates, world.make_case(), scan=scan).findobj(Text))
+        path = length_text(float(candidates.path.length[candidates.best.row]), scan)
+        told = head.removeprefix("clearance").removesuffix(", mm")
+        assert f"path in the body {path}, " in drawn and path.endswith(f"{told} mm")

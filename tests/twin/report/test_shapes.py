@@ -6,7 +6,7 @@ import trimesh
 
 from puncture_twin.planning.geometry.mesh import box
 from puncture_twin.planning.geometry.rigid import exp_rotation, pose
-from puncture_twin.twin.report.scene.shapes import ball, bar, revolved, ring
+from puncture_twin.twin.report.scene.scene_parts import ball, bar, revolved, ring
 
 T = pose(exp_rotation(np.array([0.3, -1.1, 0.7])), np.array([40.0, -7.0, 12.0]))
 

@@ -11,10 +11,9 @@ from PIL import Image
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.candidates import Pick
-from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, PIXELS, TONES, draw_panel, stored
+from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, PIXELS, TONES, Subject, draw_panel, stored
 from puncture_twin.twin.report.slices.planes import capsule, ellipse, letters, needle_planes, outline
 from puncture_twin.twin.report.slices.sheet import NO_CT, draw_slices, write_sheet
-from puncture_twin.twin.report.slices.subject import Subject
 
 UNITS = st.tuples(*[st.floats(-1, 1) for _ in range(3)]).filter(lambda v: np.linalg.norm(v) > 0.1)
 CYAN = np.array([0, 229, 255])

@@ -8,8 +8,9 @@ import pytest
 from refusals import refused
 from servo_world import CASE, NoContacts
 
+from puncture_twin.planning.base.files import new_folder
 from puncture_twin.twin.guidance.stereo.recording import read_recording
-from puncture_twin.twin.jobs.servo.job import follow_recording, new_folder
+from puncture_twin.twin.jobs.servo.job import follow_recording
 from puncture_twin.twin.rehearsal.stereo_session import run_session
 
 
@@ -61,6 +62,12 @@ def smaller(folder):
     cv2.imwrite(str(folder / "markers_001_1_1.png"), np.zeros((480, 640), np.uint8))
 
 
+def cut(folder):
+    """A picture without its lower half, which a picture library fills with black."""
+    path = folder / "points_001_1_1.png"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
 WRONG = {
     "no table": (lambda folder: (folder / "stops.csv").unlink(), "no_such_file"),
     "other columns": (edited("points.csv", "q1_deg", "q1_rad"), "wrong_columns"),
@@ -72,7 +79,8 @@ WRONG = {
     "a picture in colour": (in_colour, "not_grey"),
     "a picture of another size": (smaller, "wrong_size"),
     "a marker twice": (edited("markers.csv", CASE.markers.names[1], CASE.markers.names[0]), "duplicate_name"),
-    "a picture cut short": (lambda folder: (folder / "points_001_1_1.png").write_bytes(b"\x89PNG"), "not_grey"),
+    "no picture at all": (lambda folder: (folder / "points_001_1_1.png").write_bytes(b"\x89PNG"), "wrong_format"),
+    "a picture cut short": (cut, "file_cut"),
 }
 
 

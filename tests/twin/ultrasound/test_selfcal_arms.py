@@ -82,7 +82,7 @@ def test_the_declared_errors_move_the_true_arms_flanges(room):
     arm, sigma = truth.probe_arm, case.declared_arms.probe.deviations()
     offsets = (arm.a - arm.nominal.a, (arm.d - arm.nominal.d)[[0, 2, 3, 4, 5]], arm.alpha - arm.nominal.alpha)
     eta = np.concatenate([*offsets, arm.joint_offsets]) / sigma
-    moved, true = corrected(recording.A, errors.probe @ eta), arm.flange_pose(recording.q_probe)
+    moved, true = corrected(recording.A, errors.probe.slopes @ eta), arm.flange_pose(recording.q_probe)
     np.testing.assert_allclose(moved[:, :3, 3], true[:, :3, 3], atol=2e-3)
     turned = log_rotation(moved[:, :3, :3].transpose(0, 2, 1) @ true[:, :3, :3])
     assert np.abs(turned).max() < 2e-6
@@ -115,9 +115,9 @@ def test_play_of_unknown_sign_is_noise(room):
     )
     for one in (recording, replace(recording, **{key: np.zeros((30, 6)) for key in ("turn_probe", "turn_needle")})):
         found = arm_errors(play, one)
-        np.testing.assert_allclose(found.probe_arrival, arm_errors(noise, one).probe_arrival, rtol=1e-12)
-        assert not found.probe_play.any()
-        assert not found.probe[:, :, 23:].any()
+        np.testing.assert_allclose(found.probe.arrival, arm_errors(noise, one).probe.arrival, rtol=1e-12)
+        assert not found.probe.play.any()
+        assert not found.probe.slopes[:, :, 23:].any()
     assert PLAY_SIGN in calibrate(recording, noise=NOISE, arms=play).cannot_show
 
 

@@ -36,7 +36,8 @@ def case_folder(tmp_path_factory):
 def done(case_folder, tmp_path_factory):
     """Run once: the folder of its files."""
     out = tmp_path_factory.mktemp("out")
-    assert main(["selfcal", str(case_folder), "--seeds", "1", "--out", str(out)]) == OK
+    record = out.with_name("kept")
+    assert main(["selfcal", str(case_folder), "--seeds", "1", "--out", str(out), "--record", str(record)]) == OK
     return out
 
 
@@ -93,6 +94,30 @@ def test_a_recording_gives_the_same_calibration(case_folder, done, tmp_path, cap
     assert summary["trials"] == []
     names = {"calibration.json", "report.html", "manifest.json", "timings.json"}
     assert {path.name for path in tmp_path.iterdir()} == names
+
+
+def test_the_kept_pictures_give_the_same_calibration(case_folder, done, tmp_path, capsys):
+    """Read, detected and calibrated again, with the joints alone; every picture is an input, and none is written."""
+    kept = done.with_name("kept")
+    arguments = ["selfcal", str(case_folder), "--recording", str(kept), "--out", str(tmp_path), "--json"]
+    assert main(arguments) == OK
+    summary, found = json.loads(capsys.readouterr().out), json.loads((done / "calibration.json").read_text())
+    for key in ("T_end1_image", "T_base1_base2", "tip_end2_mm", "predicted_tre_mm"):
+        assert summary[key] == pytest.approx(np.array(found[key]), abs=1e-6)
+    assert summary["without_needle"] == found["without_needle"]
+    pictures = sorted(path.name for path in kept.glob("*.png"))
+    assert [one["path"] for one in summary["inputs"]] == ["recording.csv", *pictures, "selfcal.toml"]
+    assert len(pictures) == 20 + len(found["without_needle"])
+
+
+def test_pictures_are_not_kept_of_a_recording_or_over_others(case_folder, done, tmp_path, capsys):
+    """One line each, before anything is drawn."""
+    kept = done.with_name("kept")
+    out = ["--out", tmp_path / "out"]
+    refused_command(["selfcal", case_folder, "--record", kept, *out], capsys, "output_exists")
+    both = ["selfcal", "--recording", kept, "--record", tmp_path / "new", *out]
+    refused_command(both, capsys, "conflicting_options")
+    refused_command(["selfcal", "--recording", kept, *out], capsys, "missing_column", "joints")  # arms of no case
 
 
 def test_a_recording_without_joints_says_what_it_cannot_count(case_folder, done, tmp_path, capsys):

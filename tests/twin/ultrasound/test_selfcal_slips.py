@@ -9,8 +9,8 @@ from refusals import refused
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
+from puncture_twin.twin.guidance.ultrasound.puncture import predicted_tre
 from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
-from puncture_twin.twin.guidance.ultrasound.summaries import predicted_tre
 from puncture_twin.twin.plant.simulated_recording import PoseRanges, simulate_recording
 
 FILE = Path("recording.csv")

@@ -34,7 +34,7 @@ from puncture_twin.twin.guidance.ultrasound.two_arms import (
 )
 from puncture_twin.twin.plant.bmode_image import NeedleInImage
 from puncture_twin.twin.plant.ultrasound_workcell import draw_workcell, jog_into_slice
-from puncture_twin.twin.report.scene.shapes import bar
+from puncture_twin.twin.report.scene.scene_parts import bar
 
 
 def make_case(**sections):

@@ -1,7 +1,5 @@
 """The tip under control: dynamics at any mount, springs that yield by F / K, and what is refused before it diverges."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from control_world import (

@@ -4,8 +4,6 @@ Every needle of the cards, bare and with each structure's margin about it, is pu
 the structures' whole surfaces, and its contacts are compared with FCL's collision of the same capsule.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """The simulated room: units, kinematics against the closed form, gravity, contacts, pictures."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

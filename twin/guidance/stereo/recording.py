@@ -8,29 +8,21 @@ case's. A picture is ``<table>_<row>_<camera>_<n>.png``, all counted from 1, 8 b
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-import cv2
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import is_plain_file, read_input
-from puncture_twin.planning.formats.points import (
-    NamedPoints,
-    csv_lines,
-    joint_readings,
-    read_points,
-    row_numbers,
-    write_points,
-)
+from puncture_twin.planning.formats.points import NamedPoints, joint_readings, read_points, write_points
+from puncture_twin.planning.formats.pose_table import parse_table, table_text
 from puncture_twin.planning.geometry.spaces import Unit
 from puncture_twin.twin.devices import Arm, Cameras, GreyImage, MeasuringArm, Operator
 from puncture_twin.twin.guidance.stereo.session import ImageReading
+from puncture_twin.twin.pictures import parse_png, png_bytes
 
 POINTS, MARKERS, STOPS = "points", "markers", "stops"
 JOINTS, PLACE = tuple(f"q{i}_deg" for i in range(1, 7)), ("x_mm", "y_mm", "z_mm")
@@ -95,16 +87,13 @@ class Recorder:
             self._begin(STOPS, self.target, *self._joints)
         key = (self._table, len(self._rows[self._table]), number + 1)
         self._taken[key] = self._taken.get(key, 0) + 1
-        encoded = cv2.imencode(".png", image.grey)[1]
-        picture_path(self.folder, *key, self._taken[key]).write_bytes(encoded.tobytes())
+        picture_path(self.folder, *key, self._taken[key]).write_bytes(png_bytes(image.grey))
         return image
 
     def finish(self, names: tuple[tuple[str, ...], tuple[str, ...]], reading: ImageReading) -> None:
         """Write the tables, and markers and targets as they were read in the CT, by their names."""
         for table, rows in self._rows.items():
-            text = io.StringIO()
-            csv.writer(text, lineterminator="\n").writerows([COLUMNS[table], *rows])
-            (self.folder / f"{table}.csv").write_text(text.getvalue(), encoding="utf-8")
+            (self.folder / f"{table}.csv").write_text(table_text(COLUMNS[table], rows), encoding="utf-8")
         for file, some, points in zip(IMAGE_POINTS, names, reading, strict=True):
             write_points(self.folder / file, NamedPoints(some, points, None))
 
@@ -182,15 +171,12 @@ class Replay:
             count -= 1
             path = picture_path(self.folder, *key, count)
         self._seen[key] = count
-        content = read_input(path, max_bytes=MAX_PICTURE_BYTES, where=str(path))
-        grey = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        if grey is None or grey.dtype != np.uint8 or grey.ndim != 2:
-            refuse("is no picture of one grey channel with 8 bits", path, "a PNG of 8-bit grey", "not_grey")
+        grey = parse_png(read_input(path, max_bytes=MAX_PICTURE_BYTES, where=str(path)), path)
         if grey.shape != self.size_px[::-1]:
             width, height = self.size_px
             what = f"a picture of {grey.shape[1]} x {grey.shape[0]} pixels"
             refuse(what, path, f"{width} x {height}, as [cameras] size_px", "wrong_size")
-        return GreyImage(np.asarray(grey, dtype=np.uint8))
+        return GreyImage(grey)
 
     def reading(self, markers: NamedPoints, targets: NamedPoints) -> ImageReading:
         """Markers and targets as they were read in the CT: the recording's, else the case's.
@@ -221,19 +207,12 @@ def read_recording(folder: Path, size_px: tuple[int, int]) -> Replay:
     tables = {}
     for table, header in COLUMNS.items():
         path = folder / f"{table}.csv"
-        allowed = ",".join(header)
         content = read_input(path, max_bytes=MAX_BYTES, where=str(path))
-        found = [one for one in csv_lines(content, str(path), allowed) if not one.fields[0].startswith("#")]
-        if not found or tuple(field.strip() for field in found[0].fields) != header:
-            shown = ",".join(found[0].fields)[:200] if found else "nothing"
-            refuse(f"columns {shown}", f"{path}, header", allowed, "wrong_columns")
-        rows = [row_numbers(fields, header, header[1:], f"{path}, line {line}") for line, fields in found[1:]]
-        if not rows:
-            refuse("no row", path, "one row or more", "empty")
-        names = tuple(fields[0].strip() for _, fields in found[1:])
+        groups = {"all": header[1:]}
+        names, numbers, _ = parse_table(content, path, groups, bool, ("all",), first=header[0])
         if table == MARKERS and len(set(names)) < len(names):
             refuse(f"a marker appears twice: {', '.join(names)}", path, "each name once", "duplicate_name")
-        tables[table] = RecordedTable(names, np.array(rows))
+        tables[table] = RecordedTable(names, numbers["all"])
     for table in (POINTS, STOPS):
         joint_readings(tables[table].values[:, :6], "deg", where=folder / f"{table}.csv", names=tables[table].names)
     return Replay(folder, tables, size_px)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,12 +14,15 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count, uncounted
+from puncture_twin.planning.formats.pose_table import table_text
 from puncture_twin.twin.devices import Arm, JogOperator, Probe
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, Missed, detect
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, choose_poses, drawing
+from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME, GROUPS
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
+from puncture_twin.twin.pictures import png_bytes
 
 JOG_FAILED = "jog out of reach"
 JOG_TOUCHES = "jog would touch"
@@ -129,7 +133,31 @@ def acquire(
             count(len(shots) + tried, wanted + tried)
     play = any(arm.errors.backlash_deg > 0.0 for arm in (case.content.probe_arm, case.content.needle_arm))
     reasons = Counter(shot.found.value for shot in missed if isinstance(shot.found, Missed)) + given_up
-    return Acquisition(_recording(workcell, shots, play=play), tuple(shots), dict(reasons), tuple(missed), left)
+    recording = _recording(workcell, shots, missed, play=play)
+    return Acquisition(recording, tuple(shots), dict(reasons), tuple(missed), left)
+
+
+def keep_pictures(taken: Acquisition, pixel_mm: float, folder: Path) -> None:
+    """Write a recording with its pictures, found or not, into an empty folder: the tips are to be read from them.
+
+    Args:
+        taken: What was recorded.
+        pixel_mm: Edge of a pixel.
+        folder: The folder.
+    """
+    shots = sorted((*taken.shots, *taken.missed_shots), key=lambda shot: shot.number)
+    play = taken.recording.turn_probe is not None
+    q, turns = (
+        [(getattr(shot, f"{key}_probe"), getattr(shot, f"{key}_needle")) for shot in shots] for key in ("q", "turn")
+    )
+    header = ("name", *GROUPS["picture"], *GROUPS["pixel"], *GROUPS["q"], *(GROUPS["turn"] if play else ()))
+    rows = []
+    for shot, joints, turn in zip(shots, q, turns, strict=True):
+        name = f"{shot.number + 1:03d}.png"
+        (folder / name).write_bytes(png_bytes(shot.image))
+        behind = [*np.degrees(np.concatenate(joints)).tolist(), *(np.concatenate(turn).tolist() if play else [])]
+        rows.append((str(shot.number + 1), name, pixel_mm, *behind))
+    (folder / FILE_NAME).write_text(table_text(header, rows), encoding="utf-8")
 
 
 def choose(
@@ -179,7 +207,7 @@ def _shot(
     return ProbeShot(number, row, q_probe, q_needle, turn_probe, turn_needle, image, found)
 
 
-def _recording(workcell: TwoArms, shots: list[ProbeShot], *, play: bool) -> Recording:
+def _recording(workcell: TwoArms, shots: list[ProbeShot], missed: list[ProbeShot], *, play: bool) -> Recording:
     """The recording of images and controllers; with the joints' directions of rotation, where these matter."""
     found = [shot.found for shot in shots if isinstance(shot.found, Detection)]
     q_probe, q_needle = (np.array([getattr(shot, key) for shot in shots]) for key in ("q_probe", "q_needle"))
@@ -190,11 +218,13 @@ def _recording(workcell: TwoArms, shots: list[ProbeShot], *, play: bool) -> Reco
         flange_pose(workcell.needle_model, q_needle),
         np.array([one.tip_image for one in found]),
         np.array([one.direction_image for one in found]),
+        tuple(str(shot.number + 1) for shot in shots),
         q_probe=q_probe,
         q_needle=q_needle,
         turn_probe=turn_probe,
         turn_needle=turn_needle,
         shaft_mm=np.array([one.shaft_mm for one in found]),
+        missed=tuple((str(shot.number + 1), str(shot.found)) for shot in missed),
     )
 
 

@@ -52,6 +52,18 @@ def expected_error_mm(calibration: Calibration, poses: Recording) -> float:
     return float(np.sqrt(np.mean(np.trace(calibration.tip_covariances(poses), axis1=1, axis2=2))))
 
 
+def predicted_tre(found: Calibration, recording: Recording) -> float:
+    """Expected (rms) error at the recorded tips, mm: from the calibration, the declared arms, an image that errs."""
+    known = rms(found.predicted_tre_mm(recording.P, recording.A)) if found.arms is None else None
+    image_mm = found.image.rms_mm if found.image is not None and found.image.significant else 0.0
+    return float(np.hypot(expected_error_mm(found, recording) if known is None else known, image_mm))
+
+
+def rms(values: Floats) -> float:
+    """Root mean square of any shape; NaN of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
+
+
 def recorded_pose(models: tuple[UrModel, UrModel], q_probe: Floats, q_needle: Floats, tip_mm: Floats) -> Recording:
     """One pose as both controllers print it, with the tip at a point of the image."""
     A, B = flange_pose(models[0], q_probe), flange_pose(models[1], q_needle)

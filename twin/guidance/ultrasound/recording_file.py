@@ -1,30 +1,88 @@
-"""Recordings of the self-calibration as files: CSV, one line a pose.
+"""Recordings of the self-calibration as files: a CSV with a row per pose, its tips read already or still in pictures.
 
-Frames and letters are those of :class:`axp_ybq.recording.Recording`.
+Frames and letters are those of :class:`axp_ybq.recording.Recording`. Pictures lie beside the CSV; the needle is
+detected in each, and one that does not show it is left out and named.
 """
 
 from __future__ import annotations
 
-import csv
-import io
-from itertools import product
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.base.files import atomic, decode_text, is_folder, read_input
-from puncture_twin.planning.formats.points import joint_readings, row_numbers
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.planning.base.files import atomic, is_folder, read_input, unfinished_warnings
+from puncture_twin.planning.base.provenance import Input, content_input
+from puncture_twin.planning.formats.points import joint_readings
+from puncture_twin.planning.formats.pose_table import (
+    GroupedTable,
+    parse_table,
+    pose_columns,
+    pose_names,
+    pose_values,
+    poses_of,
+    table_text,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import OPTIONAL, Recording
+from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
+from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
+    ENDS_AGREE_MM,
+    RIDGE_MM,
+    SHAFT_MM,
+    Detection,
+    detect,
+)
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
+from puncture_twin.twin.pictures import SAME_SIZE, read_frames
 
 FILE_NAME = "recording.csv"
 """Name of the file that a folder is searched for."""
 
 MAX_BYTES = 50_000_000
 """More than 50,000 poses: no calibration needs so many, and a larger file is likely something else."""
+
+GROUPS = MappingProxyType(
+    {
+        "A": pose_columns("A"),
+        "B": pose_columns("B"),
+        "P_mm": ("P_u_mm", "P_v_mm"),
+        "P_w": ("P_w_mm",),
+        "P_px": ("P_u_px", "P_v_px"),
+        "v": ("v_x", "v_y"),
+        "v_z": ("v_z",),
+        "shaft": ("shaft_mm",),
+        "picture": ("picture",),
+        "frame": ("frame",),
+        "pixel": ("pixel_mm",),
+        "q": tuple(f"{arm}_q{i}_deg" for arm in "AB" for i in "123456"),
+        "turn": tuple(f"{arm}_turn{i}" for arm in "AB" for i in "123456"),
+    }
+)
+"""Columns behind the name, in their order."""
+
+NEEDS = MappingProxyType(
+    {"P_w": "P_mm", "v_z": "v", "shaft": "v", "frame": "picture", "pixel": "picture", "turn": "q", "A": "B", "B": "A"}
+)
+"""A group that only stands beside another one."""
+
+COVERED = "something coloured covers the needle's tip"
+
+PIXEL_MM = (0.01, 2.0)
+"""Least and largest size of a pixel."""
+
+
+class ReadRecording(NamedTuple):
+    """A recording, and the files that it is made from."""
+
+    recording: Recording
+    inputs: tuple[Input, ...]
+    warnings: tuple[str, ...]
 
 
 def recording_file(path: Path) -> Path:
@@ -33,56 +91,178 @@ def recording_file(path: Path) -> Path:
 
 
 def read_recording(path: Path) -> Recording:
-    """Read a recording from its CSV, or from ``recording.csv`` in a folder.
+    """Read a recording that says all by itself; see `open_recording`."""
+    return open_recording(path, None).recording
 
-    Columns: ``name``; ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``; the same for B; ``P_u_mm, P_v_mm`` (or ``_px``); and,
-    where directions were measured, ``v_x, v_y`` or ``v_x, v_y, v_z``, and behind them, where it was measured too, how
-    much of the shaft shows, ``shaft_mm``; and, where the joints were recorded,
-    ``A_q1_deg .. A_q6_deg, B_q1_deg .. B_q6_deg``; and, behind these, the direction of each joint's last rotation
-    (1, -1; 0 where unknown), ``A_turn1 .. B_turn6``. Lines that start with # are passed over.
+
+def open_recording(path: Path, case: SelfcalCase | None) -> ReadRecording:
+    """Read a recording from its CSV, or from ``recording.csv`` in a folder; see docs/reference/selfcal-recording.md.
+
+    Args:
+        path: The CSV or its folder.
+        case: Whose arms turn joints into flanges, and whose image is that of the pictures; None where the file says
+            all by itself.
 
     Raises:
-        InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
+        InputError: Another header, a field that is no finite number, a matrix that is no rigid motion, a picture that
+            is absent, damaged or of another size, or a pixel of no size or of two.
     """
     file = recording_file(path)
-    return parse_recording(read_input(file, max_bytes=MAX_BYTES, where=str(file)), file)
-
-
-def parse_recording(content: bytes, file: Path) -> Recording:
-    """Parse a recording that has been read, like `read_recording`; it is not opened again.
-
-    Raises:
-        InputError: As `read_recording`, but for reading.
-    """
-    text = decode_text(content, str(file))
+    content = read_input(file, max_bytes=MAX_BYTES, where=str(file))
+    table = parse_table(content, file, GROUPS, _fits, ("A", "B", "P_mm", "v", "q"), texts=frozenset({"picture"}))
+    inputs = [content_input("recording", file.name, content)]
+    seen = _seen(table, file, case, inputs) if "picture" in table.texts else None
     try:
-        rows = [row for row in csv.reader(io.StringIO(text), strict=True) if row and not row[0].startswith("#")]
-    except csv.Error as error:
-        what = f"is not a CSV file ({error})"
-        raise InputError(what, where=file, allowed="one line per pose, with numbers", code="not_csv") from error
-    header = tuple(cell.strip() for cell in rows[0]) if rows else ()
-    if header not in KINDS:
-        allowed = ", ".join(columns(False, (3, 1), 24))
-        refuse(f"columns {', '.join(header)[:200]}", f"{file}, header", allowed, "wrong_columns")
-    pixels, (width, shaft), behind = KINDS[header]
-    places = (f"{file}, row {i}" for i in range(2, len(rows) + 1))
-    values = np.array([row_numbers(row, header, header[1:], at) for row, at in zip(rows[1:], places, strict=True)])
-    if values.size == 0:
-        refuse("no pose", file, "one row per pose", "empty")
-    names = tuple(row[0].strip() for row in rows[1:])
-    try:
-        first = 26 + width + shaft
-        v, shaft_mm = values[:, 26 : 26 + width] if width else None, values[:, first - 1] if shaft else None
-        q_probe, q_needle = None, None
-        if behind:
-            parts = np.split(values[:, first : first + 12], 2, axis=1)
-            q_probe, q_needle = (joint_readings(part, "deg", where="joints", names=names) for part in parts)
-        turn_probe, turn_needle = np.split(values[:, first + 12 :], 2, axis=1) if behind == 24 else (None, None)
-        A, B = (pose(part[:, :9].reshape(-1, 3, 3), part[:, 9:]) for part in (values[:, :12], values[:, 12:24]))
-        joints = (q_probe, q_needle, turn_probe, turn_needle)
-        return Recording(A, B, values[:, 24:26], v, names, pixels, *joints, shaft_mm)
+        recording = _recording(table, seen, case)
     except InputError as error:
         raise error.at(f"{file}: {error.where}") from error
+    warnings = () if seen is None else seen.warnings
+    return ReadRecording(recording, tuple(inputs), (*unfinished_warnings(content, file.name), *warnings))
+
+
+def _fits(found: frozenset[str]) -> bool:
+    """Whether columns belong together: poses or joints, and one of the three ways to say where the tip is."""
+    whole = all(need in found for group, need in NEEDS.items() if group in found)
+    return whole and bool(found & {"A", "q"}) and len(found & {"P_mm", "P_px", "picture"}) == 1
+
+
+class _Seen(NamedTuple):
+    """What pictures show of the needle; NaN in those without it."""
+
+    P: Floats
+    """Shape (n, 2), mm."""
+    v: Floats
+    """Shape (n, 2)."""
+    shaft_mm: Floats
+    """Shape (n,)."""
+    missed: tuple[str, ...]
+    """Why there is no needle; empty where there is one."""
+    warnings: tuple[str, ...]
+
+
+def _recording(table: GroupedTable, seen: _Seen | None, case: SelfcalCase | None) -> Recording:
+    """The recording of a table and its pictures, without the rows that show no needle."""
+    numbers, names = dict(table.numbers), pose_names(table.names, len(table.names))
+    if seen is not None:
+        numbers |= {"P_mm": seen.P, "v": seen.v, "shaft": seen.shaft_mm[:, None]}
+    joints: list[Floats | None] = [None, None]
+    if "q" in numbers:
+        both = np.split(numbers["q"], 2, axis=1)
+        joints = [joint_readings(part, "deg", where="joints", names=names) for part in both]
+    turns = np.split(numbers["turn"], 2, axis=1) if "turn" in numbers else [None, None]
+    poses = [poses_of(numbers[arm]) for arm in "AB" if arm in numbers]
+    if not poses and case is None:
+        refuse("joints alone", "header", "columns A_r11 .. B_z_mm, or a case that names the arms", "missing_column")
+    if not poses and case is not None:
+        poses = [flange_pose(model, q) for model, q in zip(case.models, joints, strict=True) if q is not None]
+    P = np.column_stack([numbers[key] for key in ("P_mm", "P_w", "P_px") if key in numbers])
+    v = np.column_stack([numbers[key] for key in ("v", "v_z") if key in numbers]) if "v" in numbers else None
+    kept = np.asarray(np.isfinite(P).all(axis=1))
+    if not kept.any():
+        refuse(f"none of {len(kept)} pictures shows a needle", "pictures", "pictures with a needle", "too_few_poses")
+    shaft = numbers["shaft"][:, 0] if "shaft" in numbers else None
+    optional = dict(zip(OPTIONAL, (v, shaft, *joints, *turns), strict=True))
+    parts: dict[str, Any] = {key: None if one is None else one[kept] for key, one in optional.items()}
+    parts["names"] = tuple(np.array(names)[kept].tolist())
+    parts["missed"] = () if seen is None else tuple(one for one in zip(names, seen.missed, strict=True) if one[1])
+    return Recording(poses[0][kept], poses[1][kept], P[kept], pixels="P_px" in numbers, **parts)
+
+
+def _seen(table: GroupedTable, file: Path, case: SelfcalCase | None, inputs: list[Input]) -> _Seen:
+    """The needle in every picture of a table, each file read once; the files join the inputs."""
+    n, files = len(table.names), table.texts["picture"]
+    frames = table.numbers["frame"][:, 0] if "frame" in table.numbers else np.ones(n)
+    pairs = list(zip(files, frames.tolist(), strict=True))
+    if len(set(pairs)) < n:
+        twice = next(pair for i, pair in enumerate(pairs) if pair in pairs[:i])
+        refuse(f"picture {twice[0]}, frame {twice[1]:g} twice", file, "each picture once", "duplicate_name")
+    P, v, shaft, missed = np.full((n, 2), np.nan), np.full((n, 2), np.nan), np.full(n, np.nan), [""] * n
+    coloured: dict[str, float] = {}
+    imager: Imager | None = None
+    by_file: dict[str, list[int]] = {}
+    for row, name in enumerate(files):
+        by_file.setdefault(name, []).append(row)
+    for name, rows in by_file.items():
+        path = file.parent / name
+        if Path(name).name != name:
+            refuse(f"picture {name[:100]!r}", file, "the name of a file beside it", "bad_value")
+        read = read_frames(path)
+        inputs.append(read.source)
+        for row in rows:
+            if frames[row] not in range(1, len(read.grey) + 1):
+                refuse(f"frame {frames[row]:g} of {path.name}", file, f"1 to {len(read.grey)}", "out_of_range")
+            size = _pixel_mm(table, row, read.pixel_mm, case, path)
+            shown = int(frames[row]) - 1
+            grey = _squared(read.grey[shown], size)
+            colour = None if read.coloured is None else np.argwhere(read.coloured[shown])[:, ::-1] * np.array(size)
+            if colour is not None and len(colour):
+                coloured[table.names[row]] = len(colour) / read.grey[shown].size
+            own = _imager(case, grey, min(size))
+            if imager is not None and own != imager:
+                what = f"{own.columns} x {own.rows} pixels of {own.pixel_mm:g} mm"
+                first = f"{imager.columns} x {imager.rows} of {imager.pixel_mm:g} mm, as {files[0]}"
+                refuse(what, path, first, "wrong_size")
+            imager, found = own, detect(grey, own)
+            if isinstance(found, Detection) and colour is not None and _covers(colour, found):
+                missed[row] = COVERED
+            elif isinstance(found, Detection):
+                P[row], v[row], shaft[row] = found.tip_image, found.direction_image, found.shaft_mm
+            else:
+                missed[row] = found.value
+    return _Seen(P, v, shaft, tuple(missed), _colour_warning(coloured))
+
+
+def _covers(colour: Floats, found: Detection) -> bool:
+    """Whether something coloured lies at the needle's tip; pixels (n, 2), mm."""
+    offset, (along_u, along_v) = colour - found.tip_image, found.direction_image
+    along, across = offset @ found.direction_image, offset @ np.array([-along_v, along_u])
+    return bool(np.any((np.abs(across) < RIDGE_MM) & (along > -SHAFT_MM) & (along < ENDS_AGREE_MM)))
+
+
+def _colour_warning(coloured: dict[str, float]) -> tuple[str, ...]:
+    """One line for all pictures in which something coloured was drawn."""
+    if not coloured:
+        return ()
+    most = max(coloured, key=lambda name: coloured[name])
+    covered = f"at most {100 * coloured[most]:.1f} % of one, {most}"
+    return (f"colour in {len(coloured)} pictures ({covered}): not searched for the needle",)
+
+
+def _pixel_mm(
+    table: GroupedTable, row: int, stated: tuple[float, float] | None, case: SelfcalCase | None, path: Path
+) -> tuple[float, float]:
+    """Width and height of a picture's pixel, mm, by its file, its row and the case, which must not differ."""
+    sizes = [] if stated is None else [stated]
+    if "pixel" in table.numbers:
+        sizes.append((float(table.numbers["pixel"][row, 0]),) * 2)
+    if case is not None and "pixel_mm" in case.content.image.model_fields_set:
+        sizes.append((case.content.image.pixel_mm,) * 2)
+    if not sizes:
+        allowed = "a column pixel_mm, [image] pixel_mm in a case, or DICOM that states it"
+        refuse("nothing states the size of its pixels", path, allowed, "pixel_size")
+    if not np.allclose(sizes, sizes[0], rtol=SAME_SIZE):
+        said = " and ".join(f"{width:g} x {height:g}" for width, height in sizes)
+        refuse(f"pixels of {said} mm", path, "one size in file, column pixel_mm and [image] pixel_mm", "pixel_size")
+    if not PIXEL_MM[0] <= min(sizes[0]) <= max(sizes[0]) <= PIXEL_MM[1]:
+        refuse(f"pixels of {sizes[0][0]:g} x {sizes[0][1]:g} mm", path, "{} to {} mm".format(*PIXEL_MM), "pixel_size")
+    return sizes[0]
+
+
+def _squared(grey: Pixels, size: tuple[float, float]) -> Pixels:
+    """A picture with square pixels of the smaller edge; the middle of the first one stays where it is."""
+    edge = min(size)
+    if max(size) <= edge * (1 + SAME_SIZE):
+        return grey
+    rows, columns = (int((n - 1) * mm / edge) + 1 for n, mm in zip(grey.shape, size[::-1], strict=True))
+    u, v = np.meshgrid(np.arange(columns) * edge / size[0], np.arange(rows) * edge / size[1])
+    sampled = cv2.remap(grey, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+    return np.asarray(sampled, dtype=np.uint8)
+
+
+def _imager(case: SelfcalCase | None, grey: Pixels, pixel_mm: float) -> Imager:
+    """The case's machine, or the usual one, with pictures of this size."""
+    own = Imager() if case is None else case.content.image.imager()
+    return replace(own, rows=grey.shape[0], columns=grey.shape[1], pixel_mm=pixel_mm)
 
 
 def write_recording(recording: Recording, path: Path) -> None:
@@ -91,38 +271,20 @@ def write_recording(recording: Recording, path: Path) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    seen = [part for part in (recording.v, recording.shaft_mm) if part is not None]
-    width = 0 if recording.v is None else recording.v.shape[1]
-    joints = [np.degrees(q) for q in (recording.q_probe, recording.q_needle) if q is not None]
-    turns = [turn for turn in (recording.turn_probe, recording.turn_needle) if turn is not None]
-    parts = [_row_major(recording.A), _row_major(recording.B), recording.P]
-    values = np.column_stack([*parts, *seen, *joints, *turns])
-    with atomic(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(
-            columns(recording.pixels, (width, int(recording.shaft_mm is not None)), 6 * len(joints + turns))
-        )
-        writer.writerows([name, *map(repr, row)] for name, row in zip(recording.names, values.tolist(), strict=True))
-
-
-def _row_major(T: Floats) -> Floats:
-    return np.column_stack([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]])
-
-
-def columns(pixels: bool, direction: tuple[int, int], behind: int) -> tuple[str, ...]:
-    """The header: columns of the direction and of its shaft's length, and of the joints and turns behind them."""
-    unit = "px" if pixels else "mm"
-    poses = [
-        [f"{arm}_r{i}{j}" for i in "123" for j in "123"] + [f"{arm}_{axis}_mm" for axis in "xyz"] for arm in ("A", "B")
-    ]
-    joints = [f"{arm}_q{i}_deg" for arm in "AB" for i in "123456"]
-    turns = [f"{arm}_turn{i}" for arm in "AB" for i in "123456"]
-    width, shaft = direction
-    seen = (f"P_u_{unit}", f"P_v_{unit}", *("v_x", "v_y", "v_z")[:width], *("shaft_mm",)[:shaft])
-    return ("name", *poses[0], *poses[1], *seen, *(joints + turns)[:behind])
-
-
-CHOICES = product((False, True), ((0, 0), (2, 0), (3, 0), (2, 1), (3, 1)), (0, 12, 24))
-
-KINDS = MappingProxyType({columns(*choice): choice for choice in CHOICES})
-"""Every header that is read: whether P is in pixels, columns of direction and shaft, and how many are behind them."""
+    parts = {"A": pose_values(recording.A), "B": pose_values(recording.B)}
+    parts["P_px" if recording.pixels else "P_mm"] = recording.P[:, :2]
+    parts["P_w"] = recording.P[:, 2:]
+    if recording.v is not None:
+        parts |= {"v": recording.v[:, :2], "v_z": recording.v[:, 2:]}
+    if recording.shaft_mm is not None:
+        parts["shaft"] = recording.shaft_mm[:, None]
+    if recording.q_probe is not None and recording.q_needle is not None:
+        parts["q"] = np.degrees(np.column_stack([recording.q_probe, recording.q_needle]))
+    if recording.turn_probe is not None and recording.turn_needle is not None:
+        parts["turn"] = np.column_stack([recording.turn_probe, recording.turn_needle])
+    groups = [group for group in GROUPS if group in parts and parts[group].size]
+    header = ("name", *(column for group in groups for column in GROUPS[group]))
+    values = np.column_stack([parts[group] for group in groups]).tolist()
+    rows = [(name, *row) for name, row in zip(recording.names, values, strict=True)]
+    with atomic(path) as temporary:
+        temporary.write_text(table_text(header, rows), encoding="utf-8")

@@ -22,10 +22,18 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 
 
-def calibrate_case(recording: Recording, case: SelfcalCase | None) -> Calibration:
-    """Calibrate with the case's noise and needle; pixels are solved for where the recording has them."""
+def held_length_mm(case: SelfcalCase | None) -> float | None:
+    """The needle's length where the case holds it."""
+    return case.content.needle.length_mm if case is not None and case.content.hold_needle_length else None
+
+
+def calibrate_case(recording: Recording, case: SelfcalCase | None, *, hold: bool = True) -> Calibration:
+    """Calibrate with the case's noise and, where it is to be held, the needle's length.
+
+    Pixels are solved for where the recording has them.
+    """
     noise = None if case is None or case.content.noise is None else case.content.noise.noise()
-    length = case.content.needle.length_mm if case is not None and case.content.hold_needle_length else None
+    length = held_length_mm(case) if hold else None
     arms = None if case is None or recording.q_probe is None else case.declared_arms
     return calibrate(recording, noise=noise, needle_length_mm=length, scale=recording.pixels, arms=arms)
 
@@ -47,20 +55,23 @@ LEAST_REACH_MM = 20.0
 ALLOWED = "A = T_base1_end1 and B = T_base2_end2 in mm, rotations by rows, P in mm"
 
 
-def checked_calibration(recording: Recording, case: SelfcalCase | None, where: Path) -> Calibration:
+def checked_calibration(
+    recording: Recording, case: SelfcalCase | None, where: Path, *, hold: bool = True
+) -> Calibration:
     """Calibration of a recording from outside; one that was read otherwise than meant is refused.
 
     Args:
         recording: As its file gives it.
         case: As `calibrate_case` takes it.
         where: Its file.
+        hold: Whether the needle's length is held where the case says so.
 
     Raises:
         InputError: Another reading fits and this one does not, or none does; or what `calibrate_case` refuses.
     """
     _check_reach(recording, where)
     try:
-        found = calibrate_case(recording, case)
+        found = calibrate_case(recording, case, hold=hold)
     except InputError as error:
         rms_mm = _residual_mm(lambda r: _read(r, r.A, r.B, r.P), recording)
         if rms_mm > SUSPECT_MM:
@@ -103,6 +114,13 @@ def _read(recording: Recording, A: Floats, B: Floats, P: Floats) -> Recording:
     return Recording(A, B, P, None, recording.names, recording.pixels)
 
 
+def _later(recording: Recording, rows: int) -> Recording:
+    """The poses with the tip of the row that follows so many rows later."""
+    first, last = (slice(0, -rows), slice(rows, None)) if rows > 0 else (slice(-rows, None), slice(0, rows))
+    names = recording.names[first]
+    return Recording(recording.A[first], recording.B[first], recording.P[last], None, names, recording.pixels)
+
+
 def _transposed(T: Floats) -> Floats:
     found = np.array(T)
     found[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
@@ -128,6 +146,9 @@ SLIPS: Mapping[str, Reading] = MappingProxyType(
         "A and B are in cm": lambda r: _read(r, _longer(r.A, 10), _longer(r.B, 10), r.P),
         "P is in metres": lambda r: _read(r, r.A, r.B, r.P * 1000),
         "P is in cm": lambda r: _read(r, r.A, r.B, r.P * 10),
+        "P_w has the other sign": lambda r: _read(r, r.A, r.B, r.P * np.array([1, 1, -1])[: r.P.shape[1]]),
+        "each picture belongs to the row before it": lambda r: _later(r, 1),
+        "each picture belongs to the row behind it": lambda r: _later(r, -1),
     }
 )
 """What people write instead of `ALLOWED`, in words, and how it is undone."""

@@ -51,7 +51,7 @@ def _run(
     as_json: JsonOption = False,
 ) -> None:
     """Run the cases that have no result yet. Finished cases are kept if the run is stopped."""
-    from puncture_twin.planning.batch.workers import Limits
+    from puncture_twin.planning.batch.run_case import Limits
     from puncture_twin.twin.jobs.batch.jobs import Where, run_part, run_summary
     from puncture_twin.twin.jobs.batch.report import run_text
 

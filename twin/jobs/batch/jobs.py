@@ -47,13 +47,13 @@ from puncture_twin.planning.batch.run import (
     Part,
     Request,
     RunCounts,
-    RunTasks,
     estimate,
+    on_scheduler,
     parse_part,
     run_cohort,
     slurm_part,
 )
-from puncture_twin.planning.batch.workers import Limits
+from puncture_twin.planning.batch.run_case import Limits
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.jobs.batch.report import write_cohort_page
@@ -68,8 +68,6 @@ class PlanRun:
     """A cohort's plan, and where it was written, if it was.
 
     Attributes:
-        cases: The plan's rows.
-        out: The cohort's folder.
         known: Cases that have a row there already.
         guess: How long the cohort will take; of a dry run alone.
     """
@@ -132,9 +130,7 @@ class Where:
     Attributes:
         part: As it was typed, or None.
         scheduler: Address of a Dask scheduler, or None for processes of this machine.
-        jobs: Processes of this machine.
         pages: Whether each case gets its page.
-        limits: Of each case.
     """
 
     part: str | None
@@ -153,7 +149,8 @@ def run_part(out: Path, where: Where, watcher: Watcher) -> RunCounts:
     part = _part(where.part, watcher)
     write_page = write_case_page if where.pages else None
     request = Request(part, where.jobs, where.limits, write_page)
-    return run_cohort(out, request, watcher, _elsewhere(where.scheduler))
+    elsewhere = None if where.scheduler is None else on_scheduler(where.scheduler)
+    return run_cohort(out, request, watcher, elsewhere)
 
 
 def _part(typed: str | None, watcher: Watcher) -> Part:
@@ -165,14 +162,6 @@ def _part(typed: str | None, watcher: Watcher) -> Part:
         return WHOLE
     watcher.note(f"part {part.text}, from SLURM's array ({TASK}={os.environ[TASK]}); --part i/n overrides it")
     return part
-
-
-def _elsewhere(scheduler: str | None) -> RunTasks | None:
-    if scheduler is None:
-        return None
-    from puncture_twin.planning.batch.run import on_scheduler
-
-    return on_scheduler(scheduler)
 
 
 def write_case_page(context: CaseContext, candidates: Candidates, folder: Path) -> None:
@@ -207,7 +196,6 @@ class Merged(Shown):
     """A merged cohort.
 
     Attributes:
-        rows: Of ``cases.parquet``.
         files: That were written; of the dataset its folder.
         changed: Cases that are not as they were expected; None where nothing was.
     """
@@ -267,10 +255,8 @@ def merge_cohort(out: Path, expect: Path | None, tolerance_mm: float, watcher: W
     """Write ``cases.parquet``, the dataset of candidates and the page.
 
     Args:
-        out: The cohort's folder.
         expect: An earlier ``cases.parquet``, or the folder of one, against which the verdicts are held.
         tolerance_mm: By so much a best clearance may differ from it.
-        watcher: Whoever shows progress.
 
     Raises:
         InputError: No plan, nothing that can be expected, or a folder that cannot be written to.

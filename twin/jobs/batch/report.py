@@ -170,9 +170,6 @@ def write_cohort_page(name: str, rows: Sequence[Row], inputs: Sequence[Input], p
     """Write the page: failures first, then distributions, then a sortable table.
 
     Args:
-        name: Of the cohort's folder.
-        rows: Of ``cases.parquet``.
-        inputs: What the table was made from.
         path: The HTML to write; it appears whole or not at all.
     """
     charts = tuple(histogram(found, said) for column, said in DISTRIBUTIONS if (found := _values(rows, column)))
@@ -234,7 +231,6 @@ def histogram(values: Sequence[float], text: str) -> Markup:
     """A picture of the count of cases over a number.
 
     Args:
-        values: At least one, finite.
         text: What it is, with its unit.
     """
     from matplotlib.ticker import MaxNLocator  # here: a cohort is searched without it

@@ -19,7 +19,7 @@ from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.text import Shown, plural
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.plan.recheck import check_plan
+from puncture_twin.planning.plan.plan_check import check_plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, explain_choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext, prepare
@@ -91,12 +91,7 @@ def compare_source(
     """Two plans, or two choices of a case: see the functions below.
 
     Args:
-        source: A plan, or a case.
-        other: The other plan.
-        case: Of two plans.
-        stated: What names choices, as `parse_two` takes it.
         arm: Whether the arm must reach a choice; None where the case says where its base is.
-        watcher: Is told how far the work is.
     """
     plans = two_plans(source, other, case, any(stated))
     if plans is None:
@@ -225,7 +220,6 @@ class Side:
     """One of two paths.
 
     Attributes:
-        title: How it was chosen.
         outward_ct: Shape (3,), unit.
         entry_ct: Shape (3,), mm; NaN without a skin entry.
         explained: Checked against its case; None of a plan alone.
@@ -273,8 +267,6 @@ class Comparison(Shown):
 
     Attributes:
         case_name: The case, or those that two plans name.
-        inputs: Every file that decided it.
-        warnings: Of the case.
     """
 
     case_name: str

@@ -107,7 +107,6 @@ class Outcome(NamedTuple):
         verdict: ``safe``, ``rejected``, or `REFUSED`.
         detail: Why it has no explanation.
         safe_directions: Of a target's search; None of an entry.
-        windows: The same.
     """
 
     explained: Explanation | None
@@ -122,12 +121,10 @@ class CheckedList:
     """All rows of a list.
 
     Attributes:
-        case_name: The case.
         arm: Whether the arm was checked: see `Candidates.arm_note`.
         inputs: The list, then what the case names.
         rows: In the order of the list, by `COLUMNS`.
         warnings: Of the list and of the case.
-        files: What was written.
     """
 
     case_name: str
@@ -177,7 +174,6 @@ def check_targets(context: CaseContext, listed: ReadList, aimed: Callable[[Liste
 
     Args:
         context: Of the case, for what does not depend on the target.
-        listed: The targets.
         aimed: The case with a row's point as its target, read anew.
     """
 
@@ -204,7 +200,7 @@ def write_checked(checked: CheckedList, context: CaseContext, out: Path) -> Chec
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        from puncture_twin.twin.jobs.patient.candidates_export import csv_text
+        from puncture_twin.twin.jobs.patient.export_jobs import csv_text
 
         rows = [[row[name] for name in COLUMNS] for row in checked.rows]
         paths[0].write_text(csv_text(COLUMNS, rows), encoding="utf-8", newline="")

@@ -47,7 +47,6 @@ class DrawnRuns:
     Attributes:
         alike_mm: The tip's rms error in the truths of the physical runs that ended, mm; NaN where none did.
         realised_mm: The same in all that were drawn.
-        draws: How many.
     """
 
     alike_mm: float
@@ -65,13 +64,7 @@ class DrawnRuns:
 
 
 def drawn_runs(context: CaseContext, tour: Tour, ended: Iterable[int]) -> DrawnRuns:
-    """Draw the truths of many seeds.
-
-    Args:
-        context: As of the physical runs.
-        tour: Theirs.
-        ended: Seeds of those that ended.
-    """
+    """Draw the truths of many seeds."""
     error_mm = {seed: _error_mm(context, tour, seed) for seed in range(DRAWS)}
     alike = [error_mm[seed] if seed in error_mm else _error_mm(context, tour, seed) for seed in ended]
     return DrawnRuns(_rms(alike), _rms(error_mm.values()), DRAWS)
@@ -96,11 +89,9 @@ class PhysicalRun:
     """One experiment.
 
     Attributes:
-        seed: Of its truth.
         tip_error_mm: The needle's tip from the true target; NaN where a touch or the puncture stopped.
-        fre_mm: Of its registration, likewise.
-        seconds_per_touch: Of the tour, home to home, likewise.
-        off_path_mm: Of the tip from its commanded path, at most while it went in, likewise.
+        seconds_per_touch: Of the tour, home to home; NaN likewise.
+        off_path_mm: Of the tip from its commanded path, at most while it went in; NaN likewise.
         refused: Why it stopped; empty where it did not.
     """
 
@@ -118,7 +109,6 @@ class PhysicalRuns:
 
     Attributes:
         expected_mm: The tip's rms error that the declaration predicts for these touches.
-        runs: One a seed.
         kept: So many were there already.
         drawn: Truths without physics, the same ones and many more.
     """
@@ -175,7 +165,6 @@ def physical_runs(context: CaseContext, out: Path, runs: int) -> PhysicalRuns:
     Args:
         context: Of a case with declared errors, markers and an arm.
         out: Holds the folder of the runs that are kept.
-        runs: How many.
 
     Raises:
         InputError: The case declares no errors, or has no markers.

@@ -27,8 +27,13 @@ from puncture_twin.planning.formats.points import (
     write_points,
 )
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.touch.pivot_planner import LEAST_POSES, MOST_POSES, plan_pivot
-from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers
+from puncture_twin.planning.touch.touch_planner import (
+    LEAST_POSES,
+    MOST_POSES,
+    TOUCHING_PADDING_MM,
+    approach_checkers,
+    plan_pivot,
+)
 from puncture_twin.planning.touch.tour_motions import TouchTour
 from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, arm_covariance, check_one_place, pivot_calibration
 from puncture_twin.twin.jobs.terminal import write_result
@@ -44,14 +49,7 @@ STANDS_OUT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class PivotRun:
-    """A calibrated tip beside the case's.
-
-    Attributes:
-        case: Whose arm and needle.
-        pivot: What was found.
-        names: Of its touches.
-        inputs: Every file that decided.
-    """
+    """A calibrated tip beside the case's."""
 
     case: Case
     pivot: Pivot
@@ -77,11 +75,7 @@ class PivotRun:
 
 
 def refuse_of_twin(*options: object) -> None:
-    """Refuse options of the twin beside touches that were read.
-
-    Raises:
-        InputError: One of them is stated.
-    """
+    """Refuse options of the twin beside touches that were read."""
     if any(option is not None for option in options):
         allowed = "JOINTS.csv, or the options of the twin"
         refuse("twin options with recorded touches", "pivot", allowed, "conflicting_options")
@@ -91,7 +85,6 @@ def pivot_case(case: Case, joints: Path) -> PivotRun:
     """Calibrate the tip from a list of touches of one place.
 
     Args:
-        case: For the arm and the declared errors.
         joints: CSV, a line a pose, with q1_deg to q6_deg alone or among other columns, as `pivot CASE` writes it.
 
     Raises:
@@ -107,11 +100,7 @@ def pivot_case(case: Case, joints: Path) -> PivotRun:
 
 
 def calibrated(case: Case, names: tuple[str, ...], q: Floats, *, where: str) -> Pivot:
-    """The tip from joints (n, 6), rad, that touched one place.
-
-    Raises:
-        InputError: As `pivot_case`.
-    """
+    """The tip from joints (n, 6), rad, that touched one place."""
     if case.errors is None:
         refuse("no noise is declared", case.path, "[errors] touch_mm", "no_noise")
     model, tip_mm = case.robot.model, case.needle.length_mm
@@ -164,11 +153,8 @@ class PivotTourRun:
 
     Attributes:
         found: The tip that its joints give.
-        seed: Of the truth.
         place_base: Shape (3,), mm: the place as it was planned.
         true_tip_flange: Shape (3,), mm.
-        touched: The readings.
-        files: Written.
     """
 
     found: PivotRun
@@ -217,10 +203,8 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
 
     Args:
         context: Of a case with declared errors and an arm.
-        out: The output folder.
         poses: How many, 4 to 12.
         place_base: Shape (3,), mm, where; None for a place that is found.
-        seed: Of the motions and of the truth.
 
     Raises:
         InputError: The case declares no errors or has no arm, or so many poses are not planned.

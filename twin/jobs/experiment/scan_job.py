@@ -60,10 +60,8 @@ class ScanRequest(NamedTuple):
     """What the user asks for.
 
     Attributes:
-        settings: How to scan.
         marker: What stands at the markers' places.
         rehearsal: Its needle is shown in a control CT.
-        beside: What lies beside the patient.
     """
 
     settings: ScanSettings
@@ -424,7 +422,6 @@ class Shown(NamedTuple):
         target: Shape (3,).
         markers: As they were found, or None.
         needle: As it was found, or None.
-        length_mm: Of the needle.
     """
 
     target: Floats

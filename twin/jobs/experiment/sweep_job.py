@@ -28,16 +28,7 @@ Angles = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class SweepRun:
-    """What was planned and what was measured.
-
-    Attributes:
-        case_name: The case.
-        inputs: Every file that decided.
-        control: How it was followed.
-        plan: The motion.
-        swept: The measurement.
-        files: Written.
-    """
+    """What was planned and what was measured."""
 
     case_name: str
     inputs: tuple[Input, ...]
@@ -75,9 +66,6 @@ def sweep_case(context: CaseContext, out: Path, choice: Choice, to: Angles | Non
     """Plan a sweep, execute it in the twin, write what was measured.
 
     Args:
-        context: Of a case with an arm.
-        out: The output folder.
-        choice: Where it starts.
         to: Theta and beta, rad, where it ends; None for the farthest direction of the start's window.
 
     Raises:
@@ -102,7 +90,6 @@ def sweep_end(source: Path, to: str | None, *, sweep: bool, alone: bool) -> Angl
     """Where a sweep shall end; None leaves it open.
 
     Args:
-        source: What is swept.
         to: "THETA,BETA" in degrees.
         sweep: Whether a sweep is wanted: without one nothing ends.
         alone: Whether nothing else is asked of the source.

@@ -75,13 +75,7 @@ class TouchRun(Shown):
     """What was planned, what was read, and what it is good for.
 
     Attributes:
-        case_name: The case.
-        inputs: Every file that decided.
-        seed: Of the truth.
-        plan: The tour.
-        touched: Its readings.
         use: What the readings are good for; in words why not, where they do not suffice for a registration.
-        files: Written.
     """
 
     case_name: str
@@ -138,9 +132,6 @@ def touch_case(context: CaseContext, out: Path, choice: Choice, seed: int) -> To
 
     Args:
         context: Of a case with declared errors, markers and an arm.
-        out: The output folder.
-        choice: Of the puncture that the touches are for.
-        seed: Of the motions and of the truth.
 
     Raises:
         InputError: The case declares no errors, or has no markers.
@@ -179,11 +170,7 @@ class TouchedOnce(NamedTuple):
 
 
 def plan_tour(context: CaseContext, choice: Choice, seed: int) -> Tour:
-    """Plan the touches for a chosen puncture.
-
-    Raises:
-        InputError, NoAnswerError: See `touch_case`.
-    """
+    """Plan the touches for a chosen puncture."""
     context.require_arm()
     q_insertion, outward_ct = _puncture(context, choice)
     with context.stages.time("touch plan"):

@@ -67,11 +67,8 @@ class AxpYbqRow:
     """One number beside the specified one.
 
     Attributes:
-        what: In words.
         known: What the specification has; None where it has none.
-        ours: Measured.
         limit: The most that is allowed, with what chance adds in few runs; None where nothing is demanded.
-        unit: Of all three.
     """
 
     what: str
@@ -112,7 +109,6 @@ def reproduce(out_dir: Path | None, seeds: int | None) -> AxpYbqTables:
     """Compute every number.
 
     Args:
-        out_dir: Not used: nothing is drawn.
         seeds: Number of runs; None takes 200, for which the limits are meant. With fewer they are wider.
     """
     del out_dir

@@ -126,7 +126,6 @@ def one_insertion(registration: Registration, target_ct: Floats, read_cov_ct: Fl
     """Within which of its true place a target is sent to in 95 of 100 registrations, its own reading in it.
 
     Args:
-        registration: Of the markers.
         target_ct: Shape (3,), mm.
         read_cov_ct: Of the target's reading, as declared; None where it is read as a marker is, in both lists.
     """

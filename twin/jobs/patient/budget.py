@@ -37,8 +37,6 @@ def budget_facts(
     """The budget of one insertion, mm; None where the arm reaches none, or no errors are declared.
 
     Args:
-        case: The case.
-        registration: Of its markers.
         skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
         anatomy: Its structures; called where they bend a needle alone.
         q_insertion: Shape (6,), rad, the tip on the target; None takes one that the arm reaches.
@@ -91,10 +89,7 @@ def needle_angles(case: Case, registration: Registration, q: Floats) -> dict[str
     """Of the direction from which the needle comes in a configuration (6,), rad."""
     outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(case.robot.model, q)[:3, 2])
     theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
-    return {
-        "theta_deg": float(np.degrees(theta)),
-        "beta_deg": float(np.degrees(beta)) if theta > POLE else 0.0,
-    }
+    return {"theta_deg": float(np.degrees(theta)), "beta_deg": float(np.degrees(beta)) if theta > POLE else 0.0}
 
 
 def _change(case: Case, one: Change) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
@@ -57,7 +58,12 @@ class InitRun:
             "sides": [side.document() for side in self.context.sides],
             "warnings": list(self.warnings),
             "findings": self.context.provenance()["findings"],
-            "inputs": inputs_document(self.context.case.inputs),
+            "inputs": inputs_document(
+                replace(one, path=CASE, sha256=hashlib.sha256(self.start.text.encode()).hexdigest())  # as it is written
+                if one.role == "case"
+                else one
+                for one in self.context.case.inputs
+            ),
             "files": [str(path) for path in (self.path, self.picture) if path is not None],
         }
 
@@ -66,9 +72,7 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
     """Make the case, read it as `search` does, and write it; what is wrong leaves nothing behind.
 
     Args:
-        request: What the user asks for.
         force: Whether a case that is there may be replaced.
-        watcher: Is told how far reading is.
 
     Raises:
         InputError: Everything that keeps the case from being searched, in one line.
@@ -98,8 +102,8 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
         found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
     picture = None if context.anatomy.scan is None else folder / SLICES
     if picture is not None:
+        from puncture_twin.twin.report.slices.panel import Subject
         from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet  # with matplotlib
-        from puncture_twin.twin.report.slices.subject import Subject
 
         write_sheet(draw_slices(Subject(context.case, context.anatomy, None)), picture)
     return InitRun(path, replace(start, text=text), context, (*start.notes, *found), picture)

@@ -113,10 +113,7 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
     """Plan, rehearse the plan, in many rooms too where a number is given, and write everything.
 
     Args:
-        context: The case.
-        out: The folder of the files.
         rooms: How many, beside the one that is filmed.
-        choice: What is planned.
 
     Raises:
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
@@ -223,8 +220,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     Raises:
         InputError: A plan that does not belong to the case or does not hold any more.
     """
-    from puncture_twin.planning.plan.plan_check import with_case_arm
-    from puncture_twin.planning.plan.recheck import check_plan
+    from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
@@ -268,7 +264,7 @@ def export(
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
     from puncture_twin.planning.export.exporter import export_name, export_plan
-    from puncture_twin.planning.plan.recheck import check_plan
+    from puncture_twin.planning.plan.plan_check import check_plan
 
     source, plan = read_noted_plan(plan_path, note)
     if context is not None:
@@ -342,9 +338,7 @@ def case_of(source: Path, case: Path | None, choice: Choice) -> Path | None:
     """The case of a command: its source, or what is named beside a plan; None of a plan without its case.
 
     Args:
-        source: A case, or a plan.
         case: The option ``--case``.
-        choice: Which candidate is wanted.
 
     Raises:
         InputError: A plan with a choice, since it has its direction, or two cases.

@@ -26,8 +26,8 @@ from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Shown, Uncertainty, write_page
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
+from puncture_twin.twin.report.slices.panel import Subject
 from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
-from puncture_twin.twin.report.slices.subject import Subject
 
 
 class Drawn(NamedTuple):
@@ -49,7 +49,7 @@ def draw_pictures(run: Run, out: Path) -> Drawn:
     case, anatomy, stages = context.case, context.anatomy, context.stages
     with stages.time("map"):
         raster = map_raster(found, map_view(case, found))
-        draw_map(found, case, out / "map.png", run.pick, raster)
+        draw_map(found, case, out / "map.png", run.pick, raster, anatomy.scan)
     with stages.time("scene"):
         T_base_ct = _checked_base(run)
         draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick, T_base_ct, failed=bool(run.refusal))

@@ -61,7 +61,6 @@ class _Clock:
     """Whether the search goes on, and for how long still.
 
     Args:
-        context: Whose watcher is told.
         end: `time.perf_counter` then; infinite for a search to its end.
     """
 
@@ -98,8 +97,6 @@ def place_case(
 
     Args:
         context: The case, whose own arm need not be checked.
-        out: The folder.
-        jobs: Processes.
         pictures: Whether to draw.
         quick_s: End after about so many seconds, with what is known then; None searches to the end.
         began: `time.perf_counter` from which they count; now, if None.
@@ -129,14 +126,14 @@ def place_case(
 
 
 def refuse_none(found: PlaceSearch) -> None:
-    """Refuse a search in which no placement reaches a direction: its best is none.
-
-    Raises:
-        NoAnswerError: Says how much was checked.
-    """
+    """Refuse a search in which no placement reaches a direction: its best is none."""
     if not any(one.verdict.reached for one in found.rated):
         what = f"the arm reaches no organ-safe direction from any placement ({plural(found.checked[0], 'check')})"
-        what += "" if found.complete else ", as far as was searched; --full searches to the end"
+        what += (
+            ""
+            if found.complete
+            else ", as far as was searched; to search to the end: --full, or quick_s=None in Python"
+        )
         raise NoAnswerError(what, code="no_placement")
 
 
@@ -152,7 +149,6 @@ def find_places(context: CaseContext, jobs: int, until: float = np.inf) -> Place
 
     Args:
         context: The case, whose own arm need not be checked.
-        jobs: Processes.
         until: `time.perf_counter` at which it ends with what is known then; infinite for a search to its end.
 
     Raises:
@@ -197,7 +193,8 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: f
 
         with stages.time("map"):
             reached = ranked(case, with_answers(case, candidates, best.answers))
-            draw_map(reached, replace(case, name=f"{case.name}, arm at the best place"), out / "map_best_place.png")
+            shown = replace(case, name=f"{case.name}, arm at the best place")
+            draw_map(reached, shown, out / "map_best_place.png", scan=context.anatomy.scan)
             files.append(out / "map_best_place.png")
     return PlaceRun(context, found, document, tuple(files))
 

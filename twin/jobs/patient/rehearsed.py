@@ -63,11 +63,7 @@ def _execute(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
 
 
 def rehearse_once(context: CaseContext, plan: Plan, rooms: RoomCount | None, seed: int | None) -> Rehearsal:
-    """A plan executed where the truth differs: the drawn one, or the median one of many rooms.
-
-    Raises:
-        InputError: See `plan_truth`, `in_rooms`.
-    """
+    """A plan executed where the truth differs: the drawn one, or the median one of many rooms."""
     found = None if rooms is None else in_rooms(context, plan, rooms, seed)
     truth = plan_truth(context, plan, seed) if found is None else median_truth(found)
     scale = error_scale(context, plan.insertion.q[-1], found)
@@ -95,12 +91,8 @@ class PendingRehearsal:
         """The run with what was measured and the film, once they are there; the numbers and the rooms are written.
 
         Args:
-            out: The folder of the files.
             with_page: Adds the page that shows them all to a run; while the film is made, which has the usual name
                 but where no encoder can be started.
-
-        Raises:
-            InputError: See `rehearse`.
         """
         shown, run, time = self._rooms_drawn(out), self.run, self.run.context.stages.time
         with time("rehearsal"):
@@ -133,12 +125,7 @@ class PendingRehearsal:
 
 
 def begin_rehearsal(run: Run, rooms: RoomCount | None, begin: Begin) -> PendingRehearsal:
-    """Have the run's plan executed where the truth differs, of many rooms in the median one.
-
-    Raises:
-        InputError: See `plan_truth`.
-        NoAnswerError: See `plan_truth`.
-    """
+    """Have the run's plan executed where the truth differs, of many rooms in the median one."""
     assert run.plan is not None
     context, plan = run.context, run.plan
     run = run if rooms is None else replace(run, distribution=in_rooms(context, plan, rooms))

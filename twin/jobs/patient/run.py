@@ -182,7 +182,9 @@ class Run:
             Section(f"case {self.context.case.name}: {found.windows.headline}", []),
             Section(f"{plural(len(found), 'direction')}{looked}", patient.counts(found)),
             *(Section(one, []) for one in warned),
-            Section("the best of each window", patient.windows(found)) if found.safe.any() else self._nothing_safe(),
+            Section("the best of each window", patient.windows(found, self.context.anatomy.scan))
+            if found.safe.any()
+            else self._nothing_safe(),
         ]
 
     def _nothing_safe(self) -> Section:

@@ -155,8 +155,6 @@ def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -
     """What a receiver reads, every so often; nothing twice. Time and angles may be one package (8 ms) apart.
 
     Args:
-        receiver: A running arm.
-        period_s: Between two readings.
         seconds: How long, by the robot's clock; None for ever.
 
     Raises:
@@ -233,10 +231,6 @@ def readings_of(
     """The readings of a running arm, or of a recording.
 
     Args:
-        host: Address of the arm.
-        recording: The file, in its place.
-        case: Whose patient the arm stands at.
-        period_s: Of the running arm's readings.
         seconds: How long it is read; None until it is interrupted.
 
     Raises:

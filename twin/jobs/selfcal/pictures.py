@@ -31,7 +31,7 @@ from puncture_twin.twin.report.figures import cross, figure_of, ring, write_png
 from puncture_twin.twin.report.raster.camera import camera_around
 from puncture_twin.twin.report.raster.compositing import compose
 from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, shells_of
-from puncture_twin.twin.report.scene.shapes import bar
+from puncture_twin.twin.report.scene.scene_parts import bar
 
 PX_PER_MM = 8
 """Of the sheet."""

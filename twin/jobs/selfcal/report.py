@@ -1,8 +1,9 @@
-"""What ``selfcal`` found: plain values for ``--json``, and the sections that the terminal and ``report.html`` show."""
+"""The command ``selfcal``: run, then every file that shows what was found, and the sections of terminal and page."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -11,11 +12,26 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from puncture_twin.planning.base.errors import PlanningError, refuse
+from puncture_twin.planning.base.files import new_folder
+from puncture_twin.planning.base.output.output_set import withdraw, writing
+from puncture_twin.planning.base.output.publish import Draft
+from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.twin.guidance.ultrasound.acquisition import keep_pictures
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.summaries import calibration_summary, choice_summary
-from puncture_twin.twin.jobs.selfcal.selfcal import SelfcalRun
+from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME, write_recording
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
+from puncture_twin.twin.jobs.selfcal.pictures import detection_sheet, workcell_picture
+from puncture_twin.twin.jobs.selfcal.selfcal import (
+    SelfcalRun,
+    calibration_summary,
+    choice_summary,
+    selfcal_recording,
+    selfcal_twin,
+)
+from puncture_twin.twin.jobs.terminal import write_json
 from puncture_twin.twin.rehearsal.selfcal_trial import Puncture, puncture_summary, trial_summary
 from puncture_twin.twin.report.figures import png
 from puncture_twin.twin.report.page.template import Card
@@ -66,6 +82,103 @@ NOISE_TEXT = MappingProxyType(
 HELD_OUT = "Held-out: predicted minus true tip at poses that were not recorded, with the remaining errors of the arms."
 
 
+COMMAND = "selfcal"
+ANSWERS = ("calibration.json", "report.html")
+PICTURES = ("bmode.png", "room.png")
+
+VERSION = 2
+"""Of ``calibration.json``. 2: ``inputs`` lists each file with its role."""
+
+
+def run_selfcal(
+    case_path: Path | None,
+    recording: Path | None,
+    seeds: int,
+    out: Path,
+    watcher: Watcher,
+    record: Path | None = None,
+    shots: Path | None = None,
+) -> SelfcalRun:
+    """Simulate a case, or calibrate a recording, and write everything into a folder.
+
+    Args:
+        case_path: The case, or its folder; None only beside a recording.
+        recording: A recording's CSV or folder; None to simulate.
+        seeds: Rooms that are drawn, from the case's seed on.
+        out: Where files go.
+        watcher: Shows progress.
+        record: A folder that is not there yet, for the first seed's pictures and joints; None for none.
+        shots: A recording of what was seen after ``recording``; None for none.
+
+    Raises:
+        InputError: Something that cannot be used, or poses that cannot show every unknown.
+        NoAnswerError: Not enough poses can be taken or show the needle.
+    """
+    if (recording is not None and record is not None) or (recording is None and shots is not None):
+        allowed = "--record without --recording, and --shots with it"
+        refuse("--record or --shots", "selfcal", allowed, "conflicting_options")
+    case = None if case_path is None else load_selfcal_case(case_path)
+    names = ANSWERS if recording is not None else (*ANSWERS, *PICTURES, FILE_NAME)
+    try:
+        with new_folder(record) as kept, writing(out, COMMAND, names=names, note=watcher.note) as draft:
+            if recording is not None:
+                run = _calibrated(case, recording, shots, draft)
+            else:
+                assert case is not None  # the command line gives one of the two
+                run = _simulated(case, seeds, draft, watcher)
+                if kept is not None:
+                    keep_pictures(run.trials[0].acquisition, case.content.image.pixel_mm, kept)
+            draft.inputs, draft.seconds = run.inputs, run.stages.seconds
+    except PlanningError:
+        withdraw(out, COMMAND, keep=(FILE_NAME,))
+        raise
+    return replace(run, files=draft.final(run.files))
+
+
+def _calibrated(case: SelfcalCase | None, recording: Path, shots: Path | None, draft: Draft) -> SelfcalRun:
+    """Calibrate a recording. One that an earlier run wrote into the folder stays there: it may be this one."""
+    run = write_run(selfcal_recording(recording, case, shots), draft.folder)
+    draft.keep(FILE_NAME)
+    return run.with_files(write_page(run, None, None, draft.folder / "report.html"))
+
+
+def _simulated(case: SelfcalCase, seeds: int, draft: Draft, watcher: Watcher) -> SelfcalRun:
+    """Run the twin, and draw what it saw."""
+    run = write_run(selfcal_twin(case, seeds, watcher), draft.folder)
+    with run.stages.time("pictures"):
+        trial = run.trials[0]
+        sheet = detection_sheet(case, trial, draft.folder / "bmode.png")
+        shot = trial.acquisition.shots[0]
+        picture = workcell_picture(case, shot.q_probe, shot.q_needle, draft.folder / "room.png")
+    return run.with_files(sheet, picture, write_page(run, sheet, picture, draft.folder / "report.html"))
+
+
+def write_run(run: SelfcalRun, out: Path) -> SelfcalRun:
+    """Write ``calibration.json`` and, in the twin, the first seed's ``recording.csv``."""
+    written = [write_json(calibration_file(run), out / "calibration.json")]
+    if run.trials:
+        write_recording(run.recording, out / FILE_NAME)
+        written.append(out / FILE_NAME)
+    return run.with_files(*written)
+
+
+def calibration_file(run: SelfcalRun) -> dict[str, Any]:
+    """What ``calibration.json`` holds."""
+    found = run.calibration
+    return {
+        "version": VERSION,
+        "name": run.name,
+        "seed": run.trials[0].seed if run.trials else None,
+        "inputs": inputs_document(run.inputs),
+        **calibration_summary(found, run.recording),
+        "residuals_mm": dict(zip(run.recording.names, found.residuals.tolist(), strict=True)),
+        "parameters": list(found.parameters),
+        "covariance": found.covariance_counts.tolist(),
+        "region_limit_95": found.region_limit(),
+        "shots": [shot._asdict() for shot in run.shots],
+    }
+
+
 def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
     """Poses, calibration, trials, punctures, and what was written."""
     return {
@@ -74,6 +187,7 @@ def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
         "inputs": inputs_document(run.inputs),
         "candidates": None if run.candidates is None else run.candidates.counts,
         "choice": None if run.choice is None else choice_summary(run.choice),
+        "shots": [shot._asdict() for shot in run.shots],
         "trials": [trial_summary(trial) for trial in run.trials],
         "punctures": puncture_summary(run.punctures),
         "seconds": {stage: round(seconds, 3) for stage, seconds in run.stages.seconds.items()},
@@ -123,6 +237,9 @@ def sections(found: Facts) -> list[Section]:
         Section("what the data cannot determine", [Warn(tuple(found["cannot_show"]))]),
         Section("calibration", [facts_table([*CALIBRATION, *_if_known(found)], found)]),
     ]
+    if found["shots"]:
+        words = "Each updated the calibration where it fits; residuals above are those of the recording."
+        shown.append(Section("shots after the recording", [words, grid(SHOT, found["shots"])]))
     if found["trials"]:
         shown += [
             Section("insertions to targets in the image", _punctures(found)),
@@ -135,6 +252,7 @@ def sections(found: Facts) -> list[Section]:
 CALIBRATION = (
     Field("poses used", lambda one: f"{one['poses'] - len(one['set_aside'])} of {one['poses']}"),
     Field("set aside", lambda one: ", ".join(one["set_aside"]) or "none"),
+    Field("pictures without a needle", lambda one: named(one["without_needle"])),
     Field("residuals, rms", "residual_rms_mm", 3, "mm"),
     Field("expected tip error, rms", lambda one: f"{one['predicted_tre_mm']:.3f} mm, {counted(one)}"),
     Field("tip in the needle's flange frame", lambda one: vector(one["tip_end2_mm"], 3, "mm")),
@@ -155,6 +273,12 @@ TRIAL = (
     Field("not used", lambda one: "; ".join(f"{count} {why}" for why, count in one["missed"].items()) or "none"),
     Field("set aside", lambda one: ", ".join(one["set_aside"]) or "none"),
 )
+SHOT = (
+    Field("shot", "name"),
+    Field("χ²", "chi_squared", 1),
+    Field("fits below", "limit", 1),
+    Field("", lambda one: "used" if one["used"] else "does not fit: left out"),
+)
 PUNCTURES = (
     Field("targets", "targets"),
     Field("true tip to true target, rms", "error_rms_mm", 2, "mm"),
@@ -166,6 +290,11 @@ PUNCTURES = (
     Field("expected (rms): calibration and arms", "predicted_rms_mm", 2, "mm"),
     Field("expected (rms): with the target's reading", "predicted_with_reading_rms_mm", 2, "mm"),
 )
+
+
+def named(some: Facts) -> str:
+    """How many, and which."""
+    return f"{len(some)}: {', '.join(some)}" if some else "none"
 
 
 def counted(found: Facts) -> str:

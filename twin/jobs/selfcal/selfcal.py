@@ -4,28 +4,45 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.files import read_input, unfinished_warnings
 from puncture_twin.planning.base.progress import Stages, Watcher
-from puncture_twin.planning.base.provenance import Input, content_input
+from puncture_twin.planning.base.provenance import Input
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, choice_noise
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import Shot, ShotByShot
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, drawing, expected_tre_mm, find_candidates
-from puncture_twin.twin.guidance.ultrasound.recording_file import MAX_BYTES, parse_recording, recording_file
+from puncture_twin.twin.guidance.ultrasound.puncture import predicted_tre
+from puncture_twin.twin.guidance.ultrasound.recording_file import open_recording, recording_file
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
-from puncture_twin.twin.guidance.ultrasound.summaries import Choice
+from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration, held_length_mm
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 from puncture_twin.twin.rehearsal.selfcal_trial import Puncture, SelfcalTrial, run_trial
 
 NO_JOINTS = "{file}: no joints (columns A_q1_deg to B_q6_deg): the declared arm errors of the case are not counted"
 
+MOST_MISSED = "{file}: no needle in {missed} pictures, and one in {shown}: is the display that of the case's machine?"
+
 RANDOM_SETS = 50
 """Random choices that the informative one is compared with."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Gain by choosing poses, as the Cramer-Rao bound over all candidates, mm."""
+
+    chosen_mm: float
+    random_mm: tuple[float, ...]
+    """Bounds of random choices of as many poses."""
+
+    @property
+    def median_random_mm(self) -> float:
+        """Median of the random ones."""
+        return float(np.median(self.random_mm))
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +61,7 @@ class SelfcalRun:
         stages: Seconds.
         files: What was written.
         warnings: What the recording leaves open, one sentence each.
+        shots: What came of each shot after the recording.
     """
 
     name: str
@@ -57,6 +75,7 @@ class SelfcalRun:
     stages: Stages = field(default_factory=Stages)
     files: tuple[Path, ...] = ()
     warnings: tuple[str, ...] = ()
+    shots: tuple[Shot, ...] = ()
 
     @property
     def punctures(self) -> tuple[Puncture, ...]:
@@ -100,8 +119,13 @@ def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
     )
 
 
-def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
+def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None = None) -> SelfcalRun:
     """Calibrate from a recording's CSV, or a folder with ``recording.csv``; a case says noise and needle length.
+
+    Args:
+        path: The recording.
+        case: What it was recorded with.
+        shots: A recording of what was seen afterwards: each of its poses updates the calibration; None for none.
 
     Raises:
         InputError: A recording that cannot be used, or that fits only in another reading (inverse, swapped, metres).
@@ -110,15 +134,27 @@ def selfcal_recording(path: Path, case: SelfcalCase | None) -> SelfcalRun:
     file = recording_file(path)
     stages = Stages()
     with stages.time("read"):
-        content = read_input(file, max_bytes=MAX_BYTES, where=str(file))
-        recording = parse_recording(content, file)
+        recording, inputs, warnings = open_recording(path, case)
     with stages.time("calibrate"):
-        calibration = checked_calibration(recording, case, file)
-    inputs = (content_input("recording", file.name, content), *(() if case is None else case.inputs))
-    warnings = (*unfinished_warnings(content, file.name), *calibration.warnings())
+        calibration = checked_calibration(recording, case, file, hold=shots is None)
+    tried: tuple[Shot, ...] = ()
+    if shots is not None:
+        with stages.time("shots"):
+            following = ShotByShot.of(calibration)
+            more, files, notes = open_recording(shots, case)
+            for row in range(len(more)):
+                following = following.with_shot(more.subset(slice(row, row + 1)))
+            calibration = following.calibration(needle_length_mm=held_length_mm(case))
+        tried, inputs, warnings = following.shots, (*inputs, *files), (*warnings, *notes)
+    inputs = (*inputs, *(() if case is None else case.inputs))
+    warnings = (*warnings, *calibration.warnings())
+    if len(recording.missed) > len(recording):
+        warnings += (MOST_MISSED.format(file=file.name, missed=len(recording.missed), shown=len(recording)),)
     if case is not None and calibration.arms is None:
         warnings += (NO_JOINTS.format(file=file.name),)
-    return SelfcalRun(file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings)
+    return SelfcalRun(
+        file.stem, calibration, recording, inputs, case=case, stages=stages, warnings=warnings, shots=tried
+    )
 
 
 def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisition) -> Choice:
@@ -132,3 +168,66 @@ def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisi
 
     sets = [rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS)]
     return Choice(expected(rows), tuple(expected(some) for some in sets))
+
+
+def calibration_summary(found: Calibration, recording: Recording) -> dict[str, Any]:
+    """A calibration's main values, mm and degrees."""
+    return {
+        "T_end1_image": found.X.tolist(),
+        "T_base1_base2": found.Y.tolist(),
+        "tip_end2_mm": found.tip_end2.tolist(),
+        "needle_direction_end2": found.needle_direction_end2.tolist(),
+        "scale_mm": found.scale.tolist() if recording.pixels else None,
+        "poses": len(recording),
+        "residual_rms_mm": found.rms_mm,
+        "set_aside": list(found.outliers),
+        "without_needle": dict(recording.missed),
+        "findings": [one.document() for one in found.findings],
+        "iterations": found.iterations,
+        "condition": found.condition,
+        "noise": noise_summary(found),
+        "predicted_tre_mm": predicted_tre(found, recording),
+        "tip_bias_mm": found.tip_bias_mm,
+        "arms": arms_summary(found),
+        "cannot_show": list(found.cannot_show),
+    }
+
+
+def noise_summary(found: Calibration) -> dict[str, float]:
+    """The stated noise, or the estimated spread."""
+    if isinstance(found.noise, Noise):
+        stated = found.noise
+        return {
+            "robot_mm": stated.robot_mm,
+            "robot_deg": float(np.degrees(stated.robot_rad)),
+            "image_mm": stated.image_mm,
+            "direction_deg": float(np.degrees(stated.direction_rad)),
+            "off_plane_mm": stated.off_plane_mm,
+        }
+    spread = found.noise
+    return {
+        "inside_image_mm": spread.inside_mm,
+        "across_image_mm": spread.across_mm,
+        "direction_deg": float(np.degrees(spread.direction_rad)),
+    }
+
+
+def arms_summary(found: Calibration) -> dict[str, Any] | None:
+    """Estimated errors of the declared arms, and whether the residuals agree; None where none were declared."""
+    if found.arms is None:
+        return None
+    return {
+        "found_sd": found.arm_errors.tolist(),
+        "chi2_per_freedom": found.chi_squared_ratio,
+        "chi2_chance": found.chi_squared_chance(),
+    }
+
+
+def choice_summary(choice: Choice) -> dict[str, Any]:
+    """The bounds of a choice, mm."""
+    return {
+        "chosen_bound_mm": choice.chosen_mm,
+        "random_bound_median_mm": choice.median_random_mm,
+        "random_bound_best_mm": min(choice.random_mm),
+        "random_sets": len(choice.random_mm),
+    }

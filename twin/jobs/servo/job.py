@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.base.files import check_writable
+from puncture_twin.planning.base.files import new_folder
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.twin.guidance.stereo.detection import image_detector
@@ -78,25 +76,6 @@ def run_servo(
         written = _files(case, result.first, facts, draft.folder)
     facts["files"] = [str(path) for path in draft.final(written)]
     return ServoJob(result.ours.not_confirmed == 0.0 and result.ours.refused == 0, facts, servo_text(facts))
-
-
-@contextmanager
-def new_folder(path: Path | None) -> Iterator[Path | None]:
-    """A folder that appears whole or not at all; None for none.
-
-    Raises:
-        InputError: Something is there already, or it cannot be made.
-    """
-    if path is None:
-        yield None
-        return
-    if path.exists():
-        refuse("is there already", path, "a new folder", "output_exists")
-    with tempfile.TemporaryDirectory(dir=check_writable(path.parent), prefix=".") as beside:
-        kept = Path(beside) / path.name
-        kept.mkdir()
-        yield kept
-        kept.replace(path)
 
 
 def refuse_with_recording(out_dir: Path | None, record: Path | None, seeds: int) -> None:

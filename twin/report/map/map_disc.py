@@ -63,10 +63,6 @@ def draw_disc(axes: Axes, candidates: Candidates, view: MapView, raster: MapRast
 
     Args:
         axes: A square of 2 `RADIUS` pixels.
-        candidates: The grid, checked.
-        view: The map's geometry.
-        raster: Its pixels.
-        pick: The direction that gets the star.
     """
     axes.set_axis_off()
     axes.set(xlim=(-1, 1), ylim=(-1, 1), autoscale_on=False)
@@ -179,7 +175,6 @@ def chance_raster(candidates: Candidates, rows: NDArray[np.int64]) -> NDArray[np
     """The chance under each pixel, smoothed within the region that has chances; NaN elsewhere; None without any.
 
     Args:
-        candidates: The grid.
         rows: Shape (n, n), the candidate under each pixel, -1 outside.
     """
     chance = touch_nothing(candidates)
@@ -225,7 +220,6 @@ def region_codes(verdict: Verdict, rows: Ints) -> tuple[NDArray[np.int64], list[
     """Index, for each pixel, of the name that is written over it, in a list whose first name is empty.
 
     Args:
-        verdict: Of every direction.
         rows: Shape (n, n), the candidate under each pixel, -1 outside.
     """
     written = _region_names(verdict)

@@ -49,6 +49,7 @@ from puncture_twin.twin.report.map_view import BEYOND, MapView, map_view, step_o
 from puncture_twin.twin.report.numbers import (
     ReasonCount,
     arm_text,
+    length_text,
     nearest_text,
     needle_text,
     reason_counts,
@@ -70,28 +71,39 @@ SMALL = 9.5
 
 
 def draw_map(
-    candidates: Candidates, case: Any, path: Path, pick: Pick | None = None, raster: MapRaster | None = None
+    candidates: Candidates,
+    case: Any,
+    path: Path,
+    pick: Pick | None = None,
+    raster: MapRaster | None = None,
+    scan: Any | None = None,
 ) -> None:
     """Write the map of a search.
 
     Args:
-        candidates: The grid, checked.
         case: The case: ``name``, ``space``, ``T_ct_entry``, ``needle``, ``target_name``.
         path: The PNG to write; it appears whole or not at all.
         pick: The planned candidate, or the one to be shown; None shows the best.
         raster: The map's pixels where somebody has them already.
+        scan: The CT, whose voxels say how many digits a length has; None for meshes alone.
     """
-    write_png(map_figure(candidates, case, pick, raster), path)
+    write_png(map_figure(candidates, case, pick, raster, scan), path)
 
 
-def map_figure(candidates: Candidates, case: Any, pick: Pick | None = None, raster: MapRaster | None = None) -> Figure:
+def map_figure(
+    candidates: Candidates,
+    case: Any,
+    pick: Pick | None = None,
+    raster: MapRaster | None = None,
+    scan: Any | None = None,
+) -> Figure:
     """The map, arguments as of `draw_map`; the disc is the first of its axes, the column the second."""
     pick = pick or candidates.best
     view = map_view(case, candidates)
     figure = figure_of(WIDTH, HEIGHT, dpi=DPI)
     raster = map_raster(candidates, view) if raster is None else raster
     draw_disc(figure.add_axes(DISC), candidates, view, raster, pick)
-    _column(figure.add_axes(SIDE), candidates, view, pick)
+    _column(figure.add_axes(SIDE), candidates, view, pick, scan)
     title = f"{case.name}: entry directions to {target_text(case)}"
     figure.text(0.02, 0.955, title, fontsize=19, weight="bold")
     line = f"{plural(len(candidates), 'direction')}, step {np.degrees(step_of(candidates)):g}°;  {needle_text(case)}"
@@ -102,7 +114,7 @@ def map_figure(candidates: Candidates, case: Any, pick: Pick | None = None, rast
     return figure
 
 
-def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None) -> None:
+def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None, scan: Any | None) -> None:
     """What the colours and marks mean, the chosen direction, and how to read the map; y 0..1 runs downwards."""
     axes.set_axis_off()
     axes.set(xlim=(0, 1), ylim=(1, 0), autoscale_on=False)
@@ -110,7 +122,7 @@ def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None
     y = _scale(axes, candidates, y + 0.01)
     y = _chance_legend(axes, candidates, y)
     y = _mark_legend(axes, candidates, view, y + 0.05)
-    _chosen(axes, candidates, pick, y + 0.04)
+    _chosen(axes, candidates, pick, y + 0.04, scan)
     whole = candidates.grid is None or (candidates.grid.full_circle and candidates.theta.min() < step_of(candidates))
     outside = "" if whole else f"White with lines: {NOT_SEARCHED_TEXT}.\n"
     toward = f"Centre (+), θ = 0: {view.centre}.\n" if view.centre else ""
@@ -258,7 +270,7 @@ def _mark_legend(axes: Axes, candidates: Candidates, view: MapView, y: float) ->
     return y
 
 
-def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float) -> None:
+def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float, scan: Any | None) -> None:
     """The chosen direction in a box; or, in a box of warning, that there is none."""
     box = {"boxstyle": "round,pad=0.45", "facecolor": "#eef7f2", "edgecolor": "#00684a"}
     look: dict[str, Any] = {"fontsize": 10, "linespacing": 1.4, "va": "top", "bbox": box}
@@ -272,9 +284,9 @@ def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float) -> 
         theta, beta = np.degrees(found.theta[row]), np.degrees(found.beta[row])
         text = (
             f"{word}: θ {theta:.4g}°, β {beta:.4g}°{_chances(found, row)}\n"
-            f"path in the body {number(found.path.length[row], 1, 'mm')}, "
+            f"path in the body {length_text(float(found.path.length[row]), scan)}, "
             f"skin angle {number(float(np.degrees(found.path.skin_angle[row])), 0)}°\n"
-            f"{nearest_text(found, row)}"
+            f"{nearest_text(found, row, scan)}"
         )
     axes.text(0.017, y + 0.008, text, **look)
 

@@ -52,7 +52,6 @@ class ClearanceScale(NamedTuple):
     """The clearances that the shades of safe stand for, mm.
 
     Attributes:
-        low: Of the lightest shade.
         high: Of the darkest; infinite, as ``low`` is, where no structure has a margin.
     """
 
@@ -94,13 +93,7 @@ def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
 
 
 def map_raster(candidates: Candidates, view: MapView, size: int = PIXELS) -> MapRaster:
-    """Draw the cap.
-
-    Args:
-        candidates: The grid's rows.
-        view: The map's geometry.
-        size: Pixels per side.
-    """
+    """Draw the cap."""
     rows = MapCells.of(candidates).picture(view, size)
     table = np.zeros((len(candidates) + 1, 4), dtype=np.uint8)
     table[:-1, :3] = row_colours(candidates)

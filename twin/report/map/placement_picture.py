@@ -54,8 +54,6 @@ def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Pat
     """Write the map of fractions over position.
 
     Args:
-        found: The search's result.
-        case: The case.
         skin: The patient, CT frame.
         path: The PNG to write; it appears whole or not at all.
     """
@@ -133,11 +131,22 @@ def _directions(axes: Axes, found: PlaceSearch, space: str) -> None:
         axes.text(x, 0.5, text, transform=axes.transAxes, ha=side, va="center", rotation=turn, **look)
 
 
+LABELS_ALONG_MM, LABELS_ACROSS_MM = 200.0, 900.0
+"""Nearer marks have the upper one's label above it."""
+
+
 def _marks(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any) -> None:
-    for rank, one in enumerate(found.rated, start=1):
-        if one.site is not None and one.site.region in regions:
-            along, across, height = one.site.position
-            _mark(axes, across, along, "*" if rank == 1 else "o", f"{rank}: {_worth(one, found)}, h {height:+.0f}")
+    here = [
+        (*one.site.position, rank, one)
+        for rank, one in enumerate(found.rated, start=1)
+        if one.site is not None and one.site.region in regions
+    ]
+    marked: list[tuple[float, float]] = []
+    for along, across, height, rank, one in sorted(here, key=lambda mark: mark[0]):
+        beside = any(along - a < LABELS_ALONG_MM and abs(across - b) < LABELS_ACROSS_MM for a, b in marked)
+        text = f"{rank}: {_worth(one, found)}, h {height:+.0f}"
+        _mark(axes, across, along, "*" if rank == 1 else "o", text, above=beside)
+        marked.append((along, across))
     if found.own is None:
         return
     T = np.linalg.inv(mount_pose(found.own.mount, case.space, case.path) @ found.T_ct_bed)
@@ -150,10 +159,10 @@ def _worth(one: RatedPlacement, found: PlaceSearch) -> str:
     return f"{estimated}{100 * one.verdict.fraction:.0f} %"
 
 
-def _mark(axes: Axes, x: float, y: float, shape: str, text: str) -> None:
+def _mark(axes: Axes, x: float, y: float, shape: str, text: str, *, above: bool = False) -> None:
     size = 230 if shape == "*" else 60
     axes.scatter([x], [y], s=size, marker=shape, c="white", edgecolors="black", linewidths=1.3, zorder=9)
-    offset, align = ((0, -15), "center") if shape != "D" else ((8, -3), "left")
+    offset, align = ((0, 8 if above else -15), "center") if shape != "D" else ((8, -3), "left")
     axes.annotate(
         text, (x, y), offset, textcoords="offset points", ha=align, fontsize=8.5, path_effects=HALO, zorder=10
     )

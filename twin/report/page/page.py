@@ -30,13 +30,14 @@ from puncture_twin.twin.report.numbers import (
     TRUTH_IS_BELIEF,
     demanding,
     expected_text,
+    length_text,
     nearest_text,
     needle_text,
     reason_counts,
     target_text,
 )
 from puncture_twin.twin.report.page.page_map import map_data, picked_row
-from puncture_twin.twin.report.page.page_scene import scene_figure
+from puncture_twin.twin.report.page.page_scene import arm_data, scene_figure
 from puncture_twin.twin.report.page.page_slices import slices_data
 from puncture_twin.twin.report.page.template import (
     Card,
@@ -56,8 +57,7 @@ from puncture_twin.twin.report.present import (
     percent,
     picture,
 )
-from puncture_twin.twin.report.slices.panel import TONES
-from puncture_twin.twin.report.slices.subject import Subject
+from puncture_twin.twin.report.slices.panel import TONES, Subject
 
 
 class Uncertainty(NamedTuple):
@@ -142,7 +142,7 @@ def write_page(shown: Shown, path: Path) -> None:
         refused=_refused(found),
         cards=_cards(shown),
         counts=blocks_html(patient.counts(found)),
-        best=blocks_html(patient.windows(found)),
+        best=blocks_html(patient.windows(found, shown.anatomy.scan)),
         plan=blocks_html(patient.plan(plan, at_patient, shown.refusal, declared=declared, notes=shown.notes)),
         planned="Plan" if plan is not None or shown.refusal else "The best path at the patient",
         registration=blocks_html(patient.registration(shown.registration)) if shown.registration else "",
@@ -165,6 +165,7 @@ def _drawn(shown: Shown) -> dict[str, Any]:
     data = {
         "map": map_data(case, found, pick, shown.raster),
         "scene": scene_figure(case, shown.anatomy, found, shown.plan, user_cache(), pick, shown.T_base_ct),
+        "arm": arm_data(case, found, shown.plan, pick, shown.T_base_ct),
         "slices": slices,
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),
@@ -229,7 +230,7 @@ def _cards(shown: Shown) -> list[Card]:
     cards = [] if breakdown is None or shown.chosen is None else [chance_card(breakdown, _angles(*shown.chosen))]
     cards.append(_window_card(candidates))
     if shown.chosen is not None:
-        cards.append(_direction_card(*shown.chosen, best=shown.chosen == candidates.best))
+        cards.append(_direction_card(*shown.chosen, shown.anatomy.scan, best=shown.chosen == candidates.best))
     if not candidates.arm_checked:
         cards.append(Card("arm", "not checked", candidates.arm_note.removeprefix("not checked: ")))
     if shown.plan is None:
@@ -264,8 +265,9 @@ def _location(case: Any) -> str:
     return f"Case {case.name}; target {target_text(case)} at ({point}) mm {case.space};"
 
 
-def _direction_card(candidates: Candidates, row: int, *, best: bool) -> Card:
-    detail = f"{number(float(candidates.path.length[row]), 1, 'mm')} in the body; {nearest_text(candidates, row)}"
+def _direction_card(candidates: Candidates, row: int, scan: Any | None, *, best: bool) -> Card:
+    path = length_text(float(candidates.path.length[row]), scan)
+    detail = f"{path} in the body; {nearest_text(candidates, row, scan)}"
     return Card("best direction" if best else "chosen direction", _angles(candidates, row), detail)
 
 

@@ -19,7 +19,7 @@ from puncture_twin.twin.report.map.map_raster import PIXELS as FINE, MapRaster, 
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.template import image_address
 from puncture_twin.twin.report.palette import PNG_LEVEL, reason_of
-from puncture_twin.twin.report.slices.subject import MOST_NEAR, NEAR_MM
+from puncture_twin.twin.report.slices.panel import MOST_NEAR, NEAR_MM
 
 PIXELS = FINE // 2
 """Side of the map on the page, CSS pixels; the picture is twice as fine for sharp screens."""

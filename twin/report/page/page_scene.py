@@ -15,19 +15,23 @@ import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.twin.report.map_view import body_directions
 from puncture_twin.twin.report.raster.render import Layer
 from puncture_twin.twin.report.scene.scene_parts import (
+    FLANGE,
     ArmPicture,
     SceneBody,
     arm_bodies,
     chosen_direction,
+    joints_on_target,
     needle_bodies,
     patient,
     room,
@@ -40,6 +44,12 @@ TRIANGLES = 40_000
 
 GRAIN_MM = 0.25
 """Vertices are shown to so much, a power of two: it packs well."""
+
+JOINT_DIGITS = 5
+"""Of rad: 0.01 mm at a metre."""
+
+AROUND_LINKS_MM = 100.0
+"""More than a link's body is from the line between its frames."""
 
 VIEW = (1200, 640)
 """Width and height of the scene on the page, CSS pixels."""
@@ -95,9 +105,40 @@ def scene_figure(
         _trace(body, hidden=i in hidden, in_legend=first.get(_legend_name(body)) == i) for i, body in enumerate(light)
     ]
     traces.append(_labels(case, anatomy))
-    shown = np.concatenate([one.mesh.vertices for one in light if one.group != "room"])
+    arms = _arms_box(case, candidates, T_base_ct)
+    shown = np.concatenate([*(one.mesh.vertices for one in light if one.group != "room"), arms])
     layout = _layout(case, bodies, box_of(np.concatenate([shown, _label_places(case, anatomy)])))
     return {"data": [*traces, _probe()], "layout": layout}
+
+
+def _arms_box(case: Any, candidates: Candidates, T_base_ct: Floats | None) -> Floats:
+    """Corners of a box that holds the arm of every direction, shape (2, 3), mm, or none: plotly cuts what is beyond."""
+    q = candidates.arm.q_insertion
+    q = q[np.isfinite(q).all(axis=1)]
+    if T_base_ct is None or not len(q):
+        return np.zeros((0, 3))
+    origins = apply(np.linalg.inv(T_base_ct), link_poses(case.robot.model, q)[..., :3, 3].reshape(-1, 3))
+    return np.stack([origins.min(axis=0) - AROUND_LINKS_MM, origins.max(axis=0) + AROUND_LINKS_MM])
+
+
+def arm_data(
+    case: Any, candidates: Candidates, plan: Any | None, pick: Pick | None, T_base_ct: Floats | None
+) -> dict[str, Any] | None:
+    """With which the page's script moves the links to every direction that the arm reaches; None without them.
+
+    Denavit and Hartenberg's lengths, where the base is, the joints of the scene's meshes, and those of each row, rad.
+    """
+    first = joints_on_target(plan, pick)
+    if first is None or T_base_ct is None or (plan is not None and not np.allclose(plan.T_base_ct, T_base_ct)):
+        return None
+    q = candidates.arm.q_insertion
+    rows = np.flatnonzero(np.isfinite(q).all(axis=1))
+    return {
+        "lengths": list(case.robot.model.lengths),
+        "base": np.linalg.inv(T_base_ct)[:3].T.tolist(),
+        "first": first.tolist(),
+        "q": dict(zip(rows.tolist(), np.round(q[rows], JOINT_DIGITS).tolist(), strict=True)),
+    }
 
 
 def box_of(points_ct: Floats) -> Floats:
@@ -154,7 +195,11 @@ def _trace(body: SceneBody, *, hidden: bool, in_legend: bool) -> dict[str, Any]:
         "hoverinfo": "name" if base == "organ" else "skip",
         "flatshading": False,
         "lighting": {"ambient": 0.5, "diffuse": 0.7, "specular": 0.15, "roughness": 0.6, "fresnel": 0.1},
-        "meta": {"pose": "standoff" if hidden else "target" if moving else "", "arm": base == "arm"},
+        "meta": {
+            "pose": "standoff" if hidden else "target" if moving else "",
+            "arm": base == "arm",
+            "frame": FLANGE if base == "needle" else body.frame,
+        },
     }
 
 

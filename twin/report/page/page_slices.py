@@ -1,56 +1,55 @@
-"""The page's slices: one block of the CT about target and entries, the surfaces in it, and how to draw a needle there.
+"""The page's slices: one block of the CT about target and entries, and how to draw a needle there.
 
-A script of the page (``slices.js``) cuts both in any plane, as `slices.panel` does for ``slices.png``.
+A script of the page (``slices.js``) cuts it and the surfaces in any plane, as `slices.panel` does for ``slices.png``.
 """
 
 from __future__ import annotations
 
 import gzip
+import io
 import itertools
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import css
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.bedside import slice_numbers
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.twin.report.page.page_surfaces import LEVEL, Packed, surfaces
 from puncture_twin.twin.report.palette import SKIN
-from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, TONES, stored
+from puncture_twin.twin.report.slices.panel import BESIDE, KNOTS_BYTE, KNOTS_HU, TONES, Subject, stored
 from puncture_twin.twin.report.slices.planes import letters, toward_text
-from puncture_twin.twin.report.slices.subject import BESIDE, Subject
 
 AROUND_MM = 60.0
 """What the block holds beyond target and entries, to every side."""
 
 FINE_MM = 1.0
-"""Voxels finer than this are averaged up to it: their noise would take most of the page."""
+"""Where the CT's own voxels do not fit the page, finer ones become means over this."""
 
-MOST_CT, MOST_TRIANGLES = 1_600_000, 250_000
-"""Bytes of the packed CT, and triangles of the surfaces: in base64 they take 2.1 and at most 0.9 MB of the page."""
+MOST_CT, MOST_TOGETHER = 1_600_000, 2_800_000
+"""Bytes of the packed CT, and of CT and surfaces: in base64 2.1 and 3.7 MB of the page."""
 
-LEAST_UNIT_MM = 1 / 16
-"""To which the surfaces' corners are rounded; the unit is doubled until there are no more triangles than that."""
+MOST_VOXELS = 30_000_000
+"""A browser holds a byte for each; more of them are not tried as they are."""
 
-MOST_UNITS = 32_000
-"""A corner's coordinates fit 16 bits."""
+SAMPLE = 16
+"""Slices by which it is seen at once that all will not fit."""
 
-COARSE_MM = 32.0
-"""How coarse surfaces beyond the box are, and how far beyond: they are not drawn."""
+WORST, BEST = 15, 95
+"""Qualities of a JPEG. Below the first, edges ring; then voxels grow by a quarter."""
 
-LEVEL = 6
-"""Of gzip's."""
+STRIP = 4096
+"""Rows of a JPEG at most: browsers on phones read no larger canvas."""
 
+JPEG_BLOCK = 8
+"""Rows of a slice are filled up to a multiple, so that no block of the JPEG holds two slices."""
 
-class Packed(NamedTuple):
-    """What the page carries: facts as plain values, and bytes that are unpacked by a script."""
-
-    facts: dict[str, Any]
-    content: bytes
+SOFT_HU = (-160.0, 240.0)
+"""Where the page states the error of a lossy CT."""
 
 
 def slices_data(
@@ -66,12 +65,12 @@ def slices_data(
     """
     case, anatomy = subject.case, subject.anatomy
     box = block_box(case.target_ct, candidates)
+    skin = ("skin", "skin", anatomy.skin.mesh)
+    shapes = surfaces([*((one.name, str(one.role), one.mesh) for one in anatomy.checked), skin], case.target_ct, box)
     ct = None
     if anatomy.scan is not None:
         hu, T_ct_index = anatomy.scan.measured
-        ct = ct_block(hu, T_ct_index, box)
-    skin = ("skin", "skin", anatomy.skin.mesh)
-    shapes = surfaces([*((one.name, str(one.role), one.mesh) for one in anatomy.checked), skin], case.target_ct, box)
+        ct = ct_block(hu, T_ct_index, box, min(MOST_CT, MOST_TOGETHER - len(shapes.content)))
     colours = {**subject.colours, "skin": SKIN}
     for one in shapes.facts["parts"]:
         one |= {"colour": css(colours[one["name"]]), "target": one["name"] == case.target_structure}
@@ -127,13 +126,15 @@ def block_box(target_ct: Floats, candidates: Candidates) -> Floats:
 
 
 def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = MOST_CT) -> Packed:
-    """The CT in a box, in bytes of `stored`, packed: its own voxels, or where they are too many means of some.
+    """The CT in a box, in bytes of `stored`: its own voxels without loss, or where these are too many as JPEG.
+
+    Voxels of a JPEG are means over at least `FINE_MM`; its quality is the best that fits.
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         box_ct: Shape (2, 3), mm.
-        most: Bytes; the voxels grow until the block takes no more.
+        most: Bytes.
     """
     corners = np.array(list(itertools.product(*box_ct.T)))
     index = apply(np.linalg.inv(T_ct_index), corners)
@@ -141,18 +142,21 @@ def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = M
     high = np.clip(np.ceil(index.max(axis=0)) + 1, 0, hu.shape).astype(int)
     part = hu[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
     spacing = np.linalg.norm(T_ct_index[:3, :3], axis=0)
-    factor = np.maximum(1, np.floor(FINE_MM / spacing + 1e-6)).astype(int)
-    while True:
-        values = _means(part, np.minimum(factor, np.maximum(1, part.shape)))
-        content = gzip.compress(_differences(stored(values)), LEVEL, mtime=0)
-        if len(content) <= most:
-            break
-        factor[np.argmin(spacing * factor)] += 1
-    T_index_block = np.diag([*factor.astype(float), 1.0])
+    factor, packed = np.ones(3), None
+    middle = max(0, part.shape[2] - SAMPLE) // 2
+    sample = _exact(stored(part[:, :, middle : middle + SAMPLE])).content
+    if part.size <= MOST_VOXELS and len(sample) * part.shape[2] < 2 * SAMPLE * most:
+        packed = _exact(stored(part))
+    grain = FINE_MM
+    while packed is None or len(packed.content) > most:
+        factor = np.clip(grain / spacing, 1.0, np.maximum(1, part.shape))
+        packed = _lossy(stored(_means(part, factor)), most)
+        grain *= 1.25
+    T_index_block = np.diag([*factor, 1.0])
     T_index_block[:3, 3] = low + (factor - 1) / 2
     T = T_ct_index @ T_index_block
     facts = {
-        "shape": values.shape,
+        **packed.facts,
         "T": T[:3].ravel().tolist(),
         "image": [
             ((edge - T_index_block[:3, 3]) / factor).tolist() for edge in (np.full(3, -0.5), np.array(hu.shape) - 0.5)
@@ -160,18 +164,61 @@ def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = M
         "voxel_mm": np.round(spacing, 3).tolist(),
         "shown_mm": np.round(spacing * factor, 3).tolist(),
     }
-    return Packed(facts, content)
+    return Packed(facts, packed.content)
 
 
-def _means(values: NDArray[Any], factor: NDArray[np.int64]) -> NDArray[Any]:
-    """Means of blocks of voxels; what does not fill one at the end is left out."""
-    if np.all(factor == 1):
-        return values
-    count = np.array(values.shape) // factor
-    total = np.zeros(count, np.float32)
-    for first in itertools.product(*(range(n) for n in factor)):
-        total += values[tuple(slice(f, f + n * s, s) for f, n, s in zip(first, count, factor, strict=True))]
-    return total / np.float32(factor.prod())
+def _exact(values: NDArray[np.uint8]) -> Packed:
+    return Packed({"shape": values.shape}, gzip.compress(_differences(values), LEVEL, mtime=0))
+
+
+def _means(values: NDArray[Any], factor: Floats) -> NDArray[Any]:
+    """Means over so many voxels along each axis, also parts of voxels; a rest at the end is left out."""
+    for axis, (step, count) in enumerate(zip(factor, values.shape, strict=True)):
+        if step > 1.0:
+            start, voxel = step * np.arange(int(count / step + 1e-9))[:, None], np.arange(count)
+            shared = np.minimum(start + step, voxel + 1) - np.maximum(start, voxel)
+            weights = (np.maximum(shared, 0.0) / step).astype(np.float32)
+            values = np.moveaxis(np.tensordot(weights, values.astype(np.float32), (1, axis)), 0, axis)
+    return values
+
+
+def _lossy(values: NDArray[np.uint8], most: int) -> Packed:
+    """Slices below one another as grey JPEGs, of the best quality that takes no more than so many bytes.
+
+    The facts hold each JPEG's bytes, slices and mean, by which a browser that alters pictures is found out, and the
+    errors: rms in bytes; rms and greatest where the CT has `SOFT_HU`.
+    """
+    slices = np.pad(values.transpose(2, 1, 0), ((0, 0), (0, -values.shape[1] % JPEG_BLOCK), (0, 0)), mode="edge")
+    each = max(1, STRIP // slices.shape[1])
+    strips = [slices[k : k + each].reshape(-1, slices.shape[2]) for k in range(0, len(slices), each)]
+    low, high = WORST, BEST
+    while low < high:
+        middle = (low + high + 1) // 2
+        fits = sum(len(_jpeg(one, middle)) for one in strips) <= most
+        low, high = (middle, high) if fits else (low, middle - 1)
+    packed = [_jpeg(one, low) for one in strips]
+    shown = [np.asarray(Image.open(io.BytesIO(one))) for one in packed]
+    found = np.concatenate(shown).reshape(slices.shape)[:, : values.shape[1]].transpose(2, 1, 0)
+    hu_of = np.interp(np.arange(256), KNOTS_BYTE, KNOTS_HU).astype(np.float32)
+    true = hu_of[values]
+    soft = (hu_of[found] - true)[(true > SOFT_HU[0]) & (true < SOFT_HU[1])]
+    facts = {
+        "shape": values.shape,
+        "strips": [
+            [len(one), len(rows) // slices.shape[1], rows.mean()] for one, rows in zip(packed, shown, strict=True)
+        ],
+        "rows": slices.shape[1],
+        "rms_bytes": float(np.sqrt(np.square(found - values.astype(np.float32)).mean())),
+        "rms_hu": float(np.sqrt(np.square(soft).mean())) if len(soft) else 0.0,
+        "worst_hu": float(np.abs(soft).max(initial=0.0)),
+    }
+    return Packed(facts, b"".join(packed))
+
+
+def _jpeg(rows: NDArray[np.uint8], quality: int) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(rows).save(stream, "JPEG", quality=quality, optimize=True)
+    return stream.getvalue()
 
 
 def _differences(values: NDArray[np.uint8]) -> bytes:
@@ -179,81 +226,3 @@ def _differences(values: NDArray[np.uint8]) -> bytes:
     wide = np.pad(values, ((1, 0),) * 3).astype(np.int16)
     before = (wide[:-1, 1:, 1:] + wide[1:, :-1, 1:] + wide[1:, 1:, :-1]) // 3
     return (values - before).astype(np.uint8).transpose(2, 1, 0).tobytes()
-
-
-def surfaces(parts: Iterable[tuple[str, str, TriangleMesh]], target_ct: Floats, box_ct: Floats) -> Packed:
-    """Surfaces in a box; corners from the target, in whole units, as differences.
-
-    Corners that round to one are one: so surfaces grow coarser, each of its points by less than 0.87 units, and none
-    of them vanishes but what is smaller than a unit. What lies beyond the box is only kept as far as it tells what is
-    inside of a closed surface; the first triangles of each, ``drawn`` of them, are those that reach the box.
-
-    Args:
-        parts: Name, role and mesh.
-        target_ct: Shape (3,), mm.
-        box_ct: Shape (2, 3), mm.
-    """
-    box = box_ct - target_ct
-    boxed = [
-        (name, role, mesh.closed, *_boxed(mesh.vertices - target_ct, mesh.faces, box)) for name, role, mesh in parts
-    ]
-    farthest = max((float(np.abs(one[3]).max(initial=0.0)) for one in boxed), default=0.0)
-    unit = LEAST_UNIT_MM
-    while farthest / unit > MOST_UNITS:
-        unit *= 2
-    while True:
-        rounded = [_rounded(vertices / unit, faces, drawn) for *_, vertices, faces, drawn in boxed]
-        if sum(len(faces) for _, faces, _ in rounded) <= MOST_TRIANGLES:
-            break
-        unit *= 2
-    found = zip(boxed, rounded, strict=True)
-    kept = [(one, v, f, drawn) for one, (v, f, drawn) in found if drawn or (one[2] and len(f))]
-    corners = [np.diff(v, axis=0, prepend=0).astype("<i2").T.tobytes() for _, v, _, _ in kept]
-    triangles = [np.diff(f.ravel(), prepend=0).astype("<i4").tobytes() for _, _, f, _ in kept]
-    facts = [
-        {"name": one[0], "role": one[1], "closed": one[2], "corners": len(v), "triangles": len(f), "drawn": drawn}
-        for one, v, f, drawn in kept
-    ]
-    content = gzip.compress(b"".join([*corners, *triangles]), LEVEL, mtime=0)
-    return Packed({"unit_mm": unit, "parts": facts}, content)
-
-
-def _boxed(vertices: Floats, faces: NDArray[np.int32], box: Floats) -> tuple[Floats, NDArray[np.int32], int]:
-    """Triangles that reach a box first, and their number; the corners of all others drawn near, and coarse.
-
-    Each of these others lies beyond one face of the box with all of its corners, before and after: what is inside of a
-    closed surface, for a point in the box, stays so.
-    """
-    corner = vertices[faces]
-    reach = ((corner.max(axis=1) >= box[0]) & (corner.min(axis=1) <= box[1])).all(axis=1)
-    exact = np.zeros(len(vertices), bool)
-    exact[faces[reach]] = True
-    coarse = np.clip(np.round(vertices / COARSE_MM) * COARSE_MM, *box)
-    beyond = np.where(vertices > box[1], box[1] + COARSE_MM, np.where(vertices < box[0], box[0] - COARSE_MM, coarse))
-    moved = np.where(exact[:, None], vertices, beyond)
-    return moved, np.concatenate([faces[reach], faces[~reach]]), int(reach.sum())
-
-
-def _rounded(
-    vertices: Floats, faces: NDArray[np.int32], drawn: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Whole corners, each once and in the order of first use; the triangles left of these, and of those to be drawn.
-
-    Of the others two in one place cancel out.
-    """
-    used, index = np.unique(faces, return_inverse=True)
-    whole = np.round(vertices[used]).astype(np.int64)
-    key = ((whole + MOST_UNITS) << np.array([32, 16, 0])).sum(axis=1)  # one number a corner: 16 bits an axis
-    _, same = np.unique(key, return_inverse=True)
-    found = same[index.reshape(-1, 3)]
-    apart = (found != np.roll(found, 1, axis=1)).all(axis=1)
-    near, others = found[:drawn][apart[:drawn]], found[drawn:][apart[drawn:]]
-    _, one, count = np.unique(np.sort(others, axis=1), axis=0, return_index=True, return_counts=True)
-    left = np.concatenate([near, others[np.sort(one[count % 2 == 1])]])
-    used, first = np.unique(left, return_index=True)
-    order = np.argsort(first)
-    place = np.zeros(len(whole), np.int64)
-    place[used[order]] = np.arange(len(order))
-    corner = np.zeros((len(whole), 3), np.int64)
-    corner[same] = whole
-    return corner[used[order]], place[left], len(near)

@@ -27,8 +27,6 @@ class ViewCamera:
         look_at: Shape (3,), mm.
         up: Shape (3,), any vector not along the view.
         fov: Vertical opening angle, rad.
-        width: Pixels.
-        height: Pixels.
     """
 
     eye: Floats
@@ -86,8 +84,6 @@ def camera_around(points_ct: Floats, toward: Floats, up: Floats, *, fov: float, 
         toward: Shape (3,), the direction of view.
         up: Shape (3,).
         fov: Vertical opening, rad.
-        width: Pixels.
-        height: Pixels.
     """
     points = np.asarray(points_ct, dtype=float)
     toward = np.asarray(toward, dtype=float) / np.linalg.norm(toward)

@@ -86,7 +86,6 @@ def compose(shot: RasterShot, shells: Shells) -> NDArray[np.uint8]:
     The "over" operator of Porter and Duff, Compositing Digital Images (SIGGRAPH 1984), from back to front.
 
     Args:
-        shot: The opaque part, in the sample grid.
         shells: Drawn where they lie before the opaque part.
     """
     height, width = shot.depth.shape
@@ -101,8 +100,6 @@ def recompose(pixels: NDArray[np.uint8], shot: RasterShot, shells: Shells, befor
 
     Args:
         pixels: Shape (h, w, 3), what `compose` made of the same shells and another shot.
-        shot: What is opaque now.
-        shells: The shells.
         before: Shape of ``shot.depth``, its depths then; a sample of the same depth shows the same.
         box: The part in which something may have changed, in samples.
     """

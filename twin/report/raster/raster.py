@@ -82,11 +82,6 @@ def _faces_away(points, a, b, c):
 def sorted_by_band(spans, rows, count):
     """Which triangles each band of a picture needs.
 
-    Args:
-        spans: What `outlines` returned.
-        rows: Rows of a band.
-        count: How many bands there are.
-
     Returns:
         Where each band begins in the second array, shape (count + 1,); rows of ``spans``, band after band.
     """
@@ -132,7 +127,6 @@ def draw(points, faces, bodies, spans, grid, corner, before, inverse, triangle):
         points: Shape (n, 3), camera's frame, mm.
         faces: Shape (m, 3).
         bodies: Shape (m,), the body of each triangle; bodies ascend.
-        spans: Rows of what `outlines` returned.
         grid: Samples per unit of x and y, rows, columns of the whole picture.
         corner: Row and column of the picture at which the arrays below begin.
         before: Shape (h, w), 1/z of what is opaque there already, 0 for nothing.

@@ -168,9 +168,7 @@ class View:
     """A layer as a camera has it before it: corners in the camera's frame, and where each triangle lies.
 
     Args:
-        layer: The layer.
-        camera: Its pixels are the samples.
-        seen: The layer's corners and their normals.
+        camera: The samples are its pixels.
     """
 
     def __init__(self, layer: Layer, camera: ViewCamera, seen: Posed) -> None:
@@ -199,9 +197,7 @@ class View:
         """Draw what is opaque into a picture, where it is nearer than what is there; in place.
 
         Args:
-            shot: A part of the picture.
             corner: Row and column of the whole picture at which it begins, multiples of ``SAMPLES``.
-            spans: The triangles that it needs.
         """
         drawn = Drawn.empty(1, shot.depth.shape)
         self.draw(depth_before(shot.depth, self.grid, corner), drawn, corner, spans)
@@ -212,9 +208,7 @@ class View:
 
         Args:
             hidden: Shape (h, w), of `depth_before`: what is there already.
-            drawn: With nothing in it; written to.
             corner: Row and column of the whole picture at which it begins.
-            spans: The triangles that it needs.
         """
         draw(*self._mesh, spans, self.grid, corner, hidden, *drawn)
 
@@ -229,7 +223,6 @@ class View:
         Args:
             before: Depth of what is opaque in a part of the picture, shape (h, w), mm along the ray.
             corner: Row and column of the whole picture at which it begins, multiples of ``SAMPLES``.
-            spans: The triangles that it needs.
         """
         drawn = Drawn.empty(MAX_SHELLS, before.shape)
         self.draw(depth_before(before, self.grid, corner), drawn, corner, spans)
@@ -257,7 +250,7 @@ def shells_of(layer: Layer, camera: ViewCamera) -> Shells:
 
     Args:
         layer: The surfaces, CT frame.
-        camera: Its pixels are the samples.
+        camera: The samples are its pixels.
     """
     view = View(layer, camera, posed(layer, camera))
     depth = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
@@ -271,8 +264,6 @@ def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> NDArray[n
     """A scene in the CT frame in pixels, shape (h, w, 3): what is opaque, and what is see-through over it.
 
     Args:
-        opaque: The opaque surfaces.
-        translucents: The see-through ones.
         camera: Its pixels are the picture's; each is the mean of ``SAMPLES`` by ``SAMPLES``.
     """
     fine = camera.finer(SAMPLES)
@@ -326,7 +317,6 @@ class MovingPicture:
 
     Args:
         opaque: What stands still, CT frame.
-        translucents: What of it is see-through.
         layers: What moves, each in its own frame. Of two in one place the first is seen.
         camera: Its pixels are the picture's.
     """

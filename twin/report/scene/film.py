@@ -25,10 +25,18 @@ from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface
-from puncture_twin.twin.report.scene.film_file import Frame, Part, Pixels, write_gif, write_mp4
-from puncture_twin.twin.report.scene.film_text import BELOW, FrameText, FrameWords, model_note
-from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, needle_bodies, patient, room
-from puncture_twin.twin.report.scene.shapes import bar
+from puncture_twin.twin.report.scene.film_text import (
+    BELOW,
+    Frame,
+    FrameText,
+    FrameWords,
+    Part,
+    Pixels,
+    model_note,
+    write_gif,
+    write_mp4,
+)
+from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, bar, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.views import close_up, overview
 
 MOST_THREADS = 4
@@ -92,23 +100,12 @@ def film_times(total_s: float) -> FilmTimes:
     return FilmTimes(tuple(float(m) for m in moments), float(speed), round(STILL_S * FRAMES_PER_SECOND))
 
 
-def draw_film(
-    rehearsal: Any,
-    plan: Any,
-    case: Any,
-    anatomy: Any,
-    path: Path,
-    progress: Count | None = None,
-) -> Path:
+def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path, progress: Count | None = None) -> Path:
     """Write the film; a GIF beside it when no H.264 encoder can be started.
 
     Args:
-        rehearsal: What was measured.
-        plan: What was planned.
-        case: The case.
         anatomy: Structures and skin, CT frame.
         path: The ``.mp4`` to write; it appears whole or not at all.
-        progress: Called with frames done and all frames.
 
     Returns:
         The file that was written.

@@ -14,8 +14,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.twin.report import annotate, palette
-from puncture_twin.twin.report.numbers import nearest_text, target_text
-from puncture_twin.twin.report.present import number
+from puncture_twin.twin.report.numbers import length_text, nearest_text, target_text
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
 from puncture_twin.twin.report.scene.scene_parts import (
@@ -66,7 +65,6 @@ def draw_scene(
     """Write the picture of the scene.
 
     Args:
-        case: The case.
         anatomy: Structures and skin, CT frame.
         candidates: The search's rows; the safe ones make the corridor.
         plan: The plan, or None: then the needle is that of the best candidate, and the arm that of the search.
@@ -93,7 +91,7 @@ def draw_scene(
     near = _close_camera(case, bodies, path_ct)
     few = [body for body in bodies if body.name != "needle holder" and body.group not in HIDDEN_NEARBY]
     _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
-    bottom = _text(draw, case, candidates, plan, bool(arm), bodies, pick, failed)
+    bottom = _text(draw, case, candidates, plan, bool(arm), bodies, pick, failed, anatomy.scan)
     image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
     annotate.write_image(image, path)
 
@@ -191,6 +189,7 @@ def _text(
     bodies: Sequence[SceneBody],
     pick: Pick | None,
     failed: bool,
+    scan: Any | None,
 ) -> float:
     """Everything around the views; returns the row below the legend."""
     annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_text(case)}", size=28, bold=True)
@@ -198,7 +197,7 @@ def _text(
     if nothing:
         text, colour = "NOTHING IS SAFE: every direction is rejected; no needle is shown", annotate.RED
     else:
-        text, colour = _path_text(plan, pick, failed, arm), annotate.RED if failed else annotate.FAINT
+        text, colour = _path_text(plan, pick, failed, arm, scan), annotate.RED if failed else annotate.FAINT
     annotate.write(draw, (18, 50), text, size=18, bold=nothing, colour=colour)
     items = [("target", palette.TARGET_POINT), (needle_text(case.needle), palette.NEEDLE)]
     if candidates.safe.any():
@@ -225,7 +224,7 @@ def _see_through(body: SceneBody) -> str:
     return body.name + (" (see-through)" if body.alpha < 1 else "")
 
 
-def _path_text(plan: Any | None, pick: Pick | None, failed: bool, arm: bool) -> str:
+def _path_text(plan: Any | None, pick: Pick | None, failed: bool, arm: bool, scan: Any | None) -> str:
     if plan is not None:
         theta, beta = np.degrees(plan.theta), np.degrees(plan.beta)
         length = float(np.linalg.norm(plan.entry_ct - plan.target_ct))
@@ -233,9 +232,9 @@ def _path_text(plan: Any | None, pick: Pick | None, failed: bool, arm: bool) -> 
         assert pick is not None
         theta, beta = np.degrees(pick.candidates.theta[pick.row]), np.degrees(pick.candidates.beta[pick.row])
         length = float(pick.candidates.path.length[pick.row])
-    text = f"θ {theta:g}°, β {beta:g}°, {number(length, 1, 'mm')} in the body"
+    text = f"θ {theta:g}°, β {beta:g}°, {length_text(length, scan)} in the body"
     if pick is not None:
-        text += f"; {nearest_text(*pick)}"
+        text += f"; {nearest_text(*pick, scan)}"
     if arm:
         return text
     return text + ("  PLANNING FAILED: no arm is shown" if failed else "  (no plan was requested: no arm is shown)")
@@ -246,11 +245,7 @@ MOST_ENTRIES = 26
 
 
 def families(names: list[tuple[str, Rgb]]) -> list[tuple[str, Rgb]]:
-    """Legend entries, with numbered families (ribs, vertebrae) folded into one when there are many.
-
-    Args:
-        names: Name and colour of each structure.
-    """
+    """Legend entries, with numbered families (ribs, vertebrae) folded into one when there are many."""
     if len(names) <= MOST_ENTRIES:
         return names
     folded: dict[tuple[str, Rgb], int] = {}

@@ -60,10 +60,8 @@ def overview(
     """A view of everything from above the table and from the needle's side, from where it is best seen.
 
     Args:
-        case: For the direction up.
         content_ct: Shape (n, 3), what must be in the picture.
         focus_ct: Shape (k, 3), what should not be hidden.
-        blockers: What can hide it.
         size: Width and height in pixels.
         outward_ct: Shape (3,), unit, from the target out of the body along the needle; None looks from any side.
     """
@@ -85,10 +83,8 @@ def close_up(case: Any, path_ct: Floats, radius: float, blockers: Layer, size: t
     """A view across the needle's path, from where the fewest structures hide it.
 
     Args:
-        case: For the direction up.
         path_ct: Shape (2, 3), target and entry.
         radius: mm about the path's ends that must be in the picture.
-        blockers: What can hide the path.
         size: Width and height in pixels.
     """
     along = (path_ct[1] - path_ct[0]) / np.linalg.norm(path_ct[1] - path_ct[0])

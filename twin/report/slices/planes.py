@@ -34,12 +34,10 @@ class Plane:
     """One square picture.
 
     Attributes:
-        name: What it is called.
         at_ct: Shape (3,), a point of the plane, the target.
         right: Shape (3,), unit, CT frame: what lies to the right in the picture.
         up: Shape (3,), unit.
         centre: Shape (2,), the picture's middle from the target, mm to the right and up.
-        half_mm: Half its side.
     """
 
     name: str
@@ -178,8 +176,7 @@ def _cut(vertices, faces, normal, offset):
     Args:
         vertices: Shape (v, 3), mm, read-only.
         faces: Shape (m, 3), read-only.
-        normal: The plane's, three numbers.
-        offset: Of its points along the normal, mm.
+        offset: Of the plane's points along the normal, mm.
     """
     height = np.empty(len(vertices))
     for v in range(len(vertices)):
@@ -225,7 +222,6 @@ def capsule(outward_ct: Floats, length_mm: float, radius_mm: float, plane: Plane
         outward_ct: From the target along the needle, unit, shape (3,).
         length_mm: The piece's length; it begins at the target.
         radius_mm: Greater than 0.
-        plane: A plane through the target.
         points: On each of the line's two sides.
 
     Returns:

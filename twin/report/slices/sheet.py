@@ -22,12 +22,12 @@ from puncture_twin.twin.report.slices.panel import (
     REGION_COLOUR,
     TONES,
     Panel,
+    Subject,
     Tone,
     draw_panel,
     leaning,
 )
 from puncture_twin.twin.report.slices.planes import body_planes, needle_planes
-from puncture_twin.twin.report.slices.subject import Subject
 
 WITHOUT_CT: Rgb = (44, 47, 54)
 """Behind the outlines of a case without CT."""
@@ -42,8 +42,7 @@ class Slices:
     """The drawn slices of one direction.
 
     Attributes:
-        subject: The direction.
-        panels: Its four slices; three of an image alone.
+        panels: Four slices; three of an image alone.
         units: Hounsfield units along the needle; None without a CT or an entry.
     """
 

@@ -170,6 +170,7 @@
     }
     explain(row);
     probe(row);
+    noteArm();
     present(own ?? needleOf(row));
   }
   for (const button of document.querySelectorAll("button.pick"))
@@ -199,7 +200,7 @@
       margin: Math.max(0, ...strong.map((name) => slices.margins[name])), region: slices.regions[row], bent: slices.bent[row], title: anglesOf(row),
     };
   }
-  const readout = (text) => { byId("cursor").textContent = text || `Point at a slice: ${slices.ct ? "Hounsfield units, " : ""}structure, place.`; };
+  const readout = (text) => { byId("cursor").textContent = text || `Point at a slice: ${data.ct ? "Hounsfield units, " : ""}structure, place.`; };
   const view = new slicing.View(byId("slices-a"), { readout, moved: moveNeedle });
   let beside = null, kept = null, own = null;
   const saidOf = (needle) => needle.verdict ?? verdictOf(needle.row);
@@ -226,7 +227,7 @@
       slicing.voxelNote, slicing.surfaceNote,
       `Needle as thick as it is; dashed: with the greatest margin near it${needle.margin ? `, ${needle.margin} mm` : ""}. Beads: the edge of what is unknown.`,
       Object.keys(slices.bent).length && !needle.bent ? "The range of bending by the bevel is drawn only for the planned or best direction." : "",
-    ].filter(Boolean).map((note) => make("div", {}, note)));
+    ].filter(Boolean).map((note) => make("div", slicing.coarse && note === slicing.surfaceNote ? { class: "bad" } : {}, note)));
   }
   const { halfVoxel } = slicing; // lengths have the digits that a voxel can carry
   const doubted = (mm) => halfVoxel === null ? `${mm.toFixed(1)} mm` : halfVoxel < 1 ? `${mm.toFixed(1)} ± ${halfVoxel.toFixed(1)} mm` : `${mm.toFixed(0)} ± ${Math.ceil(halfVoxel)} mm`;
@@ -379,21 +380,60 @@
     probed = { x: [[tip[0], hub[0]]], y: [[tip[1], hub[1]]], z: [[tip[2], hub[2]]] };
     follow();
   }
+  // ---- the arm of the chosen direction: its links are moved by the frames that ``link_poses`` gives in Python -----------
+  const { arm } = data, moving = !arm ? [] : data.scene.data.flatMap((trace, index) => {
+    if (trace.meta?.pose !== "target" || !trace.meta.frame) return [];
+    const floats = ({ bdata }) => new Float32Array(Uint8Array.from(atob(bdata), (c) => c.charCodeAt(0)).buffer);
+    return [{ index, frame: trace.meta.frame, at: ["x", "y", "z"].map((axis) => floats(trace[axis])) }];
+  });
+  const toCt = (vector, origin = 0) => [0, 1, 2].reduce((sum, k) => plus(sum, arm.base[k], vector[k]), scaled(arm.base[3], origin));
+  function framesOf(q) { // axes and origin of base and links, CT frame: Rz(q) Tz(d) Tx(a) Rx(alpha) each
+    const [d1, a2, a3, d4, d5, d6] = arm.lengths, found = [[[1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, 0]]];
+    q.forEach((angle, joint) => {
+      const [x, y, z, origin] = found[joint], c = Math.cos(angle), s = Math.sin(angle);
+      const a = [0, a2, a3, 0, 0, 0][joint], d = [d1, 0, 0, d4, d5, d6][joint], turn = [1, 0, 0, 1, -1, 0][joint];
+      const along = plus(scaled(x, c), y, s), across = plus(scaled(y, c), x, -s);
+      const [up, out] = turn ? [scaled(z, turn), scaled(across, -turn)] : [across, z];
+      found.push([along, up, out, plus(plus(origin, along, a), z, d)]);
+    });
+    return found.map((frame) => frame.map((vector, k) => toCt(vector, k === 3 ? 1 : 0)));
+  }
+  const jointsOf = () => own ? null : chosen === map.first ? arm?.first : arm?.q[chosen];
+  let armOf = map.first; // the row whose arm the scene shows
+  function moveArm() {
+    const q = jointsOf(), row = q ? chosen : map.first; // what the arm does not reach has the first direction's
+    if (!moving.length || !arm || armOf === row) return;
+    const before = framesOf(arm.first), after = framesOf(q ?? arm.first);
+    const moved = moving.map(({ frame, at }) => {
+      const [from, to] = [before[frame], after[frame]], found = at.map((values) => new Float32Array(values.length));
+      for (let v = 0; v < at[0].length; v++) {
+        const away = plus([at[0][v], at[1][v], at[2][v]], from[3], -1);
+        const [x, y, z] = [0, 1, 2].reduce((sum, k) => plus(sum, to[k], dot(away, from[k])), to[3]);
+        found[0][v] = x, found[1][v] = y, found[2][v] = z;
+      }
+      return found;
+    });
+    const axis = (k) => moved.map((found) => found[k]);
+    Plotly.restyle(scene, { x: axis(0), y: axis(1), z: axis(2) }, moving.map(({ index }) => index));
+    armOf = row;
+  }
+  function noteArm() { // standoff is of the plan alone
+    const follows = jointsOf() && byId("pose-standoff").getAttribute("aria-pressed") !== "true";
+    document.querySelector(".of-scene").hidden = map.picked < 0 || follows || (!own && chosen === map.first);
+  }
   function follow() { // the scene is drawn again when it is in sight and the pointer rests: the slices follow at once
     clearTimeout(probing);
-    if (inSight && probed) probing = setTimeout(() => { Plotly.restyle(scene, probed, [probeTrace]); probed = null; }, 60);
+    if (inSight && probed) probing = setTimeout(() => { Plotly.restyle(scene, probed, [probeTrace]); probed = null; moveArm(); }, 60);
   }
   new IntersectionObserver((entries) => { inSight = entries.at(-1).isIntersecting; follow(); }).observe(scene);
   const traces = (wanted) => data.scene.data.flatMap((trace, i) => trace.meta && wanted(trace.meta) ? [i] : []);
   const poses = { none: byId("pose-none"), target: byId("pose-target"), standoff: byId("pose-standoff") };
   byId("poses").hidden = traces((meta) => meta.arm).length === 0;
-  if (!traces((meta) => meta.pose === "standoff").length) { // after a search: of one direction, and its motion is not planned
-    byId("pose-standoff").hidden = true;
-    byId("pose-target").textContent = `needle on the target, ${anglesOf(map.first)}`;
-  }
+  if (!traces((meta) => meta.pose === "standoff").length) byId("pose-standoff").hidden = true; // after a search: no motion is planned
   for (const [pose, button] of Object.entries(poses))
     button.addEventListener("click", () => {
       for (const other of Object.values(poses)) other.setAttribute("aria-pressed", String(other === button));
+      noteArm();
       if (!drawn) return;
       const show = (visible, wanted) => { const found = traces(wanted); if (found.length) Plotly.restyle(scene, { visible }, found); };
       show(pose === "standoff", (meta) => meta.pose === "standoff");

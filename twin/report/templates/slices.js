@@ -49,11 +49,13 @@ const slicing = (() => {
   };
   const [knotsHu, knotsByte] = facts.knots;
   const huOf = Float64Array.from({ length: 256 }, (_, byte) => interpolated(byte, knotsByte, knotsHu));
-  const doubtOf = (byte) => Math.max(huOf[byte] - huOf[Math.max(byte - 1, 0)], huOf[Math.min(byte + 1, 255)] - huOf[byte]) / 2;
-  const ct = facts.ct && (() => {
-    const differences = new Uint8Array(data.ct), values = new Uint8Array(differences.length);
+  const lossy = facts.ct?.strips, off = lossy ? 2 * facts.ct.rms_bytes : 0.5; // of a byte: half a step, or two standard deviations
+  const huAt = (byte) => interpolated(Math.min(255, Math.max(0, byte)), knotsByte, knotsHu);
+  const doubtOf = (byte) => Math.max(huOf[byte] - huAt(byte - off), huAt(byte + off) - huOf[byte]);
+  const ct = facts.ct && data.ct && (() => {
+    const differences = new Uint8Array(data.ct), values = lossy ? differences : new Uint8Array(differences.length);
     const [nx, ny, nz] = facts.ct.shape, row = nx, slab = nx * ny;
-    for (let k = 0, at = 0; k < nz; k++)
+    if (!lossy) for (let k = 0, at = 0; k < nz; k++)
       for (let j = 0; j < ny; j++)
         for (let i = 0; i < nx; i++, at++) {
           const before = (i ? values[at - 1] : 0) + (j ? values[at - row] : 0) + (k ? values[at - slab] : 0);
@@ -76,11 +78,15 @@ const slicing = (() => {
 
   // ---- the surfaces ------------------------------------------------------------------------------------------
   const parts = (() => {
-    const unit = facts.surfaces.unit_mm, found = [];
+    const unit = facts.surfaces.unit_mm, bytes = new Uint8Array(data.surfaces), found = [];
     let at = 0;
+    const planes = (count, width) => { // the lowest byte of all, then the next of all
+      const values = new Int32Array(count);
+      for (let shift = 0; shift < 8 * width; shift += 8) for (let i = 0; i < count; i++) values[i] |= bytes[at++] << shift;
+      return values;
+    };
     for (const part of facts.surfaces.parts) {
-      const steps = new Int16Array(data.surfaces.slice(at, at + 6 * part.corners)), n = part.corners;
-      at += 6 * n;
+      const n = part.corners, steps = planes(3 * n, 2);
       const corner = new Float32Array(3 * n), low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
       for (let axis = 0; axis < 3; axis++)
         for (let v = 0, whole = 0; v < n; v++) {
@@ -92,10 +98,8 @@ const slicing = (() => {
       found.push({ ...part, corner, low, high, height: new Float32Array(n) });
     }
     for (const part of found) {
-      const steps = new Int32Array(data.surfaces.slice(at, at + 12 * part.triangles));
-      at += 12 * part.triangles;
-      part.faces = new Int32Array(steps.length);
-      for (let i = 0, corner = 0; i < steps.length; i++) part.faces[i] = corner += steps[i];
+      let newest = 0;
+      part.faces = planes(3 * part.triangles, 3).map((below) => below ? newest - below : newest++);
     }
     return found;
   })();
@@ -401,7 +405,7 @@ const slicing = (() => {
   function leaning(plane, needle) {
     const lean = dot(needle.outward, plane.normal), tip = dot(plus(needle.at, plane.at, -1), plane.normal) - plane.offset;
     const far = tip + (Math.abs(lean) <= IN_PLANE ? 0 : lean * needle.path), side = towardText(scaled(plane.normal, Math.sign(far)));
-    if (Math.abs(lean) <= IN_PLANE) return Math.abs(far) < 0.5 ? "Holds the needle." : `The needle is ${lengthText(Math.abs(far))} from this plane, ${side}.`;
+    if (Math.abs(lean) <= IN_PLANE) return Math.abs(far) < 0.5 ? "The needle lies in this plane." : `The needle is ${lengthText(Math.abs(far))} from this plane, ${side}.`;
     return Number.isFinite(far) ? `The skin entry is ${lengthText(Math.abs(far))} from this plane, ${side}.` : "";
   }
 
@@ -591,12 +595,21 @@ const slicing = (() => {
     write(narrow ? "mm from the target (right: deeper)" : "mm from the target along the needle (left: outside; right of the target: deeper)", (left + right) / 2, bottom + 32, "center");
   }
 
+  const coarse = facts.surfaces.off_mm > 0.5;
+  function voxelNote() {
+    if (!facts.ct) return "The case has no CT: only the outlines of the structures.";
+    if (!ct) return "This browser alters pictures that a page reads, so no CT is shown: only the outlines of the structures. Allow the page to read its canvas, or see slices.png.";
+    const size = (mm) => `${mm.map((one) => +one.toFixed(2)).join(" × ")} mm`, { shown_mm, voxel_mm, rms_hu, worst_hu } = facts.ct;
+    const means = shown_mm.some((mm, axis) => mm !== voxel_mm[axis]) ? `means over ${size(shown_mm)} (its voxels: ${size(voxel_mm)})` : `its own voxels, ${size(voxel_mm)}`;
+    return lossy ? `CT: ${means}, packed with loss so that it fits this page: soft tissue is off by ${Math.ceil(rms_hu)} HU (rms), at edges by up to ${Math.ceil(worst_hu)} HU. The cursor's ± is two standard deviations.`
+      : "The CT's nearest voxels, not smoothed; HU rounded as the cursor says.";
+  }
+
   return {
     View, drawUnits, pathFrom, placeText, lengthText, shared, parts, NEAR_MM,
-    voxelNote: !ct ? "The case has no CT: only the outlines of the structures." : facts.ct.shown_mm.some((mm, axis) => mm !== facts.ct.voxel_mm[axis])
-      ? `CT: means over ${facts.ct.shown_mm.map((mm) => +mm.toFixed(2)).join(" × ")} mm (its voxels: ${facts.ct.voxel_mm.map((mm) => +mm.toFixed(2)).join(" × ")} mm), so that it fits this page; HU rounded as the cursor says.`
-      : "The CT's nearest voxels, not smoothed; HU rounded as the cursor says.",
-    surfaceNote: `Outlines: the checked surfaces to ${(0.87 * facts.surfaces.unit_mm).toFixed(2)} mm. Hatched: not on this page.`,
+    voxelNote: voxelNote(),
+    surfaceNote: `Outlines: the checked surfaces to ${facts.surfaces.off_mm.toFixed(2)} mm${coarse ? ", coarser than they were checked, so that they fit this page; slices.png has them as they are" : ""}. Hatched: not on this page.`,
+    coarse,
     halfVoxel: facts.ct ? Math.max(...facts.ct.voxel_mm) / 2 : null,
     setTone(name) { tone = name; },
   };

@@ -57,34 +57,33 @@ class DeclaredArm(NamedTuple):
             sigma[PARAMETERS[kind]] = value
         return sigma
 
-    def flange_slopes(self, q: Floats, turn: Floats) -> Floats:
-        """Shift (mm) and turn (rad) of the flange per standard deviation of each parameter, shape (n, 6, 23), base.
-
-        With play (n, 6, 29): six more parameters are by how much each joint's play differs from the declared one.
+    def motions(self, q: Floats, turn: Floats) -> FlangeMotions:
+        """How the arm's errors move its flange.
 
         Args:
             q: Joints, shape (n, 6), rad.
             turn: Direction in which each last rotated, shape (n, 6): 1, -1, or 0 where unknown.
         """
-        slopes = error_jacobian(self.model, q, 0.0)[..., :N_ARM] * self.deviations()
+        J = error_jacobian(self.model, q, 0.0)
+        slopes, joints = J[..., :N_ARM] * self.deviations(), J[..., PARAMETERS["joint"]]
+        play = -self.play_rad * joints * turn[:, None, :]  # -half the width times the direction of rotation
         if self.play_rad:
-            slopes = np.concatenate([slopes, PLAY_KNOWN * self._play_slopes(q, turn)], axis=2)
-        return np.asarray(slopes)
-
-    def play_motion(self, q: Floats, turn: Floats) -> Floats:
-        """Motion of the flange by the declared play from where its joints say, shape (n, 6); arguments as above."""
-        return np.asarray(self._play_slopes(q, turn).sum(axis=2))
-
-    def _play_slopes(self, q: Floats, turn: Floats) -> Floats:
-        """Slopes of each joint's play: -half the width times the direction in which it rotated."""
-        J = error_jacobian(self.model, q, 0.0)[..., PARAMETERS["joint"]]
-        return np.asarray(-self.play_rad * J * turn[:, None, :])
-
-    def arrival_covariance(self, q: Floats, turn: Floats) -> Floats:
-        """Covariance of the flange between arrivals at one pose, shape (n, 6, 6), mm and rad; arguments as above."""
-        J = error_jacobian(self.model, q, 0.0)[..., PARAMETERS["joint"]]
+            slopes = np.concatenate([slopes, PLAY_KNOWN * play], axis=2)
         variance = self.arrival_rad**2 + self.play_rad**2 * (turn == 0.0)  # play is noise where its sign is unknown
-        return np.asarray((J * variance[:, None, :]) @ np.swapaxes(J, -1, -2))
+        arrival = (joints * variance[:, None, :]) @ np.swapaxes(joints, -1, -2)
+        return FlangeMotions(slopes, play.sum(axis=2), arrival)
+
+
+class FlangeMotions(NamedTuple):
+    """How the errors of one arm move its flange at n poses: shift (mm) and turn (rad) along the base's axes."""
+
+    slopes: Floats
+    """Per standard deviation of each parameter, shape (n, 6, 23); (n, 6, 29) with play: six more parameters are by how
+    much each joint's play differs from the declared one."""
+    play: Floats
+    """By the declared play from where the joints say, shape (n, 6)."""
+    arrival: Floats
+    """Covariance between arrivals at one pose, shape (n, 6, 6)."""
 
 
 class DeclaredArms(NamedTuple):
@@ -101,18 +100,8 @@ class DeclaredArms(NamedTuple):
 class ArmErrors(NamedTuple):
     """How both arms' errors move the flanges of a recording."""
 
-    probe: Floats
-    """Shape (n, 6, 23), motion per standard deviation of the probe's arm; (n, 6, 29) where play is declared."""
-    needle: Floats
-    """The motion by the needle's arm, likewise shaped."""
-    probe_play: Floats
-    """How the declared play moves the flange, shape (n, 6)."""
-    needle_play: Floats
-    """How the play of the needle's arm moves its flange, shape (n, 6)."""
-    probe_arrival: Floats
-    """Covariance, shape (n, 6, 6)."""
-    needle_arrival: Floats
-    """Covariance, shape (n, 6, 6)."""
+    probe: FlangeMotions
+    needle: FlangeMotions
 
 
 def arm_errors(declared: DeclaredArms, recording: Recording) -> ArmErrors:
@@ -130,14 +119,7 @@ def arm_errors(declared: DeclaredArms, recording: Recording) -> ArmErrors:
     unknown = np.zeros(q_probe.shape)
     turn_probe = unknown if recording.turn_probe is None else recording.turn_probe
     turn_needle = unknown if recording.turn_needle is None else recording.turn_needle
-    return ArmErrors(
-        declared.probe.flange_slopes(q_probe, turn_probe),
-        declared.needle.flange_slopes(q_needle, turn_needle),
-        declared.probe.play_motion(q_probe, turn_probe),
-        declared.needle.play_motion(q_needle, turn_needle),
-        declared.probe.arrival_covariance(q_probe, turn_probe),
-        declared.needle.arrival_covariance(q_needle, turn_needle),
-    )
+    return ArmErrors(declared.probe.motions(q_probe, turn_probe), declared.needle.motions(q_needle, turn_needle))
 
 
 def corrected(T_base_flange: Floats, motion: Floats) -> Floats:
@@ -150,4 +132,7 @@ def corrected(T_base_flange: Floats, motion: Floats) -> Floats:
 
 def without_play(recording: Recording, errors: ArmErrors) -> Recording:
     """The recording with its flanges where the declared play leaves them."""
-    return replace(recording, A=corrected(recording.A, errors.probe_play), B=corrected(recording.B, errors.needle_play))
+    if not (errors.probe.play.any() or errors.needle.play.any()):
+        return recording
+    A, B = corrected(recording.A, errors.probe.play), corrected(recording.B, errors.needle.play)
+    return replace(recording, A=A, B=B)

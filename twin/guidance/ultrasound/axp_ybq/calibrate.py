@@ -69,7 +69,8 @@ def calibrate(
     tip in end2.
 
     Args:
-        recording: At least 16 poses (20 are better); 7 with ``known_tip``; unknowns / 3 + 1 with ``start``.
+        recording: At least 16 poses (20 are better); 7 with ``known_tip``; one more where P has three coordinates;
+            unknowns / 3 + 1 with ``start``.
         noise: Of both arms and the image; None estimates the residuals' spread, inside and across the image.
         known_tip: t_Q, shape (3,), mm, frame end2, where it is known.
         needle_length_mm: Distance along the shaft from the flange's origin to the tip: determines a constant error of
@@ -112,12 +113,15 @@ def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: E
         refuse("the tip is in pixels", "recording", "mm, or scale to estimate mm per pixel", "wrong_unit")
     if known_tip is not None and (np.shape(known_tip) != (3,) or not np.isfinite(known_tip).all()):
         refuse(f"known tip {known_tip}", "known_tip", "three finite numbers, mm, frame end2", "not_finite")
-    least = LEAST_POSES if known_tip is None else LEAST_POSES_KNOWN_TIP
+    if scale and recording.P.shape[1] == 3:
+        refuse("three coordinates and scale", "recording", "three coordinates in mm", "wrong_unit")
+    least = (LEAST_POSES if known_tip is None else LEAST_POSES_KNOWN_TIP) + (recording.P.shape[1] == 3)
     if start is not None:
         least = len(active_columns(tip=known_tip is None, scale=scale, direction=False)) // 3 + 1
     if len(recording) < least:
-        allowed = f"{least} or more" + (f", preferably {ADVISED_POSES}" if least == LEAST_POSES else "")
-        refuse(plural(len(recording), "pose"), "recording", allowed, "too_few_poses")
+        allowed = f"{least} or more" + (f", preferably {ADVISED_POSES}" if least >= LEAST_POSES else "")
+        missed = f" (and {plural(len(recording.missed), 'picture')} without a needle)" if recording.missed else ""
+        refuse(plural(len(recording), "pose") + missed, "recording", allowed, "too_few_poses")
 
 
 def _solve(

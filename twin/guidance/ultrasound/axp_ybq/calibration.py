@@ -24,6 +24,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
     direction_findings,
     linearised_tip,
     needle_in_image,
+    tip_points,
     tip_residuals,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import SmallSample, small_sample
@@ -62,6 +63,8 @@ class Calibration(Shown):
         parameters: Names with their units; rotations are small turns on the right, R exp([w]x).
         freedom: Residuals minus unknowns.
         noise: What the weights were made from: given, or found from the residuals (``Spread``).
+        shaft_unit: Root mean square of the directions' spreads by their shafts' lengths; 1 where those were not read.
+        lean_rad: How far the needle leans out of the image, as the residuals show it.
         noise_ratio: Size of the residuals over what ``noise`` and ``arms`` let expect; far above 1: they are larger.
         tip_bias_mm: How far the detected tip lies beyond the true one along the shaft; None without a needle length.
         orientations: M, rotation from end2 to image, shape (n, 3, 3): how the needle stood in the image.
@@ -90,6 +93,8 @@ class Calibration(Shown):
     parameters: tuple[str, ...]
     freedom: int
     noise: Noise | Spread
+    shaft_unit: float
+    lean_rad: float
     noise_ratio: float
     tip_bias_mm: float | None
     orientations: Floats
@@ -140,8 +145,8 @@ class Calibration(Shown):
         if self.arms is None:
             return poses.A, poses.B
         errors = arm_errors(self.arms, poses)
-        probe, needle = np.split(self.arm_errors, [errors.probe.shape[2]])
-        motions = errors.probe_play + errors.probe @ probe, errors.needle_play + errors.needle @ needle
+        probe, needle = np.split(self.arm_errors, [errors.probe.slopes.shape[2]])
+        motions = errors.probe.play + errors.probe.slopes @ probe, errors.needle.play + errors.needle.slopes @ needle
         return corrected(poses.A, motions[0]), corrected(poses.B, motions[1])
 
     def tip_covariances(self, poses: Recording) -> Floats:
@@ -170,7 +175,7 @@ class Calibration(Shown):
         Args:
             A: True T_base1_end1, shape (n, 4, 4), mm.
             B: True T_base2_end2, shape (n, 4, 4), mm.
-            P: True tip in the image, shape (n, 2), in the recording's unit.
+            P: True tip in the image, shape (n, 2) or (n, 3), in the recording's unit.
         """
         return np.asarray(np.linalg.norm(tip_residuals(self.estimate, Recording(A, B, P)), axis=1))
 
@@ -180,13 +185,13 @@ class Calibration(Shown):
         The needle is taken to stand in the image as it did in the recording, one orientation as likely as the other.
 
         Args:
-            points_image: Shape (m, 2), in the recording's unit.
+            points_image: Shape (m, 2), in the recording's unit, or (m, 3), mm.
             A: T_base1_end1, shape (4, 4) or (m, 4, 4), mm.
 
         Returns:
             Shape (m,), mm.
         """
-        points = np.atleast_2d(np.asarray(points_image, dtype=np.float64))[:, :2]
+        points = np.atleast_2d(np.asarray(points_image, dtype=np.float64))[:, :3]
         A = np.broadcast_to(A, (len(points), 4, 4))
         mean = self.orientations.mean(axis=0)
         J = linearised_tip(self.estimate, self._aimed(points, A)).jacobian
@@ -202,9 +207,9 @@ class Calibration(Shown):
     def _aimed(self, points: Floats, A: Floats) -> Recording:
         """Poses of the needle's arm that bring the tip to image points."""
         estimate = self.estimate
-        in_end1 = (points * self.scale) @ estimate.R_X[:, :2].T + estimate.t_X
-        target = np.einsum("nij,nj->ni", A[:, :3, :3], in_end1) + A[:, :3, 3]
         B = np.tile(np.eye(4), (len(points), 1, 1))
+        in_end1, _ = tip_points(estimate, Recording(A, B, points))
+        target = np.einsum("nij,nj->ni", A[:, :3, :3], in_end1) + A[:, :3, 3]
         B[:, :3, 3] = (target - estimate.t_Y) @ estimate.R_Y - estimate.t_Q
         return Recording(A, B, points)
 
@@ -285,6 +290,8 @@ def calibration_of(
         parameters=tuple(PARAMETERS[column] for column in problem.active),
         freedom=freedom,
         noise=problem.noise,
+        shaft_unit=problem.recording.shaft_unit,
+        lean_rad=problem.lean_rad,
         noise_ratio=float(np.sqrt(at_fit.chi_squared / max(freedom, 1))),
         tip_bias_mm=None,
         orientations=read_only(needle_in_image(estimate, problem.recording)),

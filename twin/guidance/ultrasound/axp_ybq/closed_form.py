@@ -4,7 +4,8 @@ The linear solution (spec 3, section 1) needs no start value and is exact withou
 R_A R_X p + R_A t_X + t_A = R_Y R_B t_Q + R_Y t_B + t_Y, linear in
 z = [x1; x2; t_X; vec(t_Q^T (x) R_Y); vec(R_Y); t_Y] (48 unknowns), or, with a known tip, in
 z = [x1; x2; t_X; vec(R_Y); t_Y] (21 unknowns). x1, x2 are the first two columns of R_X times mm per unit of P: the
-image is a plane, so that its third column is never excited and is left out.
+image is a plane, so that its third column is never excited and is left out. Where P has a third coordinate (a volume,
+a camera) it is: three more unknowns, at the end of z, and the handedness of the image is measured.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.geometry.rigid import exp_rotation, skew
+from puncture_twin.planning.geometry.rigid import exp_rotation, nearest_rotation, skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
 PARAMETERS = (
@@ -119,29 +120,37 @@ def closed_form(recording: Recording, *, known_tip: Floats | None = None, scale:
         scale: Whether mm per unit of P is unknown.
     """
     A, B = recording.A, recording.B
-    p = recording.P / (np.abs(recording.P).max() if scale else LENGTH_MM)  # columns of one size
+    p = recording.P[:, :2] / (np.abs(recording.P).max() if scale else LENGTH_MM)  # columns of one size
+    third = _third_columns(recording)
     system, t_A = _probe_columns(A, p), A[:, :3, 3] / LENGTH_MM
     if known_tip is None:
-        z = _solve(np.concatenate([system, _needle_columns(B)], axis=2), t_A)
+        z = _solve(np.concatenate([system, _needle_columns(B), third], axis=2), t_A)
         R_Y = nearest_rotation(z[36:45].reshape(3, 3).T)  # column-major vec
     else:
-        z = _solve(np.concatenate([system, _tip_columns(B, known_tip)], axis=2), t_A)
+        z = _solve(np.concatenate([system, _tip_columns(B, known_tip), third], axis=2), t_A)
         R_Y = nearest_rotation(z[9:18].reshape(3, 3).T)
     R_X, sizes = _image_axes(z[:3], z[3:6])
+    if third.shape[2]:
+        R_X = nearest_rotation(np.column_stack([z[:3], z[3:6], z[-3:]]))
     unit = sizes * LENGTH_MM / np.abs(recording.P).max() if scale else np.ones(2)
     t_X, t_Y, t_Q = _translations(recording, R_X, R_Y, unit, known_tip)
     return Estimate(R_X, t_X, R_Y, t_Y, t_Q, unit, np.array([0.0, 0.0, 1.0]))
 
 
-def nearest_rotation(M: Floats) -> Floats:
-    """The rotation nearest to a matrix (3, 3), in the Frobenius norm; for -M the same as for M where det M < 0."""
-    U, _, Vt = np.linalg.svd(M)
-    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
-
-
 def _probe_columns(A: Floats, p: Floats) -> Floats:
     R_A = A[:, :3, :3]
     return np.concatenate([-p[:, :1, None] * R_A, -p[:, 1:, None] * R_A, -R_A], axis=2)
+
+
+LEAST_ACROSS_MM = 5.0
+"""Tips nearer to the plane z = 0 (rms) are a plane's, as a start: the third axis is then the others' cross product."""
+
+
+def _third_columns(recording: Recording) -> Floats:
+    """Columns of R_X's third axis, shape (n, 3, 3); (n, 3, 0) where the tips lie in a plane."""
+    if recording.P.shape[1] == 2 or np.sqrt(np.mean(recording.P[:, 2] ** 2)) < LEAST_ACROSS_MM:
+        return np.zeros((len(recording), 3, 0))
+    return np.asarray(-recording.P[:, 2:, None] / LENGTH_MM * recording.A[:, :3, :3])
 
 
 def _needle_columns(B: Floats) -> Floats:
@@ -176,7 +185,7 @@ def _translations(
     """t_X, t_Y, t_Q once more, with proper rotations: R_A t_X - t_Y - R_Y R_B t_Q = R_Y t_B - R_A R_X p - t_A."""
     A, B, n = recording.A, recording.B, len(recording)
     R_A, R_YB = A[:, :3, :3], R_Y @ B[:, :3, :3]
-    right = B[:, :3, 3] @ R_Y.T - np.einsum("nij,nj->ni", R_A @ R_X[:, :2], recording.P * unit) - A[:, :3, 3]
+    right = B[:, :3, 3] @ R_Y.T - np.einsum("nij,nj->ni", R_A @ R_X, recording.points_image(unit)) - A[:, :3, 3]
     system = np.concatenate([R_A, np.tile(-np.eye(3), (n, 1, 1)), -R_YB], axis=2)
     if known_tip is not None:
         right, system = right + R_YB @ known_tip, system[:, :, :6]  # its columns are known

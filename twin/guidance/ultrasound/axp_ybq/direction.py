@@ -231,7 +231,7 @@ def linearised_tip(estimate: Estimate, recording: Recording) -> Linearised:
     """The tip's residuals with their Jacobian."""
     n, r = len(recording), tip_residuals(estimate, recording)
     R_A, R_AX = recording.A[:, :3, :3], recording.A[:, :3, :3] @ estimate.R_X
-    p = np.column_stack([recording.P * estimate.scale, np.zeros(n)])
+    p = recording.points_image(estimate.scale)
     _, in_base2 = tip_points(estimate, recording)
     J = np.zeros((n, 3, N_PARAMETERS))
     J[:, :, W_X] = R_AX @ skew(p)
@@ -239,7 +239,7 @@ def linearised_tip(estimate: Estimate, recording: Recording) -> Linearised:
     J[:, :, W_Y] = -estimate.R_Y @ skew(in_base2)
     J[:, :, T_Y] = np.eye(3)
     J[:, :, T_Q] = estimate.R_Y @ recording.B[:, :3, :3]
-    J[:, :, SCALE] = -R_AX[:, :, :2] * recording.P[:, None, :]
+    J[:, :, SCALE] = -R_AX[:, :, :2] * recording.P[:, None, :2]
     return Linearised(r, J)
 
 
@@ -252,7 +252,7 @@ def tip_residuals(estimate: Estimate, recording: Recording) -> Floats:
 
 def tip_points(estimate: Estimate, recording: Recording) -> tuple[Floats, Floats]:
     """The tip in end1, by the image, and in base2, by the needle's arm; both (n, 3), mm."""
-    in_end1 = (recording.P * estimate.scale) @ estimate.R_X[:, :2].T + estimate.t_X
+    in_end1 = recording.points_image(estimate.scale) @ estimate.R_X.T + estimate.t_X
     in_base2 = recording.B[:, :3, :3] @ estimate.t_Q + recording.B[:, :3, 3]
     return in_end1, in_base2
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, skew
+from puncture_twin.planning.geometry.rigid import exp_rotation, log_rotation, nearest_rotation, skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
     LENGTH_MM,
     T_Q,
@@ -32,7 +32,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
     W_X,
     W_Y,
     Estimate,
-    nearest_rotation,
     parameter_units,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import linearised_tip, needle_in_image, tip_points
@@ -166,7 +165,7 @@ def _tip(
 ) -> list[IllConditionedMotion]:
     """w_X = k with t_X so that the mean tip stays: the image turns about the tip, or about the line of all tips."""
     family = np.zeros((17, 3))
-    p = np.append((recording.P * estimate.scale).mean(axis=0), 0.0) / LENGTH_MM
+    p = recording.points_image(estimate.scale).mean(axis=0) / LENGTH_MM
     family[W_X], family[T_X] = np.eye(3), estimate.R_X @ skew(p)
     ill_conditioned, _ = _ill_conditioned_part(J, active, family, limit)
     if ill_conditioned == 3:
@@ -329,7 +328,7 @@ def _central(recording: Recording) -> int:
 
 def _changed(estimate: Estimate, recording: Recording, row: int, move: _Move) -> PoseChange:
     """The pose after the move, by the present estimate."""
-    A, p = recording.A[row], np.append(recording.P[row] * estimate.scale, 0.0)
+    A, p = recording.A[row], recording.points_image(estimate.scale)[row]
     R_AX, M = A[:3, :3] @ estimate.R_X, needle_in_image(estimate, recording)[row]
     tip_base1 = A[:3, :3] @ (estimate.R_X @ p + estimate.t_X) + A[:3, 3]
     rotated = R_AX @ exp_rotation(np.array(move.turn))
@@ -348,8 +347,9 @@ def _changed(estimate: Estimate, recording: Recording, row: int, move: _Move) ->
 
 def _as_recording(estimate: Estimate, recording: Recording, changes: list[PoseChange]) -> Recording:
     start = dict(zip(recording.names, recording.P, strict=True))
-    P = [start[change.reference] + change.tip_shift_mm / estimate.scale for change in changes]
-    return Recording(np.array([c.A for c in changes]), np.array([c.B for c in changes]), np.array(P))
+    P = np.array([start[change.reference] for change in changes])
+    P[:, :2] += np.array([change.tip_shift_mm for change in changes]) / estimate.scale
+    return Recording(np.array([c.A for c in changes]), np.array([c.B for c in changes]), P)
 
 
 def _greedy(

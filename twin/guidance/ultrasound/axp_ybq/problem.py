@@ -99,7 +99,7 @@ def _pose_covariances(problem: Problem, estimate: Estimate) -> Floats:
     sigma = covariances(estimate, problem.recording, problem.noise, v_image, problem.lean_rad)
     if problem.arms is not None:
         slopes = flange_slopes(estimate, problem.recording, v_image)
-        for by_flange, cov in zip(slopes, (problem.arms.probe_arrival, problem.arms.needle_arrival), strict=True):
+        for by_flange, cov in zip(slopes, (one.arrival for one in problem.arms), strict=True):
             sigma = sigma + by_flange @ cov @ by_flange.transpose(0, 2, 1)
     return sigma
 
@@ -144,10 +144,10 @@ def _propagated(estimate: Estimate, recording: Recording, noise: Noise, v_image:
         turn_A = np.concatenate([turn_A, rows @ estimate.R_X.T @ skew(end1)], axis=1)
         turn_B = np.concatenate([turn_B, -rows @ M @ skew(estimate.V)], axis=1)
     sigma = noise.robot_rad**2 * (turn_A @ turn_A.transpose(0, 2, 1) + turn_B @ turn_B.transpose(0, 2, 1))
-    in_image = (R_A @ estimate.R_X)[:, :, :2]
+    in_image = (R_A @ estimate.R_X)[:, :, : recording.P.shape[1]]
     sigma[:, :3, :3] += noise.image_mm**2 * in_image @ in_image.transpose(0, 2, 1)
     sigma[:, :3, :3] += 2 * noise.robot_mm**2 * np.eye(3)
-    if noise.off_plane_mm:
+    if noise.off_plane_mm and recording.P.shape[1] == 2:
         normal = (R_A @ estimate.R_X)[:, :, 2]
         sigma[:, :3, :3] += noise.off_plane_mm**2 * normal[:, :, None] * normal[:, None, :]
     return np.asarray(sigma)
@@ -186,7 +186,7 @@ def _shared_slopes(problem: Problem, estimate: Estimate) -> Floats | None:
         return None
     v_image = directions_image(problem.recording, estimate) if problem.with_direction else None
     by_probe, by_needle = flange_slopes(estimate, problem.recording, v_image)
-    return np.concatenate([by_probe @ problem.arms.probe, by_needle @ problem.arms.needle], axis=2)
+    return np.concatenate([by_probe @ problem.arms.probe.slopes, by_needle @ problem.arms.needle.slopes], axis=2)
 
 
 def linearise(problem: Problem, estimate: Estimate) -> Linearised:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import Shown, brief
-from puncture_twin.planning.formats.guard import MAX_COORDINATE_MM, ROTATION_TOLERANCE
 from puncture_twin.planning.formats.points import joint_readings
+from puncture_twin.planning.formats.pose_table import finite_rows, pose_names, refuse_first, rigid_poses
 
 OPTIONAL = ("v", "shaft_mm", "q_probe", "q_needle", "turn_probe", "turn_needle")
 """Optional arrays of a recording besides both flanges and the tip, with one row per pose."""
@@ -58,7 +58,8 @@ class Recording(Shown):
     Attributes:
         A: T_base1_end1, shape (n, 4, 4), mm: flange of the probe's arm.
         B: T_base2_end2, shape (n, 4, 4), mm: flange of the needle's arm.
-        P: The tip in the image, shape (n, 2), mm (pixels where ``pixels`` is set).
+        P: The tip in the image, shape (n, 2), mm (pixels where ``pixels`` is set); shape (n, 3), mm, where a volume or
+            a camera measures it out of a plane too.
         v: Direction of the needle toward its tip, in the image, made unit. Shape (n, 2) where the image alone says it,
             (n, 3) where the part across the image is measured too; None where it was not measured.
         names: One per pose; numbers where nothing is given.
@@ -71,6 +72,7 @@ class Recording(Shown):
         turn_needle: As ``turn_probe``, of the needle's arm; both only with joints.
         shaft_mm: How much of the shaft shows, shape (n,): the more, the better its direction is known. Only with
             directions; None where it was not measured: all directions then count the same.
+        missed: Name and reason of each picture in which no needle was found.
 
     Raises:
         InputError: Shapes that do not match, values that are not finite, matrices that are not rigid motions.
@@ -87,21 +89,21 @@ class Recording(Shown):
     turn_probe: Floats | None = None
     turn_needle: Floats | None = None
     shaft_mm: Floats | None = None
+    missed: tuple[tuple[str, str], ...] = ()
 
     @brief
     def __repr__(self) -> str:
-        return f"{len(self.P)} poses, the tip in {'pixels' if self.pixels else 'mm'}"
+        missed = f", {len(self.missed)} pictures without a needle" if self.missed else ""
+        return f"{len(self.P)} poses, the tip in {'pixels' if self.pixels else 'mm'}{missed}"
 
     def __post_init__(self) -> None:
-        n = len(np.atleast_1d(self.A))
-        names = tuple(self.names) or tuple(str(i + 1) for i in range(n))
-        if n == 0 or len(names) != n or len(set(names)) != n:
-            what = f"{n} poses and {len(set(names))} different names"
-            refuse(what, "recording", "one name per pose", "duplicate_name")
+        names = pose_names(self.names, len(np.atleast_1d(self.A)))
         object.__setattr__(self, "names", names)
-        object.__setattr__(self, "A", _rigid(self.A, "A", names))
-        object.__setattr__(self, "B", _rigid(self.B, "B", names))
-        object.__setattr__(self, "P", _finite(self.P, "P", names, widths=(2,)))
+        object.__setattr__(self, "A", rigid_poses(self.A, "A", names))
+        object.__setattr__(self, "B", rigid_poses(self.B, "B", names))
+        object.__setattr__(self, "P", finite_rows(self.P, "P", names, widths=(2, 3)))
+        if self.pixels and self.P.shape[1] == 3:
+            refuse("three coordinates in pixels", "recording", "mm", "wrong_unit")
         if self.v is not None:
             object.__setattr__(self, "v", _directions(self.v, names))
         if self.shaft_mm is not None:
@@ -127,8 +129,19 @@ class Recording(Shown):
         """Each direction's standard deviation over all directions' rms, shape (n,)."""
         if self.shaft_mm is None:
             return np.ones(len(self))
-        spread = self.shaft_mm**-SHAFT_POWER
-        return np.asarray(spread / np.sqrt(np.mean(spread**2)))
+        return np.asarray(self.shaft_mm**-SHAFT_POWER / self.shaft_unit)
+
+    @property
+    def shaft_unit(self) -> float:
+        """Root mean square of what the shafts' lengths say of the directions' spreads; 1 where nothing does."""
+        return 1.0 if self.shaft_mm is None else float(np.sqrt(np.mean(self.shaft_mm ** (-2 * SHAFT_POWER))))
+
+    def points_image(self, scale: Floats) -> Floats:
+        """The tips, shape (n, 3), mm, by the mm per unit of P along u and v, shape (2,); a plane has z = 0."""
+        points = np.zeros((len(self), 3))
+        points[:, : self.P.shape[1]] = self.P
+        points[:, :2] *= scale
+        return points
 
     def __len__(self) -> int:
         return len(self.names)
@@ -139,7 +152,9 @@ class Recording(Shown):
         parts: dict[str, Any] = {
             key: None if getattr(self, key) is None else getattr(self, key)[rows] for key in OPTIONAL
         }
-        return Recording(self.A[rows], self.B[rows], self.P[rows], names=names, pixels=self.pixels, **parts)
+        return Recording(
+            self.A[rows], self.B[rows], self.P[rows], names=names, pixels=self.pixels, missed=self.missed, **parts
+        )
 
     def joined(self, other: Recording) -> Recording:
         """Two recordings, one after the other, numbered anew.
@@ -148,7 +163,7 @@ class Recording(Shown):
             InputError: One has directions or pixels and the other has not.
         """
         widths = [None if r.v is None else r.v.shape[1] for r in (self, other)]
-        if widths[0] != widths[1] or self.pixels != other.pixels:
+        if widths[0] != widths[1] or self.pixels != other.pixels or self.P.shape[1] != other.P.shape[1]:
             refuse("two recordings with different columns", "recording", "the same columns", "tables_differ")
         A, B, P = (np.concatenate([getattr(r, key) for r in (self, other)]) for key in "ABP")
         parts: dict[str, Any] = {key: _both(getattr(self, key), getattr(other, key)) for key in OPTIONAL}
@@ -160,21 +175,10 @@ def _both(first: Floats | None, second: Floats | None) -> Floats | None:
     return None if first is None or second is None else np.concatenate([first, second])
 
 
-def _finite(values: Floats, what: str, names: tuple[str, ...], *, widths: tuple[int, ...]) -> Floats:
-    array = np.array(values, dtype=np.float64)
-    if array.ndim != 2 or len(array) != len(names) or array.shape[1] not in widths:
-        wanted = " or ".join(f"({len(names)}, {width})" for width in widths)
-        refuse(f"{what} has shape {array.shape}", "recording", wanted, "wrong_shape")
-    bad = np.asarray(~(np.isfinite(array) & (np.abs(array) <= MAX_COORDINATE_MM)).all(axis=1))
-    _refuse_first(
-        bad, names, what, "is not finite or out of range", f"numbers within {MAX_COORDINATE_MM:g}", "not_finite"
-    )
-    array.setflags(write=False)
-    return array
-
-
 def _angles(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
-    array = joint_readings(_finite(values, what, names, widths=(6,)), "rad", where=f"recording, {what}", names=names)
+    array = joint_readings(
+        finite_rows(values, what, names, widths=(6,)), "rad", where=f"recording, {what}", names=names
+    )
     array.setflags(write=False)
     return array
 
@@ -182,48 +186,26 @@ def _angles(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
 def _lengths(values: Floats, v: Floats | None, names: tuple[str, ...]) -> Floats:
     if v is None:
         refuse("shaft_mm without directions", "recording", "together with v, or not at all", "missing_column")
-    array = _finite(np.reshape(values, (-1, 1)), "shaft_mm", names, widths=(1,))[:, 0]
-    _refuse_first(
+    array = finite_rows(np.reshape(values, (-1, 1)), "shaft_mm", names, widths=(1,))[:, 0]
+    refuse_first(
         array < LEAST_SHAFT_MM, names, "shaft_mm", "is too little", f"at least {LEAST_SHAFT_MM:g} mm", "out_of_range"
     )
     return array
 
 
 def _signs(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
-    array = _finite(values, what, names, widths=(6,))
+    array = finite_rows(values, what, names, widths=(6,))
     bad = np.asarray(~np.isin(array, (-1.0, 0.0, 1.0)).all(axis=1))
-    _refuse_first(bad, names, what, "is not a direction of rotation", "1, -1, or 0 if not known", "bad_value")
-    return array
-
-
-def _rigid(T: Floats, what: str, names: tuple[str, ...]) -> Floats:
-    array = np.array(T, dtype=np.float64)
-    if array.shape != (len(names), 4, 4):
-        refuse(f"{what} has shape {array.shape}", "recording", f"({len(names)}, 4, 4)", "wrong_shape")
-    _finite(array.reshape(len(names), 16), what, names, widths=(16,))
-    R = array[:, :3, :3]
-    error = np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2))
-    bad = (error > ROTATION_TOLERANCE) | (np.linalg.det(R) < 0) | (np.abs(array[:, 3] - [0, 0, 0, 1]).max(axis=1) > 0)
-    allowed = f"a rotation (R^T R = 1 to {ROTATION_TOLERANCE:g}, determinant +1) and a translation, last row 0 0 0 1"
-    _refuse_first(bad, names, what, "is not a rigid motion", allowed, "not_rigid")
-    array.setflags(write=False)
+    refuse_first(bad, names, what, "is not a direction of rotation", "1, -1, or 0 if not known", "bad_value")
     return array
 
 
 def _directions(v: Floats, names: tuple[str, ...]) -> Floats:
-    array = np.array(_finite(v, "v", names, widths=(2, 3)))
+    array = np.array(finite_rows(v, "v", names, widths=(2, 3)))
     lengths = np.linalg.norm(array, axis=1)
     flat = np.linalg.norm(array[:, :2], axis=1) < LEAST_IN_PLANE * lengths
-    _refuse_first(~np.any(array != 0, axis=1), names, "v", "has no length", "a direction", "zero_direction")
-    _refuse_first(flat, names, "v", "points out of the image", "a needle that lies in the image", "out_of_image")
+    refuse_first(~np.any(array != 0, axis=1), names, "v", "has no length", "a direction", "zero_direction")
+    refuse_first(flat, names, "v", "points out of the image", "a needle that lies in the image", "out_of_image")
     array /= lengths[:, None]
     array.setflags(write=False)
     return array
-
-
-def _refuse_first(
-    bad: NDArray[np.bool_], names: tuple[str, ...], what: str, problem: str, allowed: str, code: str
-) -> None:
-    if bad.any():
-        name = names[int(np.argmax(bad))]
-        refuse(f"{what} of pose {name} {problem}", "recording", allowed, code)

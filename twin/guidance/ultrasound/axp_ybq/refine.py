@@ -262,7 +262,7 @@ def image_errors(problem: Problem, fit: RobustFit) -> ImageErrors | None:
 def _columns(recording: Recording, estimate: Estimate, with_direction: bool) -> NDArray[np.float64]:
     """The residuals' derivatives by a, b, k and w, shape (n, 3 or 5, 4)."""
     tip = linearised_tip(estimate, recording).jacobian[:, :, SCALE] * estimate.scale
-    skewed = -(recording.A[:, :3, :3] @ estimate.R_X)[:, :, :1] * (recording.P[:, None, 1:] * estimate.scale[1])
+    skewed = -(recording.A[:, :3, :3] @ estimate.R_X)[:, :, :1] * (recording.P[:, None, 1:2] * estimate.scale[1])
     columns = np.concatenate([tip, skewed, np.zeros_like(skewed)], axis=2)
     if not with_direction:
         return columns

@@ -8,7 +8,8 @@ stays small where there is no needle.
 1. Amplitude over background: the display's log compression is undone, the median around divides it.
 2. The brightest straight segment; too small a sum is no needle.
 3. The line, by weighted least squares on the ridge, through a window that narrows to it.
-4. The tip: where the amplitude along the line falls half way from the shaft's level to the background's, for good.
+4. The shaft along the line: it may be a row of beads, and has gaps of up to some mm.
+5. The tip: the last place where the amplitude falls half way to the background's.
 
 The needle goes down into the body, so the deeper end is the tip. What shows is where the needle leaves the *slice*: of
 a needle that is tilted against the image plane the end that shows need not be the tip, and no image alone can tell.
@@ -113,11 +114,18 @@ SHAFT_MM = 8.0
 NEAR_TIP_MM = 1.0
 """Length of shaft that is left out of its level: the tip is brighter."""
 
+TIP_MM = 1.5
+"""Length before the shaft's end whose brightest sample is the level of its last piece."""
+
+SURE_SHAFT = 2.5
+"""Amplitude over background that counts as shaft, however bright the rest is; the root of the shaft's where that is
+less: half way to it in greys."""
+
+MOST_LOST, MOST_GAINED = 0.5, 1.2
+"""Logarithms of amplitude that one sample at most takes away and adds."""
+
 TIP_ROUNDS = 3
 """Rounds of the shaft's level and end in turn."""
-
-SEEK_MM = 3.0
-"""How far from the shaft's coarse end the tip is looked for."""
 
 ENDS_AGREE_MM = 3.0
 """A faint shaft has gaps: where the search ends farther from the tip than this, nobody knows which is the end."""
@@ -290,28 +298,28 @@ def _profile(relative: Floats, imager: Imager, line: _Line, s: Floats) -> Floats
 
 
 def _shaft_only(relative: Floats, imager: Imager, line: _Line) -> _Line:
-    """The line cut to where it is brighter than half way between background and shaft.
+    """The line cut to the shaft: where the sum of what its greys exceed the least of a shaft by is largest.
 
-    The search lengthens a segment through any speckle that is a little bright; the shaft's own level tells better.
+    What one sample adds or takes is bounded, in logarithms: a bright bead is no more shaft than a faint one, and
+    between two beads, or facets that mirror the beam away, there may be a gap of some mm.
     """
-    for _ in range(2):
-        s = np.arange(line.start, SEEK_MM, STEP_MM)
-        profile = _profile(relative, imager, line, s)
-        shaft = float(np.percentile(profile[s < 0.0], SHAFT_PERCENTILE))
-        gain = np.cumsum(np.minimum(profile, 1.5 * shaft) - 0.5 * (1.0 + shaft))
-        lowest = np.minimum.accumulate(np.concatenate([[0.0], gain[:-1]]))
-        end = int(np.argmax(gain - lowest))
-        begin = int(np.argmin(np.concatenate([[0.0], gain])[: end + 1]))
-        line = _Line(line.point + s[end] * line.direction, line.direction, min(s[begin] - s[end], -STEP_MM))
-    return line
+    s = np.arange(line.start, float(np.hypot(*imager.size_mm)), STEP_MM)
+    profile = np.maximum(_profile(relative, imager, line, s), 1e-3)
+    least = min(float(np.sqrt(max(np.percentile(profile[s < 0.0], SHAFT_PERCENTILE), 1.0))), SURE_SHAFT)
+    gain = np.cumsum(np.clip(np.log(profile / least), -MOST_LOST, MOST_GAINED))
+    before = np.concatenate([[0.0], gain[:-1]])
+    end = int(np.argmax(gain - np.minimum.accumulate(before)))
+    begin = int(np.argmin(before[: end + 1]))
+    return _Line(line.point + s[end] * line.direction, line.direction, min(s[begin] - s[end], -STEP_MM))
 
 
 def _tip(relative: Floats, imager: Imager, line: _Line) -> _Tip:
-    """The end of the shaft: where its amplitude has fallen half way to the background's, for good.
+    """The end of the shaft: the last place where its amplitude falls half way to the background's.
 
-    For good: where the sum of what exceeds the half-way level is largest. A blurred step passes its half at the step.
+    A blurred step passes its half at the step. Half way from the level of the shaft, or of its last piece where that is
+    fainter.
     """
-    s = np.arange(-SHAFT_MM - 2.0 * SEEK_MM, 2.0 * SEEK_MM, STEP_MM)
+    s = np.arange(line.start, STEP_MM, STEP_MM)
     profile = _profile(relative, imager, line, s)
     end, shaft = 0.0, 0.0
     for _ in range(TIP_ROUNDS):
@@ -319,9 +327,11 @@ def _tip(relative: Floats, imager: Imager, line: _Line) -> _Tip:
         if not last.any():
             return _Tip(end, 0.0)
         shaft = float(np.median(profile[last]))
-        half = 0.5 * (1.0 + shaft)
-        here = np.flatnonzero(s > end - SHAFT_MM)[:-1]
-        at = int(here[np.argmax(np.cumsum(profile[here] - half))])
+        half = 0.5 * (1.0 + min(shaft, float(profile[s > end - TIP_MM].max())))
+        bright = np.flatnonzero(profile[:-1] > half)
+        if not len(bright):
+            return _Tip(end, 0.0)
+        at = int(bright[-1])
         fall = max(profile[at] - profile[at + 1], 1e-9)
         end = float(s[at] + STEP_MM * np.clip((profile[at] - half) / fall, 0.0, 1.0))
     return _Tip(end, shaft - 1.0)
