@@ -121,7 +121,7 @@ def draw(shown: dict[str, Distribution], outward_ct: Floats, path: Path) -> None
         axis.add_patch(Ellipse((0, 0), width, height, angle=lean, fill=False, edgecolor="#D55E00", linewidth=1.6))
         axis.add_patch(Ellipse((0, 0), 2 * HIT_MM, 2 * HIT_MM, fill=False, edgecolor="#666666", linestyle=":"))
         axis.set(xlim=(-SHOWN_MM, SHOWN_MM), ylim=(-SHOWN_MM, SHOWN_MM), aspect="equal")
-        hits = f"{100 * found.hit.mean():.1f} % within {HIT_MM:g} mm"
+        hits = f"{100 * (found.hit_share or 0.0):.1f} % within {HIT_MM:g} mm"
         axis.set_title(f"{way}: {found.realised_rms_mm:.2f} mm rms\n{hits}", fontsize=10)
     figure.supxlabel("across the needle, toward the head, mm")
     figure.supylabel("out along the needle, mm")
