@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from puncture_twin.planning.arm.kinematics import flange_pose
@@ -107,13 +108,13 @@ ROWS = {
 class UniformErrors(np.random.Generator):
     """Draws uniform errors where normal ones are asked for, of the same standard deviation."""
 
-    def normal(self, loc=0.0, scale=1.0, size=None):  # type: ignore[no-untyped-def, override] # as numpy has it
+    def normal(self, loc=0.0, scale=1.0, size=None):  # type: ignore[no-untyped-def] # as numpy has it
         """Uniform about ``loc``."""
         return loc + np.sqrt(3.0) * np.asarray(scale) * self.uniform(-1.0, 1.0, size)
 
 
 @cache
-def room_of(play_deg: float) -> tuple[SelfcalCase, TwoArms, CandidatePoses, Floats]:
+def room_of(play_deg: float) -> tuple[SelfcalCase, TwoArms, CandidatePoses, NDArray[np.int_]]:
     """The shipped case with a play, its checker, its candidates, and the rows that are recorded."""
     case = load_selfcal_case(CASE)
     content = case.content.model_copy(deep=True)
@@ -156,15 +157,17 @@ def outcome(kind: Kind, seed: int) -> Outcome:
 
 def with_play(truth: WorkcellTruth, factor: float) -> WorkcellTruth:
     """The room with another play."""
-    arms = (arm._replace(backlash_rad=factor * arm.backlash_rad) for arm in (truth.probe_arm, truth.needle_arm))
-    return WorkcellTruth(*arms, *truth[2:])
+    probe, needle = (
+        arm._replace(backlash_rad=factor * arm.backlash_rad) for arm in (truth.probe_arm, truth.needle_arm)
+    )
+    return truth._replace(probe_arm=probe, needle_arm=needle)
 
 
 def recorded(
     case: SelfcalCase,
     candidates: CandidatePoses,
     truth: WorkcellTruth,
-    rows: Floats,
+    rows: NDArray[np.int_],
     rng: np.random.Generator,
     *,
     noise: bool,
@@ -181,7 +184,7 @@ def recorded(
         rest[0] = truth.probe_arm.settle(q_probe[i], rest[0], rng)
         if noise:
             lean = rng.normal(0.0, np.radians(case.content.truth.lean_deg))
-            v = candidates.poses.v[row]
+            v = np.asarray(candidates.poses.v)[row]
             tip = np.array([*candidates.poses.P[row], rng.normal(0.0, case.content.truth.off_plane_mm)])
             wanted = NeedleInImage(tip, np.array([*(np.cos(lean) * v), np.sin(lean)]))
             jogged = jog_into_slice(truth, rest[0], q_needle[i], wanted, float(candidates.roll[row]))
@@ -197,8 +200,9 @@ def recorded(
         angle = angle + rng.normal(0.0, DIRECTION_RAD, len(P))
     A, B = flange_pose(truth.probe_arm.nominal, q_probe), flange_pose(truth.needle_arm.nominal, q_needle)
     v = np.column_stack([np.cos(angle), np.sin(angle)])
-    way = dict(zip(("turn_probe", "turn_needle"), turns, strict=True)) if truth.probe_arm.backlash_rad else {}
-    return Recording(A, B, P, v, q_probe=q_probe, q_needle=q_needle, **way), tips
+    way = turns if truth.probe_arm.backlash_rad else (None, None)
+    recording = Recording(A, B, P, v, q_probe=q_probe, q_needle=q_needle, turn_probe=way[0], turn_needle=way[1])
+    return recording, tips
 
 
 def with_outliers(recording: Recording, count: int, rng: np.random.Generator) -> Recording:

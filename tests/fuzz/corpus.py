@@ -14,7 +14,7 @@ import SimpleITK
 import trimesh
 from case_world import MARKERS, registration_section, whole
 from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_case
-from pydicom.uid import ImplicitVRLittleEndian, RLELossless
+from pydicom.uid import ImplicitVRLittleEndian, JPEGBaseline8Bit, RLELossless
 from slicer_files import vtk_model
 
 from puncture_twin.meshes import folder as embedded
@@ -221,6 +221,9 @@ def make_dicom(folder):
     grey = np.arange(2 * 9 * 8, dtype=np.uint8).reshape(2, 9, 8)
     seen = world.ultrasound(grey, delta_cm=(0.02, 0.02), box=(1, 1, 6, 7), spacing=(0.2, 0.2))
     world.write(seen, folder / "seen.dcm")
+    cells = np.repeat(np.arange(2 * 16 * 16, dtype=np.uint8).reshape(2, 16, 16, 1), 3, axis=3)
+    coloured = world.ultrasound(cells, spacing=(0.2, 0.2), PhotometricInterpretation="YBR_FULL_422")
+    world.write(world.encoded(coloured, JPEGBaseline8Bit, cells), folder / "clip.dcm")
     (folder / "seen.png").write_bytes(png_bytes(grey[0]))
 
 

@@ -259,7 +259,7 @@ TARGETS = [
     Target("plan", {"plan.json": "tree"}, read_plan, whole_plan),
     Target("output set", {"set.json": "tree"}, rewritten_set, whole_set),
     Target("recording", {"recording.csv": "table"}, read_recording, whole_recording),
-    Target("pictures", {"seen.png": "text", "seen.dcm": "dicom"}, read_frames, whole_frames),
+    Target("pictures", {"seen.png": "text", "seen.dcm": "dicom", "clip.dcm": "dicom"}, read_frames, whole_frames),
     Target("joints", {"joints.csv": "table"}, lambda path: list(RecordedJoints.read(path).states()), whole_states),
     Target("times", {"times.csv": "table"}, read_times, whole_motion),
 ]

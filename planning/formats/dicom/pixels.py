@@ -137,7 +137,9 @@ def decoded_frames(data: Dataset, where: str, *, raw: bool) -> Iterator[NDArray[
     if syntax in PLAIN:  # one by one: the library's own loop takes frames behind the first of YBR_FULL_422 for longer
         frames = (decoder.as_array(data, raw=raw, index=k) for k in range(sizes(data, where)[2]))
     else:
-        frames = decoder.iter_array(data, raw=raw)
+        # Every installation has Pillow; GDCM prints what a damaged JPEG has on the terminal.
+        quiet = "pillow" if not raw and "pillow" in decoder.available_plugins else ""
+        frames = decoder.iter_array(data, raw=raw, decoding_plugin=quiet)
     while True:
         with refused_if_damaged(where):
             try:

@@ -1,5 +1,6 @@
 """Slices about a path: where the planes lie, what is cut, and what is drawn where."""
 
+from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,8 @@ from PIL import Image
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.candidates import Pick
+from puncture_twin.twin.report.annotate import font
+from puncture_twin.twin.report.slices import sheet
 from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU, PIXELS, TONES, Subject, draw_panel, stored
 from puncture_twin.twin.report.slices.planes import capsule, ellipse, letters, needle_planes, outline
 from puncture_twin.twin.report.slices.sheet import NO_CT, draw_slices, write_sheet
@@ -159,6 +162,20 @@ def test_with_a_ct_and_errors(tmp_path):
     write_sheet(draw_slices(subject(scan=scan, region=np.diag([4.0, 9.0, 16.0]))), tmp_path / "two.png")
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
     assert Image.open(tmp_path / "one.png").width > 2 * PIXELS
+
+
+def test_no_two_lines_of_the_sheet_overlap(monkeypatch, tmp_path):
+    """A plane's name and how the needle lies to it, which had one line, each in its own box."""
+    boxes = []
+
+    def written(draw, at, text, *, size=16, bold=False, colour=None, anchor="la", halo=0):
+        boxes.append((draw.textbbox(at, text, font(size, bold), anchor), text))
+
+    monkeypatch.setattr(sheet, "write", written)
+    write_sheet(draw_slices(subject()), tmp_path / "slices.png")
+    assert sum("needle" in text for _, text in boxes) >= 4
+    for ((left, top, right, bottom), one), ((x, y, far, low), other) in combinations(boxes, 2):
+        assert right <= x or far <= left or bottom <= y or low <= top, (one, other)
 
 
 def test_an_image_alone_proposes_no_needle(tmp_path):

@@ -2,6 +2,7 @@
 
 import copy
 import csv
+import io
 import json
 import shutil
 from dataclasses import replace
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from dicom_world import encoded, ultrasound, write
 from other_bmode import logarithm, picture, power_law
+from PIL import Image
 from pydicom.encaps import encapsulate
 from pydicom.uid import JPEG2000, JPEGBaseline8Bit, RLELossless
 from refusals import refused, refused_command
@@ -348,6 +350,19 @@ def test_what_no_decoder_reads_names_its_transfer_syntax(tmp_path):
         data.file_meta.TransferSyntaxUID = syntax
         with refused(code, "a.dcm", syntax, "gdcmconv"):
             read_frames(write(data, tmp_path / "a.dcm"))
+
+
+def test_a_jpeg_that_is_cut_is_refused(rng, tmp_path, capfd):
+    """In one line, and without what a decoder prints on the terminal."""
+    grey = np.asarray(rng.integers(0, 255, (1, 64, 64)), np.uint8)
+    stream = io.BytesIO()
+    Image.fromarray(grey[0]).save(stream, "JPEG")
+    data = encoded(ultrasound(grey, spacing=(0.2, 0.2)), JPEGBaseline8Bit, grey)
+    for length in (len(stream.getvalue()) // 2, len(stream.getvalue()) - 2):
+        data.PixelData = encapsulate([stream.getvalue()[:length]])
+        with refused("not_decoded", "a.dcm"):
+            read_frames(write(data, tmp_path / "a.dcm"))
+    assert capfd.readouterr().err == ""
 
 
 def test_drawings_are_said_and_cover_a_needle_only_at_its_tip(world, tmp_path):

@@ -34,7 +34,7 @@ WITHOUT_CT: Rgb = (44, 47, 54)
 
 NO_CT = "The case has no CT: only the outlines of the structures."
 RADIOLOGICAL = "The patient's right is on the left. Each slice shows only its own plane: look at all of them."
-GAP, TOP, CAPTION = 16, 92, 30
+GAP, TOP, CAPTION = 16, 92, 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +182,7 @@ def write_sheet(slices: Slices, path: Path, tone: str = "abdomen") -> None:
     for i, panel in enumerate(slices.panels):
         left, top = GAP + (i % 2) * (PIXELS + GAP), TOP + (i // 2) * (PIXELS + CAPTION + GAP)
         write(draw, (left, top), panel.plane.name, size=16, bold=True)
-        write(draw, (left + PIXELS, top + 3), leaning(subject, panel.plane), anchor="ra", size=13, colour=FAINT)
+        write(draw, (left, top + 22), leaning(subject, panel.plane), size=13, colour=FAINT)
         sheet.paste(flat(panel, TONES[tone]), (left, top + CAPTION - 6))
     if slices.units is not None:
         sheet.paste(slices.units, (GAP, bottom))

@@ -99,8 +99,8 @@ def reweighted(problem: Problem, fit: RobustFit) -> RobustFit:
         model = linear_model(problem, estimate)
         r, sigma = model.residuals, _spread_of_one(model)
         for k, block in enumerate(blocks(problem)):
-            size_squared = squared_size(r[:, block.rows], sigma[:, block.rows, block.rows])
-            size = np.sqrt(size_squared / scale(size_squared, block))
+            parts = r[:, block.rows], sigma[:, block.rows, block.rows]
+            size = np.sqrt(standardised(*parts, _axes(problem, estimate, block), block, weights[k] >= 0.0))
             falls = np.minimum(1.0, HUBER / np.maximum(size, 1e-12))
             weights[k] = falls if step < HUBER_STEPS else np.maximum(1 - (size / TUKEY) ** 2, 0.0) ** 2
         estimate = refine(problem, estimate, *weights, max_steps=1).estimate
@@ -141,9 +141,12 @@ def agreeing(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[
         own = sigma[:, block.rows, block.rows]
         sign = np.where(used, -1.0, 1.0)[:, None, None]
         S = own + sign * pulled[:, block.rows, block.rows]
-        size = squared_size(r[:, block.rows], lifted(S, own))
-        believed = scale(size[used], block, ALARM_FRACTION if alarm else 1.0)
-        kept.append(size <= block.limit * believed)
+        parts = r[:, block.rows], lifted(S, own)
+        if alarm:
+            size = squared_size(*parts)
+            kept.append(size <= block.limit * scale(size[used], block, ALARM_FRACTION))
+        else:
+            kept.append(standardised(*parts, _axes(problem, fit.estimate, block), block, used) <= block.limit)
     return kept[0], kept[1] & facing(fit.estimate, problem.recording) if problem.with_direction else fit.direction_kept
 
 
@@ -178,6 +181,39 @@ def _chi_squared(level: float, freedom: int) -> float:
 def scale(squared: Floats, block: Block, fraction: float = 1.0) -> float:
     """Variance over the expected one, from the median of the squared sizes."""
     return max(fraction * float(np.median(squared)) / block.median, block.least)
+
+
+def standardised(r: Floats, S: Floats, axes: Floats, block: Block, used: Bools) -> Floats:
+    """Squared size of each pose's residuals over their spread, shape (n,): chi-squared where the noise is as S says.
+
+    S says how large the noise is against itself; how large at all, the median says. Where the medians along single axes
+    say more, those count: a tip that is found to .1 mm along the shaft and to .01 mm across it, by exact poses, has
+    residuals of one dimension, whose largest are further from their median than those of three dimensions.
+
+    Args:
+        r: Residuals (n, k).
+        S: Their covariance (n, k, k).
+        axes: Columns in which their parts are independent, shape (n, k, k).
+        block: Which kind they are.
+        used: Those whose medians count, shape (n,).
+    """
+    turned = axes.transpose(0, 2, 1)
+    r, S = (turned @ r[:, :, None])[:, :, 0], turned @ S @ axes
+    pooled = scale(squared_size(r, S)[used], block)
+    single = np.median((r**2 / np.diagonal(S, axis1=1, axis2=2))[used], axis=0) / _chi_squared(0.5, 1)
+    return np.asarray(squared_size(r / np.sqrt(np.maximum(1.0, single / pooled)), S) / pooled)
+
+
+def _axes(problem: Problem, estimate: Estimate, block: Block) -> Floats:
+    """Along the shaft, across it and across the image for tips, in base1; the image's own axes without directions."""
+    recording = problem.recording
+    if block.rows.start:
+        return np.ones((len(recording), 1, 1))
+    local = np.tile(np.eye(3), (len(recording), 1, 1))
+    if recording.v is not None:
+        along = recording.v[:, :2] / np.linalg.norm(recording.v[:, :2], axis=1)[:, None]
+        local[:, :2, 0], local[:, :2, 1] = along, along[:, ::-1] * [-1.0, 1.0]
+    return np.asarray(recording.A[:, :3, :3] @ estimate.R_X @ local)
 
 
 def squared_size(r: Floats, S: Floats) -> Floats:
