@@ -522,11 +522,12 @@ def rehearse(
         seeds: Draw so many rooms: the median one is executed, and ``distribution`` holds all.
         physics: So many of them are executed in the simulator too.
         guidance: How the needle is led in the rooms: ct, stereo, us, us+tip, ct+stereo, ct+us, ct+us+tip or all, by the
-            devices that the case declares, in bodies that move as it declares; None by the markers, in bodies at rest.
+            devices that the case declares, or assumed ones, in bodies that move as it declares; None by the markers, in
+            bodies at rest.
 
     Raises:
         InputError: A plan that does not hold in this case, many rooms of a case without declared errors or markers,
-            unknown guidance, one without its devices or without ``seeds``, or the extra ``twin`` is not installed.
+            unknown guidance or some without ``seeds``, or the extra ``twin`` is not installed.
         NoAnswerError: The arm reaches the target in none of the rooms.
     """
     from puncture_twin.planning.base.errors import require_extra

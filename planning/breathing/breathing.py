@@ -61,10 +61,13 @@ class Breathing:
         return np.asarray((s - self.scanned_at) * weight * self.amplitude_mm * self.direction_ct)
 
     @property
-    def rms_ct(self) -> Floats:
-        """Root of the mean square displacement of the target in the gate's window, along its line, shape (3,), mm."""
-        square = mean_square_within(1.0 if self.gate is None else self.gate, self.exponent, self.scanned_at)
-        return np.asarray(np.sqrt(square) * self.amplitude_mm * self.direction_ct)
+    def spread_ct(self) -> Floats:
+        """Mean and standard deviation of the target's displacement in the gate's window, along its line, (3, 2), mm."""
+        gate = 1.0 if self.gate is None else self.gate
+        about_0, about_1 = (mean_square_within(gate, self.exponent, about) for about in (0.0, 1.0))
+        mean = (1.0 + about_0 - about_1) / 2.0
+        both = [mean - self.scanned_at, np.sqrt(max(about_0 - mean**2, 0.0))]
+        return np.asarray(self.amplitude_mm * np.outer(self.direction_ct, both))
 
     def phase_text(self, s: float) -> str:
         """A position for people."""

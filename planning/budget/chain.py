@@ -106,8 +106,8 @@ class Breath:
 
     def mean_square_base(self) -> Floats:
         """Shape (3, 3), mm^2, of the target against where the CT shows it, base axes."""
-        moved = self.R_base_ct @ self.breathing.rms_ct
-        return np.asarray(np.outer(moved, moved))
+        moved = self.R_base_ct @ self.breathing.spread_ct
+        return np.asarray(moved @ moved.T)
 
 
 @dataclass(frozen=True, eq=False)

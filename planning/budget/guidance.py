@@ -8,7 +8,8 @@ point of the needle is displaced by more than |s|, so that every needle with
 
     |s| <= min_j slack_j
 
-keeps every margin in the anatomy as the CT shows it. What would go farther is not executed.
+keeps every margin in the anatomy as the CT shows it. What would go farther is not executed: the needle is stopped, and
+does not hit.
 """
 
 from __future__ import annotations
@@ -24,8 +25,11 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_withi
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.breathing.breathing import position_at
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.settings import stereo_of, ultrasound_of
+from puncture_twin.planning.case.tables import StereoSection, UltrasoundSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.reach.standoff import case_axis_lengths, case_paths, standoffs
@@ -40,6 +44,7 @@ from puncture_twin.planning.sight.cameras import CameraView, camera_view
 from puncture_twin.planning.sight.probe import ProbeView, probe_view
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.guided import (
+    ALIKE_MM,
     CAMERAS,
     WAYS,
     WHOLLY,
@@ -90,18 +95,30 @@ def ways_of(text: str) -> tuple[str, ...]:
     return ways
 
 
-def check_devices(case: Case, way: str) -> None:
-    """Refuse a way whose devices a case does not declare.
+def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
+    """A case with all devices of a way: undeclared ones have the reference's defaults, and a sentence each.
 
-    Raises:
-        InputError: Naming their tables.
+    Balls that do not fit on the needle are assumed at half of its shaft and at its hub.
     """
-    needed = dict.fromkeys(table for device, table in _DEVICES.items() if device in WAYS[way])
-    lacking = [f"[{table}]" for table in needed if getattr(case, table) is None]
-    if lacking:
-        what = f"guidance '{way}' needs {' and '.join(lacking)}, which the case does not declare"
-        allowed = f"{', '.join(lacking)} in the case, or {', '.join(declared_ways(case))}"
-        refuse(what, case.path, allowed, "no_device")
+    needed, said = {_DEVICES[device] for device in WAYS[way] if device in _DEVICES}, []
+    if "stereo" in needed and case.stereo is None:
+        cameras = stereo_of(StereoSection(), case.space, case.path)
+        assert cameras is not None
+        short, shaft_mm = cameras.balls_mm[-1] >= case.needle.length_mm, case.needle.shaft_mm
+        cameras = replace(cameras, balls_mm=(shaft_mm / 2.0, shaft_mm)) if short else cameras
+        where = " and ".join(f"{mm:g}" for mm in cameras.balls_mm)
+        why = f" (half of the shaft and the hub: the needle is {case.needle.length_mm:g} mm long)" if short else ""
+        said.append(f"[stereo] balls {where} mm behind the tip{why}, seen to {cameras.sd_mm:g} mm")
+        case = replace(case, stereo=cameras)
+    if "ultrasound" in needed and case.ultrasound is None:
+        probe = ultrasound_of(UltrasoundSection(), case.space, case.path)
+        assert probe is not None
+        target, tip = (
+            "{:g} mm in the picture and {:g} mm across".format(*sd) for sd in (probe.target_sd_mm, probe.tip_sd_mm)
+        )
+        said.append(f"[ultrasound] target read to {target}, tip to {tip}, calibrated to {probe.calibration_sd_mm:g} mm")
+        case = replace(case, ultrasound=probe)
+    return case, tuple(f"assumed: {one}" for one in said)
 
 
 def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
@@ -188,9 +205,9 @@ def guided_model(
         sight: What the devices see of it; None hides nothing, and has the picture along the body.
     """
     R, breathing = registration.T_base_ct[:3, :3], case.breathing
-    breath, skin_weight = np.zeros(3), 0.0
+    breath, skin_weight = np.zeros((3, 2)), 0.0
     if breathing is not None:
-        breath, skin_weight = breathing.rms_ct, moving_weights(case, breathing, anatomy).skin
+        breath, skin_weight = breathing.spread_ct, moving_weights(case, breathing, anatomy).skin
     motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
     return GuidedModel(
         error=error,
@@ -255,16 +272,16 @@ def way_chances(
     error = as_rehearsed(chance.error, touches(case, registration.markers))
     error = replace(error, bend=None if path is None else path.bend)
     model = guided_model(case, context.anatomy, error, registration, outward_ct, q, sight)
-    found = []
+    corridor, found = corridor_mm(case, chance, outward_ct), []
     for way in ways:
         lost = "; ".join(lost_sight(model, way))
         try:
             left = guided_error(model, way)
         except NoAnswerError as refused:
-            found.append(WayChance(way, np.nan, np.nan, lost or str(refused)))
+            found.append(WayChance(way, np.nan, np.nan, np.nan, lost or str(refused)))
             continue
-        p_hit = float(replace(chance, error=left).hit_chance(left.covariance_ct(q[None]))[0])
-        found.append(WayChance(way, float(np.sqrt(np.trace(left.tip_covariance(q[None])[0]))), p_hit, lost))
+        rms_mm = float(np.sqrt(np.trace(left.tip_covariance(q[None])[0])))
+        found.append(WayChance(way, rms_mm, *guided_chances(model, way, chance, corridor), lost))
     return tuple(found)
 
 
@@ -286,7 +303,7 @@ def check_ways(context: CaseContext, plan: Plan, where: str | Path) -> None:
     same = len(known) == len(plan.guidance) and all(
         a.way == b.way
         and a.lost_sight == b.lost_sight
-        and np.allclose(a[1:3], b[1:3], rtol=0, atol=1e-6, equal_nan=True)
+        and np.allclose(a[1:4], b[1:4], rtol=0, atol=1e-6, equal_nan=True)
         for a, b in zip(known, plan.guidance, strict=True)
     )
     if not same:
@@ -340,8 +357,41 @@ def guided_error(model: GuidedModel, way: str, follows: Follows = WHOLLY) -> Gui
     if found is None:
         lost = "; ".join(lost_sight(model, way)) or "its readings leave the needle's place against the CT open"
         raise NoAnswerError(f"guidance '{way}' does not see enough: {lost}", code="lost_sight")
-    found = found if follows == WHOLLY else found._replace(cov=model.cov(found.gain, follows))
+    if follows != WHOLLY:
+        cov, breath = model.left(found.gain, follows)
+        found = found._replace(cov=cov, breath=breath, tip_cov=cov[:3, :3])  # no picture shows this anatomy
     return GuidedError(one.model, one.tip_mm, one.target_base, one.errors, one.fit, one.bend, found)
+
+
+PHASES = 8
+"""Positions of the breath, of equal chances, over which chances are averaged: it is neither about 0 nor normal."""
+
+
+def at_phases(model: GuidedModel, way: str, chance: ChanceModel, follows: Follows = WHOLLY) -> list[ChanceModel]:
+    """The chances of a way's needle against such anatomy at each position of the breath in the gate, known there.
+
+    Raises:
+        NoAnswerError: As `guided_error`.
+    """
+    error, breathing, deviations = guided_error(model, way, follows), chance.case.breathing, np.zeros(1)
+    if breathing is not None:
+        gate = 1.0 if breathing.gate is None else breathing.gate
+        s = position_at((np.arange(PHASES) + 0.5) / PHASES, gate, breathing.exponent)
+        mean_mm, deviation_mm = breathing.direction_ct @ breathing.spread_ct
+        moved_mm = (s - breathing.scanned_at) * breathing.amplitude_mm
+        deviations = (moved_mm - mean_mm) / max(deviation_mm, ALIKE_MM)
+    return [chance.led(*error.about_breath(deviation)) for deviation in deviations.tolist()]
+
+
+def guided_chances(model: GuidedModel, way: str, chance: ChanceModel, corridor_mm: float) -> tuple[float, float]:
+    """The chance that a way's needle is not stopped, and hits, and the chance that it is stopped.
+
+    Raises:
+        NoAnswerError: As `guided_error`.
+    """
+    q, p_stop = model.q_insertion[None], model.stop_chance(way, corridor_mm)
+    hit = [one.hit_chance(one.error.covariance_ct(q))[0] for one in at_phases(model, way, chance)]
+    return (1.0 - p_stop) * float(np.mean(hit)), p_stop
 
 
 def corridor_mm(case: Case, chance: ChanceModel, outward_ct: Floats) -> float:

@@ -199,8 +199,8 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
 
 
 def _way(value: Any) -> WayChance:
-    error, chance = (field(value, name, number_or_nan) for name in ("expected_error_mm", "p_hit"))
-    return WayChance(field(value, "way", text), error, chance, field(value, "lost_sight", text))
+    error, hit, stop = (field(value, name, number_or_nan) for name in ("expected_error_mm", "p_hit", "p_stop"))
+    return WayChance(field(value, "way", text), error, hit, stop, field(value, "lost_sight", text))
 
 
 def _speed_limits(value: Any) -> SpeedLimits:

@@ -199,7 +199,10 @@ class Explanation(Shown):
 
     def _breakdown(self) -> list[str]:
         if self.breakdown is not None:
-            led = (f"  by {way:10s} {mm} mm rms, hits {hit}" for way, mm, hit, _ in map(way_cells, self.guidance))
+            led = (
+                f"  by {way:10s} {mm} mm rms, hits {hit}, stopped {stop}"
+                for way, mm, hit, stop, _ in map(way_cells, self.guidance)
+            )
             return [*(f"  {line}" for line in self.breakdown.lines()), *led]
         return [] if self.case.errors is None else [f"  {NO_CHANCES}"]
 

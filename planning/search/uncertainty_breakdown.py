@@ -179,14 +179,14 @@ def chance_text(chance: float) -> str:
     return f"{chance:.{digits}f}"
 
 
-def way_cells(one: WayChance) -> tuple[str, str, str, str]:
+def way_cells(one: WayChance) -> tuple[str, str, str, str, str]:
     """A way of guidance as a row of a table for a person, under `WAY_HEAD`."""
     if np.isnan(one.p_hit):
-        return one.way, "-", "-", one.lost_sight
-    return one.way, f"{one.expected_error_mm:.2f}", chance_text(one.p_hit), one.lost_sight
+        return one.way, "-", "-", "-", one.lost_sight
+    return one.way, f"{one.expected_error_mm:.2f}", chance_text(one.p_hit), chance_text(one.p_stop), one.lost_sight
 
 
-WAY_HEAD = ("guidance", "expected tip error (rms), mm", "chance to hit", "out of sight")
+WAY_HEAD = ("guidance", "expected tip error (rms), mm", "chance to hit", "to be stopped", "out of sight")
 
 
 def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown:

@@ -15,7 +15,7 @@ from types import MappingProxyType
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import UNNAMED_DENSE, UNNAMED_GAS, Anatomy
-from puncture_twin.planning.anatomy.default_roles import default_role
+from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
 from puncture_twin.planning.anatomy.scan import Scan
 from puncture_twin.planning.anatomy.skin import Skin, skin_paths
 from puncture_twin.planning.anatomy.structure import Role
@@ -63,6 +63,9 @@ BONE = (
     "devices",
 )
 """Groups of `planning.anatomy.default_roles` that no sound passes."""
+
+GAS = frozenset({"gas", "air", "pneumothorax"})
+"""Words of a name that say it."""
 
 AIRY = ("lungs", "airways", "stomach and bowel")
 """Groups that hold air; of the last a CT says where."""
@@ -257,7 +260,7 @@ def opaque(anatomy: Anatomy, region: str) -> Opaque:
         group = "" if line is None else line.group
         if one.name == UNNAMED_DENSE or group in BONE:
             found[Ruled.BONE].append(one.mesh)
-        elif one.name == UNNAMED_GAS or group in airy:
+        elif one.name == UNNAMED_GAS or group in airy or not GAS.isdisjoint(plain_name(one.name).split("_")):
             found[Ruled.AIR].append(one.mesh)
         elif one.role is Role.UNKNOWN:
             found[Ruled.UNKNOWN].append(one.mesh)

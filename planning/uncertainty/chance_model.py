@@ -92,6 +92,14 @@ class ChanceModel:
         margins = np.array([self.anatomy.checked[column].margin_mm for column in self.columns], dtype=np.float64)
         return self.case.needle.radius_mm + margins
 
+    def led(self, error: PoseError, mean_ct: Floats) -> ChanceModel:
+        """The model for another error, about needles that end off the target by a known mean, shape (3,), mm."""
+        if not mean_ct.any():
+            return replace(self, error=error)
+        case, mesh = self.case, self.anatomy.structure(self.case.target_structure).mesh
+        hit = hit_model(case.hit_radius_mm, mesh, case.target_ct, mean_ct)
+        return replace(self, case=replace(case, target_ct=case.target_ct + mean_ct), error=error, hit=hit)
+
     def needles(self, outward_ct: Floats, q: Floats, axes: AxisDistances | None = None) -> Needles:
         """Needles with their covariances and proximity to the structures; arguments as of `chances`."""
         target, columns = self.case.target_ct, self.columns

@@ -7,7 +7,7 @@ are linear in both:
     needle_k = J_k (eta + drift + arrival_k)             eta 28 parameters of arm and tool, k a look or the end
     anatomy  = pose + motion + breath                    of the target and what surrounds it, since the scan
     target   = anatomy + reading of the target in the CT
-    touch_i  = A_i pose - J_i eta - R r_i + w breath' + n       marker i: r its reading in the CT, w that of the skin
+    touch_i  = A_i pose - J_i eta - R r_i + w breath' + n       marker i: r its reading in the CT, w the skin's weight
     cameras  = A_i (pose + frame) - R r_i + w breath + n        markers, A_i = [I, -[p_i - f]x],
                [I, -[b]x] needle_k + A_b frame + n              and balls b behind the tip
     picture  = target + calibration + n                  ultrasound: the target,
@@ -17,6 +17,8 @@ All readings stacked are z = H x + F u. A way uses some of them. What it estimat
 the tip is moved by -K z, with the weights K of the least error among those that no flat part enters:
 
     min |a - K H|^2  with  K F = b:      K = K0 + M N',   K0 F = b,   N' F = 0,   M by least squares
+
+The breath at the touches (breath') and later have their mean in common; about it each has a deviation of its own.
 
 The flat parts are eliminated, not given a large variance. ct is the registration as it is, K = -X L. The needle keeps
 the direction that the registration gave it: in every way
@@ -30,7 +32,7 @@ again does not average them. Cameras err anew with each picture.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -69,6 +71,9 @@ FREE = 0.01
 """mm that the tip's estimate may follow per mm of a flat part that no reading shows: more, and it is open. Cameras do
 not see a roll about the needle; where the registered target is .1 mm beside its line, that is .001."""
 
+STOP_DRAWS = 20_000
+"""Draws of the estimates after all looks together: a chance to be stopped is known to .004."""
+
 CAMERAS = "cameras"
 
 FLAT = ("pose", "frame")
@@ -88,9 +93,9 @@ def _times(M: Floats, rows: Rows) -> Rows:
 
 
 def _root(cov: Floats) -> Floats:
-    """S with S S' = cov, of covariances (..., 3, 3) that may be singular."""
+    """The symmetric S with S S = cov, of covariances (..., k, k) that may be singular; no machine has another."""
     values, axes = np.linalg.eigh(cov)
-    return np.asarray(axes * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+    return np.asarray(axes * np.sqrt(np.maximum(values, 0.0))[..., None, :] @ np.swapaxes(axes, -1, -2))
 
 
 def picture_root(sd_mm: tuple[float, float], across: Floats) -> Floats:
@@ -148,7 +153,7 @@ class GuidedModel:
         q_insertion: Shape (6,), rad, the tip on the target.
         looks: In their order.
         motion: Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan.
-        breath: Shape (3,), mm: rms displacement of the target by the breath, along its line; zero without breathing.
+        breath: Shape (3, 2), mm: mean and deviation of the target's displacement by the breath; 0 without breathing.
         skin_weight: By how much of it the markers move.
         stereo: The cameras, or None.
         ultrasound: The probe, or None.
@@ -186,9 +191,9 @@ class GuidedModel:
 
     def anatomy(self, follows: Follows = WHOLLY) -> Rows:
         """Deviation of anatomy at the target from where the registration puts it, 6 rows."""
-        motion, breath = follows.motion * _root(self.motion), follows.breath * self.breath[:, None]
+        motion, breath = follows.motion * _root(self.motion), follows.breath * self.breath
         still = np.zeros((3, 3))
-        return {"pose": np.eye(6), "motion": np.vstack([motion, still]), "breath": np.vstack([breath, still[:, :1]])}
+        return {"pose": np.eye(6), "motion": np.vstack([motion, still]), "breath": np.vstack([breath, still[:, :2]])}
 
     @cached_property
     def target(self) -> Rows:
@@ -213,7 +218,8 @@ class GuidedModel:
         own = {
             "arm": -scale * noise.arm_jacobian * np.sqrt(noise.eta_variances),
             "touch": touch.reshape(3 * count, 3 * count),
-            "breath at touch": np.tile(self.skin_weight * self.breath, count)[:, None],
+            "breath at touch": np.tile(self.skin_weight * self.breath[:, 1], count)[:, None],
+            "breath": np.tile(self.skin_weight * self.breath * [1.0, 0.0], (count, 1)),
         }
         return _sum(self._markers, own)
 
@@ -229,7 +235,7 @@ class GuidedModel:
             return []
         T, seen = flange_pose(self.error.model, look.q), dict[str, Rows]()
         tip, outward = T[:3, 3] + self.error.tip_mm * T[:3, 2], -T[:3, 2]
-        moved = {"breath": self.skin_weight * self.breath[:, None]}
+        moved = {"breath": self.skin_weight * self.breath}
         for row, (name, point) in enumerate(zip(self.markers, self.points_base, strict=True)):
             own = {source: part[3 * row : 3 * row + 3] for source, part in self._markers.items()}
             seen[marker_name(name)] = _sum(own, moved, {"frame": self._at(point[None])})
@@ -303,7 +309,7 @@ class GuidedModel:
             gain[:3] = 0.0
             gain[:3, used] = -K
         tip = a + gain[:3] @ H
-        return Guided(gain, self.cov(gain), tip @ tip.T, self._parts(tip), gain[:3] + self._aside(way, last))
+        return Guided(gain, *self.left(gain), tip @ tip.T, self._parts(tip), gain[:3] + self._aside(way, last))
 
     def _aside(self, way: str, last: int) -> Floats:
         """The weights, shape (3, m), that estimate the needle's shift from its plan in the body at rest, uncorrected.
@@ -320,21 +326,32 @@ class GuidedModel:
         weights[:, used] = K
         return weights
 
-    def _against(self, gain: Floats, follows: Follows) -> Floats:
-        """Needle against anatomy that follows the target so, under a gain, 6 rows of the sources."""
+    def left(self, gain: Floats, follows: Follows = WHOLLY) -> tuple[Floats, Floats]:
+        """`Guided.cov` and `Guided.breath` of the needle against anatomy that follows the target so, under a gain."""
         E, _ = self.matrices(_sum(self.end, _times(-np.eye(6), self.anatomy(follows))))
-        return np.asarray(E + gain @ self._stacked[0])
+        rows = E + gain @ self._stacked[0]
+        return rows @ rows.T, self._breath_of(rows)
 
-    def cov(self, gain: Floats, follows: Follows = WHOLLY) -> Floats:
-        """Sigma6, shape (6, 6), of the needle against anatomy that follows the target so, under a gain."""
-        rows = self._against(gain, follows)
-        return np.asarray(rows @ rows.T)
-
-    def breath_shift(self, gain: Floats, follows: Follows) -> Floats:
-        """By how much the needle's tip moves against such anatomy while the target moves by ``breath``, shape (3,)."""
+    def _breath_of(self, rows: Floats) -> Floats:
+        """Of values linear in the sources, shape (m, n), what the breath's mean and one deviation give: (m, 2)."""
         names = list(self._widths)
         at = sum(self._widths[name] for name in names[: names.index("breath")])
-        return np.asarray(self._against(gain, follows)[:3, at])
+        return rows[:, at : at + 2]
+
+    def stop_chance(self, way: str, corridor_mm: float) -> float:
+        """The chance that, after any of its looks, a way estimates its needle farther from the plan than a corridor.
+
+        No flat part enters those estimates. ct corrects nothing, and is never stopped.
+        """
+        if way == "ct":
+            return 0.0
+        looked = [found for last in range(len(self.looks)) if (found := self.guided(way, last)) is not None]
+        aside = np.concatenate([one.aside @ self._stacked[0] for one in looked])
+        mean = self._breath_of(aside)[:, 0]
+        root = _root(aside @ aside.T - np.outer(mean, mean))
+        drawn = mean + np.random.default_rng(0).normal(size=(STOP_DRAWS, len(mean))) @ root.T
+        far = np.linalg.norm(drawn.reshape(STOP_DRAWS, -1, 3), axis=2).max(axis=1)
+        return float(np.mean(far > corridor_mm))
 
     def _parts(self, tip: Floats) -> dict[str, float]:
         """Mean square of the tip's error by source, mm^2, named as in `SOURCES`."""
@@ -399,7 +416,9 @@ class Guided(NamedTuple):
     gain: Floats
     """G, shape (6, m): how the command follows all readings; 0 for those that the way does not use."""
     cov: Floats
-    """Sigma6, shape (6, 6), of the needle against the CT's anatomy about the target."""
+    """Sigma6, shape (6, 6), of the needle against the CT's anatomy about the target, what is known of it included."""
+    breath: Floats
+    """Shape (6, 2): what the breath's mean and one deviation add to it; no correction of the way takes them out."""
     tip_cov: Floats
     """Shape (3, 3), mm^2, of the tip about the true target."""
     parts: Mapping[str, float]
@@ -415,12 +434,15 @@ class WayChance(NamedTuple):
     expected_error_mm: float
     """Rms of the tip about the target; NaN where the way does not see enough."""
     p_hit: float
+    """That it is not stopped, and hits."""
+    p_stop: float
+    """That a correction would lead out of the corridor: it is not executed, and the needle is stopped."""
     lost_sight: str
     """What is not seen, and why; empty where all is."""
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON; null where there is no number."""
-        numbers = {name: or_null(getattr(self, name)) for name in ("expected_error_mm", "p_hit")}
+        numbers = {name: or_null(getattr(self, name)) for name in ("expected_error_mm", "p_hit", "p_stop")}
         return {"way": self.way, **numbers, "lost_sight": self.lost_sight}
 
 
@@ -449,6 +471,18 @@ class GuidedError(PoseError):
         """What the true target adds, CT axes: less than nothing where a picture of it led the needle."""
         R = self.fit.R_base_ct
         return np.asarray(R.T @ (self.known.tip_cov - self.known.cov[:3, :3]) @ R)
+
+    def about_breath(self, deviations: float | None = None) -> tuple[GuidedError, Floats]:
+        """The error about what is known of the breath, and where the tip ends by that: shape (3,), mm, CT axes.
+
+        Args:
+            deviations: So far from its mean the breath is; None where its mean alone is known, which is no chance.
+        """
+        one = self.known
+        known = one.breath[:, :1] if deviations is None else one.breath
+        cov, shift = known @ known.T, known[:3] @ np.array([1.0, deviations or 0.0])[: known.shape[1]]
+        left = one._replace(cov=one.cov - cov, tip_cov=one.tip_cov - cov[:3, :3], breath=np.zeros((6, 2)))
+        return replace(self, guided=left), self.fit.R_base_ct.T @ shift
 
     def mean_squares(self, q: Floats) -> dict[str, float]:
         """By source, those of devices and motion too."""

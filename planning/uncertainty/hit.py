@@ -43,7 +43,7 @@ class HitModel:
 
     Attributes:
         radius_mm: Where a case gives one.
-        rays: The target's mesh, else.
+        rays: The target's mesh, else; or the ball about a target that tips are off on average.
     """
 
     radius_mm: float | None
@@ -51,15 +51,29 @@ class HitModel:
 
     def chance(self, error: PoseError, cov_ct: Floats, surface_mm: float = 0.0) -> Floats:
         """The chance of needles with these Sigma6, shape (n, 6, 6), CT axes, in a mesh that may lie off: shape (n,)."""
-        if self.rays is None or self.radius_mm is not None:
+        cov = cov_ct[:, :3, :3] if self.radius_mm is None else cov_ct[:, :3, :3] + error.target_covariance_ct
+        if self.rays is None:
             assert self.radius_mm is not None
-            return hit_in_ball(cov_ct[:, :3, :3] + error.target_covariance_ct, self.radius_mm, error.freedom)
-        return hit_in_mesh(self.rays, np.ascontiguousarray(cov_ct[:, :3, :3]), error.freedom, surface_mm)
+            return hit_in_ball(cov, self.radius_mm, error.freedom)
+        return hit_in_mesh(self.rays, np.ascontiguousarray(cov), error.freedom, surface_mm)
 
 
-def hit_model(radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats) -> HitModel:
-    """Model of hitting the target: by its radius where one is stated, else by the mesh of its structure."""
-    return HitModel(radius_mm, None if radius_mm is not None else target_rays(mesh, target_ct))
+def hit_model(
+    radius_mm: float | None, mesh: TriangleMesh, target_ct: Floats, mean_ct: Floats | None = None
+) -> HitModel:
+    """Model of hitting the target: by its radius where one is stated, else by the mesh of its structure.
+
+    Args:
+        radius_mm: The radius, or None.
+        mesh: Of the structure.
+        target_ct: Shape (3,), mm.
+        mean_ct: Shape (3,), mm: by how much tips are off the target on average; None where they are not.
+    """
+    if mean_ct is None:
+        return HitModel(radius_mm, None if radius_mm is not None else target_rays(mesh, target_ct))
+    return HitModel(
+        radius_mm, target_rays(mesh, target_ct + mean_ct) if radius_mm is None else rays_to_ball(mean_ct, radius_mm)
+    )
 
 
 def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Floats:

@@ -96,6 +96,6 @@ def test_terminal_and_page_show_one_table(planned):
     shown = patient.plan(replace(plan, guidance=(plan.guidance[0], blind)), (), declared=True)
     (table,) = [block for block in shown if isinstance(block, Table) and block.head == WAY_HEAD]
     assert table.rows[0][:2] == ("ct", f"{plan.guidance[0].expected_error_mm:.2f}")
-    assert table.rows[1] == ("stereo", "-", "-", "behind the arm")
+    assert table.rows[1] == ("stereo", "-", "-", "-", "behind the arm")
     bare = patient.plan(replace(plan, guidance=()), ())
     assert not [block for block in bare if isinstance(block, Table) and block.head == WAY_HEAD]

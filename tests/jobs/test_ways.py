@@ -109,6 +109,16 @@ def test_a_plan_is_compared_too_and_blind_ways_say_why(compared, plan, tmp_path,
     assert caught.value.code == "lost_sight"
 
 
+def test_devices_that_are_not_declared_are_assumed(plan):
+    """As they would be declared without a value, and it is said of each way that has them."""
+    context, one_plan = plan
+    bare = replace(context, case=replace(context.case, stereo=None, ultrasound=None))
+    (of_bare, _), (declared, _) = (ways._rehearsed(one, one_plan, ("ct", "ct+us"), 50) for one in (bare, context))
+    assert [one.found.realised_rms_mm for one in of_bare] == [one.found.realised_rms_mm for one in declared]
+    said = {one.found.guidance: " ".join(one.found.assumed) for one in of_bare}
+    assert said["ct"] == "" and "[ultrasound]" in said["ct+us"] and "[stereo]" not in said["ct+us"]
+
+
 def test_failing_is_worse_than_erring(plan, tmp_path):
     """A way that stops most trials has the smallest errors of the rest, and stands last; equal ones are as good."""
     context, one_plan = plan
@@ -137,11 +147,10 @@ def test_failing_is_worse_than_erring(plan, tmp_path):
         ("ct,us,ct", 10, "stated_twice", "'ct'"),
         ("ct,", 10, "unknown_guidance", "''"),
         ("ct,us", None, "conflicting_options", "--seeds"),
-        ("ct,us", 10, "no_device", "[ultrasound]"),
     ],
 )
 def test_a_list_is_refused_in_one_line(tmp_path, capfd, guidance, seeds, code, named):
-    """Unknown ways, one twice, no trials, and a way without its devices; nothing is written."""
+    """Unknown ways, one twice, no trials; nothing is written."""
     case = ball(tmp_path, errors="touch_mm = 0.2\n")
     counted = [] if seeds is None else ["--seeds", seeds]
     command = ["rehearse", case, "--guidance", guidance, *counted, "--out", tmp_path / "out"]

@@ -158,7 +158,7 @@ def test_names_decide_what_sound_passes():
         return opaque(SimpleNamespace(structures=structures, scan=scan), "abdomen")
 
     bone = ["rib_left_7", "vertebrae_L2", "sternum", "hip_right", "stent", UNNAMED_DENSE]
-    air = ["lung_upper_lobe_left", "trachea", UNNAMED_GAS]
+    air = ["lung_upper_lobe_left", "trachea", "free_air", "Bowel Gas", UNNAMED_GAS]
     soft = ("liver", "aorta", "lesion", "bone_metastasis_lesion", "kidney_left", "something")
     found = named(*bone, *air, *soft, "colon", "small_bowel")
     assert found == {Ruled.UNKNOWN: [], Ruled.AIR: [*air, "colon", "small_bowel"], Ruled.BONE: bone}

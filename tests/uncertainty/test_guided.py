@@ -13,7 +13,8 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fit_uncertainty import fit_uncertainty, reading_noise
 from puncture_twin.planning.registration.fits import fit_triad
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.planning.uncertainty.guided import WAYS, GuidedError, GuidedModel, Look
+from puncture_twin.planning.uncertainty.guided import WAYS, Follows, GuidedError, GuidedModel, Look, _root
+from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 CASE = load_case(ROOT / "meshes/abdomen/case.toml")
@@ -28,6 +29,7 @@ DECLARED = CASE.errors
 NOMINAL = replace(DECLARED, arm=replace(DECLARED.arm, link_mm=0.5, twist=np.radians(0.05), joint=np.radians(0.1)))
 SLICES = np.diag([0.7**2, 0.7**2, 5.0**2]) / 12
 THICK = replace(DECLARED, marker_cov_ct=SLICES, target_cov_ct=SLICES)
+NO_BREATH = np.zeros((3, 2))
 STILL, FEET, ANYWHERE = (0.0, 0.0, 0.0), (0.0, 0.0, 1.1), (3.0 / 3**0.5,) * 3
 
 TABLE = {
@@ -47,7 +49,7 @@ def model(
     looks=(1.0,),
     hidden=None,
     stereo=STEREO,
-    breath=(0.0, 0.0, 0.0),
+    breath=NO_BREATH,
     skin=0.0,
 ):
     """One insertion along the case's plan, the picture in the plane of needle and bed axis."""
@@ -87,6 +89,21 @@ def test_every_way_errs_as_an_independent_prototype_found(situation):
     for way, figure in zip(WAYS, expected, strict=True):
         if figure is not None:  # without the cancellation that a self-calibration has
             assert rms(made.guided(way)) == pytest.approx(figure, rel=0.05), way
+
+
+def test_chances_to_be_stopped_are_those_of_the_places_in_the_body():
+    """By one look: beyond a ball, of the Gaussian of what is known of the needle in the body at rest.
+
+    That is where a led needle is there, less what touches leave unknown of it; and no other by the axes' signs.
+    """
+    made, corridor, rest = model(motion_mm=ANYWHERE), 4.0, Follows(0.0, 0.0)
+    led, unknown = (made.left(made.guided(way).gain, rest)[0][:3, :3] for way in ("us", "ct"))
+    found = made.stop_chance("us", corridor)
+    assert found == pytest.approx(1.0 - hit_in_ball((led - unknown)[None], corridor)[0], abs=0.01)
+    assert 0.1 < found < 0.9
+    assert made.stop_chance("ct", 0.0) == 0.0 and made.stop_chance("us", 0.0) == 1.0
+    root = _root(np.diag([4.0, 1.0, 0.0]))
+    np.testing.assert_allclose(root, np.diag([2.0, 1.0, 0.0]), atol=1e-12)
 
 
 def test_ct_is_the_registration_as_it_is():

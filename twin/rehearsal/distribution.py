@@ -12,15 +12,16 @@ from scipy.special import chdtri
 from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.breathing.breathing import position_at
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.budget.guidance import (
     Sight,
     as_rehearsed,
-    check_devices,
+    at_phases,
     check_way,
     corridor_mm,
+    equipped,
     followers,
+    guided_chances,
     guided_error,
     guided_model,
     lost_sight,
@@ -35,7 +36,6 @@ from puncture_twin.planning.registration.residuals import INTERVAL
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model, demanding, refined_chances
-from puncture_twin.planning.uncertainty.guided import Follows
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import not_modelled
@@ -80,9 +80,9 @@ class Distribution:
         puncture: Common part of all trials.
         trials: The n trials.
         cov_ct: Shape (3, 3), predicted of it, mm^2.
-        in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid.
+        in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid, about the mean where one is known.
         hit: Shape (n,).
-        p_hit: Predicted.
+        p_hit: Predicted; of a guided needle that it is not stopped, and hits.
         structures: The k structures that must not be touched.
         touched: Shape (n, k).
         p_touch: Shape (k,), predicted.
@@ -92,9 +92,11 @@ class Distribution:
         not_modelled: What neither the trials nor the chances contain.
         physics: Some of the trials in the simulator, if any.
         guidance: The way of guidance that led the needle, None where none was asked for.
-        stopped: Further trials, whose correction would have left the corridor.
+        stopped: Further trials, whose correction would have left the corridor: they do not hit.
+        p_stop: Predicted.
         hidden: What was out of sight, a sentence each.
         looks: How often the way reads each kind of device.
+        assumed: Devices of the way that the case does not declare, a sentence each.
     """
 
     seed: int
@@ -115,8 +117,10 @@ class Distribution:
     physics: PhysicsTrials | None = None
     guidance: str | None = None
     stopped: int = 0
+    p_stop: float = 0.0
     hidden: tuple[str, ...] = ()
     looks: Mapping[str, int] = field(default_factory=dict)
+    assumed: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.trials.tip_ct)
@@ -130,6 +134,12 @@ class Distribution:
     def tip_error_mm(self) -> Floats:
         """Distance of true tip and true target, shape (n,), mm."""
         return np.asarray(np.linalg.norm(self.error_ct, axis=1))
+
+    @property
+    def hit_share(self) -> float | None:
+        """Of the trials that the arm could reach, the fraction that hit; None of none."""
+        tried = len(self) + self.stopped
+        return float(self.hit.sum() / tried) if tried else None
 
     @property
     def realised_rms_mm(self) -> float:
@@ -152,7 +162,7 @@ class Distribution:
             "predicted_rms_mm": self.predicted_rms_mm,
             "median_mm": finite(np.median(self.tip_error_mm) if len(self) else np.nan),
             "coverage_95": _fraction(self.in_region),
-            "hit_share": _fraction(self.hit),
+            "hit_share": self.hit_share,
             "mean_p_hit": self.p_hit,
             "touch_share": _fraction(np.asarray(self.touched.any(axis=1))),
             "mean_p_touch": float(min(1.0, self.p_touch.sum())),
@@ -169,8 +179,8 @@ class Distribution:
         }
 
     def _guided(self) -> dict[str, Any]:
-        seen = {"lost_sight": list(self.hidden), "looks": dict(self.looks)}
-        return {"guidance": self.guidance, "stopped": self.stopped, **seen}
+        said = {"lost_sight": list(self.hidden), "assumed": list(self.assumed), "looks": dict(self.looks)}
+        return {"guidance": self.guidance, "stopped": self.stopped, "p_stop": self.p_stop, **said}
 
 
 def _fraction(trials: Bools) -> float | None:
@@ -195,28 +205,29 @@ def rehearse_trials(
         count: Trials, at least 1.
         seed: Of all draws.
         guidance: One of `WAYS`, in bodies that move as the case declares: every way has the same patients by a seed.
-            None is by registration, in bodies at rest.
+            None is by registration, in bodies at rest. Devices that the case does not declare are assumed.
         sight: What its devices see of the insertion; None hides nothing.
 
     Raises:
-        InputError: The case declares no errors, has no markers, or lacks a device of the way.
+        InputError: The case declares no errors, has no markers, or the way is unknown.
         NoAnswerError: What the way's devices see does not determine the needle against the target.
     """
     query = _query(context, outward_ct, q_insertion)
     rng = np.random.default_rng(seed)
     if guidance is None:
         return _measured(context, query, draw_trials(query.puncture, query.truth, count, rng), rng, seed)
+    check_way(guidance)
+    case, assumed = equipped(context.case, guidance)
+    context = replace(context, case=case)
     way, moving = _way(context, query, guidance, sight)
     truths = draw_truths(query.puncture, query.truth, count, rng, moving)
     done = guided_trials(query.puncture, truths, query.truth, way, np.random.default_rng([seed, 4]))
-    return _measured(context, query, done.trials, rng, seed, (way, done.stopped))
+    return replace(_measured(context, query, done.trials, rng, seed, (way, done.stopped)), assumed=assumed)
 
 
 def _way(context: CaseContext, query: _Query, name: str, sight: Sight | None = None) -> tuple[Way, Moving]:
     """One way of guidance of a query's puncture, and what moves in the truth."""
     case, puncture = context.case, query.puncture
-    check_way(name)
-    check_devices(case, name)
     assert context.placement is not None and context.placement.registration is not None
     registration = context.placement.registration
     model = guided_model(
@@ -291,12 +302,15 @@ def _measured(
     stopped = np.zeros(len(trials.reached), bool) if guided is None else guided[1]
     went = trials.reached & ~stopped
     unreached, trials = int((~trials.reached).sum()), trials.of(went)
-    believed = query.believed if guided is None else guided_error(guided[0].model, guided[0].name)
-    cov_ct, error_ct = believed.tip_covariance_ct(q)[0], trials.tip_ct - trials.target_ct
-    model = chance_model(case, context.anatomy, context.engine, believed)
+    believed = about = query.believed
+    model, mean_ct = chance_model(case, context.anatomy, context.engine, believed), np.zeros(3)
     assert model is not None
+    if guided is not None:
+        believed = left = guided_error(guided[0].model, guided[0].name)
+        about, mean_ct = left.about_breath()
     off_mm = off[went] * _surfaces(model, puncture, query.truth)
-    inverse = np.linalg.inv(cov_ct + LEAST_VARIANCE * np.eye(3))
+    error_ct = trials.tip_ct - trials.target_ct - mean_ct
+    inverse = np.linalg.inv(about.tip_covariance_ct(q)[0] + LEAST_VARIANCE * np.eye(3))
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
     counted = () if puncture.bend is None else ("bending",)
     distribution = Distribution(
@@ -304,7 +318,7 @@ def _measured(
         unreached=unreached,
         puncture=puncture,
         trials=trials,
-        cov_ct=cov_ct,
+        cov_ct=believed.tip_covariance_ct(q)[0],
         in_region=square <= chdtri(3, 1 - INTERVAL),
         hit=_hits(context, trials, off_mm),
         p_hit=float(model.hit_chance(believed.covariance_ct(q))[0]),
@@ -319,10 +333,19 @@ def _measured(
     if guided is None:
         return distribution
     way = guided[0]
-    said = not_modelled(case, counted=(*counted, "breathing", *(() if case.motion is None else ("motion",))))
-    stops = len(went) - unreached - int(went.sum())
-    hidden, looks = lost_sight(way.model, way.name), way.model.looks_of(way.name)
-    return replace(distribution, guidance=way.name, stopped=stops, hidden=hidden, looks=looks, not_modelled=said)
+    moving = {"breathing": case.breathing, "motion": case.motion}
+    said = not_modelled(case, counted=(*counted, *(name for name, one in moving.items() if one is not None)))
+    p_hit, p_stop = guided_chances(way.model, way.name, model, way.corridor_mm)
+    return replace(
+        distribution,
+        guidance=way.name,
+        stopped=len(went) - unreached - int(went.sum()),
+        p_stop=p_stop,
+        p_hit=p_hit,
+        hidden=lost_sight(way.model, way.name),
+        looks=way.model.looks_of(way.name),
+        not_modelled=said,
+    )
 
 
 def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel, way: Way | None) -> Floats:
@@ -337,33 +360,9 @@ def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel,
     follows = [followers(context.case, context.anatomy)[column] for column in model.columns]
     found = np.zeros(len(follows))
     for one in set(follows):
-        chances = np.mean([touch(of) for of in _at_phases(model, way, one)], axis=0)
+        chances = np.mean([touch(of) for of in at_phases(way.model, way.name, model, one)], axis=0)
         found = np.where([its == one for its in follows], chances, found)
     return found
-
-
-PHASES = 8
-"""Positions of the breath, of equal chances, over which chances to touch are averaged: it goes to one side."""
-
-
-def _at_phases(model: ChanceModel, way: Way, follows: Follows) -> list[ChanceModel]:
-    """The chances at each position of the breath in the gate: the needle displaced by it, and no longer uncertain."""
-    error, breathing, known = (
-        guided_error(way.model, way.name, follows),
-        model.case.breathing,
-        way.model.guided(way.name),
-    )
-    if breathing is None or known is None or not way.model.breath.any():
-        return [replace(model, error=error)]
-    shift = way.model.breath_shift(known.gain, follows)
-    resting = np.array(error.known.cov)
-    resting[:3, :3] -= np.outer(shift, shift)
-    error = replace(error, guided=error.known._replace(cov=resting))
-    gate = 1.0 if breathing.gate is None else breathing.gate
-    s = position_at((np.arange(PHASES) + 0.5) / PHASES, gate, breathing.exponent)
-    moved = (s - breathing.scanned_at) * breathing.amplitude_mm / np.linalg.norm(way.model.breath)
-    targets = model.case.target_ct + moved[:, None] * (error.fit.R_base_ct.T @ shift)
-    return [replace(model, error=error, case=replace(model.case, target_ct=target)) for target in targets]
 
 
 def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floats:

@@ -17,7 +17,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.planning.uncertainty.guided import GuidedModel, Look, ball_name, marker_name
+from puncture_twin.planning.uncertainty.guided import CAMERAS, GuidedModel, Look, ball_name, marker_name
 from puncture_twin.twin.plant.room_devices import RoomCameras, RoomProbe
 from puncture_twin.twin.plant.true_needle import TrueNeedle, true_needle
 from puncture_twin.twin.rehearsal.trials import (
@@ -75,6 +75,7 @@ def guided_trials(
     if way.name == "ct":
         return GuidedTrials(open_loop(puncture, truths), np.zeros(count, bool), np.zeros((count, 3)))
     T_base_ct = registered(puncture, truths)
+    turned = T_base_ct[:, :3, :3] @ model.error.fit.R_base_ct.T  # the gain is of the nominal patient's axes
     room = _Room(puncture, truths, model, T_base_ct, *_devices(puncture, truths, model, rng))
     drift = _drift(errors, truths.arrival, rng)
     moved, aside = np.zeros((count, 3)), np.zeros((count, 3))
@@ -89,7 +90,10 @@ def guided_trials(
         reached &= there
         if (known := model.guided(way.name, number)) is not None:
             z = np.hstack([found[one.name, one.look] for one in model.readings if one.look <= number])
-            wanted, off = (z @ rows[:, : z.shape[1]].T for rows in (known.gain[:3], known.aside))
+            z = (z.reshape(count, -1, 3) @ turned).reshape(count, -1)
+            wanted, off = (
+                np.einsum("nab,nb->na", turned, z @ rows[:, : z.shape[1]].T) for rows in (known.gain[:3], known.aside)
+            )
             stopped |= np.linalg.norm(off, axis=1) > way.corridor_mm
             moved, aside = np.where(stopped[:, None], (moved, aside), (wanted, off))
     q, there = commanded(puncture, T_base_ct, moved)
@@ -141,22 +145,25 @@ class _Room:
         nominal = flange_pose(self.puncture.model, q)
         axis = nominal[:, :3, 2]
         tip = nominal[:, :3, 3] + self.puncture.tip_mm * axis
-        found = {**self._by_cameras(needle, tip, axis), **self._by_probe(look, needle, tip)}
+        found = {**self._by_cameras(look, needle, tip, axis), **self._by_probe(look, needle, tip)}
         return {(name, number): value for name, value in found.items() if name not in look.hidden}
 
-    def _by_cameras(self, needle: TrueNeedle, tip: Floats, axis: Floats) -> dict[str, Floats]:
-        if self.cameras is None:
+    def _by_cameras(self, look: Look, needle: TrueNeedle, tip: Floats, axis: Floats) -> dict[str, Floats]:
+        if self.cameras is None or CAMERAS in look.hidden:
             return {}
-        truths, behind = self.truths, np.array(self.cameras.device.balls_mm)[:, None]
+        names = [marker_name(name) for name in self.model.markers]
+        shown = [name not in look.hidden for name in names]
+        behind = np.array([mm for mm in self.cameras.device.balls_mm if ball_name(mm) not in look.hidden])[:, None]
+        truths = self.truths
         skin_ct = self.model.skin_weight * truths.breath_ct
         markers = self.cameras.read(apply(self.puncture.T_base_ct, self.puncture.points_ct + skin_ct[:, None]))
         balls = self.cameras.read(needle.tip_base[:, None] - behind * needle.R_base_needle[:, None, :, 2])
         expected = apply_each(self.T_base_ct, truths.read_ct)
-        T_base_cameras = fit_rigid(markers, expected)  # where the belief is linear: the frame is free
+        T_base_cameras = fit_rigid(markers[:, shown], expected[:, shown])  # where the belief is linear: frame is free
         off = apply_each(T_base_cameras, balls) - (tip[:, None] - behind * axis[:, None])
-        seen = {ball_name(mm): off[:, row] for row, mm in enumerate(self.cameras.device.balls_mm)}
+        seen = {ball_name(mm): off[:, row] for row, mm in enumerate(behind[:, 0].tolist())}
         there = apply_each(T_base_cameras, markers) - expected
-        return {**{marker_name(name): there[:, row] for row, name in enumerate(self.model.markers)}, **seen}
+        return {**{name: there[:, row] for row, name in enumerate(names)}, **seen}
 
     def _by_probe(self, look: Look, needle: TrueNeedle, tip: Floats) -> dict[str, Floats]:
         if self.probe is None:

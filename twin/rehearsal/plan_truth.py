@@ -101,7 +101,7 @@ def median_truth(found: Distribution) -> Truth:
     Raises:
         NoAnswerError: As `plan_truth`.
     """
-    count = len(found) + found.unreached
+    count = len(found) + found.unreached + found.stopped
     row = int(spread_rows(found, 1)[0]) if len(found) else 0
     return _of_drawn(found, row, f"the median of {plural(count, 'trial')}, seed {found.seed}, from {_declared(found)}")
 
@@ -115,8 +115,9 @@ def spread_rows(found: Distribution, count: int) -> Ints:
 
 def _of_drawn(found: Distribution, row: int, source: str) -> Truth:
     if len(found) == 0:
-        what = f"in none of {found.unreached} trials did the arm reach the pose that its registration gave"
-        raise NoAnswerError(what, code="out_of_reach")
+        what = f"the needle reached the target in none of {found.unreached + found.stopped} trials"
+        why = f"{found.unreached} beyond the arm's reach, {found.stopped} stopped before a correction left the corridor"
+        raise NoAnswerError(f"{what}: {why}", code="out_of_reach")
     return drawn_truth(found.puncture, found.trials, row, found.seed, source)
 
 

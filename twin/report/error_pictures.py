@@ -249,7 +249,7 @@ def _reliability(axes: Axes, found: Any) -> None:
     axes.fill_between(fine, fine - spread, fine + spread, color="0.85", lw=0, label="95 % range of chance alone")
     axes.plot([0, 1], [0, 1], color=PREDICTED, lw=1.0)
     axes.scatter(LEVELS, within, s=16, c=WITHIN, label="tip within a radius", zorder=3)
-    axes.scatter([found.p_hit], [found.hit.mean()], s=60, c=BEYOND, marker="*", label="target hit", zorder=4)
+    axes.scatter([found.p_hit], [found.hit_share], s=60, c=BEYOND, marker="*", label="target hit", zorder=4)
     axes.scatter(
         found.p_touch, found.touched.mean(axis=0), s=26, c=BEYOND, marker="x", label="a structure touched", zorder=4
     )

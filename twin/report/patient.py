@@ -222,7 +222,7 @@ def rooms(found: Mapping[str, Any] | None) -> list[Block]:
     if found is None:
         return []
     if found["realised_rms_mm"] is None:
-        return [Warn((f"{plural(found['rooms'], 'trial')}: the arm reached the pose of its registration in none",))]
+        return [Warn((f"{plural(found['rooms'], 'trial')}: the needle reached the target in none",))]
     touched = (
         (f"touched {name.replace('_', ' ')}", fraction, found["p_touch_by_structure"][name])
         for name, fraction in found["touch_share_by_structure"].items()
@@ -253,8 +253,10 @@ def _reserves(found: Mapping[str, Any]) -> list[str]:
         said.append(f"In {found['unreached']:,} trials the arm did not reach the pose; they are not counted.")
     if found.get("stopped"):
         left = "a correction would have left the corridor, and the needle was stopped"
-        said.append(f"In {found['stopped']:,} trials {left}; they are not counted.")
-    said += [f"{one}." for one in found.get("lost_sight", ())]
+        counted = f"predicted: {_percent(found['p_stop'])}; they do not hit, and are in no other number"
+        said.append(f"In {found['stopped']:,} trials {left} ({counted}).")
+    notes = (*found.get("assumed", ()), *found.get("lost_sight", ()))
+    said += [f"{one[0].upper()}{one[1:]}." for one in notes]
     if found["guessed_touches"]:
         how = "a posture was assumed (touch.csv, q1_deg to q6_deg)"
         said.append(f"The arm's joints at the touches are not known: {how}.")

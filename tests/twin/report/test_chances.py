@@ -147,9 +147,7 @@ def test_a_truth_that_equals_the_belief_is_said_above_all(shown, tmp_path):
 def test_rooms_without_any_that_was_reached_say_nothing():
     """There is no table of nothing."""
     said = text([Section("many trials", rooms({**ROOMS, "realised_rms_mm": None}))])
-    assert (
-        "the arm reached the pose of its registration in none" in said and "realised" not in said and rooms(None) == []
-    )
+    assert "the needle reached the target in none" in said and "realised" not in said and rooms(None) == []
 
 
 def test_the_cloud_is_drawn_in_the_needles_frame(tmp_path):
@@ -162,7 +160,7 @@ def test_the_cloud_is_drawn_in_the_needles_frame(tmp_path):
         puncture=SimpleNamespace(outward_ct=outward), error_ct=error, cov_ct=np.diag([1.0, 4.0, 0.25]), seed=0,
         in_region=np.arange(300) < 285, realised_rms_mm=2.3, predicted_rms_mm=2.29,
         tip_error_mm=np.linalg.norm(error, axis=1), __len__=lambda: 300,
-        hit=np.arange(300) < 210, p_hit=0.71, touched=np.zeros((300, 2), bool), p_touch=np.array([0.01, 0.0]),
+        hit_share=0.7, p_hit=0.71, touched=np.zeros((300, 2), bool), p_touch=np.array([0.01, 0.0]),
     )  # fmt: skip
 
     class Found(SimpleNamespace):

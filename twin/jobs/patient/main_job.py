@@ -29,7 +29,7 @@ from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.choice import BEST, Choice, choose_stated, with_file_read
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
-from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run, check_rooms
+from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
 
 if TYPE_CHECKING:
     from puncture_twin.planning.export.exporter import Exported
@@ -123,7 +123,6 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal, two_stages
 
     context.require_arm()
-    check_rooms(context.case, rooms)
     choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
     with _writing(out, "plan", context, names, read=choice.read) as draft, two_stages() as begin:
@@ -224,7 +223,6 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
-    check_rooms(context.case, rooms)
     source, plan, candidates = checked_plan(context, plan_path)
     with _writing(out, "rehearse", context, ("rehearsal.json", FILM, ROOMS), source) as draft:
         run = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), rooms, partial).ended(draft.folder)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from puncture_twin.planning.base.processes import process_pool, worker_count
 from puncture_twin.planning.base.provenance import inputs_document
-from puncture_twin.planning.budget.guidance import sight_of
+from puncture_twin.planning.budget.guidance import equipped, sight_of
 from puncture_twin.twin.jobs.patient.run import FILM, ROOMS, RoomCount, Run
 from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
 from puncture_twin.twin.jobs.terminal import write_json
@@ -144,7 +144,9 @@ def in_rooms(context: CaseContext, plan: Plan, count: RoomCount, seed: int | Non
     seed = context.case.rehearsal.seed if seed is None else seed
     with context.stages.time("rooms"):
         q = plan.insertion.q[-1]
-        sight = None if count.guidance is None else sight_of(context, plan, count.guidance)
+        sight = None
+        if (way := count.guidance) is not None:
+            sight = sight_of(replace(context, case=equipped(context.case, way)[0]), plan, way)
         found = rehearse_trials(context, plan.outward_ct, q, count.rooms, seed, count.guidance, sight)
     if not (count.physics and len(found)):
         return found

@@ -11,8 +11,7 @@ import numpy as np
 from puncture_twin.planning.base.errors import Severity, refuse
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.text import plural
-from puncture_twin.planning.budget.guidance import check_devices, check_way
-from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.budget.guidance import check_way
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
@@ -52,16 +51,6 @@ class RoomCount(NamedTuple):
     rooms: int
     physics: int = 0
     guidance: str | None = None
-
-
-def check_rooms(case: Case, count: RoomCount | None) -> None:
-    """Refuse guidance whose devices a case does not declare, before anything is searched.
-
-    Raises:
-        InputError: See `check_devices`.
-    """
-    if count is not None and count.guidance is not None:
-        check_devices(case, count.guidance)
 
 
 def room_count(rooms: int | None, physics: int, guidance: str | None = None) -> RoomCount | None:

@@ -148,9 +148,9 @@ def rehearsal_failures(context: CaseContext, rehearsal: Rehearsal) -> tuple[str,
 def trial_failures(case: Case, found: Distribution) -> Iterator[str]:
     """Where more of many rooms missed or touched than the case's limits of the chances allow, one sentence each."""
     if not len(found):
-        yield "in no trial did the arm reach the pose"
+        yield "in no trial did the needle reach the target"
         return
-    least, hit, touched = case.search.min_hit or 0.0, float(found.hit.mean()), found.touched.mean(axis=0)
+    least, hit, touched = case.search.min_hit or 0.0, found.hit_share or 0.0, found.touched.mean(axis=0)
     if hit < least:
         yield f"{100 * hit:.2f} % of the trials hit the target; search.min_hit demands {100 * least:.2f} %"
     for name, share in zip(found.structures, touched.tolist(), strict=True):

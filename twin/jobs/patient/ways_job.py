@@ -21,7 +21,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.text import plural
-from puncture_twin.planning.budget.guidance import check_devices, sight_of
+from puncture_twin.planning.budget.guidance import equipped, sight_of
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.choice import Choice
 from puncture_twin.planning.search.context import CaseContext
@@ -125,6 +125,7 @@ class Compared:
         lost = [f"{row['guidance']}: {one}" for row in rows for one in (*row["failures"], *row["lost_sight"])]
         lost += [f"{way}: {why}" for way, why in self.unknown.items()]
         said = [f"Not modelled: {first['not_modelled']}."]
+        said += dict.fromkeys(one for row in rows for one in row["assumed"])
         said += ["The trials were drawn from [rehearsal.errors]: the belief is wrong."] * first["wrong_belief"]
         said += ["How the arm touched the markers is not known: a posture was assumed."] * first["guessed_touches"]
         title = f"the same {patients} by each way of guidance, seed {first['seed']}; best first"
@@ -230,11 +231,9 @@ def ways_job(
     """Compare ways of guidance along a plan, or along a case's best or chosen direction; write page and picture.
 
     Raises:
-        InputError: The case lacks a device of a way, errors or markers, or the plan does not hold in it.
+        InputError: The case lacks errors or markers, or the plan does not hold in it.
         NoAnswerError: There is no plan, or no way sees enough.
     """
-    for way in ways:
-        check_devices(context.case, way)
     read, made_from, planned = tuple[Input, ...](), dict[str, str](), tuple[Path, ...]()
     if is_plan(source):
         stated, plan, _ = checked_plan(context, source)
@@ -256,9 +255,12 @@ def _rehearsed(
     context: CaseContext, plan: Plan, ways: tuple[str, ...], count: int
 ) -> tuple[tuple[Rated, ...], dict[str, str]]:
     """The ways, the best first, and why others see too little."""
-    found, unknown = list[Distribution](), dict[str, str]()
+    found, unknown, case = list[Distribution](), dict[str, str](), context.case
+    for way in ways:
+        case, _ = equipped(case, way)
     with context.stages.time("rooms"):
-        sight, seed, q = sight_of(context, plan, *ways), context.case.rehearsal.seed, plan.insertion.q[-1]
+        sight = sight_of(replace(context, case=case), plan, *ways)
+        seed, q = context.case.rehearsal.seed, plan.insertion.q[-1]
         for way in ways:
             try:
                 found.append(rehearse_trials(context, plan.outward_ct, q, count, seed, way, sight))
