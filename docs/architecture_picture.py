@@ -26,7 +26,7 @@ COLUMNS = {
     "twin/report": 0.6, "twin/guidance/ct": 1.7, "twin/plant": -1.6, "twin/world": -0.5,
     "planning/export": 1.7, "planning/touch": 2.8, "planning/collision_cases": 3.9,
     "planning/place": 0.6, "planning/plan": 1.7, "planning/certify": 2.8, "planning/batch": 3.9,
-    "planning/budget": 5.0, "planning/sweep": 6.1, "planning/sight": 5.0,
+    "planning/budget": 5.0, "planning/sweep": 6.1, "planning/visibility": 5.0,
     "planning/search": 2.8, "planning/uncertainty": 2.8,
     "planning/registration": 0.6, "planning/motion": 1.7, "planning/reach": 2.8,
     "planning/collision": 1.7, "planning/clearance": 3.5, "planning/init": 4.6,

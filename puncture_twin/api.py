@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from puncture_twin.planning.search.candidates import Candidates, Pick
     from puncture_twin.planning.search.context import CaseContext, EngineChoice
     from puncture_twin.planning.search.explain import Explanation
-    from puncture_twin.planning.sight.cameras import CameraView
-    from puncture_twin.planning.sight.probe import ProbeView
+    from puncture_twin.planning.visibility.cameras import CameraView
+    from puncture_twin.planning.visibility.probe import ProbeView
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
@@ -552,7 +552,7 @@ def camera_view(context: CaseContext, plan: Plan) -> CameraView:
         InputError: The case declares no cameras, or a plan that does not hold in it.
         NoAnswerError: The surroundings leave no place for cameras that the case does not state.
     """
-    from puncture_twin.planning.sight.cameras import camera_view
+    from puncture_twin.planning.visibility.cameras import camera_view
 
     return camera_view(context, _own_plan(context, plan, "camera_view: plan"))
 
@@ -568,7 +568,7 @@ def probe_view(context: CaseContext, plan: Plan) -> ProbeView:
     Raises:
         InputError: The case declares no probe, its arm would stand in the patient, or a plan that does not hold in it.
     """
-    from puncture_twin.planning.sight.probe import probe_view
+    from puncture_twin.planning.visibility.probe import probe_view
 
     return probe_view(context, _own_plan(context, plan, "probe_view: plan"))
 

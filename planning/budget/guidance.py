@@ -40,8 +40,6 @@ from puncture_twin.planning.registration.residuals import NoiseTest
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import moving_weights
-from puncture_twin.planning.sight.cameras import CameraView, camera_view
-from puncture_twin.planning.sight.probe import ProbeView, probe_view
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.guided import (
     ALIKE_MM,
@@ -56,6 +54,8 @@ from puncture_twin.planning.uncertainty.guided import (
     device_of,
 )
 from puncture_twin.planning.uncertainty.pose_error import PoseError
+from puncture_twin.planning.visibility.cameras import CameraView, camera_view
+from puncture_twin.planning.visibility.probe import ProbeView, probe_view
 
 LOOKS = 3
 """One at the standoff, the others evenly on the way in, the last with the tip at the target."""

@@ -12,7 +12,7 @@ from puncture_twin import api as pt
 from puncture_twin.planning.budget.guidance import Sight, check_ways, sight_of, way_chances, with_ways
 from puncture_twin.planning.plan.plan_document import parse_plan, write_plan
 from puncture_twin.planning.search.uncertainty_breakdown import WAY_HEAD
-from puncture_twin.planning.sight.probe import ProbeView
+from puncture_twin.planning.visibility.probe import ProbeView
 from puncture_twin.twin.rehearsal.distribution import rehearse_trials
 from puncture_twin.twin.report import patient
 from puncture_twin.twin.report.present import Table

@@ -19,7 +19,7 @@ from puncture_twin.planning.collision.bodies import arm_bodies
 from puncture_twin.planning.collision.two_arms import handle_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import apply, inverse, pose
-from puncture_twin.planning.sight.probe import (
+from puncture_twin.planning.visibility.probe import (
     ASIDE,
     BASES_APART_MM,
     CLEARANCE_MM,

@@ -13,8 +13,8 @@ from puncture_twin.planning.case.case import bed_frame
 from puncture_twin.planning.collision.bodies import arm_bodies
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import apply, frame_about, inverse, pose
-from puncture_twin.planning.sight import cameras as cameras_module
-from puncture_twin.planning.sight.cameras import (
+from puncture_twin.planning.visibility import cameras as cameras_module
+from puncture_twin.planning.visibility.cameras import (
     BALL_MM,
     BASELINE_MM,
     CAMERA_MM,
