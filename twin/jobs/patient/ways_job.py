@@ -193,7 +193,8 @@ OUTCOME = (
 )  # fmt: skip
 WORSE_TEXT = (
     "Worse: clearly more of all trials fail (stopped, out of reach, missed or touched), or the error is clearly "
-    "larger, by two standard errors. All columns but the last three are of the trials that were executed."
+    "larger, by two standard errors. Tip error, region and touches are of the trials that were executed; hits are of "
+    "all that the arm could reach, and a stopped needle does not hit."
 )
 CLOUD_TEXT = "All to one scale. +: true target; line: predicted 95 % ellipsoid; crosses: outside it; dotted: hit."
 EFFORT = (
