@@ -115,6 +115,11 @@ class Trials(SimpleNamespace):
         """How many."""
         return len(self.hit)
 
+    @property
+    def hit_share(self):
+        """Of these, the fraction that hit."""
+        return float(np.mean(self.hit)) if len(self) else None
+
 
 def test_trials_say_no_where_more_miss_or_touch_than_the_case_allows():
     """Without limits they say nothing; with them, a share above one does, a share at it does not."""

@@ -4,8 +4,10 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import typer
+from hand_eye_world import hand_eye_problem, write_pairs
 from kill_world import SELFCAL, coarse_cases
 from places import ROOT
 
@@ -32,7 +34,7 @@ sys.exit(code if sent.is_set() else %d)
 ENDED_BEFORE = 77
 """The program's exit code where the command ended before it was interrupted: the machine is too fast."""
 
-QUICK = {"register", "verify", "init", "pivot", "batch", "schema"}
+QUICK = {"register", "verify", "init", "pivot", "batch", "schema", "calibrate"}
 """Commands that take less than the second after which the others are interrupted."""
 
 WRITING = {
@@ -70,6 +72,7 @@ def typed(tmp_path_factory):
     meshes.mkdir()
     for mesh in (folder() / "abdomen").glob("*.ply"):
         shutil.copy(mesh, meshes)
+    write_pairs(here / "pairs.csv", hand_eye_problem(np.random.default_rng(1), 20)[0])
     angles = ["--theta", "0", "--beta", "0"]
     return {
         "demo": [],
@@ -91,6 +94,7 @@ def typed(tmp_path_factory):
         "servo": [str(folder() / "head")],
         "reproduce": ["chen2019"],
         "schema": [],
+        "calibrate": ["hand-eye", "--recording", str(here / "pairs.csv")],
     }
 
 

@@ -114,7 +114,9 @@ def test_devices_that_are_not_declared_are_assumed(plan):
     context, one_plan = plan
     bare = replace(context, case=replace(context.case, stereo=None, ultrasound=None))
     (of_bare, _), (declared, _) = (ways._rehearsed(one, one_plan, ("ct", "ct+us"), 50) for one in (bare, context))
-    assert [one.found.realised_rms_mm for one in of_bare] == [one.found.realised_rms_mm for one in declared]
+    assert [one.found.predicted_rms_mm for one in of_bare] == pytest.approx(
+        [one.found.predicted_rms_mm for one in declared]
+    )
     said = {one.found.guidance: " ".join(one.found.assumed) for one in of_bare}
     assert said["ct"] == "" and "[ultrasound]" in said["ct+us"] and "[stereo]" not in said["ct+us"]
 
