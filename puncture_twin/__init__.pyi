@@ -26,6 +26,7 @@ from .api import (
     rehearse as rehearse,
     report as report,
     rerank as rerank,
+    safe_map as safe_map,
     search as search,
     shot_by_shot as shot_by_shot,
     touch as touch,
