@@ -1,5 +1,6 @@
 from .api import (
     batch as batch,
+    best_target as best_target,
     calibrate as calibrate,
     calibrate_hand_eye as calibrate_hand_eye,
     camera_view as camera_view,

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from puncture_twin.planning.search.candidates import Candidates, Pick
     from puncture_twin.planning.search.context import CaseContext, EngineChoice
     from puncture_twin.planning.search.explain import Explanation
-    from puncture_twin.planning.search.safe_map import SafeMap
+    from puncture_twin.planning.search.safe_map import BestTarget, SafeMap
     from puncture_twin.planning.visibility.cameras import CameraView
     from puncture_twin.planning.visibility.probe import ProbeView
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
@@ -222,6 +222,25 @@ def safe_map(context: CaseContext, target_ct: ArrayLike | None = None) -> SafeMa
     from puncture_twin.planning.search.safe_map import safe_map
 
     return safe_map(context if target_ct is None else context.at(target_ct))
+
+
+@checked
+def best_target(context: CaseContext, points: int | ArrayLike = 1000) -> BestTarget:
+    """Of many points of the target's structure, which one has the widest window, by `safe_map` and the skin.
+
+    ``context.at(found.target_ct)`` goes on from there; ``found.window_deg2`` has a row a point.
+
+    Args:
+        context: From `prepare`.
+        points: How many, evenly in the structure; or your own, shape (n, 3), mm, LPS (or the case's local frame).
+
+    Raises:
+        InputError: Points that are none, or an open structure that is to be filled.
+        NoAnswerError: No point has an open direction.
+    """
+    from puncture_twin.planning.search.safe_map import best_target
+
+    return best_target(context, points)
 
 
 @checked
