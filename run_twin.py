@@ -431,7 +431,7 @@ def live(
     case: CaseArgument,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0 takes a free one.")] = 18944,
     host: Annotated[
-        str, typer.Option("--host", help="Own address to listen at; not loopback: a warning.")
+        str, typer.Option("--host", help="Address to listen at; others than loopback are warned of.")
     ] = "127.0.0.1",
     arm: ArmOption = None,
 ) -> None:
