@@ -26,7 +26,13 @@ from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, entry_frame, grid
 from puncture_twin.planning.case.errors import ErrorModel, errors_of
-from puncture_twin.planning.case.named_files import MASK_ROLE, CaseVolumes, read_named_files, robot_warnings
+from puncture_twin.planning.case.named_files import (
+    MASK_ROLE,
+    CaseVolumes,
+    read_named_files,
+    robot_warnings,
+    wholeness_warnings,
+)
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
 from puncture_twin.planning.case.settings import (
     Axis,
@@ -165,10 +171,26 @@ class Case(Shown):
                     "empty",
                 )
         if target_ct is not None:
-            point = guard_points([target_ct], (self.target_name,), where="replace: target_ct")
-            options = {**options, "target": {"position_mm": to_lps(point, self.space)[0]}}
+            options = {**options, "target": self._target_option(target_ct, "replace: target_ct")}
         stated = self.options.with_(case_options(options, where="replace"))
         return _read(self.path, self.files.again(), stated)
+
+    def moved(self, target_ct: ArrayLike) -> Case:
+        """The case with another target, as `replace` has it; of its other files it knows what was read, and reads none.
+
+        Args:
+            target_ct: Shape (3,), mm, LPS (or the case's local frame).
+
+        Raises:
+            InputError: No such point.
+        """
+        option = self._target_option(target_ct, "at: target_ct")
+        stated = self.options.with_(case_options({"target": option}, where="at"))
+        return _read(self.path, self.files.again(), stated, self)
+
+    def _target_option(self, target_ct: ArrayLike, where: str) -> dict[str, Any]:
+        point = guard_points([target_ct], (self.target_name,), where=where)
+        return {"position_mm": to_lps(point, self.space)[0]}
 
     def directions(self) -> Directions:
         """The grid of the case."""
@@ -220,14 +242,19 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
     return _read(path, InputFiles(path.parent), options)
 
 
-def _read(path: Path, files: InputFiles, options: CaseOptions) -> Case:
-    case_volumes = CaseVolumes(files, path)
+def _read(path: Path, files: InputFiles, options: CaseOptions, known: Case | None = None) -> Case:
+    """Read a case; of one that differs from a known one by its target alone, the case file is looked at again."""
+    case_volumes = CaseVolumes(files, path) if known is None else known.volumes
     stated = files.add(CASE_ROLE, path.name, files.held(path.name) or read_toml_bytes(path, ALLOWED_CASE))
     if options.sections:
         files.state(OPTIONS_ROLE, options.text.encode())
     change = partial(options.applied, where=path)
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md", change=change)
-    whole = read_named_files(content, path, files, case_volumes)
+    if known is None:
+        whole = read_named_files(content, path, files, case_volumes)
+    else:
+        files.take(known.files, but=("target", OPTIONS_ROLE))
+        whole = wholeness_warnings(content, files, path)
     return replace(case_of(content, path, files, case_volumes, whole), options=options)
 
 

@@ -116,10 +116,9 @@ class CaseContext(Shown):
             target_ct: Shape (3,), mm, LPS (or the case's local frame).
 
         Raises:
-            InputError: As `prepare`: a target outside the skin or its structure, in an organ to be avoided, no point;
-                or files that have changed.
+            InputError: As `prepare`: a target outside the skin or its structure, in an organ to be avoided, no point.
         """
-        case, arm = self.case.replace(target_ct=target_ct), self.reach is not None
+        case, arm = self.case.moved(target_ct), self.reach is not None
         return prepare(case, arm=arm, engine=self._engine_choice, memory=self.memory, known=self.anatomy.warnings)
 
     @brief

@@ -178,6 +178,10 @@ class Memory:
         self._keep(key, value, size(value))
         return value
 
+    def holds(self, key: tuple[Hashable, ...]) -> bool:
+        """Whether the value of a key is there."""
+        return key in self._kept
+
     @property
     def most_bytes(self) -> int:
         """Bytes that the values may hold."""
