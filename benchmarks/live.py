@@ -3,10 +3,10 @@
     python -m benchmarks.live [CASE [ROUNDS]]
 
 The planner runs in a process of its own. A client that is compiled against the OpenIGTLink library
-(tests/live_client.cpp) asks from another, over loopback. Each round moves the target by 0.01 mm, so that nothing that is
-kept can answer. "map" ends when the last byte of the mesh has come. "verdict" is that of a needle alone. "both" is that
-of a needle that is known, from the moment at which a new target is sent: map first, then `check` in full. At last a
-needle is streamed at 50 Hz.
+(tests/live_client.cpp) asks from another, over loopback. Each round moves the target by 0.01 mm: nothing that is kept
+can answer. "map" ends when the last byte of the mesh has come. "verdict" is that of a needle alone. "both" is that of a
+needle that is known, from the moment at which a new target is sent: map first, then `check` in full. At last a needle
+is streamed at 50 Hz.
 """
 
 from __future__ import annotations

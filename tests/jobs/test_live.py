@@ -23,8 +23,7 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import INTERRUPTED
 from puncture_twin.twin.jobs.live.messages import Header, Message, Stamp, packed
-from puncture_twin.twin.jobs.live.planner import NO_STRUCTURE, Planner
-from puncture_twin.twin.jobs.live.server import Question
+from puncture_twin.twin.jobs.live.planner import NO_STRUCTURE, Planner, Question
 
 ABDOMEN = folder() / "abdomen"
 RAS = np.array([-1.0, -1.0, 1.0])
@@ -43,10 +42,10 @@ def planner(context):
     return Planner(context)
 
 
-def asked(planner, kind, name, content, client=1, stamp=STAMP):
+def asked(planner, kind, name, content, session=None, stamp=STAMP):
     """The answers to one message, by name; questions that arise are answered too."""
-    subject = planner.subject(Header(2, kind, name, 0, 0, len(content), 0))
-    waiting, found = [Question(client, subject, stamp, Message(kind, name, stamp, content))], {}
+    subject, session = planner.subject(Header(2, kind, name, 0, 0, len(content), 0)), session or planner.session()
+    waiting, found = [Question(1, session, subject, stamp, Message(kind, name, stamp, content))], {}
     while waiting:
         question = waiting.pop()
         try:
@@ -89,7 +88,7 @@ def verdict(planner, pose, **named):
 def test_the_map_is_that_of_the_api_wherever_it_is_drawn(context, planner):
     """Grid and mesh of a target that was moved: verdict and structure; each quad lies about its own direction."""
     target = context.case.target_ct + [2.0, -1.0, 1.5]
-    found = asked(planner, "POINT", "Target", point(RAS * target), client=2)
+    found = asked(planner, "POINT", "Target", point(RAS * target))
     expected = pt.safe_map(context, target)
     directions, n = context.case.directions(), len(expected.blocked)
     assert 0 < expected.blocked.sum() < n
@@ -130,10 +129,11 @@ def alike(one, other):
 def test_the_verdict_is_that_of_check(context, planner, rng):
     """A dozen needles, a target that was moved: every key of `check`, and joints and entry beside it."""
     target = context.case.target_ct + [1.0, 1.0, -2.0]
-    asked(planner, "TRANSFORM", "Target", transform(needle(RAS * target, [0, 0, 1])), client=3)
+    session = planner.session()
+    asked(planner, "TRANSFORM", "Target", transform(needle(RAS * target, [0, 0, 1])), session)
     at, seen = context.at(np.float32(target).astype(float)), set()
     for theta, beta in zip(rng.uniform(0, 90, 12), rng.uniform(0, 360, 12), strict=True):
-        said = verdict(planner, toward(at, theta, beta), client=3)
+        said = verdict(planner, toward(at, theta, beta), session=session)
         known = pt.check(at, said["check"]["theta_deg"], said["check"]["beta_deg"])
         assert abs(said["check"]["theta_deg"] - theta) < 1e-4
         summary = json.loads(json.dumps(known.summary()))
@@ -198,24 +198,24 @@ def is_empty(found):
 
 def test_a_refused_target_leaves_nothing_of_the_one_before(context, planner, paths):
     """Neither map nor verdict, until there is a good one: then the needle that is known is answered for it."""
-    pose, target = toward(context, *paths[0, :2]), RAS * context.case.target_ct
-    assert verdict(planner, pose, client=5)["verdict"] == "safe"
-    far = asked(planner, "POINT", "Target", point((900.0, 0.0, 0.0)), client=5)
+    pose, target, session = toward(context, *paths[0, :2]), RAS * context.case.target_ct, planner.session()
+    assert verdict(planner, pose, session=session)["verdict"] == "safe"
+    far = asked(planner, "POINT", "Target", point((900.0, 0.0, 0.0)), session)
     assert is_empty(far) == "target_misplaced"
-    assert verdict(planner, pose, client=5)["error"]["code"] == "no_target"
-    assert verdict(planner, pose, client=6)["verdict"] == "safe"  # another client has a target of its own
+    assert verdict(planner, pose, session=session)["error"]["code"] == "no_target"
+    assert verdict(planner, pose)["verdict"] == "safe"  # another client has a target of its own
     for content, code in [
         (point((np.nan, 0.0, 0.0)), "not_finite"),
         (point(target, target), "wrong_count"),
         (b"", "wrong_count"),
         (point(target)[:-1], "wrong_count"),
     ]:
-        assert is_empty(asked(planner, "POINT", "Target", content, client=5)) == code
-    again = asked(planner, "POINT", "Target", point(target), client=5)
+        assert is_empty(asked(planner, "POINT", "Target", content, session)) == code
+    again = asked(planner, "POINT", "Target", point(target), session)
     assert document(again, "Verdict")["verdict"] == "safe" and document(again, "SafeMapInfo")["blocked"] > 0
     with refused("no_target"):  # one that came damaged is a refused one
-        list(planner.answers(Question(5, "target", STAMP, fault=refusal("no_target"))))
-    assert verdict(planner, pose, client=5)["error"]["code"] == "no_target"
+        list(planner.answers(Question(1, session, "target", STAMP, fault=refusal("no_target"))))
+    assert verdict(planner, pose, session=session)["error"]["code"] == "no_target"
 
 
 def refusal(code):
@@ -236,7 +236,7 @@ def refusal(code):
 )
 def test_a_pose_that_no_needle_has_is_refused(planner, matrix, code):
     """And its verdict replaces the one before; the entry goes."""
-    found = asked(planner, "TRANSFORM", "Needle", transform(matrix), client=7)
+    found = asked(planner, "TRANSFORM", "Needle", transform(matrix))
     said = document(found, "Verdict")
     assert (said["verdict"], said["error"]["code"], found["POINT Entry"]) == ("refused", code, b"")
 
@@ -245,7 +245,6 @@ def test_of_a_stranger_nothing_is_wanted(planner):
     """Only three names, each with its types."""
     for kind, name in (("IMAGE", "Target"), ("POINT", "Needle"), ("POINT", "F"), ("STRING", "Text"), ("STATUS", "x")):
         assert planner.subject(Header(1, kind, name, 0, 0, 0, 0)) is None
-    planner.forget(12345)
 
 
 def test_a_case_in_a_frame_of_its_own_is_refused():

@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from puncture_twin.planning.search.explain import Explanation, finite
 from puncture_twin.planning.search.safe_map import NOT_TESTED, SafeMap, safe_map
 from puncture_twin.twin.jobs.live.messages import (
     Header,
+    Message,
     Stamp,
     image_content,
     mesh_content,
@@ -47,7 +48,6 @@ from puncture_twin.twin.jobs.live.messages import (
     status_content,
     text_content,
 )
-from puncture_twin.twin.jobs.live.server import Answer, Question
 
 AIMED_MM = 2.0
 """A hand and a tracker together keep a needle on a line to about this."""
@@ -103,17 +103,39 @@ class MapMesh:
         return image_content(values.astype(np.uint16).reshape(shape), first, float(np.degrees(self.grid.step)))
 
 
+SUBJECTS = ("status", "target", "needle")
+"""In the order in which they are answered: a needle is checked against the newest target."""
+
+
 @dataclass(eq=False)
 class Session:
     """What a client has said: its target, and its needle.
 
     Attributes:
         context: Of the target; None after one that was refused.
-        needle: Its last message.
+        needle: Its last question.
     """
 
     context: CaseContext | None
     needle: Question | None = None
+
+
+class Question(NamedTuple):
+    """A message about a subject, and whose it is; one with a fault could not be read."""
+
+    client: int
+    session: Session
+    subject: str
+    stamp: Stamp
+    message: Message | None = None
+    fault: PlanningError | None = None
+
+
+class Answer(NamedTuple):
+    """A message that goes out, and its type and name: of those only the newest waits."""
+
+    name: str
+    data: bytes
 
 
 class Planner:
@@ -127,19 +149,17 @@ class Planner:
         """
         if context.case.space is Space.LOCAL:
             refuse('space "local": OpenIGTLink knows RAS', context.case.path, "a case of a patient", "local_space")
-        self._context, self._mesh = context, MapMesh.of(context.case)
-        self._sessions: dict[int, Session] = {}
-        self._warm()
-
-    def _warm(self) -> None:
-        """Check some directions: the first client does not wait for compilers."""
-        at = self._context.at(self._context.case.target_ct)
-        found = safe_map(at)
-        rows = np.flatnonzero(~found.blocked)
-        rows = rows[:: max(1, len(rows) // WARM)] if len(rows) else np.zeros(1, np.int64)
-        checked = at.check(found.directions.theta[rows], found.directions.beta[rows])
+        self._mesh = MapMesh.of(context.case)
+        self._context = at = context.at(context.case.target_ct)  # shows no progress
+        free = safe_map(at)
+        rows = np.append(np.flatnonzero(~free.blocked), 0)[:: 1 + len(free.blocked) // WARM]
+        checked = at.check(free.directions.theta[rows], free.directions.beta[rows])  # compilers run now, not later
         best = 0 if checked.best is None else checked.best.row
         explained(at, float(checked.theta[best]), float(checked.beta[best])).summary()
+
+    def session(self) -> Session:
+        """Of a client that has said nothing yet: the case's target."""
+        return Session(self._context)
 
     def subject(self, header: Header) -> str | None:
         """What a message is about; see the head of this module."""
@@ -150,17 +170,13 @@ class Planner:
             return "target"
         return "needle" if kind == "TDATA" or (kind, name) == ("TRANSFORM", "Needle") else None
 
-    def forget(self, client: int) -> None:
-        """A client is gone."""
-        self._sessions.pop(client, None)
-
     def answers(self, question: Question) -> Iterator[Answer | Question]:
         """The answers to a message, as they are found.
 
         Raises:
             InputError: No target or needle that can be answered.
         """
-        session = self._sessions.setdefault(question.client, Session(self._context))
+        session = question.session
         if question.subject == "target":
             session.context = None  # an old target is not answered for, should this one be refused
         elif question.subject == "needle":

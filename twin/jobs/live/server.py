@@ -19,14 +19,14 @@ import selectors
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from ipaddress import ip_address
-from typing import NamedTuple, Protocol
 
 from puncture_twin.planning.base.errors import InputError, PlanningError, refuse
-from puncture_twin.twin.jobs.live.messages import HEADER, Header, Message, Stamp, read_header, read_message
+from puncture_twin.twin.jobs.live.messages import HEADER, Header, read_header, read_message
+from puncture_twin.twin.jobs.live.planner import SUBJECTS, Answer, Planner, Question, Session
 
 LOG = logging.getLogger(__name__)
 
@@ -53,66 +53,19 @@ SEND_BUFFER = 262_144
 MOST_LINES, LINES_S = 20, 60.0
 """So many lines in the log in this time."""
 
-SUBJECTS = ("status", "target", "needle")
-"""In the order in which they are answered: a needle is checked against the newest target."""
-
 USED = "the messages of docs/reference/live.md"
-
-
-class Question(NamedTuple):
-    """A message about a subject of the planner's, and whose it is; with a fault there is no message."""
-
-    client: int
-    subject: str
-    stamp: Stamp
-    message: Message | None = None
-    fault: PlanningError | None = None
-
-
-class Answer(NamedTuple):
-    """A message that goes out; of its name only the newest waits."""
-
-    name: str
-    data: bytes
-
-
-class Answering(Protocol):
-    """Who answers: from one thread alone, but for `subject` and `refused`."""
-
-    def subject(self, header: Header) -> str | None:
-        """Which of `SUBJECTS` a message is about, by its header; None where nobody wants it."""
-        ...
-
-    def answers(self, question: Question) -> Iterable[Answer | Question]:
-        """The answers as they are found, and questions that arise, which give way to newer ones.
-
-        Raises:
-            PlanningError: There is no answer; the fault of a question that has one.
-        """
-        ...
-
-    def refused(self, subject: str | None, stamp: Stamp, error: PlanningError) -> Iterable[Answer]:
-        """What a client gets in place of answers: nothing old may be taken for them."""
-        ...
-
-    def forget(self, client: int) -> None:
-        """A client is gone."""
-        ...
 
 
 class Exchange:
     """What waits between sockets and planner: the newest question of each subject, in turn for each client."""
 
     def __init__(self, wake: Callable[[], None]) -> None:
-        self._wake = wake
-        self._changed = threading.Condition()
+        self._wake, self._changed, self._closed = wake, threading.Condition(), False
         self._questions: dict[int, dict[str, Question]] = {}
         self._answers: dict[int, dict[str, bytes]] = {}
-        self._gone: list[int] = []
-        self._closed = False
 
     def open(self, client: int) -> None:
-        """From now on its answers are kept for it."""
+        """From now on its questions and answers are kept."""
         with self._changed:
             self._answers[client] = {}
 
@@ -121,14 +74,12 @@ class Exchange:
         with self._changed:
             self._answers.pop(client, None)
             self._questions.pop(client, None)
-            self._gone.append(client)
-            self._changed.notify()
 
     def close(self) -> None:
         """There are no more questions."""
         with self._changed:
             self._closed = True
-            self._changed.notify_all()
+            self._changed.notify()
 
     def ask(self, question: Question, *, newest: bool = True) -> None:
         """Put a question in place of an older one; one that is not the newest gives way to one that waits."""
@@ -138,25 +89,18 @@ class Exchange:
                 waiting[question.subject] = question if newest else waiting.get(question.subject, question)
                 self._changed.notify()
 
-    def take(self) -> tuple[Question | None, list[int]] | None:
-        """The next question of the client that waits longest, the first of its subjects by name, and who is gone.
-
-        None where there are no more; waits until there is one.
-        """
+    def take(self) -> Question | None:
+        """The first subject of the client that waits longest, which then waits anew; None where there are no more."""
         with self._changed:
-            while not (self._questions or self._gone or self._closed):
-                self._changed.wait()
+            self._changed.wait_for(lambda: self._questions or self._closed)
             if self._closed:
                 return None
-            gone, self._gone = self._gone, []
-            if not self._questions:
-                return None, gone
             client = next(iter(self._questions))
             waiting = self._questions.pop(client)
             question = waiting.pop(min(waiting, key=SUBJECTS.index))
             if waiting:
                 self._questions[client] = waiting
-            return question, gone
+            return question
 
     def give(self, client: int, answer: Answer) -> None:
         """Put an answer in place of an older one of its name."""
@@ -185,6 +129,7 @@ class Client:
     """
 
     number: int
+    session: Session
     socket: socket.socket
     where: str
     received: bytearray = field(default_factory=bytearray)
@@ -197,26 +142,19 @@ class Client:
 
 
 class Log:
-    """Lines about clients: each kind once for each of them, and a limited number in a time."""
+    """Lines about clients: each kind once for each of them, and `MOST_LINES` in `LINES_S`."""
 
     def __init__(self) -> None:
-        self._since, self._lines, self._left_out = 0.0, 0, 0
+        self._times: list[float] = []
 
     def line(self, client: Client, code: str, text: str) -> None:
         """Log it, if it is new, and not too many were."""
-        if code in client.logged:
-            return
-        client.logged.add(code)
         now = time.monotonic()
-        if now - self._since > LINES_S:
-            if self._left_out:
-                LOG.warning("live: %d lines left out", self._left_out)
-            self._since, self._lines, self._left_out = now, 0, 0
-        if self._lines >= MOST_LINES:
-            self._left_out += 1
-            return
-        self._lines += 1
-        LOG.warning("live: client %s: %s", client.where, text)
+        self._times = [one for one in self._times if now - one < LINES_S]
+        if code not in client.logged and len(self._times) < MOST_LINES:
+            self._times.append(now)
+            LOG.warning("live: client %s: %s", client.where, text)
+        client.logged.add(code)
 
 
 def bound(host: str, port: int) -> socket.socket:
@@ -245,7 +183,7 @@ def bound(host: str, port: int) -> socket.socket:
     return listener
 
 
-def serve(listener: socket.socket, planner: Answering) -> None:
+def serve(listener: socket.socket, planner: Planner) -> None:
     """Answer clients until it is interrupted; the port is free then.
 
     Args:
@@ -278,20 +216,17 @@ def _wake(waker: socket.socket) -> None:
         waker.send(b"x")
 
 
-def _compute(exchange: Exchange, planner: Answering) -> None:
+def _compute(exchange: Exchange, planner: Planner) -> None:
     """One question after the other, until there are no more."""
-    while (taken := exchange.take()) is not None:
-        question, gone = taken
-        for client in gone:
-            planner.forget(client)
-        for found in () if question is None else _found(planner, question):
+    while (question := exchange.take()) is not None:
+        for found in _found(planner, question):
             if isinstance(found, Question):
                 exchange.ask(found, newest=False)
-            elif question is not None:
+            else:
                 exchange.give(question.client, found)
 
 
-def _found(planner: Answering, question: Question) -> Iterator[Answer | Question]:
+def _found(planner: Planner, question: Question) -> Iterator[Answer | Question]:
     """The answers, or why there are none."""
     try:
         yield from planner.answers(question)
@@ -306,7 +241,7 @@ class Sockets:
     """The connections, and one turn over all of them."""
 
     def __init__(
-        self, selector: selectors.BaseSelector, listener: socket.socket, exchange: Exchange, planner: Answering
+        self, selector: selectors.BaseSelector, listener: socket.socket, exchange: Exchange, planner: Planner
     ) -> None:
         self.clients: dict[int, Client] = {}
         self._selector, self._listener, self._exchange, self._planner = selector, listener, exchange, planner
@@ -350,7 +285,7 @@ class Sockets:
         with suppress(OSError):  # it was gone before it was greeted
             connection, address = self._listener.accept()
             self._number += 1
-            client = Client(self._number, connection, f"{address[0]}:{address[1]}")
+            client = Client(self._number, self._planner.session(), connection, f"{address[0]}:{address[1]}")
             connection.setblocking(False)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -421,7 +356,7 @@ class Sockets:
                 what = f"{header.kind} '{header.name}' of {header.size} bytes is not used"
                 refuse(what, "OpenIGTLink", USED, "unknown_message")
             message = read_message(header, body)
-            self._exchange.ask(Question(client.number, subject, message.stamp, message))
+            self._exchange.ask(Question(client.number, client.session, subject, message.stamp, message))
         except InputError as error:
             self._wrong(client, subject, header, error)
         return True
@@ -429,7 +364,7 @@ class Sockets:
     def _wrong(self, client: Client, subject: str | None, header: Header, error: InputError) -> None:
         """Answer a message that cannot be used; of those that are about nothing here, the first of each kind."""
         if subject is not None:
-            self._exchange.ask(Question(client.number, subject, header.stamp, fault=error))
+            self._exchange.ask(Question(client.number, client.session, subject, header.stamp, fault=error))
         elif error.code not in client.logged:
             for answer in self._planner.refused(None, header.stamp, error):
                 self._exchange.give(client.number, answer)
