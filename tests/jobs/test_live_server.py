@@ -55,32 +55,35 @@ class Running:
     """A server in a thread; `stop` ends it as Ctrl-C does."""
 
     def __init__(self, planner):
-        self.planner, listener = planner, bound("127.0.0.1", 0)
-        self.port, self.ended = listener.getsockname()[1], None
-        turn = server.Sockets.turn
-
-        def stoppable(sockets):
-            if self.ended is not None:
-                raise KeyboardInterrupt
-            turn(sockets)
-
-        self.patch = pytest.MonkeyPatch()
-        self.patch.setattr(server.Sockets, "turn", stoppable)
-        self.thread = threading.Thread(target=self.run, args=(listener,))
+        self.planner, self.listener, self.ends = planner, bound("127.0.0.1", 0), False
+        self.port = self.listener.getsockname()[1]
+        self.thread = threading.Thread(target=self.run)
         self.thread.start()
 
-    def run(self, listener):
+    def __enter__(self):
+        return self.listener.__enter__()
+
+    def __exit__(self, *error):
+        return self.listener.__exit__(*error)
+
+    def accept(self):
+        """The next connection, or an interruption."""
+        accepted = self.listener.accept()
+        if self.ends:
+            raise KeyboardInterrupt
+        return accepted
+
+    def run(self):
         """Until it is stopped."""
         with pytest.raises(KeyboardInterrupt):
-            serve(listener, self.planner)
+            serve(self, self.planner)
 
     def stop(self):
         """End, and wait for it."""
-        self.ended = True
+        self.ends = True
         with suppress(OSError):
             socket.create_connection(("127.0.0.1", self.port), 1.0).close()  # it wakes
         self.thread.join(10.0)
-        self.patch.undo()
         assert not self.thread.is_alive()
 
 
@@ -296,7 +299,7 @@ def test_an_address_that_is_not_loopback_is_warned_of(caplog):
 
 def test_questions_take_turns_and_a_target_comes_before_a_needle():
     """Of two clients, whatever each has sent in which order."""
-    exchange = Exchange(lambda: None)
+    exchange = Exchange()
     stamp = (1, 0, 0, 0)
     for client in (1, 2):
         exchange.open(client)

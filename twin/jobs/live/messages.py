@@ -231,7 +231,7 @@ def image_content(values: NDArray[np.uint16], first: tuple[float, float], step: 
     return IMAGE.pack(1, 1, UINT16, LITTLE, RAS, *size, *axes, 0, 0, 0, *size) + values.astype("<u2").tobytes()
 
 
-def mesh_content(points: Floats, cells: bytes, scalars: Mapping[str, Floats | Ints]) -> bytes:
+def mesh_content(points: Floats, cells: bytes, scalars: Mapping[str, NDArray[Any]]) -> bytes:
     """Of a POLYDATA of quads with scalars.
 
     Args:

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import PlanningError, refuse
@@ -91,7 +92,7 @@ class MapMesh:
         quads = np.arange(len(units)).reshape(-1, 4)
         return cls(directions.grid, to_lps(units, Space.RAS), quad_bytes(quads), case.needle.length_mm)
 
-    def content(self, target_ras: list[float], scalars: Mapping[str, Ints]) -> bytes:
+    def content(self, target_ras: list[float], scalars: Mapping[str, NDArray[Any]]) -> bytes:
         """Of a POLYDATA about a target, with values (n,) by name."""
         points = np.array(target_ras) + self.radius_mm * self.corners
         return mesh_content(points, self.cells, {name: np.repeat(values, 4) for name, values in scalars.items()})
