@@ -226,7 +226,7 @@ class Planner:
     def _map(self, found: SafeMap, stamp: Stamp) -> Iterator[Answer]:
         """Mesh, grid and what they mean."""
         mesh, target_ras = self._mesh, _ras(found.target_ct)
-        scalars = {"blocked": found.blocked.astype(np.int64), "structure": found.structure}
+        scalars: dict[str, NDArray[Any]] = {"blocked": found.blocked.astype(np.int64), "structure": found.structure}
         yield _answer("POLYDATA", "SafeMap", stamp, mesh.content(target_ras, scalars))
         values = np.where(found.blocked, np.where(found.structure < 0, NO_STRUCTURE, found.structure + 1), FREE)
         yield _answer("IMAGE", "SafeGrid", stamp, mesh.image(values))
