@@ -152,7 +152,8 @@ class Case(Shown):
         """What the case would be if its file had these values; the file stays as it is.
 
         Args:
-            target_ct: Another target in the same structure, shape (3,), mm, LPS (or the case's local frame).
+            target_ct: Another target in the same structure, shape (3,), mm, LPS (or the case's local frame). Alone, it
+                needs no file but the case file to be read again.
             options: Tables of keys and values as in the file, in mm, degrees and the case's space: ``target``,
                 ``mount`` (in place of any registration), ``needle``, ``arm``, ``search``, ``errors``, ``margins``. Of
                 margins that fit one structure the last stated counts; ``add_mm`` is added to all of them,
@@ -170,27 +171,12 @@ class Case(Shown):
                     "keys and values, as in the case",
                     "empty",
                 )
+        known = self if target_ct is not None and not options else None  # a target alone changes no other file
         if target_ct is not None:
-            options = {**options, "target": self._target_option(target_ct, "replace: target_ct")}
+            point = guard_points([target_ct], (self.target_name,), where="replace: target_ct")
+            options = {**options, "target": {"position_mm": to_lps(point, self.space)[0]}}
         stated = self.options.with_(case_options(options, where="replace"))
-        return _read(self.path, self.files.again(), stated)
-
-    def moved(self, target_ct: ArrayLike) -> Case:
-        """The case with another target, as `replace` has it; of its other files it knows what was read, and reads none.
-
-        Args:
-            target_ct: Shape (3,), mm, LPS (or the case's local frame).
-
-        Raises:
-            InputError: No such point.
-        """
-        option = self._target_option(target_ct, "at: target_ct")
-        stated = self.options.with_(case_options({"target": option}, where="at"))
-        return _read(self.path, self.files.again(), stated, self)
-
-    def _target_option(self, target_ct: ArrayLike, where: str) -> dict[str, Any]:
-        point = guard_points([target_ct], (self.target_name,), where=where)
-        return {"position_mm": to_lps(point, self.space)[0]}
+        return _read(self.path, self.files.again(), stated, known)
 
     def directions(self) -> Directions:
         """The grid of the case."""

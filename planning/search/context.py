@@ -118,7 +118,7 @@ class CaseContext(Shown):
         Raises:
             InputError: As `prepare`: a target outside the skin or its structure, in an organ to be avoided, no point.
         """
-        case, arm = self.case.moved(target_ct), self.reach is not None
+        case, arm = self.case.replace(target_ct=target_ct), self.reach is not None
         return prepare(case, arm=arm, engine=self._engine_choice, memory=self.memory, known=self.anatomy.warnings)
 
     @brief
@@ -322,7 +322,7 @@ def _answering(
         if engine == "fcl":
             clearance_engine = FclEngine(meshes, count)
         else:
-            clearance_engine = FastEngine(meshes, count, cache=cache)
+            clearance_engine = FastEngine(meshes, count, cache.memory)
             if not isinstance(engine, str) and engine is not FastEngine:
                 clearance_engine = HeldEngine(engine(meshes, count), clearance_engine)
         reach = None

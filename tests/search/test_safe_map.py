@@ -1,5 +1,8 @@
 """Another target in the same anatomy, and the map of what its structures block."""
 
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from case_world import coarse_carton, write_case
@@ -73,3 +76,22 @@ def test_the_best_target_has_the_widest_window_and_is_a_case(case):
     assert 10 <= len(inside.points_ct) <= 40 and inside.best_deg2 >= windows[0]
     with refused("empty", by=pt.InputError):
         pt.best_target(context, np.zeros((0, 3)))
+
+
+def test_a_moved_context_goes_to_another_process_without_its_memory(case):
+    """What it holds of other targets stays here, and the map there is the same."""
+    context = prepare(case, arm=False).at([2.0, 3.0, 1.0])
+    assert context.memory.held_bytes > 0
+    sent = pickle.loads(pickle.dumps(context))
+    assert sent.memory.held_bytes == 0
+    assert np.array_equal(pt.safe_map(sent).structure, pt.safe_map(context).structure)
+    assert np.array_equal(sent.at([0.0, 1.0, 0.0]).case.target_ct, [0.0, 1.0, 0.0])
+
+
+def test_threads_share_a_context(case):
+    """Targets moved at once by several threads are those that one thread finds."""
+    context, targets = prepare(case, arm=False), [[0.5 * k, 0.2 * k, -0.3 * k] for k in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda target: pt.safe_map(context, target).structure, targets))
+    for target, structure in zip(targets, found, strict=True):
+        assert np.array_equal(structure, pt.safe_map(context, target).structure)
