@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -26,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.errors import PlanningError, refuse
+from puncture_twin.planning.base.errors import InputError, PlanningError, refuse
 from puncture_twin.planning.budget.guidance import explained_ways
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import AngleGrid, angles, outward
@@ -58,6 +59,9 @@ LEFT_OUT = ("case", "inputs", "entry_ct_mm", "warnings", "findings")
 
 FREE, NO_STRUCTURE = 0, 65_535
 """Values of SafeGrid where nothing blocks, and where no structure can be named."""
+
+ELSEWHERE_MM = 1e-6
+"""Another target, and in every case that has one as good."""
 
 WARM = 64
 """Directions that are checked before the first client comes: kernels are compiled then."""
@@ -151,6 +155,8 @@ class Planner:
         if context.case.space is Space.LOCAL:
             refuse('space "local": OpenIGTLink knows RAS', context.case.path, "a case of a patient", "local_space")
         self._mesh = MapMesh.of(context.case)
+        with suppress(InputError):  # the first other target fills the memory for all further ones
+            context.at(context.case.target_ct + ELSEWHERE_MM)
         self._context = at = context.at(context.case.target_ct)  # shows no progress
         free = safe_map(at)
         rows = np.append(np.flatnonzero(~free.blocked), 0)[:: 1 + len(free.blocked) // WARM]
