@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
-from benchmarks.safe_map import hostile
+from benchmarks.safe_map import hostile, random_grid
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.case.entry import grid
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.verdict_map import VerdictMap
 from puncture_twin.planning.formats.guard import guard_mesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from tools.hostile_scenes import KINDS
 
 WHOLE = grid((0, np.pi), (0, 2 * np.pi), np.radians(6.0), np.eye(3))
@@ -60,3 +62,29 @@ def test_a_target_inside_blocks_all_and_one_out_of_reach_nothing():
     assert (mapped(ball([0.0, 0.0, 0.0], 50.0), length=10.0) == 0).all()
     assert (mapped(ball([0.0, 60.0, 0.0], 20.0), length=37.0) == -1).all()
     assert (mapped(ball([0.0, 60.0, 0.0], 20.0), length=38.0) == 0).sum() > 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_point_blocks_all_within_its_limit(seed):
+    """Of a triangle as small as a point the cone is tight, also about poles, at the grid's ends and beside the target.
+
+    Blocked is what comes within the limit by the plain distance of a point from an axis, and nothing else.
+    """
+    rng, asked = np.random.default_rng(seed), 0
+    for _ in range(50):
+        R = Rotation.random(random_state=rng).as_matrix() if rng.random() < 0.5 else np.eye(3)
+        directions = random_grid(rng, R, 3.0)
+        where = R @ rng.choice([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]) + rng.choice([0.0, 0.1, 1.0]) * (
+            rng.normal(size=3)
+        )
+        point, limit, length = rng.uniform(5.0, 80.0) * where, rng.uniform(1.0, 20.0), rng.uniform(5.0, 90.0)
+        mesh = TriangleMesh(point + 1e-4 * np.eye(3), np.array([[0, 1, 2]]))
+        found = VerdictMap(np.zeros(3), directions.grid, directions.outward_ct, R)
+        one = Structure("point", Role.AVOID, limit, mesh, "made")
+        found.add(FastEngine([mesh]), 0, one, np.full(len(directions), length), 0.0)
+        along = np.clip(directions.outward_ct @ point, 0.0, length)
+        away = np.linalg.norm(point - along[:, None] * directions.outward_ct, axis=1)
+        clear = np.abs(away - limit) > 1e-3
+        assert np.array_equal(found.free[clear], (away > limit)[clear])
+        asked += int((~found.free).sum())
+    assert asked > 1000
