@@ -61,7 +61,7 @@ FREE, NO_STRUCTURE = 0, 65_535
 """Values of SafeGrid where nothing blocks, and where no structure can be named."""
 
 ELSEWHERE_MM = 1e-6
-"""Another target, and in every case that has one as good."""
+"""Within this of the case's target another is as good."""
 
 WARM = 64
 """Directions that are checked before the first client comes: kernels are compiled then."""
@@ -155,8 +155,8 @@ class Planner:
         if context.case.space is Space.LOCAL:
             refuse('space "local": OpenIGTLink knows RAS', context.case.path, "a case of a patient", "local_space")
         self._mesh = MapMesh.of(context.case)
-        with suppress(InputError):  # the first other target fills the memory for all further ones
-            context.at(context.case.target_ct + ELSEWHERE_MM)
+        with suppress(InputError):  # the first target that no cache on disk knows fills the memory for all others
+            context.at(context.case.target_ct + ELSEWHERE_MM * np.random.default_rng().uniform(size=3))
         self._context = at = context.at(context.case.target_ct)  # shows no progress
         free = safe_map(at)
         rows = np.append(np.flatnonzero(~free.blocked), 0)[:: 1 + len(free.blocked) // WARM]
