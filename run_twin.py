@@ -427,6 +427,26 @@ def mirror(
 
 
 @app.command()
+def live(
+    case: CaseArgument,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0 takes a free one.")] = 18944,
+    host: Annotated[
+        str, typer.Option("--host", help="Address to listen at; others than loopback are warned of.")
+    ] = "127.0.0.1",
+    arm: ArmOption = None,
+) -> None:
+    """Answer navigation programs by OpenIGTLink until Ctrl-C. Safe map of a target, verdict of a needle's pose."""
+    from puncture_twin.twin.jobs.live.planner import Planner
+    from puncture_twin.twin.jobs.live.server import bound, serve
+
+    with bound(host, port) as listener:
+        with prepared(case, arm=arm) as context:
+            planner = Planner(context)
+        print_whole("live: {} on {}, port {}; Ctrl-C ends".format(context.case.name, *listener.getsockname()[:2]))
+        serve(listener, planner)
+
+
+@app.command()
 @with_choice
 def export(
     source: SourceArgument,

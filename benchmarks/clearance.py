@@ -10,17 +10,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import fcl
 import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.shared import REPOSITORY, Scene, dense, least_seconds, scenes, took, versions
-from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.clearance.engine import NEAR_THRESHOLD_MM, too_near
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
@@ -74,10 +71,8 @@ def ask_hits(scene: Scene, directions: np.ndarray, objects: list[fcl.CollisionOb
                 fcl.collide(needle, objects[column], fcl.CollisionRequest(), fcl.CollisionResult())
 
 
-def rounds(scene: Scene, directions: np.ndarray, sample: int, kept: Cache) -> dict[str, float]:
+def rounds(scene: Scene, directions: np.ndarray, sample: int) -> dict[str, float]:
     """Seconds of everybody for all directions, means over rounds in which all take their turn.
-
-    Building again finds the order of the triangles in ``kept``, as a second search of the same surfaces does.
 
     FCL is asked for another part of a random sample in each round, and its time scaled to all directions. So a
     neighbour who comes or goes in between slows both sides alike. Only `FclEngine` is asked once for all of it: each of
@@ -87,13 +82,11 @@ def rounds(scene: Scene, directions: np.ndarray, sample: int, kept: Cache) -> di
     engine, judge, objects = FastEngine(scene.meshes, threads=1), FclEngine(scene.meshes), trees(scene)
     ask = (scene.target, directions, scene.length)
     engine.measure(*ask)
-    FastEngine(scene.meshes, cache=kept, threads=1)
     sums: dict[str, float] = {}
     for part in np.array_split(directions[chosen], ROUNDS):
         scale = len(directions) / len(part)
         times = {
             "build": took(lambda: FastEngine(scene.meshes, threads=1)),
-            "build again": took(lambda: FastEngine(scene.meshes, cache=kept, threads=1)),
             "exact": took(lambda: engine.measure(*ask)),
             "FCL build": took(lambda: FclEngine(scene.meshes)),
             "FCL capsule": took(lambda part=part: ask_distances(scene, part, objects)) * scale,
@@ -108,8 +101,7 @@ def rounds(scene: Scene, directions: np.ndarray, sample: int, kept: Cache) -> di
 def measure_scene(scene: Scene, sample: int, step_deg: float) -> None:
     """Print one scene's rows."""
     directions = scene.hemisphere(step_deg)
-    with tempfile.TemporaryDirectory() as folder:
-        s = rounds(scene, directions, sample, Cache(Path(folder)))
+    s = rounds(scene, directions, sample)
     sizes = f"{scene.triangles:,} triangles, {len(scene.meshes)} surfaces, {len(directions):,} directions"
     print(f"\n## {scene.name}: {sizes}\n| ratio | search alone | end to end, building included |\n|---|---|---|")
     for label, theirs in (

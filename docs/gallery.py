@@ -10,7 +10,7 @@ PAGE = ROOT / "docs" / "how-to" / "gallery.md"
 
 HEAD = """# Examples
 
-Eight programs that run as they are printed, six scripts and two notebooks; a test runs all of them. Each takes a case
+Nine programs that run as they are printed, seven scripts and two notebooks; a test runs all of them. Each takes a case
 of yours, or works on an embedded one.
 
 *Written by `python docs/gallery.py` from `examples/`, and held beside them by a test.*

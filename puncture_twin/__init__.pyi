@@ -1,5 +1,6 @@
 from .api import (
     batch as batch,
+    best_target as best_target,
     calibrate as calibrate,
     calibrate_hand_eye as calibrate_hand_eye,
     camera_view as camera_view,
@@ -26,6 +27,7 @@ from .api import (
     rehearse as rehearse,
     report as report,
     rerank as rerank,
+    safe_map as safe_map,
     search as search,
     shot_by_shot as shot_by_shot,
     touch as touch,

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from puncture_twin.planning.search.candidates import Candidates, Pick
     from puncture_twin.planning.search.context import CaseContext, EngineChoice
     from puncture_twin.planning.search.explain import Explanation
+    from puncture_twin.planning.search.safe_map import BestTarget, SafeMap
     from puncture_twin.planning.visibility.cameras import CameraView
     from puncture_twin.planning.visibility.probe import ProbeView
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
@@ -202,6 +203,45 @@ def check_many(context: CaseContext, theta_deg: ArrayLike, beta_deg: ArrayLike) 
     if theta.shape != beta.shape:
         refuse(f"{len(theta)} theta and {len(beta)} beta", "check_many", "as many of both", "wrong_shape")
     return context.check(np.radians(theta), np.radians(beta))
+
+
+@checked
+def safe_map(context: CaseContext, target_ct: ArrayLike | None = None) -> SafeMap:
+    """Which directions of the case's grid the margins of its structures block, at a target: a verdict, without mm.
+
+    ``blocked`` and ``structure`` have a row a direction. Skin entry and angle, bending, breathing, arm and chances are
+    not tested: `check` does that, of the context ``context.at(target_ct)``.
+
+    Args:
+        context: From `prepare`.
+        target_ct: Another target in the same structure, shape (3,), mm, LPS (or the case's local frame); None is the
+            context's own.
+
+    Raises:
+        InputError: A target that the case could not have: outside its structure or the skin, in an organ to be avoided.
+    """
+    from puncture_twin.planning.search.safe_map import safe_map
+
+    return safe_map(context if target_ct is None else context.at(target_ct))
+
+
+@checked
+def best_target(context: CaseContext, points: int | ArrayLike = 1000) -> BestTarget:
+    """Of many points of the target's structure, which one has the widest window, by `safe_map` and the skin.
+
+    ``context.at(found.target_ct)`` goes on from there; ``found.window_deg2`` has a row a point.
+
+    Args:
+        context: From `prepare`.
+        points: How many, evenly in the structure; or your own, shape (n, 3), mm, LPS (or the case's local frame).
+
+    Raises:
+        InputError: Points that are none, or an open structure that is to be filled.
+        NoAnswerError: No point has an open direction.
+    """
+    from puncture_twin.planning.search.safe_map import best_target
+
+    return best_target(context, points)
 
 
 @checked

@@ -148,7 +148,10 @@ class Scan:
         def make() -> list[TriangleMesh | None]:
             return [mask_surface(search().limbs(chosen), search().T_ct_index, where=self.source.surfaces.path)]
 
-        chosen = self._kept_arrays({**made_from, "target": target_ct.tolist()}, choose)["chosen"].tolist()
+        if self.source.surfaces.holds(known):  # another target of the same image: nothing is decoded for it
+            chosen = choose()["chosen"].tolist()
+        else:
+            chosen = self._kept_arrays({**made_from, "target": target_ct.tolist()}, choose)["chosen"].tolist()
         return self._kept({**made_from, "chosen": chosen}, make)[0] if any(chosen[1:]) else None
 
     def unnamed(self, structures: Sequence[Named], dense_hu: float) -> Unnamed:
@@ -225,12 +228,14 @@ class Scan:
         self, made_from: dict[str, Any], make: Callable[[], list[TriangleMesh | None]]
     ) -> list[TriangleMesh | None]:
         """Meshes from the cache, made where they are not there; None is kept too."""
-        return _to_meshes(self._kept_arrays(made_from, lambda: _of_meshes(make())))
+        return self.source.kept(self._of(made_from), lambda: _of_meshes(make()), _to_meshes, by=__name__)
 
     def _kept_arrays(self, made_from: dict[str, Any], make: Callable[[], Arrays]) -> Arrays:
         """What is made of this CT and the skin, from the cache."""
-        skin = None if self.skin is None else self.skin.mesh.digest
-        return self.source.kept({"skin": skin, **made_from}, make, dict, by=__name__)
+        return self.source.kept(self._of(made_from), make, dict, by=__name__)
+
+    def _of(self, made_from: dict[str, Any]) -> dict[str, Any]:
+        return {"skin": None if self.skin is None else self.skin.mesh.digest, **made_from}
 
 
 def _of_meshes(meshes: list[TriangleMesh | None]) -> Arrays:

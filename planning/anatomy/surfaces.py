@@ -165,7 +165,14 @@ class VolumeSurfaces:
         def held_bytes(value: Value) -> int:
             return size(value) if size(value) * LARGEST <= memory.most_bytes else memory.most_bytes + 1
 
-        return memory.get((__name__, what, self.path.name, *self.sha256), make, held_bytes)
+        return memory.get(self._key(what), make, held_bytes)
+
+    def holds(self, what: str) -> bool:
+        """Whether memory has what is `held` under this name."""
+        return self.cache.memory.holds(self._key(what))
+
+    def _key(self, what: str) -> tuple[str, ...]:
+        return (__name__, what, self.path.name, *self.sha256)
 
     def kept(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str

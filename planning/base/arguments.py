@@ -31,6 +31,7 @@ RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
         "seed": (0, 2**31 - 1),
         "seeds": (1, 1_000_000),
         "jobs": (1, 1024),
+        "points": (1, 100_000),
         "size_deg": (0.05, 10),
         "fle_mm": (0.001, 1e3),
         "physics": (0, 10_000),

@@ -112,6 +112,10 @@ class InputFiles:
         self._held[name] = content
         return content
 
+    def take(self, other: InputFiles, *, but: Sequence[str]) -> None:
+        """List what another result was made from, without reading it again, but for some roles."""
+        self._inputs |= {key: one for key, one in other._inputs.items() if key[0] not in (CASE_ROLE, *but)}
+
     def state(self, role: str, content: bytes) -> None:
         """List bytes that come from no file; no name of a file leads to them."""
         self._inputs[role, ""] = content_input(role, "", content)

@@ -26,7 +26,13 @@ from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, entry_frame, grid
 from puncture_twin.planning.case.errors import ErrorModel, errors_of
-from puncture_twin.planning.case.named_files import MASK_ROLE, CaseVolumes, read_named_files, robot_warnings
+from puncture_twin.planning.case.named_files import (
+    MASK_ROLE,
+    CaseVolumes,
+    read_named_files,
+    robot_warnings,
+    wholeness_warnings,
+)
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
 from puncture_twin.planning.case.settings import (
     Axis,
@@ -146,7 +152,8 @@ class Case(Shown):
         """What the case would be if its file had these values; the file stays as it is.
 
         Args:
-            target_ct: Another target in the same structure, shape (3,), mm, LPS (or the case's local frame).
+            target_ct: Another target in the same structure, shape (3,), mm, LPS (or the case's local frame). Alone, it
+                needs no file but the case file to be read again.
             options: Tables of keys and values as in the file, in mm, degrees and the case's space: ``target``,
                 ``mount`` (in place of any registration), ``needle``, ``arm``, ``search``, ``errors``, ``margins``. Of
                 margins that fit one structure the last stated counts; ``add_mm`` is added to all of them,
@@ -164,11 +171,12 @@ class Case(Shown):
                     "keys and values, as in the case",
                     "empty",
                 )
+        known = self if target_ct is not None and not options else None  # a target alone changes no other file
         if target_ct is not None:
             point = guard_points([target_ct], (self.target_name,), where="replace: target_ct")
             options = {**options, "target": {"position_mm": to_lps(point, self.space)[0]}}
         stated = self.options.with_(case_options(options, where="replace"))
-        return _read(self.path, self.files.again(), stated)
+        return _read(self.path, self.files.again(), stated, known)
 
     def directions(self) -> Directions:
         """The grid of the case."""
@@ -220,14 +228,19 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
     return _read(path, InputFiles(path.parent), options)
 
 
-def _read(path: Path, files: InputFiles, options: CaseOptions) -> Case:
-    case_volumes = CaseVolumes(files, path)
+def _read(path: Path, files: InputFiles, options: CaseOptions, known: Case | None = None) -> Case:
+    """Read a case; of one that differs from a known one by its target alone, the case file is looked at again."""
+    case_volumes = CaseVolumes(files, path) if known is None else known.volumes
     stated = files.add(CASE_ROLE, path.name, files.held(path.name) or read_toml_bytes(path, ALLOWED_CASE))
     if options.sections:
         files.state(OPTIONS_ROLE, options.text.encode())
     change = partial(options.applied, where=path)
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md", change=change)
-    whole = read_named_files(content, path, files, case_volumes)
+    if known is None:
+        whole = read_named_files(content, path, files, case_volumes)
+    else:
+        files.take(known.files, but=("target", OPTIONS_ROLE))
+        whole = wholeness_warnings(content, files, path)
     return replace(case_of(content, path, files, case_volumes, whole), options=options)
 
 

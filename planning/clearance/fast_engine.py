@@ -17,15 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Ints
-from puncture_twin.planning.base.cache.array_cache import NO_CACHE, NO_MEMORY, Cache, Memory
-from puncture_twin.planning.base.cache.entry_file import Arrays
+from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.processes import on_threads
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.clearance.fcl_engine import capsule_touches_any
-from puncture_twin.planning.clearance.kernels.blocks import Blocks, block_order, pack
+from puncture_twin.planning.clearance.kernels.blocks import Blocks, pack
 from puncture_twin.planning.clearance.kernels.lanes import LANES
 from puncture_twin.planning.clearance.kernels.segment_triangle import (
     blocks_near,
@@ -65,7 +64,7 @@ class FastEngine:
 
     Args:
         meshes: The k surfaces, in the CT frame, mm.
-        cache: Of the order of each surface's triangles; its memory holds packed surfaces.
+        memory: Holds packed surfaces.
         threads: Threads at most, one a core; the answer does not depend on them, to the bit.
 
     Attributes:
@@ -76,10 +75,10 @@ class FastEngine:
         self,
         meshes: Sequence[TriangleMesh],
         progress: Count | None = None,
-        cache: Cache = NO_CACHE,
+        memory: Memory = NO_MEMORY,
         threads: int = MOST_THREADS,
     ) -> None:
-        self._meshes, self._cache = tuple(meshes), cache
+        self._meshes, self._memory = tuple(meshes), memory
         self._placed: tuple[Floats, tuple[PlacedSurface, ...]] | None = None
         self._threads = threads
         self._progress = progress
@@ -93,9 +92,9 @@ class FastEngine:
     @cached_property
     def blocks(self) -> tuple[Blocks, ...]:
         """Packed blocks of each structure; see `ClearanceEngine`."""
-        if self._cache.memory is NO_MEMORY:
-            return _packed(self._meshes, self._threads, self._cache)
-        return _remembered(self._meshes, self._cache.memory)
+        if self._memory is NO_MEMORY:
+            return _packed(self._meshes, self._threads)
+        return _remembered(self._meshes, self._memory)
 
     def measure(
         self, target_ct: Floats, outward_ct: Floats, length: Floats | float, *, shown: bool = True
@@ -163,18 +162,15 @@ def _refuse_unsound(target: Floats, outward: Floats, lengths: Floats) -> None:
         refuse("a needle axis is not finite", "clearance", "finite mm, unit directions", "not_finite")
 
 
-def _packed(meshes: Sequence[TriangleMesh], threads: int, cache: Cache) -> tuple[Blocks, ...]:
+def _packed(meshes: Sequence[TriangleMesh], threads: int) -> tuple[Blocks, ...]:
     """Each surface packed into blocks, on threads, the largest first; blocks do not depend on the target."""
     packed: dict[int, Blocks] = {}
     order = sorted(range(len(meshes)), key=lambda row: -len(meshes[row].faces))
-    threads = threads if sum(len(mesh.faces) for mesh in meshes) >= WORTH_THREADS else 1
-    known = block_orders(meshes, cache, threads) if cache.folder is not None and len(meshes) else None
 
     def work(k: int) -> None:
-        row = order[k]
-        packed[row] = pack(meshes[row], None if known is None else known[row])
+        packed[order[k]] = pack(meshes[order[k]])
 
-    for _ in on_threads(work, len(meshes), threads):
+    for _ in on_threads(work, len(meshes), threads if sum(len(mesh.faces) for mesh in meshes) >= WORTH_THREADS else 1):
         pass
     return tuple(packed[row] for row in range(len(meshes)))
 
@@ -314,54 +310,6 @@ def _square_between(outward, i, k):  # type: ignore[no-untyped-def]  # numba inf
     """Square of the chord between two directions."""
     x, y, z = outward[i, 0] - outward[k, 0], outward[i, 1] - outward[k, 1], outward[i, 2] - outward[k, 2]
     return x * x + y * y + z * z
-
-
-Order = NDArray[np.int32]
-
-
-def block_orders(meshes: Sequence[TriangleMesh], cache: Cache, threads: int) -> tuple[Order, ...]:
-    """`block_order` of each surface, from the cache where it holds them.
-
-    An order takes half of the time of packing. The blocks themselves are not cached: they are thirty times as large,
-    and take less time to fill than to read.
-
-    Args:
-        cache: Holds the orders of all surfaces in one entry.
-    """
-    made_from = {"what": "block orders", "meshes": [mesh.digest for mesh in meshes]}
-    make = partial(_computed_orders, meshes, threads)
-    return cache.value(made_from, make, partial(_orders_of, [len(mesh.faces) for mesh in meshes]), by=__name__)
-
-
-def _computed_orders(meshes: Sequence[TriangleMesh], threads: int) -> Arrays:
-    orders: dict[int, Order] = {}
-
-    def work(k: int) -> None:
-        orders[k] = block_order(meshes[k])
-
-    for _ in on_threads(work, len(meshes), threads):
-        pass
-    return {"orders": np.concatenate([np.empty(0, np.int32), *(orders[k] for k in range(len(meshes)))])}
-
-
-def _orders_of(counts: Sequence[int], stored: Arrays) -> tuple[Order, ...]:
-    """The block order of each surface, from a cached entry.
-
-    Raises:
-        KeyError, TypeError, ValueError: An order leaves out a triangle: the search would never see it.
-    """
-    orders = stored["orders"]
-    if orders.dtype != np.int32 or orders.shape != (sum(counts),):
-        raise TypeError("orders of other surfaces")
-    each = np.split(orders, np.cumsum(counts)[:-1])
-    for order, count in zip(each, counts, strict=True):
-        listed = np.zeros(count, np.bool_)
-        if count and (order.min() < 0 or order.max() >= count):
-            raise ValueError("no triangle of the surface")
-        listed[order] = True
-        if not listed.all():
-            raise ValueError("a triangle is left out")
-    return tuple(each)
 
 
 COORDINATE_SLACK = 1e-6

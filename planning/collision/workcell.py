@@ -59,12 +59,13 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
         InputError: The robot's base, or the gantry's wall, is in the patient.
     """
     check_gantry(case, anatomy.skin.mesh)
-    skin, outside = anatomy.skin.mesh, outside_surface(anatomy)
+    skin = anatomy.skin.mesh
     boxes = case_boxes(case, T_base_ct)
     model, tool = case.robot.model, case_tool(case)
 
     def make() -> FastChecker:
-        placed, placed_outside = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in (skin, outside))
+        surfaces = skin, outside_surface(anatomy)
+        placed, placed_outside = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in surfaces)
         try:
             return FastChecker(
                 model, tool, boxes, placed, outside=placed_outside, padding_mm=ARM_PADDING_MM, cache=user_cache()
@@ -77,7 +78,7 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory
     if memory is NO_MEMORY:
         return make()
     stated = tuple((box.name, box.T_base_box.tobytes(), box.size_mm) for box in boxes)
-    meshes = [mesh for mesh in (skin, outside) if mesh is not None]
+    meshes = [skin, *(one.mesh for one in anatomy.surroundings if one.role is Role.UNKNOWN)]
     place = np.ascontiguousarray(T_base_ct, np.float64).tobytes()
     key = (__name__, model, tool, stated, tuple(mesh.digest for mesh in meshes), place, ARM_PADDING_MM)
     return memory.get(key, make, lambda _: CHECKER_BYTES + TREE_COPIES * sum(mesh.nbytes for mesh in meshes))

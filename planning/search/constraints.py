@@ -80,6 +80,14 @@ def first_broken(
     return Verdict(reasons, names_of, depths, amounts, details)
 
 
+def skin_allows(paths: SkinPaths, needle: Needle, max_skin_angle: float) -> Bools:
+    """Which paths break no constraint of the skin, shape (n,), whatever structures do; ``max_skin_angle`` in rad."""
+    none = np.empty((len(paths.path_length), 0))
+    nothing = Clearances(none, none, none.astype(bool))
+    verdict = first_broken(paths, nothing, (), needle=needle, max_skin_angle=max_skin_angle)
+    return np.asarray(verdict.reason == Reason.NONE.value)
+
+
 def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -> NDArray[np.int64]:
     """Column of the structure whose margin is violated by most, shape (n,); 0 where none is.
 

@@ -8,7 +8,7 @@ checks and explains single directions, and gives errors and provenance. A search
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, load_anatomy
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE, beyond_images
@@ -57,6 +58,9 @@ It is held to the fast engine (`HeldEngine`): it may find less clearance, and ne
 COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
 """The unit of each engine's progress."""
 
+AT_BYTES = 2_000_000_000
+"""What a context keeps for other targets at most, from the first one on."""
+
 NO_BASE = "the case does not state where the robot's base is"
 ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]"
 
@@ -70,6 +74,7 @@ class CaseContext(Shown):
         reach: The checker of the arm; None without a placement.
         chance: Model of the declared errors; None where the case declares none, or the arm is not checked.
         stages: How long reading took; later stages are added as they happen.
+        memory: What other targets of the same anatomy share.
     """
 
     case: Case
@@ -80,6 +85,7 @@ class CaseContext(Shown):
     chance: ChanceModel | None
     watcher: Watcher
     stages: Stages
+    memory: Memory = field(default_factory=lambda: Memory(AT_BYTES))
 
     def _title(self) -> str:
         return f"Case {self.case.name}, prepared"
@@ -93,9 +99,27 @@ class CaseContext(Shown):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process: what was read; what answers is made there, since compiled libraries are not sent."""
+        return _sent, (self.case, self.anatomy, self.placement, self._engine_choice, self.reach is not None)
+
+    @property
+    def _engine_choice(self) -> EngineChoice:
         kind = type(self.engine.own if isinstance(self.engine, HeldEngine) else self.engine)
-        engine = next((name for name, known in ENGINES.items() if kind is known), kind)
-        return _sent, (self.case, self.anatomy, self.placement, engine, self.reach is not None)
+        return next((name for name, known in ENGINES.items() if kind is known), kind)
+
+    def at(self, target_ct: ArrayLike) -> CaseContext:
+        """The context of another target in the same anatomy.
+
+        It is what `prepare` makes of the case with that target: nothing is taken over that the target decides. What it
+        does not decide comes from memory, which the first other target fills.
+
+        Args:
+            target_ct: Shape (3,), mm, LPS (or the case's local frame).
+
+        Raises:
+            InputError: As `prepare`: a target outside the skin or its structure, in an organ to be avoided, no point.
+        """
+        case, arm = self.case.replace(target_ct=target_ct), self.reach is not None
+        return prepare(case, arm=arm, engine=self._engine_choice, memory=self.memory, known=self.anatomy.warnings)
 
     @brief
     def __repr__(self) -> str:
@@ -237,6 +261,7 @@ def prepare(
     engine: EngineChoice = "fast",
     watcher: Watcher | None = None,
     memory: Memory = NO_MEMORY,
+    known: tuple[str, ...] = (),
 ) -> CaseContext:
     """Prepare a case: read it and everything that it names.
 
@@ -244,6 +269,7 @@ def prepare(
         case: A case, its file, or the folder that holds ``case.toml``.
         arm: Whether the arm is checked too; None checks it where the case says where its base is.
         memory: What this process keeps from one case to the next; the answer is the same.
+        known: Warnings that are not logged again.
 
     Raises:
         InputError: Anything in the case that cannot be used, an unknown engine, or an arm that is to be checked in a
@@ -264,6 +290,9 @@ def prepare(
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
         watcher.step("anatomy", "consistency of the inputs")
         anatomy = _with_findings(case, anatomy, placement, cache)
+        for warning in anatomy.warnings:
+            if warning not in known:
+                LOG.warning(warning)
         check_tissues(case, anatomy)
         case.files.release()  # image and labels are read: their memory is given back
     return _answering(case, anatomy, placement, engine, arm is not False, watcher, stages, cache)
@@ -293,7 +322,7 @@ def _answering(
         if engine == "fcl":
             clearance_engine = FclEngine(meshes, count)
         else:
-            clearance_engine = FastEngine(meshes, count, cache=cache)
+            clearance_engine = FastEngine(meshes, count, cache.memory)
             if not isinstance(engine, str) and engine is not FastEngine:
                 clearance_engine = HeldEngine(engine(meshes, count), clearance_engine)
         reach = None
@@ -301,7 +330,8 @@ def _answering(
             reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, cache.memory), placement.T_base_ct)
         error = None if reach is None or placement is None else pose_error(case, placement.registration)
         chance = chance_model(case, anatomy, clearance_engine, error)
-    return CaseContext(case, anatomy, placement, clearance_engine, reach, chance, watcher, stages)
+    made = CaseContext(case, anatomy, placement, clearance_engine, reach, chance, watcher, stages)
+    return made if cache.memory is NO_MEMORY else replace(made, memory=cache.memory)
 
 
 def _with_findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache) -> Anatomy:
@@ -313,8 +343,6 @@ def _with_findings(case: Case, anatomy: Anatomy, placement: Placement | None, ca
         *(Finding("breathing", Severity.WARNING, one) for one in breath_warnings(case, anatomy)),
     )
     warnings = tuple(one.sentence for one in collected if one.severity is not Severity.NOTE)
-    for warning in warnings:
-        LOG.warning(warning)
     return replace(anatomy, warnings=warnings, findings=collected)
 
 

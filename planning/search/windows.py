@@ -96,7 +96,7 @@ class Windows(Shown):
 
 def find_windows(candidates: Any) -> Windows:
     """The windows of ranked `Candidates`; without a grid every candidate is one of its own, without area."""
-    label = _connected(candidates.grid, candidates.safe)
+    label = connected(candidates.grid, candidates.safe)
     ranked = candidates.ranked
     firsts = ranked[np.sort(np.unique(label[ranked], return_index=True)[1])]  # best of each set, by rank
     number = np.zeros(len(candidates), np.int64)
@@ -116,7 +116,7 @@ def nearest_row(candidates: Any, outward_ct: Floats) -> int | None:
     return None if candidates.grid is None or apart > candidates.grid.step else row
 
 
-def _connected(grid: AngleGrid | None, safe: Bools) -> Ints:
+def connected(grid: AngleGrid | None, safe: Bools) -> Ints:
     """Label of each row's connected set, shape (n,): the least row among neighbouring safe ones.
 
     A label is a row of the same set. Where neighbours differ, the row that one names takes the other's label if that is

@@ -6,7 +6,7 @@ import io
 from fuzz.mutate import NUMBERS, pick
 
 COMMANDS = [
-    *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "export", "register"],
+    *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "live", "export", "register"],
     *["touch", "pivot"],
     *["calibrate", "calibrate hand-eye", "batch", "batch run", "batch status", "batch merge", "batch compare"],
     *["schema", "init", "selfcal", "servo", "reproduce", "scan", "", "serch", "x" * 3000, "--help", "-h", "--version"],
@@ -32,6 +32,8 @@ OPTIONS = {
     "--seeds": "number",
     "--seconds": "number",
     "--rate": "number",
+    "--port": "number",
+    "--host": "word",
     "--certify-size": "number",
     "--target": "word",
     "--target-label": "word",

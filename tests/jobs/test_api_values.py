@@ -71,6 +71,8 @@ def values(given):
         "search": candidates,
         "check": pt.check(context, candidate=candidates.best),
         "check_many": pt.check_many(context, [10.0], [20.0]),
+        "safe_map": pt.safe_map(context),
+        "best_target": pt.best_target(context, 2),
         "rerank": pt.rerank(candidates, given["cost"]),
         "plan": plan,
         "read_plan": pt.read_plan(tmp / "plan.json", armed),

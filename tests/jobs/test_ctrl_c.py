@@ -84,6 +84,7 @@ def typed(tmp_path_factory):
         "plan": [case],
         "rehearse": [case],
         "place": [case, "--jobs", "1"],
+        "live": [str(folder() / "abdomen"), "--port", "0"],
         "export": [case, "--format", "csv"],
         "register": [case],
         "batch": ["plan", str(cohort)],

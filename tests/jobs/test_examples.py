@@ -19,6 +19,7 @@ SAYS = {
     "06": "# checked against its case",
     "07": "written: report.html",
     "08": "safe directions with wider margins",
+    "09": "safe: theta",
 }
 
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from puncture_twin.planning.case.entry import AngleGrid, outward
 from puncture_twin.planning.search.ranking import grid_cone, with_grid_cone
-from puncture_twin.planning.search.windows import SQUARE_DEGREES, _connected, find_windows
+from puncture_twin.planning.search.windows import SQUARE_DEGREES, connected, find_windows
 from tests import report_world as world
 
 
@@ -98,7 +98,7 @@ def test_rejected_candidates_have_no_cone_and_other_directions_stay_as_they_are(
 
 @settings(max_examples=100)
 @given(share=st.floats(0.05, 0.95), seed=st.integers(0, 2**32 - 1), full=st.booleans(), low=st.sampled_from([0, 20]))
-def test_windows_are_what_scipy_calls_connected(share, seed, full, low):
+def test_windows_are_what_scipy_callsconnected(share, seed, full, low):
     """Scattered directions, round the pole, round the circle or with a gap between its ends: the same sets."""
     theta, beta = np.radians(np.arange(low, 91, 5.0)), np.radians(np.arange(0, 360 if full else 341, 5.0))
     angles = AngleGrid(theta, beta, np.radians(5.0), full)
@@ -107,8 +107,8 @@ def test_windows_are_what_scipy_calls_connected(share, seed, full, low):
     pairs = pairs[safe[pairs].all(axis=1)]
     links = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(safe), len(safe)))
     count, expected = connected_components(links, directed=False)
-    assert len(set(zip(_connected(angles, safe).tolist(), expected.tolist(), strict=True))) == count
-    assert len(set(_connected(angles, safe).tolist())) == count
+    assert len(set(zip(connected(angles, safe).tolist(), expected.tolist(), strict=True))) == count
+    assert len(set(connected(angles, safe).tolist())) == count
 
 
 def test_a_winding_window_is_one():
@@ -116,7 +116,7 @@ def test_a_winding_window_is_one():
     angles = AngleGrid(np.radians(np.arange(10, 91, 2.0)), np.radians(np.arange(0, 91, 2.0)), np.radians(2.0), False)
     safe = np.zeros((len(angles.theta), len(angles.beta)), bool)
     safe[::2] = safe[1::4, -1] = safe[3::4, 0] = True
-    label = _connected(angles, safe.ravel())
+    label = connected(angles, safe.ravel())
     assert len(np.unique(label[safe.ravel()])) == 1
 
 

@@ -85,6 +85,7 @@ RULES: Mapping[str, Rule] = MappingProxyType(
         "pivot": Rule("the touches contradict each other", _unless(lambda found: not found.pivot.large)),
         "place": Rule("no direction is safe for the organs, or no placement reaches one"),
         "mirror": Rule(NEVER),
+        "live": Rule("never: it answers until Ctrl-C (130)"),
         "export": Rule("there is no plan to write, or the case now rejects it"),
         "register": Rule("never: markers that contradict each other are refused"),
         "selfcal": Rule("never: a recording that does not determine the calibration is refused"),

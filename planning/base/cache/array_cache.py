@@ -24,6 +24,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from puncture_twin.planning.base.cache.entry_file import (
@@ -149,7 +150,7 @@ class Memory:
     """Values by key, bounded in size: the least recently used goes first.
 
     A key holds the maker's name, the hashes of all bytes that the value is made from, and every option that decides it;
-    never a path. A value is not changed after it was made. What raises is not kept.
+    never a path. A value is not changed after it was made. What raises is not kept. Threads may share one.
 
     Args:
         most_bytes: What the values may hold together; 0 keeps nothing.
@@ -158,7 +159,12 @@ class Memory:
     def __init__(self, most_bytes: int = 0) -> None:
         self._most = most_bytes
         self._held = 0
+        self._lock = Lock()
         self._kept: OrderedDict[tuple[Hashable, ...], tuple[Any, int]] = OrderedDict()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """For another process: an empty one."""
+        return Memory, (self._most,)
 
     @property
     def held_bytes(self) -> int:
@@ -171,12 +177,18 @@ class Memory:
         Args:
             size: About how many bytes it holds.
         """
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key][0]
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key][0]
         value = make()
-        self._keep(key, value, size(value))
+        with self._lock:
+            self._keep(key, value, size(value))
         return value
+
+    def holds(self, key: tuple[Hashable, ...]) -> bool:
+        """Whether the value of a key is there."""
+        return key in self._kept
 
     @property
     def most_bytes(self) -> int:
@@ -184,7 +196,7 @@ class Memory:
         return self._most
 
     def _keep(self, key: tuple[Hashable, ...], value: Any, size: int) -> None:
-        if size > self._most:
+        if size > self._most or key in self._kept:  # another thread has made it too
             return
         self._kept[key] = value, size
         self._held += size

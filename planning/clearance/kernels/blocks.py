@@ -47,18 +47,9 @@ class Blocks:
         return sum(array.nbytes for array in (self.triangles, self.local, self.center, self.disc, self.base))
 
 
-def block_order(mesh: TriangleMesh) -> NDArray[np.int32]:
-    """Order in which a surface's triangles fill its blocks, shape (m,): half of the time of packing."""
-    return kd_order(_middles(mesh.vertices, mesh.faces), LANES).astype(np.int32)
-
-
-def pack(mesh: TriangleMesh, known: NDArray[np.int32] | None = None) -> Blocks:
-    """Pack a surface.
-
-    Args:
-        known: The mesh's `block_order`, where that has been found before.
-    """
-    order = np.array(block_order(mesh) if known is None else known, np.int64)
+def pack(mesh: TriangleMesh) -> Blocks:
+    """Pack a surface."""
+    order = kd_order(_middles(mesh.vertices, mesh.faces), LANES)
     blocks = -(-len(order) // LANES)
     counts = [blocks]
     while counts[-1] > LANES:

@@ -283,9 +283,9 @@ def placement_findings(
     skin = around.skin
     if placement.registration is not None:
         own = tuple(check_markers(case, around, placement.registration, cache))
-        return (*place_warnings(case, skin.mesh, placement.T_base_ct, OF_MARKERS), *own)
+        return (*place_warnings(case, skin.mesh, placement.T_base_ct, OF_MARKERS, cache.memory), *own)
     if case.robot.stated is None:
-        return tuple(place_warnings(case, skin.mesh, placement.T_base_ct, OF_MOUNT))
+        return tuple(place_warnings(case, skin.mesh, placement.T_base_ct, OF_MOUNT, cache.memory))
     registration = marker_registration(case, case.robot.stated)
     said = tuple(check_transform(case, skin.mesh, placement.T_base_ct, registration))
     if registration is None:

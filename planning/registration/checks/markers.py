@@ -13,6 +13,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -30,7 +31,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
-from puncture_twin.planning.registration.checks.places import place_excluded, untouchable
+from puncture_twin.planning.registration.checks.places import box_keys, boxes_ct, place_excluded, untouchable
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.method import Renaming, renamings
 from puncture_twin.planning.registration.registration import Registration
@@ -149,7 +150,10 @@ def marker_list(
     fit = kept_skin_fit(points, around.skin, cache)
     T_base_ct = fit_rigid(points, registration.markers.points_base)
     moved = apply(T_base_ct, case.target_ct) - apply(registration.T_base_ct, case.target_ct)
-    behind = untouchable(case, points, fit.normals_ct, around.couch)
+    couch = None if around.couch is None else around.couch.digest
+    key = (__name__, points.tobytes(), fit.normals_ct.tobytes(), couch, box_keys(boxes_ct(case)), case.needle.length_mm)
+    find = partial(untouchable, case, points, fit.normals_ct, around.couch)
+    behind = cache.memory.get(key, find, lambda found: 100 * len(found))
     return MarkerList(fit, behind, place_excluded(case, around.skin.mesh, T_base_ct), float(np.linalg.norm(moved)))
 
 

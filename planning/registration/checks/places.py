@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory
 from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.case.case import Case, up_axis
 from puncture_twin.planning.case.settings import Obstacle
@@ -136,7 +137,7 @@ def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
     column = _column_ct(case, T_base_ct)
     if base_in_patient(case, skin, T_base_ct):
         return "the robot's base would be in the patient"
-    for box in _boxes_ct(case):
+    for box in boxes_ct(case):
         if any(np.all(np.abs(point - box.center_mm) <= box.size_mm / 2) for point in column):
             return f"the robot's base would be in obstacle '{box.name}'"
     return "the target would be out of the arm's reach" if out_of_reach(case, T_base_ct) else ""
@@ -157,7 +158,7 @@ def out_of_reach(case: Case, T_base_ct: Floats) -> bool:
 def shoulder_within(case: Case, T_base_ct: Floats) -> str:
     """Name of the obstacle of frame ``ct`` that contains the shoulder, or ""; a base on top of one is in none."""
     shoulder = _column_ct(case, T_base_ct)[1]
-    boxes = (box for box in _boxes_ct(case) if np.all(np.abs(shoulder - box.center_mm) < box.size_mm / 2))
+    boxes = (box for box in boxes_ct(case) if np.all(np.abs(shoulder - box.center_mm) < box.size_mm / 2))
     return next((box.name for box in boxes), "")
 
 
@@ -182,7 +183,7 @@ def untouchable(
     Returns:
         Row, and in words what is before it.
     """
-    boxes, length = _boxes_ct(case), case.needle.length_mm
+    boxes, length = boxes_ct(case), case.needle.length_mm
     if (not boxes and couch is None) or not len(points_ct):
         return ()
     directions = _cones(normals_ct)
@@ -222,8 +223,14 @@ def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Float
     return points[[row for row in np.flatnonzero(reached) if row not in blocked]]
 
 
-def _boxes_ct(case: Case) -> tuple[Obstacle, ...]:
+def boxes_ct(case: Case) -> tuple[Obstacle, ...]:
+    """The obstacles of the CT frame."""
     return tuple(box for box in case.obstacles if box.frame == "ct")
+
+
+def box_keys(boxes: tuple[Obstacle, ...]) -> tuple[tuple[str, bytes, bytes], ...]:
+    """What boxes are, as part of a key."""
+    return tuple((box.name, box.center_mm.tobytes(), box.size_mm.tobytes()) for box in boxes)
 
 
 def _cones(axes: Floats) -> Floats:
@@ -271,26 +278,34 @@ class BasePlace(NamedTuple):
     """The obstacle of frame ``base`` that the patient lies on, or empty."""
 
 
-def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> BasePlace:
+def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats, memory: Memory = NO_MEMORY) -> BasePlace:
     """Check a position of the base for plausibility.
 
     Args:
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm.
+        memory: Keeps how the skin lies to the boxes, which depends on no target.
     """
+
+    def lies() -> tuple[str, Lying]:
+        return in_box(case, skin, T_base_ct), lying(case, skin, T_base_ct)
+
+    placed = _up_base(case, T_base_ct).tobytes(), np.ascontiguousarray(T_base_ct).tobytes()
+    box, bed = memory.get((__name__, skin.digest, *placed, box_keys(_base_boxes(case))), lies, lambda _: 1000)
     impossible = ""
     if base_in_patient(case, skin, T_base_ct):
         impossible = "the robot's base would be in the patient"
-    elif box := in_box(case, skin, T_base_ct):
+    elif box:
         impossible = f"the patient would lie more than {ALLOWANCE_MM:g} mm deep in obstacle '{box}' or through it"
-    bed = lying(case, skin, T_base_ct)
     far = "the target would be out of the arm's reach" if out_of_reach(case, T_base_ct) else ""
     within = shoulder_within(case, T_base_ct)
     shoulder = f"the robot's shoulder would be in obstacle '{within}'" if within else ""
     return BasePlace(impossible, " and ".join(filter(None, (far, shoulder, bed.off))), bed.on)
 
 
-def place_warnings(case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str) -> Iterator[Finding]:
+def place_warnings(
+    case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str, memory: Memory = NO_MEMORY
+) -> Iterator[Finding]:
     """One warning where something speaks against the place of a mount or of markers.
 
     They say in words where the base is, and have no other reading that could be meant, so they are not refused: without
@@ -300,6 +315,6 @@ def place_warnings(case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str)
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm.
     """
-    place = base_place(case, skin, T_base_ct)
+    place = base_place(case, skin, T_base_ct, memory)
     if what := place.impossible or place.unlikely:
         yield Finding("base_place", Severity.WARNING, text.format(what=what))

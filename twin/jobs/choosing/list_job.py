@@ -73,7 +73,7 @@ def check_list(
 
     def aimed(row: Listed) -> CaseContext:
         point = to_lps(np.array([row.point_mm]), context.case.space)[0]
-        return prepare(context.case.replace(target_ct=point), arm=arm)
+        return context.at(point)
 
     if entries is not None:
         checked = check_entries(context, read_entries(entries, context.case))

@@ -1,0 +1,323 @@
+"""The sockets of `live`: what is no message, floods, stalls or dies costs its sender alone; the newest counts."""
+
+import json
+import logging
+import resource
+import socket
+import struct
+import threading
+import time
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from igtl_client import Talk, message, point, text, transform
+from refusals import refused
+
+from puncture_twin.planning.base.errors import InputError
+from puncture_twin.twin.jobs.live import server
+from puncture_twin.twin.jobs.live.messages import checksum, packed, text_content
+from puncture_twin.twin.jobs.live.planner import Answer, Question
+from puncture_twin.twin.jobs.live.server import Exchange, bound, serve
+
+
+class Slow:
+    """A planner that takes its time, and answers with the text that it was sent, or a megabyte."""
+
+    def __init__(self):
+        self.begun, self.waits_s = [], 0.0
+
+    def session(self):
+        """Nothing is kept."""
+
+    def subject(self, header):
+        """By name."""
+        return {"Query": "status", "Target": "target", "Needle": "needle"}.get(header.name)
+
+    def answers(self, question):
+        """After a while."""
+        if question.message is None:
+            raise question.fault
+        self.begun.append((question.client, question.subject, question.stamp.fraction))
+        time.sleep(self.waits_s)
+        if question.message.content.endswith(b"fail"):
+            raise ZeroDivisionError("as told")
+        content = bytes(1_000_000) if question.subject == "target" else question.message.content
+        yield Answer("Told", packed("STRING", "Told", question.stamp, content))
+
+    def refused(self, subject, stamp, error):
+        """Its code."""
+        content = text_content(json.dumps({"subject": subject, "code": error.code}))
+        yield Answer("Refused", packed("STRING", "Refused", stamp, content))
+
+
+class Running:
+    """A server in a thread; `stop` ends it as Ctrl-C does."""
+
+    def __init__(self, planner):
+        self.planner, self.listener, self.ends = planner, bound("127.0.0.1", 0), False
+        self.port = self.listener.getsockname()[1]
+        self.thread = threading.Thread(target=self.run)
+        self.thread.start()
+
+    def __enter__(self):
+        return self.listener.__enter__()
+
+    def __exit__(self, *error):
+        return self.listener.__exit__(*error)
+
+    def accept(self):
+        """The next connection, or an interruption."""
+        accepted = self.listener.accept()
+        if self.ends:
+            raise KeyboardInterrupt
+        return accepted
+
+    def run(self):
+        """Until it is stopped."""
+        with pytest.raises(KeyboardInterrupt):
+            serve(self, self.planner)
+
+    def stop(self):
+        """End, and wait for it."""
+        self.ends = True
+        with suppress(OSError):
+            socket.create_connection(("127.0.0.1", self.port), 1.0).close()  # it wakes
+        self.thread.join(10.0)
+        assert not self.thread.is_alive()
+
+
+@pytest.fixture
+def running(monkeypatch):
+    """A server that waits for nobody long."""
+    monkeypatch.setattr(server, "MESSAGE_S", 0.3)
+    monkeypatch.setattr(server, "STALL_S", 0.4)
+    started = Running(Slow())
+    yield started
+    started.stop()
+
+
+def answers_well(port, said="well"):
+    """Whether another client is answered at once."""
+    with Talk(port, 5.0) as talk:
+        begun = time.monotonic()
+        talk.send("STRING", "Query", text(said), stamp=(3, 4))
+        told = talk.receive()
+        return told.content == text(said) and told.stamp == (3, 4) and time.monotonic() - begun < 1.0
+
+
+def test_the_checksum_is_that_of_the_standard(rng):
+    """ECMA-182's check value, and the client's bit-by-bit sum of random bytes."""
+    assert checksum(b"123456789") == 0x6C40DF5F0B497347 and checksum(b"") == 0
+    data = rng.bytes(999)
+    assert struct.pack(">Q", checksum(data)) == message("A", "b", data)[50:58]
+
+
+@pytest.mark.parametrize(
+    ("sent", "code"),
+    [
+        (message("STRING", "Query", text("a"), crc=1), "file_damaged"),
+        (message("STRING", "Query", text("a"), version=2)[:58] + b"\xff" * 19, "file_damaged"),
+        (
+            message("STRING", "Query", struct.pack(">HHII", 12, 9, 9, 1) + b"\0" * 4, version=1).replace(
+                b"\0\1", b"\0\2", 1
+            ),
+            "bad_header",
+        ),
+        (message("STRING", "Query", b"short").replace(b"\0\1", b"\0\2", 1), "bad_header"),
+        (message("TRANSFORM", "Query", bytes(70_000)), "unknown_message"),
+        (message("IMAGE", "Scan", bytes(300_000), crc=0), "unknown_message"),
+        (message("STRING", "Query", text("fail")), "program_failed"),
+    ],
+    ids=["checksum", "body", "parts", "short", "long", "unknown", "fails"],
+)
+def test_a_message_that_cannot_be_used_is_answered_and_passed_over(running, sent, code, caplog):
+    """The next one of the same client is answered as if nothing had been."""
+    with caplog.at_level(logging.CRITICAL, logger=server.__name__), Talk(running.port) as talk:
+        talk.send(sent)
+        assert talk.receive().document["code"] == code
+        talk.send("STRING", "Query", text("next"))
+        assert talk.receive().content == text("next")
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n" + b" " * 58,
+        message("STRING", "Query", text("a")).replace(b"\0\1", b"\0\7", 1),
+        message("string", "Query", text("a")),
+        message("STRING", "Query", size=2**63),
+        message("STRING", "Query", text("half"))[:-2],
+        message("STRING", "Query", text("half"))[:31],
+        message("IMAGE", "Scan", bytes(10), size=1 << 29),
+    ],
+    ids=["http", "version", "type", "size", "half_body", "half_header", "half_image"],
+)
+def test_what_is_no_message_ends_its_connection_with_one_line(running, sent, caplog):
+    """Within the time that a message may take; others are answered meanwhile and afterwards."""
+    with caplog.at_level(logging.WARNING, logger=server.__name__), Talk(running.port, 3.0) as talk:
+        talk.send(sent)
+        assert answers_well(running.port)
+        assert talk.ended()
+    assert answers_well(running.port)
+    lines = [record.getMessage() for record in caplog.records]
+    assert len([line for line in lines if "disconnected" in line]) == 1
+    assert len(lines) <= 2 and all(len(line.splitlines()) == 1 for line in lines)
+
+
+def test_random_bytes_never_end_the_server(running):
+    """Messages with bytes changed or cut, several in one, and noise: 300 connections."""
+    rng = np.random.default_rng(20260101)
+    good = [
+        message("STRING", "Query", text("ok")),
+        message("POINT", "Target", point((1.0, 2.0, 3.0)), version=2, number=3),
+        message("TRANSFORM", "Needle", transform(np.eye(4))),
+    ]
+    for _ in range(300):
+        data = bytearray(good[rng.integers(3)] * int(rng.integers(1, 4)))
+        for place in rng.integers(len(data), size=int(rng.integers(0, 6))):
+            data[place] = rng.integers(256)
+        cut = int(rng.integers(1, len(data) + 1))
+        with Talk(running.port) as talk:
+            talk.send(bytes(data[:cut]) if rng.random() < 0.7 else rng.bytes(200))
+    assert answers_well(running.port)
+    assert running.thread.is_alive()
+
+
+def test_the_newest_message_counts_and_nothing_queues(running):
+    """A needle at 500 Hz before a planner that takes 50 ms: few answers, and the last one is of the last message."""
+    running.planner.waits_s = 0.05
+    with Talk(running.port) as talk:
+        for number in range(100):
+            talk.send("TRANSFORM", "Needle", transform(np.eye(4)), stamp=(0, number))
+            time.sleep(0.002)
+        sent = time.monotonic()
+        stamps = [talk.receive().stamp[1]]
+        while stamps[-1] != 99:
+            stamps.append(talk.receive().stamp[1])
+    assert time.monotonic() - sent < 0.5
+    assert stamps == sorted(set(stamps)) and len(stamps) < 20
+    assert [number for _, _, number in running.planner.begun] == stamps
+
+
+def test_one_client_that_floods_does_not_keep_another_waiting(running):
+    """Each has its turn: between two answers to the other there is one to the flood."""
+    running.planner.waits_s = 0.01
+    flood = message("TRANSFORM", "Needle", transform(np.eye(4))) * 200
+    stop = threading.Event()
+
+    def send_on():
+        with Talk(running.port) as talk:
+            while not stop.is_set():
+                talk.send(flood)
+
+    floods = [threading.Thread(target=send_on) for _ in range(2)]
+    for one in floods:
+        one.start()
+    try:
+        time.sleep(0.1)
+        with Talk(running.port) as talk:
+            for number in range(10):
+                begun = time.monotonic()
+                talk.send("STRING", "Query", text("me"), stamp=(0, number))
+                assert talk.receive().stamp == (0, number) and time.monotonic() - begun < 0.5
+    finally:
+        stop.set()
+        running.planner.waits_s = 0.0
+        for one in floods:
+            one.join(10.0)
+    assert not any(one.is_alive() for one in floods)
+
+
+def test_a_client_that_reads_nothing_is_let_go_and_takes_little_memory(running):
+    """It asks a thousand times for a megabyte; one waits for it, and after a while it is gone."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with socket.socket() as deaf:
+        deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        deaf.connect(("127.0.0.1", running.port))
+        for number in range(1000):
+            deaf.sendall(message("POINT", "Target", point((1.0, 2.0, 3.0)), stamp=(0, number)))
+        assert answers_well(running.port)
+        begun = time.monotonic()
+        with suppress(ConnectionError):
+            while time.monotonic() - begun < 5.0:
+                assert answers_well(running.port)
+                deaf.sendall(b"x")
+        assert time.monotonic() - begun < 5.0
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KB
+
+
+def test_one_client_too_many_is_not_heard_and_a_place_is_free_again(running):
+    """The others go on."""
+    talks = [Talk(running.port) for _ in range(server.MOST_CLIENTS)]
+    for talk in talks:
+        talk.send("STRING", "Query", text("x"))
+        assert talk.receive().content == text("x")
+    with Talk(running.port) as late:
+        assert late.ended()
+    talks.pop().socket.close()
+    time.sleep(0.1)
+    assert answers_well(running.port)
+    for talk in talks:
+        talk.socket.close()
+
+
+def test_a_log_that_many_write_to_stays_short(running, caplog):
+    """Fifty connections of noise: no more lines than the limit."""
+    with caplog.at_level(logging.WARNING, logger=server.__name__):
+        for _ in range(50):
+            with Talk(running.port) as talk:
+                talk.send(b"x" * 58)
+                assert talk.ended()
+    assert 10 <= len(caplog.records) <= server.MOST_LINES
+
+
+def test_the_port_is_free_after_the_end():
+    """Also with a client that was connected; and while it is taken, another is refused."""
+    running = Running(Slow())
+    with Talk(running.port) as talk:
+        talk.send("STRING", "Query", text("x"))
+        talk.receive()
+        with refused("port_not_free"):
+            bound("127.0.0.1", running.port)
+        running.stop()
+        bound("127.0.0.1", running.port).close()
+
+
+def test_an_address_that_is_not_loopback_is_warned_of(caplog):
+    """And none that is."""
+    with caplog.at_level(logging.WARNING, logger=server.__name__):
+        bound("127.0.0.1", 0).close()
+        bound("localhost", 0).close()
+        assert caplog.records == []
+        bound("0.0.0.0", 0).close()
+    assert len(caplog.records) == 1
+    for host in ("192.0.2.7", "no.such.host.invalid", "", "a\0b", "x" * 300):
+        with refused("port_not_free" if host.startswith("192") else "bad_host"):
+            bound(host or "no host", 0)
+
+
+def test_questions_take_turns_and_a_target_comes_before_a_needle():
+    """Of two clients, whatever each has sent in which order."""
+    exchange = Exchange()
+    stamp = (1, 0, 0, 0)
+    for client in (1, 2):
+        exchange.open(client)
+        for subject in ("needle", "target", "needle"):
+            exchange.ask(Question(client, None, subject, stamp))
+    exchange.ask(Question(2, None, "needle", (1, 0, 1, 0)), newest=False)
+    exchange.ask(Question(3, None, "needle", stamp))  # a client that is gone
+    taken = [exchange.take() for _ in range(4)]
+    assert [(one.client, one.subject) for one in taken] == [(1, "target"), (2, "target"), (1, "needle"), (2, "needle")]
+    assert taken[3].stamp == stamp
+    exchange.ask(Question(2, None, "needle", stamp))
+    exchange.drop(2)
+    exchange.close()
+    assert exchange.take() is None
+
+
+def test_an_answer_too_long_for_a_text_is_refused():
+    """Its length has two bytes."""
+    assert len(text_content("x" * 65_535)) == 65_539
+    with pytest.raises(InputError):
+        text_content("x" * 65_536)

@@ -1,0 +1,308 @@
+"""What `live` answers: the safe map of a target, and the verdict of a needle's direction, as `check` gives it.
+
+A message is about one of three subjects, by its name:
+
+    Target  a point       -> SafeMap (POLYDATA), SafeGrid (IMAGE), SafeMapInfo (STRING)
+    Needle  a pose        -> Verdict (STRING), Entry (POINT)
+    Query   a text        -> Status (STRING); GET_STATUS -> STATUS
+
+The needle's axis is z, from hub to tip; with f the target, p the tip and z the axis, its direction outward is -z, and
+its line passes the target at the distance |(f - p) - ((f - p)'z) z|. A verdict is that of the parallel path through the
+target. A needle beside it by no more than the least slack of that path keeps every margin, since no point of it lies
+farther from the path; one that is beside it by more, or by more than `AIMED_MM`, is "not aimed", whatever the verdict.
+
+What cannot be answered takes the place of the answer: a map without cells, a verdict "refused", no entry. So nothing
+that was said of an earlier target or needle stands where the newest is expected.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.errors import InputError, PlanningError, refuse
+from puncture_twin.planning.budget.guidance import explained_ways
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.entry import AngleGrid, angles, outward
+from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.search.choice import Choice, explain_choice
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.explain import Explanation, finite
+from puncture_twin.planning.search.safe_map import NOT_TESTED, SafeMap, safe_map
+from puncture_twin.twin.jobs.live.messages import (
+    Header,
+    Message,
+    Stamp,
+    image_content,
+    mesh_content,
+    packed,
+    point_content,
+    quad_bytes,
+    read_place,
+    read_pose,
+    status_content,
+    text_content,
+)
+
+AIMED_MM = 2.0
+"""A hand and a tracker together keep a needle on a line to about this."""
+
+LEFT_OUT = ("case", "inputs", "entry_ct_mm", "warnings", "findings")
+"""Of a direction's summary: Status has them, or they are in the case's space."""
+
+FREE, NO_STRUCTURE = 0, 65_535
+"""Values of SafeGrid where nothing blocks, and where no structure can be named."""
+
+ELSEWHERE_MM = 1e-6
+"""Within this of the case's target another is as good."""
+
+WARM = 64
+"""Directions that are checked before the first client comes: kernels are compiled then."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapMesh:
+    """The sphere on which a map is drawn: a quad for each of the n directions, half a step to each side.
+
+    Each quad has corners of its own, and so a colour of its own; scalars of cells would say the same, but the
+    OpenIGTLink library (1.11, and later) takes them for tensors and reads beyond the message.
+
+    Attributes:
+        corners: Shape (4 n, 3), unit vectors, RAS.
+        cells: The quads as bytes of a POLYDATA.
+        radius_mm: The needle's length: with its tip on the target, its hub is on the sphere.
+    """
+
+    grid: AngleGrid
+    corners: Floats
+    cells: bytes
+    radius_mm: float
+
+    @classmethod
+    def of(cls, case: Case) -> MapMesh:
+        """Of a case's grid."""
+        directions, half = case.directions(), case.search.step / 2.0
+        assert directions.grid is not None  # every case's grid is regular
+        theta = np.clip(directions.theta[:, None] + half * np.array([-1, -1, 1, 1]), 0.0, np.pi)
+        beta = directions.beta[:, None] + half * np.array([-1, 1, 1, -1])
+        units = outward(theta.ravel(), beta.ravel()) @ case.T_ct_entry[:3, :3].T
+        quads = np.arange(len(units)).reshape(-1, 4)
+        return cls(directions.grid, to_lps(units, Space.RAS), quad_bytes(quads), case.needle.length_mm)
+
+    def content(self, target_ras: list[float], scalars: Mapping[str, NDArray[Any]]) -> bytes:
+        """Of a POLYDATA about a target, with values (n,) by name."""
+        points = np.array(target_ras) + self.radius_mm * self.corners
+        return mesh_content(points, self.cells, {name: np.repeat(values, 4) for name, values in scalars.items()})
+
+    def image(self, values: Ints) -> bytes:
+        """Of an IMAGE: a value (n,) a direction; beta along its rows, theta along its columns, in degrees."""
+        shape = len(self.grid.theta), len(self.grid.beta)
+        first = float(np.degrees(self.grid.beta[0])), float(np.degrees(self.grid.theta[0]))
+        return image_content(values.astype(np.uint16).reshape(shape), first, float(np.degrees(self.grid.step)))
+
+
+SUBJECTS = ("status", "target", "needle")
+"""In the order in which they are answered: a needle is checked against the newest target."""
+
+
+@dataclass(eq=False)
+class Session:
+    """What a client has said: its target, and its needle.
+
+    Attributes:
+        context: Of the target; None after one that was refused.
+        needle: Its last question.
+    """
+
+    context: CaseContext | None
+    needle: Question | None = None
+
+
+class Question(NamedTuple):
+    """A message about a subject, and whose it is; one with a fault could not be read."""
+
+    client: int
+    session: Session
+    subject: str
+    stamp: Stamp
+    message: Message | None = None
+    fault: PlanningError | None = None
+
+
+class Answer(NamedTuple):
+    """A message that goes out, and its type and name: of those only the newest waits."""
+
+    name: str
+    data: bytes
+
+
+class Planner:
+    """Answers the questions of many clients about one case, each with a target of its own."""
+
+    def __init__(self, context: CaseContext) -> None:
+        """Prepare for questions: everything that is made once is made here.
+
+        Raises:
+            InputError: The case is in a frame of its own.
+        """
+        if context.case.space is Space.LOCAL:
+            refuse('space "local": OpenIGTLink knows RAS', context.case.path, "a case of a patient", "local_space")
+        self._mesh = MapMesh.of(context.case)
+        with suppress(InputError):  # the first target that no cache on disk knows fills the memory for all others
+            context.at(context.case.target_ct + ELSEWHERE_MM * np.random.default_rng().uniform(size=3))
+        self._context = at = context.at(context.case.target_ct)  # shows no progress
+        free = safe_map(at)
+        rows = np.append(np.flatnonzero(~free.blocked), 0)[:: 1 + len(free.blocked) // WARM]
+        checked = at.check(free.directions.theta[rows], free.directions.beta[rows])  # compilers run now, not later
+        best = 0 if checked.best is None else checked.best.row
+        explained(at, float(checked.theta[best]), float(checked.beta[best])).summary()
+
+    def session(self) -> Session:
+        """Of a client that has said nothing yet: the case's target."""
+        return Session(self._context)
+
+    def subject(self, header: Header) -> str | None:
+        """What a message is about; see the head of this module."""
+        kind, name = header.kind, header.name
+        if kind == "GET_STATUS" or (kind, name) == ("STRING", "Query"):
+            return "status"
+        if name == "Target" and kind in ("POINT", "TRANSFORM"):
+            return "target"
+        return "needle" if kind == "TDATA" or (kind, name) == ("TRANSFORM", "Needle") else None
+
+    def answers(self, question: Question) -> Iterator[Answer | Question]:
+        """The answers to a message, as they are found.
+
+        Raises:
+            InputError: No target or needle that can be answered.
+        """
+        session = question.session
+        if question.subject == "target":
+            session.context = None  # an old target is not answered for, should this one be refused
+        elif question.subject == "needle":
+            session.needle = question
+        message = question.message
+        if message is None:
+            raise question.fault or PlanningError("a question without a message")
+        if question.subject == "status":
+            yield self._status(session, message.kind, message.stamp)
+        elif question.subject == "target":
+            target_ras = read_place(message)
+            session.context = self._context.at(to_lps(target_ras[None], Space.RAS)[0])
+            yield from self._map(safe_map(session.context), message.stamp)
+            if session.needle is not None:
+                yield session.needle
+        else:
+            tip_ras, axis_ras = read_pose(message, "Needle")
+            yield from self._verdict(session, tip_ras, axis_ras, message.stamp)
+
+    def refused(self, subject: str | None, stamp: Stamp, error: PlanningError) -> Iterator[Answer]:
+        """What stands in place of answers: no cells, no free direction, no entry, and why."""
+        document = {"error": {"code": error.code, "sentence": str(error)}}
+        if subject == "target":
+            yield _answer("POLYDATA", "SafeMap", stamp, mesh_content(np.zeros((0, 3)), b"", {}))
+            yield _answer("IMAGE", "SafeGrid", stamp, self._mesh.image(np.full(len(self._mesh.grid), NO_STRUCTURE)))
+            yield _text("SafeMapInfo", stamp, document)
+        if subject in ("target", "needle"):
+            yield _text("Verdict", stamp, {"verdict": "refused", **document})
+            yield _answer("POINT", "Entry", stamp, point_content(None, ""))
+        else:
+            yield _text("Error", stamp, document)
+
+    def _status(self, session: Session, kind: str, stamp: Stamp) -> Answer:
+        if kind == "GET_STATUS":
+            return _answer("STATUS", "Status", stamp, status_content("ready"))
+        context = session.context
+        document = {
+            "case": self._context.case.name,
+            "target_ras_mm": None if context is None else _ras(context.case.target_ct),
+            "arm": self._context.arm,
+            "structures": [one.name for one in self._context.anatomy.checked],
+            "warnings": list(self._context.anatomy.warnings),
+        }
+        return _text("Status", stamp, document)
+
+    def _map(self, found: SafeMap, stamp: Stamp) -> Iterator[Answer]:
+        """Mesh, grid and what they mean."""
+        mesh, target_ras = self._mesh, _ras(found.target_ct)
+        scalars: dict[str, NDArray[Any]] = {"blocked": found.blocked.astype(np.int64), "structure": found.structure}
+        yield _answer("POLYDATA", "SafeMap", stamp, mesh.content(target_ras, scalars))
+        values = np.where(found.blocked, np.where(found.structure < 0, NO_STRUCTURE, found.structure + 1), FREE)
+        yield _answer("IMAGE", "SafeGrid", stamp, mesh.image(values))
+        document = {
+            "target_ras_mm": target_ras,
+            "radius_mm": mesh.radius_mm,
+            "directions": len(found.blocked),
+            "blocked": int(found.blocked.sum()),
+            "not_tested": NOT_TESTED,
+            "structures": list(found.structures),
+        }
+        yield _text("SafeMapInfo", stamp, document)
+
+    def _verdict(self, session: Session, tip_ras: Floats, axis_ras: Floats, stamp: Stamp) -> Iterator[Answer]:
+        """What `check` says of the needle's direction, and whether its line is the one that was checked."""
+        if session.context is None:
+            refuse("the last target was refused", "Needle", "a Target first", "no_target")
+        case = session.context.case
+        tip, axis = to_lps(np.array([tip_ras, axis_ras]), Space.RAS)
+        theta, beta = angles(-axis @ case.T_ct_entry[:3, :3])
+        found = explained(session.context, float(theta), float(beta))
+        ahead = float((case.target_ct - tip) @ axis)
+        off = float(np.linalg.norm(case.target_ct - tip - ahead * axis))
+        entry, q = found.candidates.path.entry_ct[0], found.candidates.arm.q_insertion[0]
+        verdict = _verdict_text(found, off, ahead)
+        point = _ras(entry) if np.isfinite(entry).all() else None
+        document = {
+            "verdict": verdict,
+            "text": " ".join(line.strip() for line in found.head()),
+            "target_ras_mm": _ras(case.target_ct),
+            "off_line_mm": off,
+            "ahead_mm": ahead,
+            "slack_mm": finite(_slack(found)),
+            "entry_ras_mm": point,
+            "joints_deg": np.degrees(q).tolist() if np.isfinite(q).all() else None,
+            "check": {key: value for key, value in found.summary().items() if key not in LEFT_OUT},
+        }
+        yield _text("Verdict", stamp, document)
+        yield _answer("POINT", "Entry", stamp, point_content(point, verdict))
+
+
+def explained(context: CaseContext, theta: float, beta: float) -> Explanation:
+    """One direction (rad) in full: what ``run-twin check --theta --beta`` shows."""
+    return explained_ways(context, explain_choice(context, Choice(angles=(theta, beta))))
+
+
+def _verdict_text(found: Explanation, off_mm: float, ahead_mm: float) -> str:
+    """The verdict of the needle as it is held."""
+    if not found.safe:
+        return found.verdict
+    aimed = off_mm <= min(AIMED_MM, _slack(found)) and ahead_mm >= -AIMED_MM
+    return found.candidates.safe_text if aimed else "not aimed"
+
+
+def _slack(found: Explanation) -> float:
+    """By how much the path keeps more than each margin, at least, mm; inf where no structure demands one."""
+    clearance = found.candidates.clearance
+    return float(np.nanmin(np.append(clearance.distance[0] - clearance.margins, np.inf)))
+
+
+def _ras(point_ct: Floats) -> list[float]:
+    """A point of the CT frame in RAS."""
+    return [float(one) for one in to_lps(point_ct[None], Space.RAS)[0]]
+
+
+def _text(name: str, stamp: Stamp, document: dict[str, Any]) -> Answer:
+    answered = {"time_s": stamp.time_s, "number": stamp.number}
+    text = json.dumps({"answers": answered, **document}, allow_nan=False)
+    return _answer("STRING", name, stamp, text_content(text))
+
+
+def _answer(kind: str, name: str, stamp: Stamp, content: bytes) -> Answer:
+    return Answer(f"{kind} {name}", packed(kind, name, stamp, content))

@@ -1,0 +1,333 @@
+"""The sockets of `live`: messages of many clients in, newest questions to the planner, newest answers out.
+
+Each client has two threads that wait, one to read and one to send; one more thread computes one answer after the other.
+Between them nothing queues: of each client there waits at most one question of each subject, and one answer of each
+name. A newer one takes its place, so that a needle that is tracked at 50 Hz is answered as it is now, as often as the
+planner can.
+
+What a client does wrong costs that client alone: what is no message, stays half, or is never read, ends its connection
+with one line in the log; what is a message with something wrong in it is answered, and passed over. A client is read a
+limited amount in a time; beyond that its bytes wait in its own socket.
+
+pyigtl's own server is not used: it reads whatever size a header claims into memory, serves one client while others
+wait, answers all of them from one queue, and prints a traceback for each message that it cannot read.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from ipaddress import ip_address
+from itertools import count
+
+from puncture_twin.planning.base.errors import InputError, PlanningError, refuse
+from puncture_twin.twin.jobs.live.messages import HEADER, Header, read_header, read_message
+from puncture_twin.twin.jobs.live.planner import SUBJECTS, Answer, Planner, Question
+
+LOG = logging.getLogger(__name__)
+
+MOST_CLIENTS = 8
+MOST_KEPT = 65_536
+"""Bytes of a body that is kept: 900 tracked tools. A larger one is passed over."""
+
+CHUNK = 65_536
+MOST_AT_ONCE, REST_S = 20, 0.005
+"""So many messages, or chunks that are passed over, before a client is not read for a while: 4,000 in a second."""
+
+MESSAGE_S = 5.0
+"""A message that has begun is whole after this time, or its sender is gone."""
+
+STALL_S = 10.0
+"""An answer that is not taken in this time has no reader."""
+
+SILENT_S = 1e6
+"""How long a client may say nothing."""
+
+SEND_BUFFER = 262_144
+"""Bytes that the system keeps for a client: what waits there cannot be replaced by what is newer."""
+
+MOST_LINES, LINES_S = 20, 60.0
+"""So many lines in the log in this time."""
+
+USED = "the messages of docs/reference/live.md"
+
+
+class Exchange:
+    """What waits between clients and planner: the newest question of each subject, in turn for each client."""
+
+    def __init__(self) -> None:
+        self._lock, self._closed = threading.Lock(), False
+        self._asked, self._given = threading.Condition(self._lock), threading.Condition(self._lock)
+        self._questions: dict[int, dict[str, Question]] = {}
+        self._answers: dict[int, dict[str, bytes]] = {}
+
+    def open(self, client: int) -> bool:
+        """Keep questions and answers of a client from now on; False where there are too many."""
+        with self._lock:
+            full = len(self._answers) >= MOST_CLIENTS
+            if not full:
+                self._answers[client] = {}
+            return not full
+
+    def drop(self, client: int) -> bool:
+        """Keep nothing of a client that is gone; False where that was known."""
+        with self._lock:
+            self._questions.pop(client, None)
+            self._given.notify_all()
+            return self._answers.pop(client, None) is not None
+
+    def close(self) -> None:
+        """There are no more questions, and no clients."""
+        with self._lock:
+            self._closed = True
+            self._answers.clear()
+            self._asked.notify()
+            self._given.notify_all()
+
+    def ask(self, question: Question, *, newest: bool = True) -> None:
+        """Put a question in place of an older one; one that is not the newest gives way to one that waits."""
+        with self._lock:
+            if question.client in self._answers:
+                waiting = self._questions.setdefault(question.client, {})
+                waiting[question.subject] = question if newest else waiting.get(question.subject, question)
+                self._asked.notify()
+
+    def take(self) -> Question | None:
+        """The first subject of the client that waits longest, which then waits anew; None where there are no more."""
+        with self._lock:
+            self._asked.wait_for(lambda: self._questions or self._closed)
+            if self._closed:
+                return None
+            client = next(iter(self._questions))
+            waiting = self._questions.pop(client)
+            question = waiting.pop(min(waiting, key=SUBJECTS.index))
+            if waiting:
+                self._questions[client] = waiting
+            return question
+
+    def give(self, client: int, answer: Answer) -> None:
+        """Put an answer in place of an older one of its name."""
+        with self._lock:
+            if client in self._answers:
+                self._answers[client][answer.name] = answer.data
+                self._given.notify_all()
+
+    def answer(self, client: int) -> bytes | None:
+        """The answer that waits longest for a client, taken away; None where the client is gone."""
+        with self._lock:
+            self._given.wait_for(lambda: self._answers.get(client) != {})
+            waiting = self._answers.get(client)
+            return waiting.pop(next(iter(waiting))) if waiting else None
+
+
+class Log:
+    """Lines about clients: each kind once for each of them, and `MOST_LINES` in `LINES_S`."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._times: list[float] = []
+
+    def line(self, where: str, text: str) -> None:
+        """Log it, if not too many were."""
+        with self._lock:
+            now = time.monotonic()
+            self._times = [one for one in self._times if now - one < LINES_S]
+            if len(self._times) < MOST_LINES:
+                self._times.append(now)
+                LOG.warning("live: client %s: %s", where, text)
+
+
+def bound(host: str, port: int) -> socket.socket:
+    """A socket that listens: a port that is taken is told before a case is read. Clients wait until `serve`.
+
+    Raises:
+        InputError: No such address here, or the port is taken.
+    """
+    try:
+        family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        what = f"no address of this machine ({error})"
+        raise InputError(what, where=f"--host {host}", allowed="such as 127.0.0.1", code="bad_host") from error
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen()
+    except OSError as error:
+        listener.close()
+        where, allowed = f"{host}, port {port}", "an address of this machine and a free port (--port)"
+        raise InputError(error.strerror or str(error), where=where, allowed=allowed, code="port_not_free") from error
+    if not ip_address(listener.getsockname()[0].partition("%")[0]).is_loopback:
+        LOG.warning("warning: %s is not loopback: whoever reaches it can ask, and read the answers", host)
+    return listener
+
+
+def serve(listener: socket.socket, planner: Planner) -> None:
+    """Answer clients until it is interrupted; the port is free then.
+
+    Args:
+        listener: From `bound`; closed at the end.
+    """
+    exchange, log, clients = Exchange(), Log(), dict[int, Client]()
+    computing = threading.Thread(target=_compute, args=(exchange, planner), daemon=True)
+    computing.start()
+    try:
+        with listener:
+            for number in count():
+                try:
+                    connection, address = listener.accept()
+                    client = Client(number, connection, f"{address[0]}:{address[1]}", planner, exchange, log)
+                except OSError as error:  # gone before it was greeted, or there are no more files
+                    log.line("", f"not accepted ({error.strerror})")
+                    time.sleep(REST_S)
+                    continue
+                clients = {key: one for key, one in clients.items() if one.open} | {number: client}
+                client.start()
+    finally:
+        exchange.close()
+        for client in clients.values():
+            client.close()
+        computing.join(STALL_S)
+
+
+def _compute(exchange: Exchange, planner: Planner) -> None:
+    """One question after the other, until there are no more."""
+    while (question := exchange.take()) is not None:
+        for found in _found(planner, question):
+            if isinstance(found, Question):
+                exchange.ask(found, newest=False)
+            else:
+                exchange.give(question.client, found)
+
+
+def _found(planner: Planner, question: Question) -> Iterator[Answer | Question]:
+    """The answers, or why there are none."""
+    try:
+        yield from planner.answers(question)
+    except PlanningError as error:
+        yield from planner.refused(question.subject, question.stamp, error)
+    except Exception as error:  # the last line of defence: the others are answered on
+        LOG.exception("live: the program failed")
+        yield from planner.refused(question.subject, question.stamp, PlanningError(f"the program failed: {error!r}"))
+
+
+class Client:
+    """One connection."""
+
+    def __init__(
+        self, number: int, connection: socket.socket, where: str, planner: Planner, exchange: Exchange, log: Log
+    ) -> None:
+        self.open = True
+        self._number, self._in, self._out, self._where = number, connection, connection.dup(), where
+        self._in.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._in.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._in.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        self._out.settimeout(STALL_S)  # of its own
+        self._planner, self._exchange, self._log = planner, exchange, log
+        self._session, self._logged = planner.session(), set[str]()
+
+    def start(self) -> None:
+        """Read and send from now on."""
+        if not self._exchange.open(self._number):
+            self._line("too_many", f"one more than {MOST_CLIENTS} clients; disconnected")
+            self.close()
+            return
+        for work in (self._read, self._send):
+            threading.Thread(target=work, daemon=True).start()
+
+    def close(self) -> None:
+        """End the connection: whoever waits for it wakes."""
+        self.open = False
+        with suppress(OSError):
+            self._in.shutdown(socket.SHUT_RDWR)
+        self._in.close()
+        self._out.close()
+
+    def _end(self, code: str, why: str) -> None:
+        """End it, once; an empty reason is not worth a line."""
+        if self._exchange.drop(self._number):
+            if why:
+                self._line(code, f"{why}; disconnected")
+            self.close()
+
+    def _line(self, code: str, text: str) -> None:
+        if code not in self._logged:
+            self._logged.add(code)
+            self._log.line(self._where, text)
+
+    def _send(self) -> None:
+        try:
+            while (data := self._exchange.answer(self._number)) is not None:
+                self._out.sendall(data)
+        except TimeoutError:
+            self._end("not_reading", f"has not taken an answer in {STALL_S:g} s")
+        except OSError as error:
+            self._end("broken", f"the connection broke ({error.strerror})")
+
+    def _read(self) -> None:
+        try:
+            for number in count(1):
+                self._in.settimeout(SILENT_S)
+                first = self._in.recv(1)
+                if not first:
+                    self._end("gone", "")
+                    return
+                self._read_message(first, time.monotonic() + MESSAGE_S)
+                if number % MOST_AT_ONCE == 0:
+                    time.sleep(REST_S)
+        except TimeoutError:
+            self._end("half_a_message", f"a message is not whole after {MESSAGE_S:g} s")
+        except InputError as error:  # what follows is not known to be a message
+            self._end(error.code, str(error))
+        except OSError as error:
+            self._end("broken", f"the connection broke ({error.strerror or error})")
+
+    def _read_message(self, first: bytes, until: float) -> None:
+        header = read_header(first + self._exactly(HEADER.size - 1, until))
+        subject = self._planner.subject(header)
+        try:
+            if subject is None or header.size > MOST_KEPT:
+                self._pass_over(header.size)
+                what = f"{header.kind} '{header.name}' of {header.size} bytes is not used"
+                refuse(what, "OpenIGTLink", USED, "unknown_message")
+            message = read_message(header, self._exactly(header.size, until))
+            self._exchange.ask(Question(self._number, self._session, subject, message.stamp, message))
+        except InputError as error:
+            self._wrong(subject, header, error)
+
+    def _wrong(self, subject: str | None, header: Header, error: InputError) -> None:
+        """Answer a message that cannot be used; of those that are about nothing here, the first of each kind."""
+        if subject is not None:
+            self._exchange.ask(Question(self._number, self._session, subject, header.stamp, fault=error))
+        elif error.code not in self._logged:
+            for answer in self._planner.refused(None, header.stamp, error):
+                self._exchange.give(self._number, answer)
+        self._line(error.code, str(error))
+
+    def _exactly(self, size: int, until: float) -> bytes:
+        """So many bytes.
+
+        Raises:
+            OSError: They have not come until then, or never will.
+        """
+        data = bytearray()
+        while len(data) < size:
+            self._in.settimeout(max(until - time.monotonic(), 1e-3))
+            more = self._in.recv(size - len(data))
+            if not more:
+                raise ConnectionError("ended within a message")
+            data += more
+        return bytes(data)
+
+    def _pass_over(self, size: int) -> None:
+        """Read so many bytes and keep none; each part has the time of a message."""
+        for number in count(1):
+            if size <= 0:
+                return
+            size -= len(self._exactly(min(size, CHUNK), time.monotonic() + MESSAGE_S))
+            if number % MOST_AT_ONCE == 0:
+                time.sleep(REST_S)
