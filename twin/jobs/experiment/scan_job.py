@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.metal import METAL_HU
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import FORMAT, read_output
@@ -30,7 +31,7 @@ from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.twin.guidance.ct.markers import METAL_HU, READING_MM, Markers, find_markers, read_lesion
+from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_markers, read_lesion
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, needle_error
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.plant.outside_objects import Arms, Bed, OutsideObjects, Part
