@@ -20,6 +20,9 @@ AROUND_MM = 3.0
 BLUR_MM = 1.5
 """So far from its voxels a piece of metal still blurs into others; beyond, they show what it lies in."""
 
+TOUCHED = 1.01
+"""Voxels: the next one may be filled in part."""
+
 EDGE_MM = 1.5
 """mm by which the edges of wide metal protrude from the balls that fit into it."""
 
@@ -81,25 +84,45 @@ def metal_pieces(volume: Volume, level_hu: float = METAL_HU, without: Bools | No
         yield Metal(box, voxels, middle, float(((high - low) * spacing).max()))
 
 
-def metal_parts(volume: Volume, metal: Metal) -> Floats:
+def metal_parts(
+    volume: Volume, metal: Metal, *, level_hu: float = METAL_HU, solid_hu: float = SOLID_HU, least: float = LEAST_PART
+) -> Floats:
     """Part of each voxel of a piece's box that is metal, 0 to 1, as far as a clipped range allows.
 
     What a voxel would show without metal is what the nearest voxel shows that is too far away to be blurred by it:
     air on one side of a marker and skin on the other. Without that, air would hide the outer edge of a marker.
+
+    Args:
+        level_hu: From where on other voxels of the box are metal too.
+        solid_hu: Of a voxel that is wholly metal.
+        least: Below this a part is noise.
     """
     values = volume.values[metal.box].astype(np.float64)
-    spacing = spacing_mm(volume)
-    every = metal.voxels | (values > METAL_HU)
-    outside = ndimage.distance_transform_edt(~every, spacing) > BLUR_MM
+    every, outside = _sides(values, volume, metal, level_hu)
     if not outside.any():
         return np.asarray(metal.voxels, dtype=np.float64)
-    nearest = ndimage.distance_transform_edt(~outside, spacing, return_distances=False, return_indices=True)
-    background = _smooth(values, outside)[tuple(nearest)]
-    parts = (values - background) / (SOLID_HU - background)  # linear partial volume
+    background = metal_background(volume, metal, level_hu)
+    parts = (values - background) / (solid_hu - background)  # linear partial volume
     others = every & ~metal.voxels
+    spacing = spacing_mm(volume)
     mine = ndimage.distance_transform_edt(~metal.voxels, spacing)
     strange = others.any() and mine >= ndimage.distance_transform_edt(~others, spacing)  # nearer to another piece
-    return np.where(outside | strange | (parts < LEAST_PART), 0.0, parts)
+    return np.where(outside | strange | (parts < least), 0.0, parts)
+
+
+def metal_background(volume: Volume, metal: Metal, level_hu: float = METAL_HU) -> Floats:
+    """What each voxel of a piece's box would show without metal, HU."""
+    values = volume.values[metal.box].astype(np.float64)
+    _, outside = _sides(values, volume, metal, level_hu)
+    nearest = ndimage.distance_transform_edt(~outside, spacing_mm(volume), return_distances=False, return_indices=True)
+    return np.asarray(_smooth(values, outside)[tuple(nearest)])
+
+
+def _sides(values: Floats, volume: Volume, metal: Metal, level_hu: float) -> tuple[Bools, Bools]:
+    """Of a piece's box: every voxel of metal, its own and others', and those that none blurs into, or fills in part."""
+    every, spacing = metal.voxels | (values > level_hu), spacing_mm(volume)
+    reach = np.maximum(BLUR_MM, TOUCHED * spacing)
+    return every, np.asarray(ndimage.distance_transform_edt(~every, spacing / reach) > 1.0)
 
 
 def full_part(volume: Volume) -> float:

@@ -1,0 +1,310 @@
+"""A dense thing in a CT read as a marker: kind, size and centre by drawing it again, and how well they are known.
+
+A marker is drawn as a scanner would show it: the part of each voxel that it fills, blurred in the plane, in what lies
+about it, clipped where the image is. From the weighted middle (`puncture_twin.planning.anatomy.metal`) on, Gauss-Newton
+moves it until its drawing is nearest to the image; with p the shift, size, tilt, density and blur, J the drawing's
+derivatives and P what is known beforehand of p,
+
+    cov p = s^2 (J' J + s^2 P^-1)^-1,   s^2 the mean square of what the drawing lacks, at least the image's noise.
+
+So thickness of slices, noise, blur and clipping all enter: a clipped voxel has no derivative, and what no drawing
+explains makes the centre uncertain. The kind is that whose drawing is nearest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from puncture_twin.planning.anatomy.metal import (
+    BLUR_MM,
+    METAL_HU,
+    SOLID_HU,
+    Metal,
+    centroid,
+    metal_background,
+    metal_parts,
+    spacing_mm,
+)
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about
+
+Kind = Literal["ball", "disc", "ring"]
+
+LEAST_MM, LARGEST_MM = 1.0, 15.0
+"""Diameters of markers."""
+TISSUE_HU = 50.0
+"""Muscle, and about what skin and fat have at most: the level at which a marker ends lies between this and its own."""
+CLIPPED = 0.97
+"""Of the image's greatest value: a voxel from here on may have been clipped."""
+FINE_MM, MOST_FINE = 0.5, 8
+"""Voxels are filled by cells so wide, and by so many along an axis at most."""
+HOLE = 0.4
+"""Diameter of a ring's hole over its own, assumed."""
+GROWN = 0.3
+"""Part of a marker's contrast at which it must still be alone: a wire goes on there, where noise had cut it."""
+PLAIN = MappingProxyType({"ball": 1.0, "disc": 1.1, "ring": 1.2})
+"""By which misfits are weighed: the simpler drawing has fewer freedoms."""
+AS_NEAR = 1.4
+"""Times the least misfit: such a kind may be the true one."""
+UNRESOLVED = 2.5
+"""Voxels: what is no wider in the image shows no kind."""
+SKIN_EDGE_MM = 0.12
+"""How far a marker is drawn along the skin's normal by what it hides of the skin's edge; metal is drawn less."""
+ROUNDS = 7
+"""Of Gauss-Newton; it settles after four or five."""
+SHIFT, SIZE, THICK, DENSITY, TILT = 0.5, 0.35, 0.7, 0.7, 0.25
+"""What is known beforehand (standard deviations): a shift in voxels; logarithms of size, thickness and density; rad."""
+STATED = 0.07
+"""Of the logarithm of a diameter that a person states."""
+THICK_MM = 2.5
+BLUR_SIGMA_MM, BLUR_KNOWN = 0.45, 0.12
+"""Of reconstruction and pixel together, in the plane, mm."""
+FLOOR = (0.02, 0.02)
+"""Standard deviation that no reading is below: mm, and part of a voxel along each axis."""
+
+
+class Shape(NamedTuple):
+    """A marker's shape: thickness and normal (3,), unit, of a disc or ring; of a ball they say nothing."""
+
+    kind: Kind
+    diameter_mm: float
+    thick_mm: float
+    normal: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """One dense thing, read as a marker.
+
+    Attributes:
+        centre_ct: Shape (3,), LPS mm.
+        cov_ct: Shape (3, 3), mm².
+        contrast_hu: Its greatest value above soft tissue's; of clipped metal at least so much.
+        clipped: Whether the image's range clips it.
+        misfit: Root mean square of what its drawing lacks, over that of its contrast; 0 is a perfect marker.
+    """
+
+    centre_ct: Floats
+    cov_ct: Floats
+    shape: Shape
+    contrast_hu: float
+    clipped: bool
+    misfit: float
+
+
+class Box(NamedTuple):
+    """What surrounds one thing.
+
+    Attributes:
+        volume: The voxels of the box, as an image of its own, float64.
+        peak: Shape (3,), index of its densest voxel.
+        ceiling_hu: The greatest value that the whole image has.
+    """
+
+    volume: Volume
+    peak: Ints
+    ceiling_hu: float
+    noise_hu: float
+
+
+@dataclass(frozen=True, eq=False)
+class Middle:
+    """A thing's weighted middle.
+
+    Attributes:
+        centre_ct: Shape (3,), LPS mm.
+        spread: Shape (3, 3), mm², second moment about it.
+        solid_hu: Of what it is made.
+        background: Shape of the box, HU: what it would show without.
+    """
+
+    box: Box
+    voxels: Bools
+    centre_ct: Floats
+    spread: Floats
+    peak_hu: float
+    solid_hu: float
+    background: Floats
+
+    @property
+    def clipped(self) -> bool:
+        """Whether the image's range clips it."""
+        return self.peak_hu >= CLIPPED * self.box.ceiling_hu and self.box.ceiling_hu > METAL_HU
+
+    @property
+    def roundness(self) -> float:
+        """Middle over greatest variance of its axes, 0 to 1; what slices cannot resolve counts as round."""
+        axes = np.linalg.eigvalsh(self.spread)
+        slack = float(np.max(spacing_mm(self.box.volume))) ** 2 / 12
+        return float((axes[1] + slack) / (axes[2] + slack))
+
+    @property
+    def wide_mm(self) -> float:
+        """About its diameter."""
+        variances = np.linalg.eigvalsh(self.spread - _blur(self.box.volume))
+        return float(np.clip(4 * np.sqrt(max(float(variances[1:].mean()), 0.0)), LEAST_MM, 1.3 * LARGEST_MM))
+
+
+def find_middle(box: Box) -> Middle | None:
+    """The middle of what holds together with a box's densest voxel at half of its contrast.
+
+    Returns:
+        None where it ends nowhere near: a part of something larger.
+    """
+    volume, spacing = box.volume, spacing_mm(box.volume)
+    contrast = float(volume.values[tuple(box.peak)]) - TISSUE_HU
+    level = TISSUE_HU + contrast / 2
+    mask = _joined(volume.values > level, box.peak)
+    wider = _joined(volume.values > TISSUE_HU + GROWN * contrast, box.peak)
+    if mask is None or wider is None:
+        return None
+    sides, more = (np.ptp(np.argwhere(one), axis=0) + 1 for one in (mask, wider))
+    if np.any((more - sides) * spacing > 2 * (BLUR_MM + spacing)):  # a wire, which noise has cut at the higher level
+        return None
+    peak = float(np.percentile(volume.values[mask], 90))
+    solid = SOLID_HU if peak > CLIPPED * box.ceiling_hu or (sides * spacing).max() < 2 * spacing.max() else peak
+    whole = (slice(0, mask.shape[0]), slice(0, mask.shape[1]), slice(0, mask.shape[2]))
+    metal = Metal(whole, mask, np.zeros(3), float((sides * spacing).max()))
+    full = min(1.0, box.ceiling_hu / solid)
+    parts = np.minimum(metal_parts(volume, metal, level_hu=level, solid_hu=solid), full)
+    if not parts.any():
+        return None
+    centre = centroid(parts, whole, volume.T_ct_index)
+    points = np.argwhere(parts > 0) @ volume.T_ct_index[:3, :3].T + volume.T_ct_index[:3, 3] - centre
+    heavy = parts[parts > 0]
+    spread = (points * heavy[:, None]).T @ points / heavy.sum()
+    return Middle(box, mask, centre, spread, peak, solid, metal_background(volume, metal, level))
+
+
+def _joined(mask: Bools, at: Ints) -> Bools | None:
+    """The part of a mask that holds a voxel; None where it reaches the box's faces."""
+    labels, _ = ndimage.label(mask, structure=np.ones((3, 3, 3)))
+    mine = np.asarray(labels == labels[tuple(at)])
+    inner = mine[1:-1, 1:-1, 1:-1]
+    return mine if labels[tuple(at)] and np.count_nonzero(inner) == np.count_nonzero(mine) else None
+
+
+def _blur(volume: Volume) -> Floats:
+    """Covariance of what blurs an image, shape (3, 3), mm²."""
+    spacing = spacing_mm(volume)
+    axes = volume.T_ct_index[:3, :3] / spacing
+    return np.asarray(axes @ np.diag(spacing**2 / 12 + [BLUR_SIGMA_MM**2, BLUR_SIGMA_MM**2, 0.0]) @ axes.T)
+
+
+def read_marker(middle: Middle, normal: Floats, kinds: tuple[Kind, ...], diameter_mm: float | None) -> Reading:
+    """Read a thing as a marker of the kind that is nearest to it; where others are as near, their centres count too.
+
+    Args:
+        normal: Shape (3,), unit, of the skin: a disc or ring lies about so.
+        kinds: Those that it may be.
+        diameter_mm: As a person states it.
+    """
+    if len(kinds) > 1 and middle.wide_mm < UNRESOLVED * float(spacing_mm(middle.box.volume).min()):
+        kinds = ("ball",)
+    every = sorted((_fitted(middle, kind, normal, diameter_mm) for kind in kinds), key=_rank)
+    best = every[0]
+    off = [one.centre_ct - best.centre_ct for one in every if _rank(one) < AS_NEAR * _rank(best)]
+    return replace(best, cov_ct=best.cov_ct + sum(np.outer(one, one) for one in off) / len(off))
+
+
+def _rank(reading: Reading) -> float:
+    return reading.misfit * PLAIN[reading.shape.kind]
+
+
+def _fitted(middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | None) -> Reading:
+    """The marker of a kind whose drawing is nearest to the image."""
+    box, spacing = middle.box, spacing_mm(middle.box.volume)
+    M = box.volume.T_ct_index[:3, :3]
+    size = diameter_mm or (np.sqrt(1.25) if kind == "ball" else 1.0) * middle.wide_mm
+    start = np.concatenate([np.zeros(3), np.log([size, THICK_MM, middle.solid_hu]), [0.0, 0.0, BLUR_SIGMA_MM]])
+    known = np.array(
+        [*(SHIFT * spacing), SIZE if diameter_mm is None else STATED, THICK, DENSITY, TILT, TILT, BLUR_KNOWN]
+    )
+    near = ndimage.binary_dilation(middle.voxels, np.ones((3, 3, 3)), iterations=2)
+    frame, seen = frame_about(normal), box.volume.values[near]
+    free = np.array([0, 1, 2, 3, 5, 8] if kind == "ball" else range(9))
+
+    def shape(p: Floats) -> Shape:
+        tilted = exp_rotation(frame @ np.array([p[6], p[7], 0.0])) @ normal
+        return Shape(kind, float(np.exp(p[3])), float(np.exp(p[4])), tilted)
+
+    def drawn(p: Floats) -> Floats:
+        part = filled(box.volume, shape(p), middle.centre_ct + p[:3])
+        part = ndimage.gaussian_filter(part, [*(abs(p[8]) / spacing[:2]), 0.0], mode="nearest")
+        image = middle.background + part * (np.exp(p[5]) - middle.background)
+        return np.asarray(np.minimum(image, box.ceiling_hu)[near])
+
+    scale = float(np.sqrt(np.mean((seen - middle.background[near]).clip(0.0) ** 2)))
+    p, image, J, variance = start, drawn(start), np.empty((len(seen), len(free))), scale**2
+
+    def cost(p: Floats, image: Floats, variance: float) -> float:
+        return float(np.sum((seen - image) ** 2) / variance + np.sum(((p - start) / known) ** 2))
+
+    for _ in range(ROUNDS):
+        variance = max(box.noise_hu**2, float(np.mean((seen - image) ** 2)))
+        for column, row in enumerate(free):
+            moved = p.copy()
+            moved[row] += STEPS[row]
+            J[:, column] = (drawn(moved) - image) / STEPS[row]
+        normal_matrix = J.T @ J / variance + np.diag(known[free] ** -2.0)
+        gain = J.T @ (seen - image) / variance - (p - start)[free] / known[free] ** 2
+        step, before = np.linalg.solve(normal_matrix, gain), cost(p, image, variance)
+        for part in (1.0, 0.5, 0.2):
+            tried = p.copy()
+            tried[free] += part * step
+            new = drawn(tried)
+            if cost(tried, new, variance) < before:
+                p, image = tried, new
+                break
+        else:
+            break
+        if np.all(np.abs(part * step[:3]) < 0.002):
+            break
+    cov = np.linalg.inv(normal_matrix)[:3, :3] + _unknown(middle, shape(p), M / spacing, float(np.exp(p[5])), normal)
+    misfit = float(np.sqrt(np.mean((seen - image) ** 2))) / scale
+    return Reading(middle.centre_ct + p[:3], cov, shape(p), middle.peak_hu - TISSUE_HU, middle.clipped, misfit)
+
+
+def _unknown(middle: Middle, shape: Shape, axes: Floats, solid_hu: float, normal: Floats) -> Floats:
+    """What no drawing knows of a centre, shape (3, 3), mm²: within a voxel that is wider, and at the skin's edge."""
+    spacing = spacing_mm(middle.box.volume)
+    free = np.maximum(0.0, spacing - shape.diameter_mm)
+    along = FLOOR[0] ** 2 + (FLOOR[1] * spacing) ** 2 + free**2 / 12
+    edge = SKIN_EDGE_MM * min(1.0, 1000.0 / solid_hu)
+    return np.asarray(axes @ np.diag(along) @ axes.T + edge**2 * np.outer(normal, normal))
+
+
+STEPS = np.array([0.05, 0.05, 0.05, 0.02, 0.05, 0.05, 0.05, 0.05, 0.03])
+"""By which derivatives are taken."""
+
+
+def filled(volume: Volume, shape: Shape, centre_ct: Floats) -> Floats:
+    """Part of each voxel that a marker fills, by cells whose part is that of a plane at the surface's distance."""
+    spacing, size = spacing_mm(volume), np.array(volume.values.shape)
+    counts = np.clip(np.ceil(spacing / FINE_MM), 2, MOST_FINE).astype(int)
+    steps = [(np.arange(n * m, dtype=np.float32) + 0.5) / m - 0.5 for n, m in zip(size, counts, strict=True)]
+    M, start = volume.T_ct_index[:3, :3], volume.T_ct_index[:3, 3] - centre_ct
+    x, y, z = np.ix_(*steps)
+    place = [
+        np.float32(start[k]) + np.float32(M[k, 0]) * x + np.float32(M[k, 1]) * y + np.float32(M[k, 2]) * z
+        for k in range(3)
+    ]
+    square = place[0] ** 2 + place[1] ** 2 + place[2] ** 2
+    if shape.kind == "ball":
+        beyond = np.sqrt(square) - np.float32(shape.diameter_mm / 2)
+    else:
+        along = sum(np.float32(shape.normal[k]) * place[k] for k in range(3))
+        across = np.sqrt(np.maximum(square - along**2, 0.0))
+        beyond = np.maximum(across - np.float32(shape.diameter_mm / 2), np.abs(along) - np.float32(shape.thick_mm / 2))
+        if shape.kind == "ring":
+            beyond = np.maximum(beyond, np.float32(HOLE * shape.diameter_mm / 2) - across)
+    cell = float(np.mean(spacing / counts))
+    fine = np.clip(0.5 - beyond / np.float32(cell), 0.0, 1.0)
+    fine = fine.reshape(size[0], counts[0], size[1], counts[1], size[2], counts[2])
+    return np.asarray(fine.mean(axis=(1, 3, 5)), dtype=np.float64)
