@@ -31,6 +31,7 @@ from puncture_twin.planning.anatomy.metal import (
     spacing_mm,
 )
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about
 
@@ -285,26 +286,61 @@ STEPS = np.array([0.05, 0.05, 0.05, 0.02, 0.05, 0.05, 0.05, 0.05, 0.03])
 
 
 def filled(volume: Volume, shape: Shape, centre_ct: Floats) -> Floats:
-    """Part of each voxel that a marker fills, by cells whose part is that of a plane at the surface's distance."""
-    spacing, size = spacing_mm(volume), np.array(volume.values.shape)
-    counts = np.clip(np.ceil(spacing / FINE_MM), 2, MOST_FINE).astype(int)
-    steps = [(np.arange(n * m, dtype=np.float32) + 0.5) / m - 0.5 for n, m in zip(size, counts, strict=True)]
-    M, start = volume.T_ct_index[:3, :3], volume.T_ct_index[:3, 3] - centre_ct
-    x, y, z = np.ix_(*steps)
-    place = [
-        np.float32(start[k]) + np.float32(M[k, 0]) * x + np.float32(M[k, 1]) * y + np.float32(M[k, 2]) * z
-        for k in range(3)
-    ]
-    square = place[0] ** 2 + place[1] ** 2 + place[2] ** 2
-    if shape.kind == "ball":
-        beyond = np.sqrt(square) - np.float32(shape.diameter_mm / 2)
-    else:
-        along = sum(np.float32(shape.normal[k]) * place[k] for k in range(3))
-        across = np.sqrt(np.maximum(square - along**2, 0.0))
-        beyond = np.maximum(across - np.float32(shape.diameter_mm / 2), np.abs(along) - np.float32(shape.thick_mm / 2))
-        if shape.kind == "ring":
-            beyond = np.maximum(beyond, np.float32(HOLE * shape.diameter_mm / 2) - across)
-    cell = float(np.mean(spacing / counts))
-    fine = np.clip(0.5 - beyond / np.float32(cell), 0.0, 1.0)
-    fine = fine.reshape(size[0], counts[0], size[1], counts[1], size[2], counts[2])
-    return np.asarray(fine.mean(axis=(1, 3, 5)), dtype=np.float64)
+    """Part of each voxel that a marker fills; of a voxel that its surface may pass, by cells of `FINE_MM`."""
+    spacing = spacing_mm(volume)
+    counts = np.clip(np.ceil(spacing / FINE_MM), 2, MOST_FINE).astype(np.int64)
+    T = np.array(volume.T_ct_index[:3])
+    T[:, 3] -= centre_ct
+    part = np.zeros(volume.values.shape)
+    half = np.array([shape.diameter_mm, shape.thick_mm, HOLE * shape.diameter_mm]) / 2
+    kind = {"ball": 0, "disc": 1, "ring": 2}[shape.kind]
+    _fill(T, counts, float(np.linalg.norm(spacing)) / 2, kind, half, np.array(shape.normal), part)
+    return part
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _fill(T, counts, reach, kind, half, normal, part):  # type: ignore[no-untyped-def]  # numba infers
+    """Set the part of each voxel: that of cells, each as a plane at the surface's distance would fill it.
+
+    Args:
+        T: Shape (3, 4), index to mm from the marker's centre.
+        counts: Shape (3,), cells along each axis of a voxel.
+        reach: Half of a voxel's diagonal, mm.
+        half: Shape (3,), half diameter, half thickness, half diameter of the hole, mm.
+        part: Shape (ni, nj, nk).
+    """
+    cell = 2.0 * reach / np.sqrt(float(counts[0] ** 2 + counts[1] ** 2 + counts[2] ** 2))
+    for i in range(part.shape[0]):
+        for j in range(part.shape[1]):
+            for k in range(part.shape[2]):
+                beyond = _beyond(T, float(i), float(j), float(k), kind, half, normal)
+                if beyond >= reach + cell:
+                    continue
+                if beyond <= -reach - cell:
+                    part[i, j, k] = 1.0
+                    continue
+                total = 0.0
+                for a in range(counts[0]):
+                    x = i + (a + 0.5) / counts[0] - 0.5
+                    for b in range(counts[1]):
+                        y = j + (b + 0.5) / counts[1] - 0.5
+                        for c in range(counts[2]):
+                            z = k + (c + 0.5) / counts[2] - 0.5
+                            off = _beyond(T, x, y, z, kind, half, normal)
+                            total += min(max(0.5 - off / cell, 0.0), 1.0)
+                part[i, j, k] = total / (counts[0] * counts[1] * counts[2])
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _beyond(T, i, j, k, kind, half, normal):  # type: ignore[no-untyped-def]
+    """How far a place lies beyond a marker's surface, mm; negative inside."""
+    square, along = 0.0, 0.0
+    for axis in range(3):
+        at = T[axis, 0] * i + T[axis, 1] * j + T[axis, 2] * k + T[axis, 3]
+        square += at * at
+        along += at * normal[axis]
+    if kind == 0:
+        return np.sqrt(square) - half[0]
+    across = np.sqrt(max(square - along * along, 0.0))
+    off = max(across - half[0], abs(along) - half[1])
+    return max(off, half[2] - across) if kind == 2 else off

@@ -33,7 +33,7 @@ from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, point_text
-from puncture_twin.planning.registration.checks.markers import skin_fit
+from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.registration.fiducial_reading import (
     LARGEST_MM,
     LEAST_MM,
@@ -52,6 +52,8 @@ LEVELS_HU = (150.0, 350.0, 700.0, METAL_HU, 2500.0)
 """Tried one after the other: where a marker holds together with bone at one, it is alone at a higher one."""
 AROUND_MM = 4.0
 """About a candidate, so much is looked at."""
+MOST_VERTICES = 100_000
+"""Of the skin, by which candidates are near it; on a trunk they are 3 mm apart."""
 LEAST_VOXELS, LEAST_SINGLE_HU = 3, 600.0
 """A single voxel of less is noise."""
 LEAST_CONTRAST_HU, LEAST_CONTRAST_SD = 150.0, 6.0
@@ -80,13 +82,13 @@ LEAST_OF_LAYOUT = 4
 class Stated:
     """What a person says of the markers; None for what is not known."""
 
-    kind: Kind | None = None
+    kind: str | None = None
     diameter_mm: float | None = None
     count: int | None = None
 
     def __post_init__(self) -> None:
         if self.kind is not None and self.kind not in get_args(Kind):
-            refuse(f"kind '{str(self.kind)[:40]}' is not known", "--kind", ", ".join(get_args(Kind)), "unknown_choice")
+            refuse(f"kind '{self.kind[:40]}' is not known", "--kind", ", ".join(get_args(Kind)), "unknown_choice")
         if self.diameter_mm is not None and not LEAST_MM <= self.diameter_mm <= LARGEST_MM:
             allowed = f"mm, from {LEAST_MM:g} to {LARGEST_MM:g}"
             refuse(f"{self.diameter_mm:g} mm", "--diameter", allowed, "out_of_range")
@@ -133,7 +135,7 @@ def look_for_fiducials(volume: Volume, skin: Skin, stated: Stated = NOTHING_STAT
     Args:
         volume: The CT in Hounsfield units, axes to the left, back and head.
     """
-    kinds = get_args(Kind) if stated.kind is None else (stated.kind,)
+    kinds = tuple(one for one in get_args(Kind) if stated.kind in (None, one))
     noise, ceiling = noise_hu(volume.values), float(volume.values.max())
     found: list[tuple[Reading, float]] = []
     passed: Counter[str] = Counter()
@@ -143,13 +145,13 @@ def look_for_fiducials(volume: Volume, skin: Skin, stated: Stated = NOTHING_STAT
         if middle is None or why:
             passed[why] += 1
             continue
-        gap = float(skin_fit(middle.centre_ct[None], skin).gaps_mm[0])
+        gap, normal = _at_skin(middle.centre_ct, skin)
         if not _on_skin(middle, gap):
             passed["not on the skin"] += 1
             continue
         if any(np.linalg.norm(middle.centre_ct - one.centre_ct) < one.shape.diameter_mm / 2 for one, _ in found):
             continue
-        reading = read_marker(middle, _skin_normal(middle.centre_ct, skin), kinds, stated.diameter_mm)
+        reading = read_marker(middle, normal, kinds, stated.diameter_mm)
         if why := _unlike(reading):
             passed[why] += 1
         else:
@@ -170,7 +172,9 @@ def noise_hu(values: NDArray[Any]) -> float:
 def _candidates(volume: Volume, skin: Skin, ceiling_hu: float, noise: float) -> Iterator[Box]:
     """What is dense, small and near the skin, each once, at the lowest level at which it is alone."""
     spacing = spacing_mm(volume)
-    tree = cKDTree(skin.mesh.vertices[np.unique(skin.mesh.faces[~skin.cut_faces])])
+    uncut = np.zeros(len(skin.mesh.vertices), np.bool_)
+    uncut[skin.mesh.faces[~skin.cut_faces]] = True
+    tree = cKDTree(skin.mesh.vertices[uncut][:: max(1, np.count_nonzero(uncut) // MOST_VERTICES)])
     first, values = _about_body(volume, skin)
     seen: set[tuple[int, ...]] = set()
     for level in LEVELS_HU:
@@ -187,7 +191,7 @@ def _candidates(volume: Volume, skin: Skin, ceiling_hu: float, noise: float) -> 
         inner = np.all((ends[..., 0] + first > 0) & (ends[..., 1] + first < volume.values.shape), axis=1)
         rows = np.flatnonzero(small & inner)
         middles = apply(volume.T_ct_index, (ends[rows].sum(axis=2) - 1) / 2 + first)
-        near, _ = tree.query(middles, distance_upper_bound=LARGEST_MM / 2 + OFF_SKIN_MM + UNDER_SKIN_MM)
+        near, _ = tree.query(middles, distance_upper_bound=LARGEST_MM + OFF_SKIN_MM)
         for row in rows[np.isfinite(near)].tolist():
             number, box = pieces[row]
             inside = np.where(labels[box] == number, values[box], -np.inf)
@@ -240,14 +244,22 @@ def _on_skin(middle: Middle, gap_mm: float) -> bool:
     return -half - under <= gap_mm <= half + OFF_SKIN_MM
 
 
-def _skin_normal(point_ct: Floats, skin: Skin) -> Floats:
-    """The mean outward normal of the skin about a point (3,): a marker on it is a bump of its own."""
-    triangles = skin.mesh.triangles[~skin.cut_faces]
-    near = triangles[np.linalg.norm(triangles.mean(axis=1) - point_ct, axis=1) < ABOUT_MM]
-    normal = np.cross(near[:, 1] - near[:, 0], near[:, 2] - near[:, 0]).sum(axis=0)
-    outward = normal * np.copysign(1.0, skin.mesh.volume)
-    length = float(np.linalg.norm(outward))
-    return np.asarray(outward / length) if length > 0 else np.array([0.0, -1.0, 0.0])
+def _at_skin(point_ct: Floats, skin: Skin) -> tuple[float, Floats]:
+    """How far a point (3,) is from the skin, negative inside, and the skin's mean outward normal about it.
+
+    The skin goes over a marker where that counts as body: its mean direction is less of a bump.
+    """
+    mesh = skin.mesh
+    near = np.all(np.abs(mesh.vertices - point_ct) < ABOUT_MM, axis=1)
+    rows = np.flatnonzero(near[mesh.faces[:, 0]] & ~skin.cut_faces)
+    if not len(rows):
+        return np.inf, np.array([0.0, -1.0, 0.0])
+    corners = mesh.vertices[mesh.faces[rows]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    squares, mean = squared_distance(point_ct, corners), normals.sum(axis=0)
+    nearest = corners[squares <= squares.min() + 0.01].mean(axis=(0, 1))
+    side = float((point_ct - nearest) @ normals[squares <= squares.min() + 0.01].sum(axis=0))
+    return float(np.copysign(np.sqrt(squares.min()), side)), mean / max(float(np.linalg.norm(mean)), 1e-9)
 
 
 def order_along_body(points_ct: Floats) -> list[int]:
