@@ -275,8 +275,8 @@ def _fitted(middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | Non
 def _unknown(middle: Middle, shape: Shape, axes: Floats, solid_hu: float, normal: Floats) -> Floats:
     """What no drawing knows of a centre, shape (3, 3), mm²: within a voxel that is wider, and at the skin's edge."""
     spacing = spacing_mm(middle.box.volume)
-    free = np.maximum(0.0, spacing - shape.diameter_mm)
-    along = FLOOR[0] ** 2 + (FLOOR[1] * spacing) ** 2 + free**2 / 12
+    free = np.maximum(0.0, spacing**2 - shape.diameter_mm**2) / 12
+    along = FLOOR[0] ** 2 + (FLOOR[1] * spacing) ** 2 + free
     edge = SKIN_EDGE_MM * min(1.0, 1000.0 / solid_hu)
     return np.asarray(axes @ np.diag(along) @ axes.T + edge**2 * np.outer(normal, normal))
 

@@ -288,27 +288,33 @@ def find_fiducials(
         InputError: A layout that is mirrored.
     """
     seen = look_for_fiducials(volume, skin, stated)
-    alike = [one for one in seen.fiducials if _as_stated(one, stated, volume)]
+    return choose_fiducials(seen, stated, float(spacing_mm(volume).max()), layout, where=where)
+
+
+def choose_fiducials(
+    seen: Seen, stated: Stated, voxel_mm: float, layout: NamedPoints | None = None, *, where: str | Path
+) -> Seen:
+    """Of what looks like markers those that are meant, as `find_fiducials` does.
+
+    Args:
+        voxel_mm: The longest side of a voxel.
+    """
+    size = stated.diameter_mm
+    alike = [one for one in seen.fiducials if size is None or _same_size(one.reading.shape.diameter_mm, size, voxel_mm)]
     if layout is not None:
-        return Seen(_named(alike, layout, where), seen.passed)
-    return Seen(_numbered(_one_kind(alike, stated, seen, volume)), seen.passed)
+        return Seen(named_by_layout(alike, layout, where), seen.passed)
+    return Seen(_numbered(_one_kind(alike, stated, seen, voxel_mm)), seen.passed)
 
 
 def _numbered(fiducials: Sequence[Fiducial]) -> tuple[Fiducial, ...]:
     return tuple(replace(one, name=f"M{number}") for number, one in enumerate(fiducials, start=1))
 
 
-def _as_stated(one: Fiducial, stated: Stated, volume: Volume) -> bool:
-    """Whether a thing may be of the kind and size that a person states; a kind where the image resolves it."""
-    shape, voxel = one.reading.shape, float(spacing_mm(volume).max())
-    return stated.diameter_mm is None or _same_size(shape.diameter_mm, stated.diameter_mm, voxel)
-
-
 def _same_size(one_mm: float, other_mm: float, voxel_mm: float) -> bool:
     return abs(one_mm - other_mm) <= SIZE_ALIKE * max(one_mm, other_mm) / 2 + voxel_mm / 2
 
 
-def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen, volume: Volume) -> Sequence[Fiducial]:
+def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen, voxel_mm: float) -> Sequence[Fiducial]:
     """The markers where they are of one size, and as many as stated.
 
     Raises:
@@ -320,7 +326,7 @@ def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen, volume: Vol
         if seen.fiducials:
             what = f"no marker as stated; seen: {seen_text(seen.fiducials)}"
         raise NoAnswerError(what, code="no_markers")
-    groups = _groups(alike, float(spacing_mm(volume).max()))
+    groups = _groups(alike, voxel_mm)
     if stated.count is not None:
         groups = [one for one in groups if len(one) == stated.count] or groups
     if len(groups) > 1:
@@ -362,7 +368,7 @@ def seen_text(fiducials: Sequence[Fiducial]) -> str:
     )
 
 
-def _named(alike: Sequence[Fiducial], layout: NamedPoints, where: str | Path) -> tuple[Fiducial, ...]:
+def named_by_layout(alike: Sequence[Fiducial], layout: NamedPoints, where: str | Path) -> tuple[Fiducial, ...]:
     """The markers by the names of a layout, in its order.
 
     Raises:
