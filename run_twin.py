@@ -322,9 +322,7 @@ def rehearse(
 
 @app.command()
 def markers(
-    source: Annotated[
-        Path, typer.Argument(metavar="FOLDER|FILE|CASE", help="Folder or file with a CT, or a case with one.")
-    ],
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Folder or file with a CT, or a case with one.")],
     kind: Annotated[str | None, typer.Option("--kind", metavar="ball|disc|ring", help="Kind of all markers.")] = None,
     diameter: Annotated[float | None, typer.Option("--diameter", metavar="MM", help="Their diameter, 1 to 15.")] = None,
     count: Annotated[int | None, typer.Option("--count", metavar="N", help="How many there are.")] = None,

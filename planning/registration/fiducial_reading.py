@@ -22,7 +22,6 @@ from scipy import ndimage
 
 from puncture_twin.planning.anatomy.metal import (
     BLUR_MM,
-    METAL_HU,
     SOLID_HU,
     Metal,
     centroid,
@@ -33,6 +32,7 @@ from puncture_twin.planning.anatomy.metal import (
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about
 
 Kind = Literal["ball", "disc", "ring"]
@@ -61,6 +61,9 @@ ROUNDS = 7
 """Of Gauss-Newton; it settles after four or five."""
 SHIFT, SIZE, THICK, DENSITY, TILT = 0.5, 0.35, 0.7, 0.7, 0.25
 """What is known beforehand (standard deviations): a shift in voxels; logarithms of size, thickness and density; rad."""
+STEPS = np.array([0.05, 0.05, 0.05, 0.05, 0.02, 0.03, 0.05, 0.05, 0.05])
+"""By which derivatives of a drawing are taken: shift, density, size, blur, thickness, tilts."""
+SETTLED_MM = 0.002
 STATED = 0.07
 """Of the logarithm of a diameter that a person states."""
 THICK_MM = 2.5
@@ -105,7 +108,7 @@ class Box(NamedTuple):
     Attributes:
         volume: The voxels of the box, as an image of its own, float64.
         peak: Shape (3,), index of its densest voxel.
-        ceiling_hu: The greatest value that the whole image has.
+        ceiling_hu: Where the whole image clips; infinite where it does not.
     """
 
     volume: Volume
@@ -136,7 +139,7 @@ class Middle:
     @property
     def clipped(self) -> bool:
         """Whether the image's range clips it."""
-        return self.peak_hu >= CLIPPED * self.box.ceiling_hu and self.box.ceiling_hu > METAL_HU
+        return self.peak_hu >= CLIPPED * self.box.ceiling_hu
 
     @property
     def roundness(self) -> float:
@@ -220,69 +223,105 @@ def _rank(reading: Reading) -> float:
 
 def _fitted(middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | None) -> Reading:
     """The marker of a kind whose drawing is nearest to the image."""
-    box, spacing = middle.box, spacing_mm(middle.box.volume)
-    M = box.volume.T_ct_index[:3, :3]
-    size = diameter_mm or (np.sqrt(1.25) if kind == "ball" else 1.0) * middle.wide_mm
-    start = np.concatenate([np.zeros(3), np.log([size, THICK_MM, middle.solid_hu]), [0.0, 0.0, BLUR_SIGMA_MM]])
-    known = np.array(
-        [*(SHIFT * spacing), SIZE if diameter_mm is None else STATED, THICK, DENSITY, TILT, TILT, BLUR_KNOWN]
-    )
-    near = ndimage.binary_dilation(middle.voxels, np.ones((3, 3, 3)), iterations=2)
-    frame, seen = frame_about(normal), box.volume.values[near]
-    free = np.array([0, 1, 2, 3, 5, 8] if kind == "ball" else range(9))
+    drawing, noise = _Drawing.of(middle, kind, normal, diameter_mm), middle.box.noise_hu
+    start, known = drawing.start, drawing.known
 
-    def shape(p: Floats) -> Shape:
-        tilted = exp_rotation(frame @ np.array([p[6], p[7], 0.0])) @ normal
-        return Shape(kind, float(np.exp(p[3])), float(np.exp(p[4])), tilted)
+    def linearised(p: Floats) -> System[Floats]:
+        image = drawing.image(p)
+        sd = max(noise, float(np.sqrt(np.mean((drawing.seen - image) ** 2))))
+        slopes = [(drawing.image(p + step) - image) / step.sum() for step in np.diag(drawing.steps)]
 
-    def drawn(p: Floats) -> Floats:
-        part = filled(box.volume, shape(p), middle.centre_ct + p[:3])
-        part = ndimage.gaussian_filter(part, [*(abs(p[8]) / spacing[:2]), 0.0], mode="nearest")
-        image = middle.background + part * (np.exp(p[5]) - middle.background)
-        return np.asarray(np.minimum(image, box.ceiling_hu)[near])
+        def residuals(q: Floats, image: Floats) -> Floats:
+            return np.concatenate([(image - drawing.seen) / sd, (q - start) / known])
 
-    scale = float(np.sqrt(np.mean((seen - middle.background[near]).clip(0.0) ** 2)))
-    p, image, J, variance = start, drawn(start), np.empty((len(seen), len(free))), scale**2
+        def cost(q: Floats) -> float:
+            return float(np.sum(residuals(q, drawing.image(q)) ** 2))
 
-    def cost(p: Floats, image: Floats, variance: float) -> float:
-        return float(np.sum((seen - image) ** 2) / variance + np.sum(((p - start) / known) ** 2))
+        return System(residuals(p, image), np.vstack([np.column_stack(slopes) / sd, np.diag(1 / known)]), cost)
 
-    for _ in range(ROUNDS):
-        variance = max(box.noise_hu**2, float(np.mean((seen - image) ** 2)))
-        for column, row in enumerate(free):
-            moved = p.copy()
-            moved[row] += STEPS[row]
-            J[:, column] = (drawn(moved) - image) / STEPS[row]
-        normal_matrix = J.T @ J / variance + np.diag(known[free] ** -2.0)
-        gain = J.T @ (seen - image) / variance - (p - start)[free] / known[free] ** 2
-        step, before = np.linalg.solve(normal_matrix, gain), cost(p, image, variance)
-        for part in (1.0, 0.5, 0.2):
-            tried = p.copy()
-            tried[free] += part * step
-            new = drawn(tried)
-            if cost(tried, new, variance) < before:
-                p, image = tried, new
-                break
-        else:
-            break
-        if np.all(np.abs(part * step[:3]) < 0.002):
-            break
-    cov = np.linalg.inv(normal_matrix)[:3, :3] + _unknown(middle, shape(p), M / spacing, float(np.exp(p[5])), normal)
-    misfit = float(np.sqrt(np.mean((seen - image) ** 2))) / scale
-    return Reading(middle.centre_ct + p[:3], cov, shape(p), middle.peak_hu - TISSUE_HU, middle.clipped, misfit)
+    fit = gauss_newton(start, linearised, np.add, lambda _, step: bool(np.abs(step[:3]).max() < SETTLED_MM), ROUNDS)
+    p, shape = fit.estimate, drawing.shape(fit.estimate)
+    cov = np.linalg.inv(fit.system.information)[:3, :3] + _unknown(middle, shape, drawing.solid_hu(p), normal)
+    off = float(np.sqrt(np.mean((drawing.seen - drawing.image(p)) ** 2)))
+    hu = middle.peak_hu - TISSUE_HU
+    return Reading(middle.centre_ct + p[:3], cov, shape, hu, middle.clipped, off / drawing.contrast_hu)
 
 
-def _unknown(middle: Middle, shape: Shape, axes: Floats, solid_hu: float, normal: Floats) -> Floats:
+@dataclass(frozen=True, eq=False)
+class _Drawing:
+    """A marker drawn into what lies about it.
+
+    Its unknowns are the shift (3), logarithms of density and size, the blur; of a disc or ring the logarithm of its
+    thickness and two tilts too.
+
+    Attributes:
+        start: Shape (p,), of the unknowns.
+        known: Shape (p,), how well each is known beforehand, standard deviations.
+        near: Shape of the box: the voxels that are compared.
+    """
+
+    middle: Middle
+    kind: Kind
+    normal: Floats
+    start: Floats
+    known: Floats
+    near: Bools
+
+    @classmethod
+    def of(cls, middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | None) -> _Drawing:
+        size = diameter_mm or (np.sqrt(1.25) if kind == "ball" else 1.0) * middle.wide_mm
+        start = np.concatenate([np.zeros(3), np.log([middle.solid_hu, size]), [BLUR_SIGMA_MM, np.log(THICK_MM), 0, 0]])
+        of_size = SIZE if diameter_mm is None else STATED
+        shift = SHIFT * spacing_mm(middle.box.volume)
+        known = np.array([*shift, DENSITY, of_size, BLUR_KNOWN, THICK, TILT, TILT])
+        count = 6 if kind == "ball" else 9
+        near = ndimage.binary_dilation(middle.voxels, np.ones((3, 3, 3)), iterations=2)
+        return cls(middle, kind, normal, start[:count], known[:count], near)
+
+    @property
+    def seen(self) -> Floats:
+        """Of the image, HU, shape (n,)."""
+        return self.middle.box.volume.values[self.near]
+
+    @property
+    def contrast_hu(self) -> float:
+        """Root mean square of what is seen above what lies about it."""
+        return float(np.sqrt(np.mean((self.seen - self.middle.background[self.near]).clip(0.0) ** 2)))
+
+    @property
+    def steps(self) -> Floats:
+        """By which derivatives are taken, shape (p,)."""
+        return STEPS[: len(self.start)]
+
+    def solid_hu(self, p: Floats) -> float:
+        """What it is made of."""
+        return float(np.exp(p[3]))
+
+    def shape(self, p: Floats) -> Shape:
+        """The marker of unknowns (p,)."""
+        if self.kind == "ball":
+            return Shape(self.kind, float(np.exp(p[4])), THICK_MM, self.normal)
+        tilt = exp_rotation(frame_about(self.normal) @ np.array([p[7], p[8], 0.0]))
+        return Shape(self.kind, float(np.exp(p[4])), float(np.exp(p[6])), tilt @ self.normal)
+
+    def image(self, p: Floats) -> Floats:
+        """As a scanner shows it, shape (n,), HU."""
+        box, background = self.middle.box, self.middle.background
+        part = filled(box.volume, self.shape(p), self.middle.centre_ct + p[:3])
+        sigma = abs(p[5]) / spacing_mm(box.volume)[:2]
+        part = ndimage.gaussian_filter(part, [*sigma, 0.0], mode="nearest")
+        image = background + part * (self.solid_hu(p) - background)
+        return np.asarray(np.minimum(image, box.ceiling_hu)[self.near])
+
+
+def _unknown(middle: Middle, shape: Shape, solid_hu: float, normal: Floats) -> Floats:
     """What no drawing knows of a centre, shape (3, 3), mm²: within a voxel that is wider, and at the skin's edge."""
     spacing = spacing_mm(middle.box.volume)
+    axes = middle.box.volume.T_ct_index[:3, :3] / spacing
     free = np.maximum(0.0, spacing**2 - shape.diameter_mm**2) / 12
     along = FLOOR[0] ** 2 + (FLOOR[1] * spacing) ** 2 + free
     edge = SKIN_EDGE_MM * min(1.0, 1000.0 / solid_hu)
     return np.asarray(axes @ np.diag(along) @ axes.T + edge**2 * np.outer(normal, normal))
-
-
-STEPS = np.array([0.05, 0.05, 0.05, 0.02, 0.05, 0.05, 0.05, 0.05, 0.03])
-"""By which derivatives are taken."""
 
 
 def filled(volume: Volume, shape: Shape, centre_ct: Floats) -> Floats:

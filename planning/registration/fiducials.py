@@ -56,6 +56,8 @@ MOST_VERTICES = 100_000
 """Of the skin, by which candidates are near it; on a trunk they are 3 mm apart."""
 LEAST_VOXELS, LEAST_SINGLE_HU = 3, 600.0
 """A single voxel of less is noise."""
+LEAST_CLIPPED = 4
+"""Voxels of one greatest value: dense things have noise where they are not clipped."""
 LEAST_CONTRAST_HU, LEAST_CONTRAST_SD = 150.0, 6.0
 """Of a marker above soft tissue, and over the image's noise; 200 HU less what small ones lose by blur."""
 MOST_MISFIT = 0.38
@@ -136,7 +138,7 @@ def look_for_fiducials(volume: Volume, skin: Skin, stated: Stated = NOTHING_STAT
         volume: The CT in Hounsfield units, axes to the left, back and head.
     """
     kinds = tuple(one for one in get_args(Kind) if stated.kind in (None, one))
-    noise, ceiling = noise_hu(volume.values), float(volume.values.max())
+    noise, ceiling = noise_hu(volume.values), clipped_at(volume.values)
     found: list[tuple[Reading, float]] = []
     passed: Counter[str] = Counter()
     for box in _candidates(volume, skin, ceiling, noise):
@@ -167,6 +169,13 @@ def noise_hu(values: NDArray[Any]) -> float:
     left, right = some[:-2].astype(np.float32), some[2:].astype(np.float32)
     both = (np.abs(left) < 200) & (np.abs(right) < 200)
     return float(1.4826 * np.median(np.abs(left[both] - right[both])) / np.sqrt(2)) if both.any() else 0.0
+
+
+def clipped_at(values: NDArray[Any]) -> float:
+    """The value at which an image is clipped, as several voxels have it; infinite where nothing says so."""
+    most = values.max()
+    clips = most > METAL_HU and np.count_nonzero(values == most) >= LEAST_CLIPPED
+    return float(most) if clips else np.inf
 
 
 def _candidates(volume: Volume, skin: Skin, ceiling_hu: float, noise: float) -> Iterator[Box]:

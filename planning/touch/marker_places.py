@@ -30,13 +30,8 @@ from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, Marker
 from puncture_twin.planning.registration.method import renamings
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.touch.touch_planner import (
-    MOST_MARKERS,
-    PLANNED_PADDING_MM,
-    ApproachCheckers,
-    approach_checkers,
-)
-from puncture_twin.planning.touch.tour_motions import why_not
+from puncture_twin.planning.touch.touch_planner import MOST_MARKERS, PLANNED_PADDING_MM, approach_checkers
+from puncture_twin.planning.touch.tour_motions import ApproachCheckers, why_not
 from puncture_twin.planning.uncertainty.touch_choice import touch_candidates
 
 PLACES, BETWEEN_PLACES_MM = 300, 9.0
@@ -141,7 +136,7 @@ def propose_markers(context: CaseContext, candidates: Candidates, count: int) ->
     if not MIN_MARKERS <= count <= MOST_MARKERS:
         refuse(f"{count} markers", "--propose", f"{MIN_MARKERS} to {MOST_MARKERS}", "out_of_range")
     if not candidates.safe.any():
-        raise NoAnswerError("no direction is safe: there is no window to put markers beside", code="nothing_safe")
+        raise NoAnswerError("no direction is safe: there is no window to put markers beside", code="no_safe_direction")
     entries = cKDTree(candidates.path.entry_ct[candidates.safe])
     skin = _places(case, anatomy, entries)
     skin = skin.of(_touchable(context, candidates, skin.points))

@@ -70,6 +70,14 @@ def test_kind_and_size_are_read(scans):
             assert {one.kind for one in shapes} == {markers.kind}
 
 
+def test_what_is_not_clipped_is_not_taken_for_it():
+    """Balls of 2,000 HU are the densest of an image that ends far above: their size is theirs."""
+    true, seen = found_in(Markers(hu=2000.0), ScanSettings(2.5, 1.0, seed=2), others=False)
+    assert len(matched(true, seen.fiducials)[0]) == len(true)
+    assert not any(one.reading.clipped for one in seen.fiducials)
+    assert np.allclose([one.reading.shape.diameter_mm for one in seen.fiducials], 8.0, rtol=0.05)
+
+
 def test_without_markers_none_is_seen():
     """A body with everything that is none, metal inside of it too."""
     rng = np.random.default_rng(5)

@@ -72,7 +72,7 @@ def test_a_count_out_of_range_is_refused_and_without_a_window_there_is_no_answer
     for count in (2, 13):
         with refused("out_of_range"):
             propose_markers(context, candidates, count)
-    with refused("nothing_safe", by=NoAnswerError):
+    with refused("no_safe_direction", by=NoAnswerError):
         propose_markers(context, SimpleNamespace(safe=np.zeros(4, bool)), 4)
 
 

@@ -28,6 +28,7 @@ from puncture_twin.planning.geometry.spaces import Space, Unit, to_lps
 from puncture_twin.planning.init.finder import Wanted, find
 from puncture_twin.planning.init.segmentation import Place
 from puncture_twin.planning.registration.fiducials import Fiducial, Seen, Stated, find_fiducials
+from puncture_twin.planning.search.bedside import slice_numbers
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.marker_places import MarkerPlace, Proposal, propose_markers
 from puncture_twin.twin.jobs.terminal import write_result
@@ -93,10 +94,10 @@ def read_source(source: Path, watcher: Watcher) -> SourceCt:
         found = find(place, Wanted(Space.LPS))
         if not found.cts and found.problems:
             raise found.problems[0]
-        if len(found.cts) != 1:
-            names = ", ".join(one.source for one in found.cts)
-            what = f"several CTs: {names}" if names else "no CT in Hounsfield units"
-            refuse(what, source, ALLOWED, "several_cts" if names else "no_ct")
+        if not found.cts:
+            refuse("no CT in Hounsfield units", source, ALLOWED, "no_ct")
+        if len(found.cts) > 1:
+            refuse(f"several CTs: {', '.join(one.source for one in found.cts)}", source, ALLOWED, "several_cts")
         surfaces = found.cts[0].surfaces
     watcher.step("reading", "skin")
     imaged = surfaces.imaged()
@@ -250,7 +251,12 @@ class ProposalRun:
     def _row(self, one: MarkerPlace) -> dict[str, Any]:
         space = self.context.case.space
         position = to_lps(one.point_ct[None], space)[0].tolist()
-        measured = {} if space is Space.LOCAL else {"toward_head_mm": one.head_mm, "round_to_left_mm": one.girth_mm}
+        measured: dict[str, Any] = {}
+        if space is not Space.LOCAL:
+            measured = {"toward_head_mm": one.head_mm, "round_to_left_mm": one.girth_mm}
+        if self.context.anatomy.scan is not None:
+            number, _ = slice_numbers(self.context.anatomy.scan.grid)
+            measured["slice"] = int(np.rint(number @ [*one.point_ct, 1.0]))
         return {"name": one.name, "position_mm": position, **measured, "text": one.words(space)}
 
     def text(self) -> str:
@@ -267,10 +273,14 @@ class ProposalRun:
         ]  # fmt: skip
         return text([
             Section(f"where to put {len(names)} markers, {self.context.case.name}",
-                    [facts([(one["name"], one["text"]) for one in found["proposed"]]), facts(facts_)]),
+                    [facts([(one["name"], _place_text(one)) for one in found["proposed"]]), facts(facts_)]),
             Section("straight distances, mm", [grid([Field("", "name"), *(Field(n, n, 0) for n in names)], rows)]),
             *footer(self.files),
         ])  # fmt: skip
+
+
+def _place_text(row: dict[str, Any]) -> str:
+    return row["text"] + (f"; slice {row['slice']} from the feet" if "slice" in row else "")
 
 
 def propose_places(context: CaseContext, out: Path, count: int) -> ProposalRun:
