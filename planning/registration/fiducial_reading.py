@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from scipy import ndimage
@@ -51,6 +51,8 @@ GROWN = 0.3
 """Part of a marker's contrast at which it must still be alone: a wire goes on there, where noise had cut it."""
 PLAIN = MappingProxyType({"ball": 1.0, "disc": 1.1, "ring": 1.2})
 """By which misfits are weighed: the simpler drawing has fewer freedoms."""
+SURE = 0.1
+"""A misfit below which no other kind is drawn."""
 AS_NEAR = 1.4
 """Times the least misfit: such a kind may be the true one."""
 UNRESOLVED = 2.5
@@ -149,6 +151,11 @@ class Middle:
         return float((axes[1] + slack) / (axes[2] + slack))
 
     @property
+    def thin(self) -> Floats:
+        """The direction in which it is thinnest, shape (3,), unit."""
+        return np.asarray(np.linalg.eigh(self.spread - _blur(self.box.volume))[1][:, 0])
+
+    @property
     def wide_mm(self) -> float:
         """About its diameter."""
         variances = np.linalg.eigvalsh(self.spread - _blur(self.box.volume))
@@ -201,7 +208,9 @@ def _blur(volume: Volume) -> Floats:
     return np.asarray(axes @ np.diag(spacing**2 / 12 + [BLUR_SIGMA_MM**2, BLUR_SIGMA_MM**2, 0.0]) @ axes.T)
 
 
-def read_marker(middle: Middle, normal: Floats, kinds: tuple[Kind, ...], diameter_mm: float | None) -> Reading:
+def read_marker(
+    middle: Middle, normal: Floats, kinds: tuple[Kind, ...] = get_args(Kind), diameter_mm: float | None = None
+) -> Reading:
     """Read a thing as a marker of the kind that is nearest to it; where others are as near, their centres count too.
 
     Args:
@@ -211,7 +220,12 @@ def read_marker(middle: Middle, normal: Floats, kinds: tuple[Kind, ...], diamete
     """
     if len(kinds) > 1 and middle.wide_mm < UNRESOLVED * float(spacing_mm(middle.box.volume).min()):
         kinds = ("ball",)
-    every = sorted((_fitted(middle, kind, normal, diameter_mm) for kind in kinds), key=_rank)
+    every = list[Reading]()
+    for kind in kinds:
+        every.append(_fitted(middle, kind, normal, diameter_mm))
+        if every[-1].misfit < SURE:
+            break
+    every.sort(key=_rank)
     best = every[0]
     off = [one.centre_ct - best.centre_ct for one in every if _rank(one) < AS_NEAR * _rank(best)]
     return replace(best, cov_ct=best.cov_ct + sum(np.outer(one, one) for one in off) / len(off))

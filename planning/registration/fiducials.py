@@ -208,7 +208,7 @@ def _candidates(volume: Volume, skin: Skin, ceiling_hu: float, noise: float) -> 
             peak = at + ends[row, :, 0] + first
             if tuple(peak) not in seen:
                 seen.add(tuple(peak))
-                yield _box(volume, ends[row] + first[:, None], peak, ceiling_hu, noise)
+                yield box_about(volume, ends[row] + first[:, None], peak, ceiling_hu, noise)
 
 
 def _about_body(volume: Volume, skin: Skin) -> tuple[Ints, NDArray[Any]]:
@@ -220,7 +220,8 @@ def _about_body(volume: Volume, skin: Skin) -> tuple[Ints, NDArray[Any]]:
     return low, volume.values[tuple(slice(a, max(a, b)) for a, b in zip(low, high, strict=True))]
 
 
-def _box(volume: Volume, ends: Ints, peak: Ints, ceiling_hu: float, noise: float) -> Box:
+def box_about(volume: Volume, ends: Ints, peak: Ints, ceiling_hu: float, noise: float) -> Box:
+    """What surrounds a thing whose voxels lie between ends, shape (3, 2), with its densest one at ``peak``."""
     around = np.maximum(np.ceil(AROUND_MM / spacing_mm(volume)), 2).astype(int)
     low, high = np.maximum(ends[:, 0] - around, 0), np.minimum(ends[:, 1] + around, volume.values.shape)
     part = volume.values[tuple(map(slice, low, high))].astype(np.float64)

@@ -1,7 +1,8 @@
 """Markers and a lesion found in a CT: by a voxel, as a person reads them, and by less than a voxel.
 
 The rule of Chen 2019, section 3.1, is a voxel's: the number of the slice that shows a marker best, times the spacing,
-and its place in that slice to 1 mm. The finer place is the middle of the metal, by weights.
+and its place in that slice to 1 mm. The finer place is that of the drawn marker that is nearest to the image
+(`puncture_twin.planning.registration.fiducial_reading`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.fiducial_reading import find_middle, read_marker
+from puncture_twin.planning.registration.fiducials import box_about, clipped_at, noise_hu
 
 READING_MM = 1.0
 """mm to which a person reads a place in a slice."""
@@ -33,7 +36,7 @@ class Markers(NamedTuple):
     """Markers that were found, in the order of those expected.
 
     Attributes:
-        fine: By the middle of the metal.
+        fine: By the drawn marker.
         rule: By slice number and millimetre.
     """
 
@@ -53,10 +56,23 @@ def find_markers(volume: Volume, expected: NamedPoints) -> Markers:
     """
     pieces = [piece for piece in metal_pieces(volume) if piece.size_mm <= LARGEST_MM]
     chosen = _named(pieces, expected, volume)
+    ceiling, noise = clipped_at(volume.values), noise_hu(volume.values)
     weights = [metal_weights(volume, piece) for piece in chosen]
-    fine = [centroid(some, piece.box, volume.T_ct_index) for some, piece in zip(weights, chosen, strict=True)]
     rule = [_by_rule(some, piece, volume) for some, piece in zip(weights, chosen, strict=True)]
+    fine = [_fine(some, piece, volume, ceiling, noise) for some, piece in zip(weights, chosen, strict=True)]
     return Markers(*(NamedPoints(expected.names, np.array(points), Space.LPS) for points in (fine, rule)))
+
+
+def _fine(weights: Floats, piece: Metal, volume: Volume, ceiling_hu: float, noise: float) -> Floats:
+    """The centre of the drawn marker, shape (3,), LPS mm; of what touches other metal the weighted middle."""
+    begin = np.array([one.start for one in piece.box])
+    inside = np.argwhere(piece.voxels) + begin
+    peak = inside[int(np.argmax(volume.values[tuple(inside.T)]))]
+    ends = np.stack([inside.min(axis=0), inside.max(axis=0) + 1], axis=1)
+    middle = find_middle(box_about(volume, ends, peak, ceiling_hu, noise))
+    if middle is None:
+        return centroid(weights, piece.box, volume.T_ct_index)
+    return read_marker(middle, middle.thin).centre_ct
 
 
 def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[Metal]:

@@ -53,8 +53,8 @@ CT, LABELS, CROSSED, FOUND, REPORT, PICTURE = (
     *("markers_ct.csv", "scan.json", "scan.png"),
 )
 MAX_REHEARSAL_BYTES = 50_000_000
-SUB_VOXEL_SD = 0.15
-"""Of a marker's middle along the bed, over the spacing: what the detector is held to where metal is clipped."""
+SUB_VOXEL_SD = 0.03
+"""Of a drawn marker along the bed, over the spacing: what the detector is held to where metal is clipped."""
 
 
 class ScanRequest(NamedTuple):
@@ -155,7 +155,7 @@ class ScanRun:
 
 
 def theory(settings: ScanSettings) -> dict[str, float]:
-    """Standard deviations of a reading, mm: of the rule uniform in its cell, of the metal's middle as held to."""
+    """Standard deviations of a reading, mm: of the rule uniform in its cell, of the drawn marker as held to."""
     return {
         "rule_along_bed": settings.spacing_mm / np.sqrt(12),
         "rule_in_plane": READING_MM / np.sqrt(12),
@@ -332,11 +332,9 @@ def _marker_blocks(found: dict[str, Any]) -> list[Block]:
     fields = (
         Field("errors, mm", "name"),
         Field("slice and millimetre", lambda one: _vector(one["rule_error_mm"])),
-        Field("middle of the metal", lambda one: _vector(one["error_mm"])),
+        Field("drawn marker", lambda one: _vector(one["error_mm"])),
     )
-    expected = (
-        "standard dev.  {rule_in_plane:.2f} in the plane, {rule_along_bed:.2f} along the bed; the middle of the metal"
-    )
+    expected = "standard dev.  {rule_in_plane:.2f} in the plane, {rule_along_bed:.2f} along the bed; the drawn marker"
     held = ": limit {middle_along_bed:.2f} along the bed"
     return [grid(fields, [*markers, {"name": "rms", **rms}]), (expected + held).format(**theory)]
 
