@@ -321,6 +321,36 @@ def rehearse(
 
 
 @app.command()
+def markers(
+    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Folder or file with a CT, or a case with one.")],
+    kind: Annotated[str | None, typer.Option("--kind", metavar="ball|disc|ring", help="Kind of all markers.")] = None,
+    diameter: Annotated[float | None, typer.Option("--diameter", metavar="MM", help="Their diameter, 1 to 15.")] = None,
+    count: Annotated[int | None, typer.Option("--count", metavar="N", help="How many there are.")] = None,
+    layout: Annotated[
+        Path | None, typer.Option("--layout", metavar="FILE", help="Names them: points of any frame, by distances.")
+    ] = None,
+    propose: Annotated[
+        int | None, typer.Option("--propose", metavar="N", help="Propose places for N markers on the skin of a CASE.")
+    ] = None,
+    out_dir: OutOfCaseOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the markers on the skin of a CT, or propose places for them. Writes their list for case and Slicer."""
+    from puncture_twin.twin.jobs.patient import markers_job
+
+    stated = markers_job.stated_of(kind, diameter, count, layout, propose)
+    folder = out_folder(out_dir, source, "markers")
+    if propose is not None:
+        with prepared(source) as context:
+            proposed = markers_job.propose_places(context, folder, propose)
+        finish("markers", proposed, proposed.summary(), proposed.text(), as_json)
+        return
+    with progress_display() as progress:
+        run = markers_job.find_markers(source, folder, stated, layout, progress)
+    finish("markers", run, run.summary(), run.text(), as_json)
+
+
+@app.command()
 @with_choice
 def touch(
     case: CaseArgument,

@@ -54,6 +54,7 @@ def commands(cases: Path) -> Iterator[Command]:
     yield Command("carton-scan", ("scan", carton, "--spacing", "5", "--pixel", "2", "--out", "carton-scan"))
     yield Command("carton-touch", ("touch", carton, *angles, "--out", "carton-touch"), slow=True)
     yield Command("carton-pivot", ("pivot", carton, "--poses", "4", "--out", "carton-pivot"), slow=True)
+    yield Command("carton-markers", ("markers", carton, "--propose", "4", "--out", "carton-markers"))
     sweep = ("rehearse", carton, *angles, "--sweep", "--to", "24,226", "--out", "carton-sweep")
     yield Command("carton-sweep", sweep, slow=True)
     check = ("check", str(cases / "abdomen"), "--theta", "30", "--beta", "100", "--json")

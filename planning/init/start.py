@@ -8,13 +8,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.errors import InputListError, refuse
+from puncture_twin.planning.base.cache.entry_file import Arrays
+from puncture_twin.planning.base.errors import InputListError, NoAnswerError, refuse
 from puncture_twin.planning.base.progress import Names
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.evidence.target import readings_inside
+from puncture_twin.planning.formats.points import NamedPoints
+from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.init.case_text import CaseParts, case_text
@@ -39,6 +44,7 @@ from puncture_twin.planning.init.target import (
     role_notes,
     typed_target,
 )
+from puncture_twin.planning.registration.fiducials import Stated, find_fiducials
 
 ALLOWED = (
     "a folder with a segmentation, and a CT (NIfTI, NRRD or a DICOM series) or a structure named skin or body, see "
@@ -46,6 +52,8 @@ ALLOWED = (
 )
 
 
+SEEN = "markers_ct.csv"
+"""Where markers are listed that the CT shows."""
 OUTSIDE_WAYS = "a point in the body, mm, in the space given by --space; or --skin NAME for another skin"
 PHANTOM = (
     'region = "phantom": no limbs are searched for, and the connected object is the phantom; it has no support unless '
@@ -81,11 +89,13 @@ class Start:
 
     Attributes:
         notes: What a person should look at, one sentence each.
+        seen: Markers that the CT shows where no list of them is given, as they are to be written beside the case.
     """
 
     text: str
     parts: CaseParts
     notes: tuple[str, ...]
+    seen: Markers | None = None
 
 
 def start_case(request: Request, cache: Cache, progress: Names) -> Start:
@@ -106,6 +116,7 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     body = _checked(found, point, request)
     progress("skin")
     skin = body.skin()
+    seen, of_seen = _seen_in_ct(request.folder, found, body, skin)
     progress("structures")
     if point is not None and body.ct is not None:
         _refuse_outside(point, body.ct, skin, space)
@@ -130,13 +141,13 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         sources=tuple(
             (one, assign(one.names, region, target.holding, left_out, stated)) for one in found.segmentations
         ),
-        markers=tuple(_markers_of_ct(found.markers, body.ct)),
+        markers=tuple(_markers_of_ct(found.markers, body.ct)) or tuple(filter(None, [seen])),
         left_out=tuple(name for name, why in found.passed if why == LEFT_OUT),
         keys=overrides.keys,
     )
     told = carved_notes(parts.rows, target.holding.target, border)
-    notes = (*_notes(request, found, target, parts), *told, *outlines.notes(target.point_ct))
-    return Start(case_text(parts), parts, notes)
+    notes = (*_notes(request, found, target, parts), *of_seen, *told, *outlines.notes(target.point_ct))
+    return Start(case_text(parts), parts, notes, seen)
 
 
 def _target(request: Request, point: Floats | None, outlines: Outlines) -> Target:
@@ -268,6 +279,29 @@ def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:
         return sorted(markers, key=lambda one: one.source)
     grid = ct.surfaces.source.grid
     return sorted(markers, key=lambda one: (not all(grid.holds(point) for point in one.points.points), one.source))
+
+
+def _seen_in_ct(folder: Path, found: Found, body: Body, skin: Skin) -> tuple[Markers | None, tuple[str, ...]]:
+    """Markers on the skin in the CT, where no list is given and none would be replaced; and notes for a person."""
+    if found.markers or body.ct is None or (folder / SEEN).exists():
+        return None, ()
+    imaged = body.ct.surfaces.imaged()
+
+    def look() -> Arrays:
+        volume = Volume(imaged.image.hu, imaged.image.T_ct_index, folder)
+        try:
+            seen = find_fiducials(volume, skin, Stated(), where=folder).fiducials
+        except NoAnswerError as error:
+            return {"points": np.zeros((0, 3)), "why": np.array("" if error.code == "no_markers" else str(error))}
+        return {"points": np.array([one.position_ct for one in seen]), "why": np.array("")}
+
+    kept = imaged.kept({"what": "markers", "skin": skin.mesh.digest}, look, dict, by=__name__)
+    points, why = kept["points"], str(kept["why"])
+    if not len(points):
+        return None, (f"the CT may show markers ({why}): see run-twin markers {folder}",) if why else ()
+    names = tuple(f"M{number}" for number in range(1, len(points) + 1))
+    note = f"the CT shows {len(points)} markers, written to {SEEN}; run-twin markers {folder} draws them"
+    return Markers(SEEN, NamedPoints(names, points, Space.LPS)), (note,)
 
 
 def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> Iterator[str]:

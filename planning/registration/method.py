@@ -201,7 +201,7 @@ def renamings(markers: MarkerPairs, target_ct: Floats, alike_mm: float, *, movin
     """
     x, y = (points - points.mean(axis=0) for points in (markers.points_ct, markers.points_base))
     bound = len(markers) * alike_mm**2
-    orders = _matching(x, y, bound)
+    orders = matching(x, y, bound)
     complete = orders is not None
     fitting = _fitting_swaps(x, y, bound) if orders is None else orders[rigid_rss(x, y[orders]) <= bound]
     T_given = fit_rigid(markers.points_ct, markers.points_base)
@@ -221,7 +221,7 @@ def _rss(H: Floats, spreads: Floats | float) -> Floats:
     return np.asarray(np.maximum(spreads - 2 * values.sum(axis=-1), 0.0))
 
 
-def _matching(x: Floats, y: Floats, bound: float) -> Ints | None:
+def matching(x: Floats, y: Floats, bound: float) -> Ints | None:
     """Every permutation that can have an RSS within the bound, shape (m, n); None where too many begin well."""
     count = len(x)
     in_ct, in_base = (np.linalg.norm(p[:, None] - p[None], axis=2) for p in (x, y))

@@ -7,7 +7,7 @@ from fuzz.mutate import NUMBERS, pick
 
 COMMANDS = [
     *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "live", "export", "register"],
-    *["touch", "pivot"],
+    *["touch", "pivot", "markers"],
     *["calibrate", "calibrate hand-eye", "batch", "batch run", "batch status", "batch merge", "batch compare"],
     *["schema", "init", "selfcal", "servo", "reproduce", "scan", "", "serch", "x" * 3000, "--help", "-h", "--version"],
 ]
@@ -42,6 +42,11 @@ OPTIONS = {
     "--trust-labels": None,
     "--force": None,
     "--cross-check": "number",
+    "--kind": "word",
+    "--diameter": "number",
+    "--count": "number",
+    "--layout": "path",
+    "--propose": "number",
     "--engine": "word",
     "--format": "word",
     "--json": None,

@@ -50,6 +50,7 @@ WRITING = {
     "reproduce",
     "scan",
     "touch",
+    "markers",
 }
 
 ENDS_BY_CTRL_C = {"mirror"}
@@ -89,6 +90,7 @@ def typed(tmp_path_factory):
         "register": [case],
         "batch": ["plan", str(cohort)],
         "scan": [case],
+        "markers": [case, "--propose", "3"],
         "touch": [case],
         "pivot": [case, str(here / "joints.csv")],  # it reads the case first
         "selfcal": [str(here / "selfcal")],

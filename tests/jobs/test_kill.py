@@ -39,6 +39,7 @@ WRITTEN = {
     "batch merge": ("candidates/id=1/a.parquet", "candidates/id=2/a.parquet", "cases.parquet", "cohort.html"),
     "scan": ("dicom/IM0001.dcm", "ct.nii.gz", "labels.nii.gz", "markers_ct.csv", "scan.json", "scan.png"),
     "touch": ("touch.csv", "touch.json"),
+    "markers": ("markers_ct.csv", "markers_ct.mrk.json", "markers.png", "markers.json"),
     "pivot": ("pivot.csv", "pivot.json"),
     "sweep": ("sweep.json", "sweep.png"),
     "reproduce": ("camera_1.png", "camera_2.png", "convergence.png", "servo.html"),
@@ -170,6 +171,7 @@ def test_export_killed_at_random(plans, tmp_path):
         ("scan", ["scan", "--spacing", "5", "--pixel", "2"]),
         ("touch", ["touch", "--theta", "18", "--beta", "232"]),
         ("pivot", ["pivot", "--poses", "4"]),
+        ("markers", ["markers", "--propose", "4"]),
         ("sweep", ["rehearse", "--theta", "18", "--beta", "232", "--sweep", "--to", "19,231"]),
     ],
 )

@@ -81,6 +81,7 @@ RULES: Mapping[str, Rule] = MappingProxyType(
             "by none of the ways the trials keep to what `search.min_hit`, `max_touch`, `max_touch_of` allow",
             _unless(lambda found: found.passed),
         ),
+        "markers": Rule("no markers are found, too few, too many, or of several kinds; with `--propose` no places"),
         "touch": Rule("too few markers were touched for a registration", _unless(lambda run: run.suffices)),
         "pivot": Rule("the touches contradict each other", _unless(lambda found: not found.pivot.large)),
         "place": Rule("no direction is safe for the organs, or no placement reaches one"),

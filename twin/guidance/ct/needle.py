@@ -9,11 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.special import ndtr
 
-from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.formats.volumes.volume_files import Volume
-from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.ct.markers import (
+from puncture_twin.planning.anatomy.metal import (
     AROUND_MM,
     METAL_HU,
     Metal,
@@ -25,6 +21,10 @@ from puncture_twin.twin.guidance.ct.markers import (
     spacing_mm,
     wide_metal,
 )
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.errors import InputError, refuse
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.rigid import apply
 
 SHORTEST_MM = 20.0
 """A shorter piece of metal is no needle."""

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.metal import METAL_HU
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import FORMAT, read_output
@@ -30,7 +31,7 @@ from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.twin.guidance.ct.markers import METAL_HU, READING_MM, Markers, find_markers, read_lesion
+from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_markers, read_lesion
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, needle_error
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.plant.outside_objects import Arms, Bed, OutsideObjects, Part
@@ -52,8 +53,8 @@ CT, LABELS, CROSSED, FOUND, REPORT, PICTURE = (
     *("markers_ct.csv", "scan.json", "scan.png"),
 )
 MAX_REHEARSAL_BYTES = 50_000_000
-SUB_VOXEL_SD = 0.15
-"""Of a marker's middle along the bed, over the spacing: what the detector is held to where metal is clipped."""
+SUB_VOXEL_SD = 0.03
+"""Of a drawn marker along the bed, over the spacing: what the detector is held to where metal is clipped."""
 
 
 class ScanRequest(NamedTuple):
@@ -154,7 +155,7 @@ class ScanRun:
 
 
 def theory(settings: ScanSettings) -> dict[str, float]:
-    """Standard deviations of a reading, mm: of the rule uniform in its cell, of the metal's middle as held to."""
+    """Standard deviations of a reading, mm: of the rule uniform in its cell, of the drawn marker as held to."""
     return {
         "rule_along_bed": settings.spacing_mm / np.sqrt(12),
         "rule_in_plane": READING_MM / np.sqrt(12),
@@ -331,11 +332,9 @@ def _marker_blocks(found: dict[str, Any]) -> list[Block]:
     fields = (
         Field("errors, mm", "name"),
         Field("slice and millimetre", lambda one: _vector(one["rule_error_mm"])),
-        Field("middle of the metal", lambda one: _vector(one["error_mm"])),
+        Field("drawn marker", lambda one: _vector(one["error_mm"])),
     )
-    expected = (
-        "standard dev.  {rule_in_plane:.2f} in the plane, {rule_along_bed:.2f} along the bed; the middle of the metal"
-    )
+    expected = "standard dev.  {rule_in_plane:.2f} in the plane, {rule_along_bed:.2f} along the bed; the drawn marker"
     held = ": limit {middle_along_bed:.2f} along the bed"
     return [grid(fields, [*markers, {"name": "rms", **rms}]), (expected + held).format(**theory)]
 

@@ -17,6 +17,7 @@ from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case import ALLOWED_CASE
 from puncture_twin.planning.case.case_file import CaseFile, Region
+from puncture_twin.planning.formats.points import write_points
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 from puncture_twin.planning.init.case_text import with_image_seen
 from puncture_twin.planning.init.overrides import WAYS, with_keys
@@ -41,6 +42,11 @@ class InitRun:
     warnings: tuple[str, ...]
     picture: Path | None
 
+    @property
+    def markers(self) -> Path | None:
+        """The list of the markers that the CT shows, where none was given."""
+        return None if self.start.seen is None else self.path.parent / self.start.seen.source
+
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm, in the case's space."""
         parts = self.start.parts
@@ -64,7 +70,7 @@ class InitRun:
                 else one
                 for one in self.context.case.inputs
             ),
-            "files": [str(path) for path in (self.path, self.picture) if path is not None],
+            "files": [str(path) for path in (self.path, self.picture, self.markers) if path is not None],
         }
 
 
@@ -98,6 +104,9 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
             ) from error
         text = _with_seen(start, request, context)
         parse_toml(text.encode(), path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
+        if start.seen is not None:
+            points, space = start.seen.points, start.parts.space
+            write_points(folder / start.seen.source, replace(points, points=to_lps(points.points, space), space=space))
         draft.write_text(text, encoding="utf-8")
         found = [one.replace(draft.name, CASE) for one in context.provenance()["warnings"]]
     picture = None if context.anatomy.scan is None else folder / SLICES

@@ -1,0 +1,154 @@
+"""Metal in a CT: its connected pieces, how much of each voxel is metal, and the middle by these parts."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.rigid import apply
+
+METAL_HU = 1500.0
+"""Cortical bone and teeth end about here; half a voxel of steel has more."""
+AROUND_MM = 3.0
+"""So far about metal its surroundings are looked at."""
+BLUR_MM = 1.5
+"""So far from its voxels a piece of metal still blurs into others; beyond, they show what it lies in."""
+
+TOUCHED = 1.01
+"""Voxels: the next one may be filled in part."""
+
+EDGE_MM = 1.5
+"""mm by which the edges of wide metal protrude from the balls that fit into it."""
+
+SOLID_HU = 8000.0
+"""Assumed of a voxel that is wholly metal, whose value the range of the image clips. It only decides at which part of
+metal a voxel in air and one in tissue count as full: alike, so that a marker on the skin is not drawn to one side."""
+LEAST_PART = 0.02
+"""Below this a voxel's noise, not metal, is weighed."""
+
+Box = tuple[slice, slice, slice]
+
+
+class Metal(NamedTuple):
+    """One connected piece of metal.
+
+    Attributes:
+        box: Its voxels' box with `AROUND_MM` about it.
+        voxels: Of the box: which belong to the piece.
+        middle_ct: Shape (3,), of its voxels, LPS mm.
+        size_mm: The longest side of its box.
+    """
+
+    box: Box
+    voxels: Bools
+    middle_ct: Floats
+    size_mm: float
+
+
+def spacing_mm(volume: Volume) -> Floats:
+    """Distance of neighbouring voxels along i, j and k, shape (3,)."""
+    return np.asarray(np.linalg.norm(volume.T_ct_index[:3, :3], axis=0))
+
+
+def wide_metal(volume: Volume, diameter_mm: float) -> Bools:
+    """Voxels of metal that is wider than a rod, and those into which it blurs; shape of the image.
+
+    Wide is what a ball fits into that is wider than the rod's own image.
+    """
+    metal, spacing = volume.values > METAL_HU, spacing_mm(volume)
+    radius = diameter_mm / 2 + BLUR_MM
+    core = ndimage.distance_transform_edt(np.pad(metal, 1), spacing)[1:-1, 1:-1, 1:-1] > radius  # erosion
+    if not core.any():
+        return np.zeros_like(metal)
+    return np.asarray(ndimage.distance_transform_edt(~core, spacing) <= radius + EDGE_MM + BLUR_MM)
+
+
+def metal_pieces(volume: Volume, level_hu: float = METAL_HU, without: Bools | None = None) -> Iterator[Metal]:
+    """Every connected piece of metal, diagonal neighbours included, from a level on, but for some voxels."""
+    metal = volume.values > level_hu
+    labels, _ = ndimage.label(metal if without is None else metal & ~without, structure=np.ones((3, 3, 3)))
+    spacing = spacing_mm(volume)
+    around = np.ceil(AROUND_MM / spacing).astype(int)
+    for number, found in enumerate(ndimage.find_objects(labels), start=1):
+        low, high = np.array([(one.start, one.stop) for one in found]).T
+        begin, end = np.maximum(low - around, 0), np.minimum(high + around, volume.values.shape)
+        box = (slice(begin[0], end[0]), slice(begin[1], end[1]), slice(begin[2], end[2]))
+        voxels = labels[box] == number
+        middle = apply(volume.T_ct_index, np.argwhere(voxels).mean(axis=0) + begin)
+        yield Metal(box, voxels, middle, float(((high - low) * spacing).max()))
+
+
+def metal_parts(
+    volume: Volume, metal: Metal, *, level_hu: float = METAL_HU, solid_hu: float = SOLID_HU, least: float = LEAST_PART
+) -> Floats:
+    """Part of each voxel of a piece's box that is metal, 0 to 1, as far as a clipped range allows.
+
+    What a voxel would show without metal is what the nearest voxel shows that is too far away to be blurred by it:
+    air on one side of a marker and skin on the other. Without that, air would hide the outer edge of a marker.
+
+    Args:
+        level_hu: From where on other voxels of the box are metal too.
+        solid_hu: Of a voxel that is wholly metal.
+        least: Below this a part is noise.
+    """
+    values = volume.values[metal.box].astype(np.float64)
+    every, outside = _sides(values, volume, metal, level_hu)
+    if not outside.any():
+        return np.asarray(metal.voxels, dtype=np.float64)
+    background = metal_background(volume, metal, level_hu)
+    parts = (values - background) / (solid_hu - background)  # linear partial volume
+    others = every & ~metal.voxels
+    spacing = spacing_mm(volume)
+    mine = ndimage.distance_transform_edt(~metal.voxels, spacing)
+    strange = others.any() and mine >= ndimage.distance_transform_edt(~others, spacing)  # nearer to another piece
+    return np.where(outside | strange | (parts < least), 0.0, parts)
+
+
+def metal_background(volume: Volume, metal: Metal, level_hu: float = METAL_HU) -> Floats:
+    """What each voxel of a piece's box would show without metal, HU."""
+    values = volume.values[metal.box].astype(np.float64)
+    _, outside = _sides(values, volume, metal, level_hu)
+    nearest = ndimage.distance_transform_edt(~outside, spacing_mm(volume), return_distances=False, return_indices=True)
+    return np.asarray(_smooth(values, outside)[tuple(nearest)])
+
+
+def _sides(values: Floats, volume: Volume, metal: Metal, level_hu: float) -> tuple[Bools, Bools]:
+    """Of a piece's box: every voxel of metal, its own and others', and those that none blurs into, or fills in part."""
+    every, spacing = metal.voxels | (values > level_hu), spacing_mm(volume)
+    reach = np.maximum(BLUR_MM, TOUCHED * spacing)
+    return every, np.asarray(ndimage.distance_transform_edt(~every, spacing / reach) > 1.0)
+
+
+def full_part(volume: Volume) -> float:
+    """Part of metal from which a voxel is clipped, in soft tissue."""
+    return float(volume.values.max()) / SOLID_HU
+
+
+def metal_weights(volume: Volume, metal: Metal) -> Floats:
+    """Weights of metal, counted as full from where a voxel may be clipped: in air and in tissue alike."""
+    full = full_part(volume)
+    return np.asarray(np.minimum(metal_parts(volume, metal), full) / full)
+
+
+def _smooth(values: Floats, some: Bools) -> Floats:
+    """The mean about each voxel of those that count."""
+    near = ndimage.gaussian_filter(some.astype(np.float64), 1.0)
+    return np.asarray(ndimage.gaussian_filter(np.where(some, values, 0.0), 1.0) / np.maximum(near, 1e-3))
+
+
+def centroid(weights: Floats, box: Box, T_ct_index: Floats) -> Floats:
+    """The weights' middle, shape (3,), LPS mm."""
+    starts = [axis.start for axis in box]
+    index = [np.tensordot(np.arange(n), weights.sum(axis=_others(axis)), 1) for axis, n in enumerate(weights.shape)]
+    return apply(T_ct_index, np.array(index) / weights.sum() + starts)
+
+
+def _others(axis: int) -> tuple[int, int]:
+    a, b = itertools.compress(range(3), [one != axis for one in range(3)])
+    return a, b

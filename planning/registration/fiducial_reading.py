@@ -1,0 +1,399 @@
+"""A dense thing in a CT read as a marker: kind, size and centre by drawing it again, and how well they are known.
+
+A marker is drawn as a scanner would show it: the part of each voxel that it fills, blurred in the plane, in what lies
+about it, clipped where the image is. From the weighted middle (`puncture_twin.planning.anatomy.metal`) on, Gauss-Newton
+moves it until its drawing is nearest to the image; with p the shift, size, tilt, density and blur, J the drawing's
+derivatives and P what is known beforehand of p,
+
+    cov p = s^2 (J' J + s^2 P^-1)^-1,   s^2 the mean square of what the drawing lacks, at least the image's noise.
+
+So thickness of slices, noise, blur and clipping all enter: a clipped voxel has no derivative, and what no drawing
+explains makes the centre uncertain. The kind is that whose drawing is nearest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from scipy import ndimage
+
+from puncture_twin.planning.anatomy.metal import (
+    BLUR_MM,
+    SOLID_HU,
+    Metal,
+    centroid,
+    metal_background,
+    metal_parts,
+    spacing_mm,
+)
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.numba_kernels import nb
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
+from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about
+
+Kind = Literal["ball", "disc", "ring"]
+
+LEAST_MM, LARGEST_MM = 1.0, 15.0
+"""Diameters of markers."""
+TISSUE_HU = 50.0
+"""Muscle, and about what skin and fat have at most: the level at which a marker ends lies between this and its own."""
+CLIPPED = 0.97
+"""Of the image's greatest value: a voxel from here on may have been clipped."""
+FINE_MM, MOST_FINE = 0.5, 8
+"""Voxels are filled by cells so wide, and by so many along an axis at most."""
+HOLE = 0.4
+"""Diameter of a ring's hole over its own, assumed."""
+GROWN = 0.3
+"""Part of a marker's contrast at which it must still be alone: a wire goes on there, where noise had cut it."""
+PLAIN = MappingProxyType({"ball": 1.0, "disc": 1.1, "ring": 1.2})
+"""By which misfits are weighed: the simpler drawing has fewer freedoms."""
+SURE = 0.1
+"""A misfit below which no other kind is drawn."""
+AS_NEAR = 1.4
+"""Times the least misfit: such a kind may be the true one."""
+UNRESOLVED = 2.5
+"""Voxels: what is no wider in the image shows no kind."""
+SKIN_EDGE_MM = 0.12
+"""How far a marker is drawn along the skin's normal by what it hides of the skin's edge; metal is drawn less."""
+ROUNDS = 7
+"""Of Gauss-Newton; it settles after four or five."""
+SHIFT, SIZE, THICK, DENSITY, TILT = 0.5, 0.35, 0.7, 0.7, 0.25
+"""What is known beforehand (standard deviations): a shift in voxels; logarithms of size, thickness and density; rad."""
+STEPS = np.array([0.05, 0.05, 0.05, 0.05, 0.02, 0.03, 0.05, 0.05, 0.05])
+"""By which derivatives of a drawing are taken: shift, density, size, blur, thickness, tilts."""
+SETTLED_MM = 0.002
+STATED = 0.07
+"""Of the logarithm of a diameter that a person states."""
+THICK_MM = 2.5
+BLUR_SIGMA_MM, BLUR_KNOWN = 0.45, 0.12
+"""Of reconstruction and pixel together, in the plane, mm."""
+FLOOR = (0.02, 0.02)
+"""Standard deviation that no reading is below: mm, and part of a voxel along each axis."""
+
+
+class Shape(NamedTuple):
+    """A marker's shape: thickness and normal (3,), unit, of a disc or ring; of a ball they say nothing."""
+
+    kind: Kind
+    diameter_mm: float
+    thick_mm: float
+    normal: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """One dense thing, read as a marker.
+
+    Attributes:
+        centre_ct: Shape (3,), LPS mm.
+        cov_ct: Shape (3, 3), mm².
+        contrast_hu: Its greatest value above soft tissue's; of clipped metal at least so much.
+        clipped: Whether the image's range clips it.
+        misfit: Root mean square of what its drawing lacks, over that of its contrast; 0 is a perfect marker.
+    """
+
+    centre_ct: Floats
+    cov_ct: Floats
+    shape: Shape
+    contrast_hu: float
+    clipped: bool
+    misfit: float
+
+
+class Box(NamedTuple):
+    """What surrounds one thing.
+
+    Attributes:
+        volume: The voxels of the box, as an image of its own, float64.
+        peak: Shape (3,), index of its densest voxel.
+        ceiling_hu: Where the whole image clips; infinite where it does not.
+    """
+
+    volume: Volume
+    peak: Ints
+    ceiling_hu: float
+    noise_hu: float
+
+
+@dataclass(frozen=True, eq=False)
+class Middle:
+    """A thing's weighted middle.
+
+    Attributes:
+        centre_ct: Shape (3,), LPS mm.
+        spread: Shape (3, 3), mm², second moment about it.
+        solid_hu: Of what it is made.
+        background: Shape of the box, HU: what it would show without.
+    """
+
+    box: Box
+    voxels: Bools
+    centre_ct: Floats
+    spread: Floats
+    peak_hu: float
+    solid_hu: float
+    background: Floats
+
+    @property
+    def clipped(self) -> bool:
+        """Whether the image's range clips it."""
+        return self.peak_hu >= CLIPPED * self.box.ceiling_hu
+
+    @property
+    def roundness(self) -> float:
+        """Middle over greatest variance of its axes, 0 to 1; what slices cannot resolve counts as round."""
+        axes = np.linalg.eigvalsh(self.spread)
+        slack = float(np.max(spacing_mm(self.box.volume))) ** 2 / 12
+        return float((axes[1] + slack) / (axes[2] + slack))
+
+    @property
+    def thin(self) -> Floats:
+        """The direction in which it is thinnest, shape (3,), unit."""
+        return np.asarray(np.linalg.eigh(self.spread - _blur(self.box.volume))[1][:, 0])
+
+    @property
+    def wide_mm(self) -> float:
+        """About its diameter."""
+        variances = np.linalg.eigvalsh(self.spread - _blur(self.box.volume))
+        return float(np.clip(4 * np.sqrt(max(float(variances[1:].mean()), 0.0)), LEAST_MM, 1.3 * LARGEST_MM))
+
+
+def find_middle(box: Box) -> Middle | None:
+    """The middle of what holds together with a box's densest voxel at half of its contrast.
+
+    Returns:
+        None where it ends nowhere near: a part of something larger.
+    """
+    volume, spacing = box.volume, spacing_mm(box.volume)
+    contrast = float(volume.values[tuple(box.peak)]) - TISSUE_HU
+    level = TISSUE_HU + contrast / 2
+    mask = _joined(volume.values > level, box.peak)
+    wider = _joined(volume.values > TISSUE_HU + GROWN * contrast, box.peak)
+    if mask is None or wider is None:
+        return None
+    sides, more = (np.ptp(np.argwhere(one), axis=0) + 1 for one in (mask, wider))
+    if np.any((more - sides) * spacing > 2 * (BLUR_MM + spacing)):  # a wire, which noise has cut at the higher level
+        return None
+    peak = float(np.percentile(volume.values[mask], 90))
+    solid = SOLID_HU if peak > CLIPPED * box.ceiling_hu or (sides * spacing).max() < 2 * spacing.max() else peak
+    whole = (slice(0, mask.shape[0]), slice(0, mask.shape[1]), slice(0, mask.shape[2]))
+    metal = Metal(whole, mask, np.zeros(3), float((sides * spacing).max()))
+    full = min(1.0, box.ceiling_hu / solid)
+    parts = np.minimum(metal_parts(volume, metal, level_hu=level, solid_hu=solid), full)
+    if not parts.any():
+        return None
+    centre = centroid(parts, whole, volume.T_ct_index)
+    points = np.argwhere(parts > 0) @ volume.T_ct_index[:3, :3].T + volume.T_ct_index[:3, 3] - centre
+    heavy = parts[parts > 0]
+    spread = (points * heavy[:, None]).T @ points / heavy.sum()
+    return Middle(box, mask, centre, spread, peak, solid, metal_background(volume, metal, level))
+
+
+def _joined(mask: Bools, at: Ints) -> Bools | None:
+    """The part of a mask that holds a voxel; None where it reaches the box's faces."""
+    labels, _ = ndimage.label(mask, structure=np.ones((3, 3, 3)))
+    mine = np.asarray(labels == labels[tuple(at)])
+    inner = mine[1:-1, 1:-1, 1:-1]
+    return mine if labels[tuple(at)] and np.count_nonzero(inner) == np.count_nonzero(mine) else None
+
+
+def _blur(volume: Volume) -> Floats:
+    """Covariance of what blurs an image, shape (3, 3), mm²."""
+    spacing = spacing_mm(volume)
+    axes = volume.T_ct_index[:3, :3] / spacing
+    return np.asarray(axes @ np.diag(spacing**2 / 12 + [BLUR_SIGMA_MM**2, BLUR_SIGMA_MM**2, 0.0]) @ axes.T)
+
+
+def read_marker(
+    middle: Middle, normal: Floats, kinds: tuple[Kind, ...] = get_args(Kind), diameter_mm: float | None = None
+) -> Reading:
+    """Read a thing as a marker of the kind that is nearest to it; where others are as near, their centres count too.
+
+    Args:
+        normal: Shape (3,), unit, of the skin: a disc or ring lies about so.
+        kinds: Those that it may be.
+        diameter_mm: As a person states it.
+    """
+    if len(kinds) > 1 and middle.wide_mm < UNRESOLVED * float(spacing_mm(middle.box.volume).min()):
+        kinds = ("ball",)
+    every = list[Reading]()
+    for kind in kinds:
+        every.append(_fitted(middle, kind, normal, diameter_mm))
+        if every[-1].misfit < SURE:
+            break
+    every.sort(key=_rank)
+    best = every[0]
+    off = [one.centre_ct - best.centre_ct for one in every if _rank(one) < AS_NEAR * _rank(best)]
+    return replace(best, cov_ct=best.cov_ct + sum(np.outer(one, one) for one in off) / len(off))
+
+
+def _rank(reading: Reading) -> float:
+    return reading.misfit * PLAIN[reading.shape.kind]
+
+
+def _fitted(middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | None) -> Reading:
+    """The marker of a kind whose drawing is nearest to the image."""
+    drawing, noise = _Drawing.of(middle, kind, normal, diameter_mm), middle.box.noise_hu
+    start, known = drawing.start, drawing.known
+
+    def linearised(p: Floats) -> System[Floats]:
+        image = drawing.image(p)
+        sd = max(noise, float(np.sqrt(np.mean((drawing.seen - image) ** 2))))
+        slopes = [(drawing.image(p + step) - image) / step.sum() for step in np.diag(drawing.steps)]
+
+        def residuals(q: Floats, image: Floats) -> Floats:
+            return np.concatenate([(image - drawing.seen) / sd, (q - start) / known])
+
+        def cost(q: Floats) -> float:
+            return float(np.sum(residuals(q, drawing.image(q)) ** 2))
+
+        return System(residuals(p, image), np.vstack([np.column_stack(slopes) / sd, np.diag(1 / known)]), cost)
+
+    fit = gauss_newton(start, linearised, np.add, lambda _, step: bool(np.abs(step[:3]).max() < SETTLED_MM), ROUNDS)
+    p, shape = fit.estimate, drawing.shape(fit.estimate)
+    cov = np.linalg.inv(fit.system.information)[:3, :3] + _unknown(middle, shape, drawing.solid_hu(p), normal)
+    off = float(np.sqrt(np.mean((drawing.seen - drawing.image(p)) ** 2)))
+    hu = middle.peak_hu - TISSUE_HU
+    return Reading(middle.centre_ct + p[:3], cov, shape, hu, middle.clipped, off / drawing.contrast_hu)
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawing:
+    """A marker drawn into what lies about it.
+
+    Its unknowns are the shift (3), logarithms of density and size, the blur; of a disc or ring the logarithm of its
+    thickness and two tilts too.
+
+    Attributes:
+        start: Shape (p,), of the unknowns.
+        known: Shape (p,), how well each is known beforehand, standard deviations.
+        near: Shape of the box: the voxels that are compared.
+    """
+
+    middle: Middle
+    kind: Kind
+    normal: Floats
+    start: Floats
+    known: Floats
+    near: Bools
+
+    @classmethod
+    def of(cls, middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | None) -> _Drawing:
+        size = diameter_mm or (np.sqrt(1.25) if kind == "ball" else 1.0) * middle.wide_mm
+        start = np.concatenate([np.zeros(3), np.log([middle.solid_hu, size]), [BLUR_SIGMA_MM, np.log(THICK_MM), 0, 0]])
+        of_size = SIZE if diameter_mm is None else STATED
+        shift = SHIFT * spacing_mm(middle.box.volume)
+        known = np.array([*shift, DENSITY, of_size, BLUR_KNOWN, THICK, TILT, TILT])
+        count = 6 if kind == "ball" else 9
+        near = ndimage.binary_dilation(middle.voxels, np.ones((3, 3, 3)), iterations=2)
+        return cls(middle, kind, normal, start[:count], known[:count], near)
+
+    @property
+    def seen(self) -> Floats:
+        """Of the image, HU, shape (n,)."""
+        return self.middle.box.volume.values[self.near]
+
+    @property
+    def contrast_hu(self) -> float:
+        """Root mean square of what is seen above what lies about it."""
+        return float(np.sqrt(np.mean((self.seen - self.middle.background[self.near]).clip(0.0) ** 2)))
+
+    @property
+    def steps(self) -> Floats:
+        """By which derivatives are taken, shape (p,)."""
+        return STEPS[: len(self.start)]
+
+    def solid_hu(self, p: Floats) -> float:
+        """What it is made of."""
+        return float(np.exp(p[3]))
+
+    def shape(self, p: Floats) -> Shape:
+        """The marker of unknowns (p,)."""
+        if self.kind == "ball":
+            return Shape(self.kind, float(np.exp(p[4])), THICK_MM, self.normal)
+        tilt = exp_rotation(frame_about(self.normal) @ np.array([p[7], p[8], 0.0]))
+        return Shape(self.kind, float(np.exp(p[4])), float(np.exp(p[6])), tilt @ self.normal)
+
+    def image(self, p: Floats) -> Floats:
+        """As a scanner shows it, shape (n,), HU."""
+        box, background = self.middle.box, self.middle.background
+        part = filled(box.volume, self.shape(p), self.middle.centre_ct + p[:3])
+        sigma = abs(p[5]) / spacing_mm(box.volume)[:2]
+        part = ndimage.gaussian_filter(part, [*sigma, 0.0], mode="nearest")
+        image = background + part * (self.solid_hu(p) - background)
+        return np.asarray(np.minimum(image, box.ceiling_hu)[self.near])
+
+
+def _unknown(middle: Middle, shape: Shape, solid_hu: float, normal: Floats) -> Floats:
+    """What no drawing knows of a centre, shape (3, 3), mm²: within a voxel that is wider, and at the skin's edge."""
+    spacing = spacing_mm(middle.box.volume)
+    axes = middle.box.volume.T_ct_index[:3, :3] / spacing
+    free = np.maximum(0.0, spacing**2 - shape.diameter_mm**2) / 12
+    along = FLOOR[0] ** 2 + (FLOOR[1] * spacing) ** 2 + free
+    edge = SKIN_EDGE_MM * min(1.0, 1000.0 / solid_hu)
+    return np.asarray(axes @ np.diag(along) @ axes.T + edge**2 * np.outer(normal, normal))
+
+
+def filled(volume: Volume, shape: Shape, centre_ct: Floats) -> Floats:
+    """Part of each voxel that a marker fills; of a voxel that its surface may pass, by cells of `FINE_MM`."""
+    spacing = spacing_mm(volume)
+    counts = np.clip(np.ceil(spacing / FINE_MM), 2, MOST_FINE).astype(np.int64)
+    T = np.array(volume.T_ct_index[:3])
+    T[:, 3] -= centre_ct
+    part = np.zeros(volume.values.shape)
+    half = np.array([shape.diameter_mm, shape.thick_mm, HOLE * shape.diameter_mm]) / 2
+    kind = {"ball": 0, "disc": 1, "ring": 2}[shape.kind]
+    _fill(T, counts, float(np.linalg.norm(spacing)) / 2, kind, half, np.array(shape.normal), part)
+    return part
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _fill(T, counts, reach, kind, half, normal, part):  # type: ignore[no-untyped-def]  # numba infers
+    """Set the part of each voxel: that of cells, each as a plane at the surface's distance would fill it.
+
+    Args:
+        T: Shape (3, 4), index to mm from the marker's centre.
+        counts: Shape (3,), cells along each axis of a voxel.
+        reach: Half of a voxel's diagonal, mm.
+        half: Shape (3,), half diameter, half thickness, half diameter of the hole, mm.
+        part: Shape (ni, nj, nk).
+    """
+    cell = 2.0 * reach / np.sqrt(float(counts[0] ** 2 + counts[1] ** 2 + counts[2] ** 2))
+    for i in range(part.shape[0]):
+        for j in range(part.shape[1]):
+            for k in range(part.shape[2]):
+                beyond = _beyond(T, float(i), float(j), float(k), kind, half, normal)
+                if beyond >= reach + cell:
+                    continue
+                if beyond <= -reach - cell:
+                    part[i, j, k] = 1.0
+                    continue
+                total = 0.0
+                for a in range(counts[0]):
+                    x = i + (a + 0.5) / counts[0] - 0.5
+                    for b in range(counts[1]):
+                        y = j + (b + 0.5) / counts[1] - 0.5
+                        for c in range(counts[2]):
+                            z = k + (c + 0.5) / counts[2] - 0.5
+                            off = _beyond(T, x, y, z, kind, half, normal)
+                            total += min(max(0.5 - off / cell, 0.0), 1.0)
+                part[i, j, k] = total / (counts[0] * counts[1] * counts[2])
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _beyond(T, i, j, k, kind, half, normal):  # type: ignore[no-untyped-def]
+    """How far a place lies beyond a marker's surface, mm; negative inside."""
+    square, along = 0.0, 0.0
+    for axis in range(3):
+        at = T[axis, 0] * i + T[axis, 1] * j + T[axis, 2] * k + T[axis, 3]
+        square += at * at
+        along += at * normal[axis]
+    if kind == 0:
+        return np.sqrt(square) - half[0]
+    across = np.sqrt(max(square - along * along, 0.0))
+    off = max(across - half[0], abs(along) - half[1])
+    return max(off, half[2] - across) if kind == 2 else off

@@ -1,0 +1,286 @@
+"""Where to put markers on a new patient: places on the skin that leave the least expected error at the target.
+
+With markers i at p_i, read and touched with covariance C, and A_i = [I, -[p_i - t]x] about the target t, the registered
+pose is off at the target by the covariance
+
+    (sum_i A_i' C^-1 A_i)^-1,   of which the first three axes are the shift,
+
+so that places far apart and all round the target are best. Places are exchanged, one at a time, until none is better;
+those are passed over that lie in or near an entry window, that no needle can touch, or whose names could be swapped
+without a trace, also where a person puts each a few mm off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import ConvexHull, cKDTree
+
+from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, Anatomy
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
+from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.case.case import Case, up_axis
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.spaces import Space, point_text
+from puncture_twin.planning.registration.checks.places import untouchable
+from puncture_twin.planning.registration.fits import design
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs
+from puncture_twin.planning.registration.method import renamings
+from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.touch.touch_planner import MOST_MARKERS, PLANNED_PADDING_MM, approach_checkers
+from puncture_twin.planning.touch.tour_motions import ApproachCheckers, why_not
+from puncture_twin.planning.uncertainty.touch_choice import touch_candidates
+
+PLACES, BETWEEN_PLACES_MM = 300, 9.0
+"""Places of the skin that are tried, and the least distance between two of them."""
+FAR_MM = 150.0
+"""From the target: farther away the skin moves on its own, and an arm does not reach both."""
+APART_MM = 35.0
+"""Markers are no nearer to each other."""
+WINDOW_MM = 25.0
+"""From an entry of a safe direction: half a drape's hole, and a finger."""
+END_MM = 15.0
+"""From where the image ends."""
+LEAST_UP = 0.1
+"""Cosine between the skin's normal and up: a marker below is not seen from where an arm stands."""
+SLIP_MM = 6.0
+"""A set of names swapped must not fit to so much (rms): a person puts a marker some mm off."""
+STARTS, SWEEPS, SEED = 6, 6, 37
+TRIES = 80
+"""The best places that are looked at for one marker in a sweep."""
+POSES = 8
+"""Touches of one place that are tried."""
+LEAST_KNOWN = 1e-9
+"""Least over greatest information: markers on a line leave a rotation free."""
+FLE_MM = 1.0
+"""Error of one marker where the case declares none: the answer then is per mm of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerPlace:
+    """Where one marker should be put, LPS mm.
+
+    Attributes:
+        point_ct: Shape (3,), on the skin.
+        head_mm: Toward the head from the target's level, negative toward the feet.
+        girth_mm: Along a tape round the body at that level, from its highest point, positive to the patient's left.
+    """
+
+    name: str
+    point_ct: Floats
+    normal_ct: Floats
+    head_mm: float
+    girth_mm: float
+
+    def words(self, space: Space) -> str:
+        """How to find it on the skin; a space of its own has no anatomy, and is told by coordinates."""
+        if space is Space.LOCAL:
+            return f"at {point_text(self.point_ct, space)}"
+        level, side = "head" if self.head_mm >= 0 else "feet", "left" if self.girth_mm >= 0 else "right"
+        return (
+            f"{abs(self.head_mm):.0f} mm toward the {level} from the target's level, then {abs(self.girth_mm):.0f} mm "
+            f"along the skin to the patient's {side} from the highest point there"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """Places for markers.
+
+    Attributes:
+        expected_mm: Error (rms) at the target by reading and touching these markers; of the arm's own nothing.
+        declared: Whether the case declares the errors, or 1 mm a marker is assumed.
+        arm: Whether the arm was asked, or why not.
+        near_window_mm: Of the nearest one to an entry.
+    """
+
+    places: tuple[MarkerPlace, ...]
+    expected_mm: float
+    declared: bool
+    arm: str
+    near_window_mm: float
+
+    @property
+    def distances_mm(self) -> Floats:
+        """Straight, of each to each, shape (n, n)."""
+        points = np.array([one.point_ct for one in self.places])
+        return np.asarray(np.linalg.norm(points[:, None] - points, axis=2))
+
+
+class _Skin(NamedTuple):
+    """Places (n, 3) of the skin, mm, and normals out of it (n, 3)."""
+
+    points: Floats
+    normals: Floats
+
+    def of(self, rows: Ints | Bools) -> _Skin:
+        return _Skin(self.points[rows], self.normals[rows])
+
+
+def propose_markers(context: CaseContext, candidates: Candidates, count: int) -> Proposal:
+    """Places for some markers.
+
+    Args:
+        context: With its arm, where the case says where its base is: then the arm can touch every place.
+        candidates: Of the case: markers are put beside their entries.
+        count: 3 to 12.
+
+    Raises:
+        InputError: A count out of range.
+        NoAnswerError: No direction is safe, or too few places are left.
+    """
+    case, anatomy = context.case, context.anatomy
+    if not MIN_MARKERS <= count <= MOST_MARKERS:
+        refuse(f"{count} markers", "--propose", f"{MIN_MARKERS} to {MOST_MARKERS}", "out_of_range")
+    if not candidates.safe.any():
+        raise NoAnswerError("no direction is safe: there is no window to put markers beside", code="no_safe_direction")
+    entries = cKDTree(candidates.path.entry_ct[candidates.safe])
+    skin = _places(case, anatomy, entries)
+    skin = skin.of(_touchable(context, candidates, skin.points))
+    C = FLE_MM**2 / 3 * np.eye(3)
+    if case.errors is not None:
+        C = case.errors.marker_cov_ct + case.errors.touch_mm**2 * np.eye(3)
+    chosen, error = _exchanged(skin, case.target_ct, C, count)
+    order = sorted(chosen, key=lambda row: (-skin.points[row, 2], skin.points[row, 0]))
+    places = tuple(_described(f"M{n}", skin.of(np.array([row])), case, anatomy) for n, row in enumerate(order, start=1))
+    near, _ = entries.query(skin.points[order])
+    return Proposal(places, error, case.errors is not None, context.arm, float(near.min()))
+
+
+def _places(case: Case, anatomy: Anatomy, entries: cKDTree) -> _Skin:
+    """Places of the skin where a marker could be, evenly spread."""
+    mesh, cut = anatomy.skin.mesh, anatomy.skin.cut_faces
+    triangles = mesh.triangles
+    middles = triangles.mean(axis=1)
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    areas = np.linalg.norm(normals, axis=1)
+    usable = ~cut & (areas > 0) & (np.linalg.norm(middles - case.target_ct, axis=1) <= FAR_MM)
+    ends = [middles[cut]] if cut.any() else []
+    limbs = [one.mesh.vertices for one in anatomy.structures if one.name == ATTACHED_LIMB]
+    for points in (*ends, *limbs):
+        usable &= cKDTree(points).query(middles, distance_upper_bound=END_MM)[0] > END_MM
+    usable &= entries.query(middles, distance_upper_bound=WINDOW_MM)[0] > WINDOW_MM
+    rows = np.flatnonzero(usable)
+    if not len(rows):
+        raise NoAnswerError("no skin is left beside the entry windows", code="no_place")
+    rng = np.random.default_rng(SEED)
+    drawn = rng.choice(rows, size=min(len(rows), 20 * PLACES), replace=False, p=areas[rows] / areas[rows].sum())
+    about = cKDTree(middles)
+    smooth = np.array([normals[near].sum(axis=0) for near in about.query_ball_point(middles[drawn], BETWEEN_PLACES_MM)])
+    smooth *= np.copysign(1.0, mesh.volume) / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-9)
+    up = np.asarray(up_axis(case)) / np.linalg.norm(up_axis(case))
+    over = np.flatnonzero(smooth @ up >= LEAST_UP)
+    skin = _Skin(middles[drawn[over]], smooth[over])
+    skin = skin.of(_thinned(skin.points))
+    blocked = {row for row, _ in untouchable(case, skin.points, skin.normals, anatomy.couch)}
+    return skin.of(np.array([row for row in range(len(skin.points)) if row not in blocked], dtype=np.int64))
+
+
+def _thinned(points: Floats) -> Ints:
+    """Rows of points no nearer to each other than `BETWEEN_PLACES_MM`, `PLACES` at most."""
+    kept: list[int] = []
+    for row in range(len(points)):
+        near = not kept or np.linalg.norm(points[kept] - points[row], axis=1).min() >= BETWEEN_PLACES_MM
+        if near and len(kept) < PLACES:
+            kept.append(row)
+    return np.array(kept, dtype=np.int64)
+
+
+def _touchable(context: CaseContext, candidates: Candidates, points_ct: Floats) -> Bools:
+    """Which points (n, 3), CT frame, the arm can touch near the best insertion's orientation; all without an arm."""
+    if context.reach is None or candidates.best is None:
+        return np.ones(len(points_ct), np.bool_)
+    checkers = approach_checkers(context, PLANNED_PADDING_MM)
+    q, points = candidates.arm.q_insertion[candidates.best.row], apply(context.reach.T_base_ct, points_ct)
+    return np.array([_is_free(checkers, context.case, point, q) for point in points], dtype=np.bool_)
+
+
+def _is_free(checkers: ApproachCheckers, case: Case, point_base: Floats, q_insertion: Floats) -> bool:
+    tip = case.needle.length_mm
+    found = touch_candidates(case.robot.model, tip, point_base, q_insertion)
+    return any(not why_not(checkers, tip, q) for q in np.concatenate([found.alike, found.others])[:POSES])
+
+
+def _exchanged(skin: _Skin, target_ct: Floats, C: Floats, count: int) -> tuple[list[int], float]:
+    """Rows of the best places, by exchange from several starts, and their expected error, mm."""
+    rng, best, least = np.random.default_rng(SEED), list[int](), np.inf
+    A = design(skin.points, target_ct).reshape(-1, 3, 6)
+    each = np.swapaxes(A, 1, 2) @ np.linalg.inv(C) @ A
+    for _ in range(STARTS if len(skin.points) >= count else 0):
+        chosen = rng.permutation(len(skin.points))[:count].tolist()
+        settled = [False] * count
+        for _ in range(SWEEPS):
+            before = list(chosen)
+            for slot in range(count):
+                others = chosen[:slot] + chosen[slot + 1 :]
+                costs = _errors_mm(each[others].sum(axis=0) + each)
+                found = _first(costs, skin, others, target_ct)
+                chosen[slot], settled[slot] = (chosen[slot], False) if found is None else (found, True)
+            if chosen == before:
+                break
+        error = float(_errors_mm(each[chosen].sum(axis=0)[None])[0])
+        if all(settled) and error < least:
+            best, least = chosen, error
+    if not best:
+        what = f"no {count} places that can be told apart, of {len(skin.points)} beside the windows that can be touched"
+        raise NoAnswerError(what, code="no_place")
+    return best, least
+
+
+def _errors_mm(information: Floats) -> Floats:
+    """Expected error (rms) at the target of each (..., 6, 6); infinite where it is not determined."""
+    scale = np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])  # rotations by the arm of 100 mm, so that rounding is seen
+    scaled = information * np.outer(scale, scale)
+    values = np.linalg.eigvalsh(scaled)
+    known = values[..., 0] > LEAST_KNOWN * values[..., -1]
+    shift = np.linalg.inv(np.where(known[..., None, None], scaled, np.eye(6)))[..., :3, :3]
+    return np.where(known, np.sqrt(np.trace(shift, axis1=-2, axis2=-1)), np.inf)
+
+
+def _first(costs: Floats, skin: _Skin, others: list[int], target_ct: Floats) -> int | None:
+    """The place of least cost that is apart from the others and told apart from them."""
+    points = skin.points[others]
+    gaps = np.linalg.norm(skin.points[:, None] - points, axis=2).min(axis=1)
+    rows = [row for row in np.argsort(costs, kind="stable") if gaps[row] >= APART_MM and np.isfinite(costs[row])]
+    for row in rows[:TRIES]:
+        if _told_apart(np.vstack([points, skin.points[row]]), target_ct):
+            return int(row)
+    return None
+
+
+def _told_apart(points: Floats, target_ct: Floats) -> bool:
+    """Whether no swap of names fits as well as a person puts markers."""
+    names = tuple(map(str, range(len(points))))
+    return not renamings(MarkerPairs(names, points, points), target_ct, SLIP_MM).found
+
+
+def _described(name: str, place: _Skin, case: Case, anatomy: Anatomy) -> MarkerPlace:
+    point, normal = place.points[0], place.normals[0]
+    girth = girth_mm(anatomy.skin.mesh.vertices, point, np.asarray(up_axis(case)))
+    return MarkerPlace(name, point, normal, float(point[2] - case.target_ct[2]), girth)
+
+
+LEVEL_MM = 4.0
+"""Of a body's vertices, those so near to a level show its outline there."""
+
+
+def girth_mm(vertices: Floats, point: Floats, up: Floats) -> float:
+    """Length of a tape round the body from its highest point to a point (3,), positive to the patient's left, mm.
+
+    A tape spans hollows: it is the outline's convex hull in the axial slice.
+    """
+    level = vertices[np.abs(vertices[:, 2] - point[2]) <= LEVEL_MM][:, :2]
+    hull = level[ConvexHull(level).vertices]
+    upward = up[:2] / max(float(np.linalg.norm(up[:2])), 1e-9)
+    start = int(np.argmax(hull @ upward))
+    line = np.vstack([np.roll(hull, -start, axis=0), hull[start]])
+    edges = np.diff(line, axis=0)
+    lengths = np.linalg.norm(edges, axis=1)
+    part = np.clip(np.einsum("ij,ij->i", point[:2] - line[:-1], edges) / np.maximum(lengths**2, 1e-12), 0.0, 1.0)
+    nearest = int(np.argmin(np.linalg.norm(line[:-1] + part[:, None] * edges - point[:2], axis=1)))
+    along = float(lengths[:nearest].sum() + part[nearest] * lengths[nearest])
+    back = float(lengths.sum()) - along
+    return along if along <= back else -back  # the hull runs from left to back, as its points are ordered in (x, y)

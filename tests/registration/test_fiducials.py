@@ -1,0 +1,265 @@
+"""Markers found in virtual scans whose truth is known, in real CTs that hold none, and named by a layout."""
+
+import numpy as np
+import pytest
+from marker_world import Markers, Stated, body_of, distractors, found_in, matched, scanned, scene
+from places import DATA, REAL_CT
+from refusals import refused
+
+from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.formats.points import NamedPoints
+from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
+from puncture_twin.planning.geometry.rigid import exp_rotation
+from puncture_twin.planning.registration.fiducial_reading import Reading, Shape
+from puncture_twin.planning.registration.fiducials import (
+    Fiducial,
+    choose_fiducials,
+    find_fiducials,
+    look_for_fiducials,
+    named_by_layout,
+    noise_hu,
+    order_along_body,
+)
+from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball
+
+KINDS = [
+    (Markers("ball", 8.0), 2.5, 0.8),
+    (Markers("disc", 8.0, 8000.0, 1.5), 5.0, 0.8),
+    (Markers("ring", 12.0, 8000.0, 2.0), 2.5, 1.2),
+    (Markers("ball", 10.0, 300.0), 2.5, 1.0),
+    (Markers("disc", 10.0, 1200.0, 3.0), 2.5, 1.4),
+    (Markers("ball", 3.0, 8000.0, off_mm=-5.0), 1.5, 1.0),
+]
+"""Of metal, clipped, and of contrast; thick slices and thin ones; on the skin and 2 mm under it; blur, mm."""
+
+
+@pytest.fixture(scope="module")
+def scans():
+    """True centres and what is found, of each kind, among ribs, clips, a wire, a needle, a table with bolts."""
+    return [
+        found_in(markers, ScanSettings(spacing, 0.9, 20.0, seed=number, blur_mm=blur))
+        for number, (markers, spacing, blur) in enumerate(KINDS)
+    ]
+
+
+def test_all_are_found_and_nothing_else(scans):
+    """Each of six, and neither bone, wire, clip, needle, calcification nor bolt."""
+    for (markers, spacing, _), (true, seen) in zip(KINDS, scans, strict=True):
+        errors, _, false = matched(true, seen.fiducials)
+        assert (len(errors), false) == (len(true), 0), (markers, spacing, seen.passed)
+
+
+def test_centres_are_as_sure_as_they_say(scans):
+    """Errors over their covariance are chi-squared: their mean is 3, few are large; none is a tenth of a slice off."""
+    normalised = []
+    for (_, spacing, _), (true, seen) in zip(KINDS, scans, strict=True):
+        errors, covs, _ = matched(true, seen.fiducials)
+        normalised += [error @ np.linalg.solve(cov, error) for error, cov in zip(errors, covs, strict=True)]
+        assert np.sqrt(np.mean(errors[:, :2] ** 2)) < 0.12
+        assert np.sqrt(np.mean(errors[:, 2] ** 2)) < 0.06 * spacing
+    assert 0.3 < np.mean(normalised) / 3 < 1.5
+    assert np.mean(np.array(normalised) < 7.815) >= 0.9  # the 95 % point of three degrees
+
+
+def test_kind_and_size_are_read(scans):
+    """Size to a tenth, and the kind, where it is wider than four voxels in the plane."""
+    for (markers, _, _), (_, seen) in zip(KINDS, scans, strict=True):
+        shapes = [one.reading.shape for one in seen.fiducials]
+        assert np.allclose([one.diameter_mm for one in shapes], markers.diameter, rtol=0.1)
+        if markers.diameter > 4 * 0.9:
+            assert {one.kind for one in shapes} == {markers.kind}
+
+
+def test_what_is_not_clipped_is_not_taken_for_it():
+    """Balls of 2,000 HU are the densest of an image that ends far above: their size is theirs."""
+    true, seen = found_in(Markers(hu=2000.0), ScanSettings(2.5, 1.0, seed=2), others=False)
+    assert len(matched(true, seen.fiducials)[0]) == len(true)
+    assert not any(one.reading.clipped for one in seen.fiducials)
+    assert np.allclose([one.reading.shape.diameter_mm for one in seen.fiducials], 8.0, rtol=0.05)
+
+
+def test_without_markers_none_is_seen():
+    """A body with everything that is none, metal inside of it too."""
+    rng = np.random.default_rng(5)
+    _, solids = scene(Markers(), rng)
+    solids = [one for one in solids if one.name != "marker"]
+    volume, skin = body_of(scanned(solids, ScanSettings(2.5, 0.9), rng))
+    with refused("no_markers", by=NoAnswerError):
+        find_fiducials(volume, skin, Stated(), where="test")
+
+
+@pytest.fixture(scope="module")
+def two_sizes():
+    """Four balls of 8 mm and three of 4 mm on one body."""
+    rng = np.random.default_rng(6)
+    large, solids = scene(Markers(count=4), rng, others=False)
+    small, more = scene(Markers("ball", 4.0, count=7), rng, others=False)
+    away = [k for k, one in enumerate(small) if np.linalg.norm(large - one, axis=1).min() > 20.0][:3]
+    solids += [one for k, one in enumerate(more[1:]) if k in away]
+    return large, small[away], look_for_fiducials(*body_of(scanned(solids, ScanSettings(2.5, 0.9), rng)))
+
+
+def test_several_sizes_are_not_guessed(two_sizes):
+    """They are told with places and sizes; a size, or a count that one of them has, decides; a wrong one does not."""
+    large, small, seen = two_sizes
+    with refused("markers_unclear", "8.0 mm", "4.0 mm", by=NoAnswerError):
+        choose_fiducials(seen, Stated(), 2.5, where="test")
+    for stated, true in ((Stated(diameter_mm=8.0), large), (Stated(count=4), large), (Stated(diameter_mm=4.0), small)):
+        found = choose_fiducials(seen, stated, 2.5, where="test").fiducials
+        assert len(found) == len(true) and len(matched(true, found)[0]) == len(true)
+        assert [one.name for one in found] == [f"M{n}" for n in range(1, len(true) + 1)]
+    for stated, code in (
+        (Stated(diameter_mm=8.0, count=5), "too_few_markers"),
+        (Stated(diameter_mm=8.0, count=3), "too_many_markers"),
+        (Stated(diameter_mm=14.0), "no_markers"),
+    ):
+        with refused(code, by=NoAnswerError):
+            choose_fiducials(seen, stated, 2.5, where="test")
+
+
+@pytest.mark.parametrize(
+    ("stated", "code"),
+    [({"kind": "cube"}, "unknown_choice"), ({"diameter_mm": 0.5}, "out_of_range"), ({"count": 2}, "out_of_range")],
+)
+def test_what_no_marker_is_is_refused(stated, code):
+    """Before anything is read."""
+    with refused(code):
+        Stated(**stated)
+
+
+def test_noise_is_that_of_the_voxels():
+    """Of soft tissue, beside air and bone."""
+    hu = np.full((60, 60, 20), -1000.0)
+    hu[10:50, 10:50] = 40.0
+    hu[20:24, 20:24] = 900.0
+    hu += 25.0 * np.random.default_rng(0).standard_normal(hu.shape)
+    assert noise_hu(hu) == pytest.approx(25.0, rel=0.05)
+
+
+def test_order_is_from_head_to_feet_then_from_right_to_left():
+    """Less than a centimetre apart along the body counts as one row; LPS: x runs to the patient's left."""
+    points = np.array([[30.0, 0, 100], [-30.0, 0, 95], [0.0, 0, 99], [5.0, 0, 160], [0.0, 0, 20]])
+    assert order_along_body(points) == [3, 1, 2, 0, 4]
+    assert order_along_body(np.zeros((0, 3))) == []
+
+
+LAYOUT = np.array([[0.0, 0, 0], [60, 5, 0], [10, 90, 12], [75, 80, 30], [30, 40, 45]])
+NAMES = tuple("ABCDE")
+
+
+def fiducials(points):
+    """Balls of 8 mm there, under other names."""
+    shape = Shape("ball", 8.0, 1.0, np.array([0.0, -1, 0]))
+    return [
+        Fiducial(f"M{k}", Reading(p, np.eye(3) * 0.01, shape, 900.0, False, 0.1), 4.0) for k, p in enumerate(points)
+    ]
+
+
+def moved(points, rng):
+    """Turned and shifted anyhow, and read with an error."""
+    R = exp_rotation(rng.normal(size=3))
+    return points @ R.T + rng.uniform(-200, 200, 3) + rng.normal(0, 0.2, points.shape)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_layout_names_them_in_any_order_and_frame(seed):
+    """Also with things that are no part of it, and where one of it is not seen."""
+    rng = np.random.default_rng(seed)
+    shown = LAYOUT if seed % 2 else LAYOUT[:4]
+    points = moved(np.vstack([shown, rng.uniform(-150, 150, (3, 3))]), rng)
+    order = rng.permutation(len(points))
+    named = named_by_layout(fiducials(points[order]), NamedPoints(NAMES, LAYOUT, None), "layout")
+    assert [one.name for one in named] == list(NAMES[: len(shown)])
+    assert np.allclose([one.position_ct for one in named], points[: len(shown)])
+
+
+def test_a_mirrored_layout_is_refused():
+    """Its distances are the same, and its names would be wrong; a flat one has no handedness, and names them."""
+    mirror = np.diag([1.0, 1.0, -1.0])
+    seen = fiducials(moved(LAYOUT, np.random.default_rng(1)))
+    with refused("markers_mirrored"):
+        named_by_layout(seen, NamedPoints(NAMES, LAYOUT @ mirror, None), "layout")
+    flat = LAYOUT * [1.0, 1.0, 0.0]
+    named = named_by_layout(
+        fiducials(moved(flat, np.random.default_rng(2))),
+        NamedPoints(NAMES, flat @ np.diag([-1.0, 1, 1]), None),
+        "layout",
+    )
+    assert [one.name for one in named] == list(NAMES)
+
+
+def test_a_layout_that_fits_in_two_ways_is_not_guessed():
+    """A square has eight; three of a chain of equal steps may be the first three or the last three."""
+    rng = np.random.default_rng(3)
+    square = np.array([[0.0, 0, 0], [50, 0, 0], [50, 50, 0], [0, 50, 0]])
+    with refused("markers_ambiguous", by=NoAnswerError):
+        named_by_layout(fiducials(moved(square, rng)), NamedPoints(tuple("ABCD"), square, None), "layout")
+    zigzag = np.array([[0.0, 0, 0], [40, 20, 0], [90, 0, 0], [130, 20, 0], [180, 0, 0]])
+    with refused("markers_ambiguous", by=NoAnswerError):
+        named_by_layout(fiducials(moved(zigzag, rng)), NamedPoints(tuple("ABC"), zigzag[:3], None), "layout")
+
+
+def test_a_layout_of_other_distances_is_not_seen():
+    """Nor one of which three remain, which fit by chance too often."""
+    rng = np.random.default_rng(4)
+    with refused("layout_not_seen", by=NoAnswerError):
+        named_by_layout(fiducials(moved(1.2 * LAYOUT, rng)), NamedPoints(NAMES, LAYOUT, None), "layout")
+    with refused("layout_not_seen", by=NoAnswerError):
+        named_by_layout(fiducials(moved(LAYOUT[:3], rng)), NamedPoints(NAMES, LAYOUT, None), "layout")
+
+
+REAL = [REAL_CT / "ct.nii.gz", DATA / "slicer_chest_ct4" / "CTChest4.nrrd"]
+
+
+def drawn_into(volume, skin, diameter, hu, rng, count=5):
+    """Balls drawn onto the skin of a CT: voxels cut into 6 x 6 x 6 points, blurred; centres (n, 3) and the image."""
+    T, faces = volume.T_ct_index, np.flatnonzero(~skin.cut_faces)
+    corners = skin.mesh.triangles[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    middles, hu_drawn, centres = corners.mean(axis=1), volume.values.astype(float), []
+    inner = np.linalg.inv(T)
+    spacing = np.linalg.norm(T[:3, :3], axis=0)
+    while len(centres) < count:
+        row = rng.integers(len(faces))
+        centre = middles[row] + (diameter / 2 + 0.3) * normals[row]
+        index = inner[:3, :3] @ centre + inner[:3, 3]
+        low = np.floor(index - (diameter / 2 + 4.0) / spacing).astype(int)
+        high = np.ceil(index + (diameter / 2 + 4.0) / spacing).astype(int) + 1
+        near = centres and np.linalg.norm(np.array(centres) - centre, axis=1).min() < 50.0
+        if normals[row, 1] > -0.5 or near or low.min() < 1 or np.any(high >= volume.values.shape):
+            continue
+        cells = [np.arange(a, b, 1 / 6) + 1 / 12 - 0.5 for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*cells, indexing="ij"), axis=-1) @ T[:3, :3].T + T[:3, 3]
+        inside = np.linalg.norm(grid - centre, axis=-1) < diameter / 2
+        size = high - low
+        part = inside.reshape(size[0], 6, size[1], 6, size[2], 6).mean(axis=(1, 3, 5))
+        box = tuple(map(slice, low, high))
+        hu_drawn[box] = np.minimum(hu_drawn[box] + part * (hu - hu_drawn[box]), 3071.0)
+        centres.append(centre)
+    return np.array(centres), Volume(np.rint(hu_drawn).astype(np.int16), T, volume.path)
+
+
+@pytest.mark.parametrize(("path", "diameter"), [(REAL[0], 8.0), (REAL[1], 15.0)], ids=["abdomen", "chest"])
+def test_real_cts(path, diameter):
+    """They hold no marker, and none is seen; balls drawn into them by another renderer are all found."""
+    if not path.exists():
+        pytest.skip(f"{path.name} is not on this machine")
+    volume, skin = body_of(read_volume(path))
+    assert look_for_fiducials(volume, skin).fiducials == ()
+    true, drawn = drawn_into(volume, skin, diameter, 8000.0, np.random.default_rng(2))
+    errors, covs, false = matched(true, look_for_fiducials(drawn, skin).fiducials)
+    assert (len(errors), false) == (len(true), 0)
+    assert np.all(np.abs(errors) < 0.12 * np.linalg.norm(volume.T_ct_index[:3, :3], axis=0))
+    assert np.mean([e @ np.linalg.solve(c, e) for e, c in zip(errors, covs, strict=True)]) / 3 < 2.5
+
+
+def test_a_marker_on_a_rib_is_told_from_it_and_a_calcification_is_passed_over():
+    """On the skin over bone 3 mm from it; contrast 3 mm under the skin is none, whatever its size."""
+    rng = np.random.default_rng(8)
+    true, solids = scene(Markers("ball", 6.0, 900.0, count=4), rng, others=False)
+    others = [one for one in distractors(rng) if one.name == "calcification"]
+    ribs = [Solid("rib", ball(point * (1 - 11.0 / np.linalg.norm(point)), 9.0), 500.0) for point in true]
+    volume, skin = body_of(scanned([*solids[:1], *ribs, *others, *solids[1:]], ScanSettings(2.0, 0.9), rng))
+    errors, _, false = matched(true, find_fiducials(volume, skin, Stated(), where="test").fiducials)
+    assert (len(errors), false) == (4, 0)

@@ -1,0 +1,306 @@
+"""The job ``markers``: markers found in a CT, or places proposed for them, as files for a case and for 3D Slicer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.anatomy import load_anatomy
+from puncture_twin.planning.anatomy.scan import nearest
+from puncture_twin.planning.anatomy.skin import Skin
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.base.files import is_folder, is_plain_file
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.progress import Watcher
+from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.case.case import load_case
+from puncture_twin.planning.export.slicer import markups_text
+from puncture_twin.planning.formats.points import NamedPoints, read_points, write_points
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.spaces import Space, Unit, to_lps
+from puncture_twin.planning.init.finder import Wanted, find
+from puncture_twin.planning.init.segmentation import Place
+from puncture_twin.planning.registration.fiducials import Fiducial, Seen, Stated, find_fiducials
+from puncture_twin.planning.search.bedside import slice_numbers
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.touch.marker_places import MarkerPlace, Proposal, propose_markers
+from puncture_twin.twin.jobs.terminal import write_result
+from puncture_twin.twin.report.present import Field, Section, facts, footer, grid, number, text
+
+FOUND, PROPOSED, MARKUPS = "markers_ct.csv", "markers_proposed.csv", ".mrk.json"
+"""Never one name for both: a person puts a marker some mm beside its proposed place."""
+PICTURE, REPORT = "markers.png", "markers.json"
+CASE = "case.toml"
+ALLOWED = "a folder with one CT, a CT file (NIfTI, NRRD, a DICOM folder), or a case with one"
+
+
+def stated_of(
+    kind: str | None, diameter_mm: float | None, count: int | None, layout: Path | None, propose: int | None
+) -> Stated:
+    """What a person says of the markers.
+
+    Raises:
+        InputError: A kind, size or count that none has, or any of it beside a proposal.
+    """
+    if propose is not None and any(one is not None for one in (kind, diameter_mm, count, layout)):
+        allowed = "--propose alone, or options of the markers that are there"
+        refuse("markers are to be found and proposed", "--propose", allowed, "conflicting_options")
+    return Stated(kind, diameter_mm, count)
+
+
+@dataclass(frozen=True, eq=False)
+class SourceCt:
+    """A CT in which markers are looked for.
+
+    Attributes:
+        name: Of the file, folder or case.
+        volume: Hounsfield units, axes to the left, back and head, LPS.
+        space: In which a person reads places.
+    """
+
+    name: str
+    volume: Volume
+    skin: Skin
+    space: Space
+    inputs: tuple[Input, ...]
+
+
+def read_source(source: Path, watcher: Watcher) -> SourceCt:
+    """The CT of a folder, a file, or a case, with its skin.
+
+    Raises:
+        InputError: There is none, or several, or it cannot be read.
+    """
+    path = source / CASE if is_plain_file(source / CASE) else source
+    if path.suffix.lower() == ".toml":
+        case = load_case(path)
+        anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), user_cache())
+        if anatomy.scan is None:
+            refuse("the case has no CT", path, ALLOWED, "no_ct")
+        values, T = anatomy.scan.measured
+        return SourceCt(case.name, Volume(values, T, path), anatomy.skin, case.space, case.inputs)
+    folder, name = (source, None) if is_folder(source) else (source.parent, source.name)
+    place = Place(folder, user_cache(), partial(watcher.step, "reading"))
+    if name is not None:
+        surfaces = place.volume(name)
+    else:
+        found = find(place, Wanted(Space.LPS))
+        if not found.cts and found.problems:
+            raise found.problems[0]
+        if not found.cts:
+            refuse("no CT in Hounsfield units", source, ALLOWED, "no_ct")
+        if len(found.cts) > 1:
+            refuse(f"several CTs: {', '.join(one.source for one in found.cts)}", source, ALLOWED, "several_cts")
+        surfaces = found.cts[0].surfaces
+    watcher.step("reading", "skin")
+    imaged = surfaces.imaged()
+    skin, image = imaged.skin(), imaged.image
+    return SourceCt(source.name, Volume(image.hu, image.T_ct_index, source), skin, Space.LPS, place.files.inputs)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkersRun:
+    """Markers that were found, and the files that were written."""
+
+    source: SourceCt
+    seen: Seen
+    files: tuple[Path, ...] = ()
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm, in the stated space."""
+        return {
+            "source": self.source.name,
+            "space": str(self.source.space),
+            "markers": [_row(one, self.source.space) for one in self.seen.fiducials],
+            "distances_mm": distances_mm([one.position_ct for one in self.seen.fiducials]).tolist(),
+            "passed_over": dict(self.seen.passed),
+            "inputs": inputs_document(self.source.inputs),
+            "files": [str(path) for path in self.files],
+        }
+
+    def text(self) -> str:
+        """For the terminal."""
+        rows = self.summary()["markers"]
+        head = f"{len(rows)} markers in {self.source.name}, mm {self.source.space}"
+        return text([Section(head, [grid(FIELDS, rows)]), *footer(self.files)])
+
+
+def _row(one: Fiducial, space: Space) -> dict[str, Any]:
+    shape = one.reading.shape
+    return {
+        "name": one.name,
+        "position_mm": to_lps(one.position_ct[None], space)[0].tolist(),
+        "sd_mm": one.sd_mm.tolist(),
+        "covariance_mm2": (_signs(space) @ one.reading.cov_ct @ _signs(space)).tolist(),
+        "kind": shape.kind,
+        "diameter_mm": shape.diameter_mm,
+        "contrast_hu": one.reading.contrast_hu,
+        "clipped": one.reading.clipped,
+        "misfit": one.reading.misfit,
+        "off_skin_mm": one.gap_mm,
+    }
+
+
+def _signs(space: Space) -> Floats:
+    return np.diag(to_lps(np.ones((1, 3)), space)[0])
+
+
+def distances_mm(points: Sequence[Floats]) -> Floats:
+    """Straight, of each to each, shape (n, n)."""
+    stacked = np.array(points)
+    return np.asarray(np.linalg.norm(stacked[:, None] - stacked, axis=2))
+
+
+FIELDS = (
+    Field("name", "name"),
+    Field("position", lambda one: " ".join(number(mm, 1) for mm in one["position_mm"])),
+    Field("sd", lambda one: " ".join(number(mm, 2) for mm in one["sd_mm"])),
+    Field("kind", "kind"),
+    Field("diameter", "diameter_mm", 1, "mm"),
+    Field("density", lambda one: "clipped" if one["clipped"] else number(one["contrast_hu"], 0, "HU")),
+)
+
+
+def find_markers(source: Path, out: Path, stated: Stated, layout: Path | None, watcher: Watcher) -> MarkersRun:
+    """Find the markers of a CT; write their list, the list for Slicer, a picture and the report.
+
+    Raises:
+        InputError: Nothing that can be read, or a mirrored layout.
+        NoAnswerError: No markers, too few or many, or several sizes.
+    """
+    wanted = None if layout is None else read_points(layout, default_unit=Unit.MM)
+    ct = read_source(source, watcher)
+    watcher.step("markers", "looking")
+    run = MarkersRun(ct, find_fiducials(ct.volume, ct.skin, stated, wanted, where=layout or source))
+    names, lists = tuple(one.name for one in run.seen.fiducials), _list_names(FOUND, ct.space)
+    written = (*lists, PICTURE, REPORT)
+    with writing(out, "markers", inputs=ct.inputs, names=written, note=watcher.note) as draft:
+        lines = [f"{one.reading.shape.kind} {one.reading.shape.diameter_mm:.1f} mm" for one in run.seen.fiducials]
+        points = np.array([one.position_ct for one in run.seen.fiducials])
+        _write_lists(draft.folder, lists, NamedPoints(names, points, ct.space))
+        _draw(draft.folder, ct, names, points, lines)
+        run = replace(run, files=draft.final([draft.folder / name for name in written]))
+        write_result(run.summary(), draft.folder / REPORT, out)
+    return run
+
+
+def _list_names(name: str, space: Space) -> tuple[str, ...]:
+    """As the case reads it, and as Slicer does, which knows no space of its own."""
+    return (name,) if space is Space.LOCAL else (name, name.replace(".csv", MARKUPS))
+
+
+def _write_lists(folder: Path, lists: Sequence[str], points: NamedPoints) -> None:
+    """Points in LPS, or the local frame, whose ``space`` is that of the CSV."""
+    space = points.space or Space.LPS
+    write_points(folder / lists[0], replace(points, points=to_lps(points.points, space)))
+    for name in lists[1:]:
+        (folder / name).write_text(markups_text("Fiducial", "markers", points.names, points.points), encoding="utf-8")
+
+
+def _draw(folder: Path, ct: SourceCt, names: Sequence[str], points_ct: Floats, lines: Sequence[str]) -> None:
+    T_index_ct = np.asarray(np.linalg.inv(ct.volume.T_ct_index))
+    _sheet(folder, ct.name, names, points_ct, lines, partial(nearest, ct.volume.values, T_index_ct), ct.skin)
+
+
+def _sheet(
+    folder: Path,
+    name: str,
+    names: Sequence[str],
+    points_ct: Floats,
+    lines: Sequence[str],
+    hu_at: Callable[[Floats], Floats] | None,
+    skin: Skin,
+) -> None:
+    from puncture_twin.twin.report.slices.points import Shown, write_points_sheet  # with matplotlib
+
+    shown = [Shown(*one) for one in zip(names, points_ct, lines, strict=True)]
+    write_points_sheet(folder / PICTURE, f"{name}: {len(shown)} markers", shown, hu_at, skin.mesh)
+
+
+@dataclass(frozen=True, eq=False)
+class ProposalRun:
+    """Places for markers, and the files that were written."""
+
+    context: CaseContext
+    proposal: Proposal
+    files: tuple[Path, ...] = ()
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm, in the case's space."""
+        case, proposal = self.context.case, self.proposal
+        return {
+            "case": case.name,
+            "space": str(case.space),
+            "proposed": [self._row(one) for one in proposal.places],
+            "distances_mm": distances_mm([one.point_ct for one in proposal.places]).tolist(),
+            "expected_error_mm": proposal.expected_mm,
+            "errors": "declared" if proposal.declared else "1 mm a marker",
+            "arm": proposal.arm,
+            "nearest_entry_mm": proposal.near_window_mm,
+            "inputs": inputs_document(case.inputs),
+            "files": [str(path) for path in self.files],
+        }
+
+    def _row(self, one: MarkerPlace) -> dict[str, Any]:
+        space = self.context.case.space
+        position = to_lps(one.point_ct[None], space)[0].tolist()
+        measured: dict[str, Any] = {}
+        if space is not Space.LOCAL:
+            measured = {"toward_head_mm": one.head_mm, "round_to_left_mm": one.girth_mm}
+        if self.context.anatomy.scan is not None:
+            number, _ = slice_numbers(self.context.anatomy.scan.grid)
+            measured["slice"] = int(np.rint(number @ [*one.point_ct, 1.0]))
+        return {"name": one.name, "position_mm": position, **measured, "text": one.words(space)}
+
+    def text(self) -> str:
+        """For the terminal."""
+        found = self.summary()
+        names = [one["name"] for one in found["proposed"]]
+        rows = [{"name": name, **dict(zip(names, row, strict=True))} for name, row in
+                zip(names, found["distances_mm"], strict=True)]  # fmt: skip
+        facts_ = [
+            ("expected error", f"{found['expected_error_mm']:.2f} mm (rms) at the target, of the markers alone"),
+            ("errors", found["errors"]),
+            ("arm", found["arm"]),
+            ("nearest entry", f"{found['nearest_entry_mm']:.0f} mm from a marker"),
+        ]  # fmt: skip
+        return text([
+            Section(f"where to put {len(names)} markers, {self.context.case.name}",
+                    [facts([(one["name"], _place_text(one)) for one in found["proposed"]]), facts(facts_)]),
+            Section("straight distances, mm", [grid([Field("", "name"), *(Field(n, n, 0) for n in names)], rows)]),
+            *footer(self.files),
+        ])  # fmt: skip
+
+
+def _place_text(row: dict[str, Any]) -> str:
+    return row["text"] + (f"; slice {row['slice']} from the feet" if "slice" in row else "")
+
+
+def propose_places(context: CaseContext, out: Path, count: int) -> ProposalRun:
+    """Search the case, propose places for markers beside its windows, and write them.
+
+    Raises:
+        InputError: A count out of range.
+        NoAnswerError: No direction is safe, or too few places are left.
+    """
+    candidates = context.search()
+    with context.stages.time("marker places"):
+        run = ProposalRun(context, propose_markers(context, candidates, count))
+    case, places = context.case, run.proposal.places
+    lists = _list_names(PROPOSED, case.space)
+    written = (*lists, PICTURE, REPORT)
+    with writing(out, "markers", inputs=case.inputs, names=written, note=context.watcher.note) as draft:
+        names, points = tuple(one.name for one in places), np.array([one.point_ct for one in places])
+        _write_lists(draft.folder, lists, NamedPoints(names, points, case.space))
+        hu_at = None if context.anatomy.scan is None else context.anatomy.scan.hu_at
+        _sheet(draft.folder, case.name, names, points, ["proposed"] * len(places), hu_at, context.anatomy.skin)
+        run = replace(run, files=draft.final([draft.folder / name for name in written]))
+        write_result(run.summary(), draft.folder / REPORT, out)
+    return run
