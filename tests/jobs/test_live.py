@@ -162,6 +162,7 @@ def test_a_needle_beside_the_line_is_not_called_safe(context, planner, paths):
     for off, expected in ((0.0, "safe"), (1.9, "safe"), (2.1, "not aimed"), (30.0, "not aimed")):
         said = verdict(planner, toward(context, *wide[:2], off_mm=off))
         assert (said["verdict"], said["check"]["verdict"]) == (expected, "safe")
+        assert said["text"].startswith("theta" if expected == "safe" else "not aimed")
         assert said["off_line_mm"] == pytest.approx(off, abs=1e-3) and said["ahead_mm"] == pytest.approx(150, abs=1e-3)
     assert verdict(planner, toward(context, *wide[:2], out_mm=-1.0))["verdict"] == "safe"
     assert verdict(planner, toward(context, *wide[:2], out_mm=-3.0))["verdict"] == "not aimed"

@@ -103,7 +103,7 @@ def answers_well(port, said="well"):
         begun = time.monotonic()
         talk.send("STRING", "Query", text(said), stamp=(3, 4))
         told = talk.receive()
-        return told.content == text(said) and told.stamp == (3, 4) and time.monotonic() - begun < 1.0
+        return told.content == text(said) and told.stamp == (3, 4) and time.monotonic() - begun < 3.0
 
 
 def test_the_checksum_is_that_of_the_standard(rng):
@@ -188,6 +188,7 @@ def test_the_newest_message_counts_and_nothing_queues(running):
     """A needle at 500 Hz before a planner that takes 50 ms: few answers, and the last one is of the last message."""
     running.planner.waits_s = 0.05
     with Talk(running.port) as talk:
+        begun = time.monotonic()
         for number in range(100):
             talk.send("TRANSFORM", "Needle", transform(np.eye(4)), stamp=(0, number))
             time.sleep(0.002)
@@ -195,8 +196,9 @@ def test_the_newest_message_counts_and_nothing_queues(running):
         stamps = [talk.receive().stamp[1]]
         while stamps[-1] != 99:
             stamps.append(talk.receive().stamp[1])
-    assert time.monotonic() - sent < 0.5
-    assert stamps == sorted(set(stamps)) and len(stamps) < 20
+    ended = time.monotonic()
+    assert ended - sent < 2.0
+    assert stamps == sorted(set(stamps)) and len(stamps) <= 2 + (ended - begun) / 0.05
     assert [number for _, _, number in running.planner.begun] == stamps
 
 
@@ -220,7 +222,7 @@ def test_one_client_that_floods_does_not_keep_another_waiting(running):
             for number in range(10):
                 begun = time.monotonic()
                 talk.send("STRING", "Query", text("me"), stamp=(0, number))
-                assert talk.receive().stamp == (0, number) and time.monotonic() - begun < 0.5
+                assert talk.receive().stamp == (0, number) and time.monotonic() - begun < 2.0
     finally:
         stop.set()
         running.planner.waits_s = 0.0
@@ -235,15 +237,14 @@ def test_a_client_that_reads_nothing_is_let_go_and_takes_little_memory(running):
     with socket.socket() as deaf:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         deaf.connect(("127.0.0.1", running.port))
-        for number in range(1000):
-            deaf.sendall(message("POINT", "Target", point((1.0, 2.0, 3.0)), stamp=(0, number)))
-        assert answers_well(running.port)
+        asked = message("POINT", "Target", point((1.0, 2.0, 3.0)))
         begun = time.monotonic()
         with suppress(ConnectionError):
-            while time.monotonic() - begun < 5.0:
+            deaf.sendall(asked * 1000)
+            while time.monotonic() - begun < 10.0:
                 assert answers_well(running.port)
-                deaf.sendall(b"x")
-        assert time.monotonic() - begun < 5.0
+                deaf.sendall(asked)
+        assert time.monotonic() - begun < 10.0
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # KB
 
 
@@ -270,6 +271,14 @@ def test_a_log_that_many_write_to_stays_short(running, caplog):
                 talk.send(b"x" * 58)
                 assert talk.ended()
     assert 10 <= len(caplog.records) <= server.MOST_LINES
+
+
+def test_a_name_cannot_write_lines_of_its_own_into_the_log(running, caplog):
+    """Nor colour a terminal."""
+    with caplog.at_level(logging.WARNING, logger=server.__name__), Talk(running.port) as talk:
+        talk.send("IMAGE", "\x1b[31m\nlive: client\x07", b"")
+        assert talk.receive().document["code"] == "unknown_message"
+    assert len(caplog.records) == 1 and caplog.records[0].getMessage().isprintable()
 
 
 def test_the_port_is_free_after_the_end():

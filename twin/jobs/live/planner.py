@@ -9,7 +9,7 @@ A message is about one of three subjects, by its name:
 The needle's axis is z, from hub to tip; with f the target, p the tip and z the axis, its direction outward is -z, and
 its line passes the target at the distance |(f - p) - ((f - p)'z) z|. A verdict is that of the parallel path through the
 target. A needle beside it by no more than the least slack of that path keeps every margin, since no point of it lies
-farther from the path; one that is beside it by more, or by more than `AIMED_MM`, is "not aimed", whatever the verdict.
+farther from the path; one that is beside it by more, or by more than `AIMED_MM`, is "not aimed", however safe that is.
 
 What cannot be answered takes the place of the answer: a map without cells, a verdict "refused", no entry. So nothing
 that was said of an earlier target or needle stands where the newest is expected.
@@ -53,6 +53,9 @@ from puncture_twin.twin.jobs.live.messages import (
 
 AIMED_MM = 2.0
 """A hand and a tracker together keep a needle on a line to about this."""
+
+NOT_AIMED = "not aimed"
+"""The path is safe, and the needle is not on it."""
 
 LEFT_OUT = ("case", "inputs", "entry_ct_mm", "warnings", "findings")
 """Of a direction's summary: Status has them, or they are in the case's space."""
@@ -257,11 +260,15 @@ class Planner:
         ahead = float((case.target_ct - tip) @ axis)
         off = float(np.linalg.norm(case.target_ct - tip - ahead * axis))
         entry, q = found.candidates.path.entry_ct[0], found.candidates.arm.q_insertion[0]
-        verdict = _verdict_text(found, off, ahead)
+        verdict, text = _verdict_text(found, off, ahead), " ".join(line.strip() for line in found.head())
+        if verdict == NOT_AIMED:
+            text = (
+                f"{verdict}: the line passes the target at {off:.1f} mm, {ahead:.1f} mm ahead; parallel to it, {text}"
+            )
         point = _ras(entry) if np.isfinite(entry).all() else None
         document = {
             "verdict": verdict,
-            "text": " ".join(line.strip() for line in found.head()),
+            "text": text,
             "target_ras_mm": _ras(case.target_ct),
             "off_line_mm": off,
             "ahead_mm": ahead,
@@ -284,7 +291,7 @@ def _verdict_text(found: Explanation, off_mm: float, ahead_mm: float) -> str:
     if not found.safe:
         return found.verdict
     aimed = off_mm <= min(AIMED_MM, _slack(found)) and ahead_mm >= -AIMED_MM
-    return found.candidates.safe_text if aimed else "not aimed"
+    return found.candidates.safe_text if aimed else NOT_AIMED
 
 
 def _slack(found: Explanation) -> float:

@@ -301,12 +301,13 @@ class Client:
 
     def _wrong(self, subject: str | None, header: Header, error: InputError) -> None:
         """Answer a message that cannot be used; of those that are about nothing here, the first of each kind."""
+        first = error.code not in self._logged
+        self._line(error.code, str(error))
         if subject is not None:
             self._exchange.ask(Question(self._number, self._session, subject, header.stamp, fault=error))
-        elif error.code not in self._logged:
+        elif first:
             for answer in self._planner.refused(None, header.stamp, error):
                 self._exchange.give(self._number, answer)
-        self._line(error.code, str(error))
 
     def _exactly(self, size: int, until: float) -> bytes:
         """So many bytes.
