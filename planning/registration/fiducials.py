@@ -6,8 +6,8 @@ that of a ball, disc or ring: bone, wires, clips, needles, parts of a table. Con
 calcification beneath it looks the same; metal may lie a few mm under it. The markers of a patient are of one size:
 where several sizes are seen the answer is what was seen, not a guess.
 
-It is in `planning` because `init` proposes a registration by it; the twin's reading by expected places
-(`twin.guidance.ct.markers`) has the same pieces and middle, from `planning.anatomy.metal`.
+It is in `planning` because `init` proposes a registration by it; what the twin finds by expected places
+(`twin.guidance.ct.markers`) is read in the same way.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from scipy.spatial import cKDTree
 
 from puncture_twin.planning.anatomy.metal import METAL_HU, spacing_mm
 from puncture_twin.planning.anatomy.skin import Skin
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Floats, Ints, read_only
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.text import first_few, plural
 from puncture_twin.planning.formats.points import NamedPoints
@@ -72,6 +72,8 @@ CONTRAST_ALIKE = 3.0
 """Times: so much denser is of another kind."""
 ABOUT_MM = 20.0
 """So far about a marker the skin's direction is taken."""
+FRONT = read_only([0.0, -1.0, 0.0])
+"""LPS."""
 ROW_MM = 10.0
 """Markers less far apart along the body lie in one row."""
 LAYOUT_MM = 2.0
@@ -263,13 +265,15 @@ def _at_skin(point_ct: Floats, skin: Skin) -> tuple[float, Floats]:
     near = np.all(np.abs(mesh.vertices - point_ct) < ABOUT_MM, axis=1)
     rows = np.flatnonzero(near[mesh.faces[:, 0]] & ~skin.cut_faces)
     if not len(rows):
-        return np.inf, np.array([0.0, -1.0, 0.0])
+        return np.inf, FRONT
     corners = mesh.vertices[mesh.faces[rows]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     squares, mean = squared_distance(point_ct, corners), normals.sum(axis=0)
-    nearest = corners[squares <= squares.min() + 0.01].mean(axis=(0, 1))
-    side = float((point_ct - nearest) @ normals[squares <= squares.min() + 0.01].sum(axis=0))
-    return float(np.copysign(np.sqrt(squares.min()), side)), mean / max(float(np.linalg.norm(mean)), 1e-9)
+    nearest, length = squares <= squares.min() + 0.01, float(np.linalg.norm(mean))
+    if not length > 0.0:
+        return np.inf, FRONT
+    side = float((point_ct - corners[nearest].mean(axis=(0, 1))) @ normals[nearest].sum(axis=0))
+    return float(np.copysign(np.sqrt(squares.min()), side)), mean / length
 
 
 def order_along_body(points_ct: Floats) -> list[int]:

@@ -37,6 +37,8 @@ from puncture_twin.twin.report.present import Field, Section, facts, footer, gri
 FOUND, PROPOSED, MARKUPS = "markers_ct.csv", "markers_proposed.csv", ".mrk.json"
 """Never one name for both: a person puts a marker some mm beside its proposed place."""
 PICTURE, REPORT = "markers.png", "markers.json"
+NEAR_MM, WIDE_MM = 40.0, 160.0
+"""Half a side of each slice: of a marker that is there, and of a place that a person must find on the body."""
 CASE = "case.toml"
 ALLOWED = "a folder with one CT, a CT file (NIfTI, NRRD, a DICOM folder), or a case with one"
 
@@ -111,7 +113,14 @@ class MarkersRun:
 
     source: SourceCt
     seen: Seen
+    layout: NamedPoints | None
     files: tuple[Path, ...] = ()
+
+    @property
+    def not_seen(self) -> list[str]:
+        """The names of the layout that no marker has: hidden, or moved since."""
+        names = () if self.layout is None else self.layout.names
+        return [one for one in names if one not in {marker.name for marker in self.seen.fiducials}]
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm, in the stated space."""
@@ -120,6 +129,7 @@ class MarkersRun:
             "space": str(self.source.space),
             "markers": [_row(one, self.source.space) for one in self.seen.fiducials],
             "distances_mm": distances_mm([one.position_ct for one in self.seen.fiducials]).tolist(),
+            "not_seen": self.not_seen,
             "passed_over": dict(self.seen.passed),
             "inputs": inputs_document(self.source.inputs),
             "files": [str(path) for path in self.files],
@@ -129,7 +139,8 @@ class MarkersRun:
         """For the terminal."""
         rows = self.summary()["markers"]
         head = f"{len(rows)} markers in {self.source.name}, mm {self.source.space}"
-        return text([Section(head, [grid(FIELDS, rows)]), *footer(self.files)])
+        warnings = [f"{one} of the layout is not seen, or has moved" for one in self.not_seen]
+        return text([Section(head, [grid(FIELDS, rows)]), *footer(self.files, warnings)])
 
 
 def _row(one: Fiducial, space: Space) -> dict[str, Any]:
@@ -178,7 +189,7 @@ def find_markers(source: Path, out: Path, stated: Stated, layout: Path | None, w
     wanted = None if layout is None else read_points(layout, default_unit=Unit.MM)
     ct = read_source(source, watcher)
     watcher.step("markers", "looking")
-    run = MarkersRun(ct, find_fiducials(ct.volume, ct.skin, stated, wanted, where=layout or source))
+    run = MarkersRun(ct, find_fiducials(ct.volume, ct.skin, stated, wanted, where=layout or source), wanted)
     names, lists = tuple(one.name for one in run.seen.fiducials), _list_names(FOUND, ct.space)
     written = (*lists, PICTURE, REPORT)
     with writing(out, "markers", inputs=ct.inputs, names=written, note=watcher.note) as draft:
@@ -206,7 +217,7 @@ def _write_lists(folder: Path, lists: Sequence[str], points: NamedPoints) -> Non
 
 def _draw(folder: Path, ct: SourceCt, names: Sequence[str], points_ct: Floats, lines: Sequence[str]) -> None:
     T_index_ct = np.asarray(np.linalg.inv(ct.volume.T_ct_index))
-    _sheet(folder, ct.name, names, points_ct, lines, partial(nearest, ct.volume.values, T_index_ct), ct.skin)
+    _sheet(folder, ct.name, names, points_ct, lines, partial(nearest, ct.volume.values, T_index_ct), ct.skin, NEAR_MM)
 
 
 def _sheet(
@@ -217,11 +228,12 @@ def _sheet(
     lines: Sequence[str],
     hu_at: Callable[[Floats], Floats] | None,
     skin: Skin,
+    half_mm: float,
 ) -> None:
     from puncture_twin.twin.report.slices.points import Shown, write_points_sheet  # with matplotlib
 
     shown = [Shown(*one) for one in zip(names, points_ct, lines, strict=True)]
-    write_points_sheet(folder / PICTURE, f"{name}: {len(shown)} markers", shown, hu_at, skin.mesh)
+    write_points_sheet(folder / PICTURE, f"{name}: {len(shown)} markers", shown, hu_at, skin.mesh, half_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,7 +312,7 @@ def propose_places(context: CaseContext, out: Path, count: int) -> ProposalRun:
         names, points = tuple(one.name for one in places), np.array([one.point_ct for one in places])
         _write_lists(draft.folder, lists, NamedPoints(names, points, case.space))
         hu_at = None if context.anatomy.scan is None else context.anatomy.scan.hu_at
-        _sheet(draft.folder, case.name, names, points, ["proposed"] * len(places), hu_at, context.anatomy.skin)
+        _sheet(draft.folder, case.name, names, points, ["proposed"] * len(places), hu_at, context.anatomy.skin, WIDE_MM)
         run = replace(run, files=draft.final([draft.folder / name for name in written]))
         write_result(run.summary(), draft.folder / REPORT, out)
     return run

@@ -19,7 +19,6 @@ from puncture_twin.twin.report.slices.planes import BACK, HEAD, LEFT, Plane, out
 
 TILE, GAP, CAPTION, ACROSS = 220, 10, 40, 3
 """Pixels of a slice, between slices, and of a caption; points side by side."""
-HALF_MM = 40.0
 CROSS, ARM = (3, 9), 2
 """Pixels from the point at which its cross begins and ends, and its width."""
 YELLOW: Rgb = (255, 211, 77)
@@ -35,12 +34,18 @@ class Shown(NamedTuple):
 
 
 def write_points_sheet(
-    path: Path, title: str, points: Sequence[Shown], hu_at: Callable[[Floats], Floats] | None, skin: TriangleMesh
+    path: Path,
+    title: str,
+    points: Sequence[Shown],
+    hu_at: Callable[[Floats], Floats] | None,
+    skin: TriangleMesh,
+    half_mm: float,
 ) -> Path:
     """Write the sheet; it appears whole or not at all.
 
     Args:
         hu_at: Hounsfield units at points (n, 3), NaN outside of the image; None without a CT.
+        half_mm: Half of a slice's side.
     """
     rows = -(-len(points) // ACROSS)
     width, height = 2 * TILE + GAP, TILE + CAPTION + GAP
@@ -55,7 +60,7 @@ def write_points_sheet(
         write(draw, (left, top), one.name, size=15, bold=True)
         write(draw, (left, top + 19), one.line, size=12, colour=FAINT)
         for column, (right, up) in enumerate(((LEFT, -BACK), (BACK, HEAD))):
-            plane = Plane(one.name, one.point_ct, right, up, np.zeros(2), HALF_MM)
+            plane = Plane(one.name, one.point_ct, right, up, np.zeros(2), half_mm)
             sheet.paste(_tile(plane, hu_at, skin), (left + column * (TILE + GAP), top + CAPTION))
     write_image(sheet, path)
     return path
@@ -66,7 +71,7 @@ def _tile(plane: Plane, hu_at: Callable[[Floats], Floats] | None, skin: Triangle
     if hu_at is not None:
         tile = Image.fromarray(TONES["bone"].grey(hu_at(plane.points_ct(TILE)).reshape(TILE, TILE))).convert("RGB")
     draw, middle = ImageDraw.Draw(tile), TILE / 2
-    for a, b in outline(skin, plane) * [1.0, -1.0] * middle / HALF_MM + middle:
+    for a, b in outline(skin, plane) * [1.0, -1.0] * middle / plane.half_mm + middle:
         draw.line([*a, *b], fill=SKIN, width=1)
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         near, far = ((middle + x * away, middle + y * away) for away in CROSS)
