@@ -36,8 +36,7 @@ from puncture_twin.twin.guidance.stereo.planned import calibrating_rod, carried_
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, ball_jacobian, flange_poses
 from puncture_twin.twin.plant.stereo_workcell import StereoPlant, StereoWorkcell, draw_workcell
-from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome, needle_outcome
-from puncture_twin.twin.rehearsal.stereo_trials import needle_statistics
+from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome, needle_outcome, needle_statistics
 
 PIXEL_PX = 0.03
 """Of a centre by edges, per axis; declared here, since there are no pictures of which a tracker could tell it."""
@@ -215,13 +214,13 @@ def line(name: str, outcomes: Sequence[NeedleOutcome], doubted: float) -> str:
     ours = needle_statistics(outcomes)
     assert ours is not None
     pose = np.mean([one.square_of_pose <= chdtri(6, 0.05) for one in outcomes])
-    ratio = ours.realised_rms_mm / ours.predicted_rms_mm
-    hit = "" if ours.hit_share is None else f"{100 * ours.hit_share:5.1f} {100 * (ours.mean_p_hit or 0.0):5.1f}"
-    return (
-        f"{name:52s} {ours.realised_rms_mm:7.3f} {ours.predicted_rms_mm:7.3f} {ratio:6.3f} {ours.coverage_95:7.3f} "
-        f"{ours.realised_direction_deg:7.3f} {ours.predicted_direction_deg:7.3f} {pose:6.3f} {hit:>13s} "
-        f"{100 * doubted:6.1f} %"
+    ratio = ours["realised_rms_mm"] / ours["predicted_rms_mm"]
+    hit = (
+        "" if ours["hit_share"] is None else f"{100 * ours['hit_share']:5.1f} {100 * (ours['mean_p_hit'] or 0.0):5.1f}"
     )
+    figures = "{realised_rms_mm:7.3f} {predicted_rms_mm:7.3f} {ratio:6.3f} {coverage_95:7.3f} "
+    figures += "{realised_direction_deg:7.3f} {predicted_direction_deg:7.3f}"
+    return f"{name:52s} {figures.format(ratio=ratio, **ours)} {pose:6.3f} {hit:>13s} {100 * doubted:6.1f} %"
 
 
 def fast_rooms(name: str, case: ServoCase, count: int, jobs: int) -> None:

@@ -151,8 +151,9 @@ def test_a_session_predicts_every_needle_that_it_saw():
         empty=NoContacts(),
         detector_of=lambda plant: pixel_detector(plant, 0.03),
     )
-    for one in session.reached:
-        assert one.seen.predicted_rms_mm < one.unseen.predicted_rms_mm
-        assert one.seen.offset_mm < HERE.file.servo.tolerance_mm + 0.1
-        assert one.seen.square < 25
-        assert 0.0 <= one.unseen.p_hit <= one.seen.p_hit <= 1.0
+    for one in session.trial.targets:
+        seen, unseen = one.needle_servoed, one.needle_open_loop
+        assert seen.predicted_rms_mm < unseen.predicted_rms_mm
+        assert seen.offset_mm < HERE.file.servo.tolerance_mm + 0.1
+        assert seen.square < 25
+        assert 0.0 <= unseen.p_hit <= seen.p_hit <= 1.0

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -24,9 +24,9 @@ from puncture_twin.twin.experiment.chen2019 import (
     paper_strains,
     run_draws,
 )
-from puncture_twin.twin.jobs.papers import axp_ybq, chen2019
+from puncture_twin.twin.jobs.papers import axp_ybq, chen2019, liu2007
 from puncture_twin.twin.jobs.papers.chen2019 import reproduction_summary, reproduction_text
-from puncture_twin.twin.jobs.servo.job import reproduce_paper
+from puncture_twin.twin.jobs.terminal import Answer
 from puncture_twin.twin.report.present import Field, Section, Table, grid, text
 
 DRAWS, SEED = 1000, 2019
@@ -143,36 +143,25 @@ def _declared(one: Experiment) -> str:
     return f"{d.name}: {', '.join(part for part in parts if part)}"
 
 
-class PaperResult(NamedTuple):
-    """A paper's numbers beside ours."""
-
-    passed: bool
-    """Whether every number that should hold does."""
-    summary: dict[str, Any]
-    """Plain values, for ``--json``."""
-    text: str
-    """For a person."""
-
-
-Reproduce = Callable[[Path, int | None], PaperResult]
+Reproduce = Callable[[Path, int | None], Answer]
 """Takes the folder for pictures and pages, and the number of seeds (None: the paper's own default)."""
 
 
-def _chen2019(out_dir: Path, seeds: int | None) -> PaperResult:
+def _chen2019(out_dir: Path, seeds: int | None) -> Answer:
     del out_dir, seeds  # arithmetic on printed tables: nothing is drawn, in either sense
     result = chen2019.reproduce()
     summary = reproduction_summary(result)
-    return PaperResult(result.passed, summary, reproduction_text(summary))
+    return Answer(result.passed, summary, reproduction_text(summary))
 
 
-def chen2019_experiment(out_dir: Path, draws: int | None, runs: int, watcher: Watcher) -> PaperResult:
+def chen2019_experiment(out_dir: Path, draws: int | None, runs: int, watcher: Watcher) -> Answer:
     """The experiment of Chen 2019 drawn anew, and so many physical runs of its second setup.
 
     Raises:
         InputError: A folder that cannot be written to.
     """
     report = reproduce_experiment(DRAWS if draws is None else draws)
-    result = PaperResult(report.agrees, experiment_summary(report), experiment_text(report))
+    result = Answer(report.agrees, experiment_summary(report), experiment_text(report))
     if not runs:
         return result
     from puncture_twin.planning.search.context import prepare
@@ -180,12 +169,12 @@ def chen2019_experiment(out_dir: Path, draws: int | None, runs: int, watcher: Wa
 
     done = physical_runs(prepare(folder() / SETUP_2, watcher=watcher), out_dir, runs)
     summary = {**result.summary, "physical": done.summary()}
-    return PaperResult(result.passed, summary, f"{result.text}\n{done.text()}")
+    return Answer(result.passed, summary, f"{result.text}\n{done.text()}")
 
 
 def reproduced(
     paper: str, out_dir: Path, seeds: int | None, watcher: Watcher, *, experiment: bool, runs: int
-) -> PaperResult:
+) -> Answer:
     """A paper's numbers beside ours, or its experiment drawn anew.
 
     Raises:
@@ -204,15 +193,13 @@ SETUP_2 = "carton/case_m_setup2.toml"
 """The embedded case of the paper's second setup, five markers."""
 
 
-def _axp_ybq(out_dir: Path, seeds: int | None) -> PaperResult:
+def _axp_ybq(out_dir: Path, seeds: int | None) -> Answer:
     result = axp_ybq.reproduce(out_dir, seeds)
     summary = axp_ybq.reproduction_summary(result)
-    return PaperResult(result.passed, summary, axp_ybq.reproduction_text(summary))
+    return Answer(result.passed, summary, axp_ybq.reproduction_text(summary))
 
 
-def _liu2007(out_dir: Path, seeds: int | None) -> PaperResult:
-    return PaperResult(*reproduce_paper(out_dir, seeds))
-
-
-PAPERS: Mapping[str, Reproduce] = MappingProxyType({"chen2019": _chen2019, "liu2007": _liu2007, "axp-ybq": _axp_ybq})
+PAPERS: Mapping[str, Reproduce] = MappingProxyType(
+    {"chen2019": _chen2019, "liu2007": liu2007.reproduce, "axp-ybq": _axp_ybq}
+)
 """Name on the command line to what reproduces it."""
