@@ -110,7 +110,7 @@ class Room:
         self.pixels = [self.seen(self.workcell.ball_c(q)) for q in self.q_true]
         truth = case.truth_errors
         self.measured_c = self.workcell.ball_c(np.array(self.q_true)) + self.rng.normal(
-            0.0, truth.measuring_mm, (12, 3)
+            0.0, truth.measuring_arm_mm, (12, 3)
         )
         self.markers = np.array([self.seen(point) for point in self.workcell.markers_c])
         self.markers_m = case.markers.points + self.rng.normal(0.0, truth.marker_mm, case.markers.points.shape)

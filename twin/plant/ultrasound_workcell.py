@@ -15,10 +15,10 @@ from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import tangent_basis
 from puncture_twin.twin.guidance.ultrasound.pose_choice import needle_flange
 from puncture_twin.twin.guidance.ultrasound.puncture import nearest_configuration
-from puncture_twin.twin.guidance.ultrasound.selfcal_case import ErrorsSection, SelfcalCase
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.two_arms import between_arms
 from puncture_twin.twin.plant.bmode_image import NeedleInImage, render
-from puncture_twin.twin.plant.truth import ArmErrors, TrueArm, draw_true_arm
+from puncture_twin.twin.plant.truth import TrueArm, draw_true_arm
 
 
 class WorkcellTruth(NamedTuple):
@@ -144,7 +144,7 @@ def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
     """A workcell whose differences from the drawing are drawn from the case's standard deviations."""
     content, off = case.content, case.content.truth
     arms = [
-        draw_true_arm(model, _spread(arm.errors), rng)
+        draw_true_arm(model, arm.errors, rng)
         for model, arm in zip(case.models, (content.probe_arm, content.needle_arm), strict=True)
     ]
     X, Y = (_shifted(T, off.mount_mm, np.radians(off.mount_deg), rng) for T in (case.T_end1_image, case.T_base1_base2))
@@ -152,11 +152,6 @@ def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
     tip = case.tip_end2 + [*rng.normal(0.0, off.tip_mm, 2), rng.normal(0.0, off.length_mm)]
     bent = V + tangent_basis(V) @ rng.normal(0.0, np.radians(off.needle_deg), 2)
     return WorkcellTruth(arms[0], arms[1], X, Y, tip, bent / np.linalg.norm(bent))
-
-
-def _spread(stated: ErrorsSection) -> ArmErrors:
-    angles = np.radians([stated.twist_deg, stated.joint_deg, stated.backlash_deg, stated.repeatability_deg])
-    return ArmErrors(stated.link_mm, *(float(angle) for angle in angles))
 
 
 def _shifted(T: Floats, mm: float, rad: float, rng: np.random.Generator) -> Floats:

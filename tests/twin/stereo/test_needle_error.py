@@ -68,10 +68,9 @@ def test_what_each_unknown_does_to_the_needle_is_a_difference(found, of):
 def test_the_servo_takes_the_arm_out_of_the_tip_but_not_out_of_the_direction():
     """An arm that is declared five times as bad leaves the tip as seen, and spoils tip unseen and direction."""
     session, target = simulate(3), CASE.targets.points[1]
-    worse = replace(
-        session.observed.errors, link_mm=1.5, joint=5 * CASE.errors.joint, twist=5 * CASE.errors.twist, tip_offset_mm=0
-    )
-    exact_tip = replace(session.observed.errors, tip_offset_mm=0.0)
+    five = {key: 5 * getattr(CASE.errors, key) for key in ("link_mm", "joint_deg", "twist_deg")}
+    exact_tip = session.observed.errors.model_copy(update={"tip_offset_mm": 0.0})
+    worse = exact_tip.model_copy(update=five)
     good, bad = (adjust(replace(session.observed, errors=errors), session.guess) for errors in (exact_tip, worse))
     tips = [np.trace(way(fit, target).tip_covariance) for fit in (good, bad) for way in (seen, unseen)]
     assert tips[2] == pytest.approx(tips[0], rel=0.05)
@@ -85,16 +84,16 @@ def test_what_no_camera_sees_stays(found):
     errors = replace(found.model.observed.errors, tip_offset_mm=0.0, needle_direction=0.0)
 
     def told(**keys):
-        observed = replace(found.model.observed, errors=replace(errors, **keys))
+        observed = replace(found.model.observed, errors=errors.model_copy(update=keys))
         return servoed_error(replace(found, model=replace(found.model, observed=observed)), -1, target)
 
     plain = told()
     tip = told(tip_offset_mm=0.7).covariance - plain.covariance
     np.testing.assert_allclose(tip, np.diag([0.49] * 3 + [0.0] * 3), atol=1e-12)
-    leaning = told(needle_direction=0.01)
+    leaning = told(needle_direction_deg=np.degrees(0.01))
     assert leaning.direction_rms**2 - plain.direction_rms**2 == pytest.approx(2e-4)
     np.testing.assert_allclose(leaning.covariance[:3, :3], plain.covariance[:3, :3], atol=1e-12)
-    moved = told(head_shift_mm=0.3, head_turn=0.02).covariance - plain.covariance
+    moved = told(head_shift_mm=0.3, head_turn_deg=np.degrees(0.02)).covariance - plain.covariance
     np.testing.assert_allclose(moved, np.diag([0.09] * 3 + [4e-4] * 3), atol=1e-9)
     read = told(target_mm=0.4)
     np.testing.assert_allclose(read.tip_covariance - plain.tip_covariance, 0.16 * np.eye(3), atol=1e-12)

@@ -303,12 +303,12 @@ def _both(needle: Facts, realised: str, predicted: str) -> list[str]:
 
 
 def _setup(case: ServoCase) -> str:
-    plan, robot, servo, arm = case.file.cameras, case.file.robot, case.file.servo, case.errors.stated()
+    plan, robot, servo, arm = case.file.cameras, case.file.robot, case.file.servo, case.errors
     return (
         f"Two cameras of {plan.size_px[0]} x {plan.size_px[1]} px, {plan.baseline_mm:g} mm apart, "
         f"{plan.distance_mm:g} mm away, noise {plan.noise_grey:g} grey levels; centre by {plan.centre}; "
-        f"{robot.model} off by {arm['link_mm']:g} mm, {arm['joint_deg']:g}°, play {arm['backlash_deg']:g}°, "
-        f"repeatability {arm['repeatability_deg']:g}°; measuring arm {case.errors.measuring_mm:g} mm an axis, "
+        f"{robot.model} off by {arm.link_mm:g} mm, {arm.joint_deg:g}°, play {arm.backlash_deg:g}°, "
+        f"repeatability {arm.repeatability_deg:g}°; measuring arm {arm.measuring_arm_mm:g} mm an axis, "
         f"12 points over {' x '.join(f'{mm:g}' for mm in case.file.calibration.size_mm)} mm; "
         f"tolerance {servo.tolerance_mm:g} mm; "
         f"estimate: {'joint' if servo.estimate == 'joint' else 'the chain'}."
