@@ -9,7 +9,7 @@ from refusals import refused
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.twin.jobs.experiment import physical_runs as module
 from puncture_twin.twin.jobs.experiment.touch_job import TouchedOnce
-from puncture_twin.twin.rehearsal.touching import Touched
+from puncture_twin.twin.plant.touching import ExecutedTouches
 
 CONTEXT = SimpleNamespace(
     watcher=SimpleNamespace(count=lambda *_: None), stages=SimpleNamespace(time=lambda _: nullcontext())
@@ -66,7 +66,7 @@ def test_a_contact_on_the_way_to_the_target_refuses_its_run(monkeypatch):
 
 def test_a_marker_that_is_not_touched_refuses_its_run(monkeypatch):
     """The prediction is of all markers."""
-    touched = Touched((), {"A": "no contact"}, 1.0)
+    touched = ExecutedTouches((), {"A": "no contact"}, 1.0, {})
     monkeypatch.setattr(module, "touch_once", lambda *_: TouchedOnce(touched, "2 of 3 markers were touched"))
     with refused("no_touch", "marker A: no contact", by=NoAnswerError):
         module.physical_run(CONTEXT, None, 7)

@@ -40,8 +40,8 @@ from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.report.present import Section, footer, text, vector
 
 if TYPE_CHECKING:  # a list is read where the simulator is not installed
+    from puncture_twin.twin.guidance.ct.touching import Touched
     from puncture_twin.twin.plant.true_needle import TouchTruth
-    from puncture_twin.twin.rehearsal.touching import Touched
 
 STANDS_OUT = 2.0
 """A touch that misses by so many times the others' root mean square is named."""
@@ -242,7 +242,7 @@ def _truth(context: CaseContext, tour: TouchTour, seed: int) -> TouchTruth:
 
 
 def _executed(context: CaseContext, tour: TouchTour, truth: TouchTruth) -> Touched:
-    from puncture_twin.twin.rehearsal.touching import execute_touches
+    from puncture_twin.twin.plant.touching import execute_touches
 
     checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
     with context.stages.time("touches"):
