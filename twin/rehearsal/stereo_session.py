@@ -20,7 +20,7 @@ from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
 from puncture_twin.twin.devices import Arm
 from puncture_twin.twin.guidance.stereo.detection import Detector, image_detector, in_space, look_at, searches_of
-from puncture_twin.twin.guidance.stereo.guide import Guide, Known, guide_of
+from puncture_twin.twin.guidance.stereo.guide import Guide
 from puncture_twin.twin.guidance.stereo.joint.needle_error import REGION, NeedleError
 from puncture_twin.twin.guidance.stereo.planned import carried_rod, grid_points, workcell_checker
 from puncture_twin.twin.guidance.stereo.recording import Recorder, StereoDevices
@@ -32,7 +32,7 @@ from puncture_twin.twin.guidance.stereo.robot_calibration import (
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ServoStop
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed
-from puncture_twin.twin.guidance.stereo.session import Aims, ImageReading, aims_of, map_markers, see_markers
+from puncture_twin.twin.guidance.stereo.session import Aims, ImageReading, aims_of, map_markers
 from puncture_twin.twin.plant.stereo_workcell import ShownBall, StereoPlant, StereoWorkcell, TrueNeedle, draw_workcell
 
 TEST_POINTS = 10
@@ -242,9 +242,7 @@ def run_session(
     stereo_mm = _try_stereo(plant, calibration, plain, parts.tests)
     reading = _read(case, parts.image)
     plant.bring_head()
-    seen = see_markers(case, calibration, detector, devices)
-    mapping = map_markers(case, calibration, seen, reading)
-    guide = guide_of(Known(case, calibration, mapping, seen, reading.markers_m, detector))
+    mapping, guide = map_markers(case, calibration, detector, devices, reading)
     aims, reached = aims_of(case, calibration, mapping, reading.targets_m, targets), []
     for row, number in enumerate(aims.numbers):
         devices.move_jp(aims.q_hover[row])

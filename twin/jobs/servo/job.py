@@ -11,12 +11,11 @@ from puncture_twin.planning.base.files import new_folder
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.twin.guidance.stereo.detection import image_detector
-from puncture_twin.twin.guidance.stereo.guide import Known, guide_of
 from puncture_twin.twin.guidance.stereo.recording import read_recording
 from puncture_twin.twin.guidance.stereo.robot_calibration import calibrate_by_robot
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import Posture
-from puncture_twin.twin.guidance.stereo.session import follow, map_markers, see_markers
+from puncture_twin.twin.guidance.stereo.session import follow, map_markers
 from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergence
 from puncture_twin.twin.jobs.servo.report import (
     Facts,
@@ -123,9 +122,7 @@ def follow_recording(path: Path, recording: Path) -> Answer:
     detector = image_detector(replay, hough_only=case.hough_only)
     calibration = calibrate_by_robot(case, Posture(replay.q_points, -1), replay, replay, detector)
     reading = replay.reading(case.markers, case.targets)
-    seen = see_markers(case, calibration, detector, replay)
-    mapping = map_markers(case, calibration, seen, reading)
-    guide = guide_of(Known(case, calibration, mapping, seen, reading.markers_m, detector))
+    mapping, guide = map_markers(case, calibration, detector, replay, reading)
     looks = list(follow(case, guide, calibration.T_base_c, reading.targets_m, replay.stops, replay))
     facts = recording_facts(case, recording, calibration, mapping, looks)
     return Answer(facts["converged"], facts, recording_text(facts))

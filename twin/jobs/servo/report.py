@@ -19,8 +19,6 @@ from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import Mapping as HeadMapping
-from puncture_twin.twin.guidance.stereo.servo_loop import Lost
-from puncture_twin.twin.guidance.stereo.session import Looked
 from puncture_twin.twin.rehearsal.stereo_session import ServoTrial, declaration_test, needle_statistics
 from puncture_twin.twin.report.page.template import Card
 from puncture_twin.twin.report.present import (
@@ -86,11 +84,11 @@ def _needle(case: ServoCase, trials: Sequence[ServoTrial]) -> dict[str, Any]:
 
 
 def recording_facts(
-    case: ServoCase, folder: Path, calibration: RobotCalibration, mapping: HeadMapping, looks: Sequence[Looked]
+    case: ServoCase, folder: Path, calibration: RobotCalibration, mapping: HeadMapping, looks: Sequence[Facts]
 ) -> dict[str, Any]:
     """What a recorded session says; mm and degrees."""
-    last = {one.target: one for one in looks}
-    within = [bool(np.linalg.norm(one.error_c) <= case.file.servo.tolerance_mm) for one in last.values()]
+    last = {one["target"]: one["error_mm"] for one in looks}
+    within = [error_mm is not None and error_mm <= case.file.servo.tolerance_mm for error_mm in last.values()]
     return {
         "case": case.name,
         "recording": str(folder),
@@ -100,23 +98,8 @@ def recording_facts(
         "robot_residual_mm": float(np.mean(calibration.robot_residual_mm)),
         "T_base_c": calibration.T_base_c.tolist(),
         "fre_mm": mapping.fre_mm,
-        "looks": [_looked(case, one) for one in looks],
+        "looks": list(looks),
         "converged": all(within),
-    }
-
-
-def _looked(case: ServoCase, one: Looked) -> dict[str, Any]:
-    radius, believed = case.file.target.hit_radius_mm, one.needle
-    lost = one.seen.reason if isinstance(one.seen, Lost) else None
-    return {
-        "target": one.target,
-        "joints_deg": np.degrees(one.q_command).tolist(),
-        "lost": lost,
-        "error_c_mm": None if lost else one.error_c.tolist(),
-        "error_mm": None if lost else float(np.linalg.norm(one.error_c)),
-        "needle_rms_mm": None if believed is None else believed.rms_mm,
-        "p_hit": None if believed is None or radius is None else believed.p_hit(radius),
-        "next_joints_deg": None if one.q_next is None else np.degrees(one.q_next).tolist(),
     }
 
 
