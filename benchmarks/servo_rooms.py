@@ -29,6 +29,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
 from puncture_twin.twin.guidance.stereo.detection import Detection, Detector, Search
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, adjust
 from puncture_twin.twin.guidance.stereo.joint.needle_error import open_loop_error, servoed_error
@@ -189,11 +190,11 @@ def drawn_from(case: ServoCase, factor: float) -> ServoCase:
 def rows() -> dict[str, ServoCase]:
     """What is drawn and declared in each row."""
     head = told_of_pixels(load_servo_case(folder() / "head"))
-    plain = replace(head, file=head.file.model_copy(update={"errors": None}))
+    plain = replace(head, file=head.file.model_copy(update={"errors": ServoErrors()}))
     return {
         "meshes/head as declared": head,
         "the defaults of [errors]": told_of_pixels(varied(plain, errors={}), target_mm=0.3),
-        "arm nominal, no play": told_of_pixels(varied(plain, errors={"arm": "nominal"})),
+        "arm nominal, no play": told_of_pixels(varied(plain, errors=ServoErrors(arm="nominal").model_dump())),
         "cameras of .3 px, head moves .2 mm, .1 deg": told_of_pixels(
             head, ball_px=0.3, head_shift_mm=0.2, head_turn_deg=0.1
         ),

@@ -22,7 +22,7 @@ from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
 from puncture_twin.twin.guidance.stereo.planned import calibration_frame, head_pose, planned_cameras
 from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection, ServoCase
 from puncture_twin.twin.plant.ball_image import BallScene, render
-from puncture_twin.twin.plant.truth import TrueArm, draw_true_arm
+from puncture_twin.twin.plant.truth import PlantArm, TrueArm, draw_true_arm
 
 LINE_OF_SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
 """Where on the ball's disc a line of sight ends: fraction of the radius, and how many around."""
@@ -169,7 +169,7 @@ class StereoWorkcell:
         return TriangleMesh(self.head_c.vertices, self.head_c.faces[near]) if near.any() else None
 
 
-class StereoPlant:
+class StereoPlant(PlantArm):
     """A workcell in time: where the arm is, whether the head is there; it answers as arm, cameras and touch do.
 
     Args:
@@ -186,11 +186,8 @@ class StereoPlant:
         arm: np.random.Generator,
         operator: np.random.Generator,
     ) -> None:
-        self.workcell = workcell
-        self.rests: list[Floats] = []
-        """True joints after each move, (6,), rad."""
-        self.pictures = pictures
-        self._arm, self._operator = arm, operator
+        super().__init__(workcell.arm, arm)
+        self.workcell, self.pictures, self._operator = workcell, pictures, operator
         self._head_there = False
         self._shown: ShownBall | None = None
 
@@ -201,11 +198,6 @@ class StereoPlant:
     def show(self, ball: ShownBall | None) -> None:
         """Show a ball in place of the arm's; None shows the arm's again."""
         self._shown = ball
-
-    def move_jp(self, q: Floats) -> None:
-        """Move the arm to joints (6,), rad: its gears stop short, its joints miss."""
-        before = self.rests[-1] if self.rests else q
-        self.rests.append(self.workcell.arm.settle(q, before, self._arm))
 
     @property
     def ball(self) -> ShownBall:
@@ -238,7 +230,7 @@ class StereoPlant:
     def measured_cp(self) -> Floats:
         """The measuring arm's reading of the ball's centre, shape (3,), mm, C."""
         sigma = self.workcell.case.truth_errors.measuring_arm_mm
-        return np.asarray(self.ball.center_c + self._arm.normal(0.0, sigma, 3))
+        return np.asarray(self.ball.center_c + self._rng.normal(0.0, sigma, 3))
 
     def pointed_cp(self, marker: str) -> Floats:
         """Where an operator points for a marker, shape (3,), mm, C."""

@@ -212,6 +212,24 @@ class TrueArm(NamedTuple):
         return np.asarray(settled + rng.normal(0.0, self.repeatability, 6))
 
 
+class PlantArm:
+    """An arm as it moves, with the play of its last arrival.
+
+    Args:
+        arm: The true arm.
+        rng: Draws its repeatability.
+    """
+
+    def __init__(self, arm: TrueArm, rng: np.random.Generator) -> None:
+        self._arm, self._rng = arm, rng
+        self.rests: list[Floats] = []
+        """True joints after each move, (6,), rad."""
+
+    def move_jp(self, q: Floats) -> None:
+        """Move to joints (6,), rad: its gears stop short, its joints miss."""
+        self.rests.append(self._arm.settle(q, self.rests[-1] if self.rests else q, self._rng))
+
+
 def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator) -> TrueArm:
     """An arm whose errors are drawn from their standard deviations.
 

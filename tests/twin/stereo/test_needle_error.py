@@ -81,7 +81,7 @@ def test_the_servo_takes_the_arm_out_of_the_tip_but_not_out_of_the_direction():
 def test_what_no_camera_sees_stays(found):
     """Tip offset, needle direction, target reading and a head that moves add what they are."""
     target = found.unknowns.markers_m.mean(axis=0)  # about which the head turns
-    errors = replace(found.model.observed.errors, tip_offset_mm=0.0, needle_direction=0.0)
+    errors = found.model.observed.errors.model_copy(update={"tip_offset_mm": 0.0, "needle_direction_deg": 0.0})
 
     def told(**keys):
         observed = replace(found.model.observed, errors=errors.model_copy(update=keys))

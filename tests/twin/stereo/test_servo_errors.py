@@ -51,6 +51,7 @@ def test_a_case_that_declares_nothing_has_the_defaults(tmp_path):
         ("[errors]", "[rehearsal.errors]", "missing_errors"),
         ("ball_offset_mm", "ball_ofset_mm", "unknown_key ball_offset_mm"),
         ("tip_offset_mm = 0.1", "tip_offset_mm = -0.1", "bad_value errors.tip_offset_mm"),
+        ("tip_offset_mm = 0.1", 'arm = ["nominal"]', "bad_value errors.arm"),
         ("hit_radius_mm = 0.5", "hit_radius_mm = 0", "bad_value target.hit_radius_mm"),
     ],
 )

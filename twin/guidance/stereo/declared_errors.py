@@ -68,7 +68,7 @@ class ServoErrors(ArmErrors):
     def _as_kind_and_marker(cls, stated: Any) -> Any:
         if not isinstance(stated, dict):
             return stated
-        kind = ARM_KINDS.get(stated.get("arm", "calibrated"), ARM_KINDS["calibrated"])
+        kind = ARM_KINDS["nominal" if stated.get("arm") == "nominal" else "calibrated"]
         return {**kind._asdict(), "target_mm": stated.get("marker_mm", DEFAULT_MARKER_MM), **stated}
 
     @property

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import PARAMETERS, check_recording, flange_pose
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.output.output_set import writing
@@ -136,7 +136,7 @@ def _doubt(run: PivotRun) -> list[str]:
         arm = pivot.expected_whole_mm > LARGE * pivot.expected_mm
         return ["most of it comes from the declared errors of the arm: more poses do not help"] if arm else []
     worst = int(np.argmax(pivot.misses_mm))
-    rest = float(np.sqrt(np.mean(np.delete(pivot.misses_mm, worst) ** 2)))
+    rest = rms(np.delete(pivot.misses_mm, worst))
     head = f"the residual is more than {LARGE:g} times the declared one"
     if pivot.misses_mm[worst] > STANDS_OUT * rest:
         one = f"{run.names[worst]} misses by {pivot.misses_mm[worst]:.2f} mm, the others by {rest:.2f} (rms)"
