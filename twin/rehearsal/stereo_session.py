@@ -185,7 +185,6 @@ class Session:
         calibration: Result of the robot's points.
         mapping: What the markers gave.
         reached: One for each target.
-        guide: The estimates of ball and target for the servo; knows everything that was measured.
         trial: The session as plain values.
     """
 
@@ -193,7 +192,6 @@ class Session:
     calibration: RobotCalibration
     mapping: Mapping
     reached: tuple[Reached, ...]
-    guide: Guide
     trial: ServoTrial
 
 
@@ -256,7 +254,7 @@ def run_session(
     residual, declaration = float(np.mean(calibration.robot_residual_mm)), _declaration(guide)
     rows, stereo = tuple(one.row for one in reached), tuple(stereo_mm.tolist())
     figures = ServoTrial(seed, stereo, calibration.rms_px, mapping.fre_mm, residual, rows, None, declaration)
-    return Session(workcell, calibration, mapping, tuple(reached), guide, figures)
+    return Session(workcell, calibration, mapping, tuple(reached), figures)
 
 
 def _declaration(guide: Guide) -> DeclarationTest | None:

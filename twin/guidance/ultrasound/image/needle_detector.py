@@ -173,8 +173,6 @@ class Detection(NamedTuple):
     """Shape (2,), mm: (u, v), corrected for the bias."""
     direction_image: Floats
     """Unit, shape (2,): toward the tip."""
-    score_mm: float
-    """Sum along the visible segment of the amplitude over background, times mm."""
     contrast_db: float
     """Amplitude of the last piece of shaft over the background."""
     shaft_mm: float
@@ -213,7 +211,7 @@ def detect(image: Pixels, imager: Imager, *, tip_bias: float = TIP_BIAS) -> Dete
     if np.any(found < EDGE_MM) or np.any(found > high):
         return Missed.TIP_AT_EDGE
     contrast = 20.0 * float(np.log10(max(1.0 + tip.step, 1e-6)))
-    return Detection(found, line.direction, segment.score, contrast, -line.start)
+    return Detection(found, line.direction, contrast, -line.start)
 
 
 def over_background(image: Pixels, imager: Imager) -> Floats:
