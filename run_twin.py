@@ -436,14 +436,14 @@ def export(
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="urscript, ros2, moveit, csv, slicer, candidates-csv, candidates-json, or one of another package.",
+            help="urscript, ros2, moveit, csv, slicer, dicom, candidates-csv, candidates-json, or another package's.",
         ),
     ],
     case: Annotated[Path | None, typer.Option("--case", help="Case of the plan: checks the plan again.")] = None,
     out_dir: OutOfCaseOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Export a plan for a robot, or a path for 3D Slicer. It is read back. Research software, not a medical device."""
+    """Export a plan for a robot, or a path for Slicer or a DICOM archive. Research software, not a medical device."""
     from puncture_twin.twin.jobs.patient.export_jobs import export_source, refuse_format
 
     refuse_format(format_name)

@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from puncture_twin.twin.jobs.batch.jobs import Merged
     from puncture_twin.twin.jobs.choosing.compare_job import Comparison
     from puncture_twin.twin.jobs.experiment.touch_job import TouchRun
-    from puncture_twin.twin.jobs.patient.export_jobs import ExportedTable, SlicerExport
+    from puncture_twin.twin.jobs.patient.export_jobs import ExportedTable
+    from puncture_twin.twin.jobs.patient.path_exports import PathExport
     from puncture_twin.twin.rehearsal.result import Rehearsal
 
     Points = NamedPoints | Mapping[str, ArrayLike]
@@ -664,17 +665,17 @@ def compare(
 @checked
 def export(
     source: Plan | Candidates | Explanation, format_name: str, folder: Path | str, *, context: CaseContext | None = None
-) -> Exported | ExportedTable | SlicerExport:
-    """Write a plan for a robot, the table of candidates, or a direction for 3D Slicer; read back before it is shown.
+) -> Exported | ExportedTable | PathExport:
+    """Write a plan for a robot, the table of candidates, or a direction for 3D Slicer or an archive; read back.
 
     Args:
         source: A plan (``urscript``, ``ros2``, ``csv``, ``moveit``, or another package's format; ``plan.json`` is
             written beside it), candidates (``candidates-csv``, ``candidates-json``), or a checked direction
-            (``slicer``).
+            (``slicer``, ``dicom``).
         format_name: One of these.
         folder: Where the files go; made where it is missing.
-        context: The plan is checked again against this case, and corners are rounded where that is free; ``moveit`` and
-            ``slicer`` need it.
+        context: The plan is checked again against this case, and corners are rounded where that is free; ``moveit``,
+            ``slicer`` and ``dicom`` need it.
 
     Raises:
         InputError: A format that is not of this source, a plan that breaks a limit of the arm or does not hold, or

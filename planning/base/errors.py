@@ -212,6 +212,7 @@ MODULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "twin": ("pybullet", "cv2", "imageio_ffmpeg"),
         "mirror": ("rtde_receive",),
         "dask": ("distributed",),
+        "dicom": ("highdicom",),
         "hdf5": ("h5py",),
         "pandas": ("pandas",),
     }

@@ -178,6 +178,10 @@ class CaseVolumes:
         """The volume of this name."""
         return self._sources[name]
 
+    def series(self, name: str | None) -> CtSeries | None:
+        """The DICOM series of this name; None where it is a file of another kind."""
+        return self._series.get(name or "")
+
     def read_masks(self, section: StructuresSection, case_ct: str | None) -> None:
         """The structures of a SEG (DICOM, or Slicer's .seg.nrrd) or RTSTRUCT whose file has been read, and its CT.
 

@@ -10,7 +10,7 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.search.choice import Choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.twin.jobs.patient import main_job
-from puncture_twin.twin.jobs.patient.export_jobs import export_to_slicer
+from puncture_twin.twin.jobs.patient.path_exports import export_path
 from tests.case_world import write_case
 
 CHANGES = (("theta_deg = [0, 10]", 'frame = "ct"\ntheta_deg = [0, 60]'),)
@@ -64,5 +64,5 @@ def test_an_entry_off_the_skin_is_told_at_once_and_the_old_set_stays(context, un
 def test_slicer_too(context, rejected, unsearched, tmp_path):
     """The same of a path for 3D Slicer."""
     with refused("direction_rejected", by=NoAnswerError):
-        export_to_slicer(context, tmp_path / "out", rejected)
+        export_path(context, "slicer", tmp_path / "out", rejected)
     assert not (tmp_path / "out").exists()

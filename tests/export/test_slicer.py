@@ -23,7 +23,7 @@ from puncture_twin.planning.search.choice import BEST, Choice
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.patient.export_jobs import export_to_slicer
+from puncture_twin.twin.jobs.patient.path_exports import export_path
 
 TURN = np.array([0.4, -1.1, 2.0])
 T_BASE_CT = pose(exp_rotation(TURN), left_jacobian(TURN) @ [310.0, -120.0, 240.0])
@@ -52,7 +52,7 @@ def context(tmp_path_factory):
 def exported(context, tmp_path_factory):
     """The folder of an export of rank 3, and what the job says."""
     out = tmp_path_factory.mktemp("out")
-    return out, export_to_slicer(context, out, Choice(rank=3))
+    return out, export_path(context, "slicer", out, Choice(rank=3))
 
 
 def check_markups(document):
@@ -179,16 +179,16 @@ def test_without_a_robot_there_is_no_transform_and_that_is_said(tmp_path, capfd)
 def test_what_cannot_be_shown_is_refused_and_nothing_is_written(tmp_path, context):
     """A plan, a rank beyond the last, a rejected direction, a frame of its own."""
     with refused("out_of_range"):
-        export_to_slicer(context, tmp_path / "a", Choice(rank=10_000))
+        export_path(context, "slicer", tmp_path / "a", Choice(rank=10_000))
     with refused("direction_rejected", by=NoAnswerError):
-        export_to_slicer(context, tmp_path / "a", Choice(angles=(np.radians(45.0), 0.0)))
+        export_path(context, "slicer", tmp_path / "a", Choice(angles=(np.radians(45.0), 0.0)))
     local = ('space = "RAS"', 'space = "local"')
     write_case(tmp_path, *CHANGES, local, NO_ROBOT)
     text = (tmp_path / "case.toml").read_text()
     vessel = text.index('[[structure]]\nname = "vessel"')
     (tmp_path / "case.toml").write_text(whole(text[:vessel]))
     with refused("local_space"):
-        export_to_slicer(prepare(tmp_path), tmp_path / "a", BEST)
+        export_path(prepare(tmp_path), "slicer", tmp_path / "a", BEST)
     assert not [one for one in (tmp_path / "a").glob("*") if one.suffix in (".json", ".mrml", ".tfm", ".vtp")]
     (tmp_path / "plan.json").write_text("{}")
     assert main(["export", str(tmp_path / "plan.json"), "--format", "slicer", "--out", str(tmp_path / "a")]) == 2

@@ -1,7 +1,5 @@
 """A plan for MoveIt and ROS 2: the scene, the goals, the arm with its needle and a sender, as one set.
 
-A chosen path of a case for 3D Slicer; the arm is not needed, and without it there is no transform.
-
 The table of candidates for programs that read no Parquet: CSV or JSON, read back and equal before it is shown.
 """
 
@@ -31,17 +29,17 @@ from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.budget.guidance import check_ways
 from puncture_twin.planning.export.exporter import Exported, format_names
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
-from puncture_twin.planning.export.slicer import NAMES, SLICER, SceneContent, entry_area, slicer_files
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
 from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.planning.search.candidates import ANGLE_DIGITS, Candidates
-from puncture_twin.planning.search.choice import BEST, Choice, choose, choose_stated, with_file_read
+from puncture_twin.planning.search.choice import BEST, Choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.twin.jobs.patient.main_job import case_of, export, is_plan, plan_case, read_noted_plan, search_case
+from puncture_twin.twin.jobs.patient.path_exports import PATH_FORMATS, PathExport, export_path
 from puncture_twin.twin.jobs.patient.summaries import export_summary
-from puncture_twin.twin.report.present import Section, Warn, text
+from puncture_twin.twin.report.present import Section, text
 
 TABLE = "candidates.parquet"
 ALLOWED = "a case, or the candidates.parquet of a search, or its folder"
@@ -222,18 +220,18 @@ def export_to_moveit(context: CaseContext, plan_path: Path, out: Path, *, seed: 
 
 def export_value(
     source: Plan | Candidates | Explanation, format_name: str, folder: Path | str, context: CaseContext | None
-) -> Exported | ExportedTable | SlicerExport:
-    """Write what is in memory: a plan for a robot, a table of candidates, or a checked direction for 3D Slicer.
+) -> Exported | ExportedTable | PathExport:
+    """Write what is in memory: a plan for a robot, a table, or a checked direction for 3D Slicer or an archive.
 
     Raises:
         InputError: A format of another source, or see the functions that write.
     """
     refuse_format(format_name)
-    kind = Candidates if format_name in CANDIDATE_FORMATS else Explanation if format_name == SLICER else Plan
+    kind = Candidates if format_name in CANDIDATE_FORMATS else Explanation if format_name in PATH_FORMATS else Plan
     if not isinstance(source, kind):
         what = f"'{format_name}' is not written from a value of type {type(source).__name__}"
         refuse(what, "export", f"one of type {kind.__name__}", "wrong_type")
-    if context is None and format_name in (MOVEIT, SLICER):
+    if context is None and format_name in (MOVEIT, *PATH_FORMATS):
         refuse(f"the scene of {format_name} is the case's", "export", "context=... beside it", "missing_option")
     if context is not None and not isinstance(source, Plan):
         context.own(source if isinstance(source, Candidates) else source.candidates)
@@ -243,7 +241,7 @@ def export_value(
     if isinstance(source, Explanation):
         assert context is not None
         one = source.candidates
-        return export_to_slicer(context, out, Choice(angles=(float(one.theta[0]), float(one.beta[0]))))
+        return export_path(context, format_name, out, Choice(angles=(float(one.theta[0]), float(one.beta[0]))))
     with writing(out, "plan", inputs=source.inputs, names=("plan.json",)) as draft:
         write_plan(source, draft.folder / "plan.json")
     if format_name == MOVEIT:
@@ -262,7 +260,7 @@ class Export(NamedTuple):
 
 def refuse_format(name: str) -> None:
     """Refuse a format that nothing writes."""
-    known = (*format_names(), MOVEIT, SLICER, *CANDIDATE_FORMATS)
+    known = (*format_names(), MOVEIT, *PATH_FORMATS, *CANDIDATE_FORMATS)
     if name not in known:
         refuse(f"format '{name}' is not known", "--format", ", ".join(known), "unknown_format")
 
@@ -287,13 +285,11 @@ def export_source(
         written = export_candidates(table, format_name, out, watcher.note)
         return Export(written, written.summary(), written.text())
     planned_case = case_of(source, case, choice)
-    if format_name == SLICER:
-        if is_plan(source):
-            refuse("slicer needs a case", source, "a case, with --rank, --window, --theta or --entry", "missing_option")
-        shown = export_to_slicer(prepare(source, watcher=watcher), out, choice)
+    if format_name in (MOVEIT, *PATH_FORMATS) and planned_case is None:
+        refuse(f"{format_name} shows the case", source, "export plan.json --case CASE", "missing_option")
+    if format_name in PATH_FORMATS and planned_case is not None:
+        shown = export_path(prepare(planned_case, watcher=watcher), format_name, out, choice, source)
         return Export(shown, shown.summary(), shown.text())
-    if format_name == MOVEIT and planned_case is None:
-        refuse("the MoveIt scene needs the case", source, "export plan.json --case CASE", "missing_option")
     context = None if planned_case is None else prepare(planned_case, watcher=watcher)
     plan_path = source
     if context is not None and not is_plan(source):
@@ -313,68 +309,3 @@ def export_text(done: Exported, case_checked: bool) -> str:
     warned = (Section(f"warning: {one}", []) for one in done.plan.warnings)
     said = Section(f"{done.format_name}: {done.path}", [direction, *done.notes, *unchecked])
     return text([said, *warned])
-
-
-NO_APPROACH = "directions checked; no approach planned"
-
-
-@dataclass(frozen=True, repr=False)
-class SlicerExport(Shown):
-    """What was written.
-
-    Attributes:
-        path: The direction that the line shows.
-        notes: What whoever opens them should know, one sentence each.
-    """
-
-    files: tuple[Path, ...]
-    path: str
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
-    inputs: tuple[Input, ...]
-
-    def summary(self) -> dict[str, Any]:
-        """As plain values."""
-        return {
-            "format": SLICER,
-            "path": self.path,
-            "notes": list(self.notes),
-            "warnings": list(self.warnings),
-            "inputs": inputs_document(self.inputs),
-            "files": [str(file) for file in self.files],
-        }
-
-    def text(self) -> str:
-        """As lines."""
-        warned = (f"warning: {one}" for one in self.warnings)
-        return text([Section(f"{SLICER}: {self.path}", [Warn(tuple(map(str, self.files))), *self.notes, *warned])])
-
-
-def export_to_slicer(context: CaseContext, out: Path, choice: Choice) -> SlicerExport:
-    """Search, and write the chosen path, the safe entry area, markers, transform and scene as one set.
-
-    Raises:
-        InputError: There is nothing of what was chosen, or the case has no patient space.
-        NoAnswerError: Nothing is safe, or what was chosen is not.
-    """
-    case, stages = context.case, context.stages
-    choice = with_file_read(case, choice)
-    inputs = (*choice.read, *case.inputs)
-    if not choice.of_grid:
-        choose_stated(context, choice)  # before the search is made for nothing
-    with writing(
-        out, f"export {SLICER}", inputs=inputs, seconds=stages.seconds, names=NAMES, note=context.watcher.note
-    ) as draft:
-        found = context.search()
-        chosen = choose(context, found, choice)
-        row = int(chosen.rows[0])
-        at = chosen.candidates.at(row)
-        name = f"path theta {at['theta_deg']:.6g} beta {at['beta_deg']:.6g}"
-        drawn = SceneContent(name, chosen.candidates.path.entry_ct[row], entry_area(found), context.placement)
-        made = slicer_files(case, drawn)
-        for file, text in made.texts.items():
-            (draft.folder / file).write_text(text, encoding="utf-8")
-    files = draft.final(tuple(draft.folder / file for file in made.texts))
-    return SlicerExport(
-        files, name, (NO_APPROACH, f"arm: {found.arm_note}", *made.notes), tuple(context.anatomy.warnings), inputs
-    )

@@ -1,0 +1,200 @@
+"""What the scan's archive is given: regions on the scan's own slices, numbers and lines as they are; of its study."""
+
+import io
+import json
+import shutil
+
+import dicom_world as world
+import highdicom as hd
+import numpy as np
+import pydicom
+import pytest
+from refusals import refused
+from search.test_dicom_case import write_scene
+
+from puncture_twin.planning.export.archive import (
+    NAMES,
+    ArchiveContent,
+    Quantity,
+    Region,
+    archive_files,
+    finest_mm,
+    report_content,
+    rod_points,
+    surface_points,
+)
+from puncture_twin.planning.formats.dicom.ct_series import CtSeries
+from puncture_twin.run_twin import main
+
+SHAPE = (40, 36, 12)
+NAME = "Björk^Åsa=山田^太郎"
+
+
+def tilted():
+    """A stack whose slices lean by 20 degrees against the table."""
+    axes = world.rotation(np.radians(20.0), (1, 2))
+    return world.affine(axes, step=(0.0, 0.0, 2.5))
+
+
+SCANS = {
+    "upright": lambda values: world.series(values),
+    "tilted": lambda values: world.series(values, tilted()),
+    "backwards": lambda values: world.series(values, world.affine(step=(0.0, 0.0, -2.5)))[::-1],
+    "enhanced": lambda values: [world.enhanced(values)],
+}
+
+
+@pytest.fixture(params=sorted(SCANS))
+def scan(request, tmp_path):
+    """A series in memory, with a patient whose name needs two character sets."""
+    slices = SCANS[request.param](world.phantom(SHAPE) % 2000)
+    content = {}
+    for number, one in enumerate(slices):
+        one.SpecificCharacterSet, one.PatientName = "ISO_IR 192", NAME
+        one.StudyDate, one.AccessionNumber = "20261126", "A-7"
+        stream = io.BytesIO()
+        one.save_as(stream, enforce_file_format=True)
+        content[f"{number}.dcm"] = stream.getvalue()
+    return CtSeries(tmp_path, tuple(content), content.__getitem__)
+
+
+def centres(scan):
+    """Every voxel's centre, shape (*shape, 3), LPS mm, by each slice's own header."""
+    made = np.empty((*scan.slice_shape, len(scan.stack.slices), 3))
+    i, j = np.meshgrid(*(np.arange(n) for n in scan.slice_shape), indexing="ij")
+    for k, one in enumerate(scan.stack.slices):
+        axes = one.plane.axes_ct * one.plane.spacing_mm
+        made[:, :, k] = one.plane.origin_ct + i[..., None] * axes[:, 0] + j[..., None] * axes[:, 1]
+    return made
+
+
+def content_of(scan):
+    """A needle across the whole volume, a triangle as its window, and three numbers."""
+    at = centres(scan)
+    ends = np.stack([at[6, 5, 2], at[31, 28, 9]])
+    corners = np.stack([at[30, 26, 9], at[36, 26, 9], at[33, 33, 10]])
+    step = finest_mm(scan)
+    regions = (
+        Region("needle", "needle", rod_points(ends, 1.0, step)),
+        Region("entry window 1", "skin", surface_points(corners, np.array([[0, 1, 2]]), step)),
+    )
+    numbers = (
+        Quantity("length_mm", float(np.pi * 10), "mm"),
+        Quantity("theta_deg", 1 / 3, "deg"),
+        Quantity("p", 0.97, ""),
+    )
+    words = (("verdict", "safe"), ("use", "für Ärzte nicht zugelassen"))
+    return ArchiveContent("A path", regions, {"path": ends, "target": ends[:1]}, numbers, words), ends
+
+
+def read_masks(data, scan):
+    """Each segment's voxels in the stack's order, by highdicom and each frame's own position."""
+    seg = hd.seg.segread(io.BytesIO(data))
+    at = centres(scan)[0, 0]
+    masks = {
+        one.SegmentLabel: np.zeros(at.shape[:0] + (*scan.slice_shape, len(at)), bool) for one in seg.SegmentSequence
+    }
+    names = list(masks)
+    for number, groups in enumerate(seg.PerFrameFunctionalGroupsSequence):
+        origin = np.array(groups.PlanePositionSequence[0].ImagePositionPatient, float)
+        k = int(np.argmin(np.linalg.norm(at - origin, axis=1)))
+        assert np.linalg.norm(at[k] - origin) < 1e-3
+        name = names[groups.SegmentIdentificationSequence[0].ReferencedSegmentNumber - 1]
+        masks[name][:, :, k] |= (
+            np.atleast_3d(seg.pixel_array.reshape(-1, *scan.slice_shape[::-1])[number].T)[:, :, 0] > 0
+        )
+    return masks
+
+
+def test_regions_lie_where_they_are(scan):
+    """Every voxel of the needle is near its axis; the axis leaves none out; all positions by the slices' headers."""
+    content, ends = content_of(scan)
+    files = archive_files(scan, content)
+    masks, at = read_masks(files[NAMES[0]], scan), centres(scan)
+    forward = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    lever = at - ends[0]
+    along = np.clip(lever @ forward, 0.0, np.linalg.norm(ends[1] - ends[0]))
+    distance = np.linalg.norm(lever - along[..., None] * forward, axis=-1)
+    half = np.linalg.norm([*scan.stack.plane.spacing_mm, np.linalg.norm(scan.stack.step_ct)]) / 2
+    assert distance[masks["needle"]].max() <= 1.0 + half
+    inside = distance <= 0.95  # by the axis itself, not by its rasterised points
+    assert masks["needle"][inside].all() and inside.sum() > 20
+    assert masks["entry window 1"][[30, 36, 33], [26, 26, 33], [9, 9, 10]].all()
+
+
+def test_the_report_has_numbers_lines_and_words(scan):
+    """Numbers exactly, lines in the single precision that DICOM has, in the scan's frame of reference."""
+    content, ends = content_of(scan)
+    data = archive_files(scan, content)[NAMES[1]]
+    read = report_content(data)
+    assert read.quantities == {"length_mm": (np.pi * 10, "mm"), "theta_deg": (1 / 3, "deg"), "p": (0.97, "1")}
+    assert np.allclose(read.lines["path"], ends, atol=1e-4) and read.sentences == content.sentences
+    tree = hd.sr.srread(io.BytesIO(data))
+    (line,) = (one for one in tree.ContentSequence if one.get("GraphicType") == "POLYLINE")
+    assert line.ReferencedFrameOfReferenceUID == world.FRAME
+
+
+def test_patient_and_study_are_the_scans(scan):
+    """And every slice that the objects rest on is named."""
+    for data in archive_files(scan, content_of(scan)[0]).values():
+        read = pydicom.dcmread(io.BytesIO(data))
+        stated = (str(read.PatientName), read.PatientID, read.StudyInstanceUID, read.StudyDate, read.AccessionNumber)
+        assert stated == (NAME, "phantom", world.STUDY, "20261126", "A-7")
+        assert read.SeriesInstanceUID != world.SERIES
+
+
+def test_what_lies_outside_is_refused(scan):
+    """A region that no voxel holds would be an empty segment, which says that there is nothing."""
+    away = Region("far", "skin", np.full((1, 3), 5000.0))
+    with refused("outside_image"):
+        archive_files(scan, ArchiveContent("A path", (away,), {}, (), ()))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A trunk as DICOM and as NIfTI, searched every 5 degrees, so that it has windows."""
+    made = tmp_path_factory.mktemp("patient")
+    write_scene(made)
+    for name in ("dicom", "nifti"):
+        text = (made / f"{name}.toml").read_text()
+        text = text.replace("[0, 180]", "[40, 140]").replace("step_deg = 30.0", "step_deg = 5.0")
+        (made / f"{name}.toml").write_text(text)
+    return made
+
+
+def test_a_case_is_exported(folder, capsys):
+    """Its windows and its best direction: the table's row is in the report."""
+    out = folder / "out"
+    case = str(folder / "dicom.toml")
+    assert main(["export", case, "--format", "dicom", "--rank", "1", "--out", str(out), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert [path.rpartition("/")[2] for path in said["files"]] == list(NAMES)
+    assert main(["search", case, "--no-pictures", "--out", str(folder / "found"), "--json"]) == 0
+    best = json.loads(capsys.readouterr().out)["best"][0]
+    read = report_content((out / NAMES[1]).read_bytes())
+    assert read.quantities["theta_deg"] == (best["theta_deg"], "deg")
+    assert dict(read.sentences)["verdict"] == "safe"
+    seg = hd.seg.segread(out / NAMES[0])
+    names = [one.SegmentLabel for one in seg.SegmentSequence]
+    assert names[0] == "planned needle" and "entry window 1" in names
+
+
+def test_a_case_without_a_series_is_refused(folder, tmp_path, capsys):
+    """There is no study; nothing is written."""
+    out = tmp_path / "out"
+    assert main(["export", str(folder / "nifti.toml"), "--format", "dicom", "--out", str(out), "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "no_dicom_series"
+    assert not out.exists()
+
+
+def test_a_series_without_a_frame_of_reference_is_refused(folder, tmp_path, capsys):
+    """Nothing may refer to its coordinates."""
+    shutil.copytree(folder, tmp_path / "again", ignore=shutil.ignore_patterns("out", "found"))
+    for path in (tmp_path / "again" / "series").iterdir():
+        data = pydicom.dcmread(path)
+        del data.FrameOfReferenceUID
+        data.save_as(path)
+    case, out = tmp_path / "again" / "dicom.toml", tmp_path / "out"
+    assert main(["export", str(case), "--format", "dicom", "--out", str(out), "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == "no_frame_of_reference"
+    assert not out.exists()

@@ -1,0 +1,178 @@
+"""A chosen path of a case for programs that show it: files for 3D Slicer, or DICOM objects for the scan's archive.
+
+The arm is not needed; without it Slicer gets no transform.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.base.errors import refuse, require_extra
+from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.text import Shown
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.export import archive, slicer
+from puncture_twin.planning.export.archive import (
+    DICOM,
+    ArchiveContent,
+    Quantity,
+    Region,
+    archive_files,
+    rod_points,
+    surface_points,
+)
+from puncture_twin.planning.export.slicer import SLICER, SceneContent, entry_area, slicer_files
+from puncture_twin.planning.formats.dicom.ct_series import CtSeries
+from puncture_twin.planning.plan.plan_check import check_plan
+from puncture_twin.planning.search.candidates import Candidates, Pick
+from puncture_twin.planning.search.choice import Choice, choose, choose_stated, with_file_read
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.table import to_table
+from puncture_twin.twin.jobs.patient.main_job import is_plan, read_noted_plan
+from puncture_twin.twin.report.present import Section, Warn, text
+
+PATH_FORMATS = (SLICER, DICOM)
+NO_APPROACH = "directions checked; no approach planned"
+PLANNED = "the direction is the plan's, checked again with its motion"
+NO_DEVICE = "Research software, not a medical device."
+OF_ONE_SEARCH = frozenset({"rank", "window", "cost", "pareto"})
+"""Columns that compare a direction with the others of its search: they say nothing of it alone."""
+UNITS = {"_mm": "mm", "_deg": "deg"}
+"""Endings of columns to units."""
+
+
+@dataclass(frozen=True, repr=False)
+class PathExport(Shown):
+    """What was written.
+
+    Attributes:
+        path: The direction that is shown.
+        notes: What whoever opens them should know, one sentence each.
+    """
+
+    format_name: str
+    files: tuple[Path, ...]
+    path: str
+    notes: tuple[str, ...]
+    warnings: tuple[str, ...]
+    inputs: tuple[Input, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """As plain values."""
+        return {
+            "format": self.format_name,
+            "path": self.path,
+            "notes": list(self.notes),
+            "warnings": list(self.warnings),
+            "inputs": inputs_document(self.inputs),
+            "files": [str(file) for file in self.files],
+        }
+
+    def text(self) -> str:
+        """As lines."""
+        warned = (f"warning: {one}" for one in self.warnings)
+        return text(
+            [Section(f"{self.format_name}: {self.path}", [Warn(tuple(map(str, self.files))), *self.notes, *warned])]
+        )
+
+
+def export_path(
+    context: CaseContext, format_name: str, out: Path, choice: Choice, source: Path | None = None
+) -> PathExport:
+    """Search, and write the chosen path and the safe entry area as one set.
+
+    Args:
+        format_name: One of `PATH_FORMATS`.
+        source: A plan of the case, whose direction is chosen after it was checked again; anything else is passed over.
+
+    Raises:
+        InputError: There is nothing of what was chosen, a plan that does not hold, the case has no patient space, or
+            for DICOM no DICOM series as its CT.
+        NoAnswerError: Nothing is safe, or what was chosen is not.
+    """
+    case, stages, note = context.case, context.stages, context.watcher.note
+    scan = _series(case) if format_name == DICOM else None
+    choice, plan = with_file_read(case, choice), None
+    read: tuple[Input, ...] = ()
+    if source is not None and is_plan(source):
+        planned, plan = read_noted_plan(source, note)
+        check_plan(plan, context, source)
+        choice, read = Choice(angles=(plan.theta, plan.beta)), (planned,)
+    inputs = (*read, *choice.read, *case.inputs)
+    if not choice.of_grid:
+        choose_stated(context, choice)  # before the search is made for nothing
+    names = archive.NAMES if scan is not None else slicer.NAMES
+    with writing(out, f"export {format_name}", inputs=inputs, seconds=stages.seconds, names=names, note=note) as draft:
+        found = context.search()
+        chosen = choose(context, found, choice)
+        pick = Pick(chosen.candidates, int(chosen.rows[0]))
+        name = f"path theta {pick.theta_deg:.6g} beta {pick.beta_deg:.6g}"
+        made: Mapping[str, str | bytes]
+        if scan is None:
+            drawn = SceneContent(name, pick.candidates.path.entry_ct[pick.row], entry_area(found), context.placement)
+            files = slicer_files(case, drawn)
+            made, notes = files.texts, files.notes
+        else:
+            made, notes = archive_files(scan, _archived(context, scan, found, pick)), (NO_DEVICE,)
+        for file, content in made.items():
+            with atomic(draft.folder / file) as temporary:
+                temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+    written = draft.final(tuple(draft.folder / file for file in made))
+    said = (NO_APPROACH if plan is None else PLANNED, f"arm: {found.arm_note}", *notes)
+    return PathExport(format_name, written, name, said, tuple(context.anatomy.warnings), inputs)
+
+
+def _series(case: Case) -> CtSeries:
+    """The DICOM series that is the case's CT.
+
+    Raises:
+        InputError: It has none, or highdicom is not installed.
+    """
+    require_extra("dicom", f"--format {DICOM}")
+    name = case.skin_section.ct or case.ct.file
+    series = case.volumes.series(name)
+    if series is None:
+        what = "no CT" if name is None else f"'{name}' is no DICOM series"
+        allowed = (
+            f'a case whose CT is the folder of a DICOM series ([ct] file = "FOLDER"); --format {SLICER} needs none'
+        )
+        refuse(f"{what}: there is no study that the objects could belong to", case.path, allowed, "no_dicom_series")
+    return series
+
+
+def _archived(context: CaseContext, scan: CtSeries, found: Candidates, pick: Pick) -> ArchiveContent:
+    """Windows and needle as regions, the path as a line, and the direction's row of the table as numbers."""
+    case, area = context.case, entry_area(found)
+    entry, target, step = pick.candidates.path.entry_ct[pick.row], case.target_ct, archive.finest_mm(scan)
+    of_face = area.window[area.faces[:, 0]] if len(area.faces) else np.zeros(0, np.int64)
+    windows = [
+        Region(f"entry window {number}", "skin", surface_points(area.points_ct, area.faces[of_face == number], step))
+        for number in np.unique(of_face).tolist()
+    ]
+    rod = rod_points(np.stack([target, entry]), case.needle.diameter_mm / 2, step)
+    quantities, sentences = _row(pick)
+    return ArchiveContent(
+        "Planned needle path",
+        (Region("planned needle", "needle", rod), *windows),
+        {"path from skin to target": np.stack([entry, target]), "target": target[None]},
+        quantities,
+        (("use", NO_DEVICE), ("case", case.name), ("arm", found.arm_note), *sentences),
+    )
+
+
+def _row(pick: Pick) -> tuple[tuple[Quantity, ...], tuple[tuple[str, str], ...]]:
+    """What the table says of one direction: its numbers, and its words; what is not known is left out."""
+    row = to_table(pick.candidates).slice(pick.row, 1).to_pylist()[0]
+    known = {name: value for name, value in row.items() if value not in (None, "") and name not in OF_ONE_SEARCH}
+    numbers = {name: float(value) for name, value in known.items() if type(value) in (int, float)}
+    return (
+        tuple(Quantity(name, value, UNITS.get(f"_{name.rpartition('_')[2]}", "")) for name, value in numbers.items()),
+        tuple((name, str(value)) for name, value in known.items() if name not in numbers),
+    )
