@@ -637,17 +637,6 @@ def scan(
     rehearsal: Annotated[
         Path | None, typer.Option("--rehearsal", metavar="rehearsal.json", help="Show the needle of a rehearsal.")
     ] = None,
-    arms: Annotated[
-        str,
-        typer.Option(
-            "--arms", metavar="none|beside|pressed|across", help="Beside the trunk, pressed against it, or across it."
-        ),
-    ] = "none",
-    bed: Annotated[
-        str,
-        typer.Option("--bed", metavar="none|flat|curved|pad", help="Mattress on a flat or curved table, or a gel pad."),
-    ] = "none",
-    lines: Annotated[int, typer.Option("--lines", min=0, max=12, help="Number of tubes and cables over the skin.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Scan a case with a virtual CT. Write DICOM, NIfTI, labels, and its readings next to the ground truth."""
@@ -655,7 +644,6 @@ def scan(
 
     from puncture_twin.twin.jobs.experiment.scan_job import (
         ScanRequest,
-        parse_beside,
         parse_marker,
         scan_case,
         scan_text,
@@ -663,7 +651,7 @@ def scan(
     from puncture_twin.twin.plant.scanner.image import ScanSettings
 
     settings = ScanSettings(spacing, pixel, noise, seed=seed, fov_mm=fov, length_mm=length, turn=radians(turn))
-    request = ScanRequest(settings, parse_marker(marker), rehearsal, parse_beside(arms, bed, lines))
+    request = ScanRequest(settings, parse_marker(marker), rehearsal)
     with prepared(case, arm=False) as context:
         run = scan_case(context, out_folder(out_dir, case, "scan"), request)
     finish("scan", run, run.summary(), scan_text(run), as_json)

@@ -21,7 +21,7 @@ from puncture_twin.twin.guidance.stereo.cameras.calibration import calibrate
 from puncture_twin.twin.guidance.stereo.cameras.camera import stereo_pair
 from puncture_twin.twin.guidance.stereo.cameras.triangulation import triangulate
 from puncture_twin.twin.guidance.ultrasound.image.imager import Imager, NeedleEcho
-from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, DetectorSettings, detect
+from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, detect
 from puncture_twin.twin.plant.ball_image import BallScene, render as render_ball
 from puncture_twin.twin.plant.bmode_image import NeedleInImage, render
 
@@ -212,13 +212,13 @@ def error(found, true):
 def bias(count, seed):
     """What the uncorrected tip lies beyond the true one, by what might matter."""
     del seed
-    settings = DetectorSettings(tip_bias=0.0)
     print("tip beyond the true one, not corrected: mm, over the pulse's standard deviation along the shaft, and sd mm")
     for steep, depth, contrast in ((s, d, c) for s in (25.0, 45.0, 65.0) for d in (20.0, 45.0) for c in (18.0, 26.0)):
         rng = np.random.default_rng([int(steep), int(depth), int(contrast)])
         direction = np.array([np.cos(np.radians(steep)), np.sin(np.radians(steep)), 0.0])
         true, echo = NeedleInImage(np.array([25.0, depth, 0.0]), direction), NeedleEcho(contrast_db=contrast)
-        found = [detect(render(IMAGER, true, rng, echo=echo), IMAGER, settings) for _ in range(max(10, count // 25))]
+        pictures = [render(IMAGER, true, rng, echo=echo) for _ in range(max(10, count // 25))]
+        found = [detect(one, IMAGER, tip_bias=0.0) for one in pictures]
         errors = np.array([error(one, true)[0] for one in found if isinstance(one, Detection)])
         spread = IMAGER.spread
         sigma = np.hypot(spread.lateral_sigma(depth) * direction[0], spread.axial_sigma(depth) * direction[1])

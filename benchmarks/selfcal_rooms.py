@@ -157,9 +157,7 @@ def outcome(kind: Kind, seed: int) -> Outcome:
 
 def with_play(truth: WorkcellTruth, factor: float) -> WorkcellTruth:
     """The room with another play."""
-    probe, needle = (
-        arm._replace(backlash_rad=factor * arm.backlash_rad) for arm in (truth.probe_arm, truth.needle_arm)
-    )
+    probe, needle = (arm._replace(backlash=factor * arm.backlash) for arm in (truth.probe_arm, truth.needle_arm))
     return truth._replace(probe_arm=probe, needle_arm=needle)
 
 
@@ -200,7 +198,7 @@ def recorded(
         angle = angle + rng.normal(0.0, DIRECTION_RAD, len(P))
     A, B = flange_pose(truth.probe_arm.nominal, q_probe), flange_pose(truth.needle_arm.nominal, q_needle)
     v = np.column_stack([np.cos(angle), np.sin(angle)])
-    way = turns if truth.probe_arm.backlash_rad else (None, None)
+    way = turns if truth.probe_arm.backlash else (None, None)
     recording = Recording(A, B, P, v, q_probe=q_probe, q_needle=q_needle, turn_probe=way[0], turn_needle=way[1])
     return recording, tips
 

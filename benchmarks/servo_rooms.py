@@ -29,6 +29,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
 from puncture_twin.twin.guidance.stereo.detection import Detection, Detector, Search
 from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, adjust
 from puncture_twin.twin.guidance.stereo.joint.needle_error import open_loop_error, servoed_error
@@ -36,8 +37,7 @@ from puncture_twin.twin.guidance.stereo.planned import calibrating_rod, carried_
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, ball_jacobian, flange_poses
 from puncture_twin.twin.plant.stereo_workcell import StereoPlant, StereoWorkcell, draw_workcell
-from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome, needle_outcome
-from puncture_twin.twin.rehearsal.stereo_trials import needle_statistics
+from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome, needle_outcome, needle_statistics
 
 PIXEL_PX = 0.03
 """Of a centre by edges, per axis; declared here, since there are no pictures of which a tracker could tell it."""
@@ -111,7 +111,7 @@ class Room:
         self.pixels = [self.seen(self.workcell.ball_c(q)) for q in self.q_true]
         truth = case.truth_errors
         self.measured_c = self.workcell.ball_c(np.array(self.q_true)) + self.rng.normal(
-            0.0, truth.measuring_mm, (12, 3)
+            0.0, truth.measuring_arm_mm, (12, 3)
         )
         self.markers = np.array([self.seen(point) for point in self.workcell.markers_c])
         self.markers_m = case.markers.points + self.rng.normal(0.0, truth.marker_mm, case.markers.points.shape)
@@ -190,11 +190,11 @@ def drawn_from(case: ServoCase, factor: float) -> ServoCase:
 def rows() -> dict[str, ServoCase]:
     """What is drawn and declared in each row."""
     head = told_of_pixels(load_servo_case(folder() / "head"))
-    plain = replace(head, file=head.file.model_copy(update={"errors": None}))
+    plain = replace(head, file=head.file.model_copy(update={"errors": ServoErrors()}))
     return {
         "meshes/head as declared": head,
         "the defaults of [errors]": told_of_pixels(varied(plain, errors={}), target_mm=0.3),
-        "arm nominal, no play": told_of_pixels(varied(plain, errors={"arm": "nominal"})),
+        "arm nominal, no play": told_of_pixels(varied(plain, errors=ServoErrors(arm="nominal").model_dump())),
         "cameras of .3 px, head moves .2 mm, .1 deg": told_of_pixels(
             head, ball_px=0.3, head_shift_mm=0.2, head_turn_deg=0.1
         ),
@@ -215,13 +215,13 @@ def line(name: str, outcomes: Sequence[NeedleOutcome], doubted: float) -> str:
     ours = needle_statistics(outcomes)
     assert ours is not None
     pose = np.mean([one.square_of_pose <= chdtri(6, 0.05) for one in outcomes])
-    ratio = ours.realised_rms_mm / ours.predicted_rms_mm
-    hit = "" if ours.hit_share is None else f"{100 * ours.hit_share:5.1f} {100 * (ours.mean_p_hit or 0.0):5.1f}"
-    return (
-        f"{name:52s} {ours.realised_rms_mm:7.3f} {ours.predicted_rms_mm:7.3f} {ratio:6.3f} {ours.coverage_95:7.3f} "
-        f"{ours.realised_direction_deg:7.3f} {ours.predicted_direction_deg:7.3f} {pose:6.3f} {hit:>13s} "
-        f"{100 * doubted:6.1f} %"
+    ratio = ours["realised_rms_mm"] / ours["predicted_rms_mm"]
+    hit = (
+        "" if ours["hit_share"] is None else f"{100 * ours['hit_share']:5.1f} {100 * (ours['mean_p_hit'] or 0.0):5.1f}"
     )
+    figures = "{realised_rms_mm:7.3f} {predicted_rms_mm:7.3f} {ratio:6.3f} {coverage_95:7.3f} "
+    figures += "{realised_direction_deg:7.3f} {predicted_direction_deg:7.3f}"
+    return f"{name:52s} {figures.format(ratio=ratio, **ours)} {pose:6.3f} {hit:>13s} {100 * doubted:6.1f} %"
 
 
 def fast_rooms(name: str, case: ServoCase, count: int, jobs: int) -> None:

@@ -6,12 +6,15 @@ here holds a true pose or an error that was drawn: the simulated plant answers l
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.touch.tour_motions import Touch
 
 
 class GreyImage(NamedTuple):
@@ -78,3 +81,35 @@ class JogOperator(Protocol):
         Returns:
             Shape (6,), rad, not moved to yet; NaN out of reach.
         """
+
+
+class StoppedError(Exception):
+    """The arm stopped where it had no planned path: something is not where it is believed to be."""
+
+
+class Moved(NamedTuple):
+    """What an arm with a force sensor says of a motion."""
+
+    q: Floats
+    """Shape (6,), rad: encoders at its end."""
+    seconds: float
+    force_n: float
+    """The largest on the needle."""
+    contact: bool
+    """Whether it ended at a contact, before its own end."""
+
+
+class TouchingArm(Protocol):
+    """An arm whose needle touches markers, with a force sensor, and somebody who sets the needle's line by eye.
+
+    Every motion raises `StoppedError` where arm or needle touches what it should not.
+    """
+
+    def at_marker(self, touch: Touch) -> AbstractContextManager[Floats]:
+        """For as long as one marker is touched: joints (6,), rad, at which the needle's line is set onto it by eye."""
+
+    def move(self, motion: Trajectory, *, in_air: bool = False) -> Moved:
+        """Follow a motion by the motors; ``in_air`` the needle must stay out of the patient."""
+
+    def move_until_contact(self, motion: Trajectory, *, yielding: bool) -> Moved:
+        """Follow a motion until the needle's tip is pressed; ``yielding`` with a spring at the tip."""

@@ -17,10 +17,10 @@ from puncture_twin.planning.reach.standoff import standoffs
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, scan_case
 from puncture_twin.twin.jobs.patient.init_job import init_case
-from puncture_twin.twin.plant.outside_objects import OutsideObjects
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from tools.phantoms.drawn.trunk import draw_trunk
 from tools.phantoms.drawn.trunk_case import CASE, write_trunk_case
+from tools.phantoms.outside_objects import OutsideObjects
 
 NEEDLE_AND_SEARCH = CASE[CASE.index("[needle]") :]
 
@@ -65,7 +65,7 @@ def scanned(folder: Path, asked: Asked):
     write_trunk_case(folder / "truth", trunk, f"drawn_{asked.seed}")
     truth = prepare(folder / "truth", arm=False)
     out = folder / "ct"
-    run = scan_case(truth, out, ScanRequest(asked.settings, "none", None, asked.beside))
+    run = scan_case(truth, out, ScanRequest(asked.settings, "none", None, asked.beside.placed))
     target = ",".join(f"{one:.3f}" for one in run.scene.target)
     init_case(
         Request(out, target, None, None, Wanted(Space.LPS, None, None, "dicom", None)), force=True, watcher=Silent()

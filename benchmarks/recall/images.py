@@ -27,9 +27,9 @@ from puncture_twin.planning.init.finder import Wanted
 from puncture_twin.planning.init.overrides import with_keys
 from puncture_twin.planning.init.start import Request
 from puncture_twin.twin.jobs.patient.init_job import init_case
-from puncture_twin.twin.plant.outside_objects import OutsideObjects
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from puncture_twin.twin.plant.scanner.writers import write_nifti
+from tools.phantoms.outside_objects import OutsideObjects
 from tools.phantoms.supine import LESION_LPS_MM, cradle_parts, trunk_parts
 
 NEEDLE = "[needle]\nlength_mm = 200.0\nshaft_mm = 150.0\ndiameter_mm = 1.2\n"

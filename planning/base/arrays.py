@@ -37,6 +37,13 @@ def read_only(array: ArrayLike, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     return copy
 
 
+def rms(values: ArrayLike) -> float:
+    """Root mean square of numbers (n,), or of the lengths of rows (n, k); NaN of none."""
+    squares = np.square(np.asarray(values, dtype=np.float64))
+    squares = squares.sum(axis=1) if squares.ndim == 2 else squares
+    return float(np.sqrt(squares.mean())) if len(squares) else float("nan")
+
+
 def is_frozen(array: Any, dtype: DTypeLike) -> bool:
     """Whether this is an array of a kind that nobody writes to, down to the memory that it looks at."""
     if type(array) is not np.ndarray or array.dtype != dtype or not (array.flags.c_contiguous and array.flags.aligned):

@@ -7,8 +7,9 @@ The readers of single values raise what `fitting` turns into one line about the 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -175,6 +176,29 @@ def texts(value: Any) -> tuple[str, ...]:
 def or_null(value: float) -> float | None:
     """A number as JSON has it: null where it is not finite."""
     return float(value) if np.isfinite(value) else None
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it: a record by its fields, an array as lists, null where a number is not finite.
+
+    >>> from typing import NamedTuple
+    >>> Hit = NamedTuple("Hit", [("tip_mm", Floats), ("error_mm", float)])
+    >>> plain([Hit(np.zeros(2), float("nan"))])
+    [{'tip_mm': [0.0, 0.0], 'error_mm': None}]
+    """
+    if is_dataclass(value) and not isinstance(value, type):
+        return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return {name: plain(one) for name, one in zip(value._fields, value, strict=True)}
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    if isinstance(value, float):
+        return or_null(value)
+    return str(value) if isinstance(value, Path) else value
 
 
 def _refused(name: str) -> float:

@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
+from pydantic import Field
 
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
@@ -20,6 +21,7 @@ from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.case.named_files import CaseVolumes
 from puncture_twin.planning.case.tables import ErrorsSection
+from puncture_twin.planning.case.toml_types import Number, Section
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 DEFAULT_READING_MM = 0.5
@@ -54,6 +56,46 @@ ARM_KINDS: Mapping[str, ArmKind] = MappingProxyType(
     {"calibrated": ArmKind(0.05, 0.005, 0.005), "nominal": ArmKind(0.5, 0.05, 0.1)}
 )
 """``calibrated``: with the maker's own kinematic calibration. ``nominal``: by data sheet; assumed, nobody states it."""
+
+
+class ArmErrors(Section):
+    """How far an arm is from its nominal model: standard deviations, and the full width of every joint's play.
+
+    ``link_mm`` is of every Denavit-Hartenberg length, ``joint_deg`` of every joint's zero, ``repeatability_deg`` of
+    every joint, anew at each arrival.
+    """
+
+    link_mm: Annotated[Number, Field(ge=0, le=50)] = ARM_KINDS["calibrated"].link_mm
+    twist_deg: Annotated[Number, Field(ge=0, le=10)] = ARM_KINDS["calibrated"].twist_deg
+    joint_deg: Annotated[Number, Field(ge=0, le=10)] = ARM_KINDS["calibrated"].joint_deg
+    backlash_deg: Annotated[Number, Field(ge=0, le=10)] = 0.0
+    repeatability_deg: Annotated[Number, Field(ge=0, le=10)] = 0.003
+
+    @property
+    def twist(self) -> float:
+        """Of every twist, rad."""
+        return float(np.radians(self.twist_deg))
+
+    @property
+    def joint(self) -> float:
+        """Of every joint's zero, rad."""
+        return float(np.radians(self.joint_deg))
+
+    @property
+    def backlash(self) -> float:
+        """Width of the play, rad."""
+        return float(np.radians(self.backlash_deg))
+
+    @property
+    def repeatability(self) -> float:
+        """Of every arrival, rad."""
+        return float(np.radians(self.repeatability_deg))
+
+    def scaled(self, factor: float) -> Self:
+        """Each number times a factor, the play too."""
+        stated = {key: value for key, value in self.model_dump().items() if isinstance(value, float | tuple)}
+        grown = {key: (factor * np.array(value)).tolist() for key, value in stated.items()}
+        return self.model_copy(update={key: tuple(v) if isinstance(v, list) else v for key, v in grown.items()})
 
 
 @dataclass(frozen=True)

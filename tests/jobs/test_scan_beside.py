@@ -4,21 +4,19 @@ Every scene is another anatomy; `init` and `search` see its CT and labels alone,
 against the true surfaces by a judge that shares no code with the product (`benchmarks/beside/judge.py`).
 """
 
-import json
-
 import numpy as np
 import pytest
 import trimesh
-from refusals import refused_command
 
 from benchmarks.beside.judge import passed
 from benchmarks.beside.scene import Asked, judged
-from puncture_twin.meshes import folder
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
-from puncture_twin.twin.plant.outside_objects import OutsideObjects
+from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, scan_case
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from tools.phantoms import __main__ as phantoms
+from tools.phantoms.outside_objects import OutsideObjects
 
 THICK = ("arm_", "table", "mattress", "pad")
 """Bodies thicker than a voxel; lines are not (`docs/concepts/virtual-ct.md`)."""
@@ -70,33 +68,15 @@ def test_the_judge_sees_what_a_needle_passes():
 
 
 def test_a_drawn_trunk_is_a_case_that_can_be_scanned(tmp_path, capsys, monkeypatch):
-    """`python -m tools.phantoms --seed`, then `scan` with everything: the surfaces lie beside the CT."""
+    """`python -m tools.phantoms --seed`, then `scan` with everything about it, closed."""
     monkeypatch.setattr("sys.argv", ["phantoms", "--out", str(tmp_path / "drawn"), "--seed", "7"])
     assert phantoms.main() == 0
-    flags = ["--arms", "across", "--bed", "flat", "--lines", "2", "--pixel", "4", "--spacing", "5", "--length", "60"]
-    command = ["scan", str(tmp_path / "drawn"), "--out", str(tmp_path / "ct"), "--marker", "none", *flags]
-    assert main([*command, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    names = {one["name"] for one in report["beside"]}
-    assert {"mattress", "table", "arm_left", "arm_right_hand", "arm_left_ulna", "line_1", "cable_2_core"} <= names
-    entry = json.loads((tmp_path / "ct" / "manifest.json").read_text())["entries"]["scan"]
-    for one in report["beside"]:
-        assert trimesh.load(tmp_path / "ct" / one["file"]).is_watertight
-        assert one["file"] in entry["files"]
-    assert main(["init", str(tmp_path / "ct"), "--ct", "dicom", f"--target={_joined(report['target_mm'])}"]) == 0
-    assert "beside/" not in (tmp_path / "ct" / "case.toml").read_text()
+    wanted = OutsideObjects("across", "flat", 2).placed
+    request = ScanRequest(ScanSettings(5.0, 4.0, length_mm=60.0), "none", None, wanted)
+    run = scan_case(prepare(tmp_path / "drawn", arm=False), tmp_path / "ct", request)
+    parts = {one.name: one.mesh for one in run.scene.outside_objects}
+    assert {"mattress", "table", "arm_left", "arm_right_hand", "arm_left_ulna", "line_1", "cable_2_core"} <= set(parts)
+    assert all(trimesh.Trimesh(one.vertices, one.faces).is_watertight for one in parts.values())
+    target = ",".join(f"{one:.3f}" for one in run.scene.target)
+    assert main(["init", str(tmp_path / "ct"), "--ct", "dicom", f"--target={target}"]) == 0
     assert "arm_left" not in capsys.readouterr().out
-
-
-def _joined(point):
-    return ",".join(f"{one:.3f}" for one in point)
-
-
-@pytest.mark.parametrize(
-    ("flags", "said"), [(("--bed", "flat"), "two_beds table"), (("--lines", "13"), "command_line --lines")]
-)
-def test_what_cannot_lie_beside_is_refused_and_leaves_nothing(flags, said, tmp_path, capsys):
-    """One line, exit code 2; a case with a table has one already."""
-    command = ["scan", folder() / "abdomen", "--out", tmp_path / "out", *flags]
-    refused_command(command, capsys, *said.split())
-    assert not (tmp_path / "out").exists()

@@ -12,14 +12,24 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.formats.meshes.ply import ply_bytes
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from tools.phantoms import abdomen, carton, guidance, head
-
-__all__ = ["ply_bytes", "points_csv", "write_phantoms"]
 
 _COMMAND = "python -m tools.phantoms --out DIR"
 _LICENCE = "Apache-2.0"
 _PAPER = "DOI 10.7652/xjtuxb201904013"
+
+
+def ply_bytes(mesh: TriangleMesh) -> bytes:
+    """A mesh as a little-endian binary PLY: float32 vertices, int32 faces."""
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, mesh.faces
+    return header.encode("ascii") + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()
 
 
 def write_phantoms(folder: Path, report: Callable[[str], None] = lambda _: None) -> None:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -101,22 +102,34 @@ def printed_errors(touched: tuple[Floats, ...]) -> dict[str, Floats]:
     Args:
         touched: Of each setup, shape (n, 8, 3), rows as `NAMES`, mm.
     """
-    found = {}
-    for setup, markers, lesion in TRIADS:
-        rows = rows_of(markers)
-        T = fit_triad(np.broadcast_to(READ[rows], (len(touched[setup]), 3, 3)), touched[setup][:, rows])
-        found[f"{lesion} by {'-'.join(markers)}, setup {setup + 1}"] = _misses(T, touched[setup], lesion)[:, 0]
-        if (setup, lesion) == (0, "M"):
-            found["mean residual of A-B-C, setup 1"] = _misses(T, touched[setup], markers).mean(axis=1)
+    by_triad = list(triad_errors(touched, READ).items())
+    residuals = _misses(_triad(touched[0], READ, "ABC"), touched[0], READ, "ABC")
+    found = dict([*by_triad[:2], ("mean residual of A-B-C, setup 1", residuals.mean(axis=1)), *by_triad[2:]])
     for setup, markers, lesion in AFFINE:
         T = np.array([fit_affine(READ[rows_of(markers)], one[rows_of(markers)]) for one in touched[setup]])
-        found[f"{lesion} by {'-'.join(markers)} (affine), setup {setup + 1}"] = _misses(T, touched[setup], lesion)[:, 0]
+        misses = _misses(T, touched[setup], READ, lesion)[:, 0]
+        found[f"{lesion} by {'-'.join(markers)} (affine), setup {setup + 1}"] = misses
     return found
 
 
-def _misses(T: Floats, touched: Floats, names: str) -> Floats:
+def triad_errors(touched: tuple[Floats, ...], read: Floats) -> dict[str, Floats]:
+    """The errors of Tables 3 and 5 of n experiments, (n,) each, mm, of points ``read`` (8, 3) in the CT."""
+    return {
+        f"{lesion} by {'-'.join(markers)}, setup {setup + 1}": _misses(
+            _triad(touched[setup], read, markers), touched[setup], read, lesion
+        )[:, 0]
+        for setup, markers, lesion in TRIADS
+    }
+
+
+def _triad(touched: Floats, read: Floats, markers: str) -> Floats:
+    rows = rows_of(markers)
+    return fit_triad(np.broadcast_to(read[rows], (len(touched), 3, 3)), touched[:, rows])
+
+
+def _misses(T: Floats, touched: Floats, read: Floats, names: str) -> Floats:
     rows = rows_of(names)
-    fitted = READ[rows] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+    fitted = read[rows] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
     return np.asarray(np.linalg.norm(fitted - touched[:, rows], axis=2))
 
 
@@ -304,52 +317,27 @@ WIDEST = 0.3
 """tan of 17 degrees: no scanner is farther out of square."""
 
 
-@dataclass(frozen=True)
-class LesionErrors:
-    """Errors of the paper's triads at a lesion, mm.
-
-    Attributes:
-        as_read: As the paper prints it.
-        square: With the skew taken off the CT's readings.
-    """
-
-    name: str
-    as_read: float
-    square: float
-
-
-@dataclass(frozen=True)
-class SkewFinding:
-    """The skew, and its effect on lesions.
-
-    Attributes:
-        angle: rad, of y against z.
-        lesions: Each lesion that the paper's triads reach for.
-    """
+class Skew(NamedTuple):
+    """The skew, and its effect on the errors of the paper's triads at lesions."""
 
     angle: float
-    lesions: tuple[LesionErrors, ...]
+    """rad, of y against z."""
+    lesions: Mapping[str, tuple[float, float]]
+    """Error as the paper prints it, and with the skew taken off the CT's readings, by triad and lesion; mm."""
 
 
-def find_skew() -> SkewFinding:
+def find_skew() -> Skew:
     """Find the skew from the markers of setup 2 alone, and take it off before every triad of both setups."""
-    names = rows_of(MARKERS)
-    touched = _touched(SETUP)
+    rows, touched = rows_of(MARKERS), measured()
+    markers = touched[SETUP][0][rows]
 
     def squares(k: float) -> float:
-        square = unskewed(READ, k)[names]
-        return float(np.sum((apply(fit_rigid(square, touched[names]), square) - touched[names]) ** 2))
+        square = unskewed(READ, k)[rows]
+        return float(np.sum((apply(fit_rigid(square, markers), square) - markers) ** 2))
 
     k = float(minimize_scalar(squares, bounds=(-WIDEST, WIDEST), method="bounded", options={"xatol": 1e-9}).x)
-    lesions = tuple(
-        LesionErrors(
-            f"{lesion} by {'-'.join(markers)}, setup {setup + 1}",
-            _miss(READ, setup, markers, lesion),
-            _miss(unskewed(READ, k), setup, markers, lesion),
-        )
-        for setup, markers, lesion in TRIADS
-    )
-    return SkewFinding(float(np.arctan(k)), lesions)
+    read, square = triad_errors(touched, READ), triad_errors(touched, unskewed(READ, k))
+    return Skew(float(np.arctan(k)), {name: (float(read[name][0]), float(square[name][0])) for name in read})
 
 
 def unskewed(points: Floats, k: float) -> Floats:
@@ -357,19 +345,6 @@ def unskewed(points: Floats, k: float) -> Floats:
     moved = points.copy()
     moved[:, 1] += k * points[:, 2]
     return moved
-
-
-def _miss(read: Floats, setup: int, markers: str, lesion: str) -> float:
-    touched, row = _touched(setup), rows_of(lesion)[0]
-    T = fit_triad(read[rows_of(markers)], touched[rows_of(markers)])
-    return float(np.linalg.norm(apply(T, read[row]) - touched[row]))
-
-
-def _touched(setup: int) -> Floats:
-    found = np.full(READ.shape, np.nan)
-    for name, point in SETUPS[setup].items():
-        found[rows_of(name)[0]] = point
-    return found
 
 
 BED = 0

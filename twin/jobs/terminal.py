@@ -27,12 +27,23 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, TextIO
+from typing import Any, NamedTuple, NoReturn, TextIO
 
 from puncture_twin.planning.base.files import atomic
 
 UNNAMED_CASES = frozenset({"case.toml", "servo.toml", "selfcal.toml", "plan.json"})
 """Files that are named by their folder."""
+
+
+class Answer(NamedTuple):
+    """What a command found."""
+
+    passed: bool
+    """What the exit code says: yes or no."""
+    summary: dict[str, Any]
+    """Plain values, for ``--json``."""
+    text: str
+    """For a person."""
 
 
 def default_out(source: Path, command: str) -> Path:

@@ -18,11 +18,11 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rotated_about
 from puncture_twin.twin.devices import GreyImage
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
-from puncture_twin.twin.guidance.stereo.declared_errors import CameraErrors
+from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
 from puncture_twin.twin.guidance.stereo.planned import calibration_frame, head_pose, planned_cameras
 from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection, ServoCase
 from puncture_twin.twin.plant.ball_image import BallScene, render
-from puncture_twin.twin.plant.truth import ArmErrors, TrueArm, draw_true_arm
+from puncture_twin.twin.plant.truth import PlantArm, TrueArm, draw_true_arm
 
 LINE_OF_SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
 """Where on the ball's disc a line of sight ends: fraction of the radius, and how many around."""
@@ -169,7 +169,7 @@ class StereoWorkcell:
         return TriangleMesh(self.head_c.vertices, self.head_c.faces[near]) if near.any() else None
 
 
-class StereoPlant:
+class StereoPlant(PlantArm):
     """A workcell in time: where the arm is, whether the head is there; it answers as arm, cameras and touch do.
 
     Args:
@@ -186,11 +186,8 @@ class StereoPlant:
         arm: np.random.Generator,
         operator: np.random.Generator,
     ) -> None:
-        self.workcell = workcell
-        self.rests: list[Floats] = []
-        """True joints after each move, (6,), rad."""
-        self.pictures = pictures
-        self._arm, self._operator = arm, operator
+        super().__init__(workcell.arm, arm)
+        self.workcell, self.pictures, self._operator = workcell, pictures, operator
         self._head_there = False
         self._shown: ShownBall | None = None
 
@@ -201,11 +198,6 @@ class StereoPlant:
     def show(self, ball: ShownBall | None) -> None:
         """Show a ball in place of the arm's; None shows the arm's again."""
         self._shown = ball
-
-    def move_jp(self, q: Floats) -> None:
-        """Move the arm to joints (6,), rad: its gears stop short, its joints miss."""
-        before = self.rests[-1] if self.rests else q
-        self.rests.append(self.workcell.arm.settle(q, before, self._arm))
 
     @property
     def ball(self) -> ShownBall:
@@ -237,8 +229,8 @@ class StereoPlant:
 
     def measured_cp(self) -> Floats:
         """The measuring arm's reading of the ball's centre, shape (3,), mm, C."""
-        sigma = self.workcell.case.truth_errors.measuring_mm
-        return np.asarray(self.ball.center_c + self._arm.normal(0.0, sigma, 3))
+        sigma = self.workcell.case.truth_errors.measuring_arm_mm
+        return np.asarray(self.ball.center_c + self._rng.normal(0.0, sigma, 3))
 
     def pointed_cp(self, marker: str) -> Floats:
         """Where an operator points for a marker, shape (3,), mm, C."""
@@ -267,12 +259,11 @@ def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
         InputError: Cameras or arm that cannot be.
     """
     errors = case.truth_errors
-    spread = ArmErrors(errors.link_mm, errors.twist, errors.joint, errors.backlash, errors.repeatability)
-    arm = draw_true_arm(case.model, spread, rng)
+    arm = draw_true_arm(case.model, errors, rng)
     T_base_c = calibration_frame(case)
     T_c_base = np.asarray(np.linalg.inv(T_base_c), dtype=np.float64)
-    cameras = tuple(_misplaced(camera, errors.camera, rng) for camera in planned_cameras(case))
-    cameras = tuple(_with_other_lens(camera, errors.camera, rng) for camera in cameras)
+    cameras = tuple(_misplaced(camera, errors, rng) for camera in planned_cameras(case))
+    cameras = tuple(replace(one, distortion=one.distortion + rng.normal(0.0, errors.lens)) for one in cameras)
     tool = TrueTool(
         rng.normal(0.0, errors.ball_offset_mm, 3),
         rng.normal(0.0, errors.tip_offset_mm, 3),
@@ -284,13 +275,9 @@ def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
     return StereoWorkcell(case, arm, T_c_base, cameras, T_c_m, after, tool)
 
 
-def _misplaced(camera: Camera, errors: CameraErrors, rng: np.random.Generator) -> Camera:
+def _misplaced(camera: Camera, errors: ServoErrors, rng: np.random.Generator) -> Camera:
     """A camera as it is in truth: rotated, shifted, its lens off its focal length and axis."""
-    T = pose(exp_rotation(rng.normal(0.0, errors.turn, 3)), rng.normal(0.0, errors.shift_mm, 3))
-    cx, cy = np.array([camera.cx, camera.cy]) + rng.normal(0.0, errors.axis_px, 2)
-    focal = camera.fx * (1.0 + rng.normal(0.0, errors.focal))
+    T = pose(exp_rotation(rng.normal(0.0, errors.camera_turn, 3)), rng.normal(0.0, errors.camera_shift_mm, 3))
+    cx, cy = np.array([camera.cx, camera.cy]) + rng.normal(0.0, errors.camera_axis_px, 2)
+    focal = camera.fx * (1.0 + rng.normal(0.0, errors.camera_focal))
     return replace(camera, fx=focal, fy=focal, cx=float(cx), cy=float(cy), T_camera_c=T @ camera.T_camera_c)
-
-
-def _with_other_lens(camera: Camera, errors: CameraErrors, rng: np.random.Generator) -> Camera:
-    return replace(camera, distortion=camera.distortion + rng.normal(0.0, errors.lens))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.arm.kinematics import FREE_D, N_PARAMETERS, PARAMETERS, dh_step, error_jacobian, flange_pose
+from puncture_twin.planning.arm.kinematics import FREE_D, N_PARAMETERS, PARAMETERS, dh_step, error_jacobian
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import ErrorModel
@@ -252,9 +252,3 @@ def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget
     arrival = rng.normal(size=6) * np.hypot(errors.arm.repeatability, errors.arm.drift)
     values, axes = np.linalg.eigh(errors.target_cov_ct)
     return AtTarget(arrival, target_ct + axes @ (rng.normal(size=3) * np.sqrt(np.maximum(values, 0.0))))
-
-
-def nominal_tip(model: UrModel, tip_mm: float, q: Floats) -> Floats:
-    """The tip by the controller, shape (3,), mm, at encoders (6,), rad."""
-    T = flange_pose(model, q)
-    return np.asarray(T[:3, 3] + tip_mm * T[:3, 2])

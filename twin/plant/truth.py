@@ -20,6 +20,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.errors import ArmErrors
 from puncture_twin.planning.case.tables import MarkerSection
 from puncture_twin.planning.formats.points import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply
@@ -181,40 +182,19 @@ def _read(case: Case, name: str, space: Space | None) -> NamedPoints:
     return parse_points(case.files.content(name), case.folder / name, default_space=space)
 
 
-class ArmErrors(NamedTuple):
-    """Deviations of an arm from its nominal model: standard deviations, normal, and the width of the play."""
-
-    link_mm: float = 0.0
-    """Deviation of every Denavit-Hartenberg length a_i and d_i."""
-    twist_rad: float = 0.0
-    """Deviation of every twist alpha_i: axes that should be parallel or square and are not quite."""
-    joint_rad: float = 0.0
-    """Deviation of every joint's zero."""
-    backlash_rad: float = 0.0
-    """Full width of the play of every joint, not random."""
-    repeatability_rad: float = 0.0
-    """Deviation of every joint, drawn anew at each arrival."""
-
-
 class TrueArm(NamedTuple):
-    """One arm, drawn. Denavit-Hartenberg numbers of shape (6,), mm and rad."""
+    """One arm, drawn."""
 
     nominal: UrModel
-    a: Floats
-    d: Floats
-    alpha: Floats
-    joint_offsets: Floats
-    """True zero minus nominal zero of each joint, rad."""
-    backlash_rad: float
-    repeatability_rad: float
-
-    def link_poses(self, q_true: Floats) -> Floats:
-        """T_base_link, shape (..., 7, 4, 4), mm, of true configurations (..., 6), rad: base first, flange last."""
-        return ErringArm(self.a, self.d, self.alpha, self.joint_offsets).link_poses(q_true)
+    true: ErringArm
+    backlash: float
+    """Full width of every joint's play, rad."""
+    repeatability: float
+    """Deviation of every joint, drawn anew at each arrival, rad."""
 
     def flange_pose(self, q_true: Floats) -> Floats:
         """T_base_flange, shape (..., 4, 4), mm, of true configurations (..., 6), rad."""
-        return np.ascontiguousarray(self.link_poses(q_true)[..., 6, :, :])
+        return np.ascontiguousarray(self.true.link_poses(q_true)[..., 6, :, :])
 
     def settle(self, q_command: Floats, q_before: Floats, rng: np.random.Generator) -> Floats:
         """Joints at rest, shape (6,), rad.
@@ -227,9 +207,27 @@ class TrueArm(NamedTuple):
             q_before: Shape (6,), what this function gave for the arrival before, or the first command.
             rng: For the repeatability.
         """
-        half = 0.5 * self.backlash_rad
+        half = 0.5 * self.backlash
         settled = np.clip(q_before, q_command - half, q_command + half)  # the play operator
-        return np.asarray(settled + rng.normal(0.0, self.repeatability_rad, 6))
+        return np.asarray(settled + rng.normal(0.0, self.repeatability, 6))
+
+
+class PlantArm:
+    """An arm as it moves, with the play of its last arrival.
+
+    Args:
+        arm: The true arm.
+        rng: Draws its repeatability.
+    """
+
+    def __init__(self, arm: TrueArm, rng: np.random.Generator) -> None:
+        self._arm, self._rng = arm, rng
+        self.rests: list[Floats] = []
+        """True joints after each move, (6,), rad."""
+
+    def move_jp(self, q: Floats) -> None:
+        """Move to joints (6,), rad: its gears stop short, its joints miss."""
+        self.rests.append(self._arm.settle(q, self.rests[-1] if self.rests else q, self._rng))
 
 
 def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator) -> TrueArm:
@@ -239,12 +237,7 @@ def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator)
     """
     d_errors = rng.normal(0.0, errors.link_mm, 6)
     d_errors[1] = 0.0
-    return TrueArm(
-        nominal,
-        a=np.array(nominal.a) + rng.normal(0.0, errors.link_mm, 6),
-        d=np.array(nominal.d) + d_errors,
-        alpha=np.array(nominal.alpha) + rng.normal(0.0, errors.twist_rad, 6),
-        joint_offsets=rng.normal(0.0, errors.joint_rad, 6),
-        backlash_rad=errors.backlash_rad,
-        repeatability_rad=errors.repeatability_rad,
-    )
+    a, alpha = np.array(nominal.a) + rng.normal(0.0, errors.link_mm, 6), np.array(nominal.alpha)
+    alpha = alpha + rng.normal(0.0, errors.twist, 6)
+    true = ErringArm(a, np.array(nominal.d) + d_errors, alpha, rng.normal(0.0, errors.joint, 6))
+    return TrueArm(nominal, true, errors.backlash, errors.repeatability)

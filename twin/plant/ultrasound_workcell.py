@@ -15,10 +15,10 @@ from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import tangent_basis
 from puncture_twin.twin.guidance.ultrasound.pose_choice import needle_flange
 from puncture_twin.twin.guidance.ultrasound.puncture import nearest_configuration
-from puncture_twin.twin.guidance.ultrasound.selfcal_case import ErrorsSection, SelfcalCase
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.two_arms import between_arms
 from puncture_twin.twin.plant.bmode_image import NeedleInImage, render
-from puncture_twin.twin.plant.truth import ArmErrors, TrueArm, draw_true_arm
+from puncture_twin.twin.plant.truth import PlantArm, TrueArm, draw_true_arm
 
 
 class WorkcellTruth(NamedTuple):
@@ -89,24 +89,6 @@ class ShownNeedle(NamedTuple):
     """Whether the arms touched each other."""
 
 
-class PlantArm:
-    """One of the arms as it moves, with the play of its last arrival.
-
-    Args:
-        arm: The true arm.
-        rng: Draws its repeatability.
-    """
-
-    def __init__(self, arm: TrueArm, rng: np.random.Generator) -> None:
-        self._arm, self._rng = arm, rng
-        self.rest = np.full(6, np.nan)
-        """True joints, shape (6,), rad; NaN before the first move."""
-
-    def move_jp(self, q: Floats) -> None:
-        """Move to joints (6,), rad."""
-        self.rest = self._arm.settle(q, q if np.isnan(self.rest).any() else self.rest, self._rng)
-
-
 class UltrasoundPlant:
     """A workcell in time: both arms, the probe, and the operator who jogs.
 
@@ -129,11 +111,11 @@ class UltrasoundPlant:
         lean = self._rng.normal(0.0, np.radians(off.lean_deg))
         tip = np.array([*tip_mm, self._rng.normal(0.0, off.off_plane_mm)])
         wanted = NeedleInImage(tip, np.array([*(np.cos(lean) * direction), np.sin(lean)]))
-        return jog_into_slice(self._truth, self.probe_arm.rest, q, wanted, roll)
+        return jog_into_slice(self._truth, self.probe_arm.rests[-1], q, wanted, roll)
 
     def measured_image(self) -> Pixels:
         """A B-mode image of the needle where both arms rest."""
-        probe, needle, image = self.probe_arm.rest, self.needle_arm.rest, self._case.content.image
+        probe, needle, image = self.probe_arm.rests[-1], self.needle_arm.rests[-1], self._case.content.image
         shown = self._truth.needle_in_image(probe, needle)
         picture = render(image.imager(), shown, self._rng, echo=image.echo())
         self.shown.append(ShownNeedle(shown, not self._between.apart(probe, needle)))
@@ -144,7 +126,7 @@ def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
     """A workcell whose differences from the drawing are drawn from the case's standard deviations."""
     content, off = case.content, case.content.truth
     arms = [
-        draw_true_arm(model, _spread(arm.errors), rng)
+        draw_true_arm(model, arm.errors, rng)
         for model, arm in zip(case.models, (content.probe_arm, content.needle_arm), strict=True)
     ]
     X, Y = (_shifted(T, off.mount_mm, np.radians(off.mount_deg), rng) for T in (case.T_end1_image, case.T_base1_base2))
@@ -152,11 +134,6 @@ def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
     tip = case.tip_end2 + [*rng.normal(0.0, off.tip_mm, 2), rng.normal(0.0, off.length_mm)]
     bent = V + tangent_basis(V) @ rng.normal(0.0, np.radians(off.needle_deg), 2)
     return WorkcellTruth(arms[0], arms[1], X, Y, tip, bent / np.linalg.norm(bent))
-
-
-def _spread(stated: ErrorsSection) -> ArmErrors:
-    angles = np.radians([stated.twist_deg, stated.joint_deg, stated.backlash_deg, stated.repeatability_deg])
-    return ArmErrors(stated.link_mm, *(float(angle) for angle in angles))
 
 
 def _shifted(T: Floats, mm: float, rad: float, rng: np.random.Generator) -> Floats:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, rms
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.budget.guidance import (
@@ -49,28 +49,6 @@ ALLOWED = "a case with [errors] and markers: trials are drawn from them"
 
 
 @dataclass(frozen=True, eq=False)
-class PhysicsTrials:
-    """Results of some trials in the simulator.
-
-    Attributes:
-        apart_mm: Shape (n,), its tip from that of the kinematics, in the patient.
-        contacts: So many of the trials had a contact of the arm.
-    """
-
-    apart_mm: Floats
-    contacts: int
-
-    def summary(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return {
-            "rooms": len(self.apart_mm),
-            "largest_apart_mm": float(self.apart_mm.max()),
-            "rms_apart_mm": float(np.sqrt(np.mean(self.apart_mm**2))),
-            "rooms_with_contacts": self.contacts,
-        }
-
-
-@dataclass(frozen=True, eq=False)
 class Distribution:
     """n trials of one puncture in which the arm reached the pose; mm.
 
@@ -90,7 +68,7 @@ class Distribution:
         budget: Where the predicted error comes from.
         guessed_touches: Whether it is not stated how the arm touched the markers, so that a posture was assumed.
         not_modelled: What neither the trials nor the chances contain.
-        physics: Some of the trials in the simulator, if any.
+        physics: What `physics_trials` says of some of the trials in the simulator, if any.
         guidance: The way of guidance that led the needle, None where none was asked for.
         stopped: Further trials, whose correction would have left the corridor: they do not hit.
         p_stop: Predicted.
@@ -114,7 +92,7 @@ class Distribution:
     budget: ErrorBudget
     guessed_touches: bool
     not_modelled: str
-    physics: PhysicsTrials | None = None
+    physics: Mapping[str, Any] | None = None
     guidance: str | None = None
     stopped: int = 0
     p_stop: float = 0.0
@@ -144,7 +122,7 @@ class Distribution:
     @property
     def realised_rms_mm(self) -> float:
         """Realised rms of the tip's error, mm."""
-        return float(np.sqrt(np.mean(self.tip_error_mm**2))) if len(self) else float("nan")
+        return rms(self.tip_error_mm)
 
     @property
     def predicted_rms_mm(self) -> float:
@@ -175,7 +153,7 @@ class Distribution:
             "guessed_touches": self.guessed_touches,
             **({} if self.puncture.bend is None else {"deflection_mm": self.puncture.bend.tip_mm}),
             "not_modelled": self.not_modelled,
-            **({} if self.physics is None else {"physics": self.physics.summary()}),
+            **({} if self.physics is None else {"physics": dict(self.physics)}),
         }
 
     def _guided(self) -> dict[str, Any]:

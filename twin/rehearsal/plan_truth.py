@@ -13,23 +13,25 @@ the joints on arrival stays one of joints. `rehearse_touched` does the same for 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Floats, Ints, rms
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import pose_error
 from puncture_twin.twin.plant.true_needle import AtTarget, TouchTruth, TrueNeedle, true_needle
 from puncture_twin.twin.plant.truth import Truth, draw_truth
-from puncture_twin.twin.rehearsal.distribution import Distribution, PhysicsTrials, bend_along, rehearse_trials
+from puncture_twin.twin.rehearsal.distribution import Distribution, bend_along, rehearse_trials
 from puncture_twin.twin.rehearsal.rehearsal import rehearse
-from puncture_twin.twin.rehearsal.result import PredictedScale, Rehearsal, Scale, TrialScale
+from puncture_twin.twin.rehearsal.result import ErrorRank, Rehearsal
 from puncture_twin.twin.rehearsal.trials import Puncture, Trials, bent
 
 TRIED = 16
@@ -125,17 +127,21 @@ def _declared(found: Distribution) -> str:
     return "[rehearsal.errors], not from the believed errors" if found.wrong_belief else "[errors]"
 
 
-def error_scale(context: CaseContext, q_insertion: Floats, found: Distribution | None) -> Scale | None:
-    """Scale of a tip error: the trials', or without trials the prediction's; None without declared errors."""
+def error_rank(
+    context: CaseContext, q_insertion: Floats, found: Distribution | None, tip_error_mm: float
+) -> ErrorRank | None:
+    """Rank of a tip error among trials, or without them in the prediction; None without declared errors."""
     if found is not None:
-        return TrialScale(found.tip_error_mm, len(found) + found.unreached)
+        errors = found.tip_error_mm
+        below = np.mean(errors < tip_error_mm) + np.mean(errors <= tip_error_mm)
+        return ErrorRank(float(50 * below), len(found) + found.unreached)
     registration = None if context.placement is None else context.placement.registration
     error = pose_error(context.case, registration)
     if error is None:
         return None
     outward_ct = -error.fit.R_base_ct.T @ flange_pose(error.model, q_insertion)[:3, 2]
     cov = replace(error, bend=bend_along(context, outward_ct)).tip_covariance(q_insertion[None])
-    return PredictedScale(cov, error.freedom)
+    return ErrorRank(100 * float(hit_in_ball(cov, tip_error_mm, error.freedom)[0]))
 
 
 def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Rehearsal:
@@ -162,7 +168,9 @@ def puncture_truth(plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Truth:
     return Truth(T_base_ct, at_target.arrival, truth.seed, source, at_target.target_ct)
 
 
-def physics_trials(context: CaseContext, plan: Plan, found: Distribution, count: int, progress: Count) -> PhysicsTrials:
+def physics_trials(
+    context: CaseContext, plan: Plan, found: Distribution, count: int, progress: Count
+) -> dict[str, Any]:
     """Run some of the trials, spread evenly over the order of their tip errors, in the simulator.
 
     Args:
@@ -171,6 +179,9 @@ def physics_trials(context: CaseContext, plan: Plan, found: Distribution, count:
         found: The trials; the arm reached the pose in one at least.
         count: How many.
         progress: Called with trials done and all of them.
+
+    Returns:
+        Plain values: how far each tip ended from that of the kinematics, and in how many the arm touched something.
     """
     rows = spread_rows(found, count)
     apart, contacts = np.empty(len(rows)), 0
@@ -180,4 +191,9 @@ def physics_trials(context: CaseContext, plan: Plan, found: Distribution, count:
         apart[number] = np.linalg.norm(done.tip_true_ct[-1] - found.trials.tip_ct[row])
         contacts += bool(done.contacts)
         progress(number + 1, len(rows))
-    return PhysicsTrials(apart, contacts)
+    return {
+        "rooms": len(apart),
+        "largest_apart_mm": float(apart.max()),
+        "rms_apart_mm": rms(apart),
+        "rooms_with_contacts": contacts,
+    }

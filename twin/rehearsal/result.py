@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.text import Shown, brief
-from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.twin.plant.true_needle import NO_TISSUE_FORCE, TissueForce
 
 if TYPE_CHECKING:
@@ -56,45 +55,6 @@ class ErrorRank:
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
         return {"percentile": self.percentile, "percentile_of": "rooms" if self.trials else "prediction"}
-
-
-@dataclass(frozen=True, eq=False)
-class TrialScale:
-    """Tip errors of trials, of which one is rehearsed.
-
-    Attributes:
-        errors_mm: Shape (n,), of those in which the arm reached the pose.
-        trials: All.
-    """
-
-    errors_mm: Floats
-    trials: int
-
-    def of(self, tip_error_mm: float) -> ErrorRank:
-        """Rank of an error among them."""
-        below = np.mean(self.errors_mm < tip_error_mm) + np.mean(self.errors_mm <= tip_error_mm)
-        return ErrorRank(float(50 * below), self.trials)
-
-
-@dataclass(frozen=True, eq=False)
-class PredictedScale:
-    """The predicted distribution of the tip's error.
-
-    Attributes:
-        cov: Shape (1, 3, 3), mm^2.
-        freedom: Of a spread that was found; None where it is stated.
-    """
-
-    cov: Floats
-    freedom: int | None
-
-    def of(self, tip_error_mm: float) -> ErrorRank:
-        """Rank of an error in it."""
-        return ErrorRank(100 * float(hit_in_ball(self.cov, tip_error_mm, self.freedom)[0]))
-
-
-Scale = TrialScale | PredictedScale
-"""The distribution that a tip error is ranked in."""
 
 
 def ordinal(number: int) -> str:

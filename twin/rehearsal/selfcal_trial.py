@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats, Pixels
+from puncture_twin.planning.base.arrays import Floats, Pixels, rms
 from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeDevices, ProbeShot, acquire
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses
-from puncture_twin.twin.guidance.ultrasound.puncture import aim, expected_error_mm, predicted_tre, recorded_pose, rms
+from puncture_twin.twin.guidance.ultrasound.puncture import aim, expected_error_mm, predicted_tre, recorded_pose
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.guidance.ultrasound.slips import calibrate_case
 from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
@@ -93,31 +93,19 @@ def punctures(
         calibration: What was found.
         rng: The reading of the target and the arms' repeatability.
     """
-    done = [_puncture(case, workcell, candidates, int(row), truth, calibration, rng) for row in rows]
-    return tuple(one for one in done if one is not None)
-
-
-def _puncture(
-    case: SelfcalCase,
-    workcell: TwoArms,
-    candidates: CandidatePoses,
-    row: int,
-    truth: WorkcellTruth,
-    calibration: Calibration,
-    rng: np.random.Generator,
-) -> Puncture | None:
-    q_probe = candidates.q_probe[row]
-    rest_probe = truth.probe_arm.settle(q_probe, q_probe, rng)
-    target = np.array([*candidates.poses.P[row], 0.0])
-    clicked = target[:2] + rng.normal(0.0, case.content.truth.click_mm, 2)
-    models = case.models
-    q_needle = aim(candidates, row, clicked, calibration, models)
-    if np.isnan(q_needle).any() or workcell.verdict(q_probe, q_needle) is not None:
-        return None
-    rest_needle = truth.needle_arm.settle(q_needle, q_needle, rng)
-    predicted = expected_error_mm(calibration, recorded_pose(models, q_probe, q_needle, clicked))
-    ended = truth.needle_in_image(rest_probe, rest_needle)
-    return Puncture(row, target, ended, predicted, case.content.truth.click_mm)
+    models, click_mm, reached = case.models, case.content.truth.click_mm, []
+    for row in rows.tolist():
+        q_probe = candidates.q_probe[row]
+        rest_probe = truth.probe_arm.settle(q_probe, q_probe, rng)
+        target = np.array([*candidates.poses.P[row], 0.0])
+        clicked = target[:2] + rng.normal(0.0, click_mm, 2)
+        q_needle = aim(candidates, row, clicked, calibration, models)
+        if np.isnan(q_needle).any() or workcell.verdict(q_probe, q_needle) is not None:
+            continue
+        rest_needle = truth.needle_arm.settle(q_needle, q_needle, rng)
+        predicted = expected_error_mm(calibration, recorded_pose(models, q_probe, q_needle, clicked))
+        reached.append(Puncture(row, target, truth.needle_in_image(rest_probe, rest_needle), predicted, click_mm))
+    return tuple(reached)
 
 
 def unseen_errors_mm(

@@ -1,22 +1,26 @@
-"""A whole stereo session in the twin: guidance by its devices, and beside each step what is true of it."""
+"""Stereo sessions in the twin: guidance by its devices, beside each step what is true of it, and many seeds of a case.
+
+One record is a target of one seed (`TargetRow`), one trial all targets of a seed (`ServoTrial`); both are plain values.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtrc, chdtri
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
 from puncture_twin.twin.devices import Arm
 from puncture_twin.twin.guidance.stereo.detection import Detector, image_detector, in_space, look_at, searches_of
-from puncture_twin.twin.guidance.stereo.guide import Guide, Known, guide_of
+from puncture_twin.twin.guidance.stereo.guide import Guide
 from puncture_twin.twin.guidance.stereo.joint.needle_error import REGION, NeedleError
 from puncture_twin.twin.guidance.stereo.planned import carried_rod, grid_points, workcell_checker
 from puncture_twin.twin.guidance.stereo.recording import Recorder, StereoDevices
@@ -28,7 +32,7 @@ from puncture_twin.twin.guidance.stereo.robot_calibration import (
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ServoStop
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed
-from puncture_twin.twin.guidance.stereo.session import Aims, ImageReading, aims_of, map_markers, see_markers
+from puncture_twin.twin.guidance.stereo.session import Aims, ImageReading, aims_of, map_markers
 from puncture_twin.twin.plant.stereo_workcell import ShownBall, StereoPlant, StereoWorkcell, TrueNeedle, draw_workcell
 
 TEST_POINTS = 10
@@ -68,11 +72,8 @@ class NeedleOutcome(NamedTuple):
     """Squared size of the error of tip and rotation together: chi-squared of 6."""
     hit: bool | None
     """Whether the tip is within the radius."""
-
-    @property
-    def in_region(self) -> bool:
-        """Whether the 95 % ellipsoid holds the tip."""
-        return bool(self.square <= chdtri(3, 1 - REGION))
+    in_region: bool
+    """Whether the 95 % ellipsoid holds the tip."""
 
 
 def needle_outcome(believed: NeedleError, true: TrueNeedle, radius_mm: float | None) -> NeedleOutcome:
@@ -89,6 +90,7 @@ def needle_outcome(believed: NeedleError, true: TrueNeedle, radius_mm: float | N
     covariance = believed.covariance + np.pad(believed.target_covariance, (0, 3))
     cosine = true.R_m_needle[:, 2] @ believed.R_m_needle[:, 2]
     longest, middle, shortest = (float(mm) for mm in believed.half_axes_mm)
+    square = _square(error[:3], believed.tip_covariance)
     return NeedleOutcome(
         predicted_rms_mm=believed.rms_mm,
         offset_mm=float(np.linalg.norm(believed.offset_m)),
@@ -99,9 +101,10 @@ def needle_outcome(believed: NeedleError, true: TrueNeedle, radius_mm: float | N
         p_hit=None if radius_mm is None else believed.p_hit(radius_mm),
         realised_mm=realised,
         realised_direction_deg=float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
-        square=_square(error[:3], believed.tip_covariance),
+        square=square,
         square_of_pose=_square(error, covariance),
         hit=None if radius_mm is None else realised < radius_mm,
+        in_region=bool(square <= chdtri(3, 1 - REGION)),
     )
 
 
@@ -109,11 +112,11 @@ def _square(error: Floats, covariance: Floats) -> float:
     return float(error @ np.linalg.solve(covariance + LEAST_VARIANCE * np.eye(len(error)), error))
 
 
-class Reached(NamedTuple):
-    """Errors at one target, measured in truth; mm."""
+class TargetRow(NamedTuple):
+    """One target of one seed; true errors, mm."""
 
+    seed: int
     target: str
-    servoed: Servoed
     mapping_mm: float
     """Estimated target to true target."""
     expected_tre_mm: float
@@ -124,19 +127,53 @@ class Reached(NamedTuple):
     """True ball to true target at the end."""
     servo_only_mm: float
     """True ball to estimated target at the end: what the servo answers for."""
+    steps: int
+    stop: str
+    needle_open_loop: NeedleOutcome | None = None
+    """The needle where the robot alone brought it; None where it could not start, or nothing can be predicted."""
+    needle_servoed: NeedleOutcome | None = None
+    """The needle at the servo's last look, if there was one."""
+
+
+class DeclarationTest(NamedTuple):
+    """Test whether the measurements are as far apart as the declared errors make them."""
+
+    chi_squared: float
+    """Chi-squared of the joint estimate's residuals."""
+    freedom: int
+
+    @property
+    def p(self) -> float:
+        """Chance of residuals so large, or larger, if the declaration holds."""
+        return float(chdtrc(self.freedom, self.chi_squared))
+
+
+class ServoTrial(NamedTuple):
+    """One seed."""
+
+    seed: int
+    stereo_mm: tuple[float, ...] = ()
+    """Error of the stereo at points of the calibrated volume."""
+    calibration_rms_px: tuple[float, ...] = ()
+    fre_mm: float = float("nan")
+    robot_residual_mm: float = float("nan")
+    """Robot against C after the rigid fit (mean)."""
+    targets: tuple[TargetRow, ...] = ()
+    refused: str | None = None
+    """Why the session failed as a whole; None when it did not."""
+    declaration: DeclarationTest | None = None
+    """Test of everything that was measured; None where the joint estimate does not settle."""
+
+
+class Reached(NamedTuple):
+    """What a picture shows of one target, beside its row."""
+
+    row: TargetRow
+    servoed: Servoed
     rests: tuple[Floats, ...]
     """True joints, (6,), rad, at each of the servo's visits."""
     q_true: Floats
     """Shape (6,), rad: true joints at the end."""
-    unseen: NeedleOutcome | None = None
-    """The needle where the robot alone brought it; None where it could not start, or nothing can be predicted."""
-    seen: NeedleOutcome | None = None
-    """The needle at the last look, if there was one."""
-
-    @property
-    def confirmed(self) -> bool:
-        """Whether the last look saw the ball within the tolerance."""
-        return self.servoed.stop is ServoStop.CONVERGED
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,22 +181,18 @@ class Session:
     """Result of a session.
 
     Attributes:
-        seed: What it was drawn from.
         workcell: The truth.
         calibration: Result of the robot's points.
         mapping: What the markers gave.
-        stereo_mm: Shape (10,): error of the stereo at points of the calibrated volume.
         reached: One for each target.
-        guide: The estimates of ball and target for the servo; knows everything that was measured.
+        trial: The session as plain values.
     """
 
-    seed: int
     workcell: StereoWorkcell
     calibration: RobotCalibration
     mapping: Mapping
-    stereo_mm: Floats
     reached: tuple[Reached, ...]
-    guide: Guide
+    trial: ServoTrial
 
 
 class _Parts(NamedTuple):
@@ -207,20 +240,29 @@ def run_session(
     stereo_mm = _try_stereo(plant, calibration, plain, parts.tests)
     reading = _read(case, parts.image)
     plant.bring_head()
-    seen = see_markers(case, calibration, detector, devices)
-    mapping = map_markers(case, calibration, seen, reading)
-    guide = guide_of(Known(case, calibration, mapping, seen, reading.markers_m, detector))
+    mapping, guide = map_markers(case, calibration, detector, devices, reading)
     aims, reached = aims_of(case, calibration, mapping, reading.targets_m, targets), []
     for row, number in enumerate(aims.numbers):
         devices.move_jp(aims.q_hover[row])
         guide.aim_at(reading.targets_m[number])
         if recorder is not None:
             recorder.target = case.targets.names[number]
-        reached.append(_reach(plant, devices, guide, aims, row))
+        reached.append(_reach(plant, devices, guide, aims, row, seed))
         devices.move_jp(aims.q_hover[row])
     if recorder is not None:
         recorder.finish((case.markers.names, case.targets.names), reading)
-    return Session(seed, workcell, calibration, mapping, stereo_mm, tuple(reached), guide)
+    residual, declaration = float(np.mean(calibration.robot_residual_mm)), _declaration(guide)
+    rows, stereo = tuple(one.row for one in reached), tuple(stereo_mm.tolist())
+    figures = ServoTrial(seed, stereo, calibration.rms_px, mapping.fre_mm, residual, rows, None, declaration)
+    return Session(workcell, calibration, mapping, tuple(reached), figures)
+
+
+def _declaration(guide: Guide) -> DeclarationTest | None:
+    try:
+        found = guide.adjusted()
+    except NoAnswerError:
+        return None
+    return DeclarationTest(found.chi2, found.freedom)
 
 
 def _read(case: ServoCase, rng: np.random.Generator) -> ImageReading:
@@ -250,7 +292,7 @@ def _try_stereo(
     return np.array(errors)
 
 
-def _reach(plant: StereoPlant, arm: Arm, guide: Guide, aims: Aims, row: int) -> Reached:
+def _reach(plant: StereoPlant, arm: Arm, guide: Guide, aims: Aims, row: int, seed: int) -> Reached:
     """Move from the hovering point onto the target by the robot alone, then by the servo."""
     workcell, number = plant.workcell, aims.numbers[row]
     true_target, unseen, seen = workcell.targets_c[number], None, None
@@ -263,19 +305,14 @@ def _reach(plant: StereoPlant, arm: Arm, guide: Guide, aims: Aims, row: int) -> 
         done = aims.correct(row, guide, arm)
         seen = _outcome(plant, guide.needle_seen(), number) if done.ended_in_sight else None
     ball, estimated = workcell.ball_c(plant.rests[-1]), guide.target_c
-    return Reached(
-        workcell.case.targets.names[number],
-        done,
-        float(np.linalg.norm(estimated - true_target)),
-        float(aims.expected_tre_mm[row]),
-        before,
-        float(np.linalg.norm(ball - true_target)),
-        float(np.linalg.norm(ball - estimated)),
-        tuple(plant.rests[first : first + len(done.visits)]),
-        plant.rests[-1],
-        unseen,
-        seen,
+    mapping, after, only = (
+        float(np.linalg.norm(a - b)) for a, b in ((estimated, true_target), (ball, true_target), (ball, estimated))
     )
+    name, expected = workcell.case.targets.names[number], float(aims.expected_tre_mm[row])
+    errors = TargetRow(
+        seed, name, mapping, expected, before, after, only, done.steps, str(done.stop), unseen, seen
+    )  # fmt: skip
+    return Reached(errors, done, tuple(plant.rests[first : first + len(done.visits)]), plant.rests[-1])
 
 
 def _outcome(plant: StereoPlant, believed: NeedleError | None, target: int) -> NeedleOutcome | None:
@@ -283,3 +320,87 @@ def _outcome(plant: StereoPlant, believed: NeedleError | None, target: int) -> N
         return None
     radius_mm = plant.workcell.case.file.target.hit_radius_mm
     return needle_outcome(believed, plant.workcell.needle_m(plant.rests[-1], target), radius_mm)
+
+
+def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> ServoTrial:
+    """The trial of one seed; a session that fails becomes a trial with its reason. Arguments as of `run_session`."""
+    try:
+        return run_session(case, seed, empty=empty).trial
+    except NoAnswerError as error:
+        return ServoTrial(seed, refused=str(error))
+
+
+def run_trials(case: ServoCase, seeds: Sequence[int], done: Count = uncounted) -> list[ServoTrial]:
+    """The trials of every seed, in the order given; they share the checker of the empty workcell.
+
+    Args:
+        case: The case.
+        seeds: Which.
+        done: Told how many of how many are done.
+    """
+    empty, found = workcell_checker(case, None), []
+    for seed in seeds:
+        found.append(run_trial(case, seed, empty))
+        done(len(found), len(seeds))
+    return found
+
+
+def declaration_test(trials: Sequence[ServoTrial]) -> DeclarationTest | None:
+    """Test of the declaration over all seeds together; None where none has a test."""
+    known = [one.declaration for one in trials if one.declaration is not None]
+    if not known:
+        return None
+    return DeclarationTest(sum(one.chi_squared for one in known), sum(one.freedom for one in known))
+
+
+def statistics(trials: Sequence[ServoTrial]) -> dict[str, Any]:
+    """Means, roots of mean squares and maxima over all targets of all seeds, mm; fractions 0..1.
+
+    Raises:
+        NoAnswerError: No trial reached a target.
+    """
+    rows = [row for one in trials for row in one.targets]
+    if not rows:
+        what = "no session was possible: " + "; ".join(sorted({one.refused or "" for one in trials}))
+        raise NoAnswerError(what, code="no_session")
+    stereo = np.concatenate([one.stereo_mm for one in trials])
+    mapping, expected, before, after, only = np.array([row[2:7] for row in rows]).T
+    found = {
+        "seeds": len(trials),
+        "targets": len(rows),
+        "refused": sum(bool(one.refused) for one in trials),  # seeds whose session failed
+        "stereo_mean": stereo.mean(),
+        "stereo_max": stereo.max(),
+        "mapping_mean": mapping.mean(),
+        "expected_tre_rms": rms(expected),
+        "mapping_rms": rms(mapping),
+        "before_mean": before.mean(),
+        "after_mean": after.mean(),
+        "servo_only_mean": only.mean(),
+        "servo_only_max": only.max(),
+        "median_steps": np.median([row.steps for row in rows]),
+        "not_confirmed": np.mean([row.stop != ServoStop.CONVERGED for row in rows]),
+        "after_over_mapping": after.mean() / mapping.mean(),  # 1 is the floor
+    }
+    return {key: value if isinstance(value, int) else float(value) for key, value in found.items()}
+
+
+def needle_statistics(outcomes: Sequence[NeedleOutcome | None]) -> dict[str, Any] | None:
+    """Predicted and realised errors of needles, mm and degrees; None where none has a prediction.
+
+    Those of one seed share a workcell.
+    """
+    known = [one for one in outcomes if one is not None]
+    if not known:
+        return None
+    angles = ("predicted_direction_deg", "realised_direction_deg")
+    chances = [one.p_hit for one in known if one.p_hit is not None]
+    return {
+        "needles": len(known),
+        "predicted_rms_mm": rms([one.predicted_rms_mm for one in known]),
+        "realised_rms_mm": rms([one.realised_mm for one in known]),
+        **{name: rms([getattr(one, name) for one in known]) for name in angles},
+        "coverage_95": float(np.mean([one.in_region for one in known])),
+        "hit_share": float(np.mean([bool(one.hit) for one in known])) if chances else None,
+        "mean_p_hit": float(np.mean(chances)) if chances else None,
+    }

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.guard import RawMesh, token_array, triangulate
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -246,15 +245,3 @@ def _faces(columns: dict[str, NDArray[Any] | _Lists], where: str) -> _Lists:
     if not (np.isfinite(values) & (values == np.trunc(values)) & (np.abs(values) < _MAX_ROWS)).all():
         refuse("a vertex index is not a whole number", where, "indices from 0", "not_whole")
     return lists[0]
-
-
-def ply_bytes(mesh: TriangleMesh) -> bytes:
-    """A mesh as a little-endian binary PLY: float32 vertices, int32 faces."""
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(mesh.vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, mesh.faces
-    return header.encode("ascii") + mesh.vertices.astype("<f4").tobytes() + faces.tobytes()

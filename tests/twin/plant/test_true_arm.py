@@ -6,7 +6,10 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
-from puncture_twin.twin.plant.truth import ArmErrors, draw_true_arm
+from puncture_twin.planning.case.errors import ArmErrors
+from puncture_twin.twin.plant.truth import draw_true_arm
+
+EXACT = ArmErrors(link_mm=0.0, twist_deg=0.0, joint_deg=0.0, repeatability_deg=0.0)
 
 
 @pytest.mark.parametrize("name", UR_MODELS)
@@ -14,29 +17,31 @@ def test_without_errors_it_is_the_nominal_arm(name):
     """Every link of a perfect arm stands where the compiled kinematics say."""
     rng = np.random.default_rng(1)
     model = ur_model(name)
-    arm = draw_true_arm(model, ArmErrors(), rng)
+    arm = draw_true_arm(model, EXACT, rng)
     q = rng.uniform(-np.pi, np.pi, (50, 6))
-    assert np.abs(arm.link_poses(q) - link_poses(model, q)).max() < 1e-9
+    assert np.abs(arm.true.link_poses(q) - link_poses(model, q)).max() < 1e-9
 
 
 def test_true_arm_against_scipy():
     """A drawn arm's flange, against the four elementary motions of each row of its table, composed by SciPy."""
     rng = np.random.default_rng(2)
-    arm = draw_true_arm(ur_model("ur3"), ArmErrors(1.0, 0.01, 0.02), rng)
+    arm = draw_true_arm(ur_model("ur3"), ArmErrors(link_mm=1.0, twist_deg=0.6, joint_deg=1.2), rng)
     q = rng.uniform(-np.pi, np.pi, 6)
     T = np.eye(4)
     for i in range(6):
         step = np.eye(4)
-        turn = Rotation.from_euler("z", q[i] + arm.joint_offsets[i])
-        step[:3, :3] = (turn * Rotation.from_euler("x", arm.alpha[i])).as_matrix()
-        step[:3, 3] = [0, 0, arm.d[i]] + turn.apply([arm.a[i], 0, 0])
+        turn = Rotation.from_euler("z", q[i] + arm.true.zeros[i])
+        step[:3, :3] = (turn * Rotation.from_euler("x", arm.true.alpha[i])).as_matrix()
+        step[:3, 3] = [0, 0, arm.true.d[i]] + turn.apply([arm.true.a[i], 0, 0])
         T = T @ step
     assert np.abs(arm.flange_pose(q) - T).max() < 1e-9
 
 
 def test_play_follows_only_past_its_edge():
     """A motion smaller than the play moves nothing; turning back costs the whole width."""
-    arm = draw_true_arm(ur_model("ur3"), ArmErrors(backlash_rad=0.02), np.random.default_rng(3))
+    arm = draw_true_arm(
+        ur_model("ur3"), EXACT.model_copy(update={"backlash_deg": np.degrees(0.02)}), np.random.default_rng(3)
+    )
     rng, q = np.random.default_rng(4), np.zeros(6)
     q = arm.settle(np.full(6, 0.009), q, rng)
     assert np.array_equal(q, np.zeros(6))
@@ -51,12 +56,12 @@ def test_play_follows_only_past_its_edge():
 def test_errors_have_the_spread_that_was_asked_for():
     """Standard deviations over many drawn arms; repeatability is drawn at each arrival."""
     rng = np.random.default_rng(5)
-    errors = ArmErrors(link_mm=0.3, twist_rad=1e-3, joint_rad=2e-3, repeatability_rad=5e-4)
+    errors = ArmErrors(link_mm=0.3, twist_deg=0.06, joint_deg=0.12, repeatability_deg=0.03)
     model = ur_model("ur3")
     arms = [draw_true_arm(model, errors, rng) for _ in range(2000)]
-    assert np.std([arm.a - np.array(model.a) for arm in arms]) == pytest.approx(0.3, rel=0.05)
-    assert np.std([np.delete(arm.d - np.array(model.d), 1) for arm in arms]) == pytest.approx(0.3, rel=0.05)
-    assert np.std([arm.alpha - np.array(model.alpha) for arm in arms]) == pytest.approx(1e-3, rel=0.05)
-    assert np.std([arm.joint_offsets for arm in arms]) == pytest.approx(2e-3, rel=0.05)
+    assert np.std([arm.true.a - np.array(model.a) for arm in arms]) == pytest.approx(0.3, rel=0.05)
+    assert np.std([np.delete(arm.true.d - np.array(model.d), 1) for arm in arms]) == pytest.approx(0.3, rel=0.05)
+    assert np.std([arm.true.alpha - np.array(model.alpha) for arm in arms]) == pytest.approx(errors.twist, rel=0.05)
+    assert np.std([arm.true.zeros for arm in arms]) == pytest.approx(errors.joint, rel=0.05)
     rests = [arms[0].settle(np.zeros(6), np.zeros(6), rng) for _ in range(2000)]
-    assert np.std(rests) == pytest.approx(5e-4, rel=0.05)
+    assert np.std(rests) == pytest.approx(errors.repeatability, rel=0.05)

@@ -29,12 +29,14 @@ from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.touch.touch_planner import TOUCHING_PADDING_MM, approach_checkers, plan_touches, registered
 from puncture_twin.planning.touch.tour_motions import line_to, plan_puncture
 from puncture_twin.run_twin import app
+from puncture_twin.twin.devices import Moved, StoppedError
+from puncture_twin.twin.guidance.ct.touching import TouchReading, nominal_tip, touch_tour
 from puncture_twin.twin.jobs.experiment import touch_job
 from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
-from puncture_twin.twin.plant.true_needle import TouchTruth, nominal_tip
-from puncture_twin.twin.rehearsal import touching
+from puncture_twin.twin.plant import touching
+from puncture_twin.twin.plant.touching import ExecutedTouches, TrueContact, execute_touches
+from puncture_twin.twin.plant.true_needle import TouchTruth
 from puncture_twin.twin.rehearsal.plan_truth import rehearse_touched
-from puncture_twin.twin.rehearsal.touching import Touched, TouchReading, execute_touches
 from puncture_twin.twin.world.client import pybullet
 from puncture_twin.twin.world.workcell import open_workcell
 
@@ -90,10 +92,10 @@ def executed(context, plan, truth):
 
 def test_touches_are_slow_soft_and_exact(done):
     """TissueForce within .03 mm of the face, at 2 mm/s at most, with 2 N at most."""
-    for one in done[0].touched.readings:
-        assert 0.0 <= one.bias_mm <= 0.03
-        assert one.speed_mm_s <= 2.0
-        assert 0.5 < one.force_n <= 2.0
+    for one in done[0].summary()["touches"]:
+        assert 0.0 <= one["bias_mm"] <= 0.03
+        assert one["speed_mm_s"] <= 2.0
+        assert 0.5 < one["force_n"] <= 2.0
 
 
 def test_the_controller_computes_the_reading_from_its_joints(done):
@@ -265,9 +267,10 @@ def test_a_registration_out_of_reach_is_no_puncture(context, done):
 def readings(plan, names):
     """What a faultless arm reads at some of the markers."""
     kept = [touch for touch in plan.touches if touch.name in names]
-    read = [TouchReading(t.name, t.point_base, t.q_touch, 10.0, 1.0, 0.0, 1.0, 0.0) for t in kept]
+    read = [TouchReading(t.name, t.point_base, t.q_touch, 10.0, 1.0, 0.0) for t in kept]
+    felt = {t.name: TrueContact(0.0, 1.0) for t in kept}
     failed = {touch.name: "no contact" for touch in plan.touches if touch not in kept}
-    return Touched(tuple(read), failed, 10.0 * len(read))
+    return ExecutedTouches(tuple(read), failed, 10.0 * len(read), felt)
 
 
 @pytest.mark.parametrize(("kept", "code"), [("ABCDE", 0), ("ABE", 0), ("AB", 1), ("", 1)])
@@ -332,3 +335,57 @@ def test_a_case_without_declared_errors_is_refused(context):
     bare = dataclasses.replace(context, case=dataclasses.replace(context.case, errors=None))
     with refused("no_markers"):
         plan_touches(bare, np.zeros(6), seed=0, progress=quiet)
+
+
+class PaperArm:
+    """An arm that is exactly where it is sent, and feels a marker where somebody says."""
+
+    def __init__(self, stops_at=None, contacts=(False, True)):
+        self.log, self.stops_at, self.contacts = [], stops_at, contacts
+
+    @contextmanager
+    def at_marker(self, touch):
+        """Where it was believed."""
+        self.name = touch.name
+        yield touch.q_touch
+
+    def move(self, motion, *, in_air=False):
+        """One second each."""
+        self.log.append((self.name, "air" if in_air else "back"))
+        if self.stops_at == self.name:
+            raise StoppedError("forearm touches trolley")
+        return Moved(motion.q[-1], 1.0, 0.1, False)
+
+    def move_until_contact(self, motion, *, yielding):
+        """Felt as stated: on the way, or at its end."""
+        self.log.append((self.name, "soft" if yielding else "stiff"))
+        return Moved(motion.q[len(motion.q) // 2], 1.0, 0.9, self.contacts[yielding])
+
+
+@pytest.mark.parametrize(
+    ("arm", "read", "failed", "seconds"),
+    [
+        (PaperArm(), 3, None, 13.0),
+        (PaperArm(contacts=(True, False)), 0, "before its believed position", 10.0),
+        (PaperArm(contacts=(False, False)), 0, "beyond its believed position", 13.0),
+    ],
+)
+def test_a_tour_needs_nothing_but_what_the_arm_says(context, done, arm, read, failed, seconds):
+    """Any arm does that answers the device's words: come, stiff, soft, back at each marker, and home at the end."""
+    found = touch_tour(done[0].plan, arm, approach_checkers(context, TOUCHING_PADDING_MM), quiet)
+    assert len(found.readings) == read
+    assert all(failed in why for why in found.failed.values())
+    assert found.seconds == seconds
+    assert [how for _, how in arm.log][-1] == "air"
+    for one in found.readings:
+        np.testing.assert_allclose(one.point_base, nominal_tip(done[0].plan.model, done[0].plan.tip_mm, one.q))
+        assert one.force_n == 0.9
+
+
+def test_an_arm_that_stops_leaves_the_rest_unread(context, done):
+    """What was read before stays; the reason is the arm's own."""
+    plan = done[0].plan
+    arm = PaperArm(stops_at=plan.touches[1].name)
+    found = touch_tour(plan, arm, approach_checkers(context, TOUCHING_PADDING_MM), quiet)
+    assert [one.name for one in found.readings] == [plan.touches[0].name]
+    assert set(found.failed.values()) == {"the tour was stopped: forearm touches trolley"}

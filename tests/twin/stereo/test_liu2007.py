@@ -11,19 +11,20 @@ from benchmarks.servo_rooms import pixel_detector, varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
-from puncture_twin.twin.jobs.servo.liu2007 import (
+from puncture_twin.twin.jobs.papers.liu2007 import (
     TABLE_1,
     TABLE_2,
-    Liu2007Tables,
-    ServoSessions,
+    conditions,
     paper_case,
     paper_columns,
+    paper_sections,
     paper_servo_only_at_least,
+    reproduction_facts,
     straightened,
 )
-from puncture_twin.twin.jobs.servo.report import reproduction_facts, servo_facts, servo_text
-from puncture_twin.twin.rehearsal.stereo_session import run_session
-from puncture_twin.twin.rehearsal.stereo_trials import ServoTrial, TargetRow, run_trial, statistics, trial
+from puncture_twin.twin.jobs.servo.job import Sessions
+from puncture_twin.twin.jobs.servo.report import servo_facts, servo_text
+from puncture_twin.twin.rehearsal.stereo_session import ServoTrial, TargetRow, run_session, run_trial, statistics
 
 SEED = 5
 DRAW = (-0.05, 0.05, -0.02, 0.02)
@@ -31,10 +32,10 @@ DRAW = (-0.05, 0.05, -0.02, 0.02)
 
 def test_the_papers_means_are_those_of_its_rows_but_one():
     """Stereo, mapping and after hold to two decimals; the printed mean before, 1.47, is 1.48 by the rows."""
-    columns = {column.name: column for column in paper_columns()}
-    assert [name for name, column in columns.items() if not column.passed] == ["before"]
-    assert round(columns["before"].mean, 2) == 1.48
-    assert columns["before"].printed_mean == 1.47
+    columns = {column["name"]: column for column in paper_columns()}
+    assert [name for name, column in columns.items() if not column["holds"]] == ["before"]
+    assert round(columns["before"]["mean"], 2) == 1.48
+    assert columns["before"]["printed_mean"] == 1.47
     assert len(TABLE_1) == 10
     assert len(TABLE_2) == 16
 
@@ -45,23 +46,29 @@ def one_trial(seed, gain, after=1.0, stop="converged"):
         TargetRow(seed, name, 1.0, 1.0, after + gain + d, after, 0.1, 1, stop)
         for name, d in zip("abcd", DRAW, strict=True)
     )
-    return ServoTrial(seed, (0.1,), (0.1,), 0.5, 1.0, rows, "")
+    return ServoTrial(seed, (0.1,), (0.1,), 0.5, 1.0, rows)
 
 
-def tables(gains, **keys):
-    """The reproduction with made-up sessions."""
+def sessions(gains, **keys):
+    """Made-up sessions."""
     trials = tuple(one_trial(seed, gain, **keys) for seed, gain in enumerate(gains))
-    sessions = ServoSessions(paper_case(), None, trials, statistics(trials))
-    return Liu2007Tables(sessions, sessions)
+    return Sessions(paper_case(), None, trials, statistics(trials))
+
+
+def held(gains, **keys):
+    """Which conditions hold."""
+    return [one["holds"] for one in conditions(sessions(gains, **keys))]
 
 
 def test_the_exit_code_stands_for_what_is_printed():
     """A gain that seeds scatter about is chance; one unconfirmed half, or an error far above the mapping's, fails."""
-    assert tables([0.5, 0.6, 0.4]).passed
-    assert [one.passed for one in tables([0.5, -0.6, 0.3]).conditions] == [False, True, True]
-    assert [one.passed for one in tables([0.5, 0.6, 0.4], after=1.6).conditions] == [True, False, True]
-    assert [one.passed for one in tables([0.5, 0.6, 0.4], stop="no_progress").conditions] == [True, True, False]
-    text = servo_text({**reproduction_facts(tables([0.5, 0.6, 0.4])), "files": []})
+    good = sessions([0.5, 0.6, 0.4])
+    facts = reproduction_facts(good, good)
+    assert facts["holds"]
+    assert held([0.5, -0.6, 0.3]) == [False, True, True]
+    assert held([0.5, 0.6, 0.4], after=1.6) == [True, False, True]
+    assert held([0.5, 0.6, 0.4], stop="no_progress") == [True, True, False]
+    text = servo_text({**facts, "files": []}, paper_sections(facts))
     assert "23 deg more" in text
     assert "paper 0.48 mm" in text
 
@@ -84,7 +91,7 @@ def test_what_the_servo_alone_left_in_the_paper_is_bounded_from_below():
 
 def short(case, seed, targets=("T1", "T6", "T11"), **keys):
     """A session at a few targets; nothing stands in the way of the calibration."""
-    return trial(run_session(case, seed, targets=targets, empty=NoContacts(), **keys))
+    return run_session(case, seed, targets=targets, empty=NoContacts(), **keys).trial
 
 
 def test_a_room_like_the_papers_shows_its_finding():
@@ -95,9 +102,9 @@ def test_a_room_like_the_papers_shows_its_finding():
     assert case.file.servo.tolerance_mm == 0.4
     trials = [short(case, SEED)]
     ours = statistics(trials)
-    assert ours.targets == 3
-    assert ours.servo_only_max < 0.4 + 3 * ours.stereo_max
-    assert ours.after_mean < ours.before_mean
+    assert ours["targets"] == 3
+    assert ours["servo_only_max"] < 0.4 + 3 * ours["stereo_max"]
+    assert ours["after_mean"] < ours["before_mean"]
     facts = servo_facts(case, trials, ours)
     assert json.loads(json.dumps(facts, allow_nan=False))["case"] == "liu2007"
     assert "after over mapping" in servo_text({**facts, "files": []})
@@ -106,9 +113,9 @@ def test_a_room_like_the_papers_shows_its_finding():
 def test_in_a_good_room_the_servo_ends_within_what_it_may():
     """Edges, a tenth of a millimetre: stereo, servo-only and the confirmation, from rendered pictures."""
     ours = statistics([short(load_servo_case(folder() / "head"), 1)])
-    assert ours.stereo_max < 0.1
-    assert ours.servo_only_max < 0.2
-    assert ours.not_confirmed == 0.0
+    assert ours["stereo_max"] < 0.1
+    assert ours["servo_only_max"] < 0.2
+    assert ours["not_confirmed"] == 0.0
 
 
 def test_a_seed_repeats_itself_and_another_does_not():
@@ -118,13 +125,13 @@ def test_a_seed_repeats_itself_and_another_does_not():
         short(case, seed, ("T1",), detector_of=lambda plant: pixel_detector(plant, 0.03)) for seed in (1, 1, 2)
     )
     assert first == again
-    assert first.rows != other.rows
+    assert first.targets != other.targets
 
 
 def test_a_head_that_hides_a_target_loses_the_ball():
     """With cameras almost level the wall of the skull hides the ball: lost, no step is driven, and the row says so."""
     case = varied(load_servo_case(folder() / "head"), cameras={"elevation_deg": 8.0})
-    (row,) = short(case, 0, ("T10",)).rows
+    (row,) = short(case, 0, ("T10",)).targets
     assert (row.stop, row.steps) == ("lost_ball", 0)
 
 

@@ -68,10 +68,9 @@ def test_what_each_unknown_does_to_the_needle_is_a_difference(found, of):
 def test_the_servo_takes_the_arm_out_of_the_tip_but_not_out_of_the_direction():
     """An arm that is declared five times as bad leaves the tip as seen, and spoils tip unseen and direction."""
     session, target = simulate(3), CASE.targets.points[1]
-    worse = replace(
-        session.observed.errors, link_mm=1.5, joint=5 * CASE.errors.joint, twist=5 * CASE.errors.twist, tip_offset_mm=0
-    )
-    exact_tip = replace(session.observed.errors, tip_offset_mm=0.0)
+    five = {key: 5 * getattr(CASE.errors, key) for key in ("link_mm", "joint_deg", "twist_deg")}
+    exact_tip = session.observed.errors.model_copy(update={"tip_offset_mm": 0.0})
+    worse = exact_tip.model_copy(update=five)
     good, bad = (adjust(replace(session.observed, errors=errors), session.guess) for errors in (exact_tip, worse))
     tips = [np.trace(way(fit, target).tip_covariance) for fit in (good, bad) for way in (seen, unseen)]
     assert tips[2] == pytest.approx(tips[0], rel=0.05)
@@ -82,19 +81,19 @@ def test_the_servo_takes_the_arm_out_of_the_tip_but_not_out_of_the_direction():
 def test_what_no_camera_sees_stays(found):
     """Tip offset, needle direction, target reading and a head that moves add what they are."""
     target = found.unknowns.markers_m.mean(axis=0)  # about which the head turns
-    errors = replace(found.model.observed.errors, tip_offset_mm=0.0, needle_direction=0.0)
+    errors = found.model.observed.errors.model_copy(update={"tip_offset_mm": 0.0, "needle_direction_deg": 0.0})
 
     def told(**keys):
-        observed = replace(found.model.observed, errors=replace(errors, **keys))
+        observed = replace(found.model.observed, errors=errors.model_copy(update=keys))
         return servoed_error(replace(found, model=replace(found.model, observed=observed)), -1, target)
 
     plain = told()
     tip = told(tip_offset_mm=0.7).covariance - plain.covariance
     np.testing.assert_allclose(tip, np.diag([0.49] * 3 + [0.0] * 3), atol=1e-12)
-    leaning = told(needle_direction=0.01)
+    leaning = told(needle_direction_deg=np.degrees(0.01))
     assert leaning.direction_rms**2 - plain.direction_rms**2 == pytest.approx(2e-4)
     np.testing.assert_allclose(leaning.covariance[:3, :3], plain.covariance[:3, :3], atol=1e-12)
-    moved = told(head_shift_mm=0.3, head_turn=0.02).covariance - plain.covariance
+    moved = told(head_shift_mm=0.3, head_turn_deg=np.degrees(0.02)).covariance - plain.covariance
     np.testing.assert_allclose(moved, np.diag([0.09] * 3 + [4e-4] * 3), atol=1e-9)
     read = told(target_mm=0.4)
     np.testing.assert_allclose(read.tip_covariance - plain.tip_covariance, 0.16 * np.eye(3), atol=1e-12)
@@ -151,8 +150,9 @@ def test_a_session_predicts_every_needle_that_it_saw():
         empty=NoContacts(),
         detector_of=lambda plant: pixel_detector(plant, 0.03),
     )
-    for one in session.reached:
-        assert one.seen.predicted_rms_mm < one.unseen.predicted_rms_mm
-        assert one.seen.offset_mm < HERE.file.servo.tolerance_mm + 0.1
-        assert one.seen.square < 25
-        assert 0.0 <= one.unseen.p_hit <= one.seen.p_hit <= 1.0
+    for one in session.trial.targets:
+        seen, unseen = one.needle_servoed, one.needle_open_loop
+        assert seen.predicted_rms_mm < unseen.predicted_rms_mm
+        assert seen.offset_mm < HERE.file.servo.tolerance_mm + 0.1
+        assert seen.square < 25
+        assert 0.0 <= unseen.p_hit <= seen.p_hit <= 1.0

@@ -114,7 +114,7 @@ def test_the_arm_reaches_everything_without_a_contact(case):
 
 def arm_hides_ball(workcell: StereoWorkcell, q):
     """Whether some link stands between a camera and the ball, by the links' own meshes."""
-    poses = workcell.arm.link_poses(q)
+    poses = workcell.arm.true.link_poses(q)
     for link in collision_links(workcell.model)[1:]:
         T_c_link = workcell.T_c_base @ poses[link.frame]
         vertices = apply(T_c_link, np.asarray(link.mesh.vertices))

@@ -1,4 +1,4 @@
-"""What a servo case declares of errors: defaults, older names, and a truth that is drawn from it."""
+"""What a servo case declares of errors: defaults, and a truth that is drawn from it."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from servo_world import CASE
 from benchmarks.servo_rooms import varied
 from puncture_twin.meshes import folder
 from puncture_twin.planning.geometry.rigid import log_rotation
-from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrorsSection, declared_errors
+from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
 from puncture_twin.twin.guidance.stereo.planned import planned_cameras
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.plant.stereo_workcell import draw_workcell
@@ -35,34 +35,28 @@ def without_errors():
 def test_a_case_that_declares_nothing_has_the_defaults(tmp_path):
     """The arm is a calibrated one; a target is read as a marker is."""
     errors = read(tmp_path, without_errors()).errors
-    assert errors == declared_errors(ServoErrorsSection(), {})
+    assert errors == ServoErrors()
     assert (errors.link_mm, errors.tip_offset_mm, errors.marker_mm, errors.target_mm) == (0.05, 0.3, 0.3, 0.3)
     assert np.degrees(errors.twist) == pytest.approx(0.005)
     assert errors.ball_px is None
-    assert declared_errors(ServoErrorsSection(arm="nominal"), {}).link_mm == 0.5
-
-
-def test_older_tables_state_the_same(tmp_path):
-    """``robot.link_mm``, ``head.marker_mm`` and their kind still declare what they always did."""
-    text = without_errors().replace('model = "ur3"', 'model = "ur3"\nlink_mm = 0.7\nbacklash_deg = 0.1')
-    errors = read(tmp_path, text.replace('unit = "mm"', 'unit = "mm"\nmarker_mm = 1.5')).errors
-    assert (errors.link_mm, errors.marker_mm, errors.target_mm) == (0.7, 1.5, 1.5)
-    assert np.degrees(errors.backlash) == pytest.approx(0.1)
+    assert ServoErrors(arm="nominal").link_mm == 0.5
+    assert ServoErrors(arm="nominal", joint_deg=0.2, marker_mm=0.7).target_mm == 0.7
 
 
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
-        ('model = "ur3"', 'model = "ur3"\nlink_mm = 0.3', "stated_twice robot.link_mm errors.link_mm"),
-        ('unit = "mm"', 'unit = "mm"\nmarker_mm = 0.3', "stated_twice head.marker_mm errors.marker_mm"),
+        ('model = "ur3"', 'model = "ur3"\nlink_mm = 0.3', "unknown_key link_mm"),
+        ('unit = "mm"', 'unit = "mm"\nmarker_mm = 0.3', "unknown_key marker_mm"),
         ("[errors]", "[rehearsal.errors]", "missing_errors"),
         ("ball_offset_mm", "ball_ofset_mm", "unknown_key ball_offset_mm"),
         ("tip_offset_mm = 0.1", "tip_offset_mm = -0.1", "bad_value errors.tip_offset_mm"),
+        ("tip_offset_mm = 0.1", 'arm = ["nominal"]', "bad_value errors.arm"),
         ("hit_radius_mm = 0.5", "hit_radius_mm = 0", "bad_value target.hit_radius_mm"),
     ],
 )
 def test_what_contradicts_itself_is_refused(tmp_path, old, new, what):
-    """One error stated twice, a truth beside no belief, an unknown key, a negative deviation."""
+    """An error outside of its table, a truth beside no belief, an unknown key, a negative deviation."""
     assert old in TEXT
     with refused(*what.split()):
         read(tmp_path, TEXT.replace(old, new, 1))
@@ -70,10 +64,10 @@ def test_what_contradicts_itself_is_refused(tmp_path, old, new, what):
 
 def test_what_is_stated_is_read_back():
     """The declaration by its keys is a section that declares the same."""
-    again = declared_errors(ServoErrorsSection.model_validate(CASE.errors.stated()), {})
+    again = ServoErrors.model_validate(CASE.errors.stated())
     assert again.arm_deviations() == pytest.approx(CASE.errors.arm_deviations())
     assert again.camera_deviations() == pytest.approx(CASE.errors.camera_deviations())
-    assert again.scaled(2.0).head_turn == 2 * again.head_turn
+    assert again.scaled(2.0).head_turn == pytest.approx(2 * again.head_turn)
     assert again.scaled(2.0).camera_deviations() == pytest.approx(2 * again.camera_deviations())
 
 
@@ -88,12 +82,12 @@ def test_the_truth_is_drawn_from_the_declaration():
         "ball": (np.array([workcell.tool.ball_offset for workcell in rooms]), errors.ball_offset_mm),
         "tip": (np.array([workcell.tool.tip_offset for workcell in rooms]), errors.tip_offset_mm),
         "lean": (np.array([workcell.tool.lean[:2] for workcell in rooms]), errors.needle_direction),
-        "links": (np.array([workcell.arm.a - workcell.arm.nominal.a for workcell in rooms]), errors.link_mm),
-        "zeros": (np.array([one.arm.joint_offsets for one in rooms]), errors.joint),
-        "axis": (np.array([one.cameras[0].cx - plan.cx for one in rooms]), errors.camera.axis_px),
+        "links": (np.array([workcell.arm.true.a - workcell.arm.nominal.a for workcell in rooms]), errors.link_mm),
+        "zeros": (np.array([one.arm.true.zeros for one in rooms]), errors.joint),
+        "axis": (np.array([one.cameras[0].cx - plan.cx for one in rooms]), errors.camera_axis_px),
         "k1": (
             np.array([one.cameras[1].distortion[0] - plan.distortion[0] for one in rooms]),
-            errors.camera.lens[0],
+            errors.lens[0],
         ),
         "turn": (log_rotation(moved[:, :3, :3]), errors.head_turn),
     }
@@ -110,4 +104,4 @@ def test_another_truth_leaves_the_belief_alone():
     assert wrong.errors == CASE.errors
     one, other = (draw_workcell(case, np.random.default_rng(1)) for case in (CASE, wrong))
     np.testing.assert_allclose(other.tool.tip_offset, 3 * one.tool.tip_offset)
-    np.testing.assert_allclose(other.arm.joint_offsets, 3 * one.arm.joint_offsets)
+    np.testing.assert_allclose(other.arm.true.zeros, 3 * one.arm.true.zeros)

@@ -6,10 +6,11 @@ from scipy.spatial.transform import Rotation
 from servo_world import CASE, HELD, NoContacts, start_configurations
 
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.case.errors import ArmErrors
 from puncture_twin.planning.collision.state_checker import Contact, FirstContact
 from puncture_twin.twin.guidance.stereo.servo_law import ServoStop, StepLimits, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen, Task, path_contact, servo
-from puncture_twin.twin.plant.truth import ArmErrors, draw_true_arm
+from puncture_twin.twin.plant.truth import draw_true_arm
 
 Q_START = start_configurations()[12]
 T_BASE_C = np.eye(4)
@@ -24,6 +25,12 @@ class Touches(NoContacts):
     def first_contact(self, q_path, *, needle_may_touch_patient):
         """The needle touches the table."""
         return FirstContact(0, Contact("needle", "table"))
+
+
+def off(**keys):
+    """An arm whose lengths are off by .3 mm, and what else is stated."""
+    exact = {"link_mm": 0.3, "twist_deg": 0.0, "joint_deg": 0.0, "repeatability_deg": 0.0}
+    return ArmErrors(**{**exact, **keys})
 
 
 class Twin:
@@ -73,7 +80,9 @@ def run(twin, **changes):
 @pytest.mark.parametrize("seed", range(8))
 def test_it_takes_the_arms_own_error_out(seed):
     """An arm that is millimetres off ends within the tolerance, play and all; the target is never told to the arm."""
-    twin = Twin(ArmErrors(0.3, 3e-4, 9e-4, np.radians(0.02), np.radians(0.003)), noise_mm=0.01, seed=seed)
+    twin = Twin(
+        off(twist_deg=0.02, joint_deg=0.05, backlash_deg=0.02, repeatability_deg=0.003), noise_mm=0.01, seed=seed
+    )
     done = run(twin)
     before, after = (np.linalg.norm(twin.ball(q) - TARGET_C) for q in (Q_START, twin.q))
     assert done.stop is ServoStop.CONVERGED
@@ -85,14 +94,14 @@ def test_it_takes_the_arms_own_error_out(seed):
 
 def test_a_perfect_arm_does_not_move():
     """Within the tolerance at the first look nothing is driven."""
-    twin = Twin(ArmErrors())
+    twin = Twin(off(link_mm=0.0))
     done = run(twin)
     assert (done.stop, done.steps, twin.drives) == (ServoStop.CONVERGED, 0, 0)
 
 
 def test_a_ball_that_is_not_seen_is_lost_and_the_arm_does_not_move():
     """So many looks as asked for, no drive, the reason kept."""
-    twin, looks = Twin(ArmErrors(0.3)), []
+    twin, looks = Twin(off()), []
 
     def blind(q_command):
         looks.append(q_command)
@@ -106,7 +115,7 @@ def test_a_ball_that_is_not_seen_is_lost_and_the_arm_does_not_move():
 
 def test_one_missed_look_is_tried_again():
     """A ball that comes back is not lost."""
-    twin = Twin(ArmErrors(0.3))
+    twin = Twin(off())
     outcomes = iter([Lost("a fly")])
 
     def now_and_then(q_command):
@@ -119,7 +128,7 @@ def test_a_wrong_calibration_diverges():
     """C turned by 150 deg against what the robot believes: two steps that make it worse end it, still near."""
     wrong = T_BASE_C.copy()
     wrong[:3, :3] = wrong[:3, :3] @ Rotation.from_euler("z", 150, degrees=True).as_matrix()
-    twin = Twin(ArmErrors(), T_base_c=wrong)
+    twin = Twin(off(link_mm=0.0), T_base_c=wrong)
     target = twin.ball(Q_START) + np.array([1.0, 0.5, 0.0])
     done = servo(task(), Q_START, lambda command: Seen(twin.ball(twin.q), target, np.eye(3)), twin)
     assert done.stop is ServoStop.DIVERGING
@@ -128,21 +137,21 @@ def test_a_wrong_calibration_diverges():
 
 def test_a_hand_that_trembles_does_not_reach_a_fine_tolerance():
     """Repeatability of .05 deg against 0.02 mm: the steps run out, and that is what it says."""
-    twin = Twin(ArmErrors(0.3, repeatability_rad=np.radians(0.05)), seed=3)
+    twin = Twin(off(repeatability_deg=0.05), seed=3)
     done = run(twin, tolerance_mm=0.02, max_steps=6)
     assert (done.stop, done.steps, twin.drives) == (ServoStop.TOLERANCE_NOT_REACHED, 6, 6)
 
 
 def test_a_way_that_touches_something_is_not_driven():
     """The contact is named and the arm stays."""
-    twin = Twin(ArmErrors(0.3))
+    twin = Twin(off())
     done = run(twin, checker=Touches())
     assert (done.stop, twin.drives, done.detail) == (ServoStop.CONTACT, 0, "needle and table")
 
 
 def test_a_singular_start_says_so():
     """With the wrist aligned and a long way to go the needle would turn: singular, and the arm stays."""
-    twin = Twin(ArmErrors())
+    twin = Twin(off(link_mm=0.0))
     q = Q_START.copy()
     q[4] = np.radians(0.3)
     rod = HELD._replace(R_base_flange=HELD.R_base_flange)
@@ -160,7 +169,7 @@ def test_joint_limit_is_a_reason_of_its_own():
     for sign in (1.0, -1.0):
         across = sign * 2.0 * np.array([-np.sin(q[0]), np.cos(q[0]), 0.0])
         goal = (ball_base(rod, q) + across - T_BASE_C[:3, 3]) @ T_BASE_C[:3, :3]
-        twin = Twin(ArmErrors())
+        twin = Twin(off(link_mm=0.0))
 
         def look(q_command, goal=goal):
             return Seen((ball_base(rod, q_command) - T_BASE_C[:3, 3]) @ T_BASE_C[:3, :3], goal, np.eye(3))

@@ -11,11 +11,12 @@ from servo_world import CASE
 
 from benchmarks.servo_rooms import varied
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.twin.jobs.servo.liu2007 import Liu2007Tables, ServoSessions
-from puncture_twin.twin.jobs.servo.report import Pictures, reproduction_facts, servo_facts, servo_text, write_servo_page
-from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome
-from puncture_twin.twin.rehearsal.stereo_trials import (
+from puncture_twin.twin.jobs.papers.liu2007 import paper_sections, reproduction_facts
+from puncture_twin.twin.jobs.servo.job import Sessions
+from puncture_twin.twin.jobs.servo.report import Pictures, servo_facts, servo_text, write_servo_page
+from puncture_twin.twin.rehearsal.stereo_session import (
     DeclarationTest,
+    NeedleOutcome,
     ServoTrial,
     TargetRow,
     needle_statistics,
@@ -25,47 +26,33 @@ from puncture_twin.twin.rehearsal.stereo_trials import (
 
 def needle(predicted, realised, square, hit):
     """A needle's outcome, of which the rest does not matter here."""
-    return NeedleOutcome(predicted, 0.05, (0.5, 0.4, 0.3), 0.2, 0.1, 0.2, 0.9, realised, 0.15, square, 5.0, hit)
+    return NeedleOutcome(
+        predicted, 0.05, (0.5, 0.4, 0.3), 0.2, 0.1, 0.2, 0.9, realised, 0.15, square, 5.0, hit, square < 7
+    )
 
 
 def trials():
     """Two seeds of two targets, one not confirmed; a third seed that could not be held."""
     rows = [
-        TargetRow(
-            1,
-            "T1",
-            0.30,
-            0.25,
-            0.9,
-            0.31,
-            0.05,
-            1,
-            "converged",
-            needle(0.9, 1.2, 9.0, False),
-            needle(0.3, 0.4, 2.0, True),
-        ),
+        TargetRow(1, "T1", 0.30, 0.25, 0.9, 0.31, 0.05, 1, "converged", needle(0.9, 1.2, 9.0, False),
+                  needle(0.3, 0.4, 2.0, True)),
         TargetRow(1, "T2", 0.20, 0.25, 1.1, 0.25, 0.15, 10, "tolerance_not_reached"),
         TargetRow(2, "T1", 0.10, 0.25, 0.7, 0.12, 0.04, 2, "converged"),
         TargetRow(2, "T2", 0.40, 0.25, 0.5, 0.32, 0.08, 1, "converged"),
-    ]
-    rod = [ServoTrial(seed, (0.01, 0.03), (0.02, 0.03), 0.4, 0.2, tuple(r for r in rows if r.seed == seed), "",
+    ]  # fmt: skip
+    rod = [ServoTrial(seed, (0.01, 0.03), (0.02, 0.03), 0.4, 0.2, tuple(r for r in rows if r.seed == seed), None,
                         DeclarationTest(300.0, 200) if seed == 1 else None) for seed in (1, 2)]  # fmt: skip
-    return [*rod, ServoTrial(3, (), (), float("nan"), float("nan"), (), "calibration, point 4: camera 1: few_inliers")]
+    return [*rod, ServoTrial(3, refused="calibration, point 4: camera 1: few_inliers")]
 
 
 def test_statistics_are_those_of_the_rows():
     """Means, maxima, medians, shares, against the numbers by hand."""
     ours = statistics(trials())
-    assert (ours.seeds, ours.targets, ours.refused) == (3, 4, 1)
-    assert ours.mapping_mean == pytest.approx(0.25)
-    assert ours.before_mean == pytest.approx(0.8)
-    assert ours.after_mean == pytest.approx(0.25)
-    assert ours.after_over_mapping == pytest.approx(1.0)
-    assert ours.servo_only_max == pytest.approx(0.15)
-    assert ours.mapping_rms == pytest.approx(np.sqrt((0.09 + 0.04 + 0.01 + 0.16) / 4))
-    assert ours.median_steps == 1.5
-    assert ours.not_confirmed == 0.25
-    assert (ours.stereo_mean, ours.stereo_max) == pytest.approx((0.02, 0.03))
+    by_hand = {"seeds": 3, "targets": 4, "refused": 1, "mapping_mean": 0.25, "before_mean": 0.8, "after_mean": 0.25,
+               "after_over_mapping": 1.0, "servo_only_max": 0.15, "median_steps": 1.5, "not_confirmed": 0.25,
+               "mapping_rms": np.sqrt((0.09 + 0.04 + 0.01 + 0.16) / 4), "stereo_mean": 0.02,
+               "stereo_max": 0.03}  # fmt: skip
+    assert {key: ours[key] for key in by_hand} == pytest.approx(by_hand)
     with refused("no_session", "few_inliers", by=NoAnswerError):
         statistics(trials()[2:])
 
@@ -83,10 +70,10 @@ def test_the_words_say_what_was_not_reached():
 
 def test_needles_are_told_beside_what_was_predicted():
     """Rms, share in the ellipsoid, hits and the declaration's test, against the rows; a wrong belief is said first."""
-    rows = [row for one in trials() for row in one.rows]
+    rows = [row for one in trials() for row in one.targets]
     ours = needle_statistics([row.needle_servoed for row in rows])
-    assert (ours.needles, ours.realised_rms_mm, ours.coverage_95, ours.hit_share) == (1, 0.4, 1.0, 1.0)
-    assert needle_statistics([row.needle_open_loop for row in rows]).coverage_95 == 0.0
+    assert [ours[key] for key in ("needles", "realised_rms_mm", "coverage_95", "hit_share")] == [1, 0.4, 1.0, 1.0]
+    assert needle_statistics([row.needle_open_loop for row in rows])["coverage_95"] == 0.0
     assert needle_statistics([None]) is None
     facts = servo_facts(CASE, trials(), statistics(trials()))
     text = servo_text({**facts, "files": []})
@@ -105,15 +92,16 @@ def test_the_page_needs_no_network_and_shows_every_number(tmp_path):
     """Pictures are embedded, nothing is loaded, and what the terminal shows is there too, with the paper's columns."""
     picture, page = tmp_path / "one.png", tmp_path / "servo.html"
     Image.new("RGB", (4, 4)).save(picture)
-    sessions = ServoSessions(CASE, None, tuple(trials()), statistics(trials()))
-    facts = reproduction_facts(Liu2007Tables(sessions, sessions))
-    write_servo_page(CASE, facts, Pictures(picture, [picture, picture]), page)
+    sessions = Sessions(CASE, None, tuple(trials()), statistics(trials()))
+    facts = reproduction_facts(sessions, sessions)
+    paper = paper_sections(facts)
+    write_servo_page(CASE, facts, Pictures(picture, [picture, picture]), page, paper)
     text = page.read_text(encoding="utf-8")
     assert "http" not in re.sub(r"http-equiv", "", text)
     assert text.count("data:image/png;base64,") == 3
     assert "{{" not in text
     for words in ("25.0 %", "Chance to touch: not computed: the case has no structures.", "tolerance not reached",
                   "1.47 / 2.41 (differs from the rows)", "1.479 / 2.41", "1.200 / 0.900"):  # fmt: skip
-        assert words in text and words in servo_text({**facts, "files": []})
+        assert words in text and words in servo_text({**facts, "files": []}, paper)
     without = servo_facts(CASE, trials(), statistics(trials()))
     assert "Liu et al." not in write_servo_page(CASE, without, Pictures(picture, [picture]), page).read_text()

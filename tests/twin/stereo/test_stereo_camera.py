@@ -129,7 +129,6 @@ def test_triangulation_returns_the_points(pair, rng):
     points = rng.uniform(-200, 200, (100, 3))
     found = triangulate(pair, np.stack([camera.project(points) for camera in pair]))
     np.testing.assert_allclose(found.points_c, points, atol=1e-7)
-    assert found.residual_px.max() < 1e-7
 
 
 def test_triangulations_covariance_is_honest(pair, rng):

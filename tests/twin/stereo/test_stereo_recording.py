@@ -32,12 +32,12 @@ def test_a_recorded_session_is_estimated_as_when_it_ran(recorded):
     assert facts["fre_mm"] == pytest.approx(session.mapping.fre_mm, abs=1e-9)
     (reached,) = session.reached
     np.testing.assert_allclose([one["error_mm"] for one in facts["looks"]], reached.servoed.errors_mm, atol=1e-9)
-    assert facts["looks"][-1]["needle_rms_mm"] == pytest.approx(reached.seen.predicted_rms_mm, abs=1e-9)
+    assert facts["looks"][-1]["needle_rms_mm"] == pytest.approx(reached.row.needle_servoed.predicted_rms_mm, abs=1e-9)
     commands = [visit.q_command for visit in reached.servoed.visits]
     np.testing.assert_allclose(np.radians([one["joints_deg"] for one in facts["looks"]]), commands, atol=1e-12)
     sent = [np.radians(one["next_joints_deg"]) for one in facts["looks"][:-1]]
     np.testing.assert_allclose(sent, commands[1:], atol=1e-9)
-    assert facts["converged"] == reached.confirmed
+    assert facts["converged"] == (reached.row.stop == "converged")
 
 
 def edited(table, old, new):

@@ -8,13 +8,12 @@ import pytest
 
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
+from puncture_twin.twin.jobs.papers import axp_ybq
 from puncture_twin.twin.jobs.papers.axp_ybq import (
     COMPARED_WITH,
-    AxpYbqRow,
-    AxpYbqTables,
     reproduce,
-    reproduction_summary,
     reproduction_text,
+    summary,
     truth_estimate,
     widened,
 )
@@ -25,23 +24,24 @@ from puncture_twin.twin.plant.simulated_recording import simulate_recording
 @pytest.fixture(scope="module")
 def result():
     """Few runs: enough to see every row, not to judge the last percent."""
-    return reproduce(None, 4)
+    return reproduce(4)
 
 
 def test_every_row_is_there(result):
     """Four methods at four counts, steps, direction, outliers, pixel sizes, and the exact case."""
-    assert len(result.rows) == 1 + 16 + 3 + 1 + 3 + 4
-    assert result.rows[0].ours < 1e-6
-    assert all(np.isfinite(row.ours) for row in result.rows)
-    steps = [row.ours for row in result.rows if row.unit == "steps"]
+    rows = result.summary["rows"]
+    assert len(rows) == 1 + 16 + 3 + 1 + 3 + 4
+    assert rows[0]["ours"] < 1e-6
+    assert all(np.isfinite(row["ours"]) for row in rows)
+    steps = [row["ours"] for row in rows if row["unit"] == "steps"]
     assert max(steps) <= 10
 
 
 def test_few_runs_already_are_near_the_known_numbers(result):
     """From 20 poses on every error is within half and double the known one, which is what four runs can tell."""
-    for row in result.rows:
-        if row.known is not None and not row.what.startswith("16"):
-            assert row.known / 2 < row.ours < row.known * 2, row.what
+    for row in result.summary["rows"]:
+        if row["known"] is not None and not row["what"].startswith("16"):
+            assert row["known"] / 2 < row["ours"] < row["known"] * 2, row["what"]
 
 
 def test_the_bound_is_the_known_one():
@@ -56,23 +56,24 @@ def test_the_bound_is_the_known_one():
         assert np.sqrt(np.mean(bounds)) == pytest.approx(known, rel=0.05)
 
 
-def test_a_number_beyond_its_limit_does_not_hold():
+def test_a_number_beyond_its_limit_does_not_hold(monkeypatch):
     """A row, the whole and the text all say so."""
-    bad = AxpYbqTables((AxpYbqRow("a", 0.1, 0.2, None, "mm"), AxpYbqRow("b", None, 0.31, 0.3, "mm")), 3, 1)
-    assert not bad.passed
-    assert [row.passed for row in bad.rows] == [True, False]
-    text = reproduction_text(reproduction_summary(bad))
+    monkeypatch.setattr(axp_ybq, "SCALE_LIMIT_MM", 0.01)
+    bad = summary(axp_ybq._scales(2)[:2], 2)
+    assert not bad["holds"]
+    assert [row["holds"] for row in bad["rows"]] == [True, False]
+    text = reproduction_text(bad)
     assert text.count("DOES NOT HOLD") == 1
     assert "NOT all within their limits" in text
 
 
 def test_it_says_with_what_it_is_compared(result):
     """The patent prints no figure: text and summary name the specification, and say that few runs widen the limits."""
-    text = reproduction_text(reproduction_summary(result))
+    text = result.text
     assert text.startswith("compared with this project's specification")
     assert "the patent application states no figure" in text
     assert "widened for the chance" in text
-    assert reproduction_summary(result)["compared_with"] == COMPARED_WITH
+    assert result.summary["compared_with"] == COMPARED_WITH
 
 
 def test_limits_widen_with_few_runs_alone():
@@ -84,8 +85,7 @@ def test_limits_widen_with_few_runs_alone():
 
 def test_the_summary_is_plain(result):
     """It survives JSON unchanged."""
-    summary = reproduction_summary(result)
-    assert json.loads(json.dumps(summary)) == summary
+    assert json.loads(json.dumps(result.summary)) == result.summary
 
 
 def test_it_has_a_name_on_the_command_line():

@@ -10,7 +10,6 @@ from scipy.ndimage import map_coordinates
 from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
 from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
     Detection,
-    DetectorSettings,
     Missed,
     brightest_segment,
     detect,
@@ -57,8 +56,7 @@ def test_every_needle_in_the_plane_is_found(in_plane):
 def test_the_correction_takes_the_bias_off(in_plane):
     """Without it the tip lies too far along the shaft in almost every picture."""
     needles, pictures, _ = in_plane
-    settings = DetectorSettings(tip_bias=0.0)
-    raw = [detect(picture, IMAGER, settings) for picture in pictures[:12]]
+    raw = [detect(picture, IMAGER, tip_bias=0.0) for picture in pictures[:12]]
     along = np.array([errors_of(*pair)[0] for pair in zip(raw, needles[:12], strict=True)])
     assert 0.1 < along.mean() < 0.3
     assert (along > 0).mean() > 0.8

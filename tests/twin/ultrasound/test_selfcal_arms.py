@@ -80,8 +80,9 @@ def test_the_declared_errors_move_the_true_arms_flanges(room):
     case, _, truth, recording = room
     errors = arm_errors(case.declared_arms, recording)
     arm, sigma = truth.probe_arm, case.declared_arms.probe.deviations()
-    offsets = (arm.a - arm.nominal.a, (arm.d - arm.nominal.d)[[0, 2, 3, 4, 5]], arm.alpha - arm.nominal.alpha)
-    eta = np.concatenate([*offsets, arm.joint_offsets]) / sigma
+    true = arm.true
+    offsets = (true.a - arm.nominal.a, (true.d - arm.nominal.d)[[0, 2, 3, 4, 5]], true.alpha - arm.nominal.alpha)
+    eta = np.concatenate([*offsets, true.zeros]) / sigma
     moved, true = corrected(recording.A, errors.probe.slopes @ eta), arm.flange_pose(recording.q_probe)
     np.testing.assert_allclose(moved[:, :3, 3], true[:, :3, 3], atol=2e-3)
     turned = log_rotation(moved[:, :3, :3].transpose(0, 2, 1) @ true[:, :3, :3])
@@ -94,8 +95,9 @@ def test_the_declared_play_is_where_the_true_arm_stops(room):
     case, _, truth, recording = room
     rng, half = np.random.default_rng(3), 1e-4
     turn = rng.choice([-1.0, 1.0], recording.q_probe.shape)
-    declared = case.declared_arms._replace(probe=case.declared_arms.probe._replace(play_rad=half))
-    arm = truth.probe_arm._replace(backlash_rad=2 * half, repeatability_rad=0.0)
+    errors = case.content.probe_arm.errors.model_copy(update={"backlash_deg": np.degrees(2 * half)})
+    declared = case.declared_arms._replace(probe=case.declared_arms.probe._replace(errors=errors))
+    arm = truth.probe_arm._replace(backlash=2 * half, repeatability=0.0)
     told = replace(recording, turn_probe=turn, turn_needle=np.zeros(turn.shape))
     moved = without_play(told, arm_errors(declared, told))
     for q, way, nominal, with_play in zip(recording.q_probe, turn, recording.A, moved.A, strict=True):
@@ -110,8 +112,8 @@ def test_play_of_unknown_sign_is_noise(room):
     case, _, _, recording = room
     arms = case.declared_arms
     play, noise = (
-        arms._replace(probe=arms.probe._replace(**{"arrival_rad": 0.0, key: 2e-4}))
-        for key in ("play_rad", "arrival_rad")
+        arms._replace(probe=arms.probe._replace(errors=arms.probe.errors.model_copy(update=stated)))
+        for stated in ({"repeatability_deg": 0.0, "backlash_deg": 0.02}, {"repeatability_deg": 0.01})
     )
     for one in (recording, replace(recording, **{key: np.zeros((30, 6)) for key in ("turn_probe", "turn_needle")})):
         found = arm_errors(play, one)

@@ -10,6 +10,7 @@ from selfcal_world import as_estimate
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.case.errors import ArmErrors
 from puncture_twin.run_twin import main
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArm, DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
@@ -157,7 +158,7 @@ def with_arms():
     A, B = (flange_pose(arm, part[fine]) for part in q)
     noisy = with_noise(rng, exact, SPEC_NOISE._replace(image_mm=0.1)).subset(fine)
     recording = Recording(A, B, noisy.P, noisy.v, q_probe=q[0][fine], q_needle=q[1][fine])
-    declared = DeclaredArms(*[DeclaredArm(arm, 0.05, 1e-4, 1e-4, 5e-5)] * 2)
+    declared = DeclaredArms(*[DeclaredArm(arm, ArmErrors())] * 2)
     return recording, declared
 
 

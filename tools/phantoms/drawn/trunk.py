@@ -13,7 +13,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.twin.plant.outside_objects import loft, tube
+from tools.phantoms.outside_objects import loft, tube
 
 HALF_LENGTH_MM = 190.0
 """Of the trunk; its ends are flat, as an image's are."""

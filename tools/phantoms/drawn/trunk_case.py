@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from puncture_twin.planning.formats.meshes.ply import ply_bytes
 from tools.phantoms.drawn.trunk import Trunk
+from tools.phantoms.manifest import ply_bytes
 
 HU = {"spine": 350.0, "rib": 500.0}
 """Of what is not made of what its name says: half of a drawn bone is denser than any organ."""

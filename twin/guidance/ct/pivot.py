@@ -19,7 +19,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import PARAMETERS
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.registration.fit_uncertainty import reading_noise
@@ -95,7 +95,7 @@ class Pivot:
     @property
     def residual_mm(self) -> float:
         """Root mean square distance of the n tips from their place."""
-        return float(np.sqrt(np.mean(self.misses_mm**2)))
+        return rms(self.misses_mm)
 
     @property
     def large(self) -> bool:

@@ -1,4 +1,4 @@
-"""Declared errors of a servo case, in the estimator's units: what may be off, and by how much.
+"""Declared errors of a servo case: what may be off, and by how much.
 
 The belief computes with them, the twin's truth is drawn from them. Defaults and reasons: docs/reference/servo-case.md.
 What is not here (a rod that bends, cameras that move after the calibration, tissue) is not modelled, which is something
@@ -7,15 +7,13 @@ else than 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.errors import ARM_KINDS
+from puncture_twin.planning.case.errors import ARM_KINDS, ArmErrors
 from puncture_twin.planning.case.toml_types import Number, Section
 
 Millimetres = Annotated[Number, Field(ge=0, le=50)]
@@ -25,12 +23,6 @@ DetectionPixels = Annotated[Number, Field(ge=1e-4, le=50)]
 Part = Annotated[Number, Field(ge=0, le=0.2)]
 """A fraction, 0 to 1."""
 
-DEFAULT_REPEATABILITY_DEG = 0.003
-"""As in the CT case: .1 mm and less at the reach of a UR3, its data sheet's pose repeatability."""
-
-DEFAULT_BACKLASH_DEG = 0.0
-"""The gears of these arms have no play worth naming."""
-
 DEFAULT_MEASURING_MM = 0.01
 """Deviation of a coordinate measuring arm."""
 
@@ -38,19 +30,24 @@ DEFAULT_MARKER_MM = 0.3
 """Deviation of a marker's centre in an image with voxels of a millimetre: 1 / sqrt(12)."""
 
 
-ANGLES = ("twist", "joint", "backlash", "repeatability", "needle_direction", "head_turn")
-"""Attributes of `ServoErrors` in rad, whose keys are in degrees."""
+class ServoErrors(ArmErrors):
+    """Standard deviations per axis.
 
-
-class ServoErrorsSection(Section):
-    """The declared errors; what is left out takes its default (`declared_errors`)."""
+    Attributes:
+        arm: Whose numbers link, twist and joint take where none are stated.
+        ball_offset_mm: Of the ball's centre against where the controller has it on the flange; the cameras see it.
+        tip_offset_mm: Of the needle's tip against the ball's centre, flange axes; no camera sees it.
+        needle_direction_deg: Of the needle, about each of the flange's x and y axes.
+        camera_axis_px: Of the principal point.
+        camera_focal: Of the focal length, as a part of it.
+        lens: Of k1, k2, p1, p2.
+        ball_px: Of the centre of a ball or marker in one look; None takes what the tracker states of each image.
+        target_mm: Of the target in the image; as a marker where it is not stated.
+        head_shift_mm: By which the head moves after its markers were seen.
+        head_turn_deg: By which it turns, about the markers' middle.
+    """
 
     arm: Literal["calibrated", "nominal"] = "calibrated"
-    link_mm: Millimetres | None = None
-    twist_deg: Degrees | None = None
-    joint_deg: Degrees | None = None
-    backlash_deg: Degrees | None = None
-    repeatability_deg: Degrees | None = None
     ball_offset_mm: Millimetres = 0.3
     tip_offset_mm: Millimetres = 0.3
     needle_direction_deg: Degrees = 0.2
@@ -60,75 +57,34 @@ class ServoErrorsSection(Section):
     camera_focal: Part = 0.01
     lens: tuple[Part, Part, Part, Part] = (0.02, 0.02, 0.0005, 0.0005)
     ball_px: DetectionPixels | None = None
-    measuring_arm_mm: Millimetres | None = None
-    marker_mm: Millimetres | None = None
-    target_mm: Millimetres | None = None
+    measuring_arm_mm: Millimetres = DEFAULT_MEASURING_MM
+    marker_mm: Millimetres = DEFAULT_MARKER_MM
+    target_mm: Millimetres = DEFAULT_MARKER_MM
     head_shift_mm: Millimetres = 0.0
     head_turn_deg: Degrees = 0.0
 
+    @model_validator(mode="before")
+    @classmethod
+    def _as_kind_and_marker(cls, stated: Any) -> Any:
+        if not isinstance(stated, dict):
+            return stated
+        kind = ARM_KINDS["nominal" if stated.get("arm") == "nominal" else "calibrated"]
+        return {**kind._asdict(), "target_mm": stated.get("marker_mm", DEFAULT_MARKER_MM), **stated}
 
-class ServoRehearsalSection(Section):
-    """Errors from which a workcell's truth is drawn, where they are not those that the belief declares."""
+    @property
+    def needle_direction(self) -> float:
+        """Of the needle, rad."""
+        return float(np.radians(self.needle_direction_deg))
 
-    errors: ServoErrorsSection | None = None
+    @property
+    def camera_turn(self) -> float:
+        """Of each camera about each axis, rad."""
+        return float(np.radians(self.camera_turn_deg))
 
-
-@dataclass(frozen=True)
-class CameraErrors:
-    """Standard deviations of a camera about its plan, before it is calibrated.
-
-    Attributes:
-        turn: About each axis, rad.
-        shift_mm: Along each axis.
-        axis_px: Of the principal point, per axis.
-        focal: Of the focal length, as a part of it.
-        lens: Of k1, k2, p1, p2.
-    """
-
-    turn: float
-    shift_mm: float
-    axis_px: float
-    focal: float
-    lens: tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class ServoErrors:
-    """Standard deviations per axis; mm, rad and px.
-
-    Attributes:
-        link_mm: Of every Denavit-Hartenberg length a_i and d_i.
-        twist: Of every twist alpha_i.
-        joint: Of every joint's zero.
-        backlash: Full width of every joint's play.
-        repeatability: Of every joint, anew at each arrival.
-        ball_offset_mm: Of the ball's centre against where the controller has it on the flange; the cameras see it.
-        tip_offset_mm: Of the needle's tip against the ball's centre, flange axes; no camera sees it.
-        needle_direction: Of the needle, about each of the flange's x and y axes.
-        camera: Of each camera.
-        ball_px: Of the centre of a ball or marker in one look; None takes what the tracker states of each image.
-        measuring_mm: Of the measuring arm.
-        marker_mm: Of a marker in the image.
-        target_mm: Of the target in the image.
-        head_shift_mm: By which the head moves after its markers were seen.
-        head_turn: By which it turns, about the markers' middle.
-    """
-
-    link_mm: float
-    twist: float
-    joint: float
-    backlash: float
-    repeatability: float
-    ball_offset_mm: float
-    tip_offset_mm: float
-    needle_direction: float
-    camera: CameraErrors
-    ball_px: float | None
-    measuring_mm: float
-    marker_mm: float
-    target_mm: float
-    head_shift_mm: float
-    head_turn: float
+    @property
+    def head_turn(self) -> float:
+        """Of the head after its markers were seen, rad."""
+        return float(np.radians(self.head_turn_deg))
 
     @property
     def arrival(self) -> float:
@@ -137,77 +93,19 @@ class ServoErrors:
 
     def arm_deviations(self) -> Floats:
         """Deviations of the 26 parameters that move the ball, shape (26,), ordered as `error_jacobian`; mm, rad."""
-        kinds = ((self.link_mm, 11), (self.twist, 6), (self.joint, 6), (self.ball_offset_mm, 3))
-        return np.repeat([value for value, _ in kinds], [count for _, count in kinds])
+        return np.repeat([self.link_mm, self.twist, self.joint, self.ball_offset_mm], [11, 6, 6, 3])
 
     def camera_deviations(self) -> Floats:
         """Deviations of a camera's 13 parameters: focal length (part), axis (px), lens, rotation (rad), shift (mm)."""
-        one = self.camera
-        return np.array([one.focal, *[one.axis_px] * 2, *one.lens, *[one.turn] * 3, *[one.shift_mm] * 3])
+        lens, axes = (self.camera_focal, *[self.camera_axis_px] * 2, *self.lens), [self.camera_turn] * 3
+        return np.array([*lens, *axes, *[self.camera_shift_mm] * 3])
 
-    def stated(self) -> dict[str, float | tuple[float, ...] | None]:
+    def stated(self) -> dict[str, Any]:
         """The deviations by the keys of ``[errors]``, mm, degrees and px."""
-        one, degrees = self.camera, {name: float(np.degrees(getattr(self, name))) for name in ANGLES}
-        return {
-            "link_mm": self.link_mm,
-            **{f"{name}_deg": value for name, value in degrees.items()},
-            "ball_offset_mm": self.ball_offset_mm,
-            "tip_offset_mm": self.tip_offset_mm,
-            "camera_turn_deg": float(np.degrees(one.turn)),
-            "camera_shift_mm": one.shift_mm,
-            "camera_axis_px": one.axis_px,
-            "camera_focal": one.focal,
-            "lens": one.lens,
-            "ball_px": self.ball_px,
-            "measuring_arm_mm": self.measuring_mm,
-            "marker_mm": self.marker_mm,
-            "target_mm": self.target_mm,
-            "head_shift_mm": self.head_shift_mm,
-        }
-
-    def scaled(self, factor: float) -> ServoErrors:
-        """Each deviation times a factor; of the pixels only where one is declared."""
-        numbers = {name: factor * value for name, value in vars(self).items() if isinstance(value, float)}
-        camera = {name: factor * value for name, value in vars(self.camera).items() if name != "lens"}
-        one, two, three, four = (factor * value for value in self.camera.lens)
-        return replace(self, **numbers, camera=CameraErrors(**camera, lens=(one, two, three, four)))
+        return self.model_dump(exclude={"arm"})
 
 
-def declared_errors(section: ServoErrorsSection, older: Mapping[str, float | None]) -> ServoErrors:
-    """The declaration in mm, rad and px, with the defaults filled in.
+class ServoRehearsalSection(Section):
+    """Errors from which a workcell's truth is drawn, where they are not those that the belief declares."""
 
-    Args:
-        section: As the case states it.
-        older: Values of keys of the same names that other tables of the case state.
-    """
-    kind = ARM_KINDS[section.arm]
-
-    def value(key: str, default: float) -> float:
-        stated = getattr(section, key)
-        stated = older.get(key) if stated is None else stated
-        return default if stated is None else float(stated)
-
-    marker = value("marker_mm", DEFAULT_MARKER_MM)
-    return ServoErrors(
-        link_mm=value("link_mm", kind.link_mm),
-        twist=np.radians(value("twist_deg", kind.twist_deg)),
-        joint=np.radians(value("joint_deg", kind.joint_deg)),
-        backlash=np.radians(value("backlash_deg", DEFAULT_BACKLASH_DEG)),
-        repeatability=np.radians(value("repeatability_deg", DEFAULT_REPEATABILITY_DEG)),
-        ball_offset_mm=section.ball_offset_mm,
-        tip_offset_mm=section.tip_offset_mm,
-        needle_direction=np.radians(section.needle_direction_deg),
-        camera=CameraErrors(
-            np.radians(section.camera_turn_deg),
-            section.camera_shift_mm,
-            section.camera_axis_px,
-            section.camera_focal,
-            section.lens,
-        ),
-        ball_px=section.ball_px,
-        measuring_mm=value("measuring_arm_mm", DEFAULT_MEASURING_MM),
-        marker_mm=marker,
-        target_mm=value("target_mm", marker),
-        head_shift_mm=section.head_shift_mm,
-        head_turn=np.radians(section.head_turn_deg),
-    )
+    errors: ServoErrors | None = None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,24 +19,27 @@ from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ball_base
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
 
 
-class Known(NamedTuple):
-    """Knowledge of a session when the servo begins."""
-
-    case: ServoCase
-    calibration: RobotCalibration
-    mapping: Mapping
-    markers: list[Detections]
-    """The markers' pixels."""
-    markers_m: Floats
-    """Shape (n, 3), mm: the markers as the image has them."""
-    detector: Detector
-
-
 class Guide:
-    """The paper's chain: calibrated cameras triangulate the ball; the mapping gives the target."""
+    """The paper's chain: calibrated cameras triangulate the ball; the mapping gives the target.
 
-    def __init__(self, known: Known) -> None:
-        case, calibration, mapping, markers, markers_m, detector = known
+    Args:
+        case: The case.
+        calibration: Of cameras and robot.
+        mapping: Of the head.
+        markers: Their pixels.
+        markers_m: Shape (n, 3), mm: the markers as the image has them.
+        detector: Finds the ball in new images.
+    """
+
+    def __init__(
+        self,
+        case: ServoCase,
+        calibration: RobotCalibration,
+        mapping: Mapping,
+        markers: list[Detections],
+        markers_m: Floats,
+        detector: Detector,
+    ) -> None:
         self._case, self._detector = case, detector
         self._calibration, self._mapping = calibration, mapping
         self._markers, self._markers_m = markers, markers_m
@@ -142,8 +144,3 @@ class JointGuide(Guide):
         found = self.adjusted().offset(-1, self.target_m)
         self.target_c = found.target_c
         return Seen(found.ball_c, found.target_c, found.ball_covariance)
-
-
-def guide_of(known: Known) -> Guide:
-    """The estimates that the case asks for."""
-    return (JointGuide if known.case.file.servo.estimate == "joint" else Guide)(known)

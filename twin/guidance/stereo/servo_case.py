@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -22,12 +21,7 @@ from puncture_twin.planning.formats.points import NamedPoints, parse_points
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
-from puncture_twin.twin.guidance.stereo.declared_errors import (
-    ServoErrors,
-    ServoErrorsSection,
-    ServoRehearsalSection,
-    declared_errors,
-)
+from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors, ServoRehearsalSection
 
 CASE_NAME = "servo.toml"
 ALLOWED_CASE = "a TOML servo case with schema = 1, or a folder with servo.toml"
@@ -35,10 +29,7 @@ ALLOWED_CASE = "a TOML servo case with schema = 1, or a folder with servo.toml"
 Pixels = Annotated[int, Strict(), Field(ge=64, le=8192)]
 Count = Annotated[int, Strict(), Field(ge=1, le=1000)]
 Degrees = Annotated[Number, Field(ge=-90, le=90)]
-SmallDegrees = Annotated[Number, Field(ge=0, le=10)]
 Coefficient = Annotated[Number, Field(ge=-2, le=2)]
-Millimetres = Annotated[Number, Field(ge=0, le=50)]
-"""A standard deviation or a tolerance."""
 
 
 class CamerasSection(Section):
@@ -59,14 +50,9 @@ class CamerasSection(Section):
 
 
 class ServoRobotSection(Section):
-    """The arm; its deviations from the nominal model are here under older names of ``[errors]``."""
+    """The arm."""
 
     model: Name = "ur3"
-    link_mm: Millimetres | None = None
-    twist_deg: SmallDegrees | None = None
-    joint_deg: SmallDegrees | None = None
-    backlash_deg: SmallDegrees | None = None
-    repeatability_deg: SmallDegrees | None = None
 
 
 class ToolSection(Section):
@@ -98,7 +84,6 @@ class CalibrationSection(Section):
 
     center_mm: Vector
     size_mm: tuple[Length, Length, Length] = (160.0, 120.0, 120.0)
-    measuring_arm_mm: Annotated[Number, Field(ge=0, le=1)] | None = None
     tilt_deg: Annotated[Number, Field(ge=-60, le=60)] | None = None
 
 
@@ -112,8 +97,6 @@ class HeadSection(Section):
     position_mm: Vector
     yaw_deg: Annotated[Number, Field(ge=-360, le=360)] = 0.0
     marker_diameter_mm: Annotated[Number, Field(ge=1, le=100)] = 8.0
-    marker_mm: Millimetres | None = None
-    target_mm: Millimetres | None = None
 
 
 class ServoTargetSection(Section):
@@ -146,15 +129,6 @@ class BoxSection(Section):
     size_mm: tuple[Length, Length, Length]
 
 
-OLDER_NAMES = (
-    *(("robot", key) for key in ("link_mm", "twist_deg", "joint_deg", "backlash_deg", "repeatability_deg")),
-    ("calibration", "measuring_arm_mm"),
-    ("head", "marker_mm"),
-    ("head", "target_mm"),
-)
-"""Sections and keys that are called alike in ``[errors]``."""
-
-
 class ServoFile(Section):
     """The whole file."""
 
@@ -168,25 +142,16 @@ class ServoFile(Section):
     head: HeadSection
     target: ServoTargetSection = ServoTargetSection()
     servo: ServoSection = ServoSection()
-    errors: ServoErrorsSection | None = None
+    errors: ServoErrors = ServoErrors()
     rehearsal: ServoRehearsalSection = ServoRehearsalSection()
     box: tuple[BoxSection, ...] = ()
 
     @model_validator(mode="after")
-    def _errors_are_declared_once(self) -> Self:
-        if self.errors is None and self.rehearsal.errors is not None:
+    def _belief_is_declared(self) -> Self:
+        if "errors" not in self.model_fields_set and self.rehearsal.errors is not None:
             what = "[rehearsal.errors] is a ground truth that differs from [errors], and [errors] is missing"
             raise SchemaError(what, "missing_errors")
-        for section, key in OLDER_NAMES:
-            if getattr(getattr(self, section), key) is not None and getattr(self.errors, key, None) is not None:
-                what = f"{section}.{key} and errors.{key} state the same error; keep errors.{key}"
-                raise SchemaError(what, "stated_twice")
         return self
-
-    @property
-    def stated_elsewhere(self) -> dict[str, float | None]:
-        """Declared errors that other tables state under the same names."""
-        return {key: getattr(getattr(self, section), key) for section, key in OLDER_NAMES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,16 +186,15 @@ class ServoCase:
         """Whether a ball's centre is that of the paper's method."""
         return self.file.cameras.centre == "hough"
 
-    @cached_property
+    @property
     def errors(self) -> ServoErrors:
         """The declared errors: all that guidance believes of errors."""
-        return declared_errors(self.file.errors or ServoErrorsSection(), self.file.stated_elsewhere)
+        return self.file.errors
 
-    @cached_property
+    @property
     def truth_errors(self) -> ServoErrors:
         """Errors from which the truth is drawn: the declared ones, unless ``[rehearsal.errors]`` states others."""
-        other = self.file.rehearsal.errors
-        return self.errors if other is None else declared_errors(other, {})
+        return self.file.rehearsal.errors or self.errors
 
     @property
     def wrong_belief(self) -> bool:

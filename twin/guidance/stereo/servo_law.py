@@ -36,7 +36,7 @@ from puncture_twin.planning.arm.kinematics import (
     singularity,
 )
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
@@ -223,7 +223,7 @@ class Mapping:
     @property
     def fre_mm(self) -> float:
         """Root mean square residual. It is not the accuracy at the target."""
-        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
+        return rms(self.residuals)
 
     def to_c(self, points_m: Floats) -> Floats:
         """Points (..., 3) of the image frame, in C, mm."""

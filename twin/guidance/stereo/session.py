@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.devices import Arm, Operator
 from puncture_twin.twin.guidance.stereo.detection import Detections, Detector, Search, in_space, look_at
-from puncture_twin.twin.guidance.stereo.guide import Guide
-from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError
+from puncture_twin.twin.guidance.stereo.guide import Guide, JointGuide
 from puncture_twin.twin.guidance.stereo.planned import carried_rod, workcell_checker
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
@@ -28,7 +27,7 @@ from puncture_twin.twin.guidance.stereo.servo_law import (
     path_upward,
     servo_step,
 )
-from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen, Servoed, Task, look_again, path_contact, servo
+from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed, Task, look_again, path_contact, servo
 
 
 class ImageReading(NamedTuple):
@@ -59,14 +58,28 @@ def see_markers(
     return found
 
 
+class Mapped(NamedTuple):
+    """The head in C, and the estimates of ball and target that the case asks for."""
+
+    mapping: Mapping
+    guide: Guide
+
+
 def map_markers(
-    case: ServoCase, calibration: RobotCalibration, seen: list[Detections], reading: ImageReading
-) -> Mapping:
-    """The head in C, from its markers' pixels and their readings."""
+    case: ServoCase, calibration: RobotCalibration, detector: Detector, operator: Operator, reading: ImageReading
+) -> Mapped:
+    """The head in C, from its markers' pixels and their readings.
+
+    Raises:
+        NoAnswerError: A marker is not found.
+    """
+    seen = see_markers(case, calibration, detector, operator)
     points = [in_space(calibration.cameras, detections) for detections in seen]
     markers = SeenMarkers(np.concatenate([p.points_c for p in points]), np.concatenate([p.covariance for p in points]))
     names, where = case.markers.names, f"{case.path}: mapping"
-    return map_head(names, markers, reading.markers_m, case.errors.marker_mm, reading.targets_m, where=where)
+    mapping = map_head(names, markers, reading.markers_m, case.errors.marker_mm, reading.targets_m, where=where)
+    kind = JointGuide if case.file.servo.estimate == "joint" else Guide
+    return Mapped(mapping, kind(case, calibration, mapping, seen, reading.markers_m, detector))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,25 +156,10 @@ def aims_of(
     return Aims(tuple(chosen), q[len(chosen) :], q[: len(chosen)], task, expected)
 
 
-class Looked(NamedTuple):
-    """One look of a recorded session at the ball."""
-
-    target: str
-    q_command: Floats
-    """Shape (6,), rad."""
-    seen: Seen | Lost
-    error_c: Floats
-    """Shape (3,), mm, C: from the ball to the target; NaN where the ball was lost."""
-    needle: NeedleError | None
-    """The needle as it is believed there."""
-    q_next: Floats | None
-    """Where the servo would send the arm next, shape (6,), rad; None where it would not."""
-
-
 def follow(
     case: ServoCase, guide: Guide, T_base_c: Floats, targets_m: Floats, stops: Sequence[tuple[str, Floats]], arm: Arm
-) -> Iterator[Looked]:
-    """What a session's looks say, stop by stop.
+) -> Iterator[dict[str, Any]]:
+    """What a session's looks at the ball say, stop by stop, as plain values: mm and degrees; None of a lost ball.
 
     Args:
         case: The case.
@@ -171,16 +169,21 @@ def follow(
         stops: Name of the target, and joints (6,), rad.
         arm: Moves to each.
     """
-    rod, limits, last = carried_rod(case), step_limits(case), ""
+    rod, limits, last, radius = carried_rod(case), step_limits(case), "", case.file.target.hit_radius_mm
     for name, q in stops:
         arm.move_jp(q)
         if name != last:
             guide.aim_at(targets_m[case.targets.names.index(name)])
             last = name
         seen = look_again(guide.look, q, case.file.servo.looks)
+        row: dict[str, Any] = {"target": name, "joints_deg": np.degrees(q).tolist()}
+        row |= dict.fromkeys(("lost", "error_c_mm", "error_mm", "needle_rms_mm", "p_hit", "next_joints_deg"))
         if isinstance(seen, Lost):
-            yield Looked(name, q, seen, np.full(3, np.nan), None, None)
+            yield {**row, "lost": seen.reason}
             continue
-        error_c = seen.target_c - seen.ball_c
-        step = servo_step(rod, q, T_base_c[:3, :3] @ error_c, limits)
-        yield Looked(name, q, seen, error_c, guide.needle_seen(), None if step.stop else step.q_path[-1])
+        error_c, needle = seen.target_c - seen.ball_c, guide.needle_seen()
+        step = servo_step(rod, q, T_base_c[:3, :3] @ error_c, limits)  # where the servo would send the arm next
+        row |= {"error_c_mm": error_c.tolist(), "error_mm": float(np.linalg.norm(error_c))}
+        if needle is not None:
+            row |= {"needle_rms_mm": needle.rms_mm, "p_hit": None if radius is None else needle.p_hit(radius)}
+        yield row if step.stop else {**row, "next_joints_deg": np.degrees(step.q_path[-1]).tolist()}

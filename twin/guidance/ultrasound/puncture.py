@@ -7,7 +7,7 @@ import numpy as np
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, needle_flange
@@ -57,11 +57,6 @@ def predicted_tre(found: Calibration, recording: Recording) -> float:
     known = rms(found.predicted_tre_mm(recording.P, recording.A)) if found.arms is None else None
     image_mm = found.image.rms_mm if found.image is not None and found.image.significant else 0.0
     return float(np.hypot(expected_error_mm(found, recording) if known is None else known, image_mm))
-
-
-def rms(values: Floats) -> float:
-    """Root mean square of any shape; NaN of nothing."""
-    return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 
 def recorded_pose(models: tuple[UrModel, UrModel], q_probe: Floats, q_needle: Floats, tip_mm: Floats) -> Recording:

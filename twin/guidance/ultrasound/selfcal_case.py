@@ -15,6 +15,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import SchemaError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
+from puncture_twin.planning.case.errors import ArmErrors
 from puncture_twin.planning.case.toml_types import Length, Name, Number, Section, Sextuple, Vector
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArm, DeclaredArms
@@ -40,29 +41,12 @@ Tool = Annotated[Number, Field(ge=20, le=1000)]
 Thickness = Annotated[Number, Field(ge=0.1, le=200)]
 
 
-class ErrorsSection(Section):
-    """How far an arm of this kind is from its nominal model: standard deviations, and the play's full width."""
-
-    link_mm: Deviation = 0.05
-    twist_deg: Deviation = 0.005
-    joint_deg: Deviation = 0.005
-    backlash_deg: Deviation = 0.0
-    repeatability_deg: Deviation = 0.003
-
-    def declared(self, model: UrModel) -> DeclaredArm:
-        """The declared arm of a calibration, mm and rad."""
-        twist, joint, play, repeated = np.radians(
-            [self.twist_deg, self.joint_deg, self.backlash_deg, self.repeatability_deg]
-        )
-        return DeclaredArm(model, self.link_mm, twist, joint, repeated, play / 2)
-
-
 class ArmSection(Section):
     """One of the two arms."""
 
     model: str = "ur3"
     home_deg: Sextuple = (0.0, -90.0, 90.0, -90.0, -90.0, 0.0)
-    errors: ErrorsSection = ErrorsSection()
+    errors: ArmErrors = ArmErrors()
 
     @field_validator("model")
     @classmethod
@@ -247,10 +231,9 @@ class SelfcalCase:
 
     @property
     def declared_arms(self) -> DeclaredArms:
-        """Declared errors of both arms; None without."""
+        """Declared errors of both arms."""
         arms = (self.content.probe_arm, self.content.needle_arm)
-        declared = (arm.errors.declared(model) for arm, model in zip(arms, self.models, strict=True))
-        return DeclaredArms(*declared)
+        return DeclaredArms(*(DeclaredArm(model, arm.errors) for arm, model in zip(arms, self.models, strict=True)))
 
     def __post_init__(self) -> None:
         content = self.content

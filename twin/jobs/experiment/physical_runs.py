@@ -2,24 +2,18 @@
 
 A reading of the simulator lies some hundredths of a millimetre from the joints that put the true tip on the true
 marker, so a run and its drawn twin err alike; and drawn ones cost milliseconds.
-
-A physical run is kept once it is done, under the hash of all that decided it: an interrupted command goes on there.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from puncture_twin.planning.base.arrays import rms
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.base.files import atomic
-from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.strict_json import or_null
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.choice import BEST
@@ -35,170 +29,69 @@ from puncture_twin.twin.jobs.experiment.touch_job import (
 )
 from puncture_twin.twin.rehearsal.plan_truth import rehearse_touched
 from puncture_twin.twin.rehearsal.result import Rehearsal
+from puncture_twin.twin.report.present import Section, text
 
 DRAWS = 400
 """Where one axis errs most their rms is known to 3.5 %."""
 
 
-@dataclass(frozen=True)
-class DrawnRuns:
-    """Truths drawn alike.
-
-    Attributes:
-        alike_mm: The tip's rms error in the truths of the physical runs that ended, mm; NaN where none did.
-        realised_mm: The same in all that were drawn.
-    """
-
-    alike_mm: float
-    realised_mm: float
-    draws: int
-
-    def text(self, ended: int) -> str:
-        """Beside so many physical runs."""
-        spread = 100.0 / np.sqrt(2.0 * self.draws)
-        return (
-            f"  without physics, the same {plural(ended, 'trial')} give {self.alike_mm:.2f} mm, all {self.draws} "
-            "trials "
-            f"{self.realised_mm:.2f} (known to {spread:.1f} %)"
-        )
-
-
-def drawn_runs(context: CaseContext, tour: Tour, ended: Iterable[int]) -> DrawnRuns:
-    """Draw the truths of many seeds."""
-    error_mm = {seed: _error_mm(context, tour, seed) for seed in range(DRAWS)}
-    alike = [error_mm[seed] if seed in error_mm else _error_mm(context, tour, seed) for seed in ended]
-    return DrawnRuns(_rms(alike), _rms(error_mm.values()), DRAWS)
-
-
-def _error_mm(context: CaseContext, tour: Tour, seed: int) -> float:
-    use = drawn_once(context, tour, seed)
-    return float("nan") if isinstance(use, str) else use.tip_error_mm
-
-
-def _rms(errors_mm: Iterable[float]) -> float:
-    """Of those that registered; NaN where none did."""
-    found = np.array([one for one in errors_mm if not np.isnan(one)])
-    return float(np.sqrt(np.mean(found**2))) if len(found) else float("nan")
-
-
-FOLDER = "runs"
-
-
-@dataclass(frozen=True)
-class PhysicalRun:
-    """One experiment.
-
-    Attributes:
-        tip_error_mm: The needle's tip from the true target; NaN where a touch or the puncture stopped.
-        seconds_per_touch: Of the tour, home to home; NaN likewise.
-        off_path_mm: Of the tip from its commanded path, at most while it went in; NaN likewise.
-        refused: Why it stopped; empty where it did not.
-    """
-
-    seed: int
-    tip_error_mm: float
-    fre_mm: float
-    seconds_per_touch: float
-    off_path_mm: float
-    refused: str = ""
-
-
-@dataclass(frozen=True)
-class PhysicalRuns:
-    """All of them.
-
-    Attributes:
-        expected_mm: The tip's rms error that the declaration predicts for these touches.
-        kept: So many were there already.
-        drawn: Truths without physics, the same ones and many more.
-    """
-
-    expected_mm: float
-    runs: tuple[PhysicalRun, ...]
-    kept: int
-    drawn: DrawnRuns
-
-    @property
-    def realised_mm(self) -> float:
-        """Rms over the runs that ended."""
-        ended = [run.tip_error_mm for run in self.runs if not run.refused]
-        return float(np.sqrt(np.mean(np.square(ended)))) if ended else float("nan")
-
-    def summary(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        ended = [run for run in self.runs if not run.refused]
-        return {
-            "expected_mm": self.expected_mm,
-            "realised_mm": self.realised_mm if ended else None,
-            "seconds_per_touch": float(np.mean([run.seconds_per_touch for run in ended])) if ended else None,
-            "drawn": {
-                "realised_mm": self.drawn.realised_mm,
-                "draws": self.drawn.draws,
-                "realised_in_the_same_truths_mm": self.drawn.alike_mm if ended else None,
-            },
-            "refused": {run.seed: run.refused for run in self.runs if run.refused},
-            "runs": [asdict(run) for run in ended],
-        }
-
-    def text(self) -> str:
-        """For a person; where one axis errs most, an rms is known to one over the root of twice their number."""
-        ended = [run for run in self.runs if not run.refused]
-        if not ended:
-            return f"none of {plural(len(self.runs), 'physical run')} ended: {self.runs[0].refused}"
-        spread = 1.0 / np.sqrt(2.0 * len(ended))
-        seconds = np.mean([run.seconds_per_touch for run in ended])
-        kept = f", {self.kept} from an earlier run" if self.kept else ""
-        lines = [
-            f"{plural(len(ended), 'physical run')} ({seconds:.1f} s per touch{kept}): the tip misses the target by "
-            f"{self.realised_mm:.2f} mm rms (known to {100 * spread:.0f} %), {self.expected_mm:.2f} predicted",
-            f"  touched and inserted in the simulator, the tip at most {max(run.off_path_mm for run in ended):.3f} mm "
-            "off its commanded path",
-        ]
-        lines.append(self.drawn.text(len(ended)))
-        lines += [f"  seed {run.seed}: {run.refused}" for run in self.runs if run.refused]
-        return "\n".join(lines)
-
-
-def physical_runs(context: CaseContext, out: Path, runs: int) -> PhysicalRuns:
+def physical_runs(context: CaseContext, runs: int) -> dict[str, Any]:
     """Run the experiment of a case's best candidate, each run with a truth of its own.
 
     Args:
         context: Of a case with declared errors, markers and an arm.
-        out: Holds the folder of the runs that are kept.
+
+    Returns:
+        Plain values: the tip's rms error that the declaration predicts for these touches and that of the runs that
+        ended, each of these, why others were refused, and the errors of truths without physics, the same and many.
 
     Raises:
         InputError: The case declares no errors, or has no markers.
         NoAnswerError: Nothing is safe, or too few markers can be touched.
     """
-    tour = plan_tour(context, BEST, seed=0)
-    key = _key(context, tour)
-    found, kept = [], 0
-    for number in range(runs):
-        path = out / FOLDER / f"{number}.json"
-        run = _read(path, key)
-        kept += run is not None
-        found.append(run or _kept(path, key, _run(context, tour, number)))
-        context.watcher.count("runs", number + 1, runs)
-    drawn = drawn_runs(context, tour, [run.seed for run in found if not run.refused])
-    return PhysicalRuns(tour.plan.expected_mm, tuple(found), kept, drawn)
+    tour, ended, refused = plan_tour(context, BEST, seed=0), [], {}
+    for seed in range(runs):
+        try:
+            ended.append(physical_run(context, tour, seed))
+        except NoAnswerError as error:
+            refused[seed] = str(error)
+        context.watcher.count("runs", seed + 1, runs)
+    drawn = {seed: drawn_error_mm(context, tour, seed) for seed in range(max(DRAWS, runs))}
+    alike = [drawn[one["seed"]] for one in ended if np.isfinite(drawn[one["seed"]])]
+    return {
+        "expected_mm": tour.plan.expected_mm,
+        "realised_mm": or_null(rms([one["tip_error_mm"] for one in ended])),
+        "seconds_per_touch": float(np.mean([one["seconds_per_touch"] for one in ended])) if ended else None,
+        "drawn": {
+            "realised_mm": rms([drawn[seed] for seed in range(DRAWS) if np.isfinite(drawn[seed])]),
+            "draws": DRAWS,
+            "realised_in_the_same_truths_mm": or_null(rms(alike)),
+        },
+        "refused": refused,
+        "runs": ended,
+    }
 
 
-def _run(context: CaseContext, tour: Tour, seed: int) -> PhysicalRun:
-    """One run; refused where a marker was not touched, for the prediction is that of all of them."""
+def physical_run(context: CaseContext, tour: Tour, seed: int) -> dict[str, Any]:
+    """One run.
+
+    Raises:
+        NoAnswerError: A marker was not touched (the prediction is of all of them), the puncture has no plan, or the arm
+            touched something.
+    """
     touched, use = touch_once(context, tour, seed)
     if touched.failed or isinstance(use, str):
         why = "; ".join(f"marker {name}: {reason}" for name, reason in touched.failed.items())
-        return _refused(seed, why or str(use))
-    try:
-        inserted = _inserted(context, tour, seed, use.registration)
-    except NoAnswerError as error:
-        return _refused(seed, str(error))
-    per_touch = touched.seconds / len(touched.readings)
-    return PhysicalRun(seed, inserted.tip_error_mm, use.registration.fre_mm, per_touch, inserted.off_path_mm)
-
-
-def _refused(seed: int, why: str) -> PhysicalRun:
-    return PhysicalRun(seed, *4 * (float("nan"),), refused=why)
+        raise NoAnswerError(why or str(use), code="no_touch")
+    inserted = _inserted(context, tour, seed, use.registration)
+    return {
+        "seed": seed,
+        "tip_error_mm": inserted.tip_error_mm,
+        "fre_mm": use.registration.fre_mm,
+        "seconds_per_touch": touched.seconds / len(touched.readings),
+        "off_path_mm": inserted.off_path_mm,
+        "refused": "",
+    }
 
 
 def _inserted(context: CaseContext, tour: Tour, seed: int, registration: Registration) -> Rehearsal:
@@ -217,24 +110,27 @@ def _inserted(context: CaseContext, tour: Tour, seed: int, registration: Registr
     return inserted
 
 
-def _key(context: CaseContext, tour: Tour) -> str:
-    """The hash of all that decides a run beside its seed."""
-    stated = json.dumps([context.provenance(), inputs_document(context.case.inputs)], sort_keys=True, default=str)
-    joints = np.concatenate([tour.q_insertion, *(touch.q_touch for touch in tour.plan.touches)])
-    return hashlib.sha256(stated.encode() + joints.tobytes()).hexdigest()
+def drawn_error_mm(context: CaseContext, tour: Tour, seed: int) -> float:
+    """The tip's error in one truth without physics; NaN where the touches do not register."""
+    use = drawn_once(context, tour, seed)
+    return float("nan") if isinstance(use, str) else use.tip_error_mm
 
 
-def _read(path: Path, key: str) -> PhysicalRun | None:
-    """A run that was kept, if it is whole and of the same experiment."""
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        return PhysicalRun(**document["run"]) if document["key"] == key else None
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-
-
-def _kept(path: Path, key: str, run: PhysicalRun) -> PhysicalRun:
-    if not run.refused:
-        with atomic(path) as temporary:
-            temporary.write_text(json.dumps({"key": key, "run": asdict(run)}) + "\n", encoding="utf-8")
-    return run
+def physical_text(facts: Mapping[str, Any]) -> str:
+    """For a person; where one axis errs most, an rms is known to one over the root of twice their number."""
+    ended, drawn = facts["runs"], facts["drawn"]
+    refused = [f"seed {seed}: {why}" for seed, why in facts["refused"].items()]
+    if not ended:
+        return text([Section(f"none of {plural(len(refused), 'physical run')} ended", refused)])
+    known, draws = (100.0 / np.sqrt(2.0 * count) for count in (len(ended), drawn["draws"]))
+    head = (
+        f"{plural(len(ended), 'physical run')} ({facts['seconds_per_touch']:.1f} s per touch): the tip misses the "
+        f"target by {facts['realised_mm']:.2f} mm rms (known to {known:.0f} %), {facts['expected_mm']:.2f} predicted"
+    )
+    off_mm = max(run["off_path_mm"] for run in ended)
+    said = [
+        f"touched and inserted in the simulator, the tip at most {off_mm:.3f} mm off its commanded path",
+        f"without physics, the same {plural(len(ended), 'trial')} give {drawn['realised_in_the_same_truths_mm']:.2f} "
+        f"mm, all {drawn['draws']} trials {drawn['realised_mm']:.2f} (known to {draws:.1f} %)",
+    ]
+    return text([Section(head, [*said, *refused])])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import PARAMETERS, check_recording, flange_pose
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.output.output_set import writing
@@ -40,8 +40,8 @@ from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.report.present import Section, footer, text, vector
 
 if TYPE_CHECKING:  # a list is read where the simulator is not installed
+    from puncture_twin.twin.guidance.ct.touching import Touched
     from puncture_twin.twin.plant.true_needle import TouchTruth
-    from puncture_twin.twin.rehearsal.touching import Touched
 
 STANDS_OUT = 2.0
 """A touch that misses by so many times the others' root mean square is named."""
@@ -136,7 +136,7 @@ def _doubt(run: PivotRun) -> list[str]:
         arm = pivot.expected_whole_mm > LARGE * pivot.expected_mm
         return ["most of it comes from the declared errors of the arm: more poses do not help"] if arm else []
     worst = int(np.argmax(pivot.misses_mm))
-    rest = float(np.sqrt(np.mean(np.delete(pivot.misses_mm, worst) ** 2)))
+    rest = rms(np.delete(pivot.misses_mm, worst))
     head = f"the residual is more than {LARGE:g} times the declared one"
     if pivot.misses_mm[worst] > STANDS_OUT * rest:
         one = f"{run.names[worst]} misses by {pivot.misses_mm[worst]:.2f} mm, the others by {rest:.2f} (rms)"
@@ -242,7 +242,7 @@ def _truth(context: CaseContext, tour: TouchTour, seed: int) -> TouchTruth:
 
 
 def _executed(context: CaseContext, tour: TouchTour, truth: TouchTruth) -> Touched:
-    from puncture_twin.twin.rehearsal.touching import execute_touches
+    from puncture_twin.twin.plant.touching import execute_touches
 
     checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
     with context.stages.time("touches"):

@@ -2,15 +2,12 @@
 
 What ``scan`` prints: how it scanned, both readings of each marker beside the truth, and the next command.
 
-What `scan` lays beside the patient: as the user asks for it, and its surfaces as files, in the scan's frame.
-
 One axial slice of a scan: through the target, or as near to it as the field of view comes.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -22,11 +19,10 @@ from numpy.typing import NDArray
 from puncture_twin.planning.anatomy.metal import METAL_HU
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.base.output.manifest import FORMAT, read_output
+from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.strict_json import array, fitting, parse_json
-from puncture_twin.planning.formats.meshes.ply import ply_bytes
 from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
@@ -34,10 +30,10 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_markers, read_lesion
 from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, needle_error
 from puncture_twin.twin.jobs.terminal import write_result
-from puncture_twin.twin.plant.outside_objects import Arms, Bed, OutsideObjects, Part
 from puncture_twin.twin.plant.scanner.case_scene import (
     CaseScene,
     MarkerKind,
+    Placer,
     TrueRod,
     case_scene,
     label_layers,
@@ -63,12 +59,13 @@ class ScanRequest(NamedTuple):
     Attributes:
         marker: What stands at the markers' places.
         rehearsal: Its needle is shown in a control CT.
+        beside: Places what lies outside of the patient; nothing where None.
     """
 
     settings: ScanSettings
     marker: MarkerKind = "disc"
     rehearsal: Path | None = None
-    beside: OutsideObjects | None = None
+    beside: Placer | None = None
 
 
 def parse_marker(text: str) -> MarkerKind:
@@ -129,7 +126,6 @@ class ScanRun:
             "markers": list(self._markers()),
             "lesion": {"true_mm": true.tolist(), "found_mm": found.tolist(), "error_mm": (found - true).tolist()},
             "needle": None if self.control is None else control_summary(self.control),
-            "beside": beside_summary(self.scene.outside_objects),
             "thin_voxels": dict(self.image.thin),
             "inputs": inputs_document(self.inputs),
             "files": [str(path) for path in self.files],
@@ -200,25 +196,15 @@ def scan_case(context: CaseContext, out: Path, request: ScanRequest) -> ScanRun:
 def _scanned(context: CaseContext, request: ScanRequest) -> ScanRun:
     case, settings = context.case, request.settings
     rng = np.random.default_rng(settings.seed)
-    _refuse_two_beds(context, request)
     needle, read = _rehearsed(request.rehearsal)
     rod = None if needle is None else needle[0]
-    scene = case_scene(
-        case, context.anatomy, settings, rng, marker=request.marker, needle=rod, outside_objects=request.beside
-    )
+    scene = case_scene(case, context.anatomy, settings, rng, marker=request.marker, needle=rod, outside=request.beside)
     image = scan_solids(scene.solids, scan_grid(scene, settings, rng), settings, rng)
     volume = Volume(image.hu, image.grid.T_ct_index, case.path)
     markers = None if scene.listed is None else find_markers(volume, scene.listed)
     lesion = _lesion(context, scene, image, volume)
     control = None if needle is None else _control(scene, volume, case.needle.diameter_mm, *needle)
     return ScanRun(context, request, scene, image, markers, lesion, control, (*read, *case.inputs))
-
-
-def _refuse_two_beds(context: CaseContext, request: ScanRequest) -> None:
-    own = [one.name for one in context.case.obstacles if one.frame == "ct"]
-    if own and request.beside is not None and request.beside.bed != "none":
-        allowed = "none, or a case without obstacles in the frame ct"
-        refuse(f"the case already has objects in the scanner: {', '.join(own)}", "--bed", allowed, "two_beds")
 
 
 def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volume) -> tuple[Floats, Floats]:
@@ -273,7 +259,6 @@ def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
     if run.markers is not None:
         write_points(folder / FOUND, run.markers.fine)
         yield folder / FOUND
-    yield from write_beside(run.scene.outside_objects, folder)
     found = None if run.markers is None else run.markers.fine
     needle = None if run.control is None else run.control.found
     yield draw_scan(image, Shown(run.scene.target, found, needle, case.needle.shaft_mm), folder / PICTURE)
@@ -305,9 +290,6 @@ def scan_text(run: ScanRun) -> str:
     settings, shape = found["settings"], " x ".join(map(str, found["voxels"]))
     target = ",".join(f"{one:.2f}" for one in found["target_mm"])
     pixel, spacing = settings["pixel_mm"], settings["spacing_mm"]
-    beside = ", ".join(
-        one["name"] for one in found["beside"] if one["place"] != "within" and not one["name"].endswith(INSIDE)
-    )
     thin = ", ".join(f"{name} ({count})" for name, count in found["thin_voxels"].items())
     rows = [
         ("scan", f"{shape} voxels of {pixel:g} x {pixel:g} x {spacing:g} mm, noise {settings['noise_hu']:g} HU, seed "
@@ -315,7 +297,6 @@ def scan_text(run: ScanRun) -> str:
         *([] if found["markers"] else [("markers", "none")]),
         ("lesion", f"{_vector(found['lesion']['error_mm'])}   read minus true"),
         *_needle_rows(found["needle"]),
-        *([("beside", f"{beside}: surfaces in beside/")] if beside else []),
         *([("thin", f"parts thinner than a voxel fill whole voxels of the label map: {thin}")] if thin else []),
     ]  # fmt: skip
     return text([
@@ -356,55 +337,12 @@ def _needle_rows(needle: dict[str, Any] | None) -> list[tuple[str, str]]:
     ]
 
 
-INSIDE = ("_core", "_foam")
-"""Ends of the names of what fills a line or a bed."""
-
-
 def _vector(numbers: list[float]) -> str:
     return " ".join(f"{one:+6.2f}" for one in numbers)
 
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-FOLDER = "beside"
-LIST = "manifest.json"
-"""`init` passes a folder whose list says that this program wrote it: the truth is no segmentation."""
-
-
-def parse_beside(arms: str, bed: str, lines: int) -> OutsideObjects | None:
-    """What shall lie beside the patient; None for nothing.
-
-    Raises:
-        InputError: A word that is not known.
-    """
-    for option, word, known in (("--arms", arms, get_args(Arms)), ("--bed", bed, get_args(Bed))):
-        if word not in known:
-            refuse(f"'{word[:40]}' is not known", option, ", ".join(known), "unknown_choice")
-    wanted = OutsideObjects(
-        next(k for k in get_args(Arms) if k == arms), next(k for k in get_args(Bed) if k == bed), lines
-    )
-    return None if wanted == OutsideObjects() else wanted
-
-
-def beside_summary(parts: Sequence[Part]) -> list[dict[str, Any]]:
-    """Plain values for JSON: name, what it is made of (HU), where it lies, and its file."""
-    return [{"name": one.name, "hu": one.hu, "place": one.place, "file": f"{FOLDER}/{one.name}.ply"} for one in parts]
-
-
-def write_beside(parts: Sequence[Part], folder: Path) -> Iterator[Path]:
-    """Each part as a PLY in the scan's frame, LPS mm, and the list of them; nothing where there are none."""
-    if not parts:
-        return
-    (folder / FOLDER).mkdir()
-    for one in parts:
-        path = folder / FOLDER / f"{one.name}.ply"
-        path.write_bytes(ply_bytes(one.mesh))
-        yield path
-    listed = {"part_of": FORMAT, "schema": 1, "unit": "mm", "space": "LPS", "parts": beside_summary(parts)}
-    (folder / FOLDER / LIST).write_text(json.dumps(listed, indent=1) + "\n", encoding="utf-8")
-    yield folder / FOLDER / LIST
-
 
 WINDOW_HU = (-160.0, 240.0)
 """What abdomens are read in: 400 wide about 40."""

@@ -29,17 +29,17 @@ from puncture_twin.planning.touch.touch_planner import (
     registered,
 )
 from puncture_twin.planning.touch.tour_motions import TouchPlan, registered_joints
+from puncture_twin.twin.guidance.ct.touching import Touched, nominal_tip
 from puncture_twin.twin.jobs.terminal import write_result
+from puncture_twin.twin.plant.touching import ExecutedTouches, execute_touches
 from puncture_twin.twin.plant.true_needle import (
     AtTarget,
     TouchTruth,
     draw_at_target,
     draw_touch_truth,
-    nominal_tip,
     true_needle,
 )
 from puncture_twin.twin.rehearsal.distribution import misregistered
-from puncture_twin.twin.rehearsal.touching import Touched, execute_touches
 from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 
 TOUCH, SUMMARY = "touch.csv", "touch.json"
@@ -82,7 +82,7 @@ class TouchRun(Shown):
     inputs: tuple[Input, ...]
     seed: int
     plan: TouchPlan
-    touched: Touched
+    touched: ExecutedTouches
     use: Use | str
     files: tuple[Path, ...] = ()
 
@@ -108,9 +108,8 @@ class TouchRun(Shown):
                     "joints_deg": np.degrees(one.q).tolist(),
                     "seconds": one.seconds,
                     "force_n": one.force_n,
-                    "bias_mm": one.bias_mm,
-                    "speed_mm_s": one.speed_mm_s,
                     "aside_mm": one.aside_mm,
+                    **self.touched.contacts[one.name]._asdict(),
                 }
                 for one in self.touched.readings
             ],
@@ -165,7 +164,7 @@ class Tour(NamedTuple):
 class TouchedOnce(NamedTuple):
     """One executed tour, and what its readings are good for, or why not."""
 
-    touched: Touched
+    touched: ExecutedTouches
     use: Use | str
 
 
@@ -268,12 +267,12 @@ def _true_errors(context: CaseContext) -> ErrorModel:
 
 
 TOUCHED = (
-    Field("marker", lambda one: one.name),
-    Field("took", lambda one: one.seconds, 1, "s"),
-    Field("contact, depth", lambda one: one.bias_mm, 3, "mm"),
-    Field("at", lambda one: one.speed_mm_s, 1, "mm/s"),
-    Field("at most", lambda one: one.force_n, 2, "N"),
-    Field("line moved at the standoff", lambda one: one.aside_mm, 1, "mm"),
+    Field("marker", "marker"),
+    Field("took", "seconds", 1, "s"),
+    Field("contact, depth", "bias_mm", 3, "mm"),
+    Field("at", "speed_mm_s", 1, "mm/s"),
+    Field("at most", "force_n", 2, "N"),
+    Field("line moved at the standoff", "aside_mm", 1, "mm"),
 )
 
 
@@ -284,7 +283,7 @@ def touch_text(run: TouchRun) -> str:
     of = f" of {len(touched.readings) + len(touched.failed)}" if touched.failed else ""
     left = (f"{name} not touched: {why}" for name, why in (*plan.left_out.items(), *touched.failed.items()))
     head = f"{len(touched.readings)}{of} markers touched in {touched.seconds:.0f} s{each}"
-    return text([Section(head, [grid(TOUCHED, touched.readings), *left]), *_use_said(run), *footer(run.files)])
+    return text([Section(head, [grid(TOUCHED, run.summary()["touches"]), *left]), *_use_said(run), *footer(run.files)])
 
 
 def _use_said(run: TouchRun) -> list[Section]:

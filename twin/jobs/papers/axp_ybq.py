@@ -8,9 +8,7 @@ Every error is the root mean square over 200 held-out exact poses and all runs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -25,6 +23,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
+from puncture_twin.twin.jobs.terminal import Answer
 from puncture_twin.twin.plant.simulated_recording import SimulatedTruth, simulate_recording
 from puncture_twin.twin.report.present import Field, Section, grid, text
 
@@ -62,38 +61,15 @@ SCALE_LIMIT_MM = 0.25
 """With the pixel size estimated; the known number is 0.239."""
 
 
-@dataclass(frozen=True)
-class AxpYbqRow:
+def _row(what: str, known: float | None, ours: float, limit: float | None, unit: str) -> dict[str, Any]:
     """One number beside the specified one.
 
-    Attributes:
+    Args:
         known: What the specification has; None where it has none.
         limit: The most that is allowed, with what chance adds in few runs; None where nothing is demanded.
     """
-
-    what: str
-    known: float | None
-    ours: float
-    limit: float | None
-    unit: str
-
-    @property
-    def passed(self) -> bool:
-        """Whether ours is within the limit."""
-        return self.limit is None or self.ours <= self.limit
-
-
-class AxpYbqTables(NamedTuple):
-    """All numbers."""
-
-    rows: tuple[AxpYbqRow, ...]
-    runs: int
-    seed: int
-
-    @property
-    def passed(self) -> bool:
-        """Whether every number that has a limit is within it."""
-        return all(row.passed for row in self.rows)
+    holds = limit is None or ours <= limit
+    return {"what": what, "known": known, "ours": ours, "limit": limit, "unit": unit, "holds": holds}
 
 
 class _Run(NamedTuple):
@@ -105,16 +81,21 @@ class _Run(NamedTuple):
     direction_deg: float
 
 
-def reproduce(out_dir: Path | None, seeds: int | None) -> AxpYbqTables:
+def reproduce(seeds: int | None) -> Answer:
     """Compute every number.
 
     Args:
         seeds: Number of runs; None takes 200, for which the limits are meant. With fewer they are wider.
     """
-    del out_dir
     runs = seeds or RUNS
-    rows = [_exact_row(), *_table(runs), *_outliers(runs), *_scales(runs)]
-    return AxpYbqTables(tuple(rows), runs, SEED)
+    facts = summary([_exact_row(), *_table(runs), *_outliers(runs), *_scales(runs)], runs)
+    return Answer(facts["holds"], facts, reproduction_text(facts))
+
+
+def summary(rows: Sequence[Mapping[str, Any]], runs: int) -> dict[str, Any]:
+    """The rows, and whether every number that has a limit is within it."""
+    holds = all(row["holds"] for row in rows)
+    return {"compared_with": COMPARED_WITH, "rows": list(rows), "runs": runs, "seed": SEED, "holds": holds}
 
 
 def truth_estimate(truth: SimulatedTruth) -> Estimate:
@@ -123,7 +104,7 @@ def truth_estimate(truth: SimulatedTruth) -> Estimate:
     return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], truth.tip_end2, np.ones(2), truth.direction_end2)
 
 
-def _exact_row() -> AxpYbqRow:
+def _exact_row() -> dict[str, Any]:
     """The closed form without noise: the largest error of any unknown, in mm or degrees."""
     worst = 0.0
     for n in (16, 20, 50):
@@ -132,10 +113,10 @@ def _exact_row() -> AxpYbqRow:
         turns = [log_rotation(a.T @ b) for a, b in ((found.R_X, exact.R_X), (found.R_Y, exact.R_Y))]
         moves = [found.t_X - exact.t_X, found.t_Y - exact.t_Y, found.t_Q - exact.t_Q]
         worst = max(worst, float(np.degrees(np.abs(turns).max())), float(np.abs(moves).max()))
-    return AxpYbqRow("closed form without noise, 16, 20 and 50 poses: largest error", None, worst, 1e-6, "mm or deg")
+    return _row("closed form without noise, 16, 20 and 50 poses: largest error", None, worst, 1e-6, "mm or deg")
 
 
-def _table(runs: int) -> list[AxpYbqRow]:
+def _table(runs: int) -> list[dict[str, Any]]:
     rows = []
     for n in COUNTS:
         found = [_run(np.random.default_rng([SEED, n, k]), n) for k in range(runs)]
@@ -145,13 +126,13 @@ def _table(runs: int) -> list[AxpYbqRow]:
             limits = [LIMITS.get((n, method), np.inf), OVER_BOUND.get(method, np.inf) * float(ours[3])]
             least = float(min(limits))
             limit = least * widened(squares[:, column]) if np.isfinite(least) else None
-            rows.append(AxpYbqRow(f"{n} poses, {method}", known, error, limit, "mm"))
+            rows.append(_row(f"{n} poses, {method}", known, error, limit, "mm"))
         if n >= 20:
-            rows.append(AxpYbqRow(f"{n} poses, most steps", None, max(run.steps for run in found), MOST_STEPS, "steps"))
+            rows.append(_row(f"{n} poses, most steps", None, max(run.steps for run in found), MOST_STEPS, "steps"))
         if n == 30:
             turns = np.array([run.direction_deg**2 for run in found])
             angle, limit = float(np.sqrt(np.mean(turns))), 0.2 * widened(turns)
-            rows.append(AxpYbqRow("30 poses, needle direction V", None, angle, limit, "deg"))
+            rows.append(_row("30 poses, needle direction V", None, angle, limit, "deg"))
     return rows
 
 
@@ -186,7 +167,7 @@ def _squared(estimate: Estimate, unseen: Recording) -> float:
     return float(np.mean(np.sum(tip_residuals(estimate, unseen) ** 2, axis=1)))
 
 
-def _outliers(runs: int) -> list[AxpYbqRow]:
+def _outliers(runs: int) -> list[dict[str, Any]]:
     """30 poses, 10 % of the tips 5 mm off in the image."""
 
     def one(rng: np.random.Generator) -> list[float]:
@@ -200,9 +181,9 @@ def _outliers(runs: int) -> list[AxpYbqRow]:
 
     (plain, unweighted, weighted), widen = _rms(one, runs, 1)
     return [
-        AxpYbqRow("30 poses, 10 % outliers, plain least squares", 0.73, plain, None, "mm"),
-        AxpYbqRow("30 poses, 10 % outliers, robust, noise not given", 0.23, unweighted, 0.25 * widen[1], "mm"),
-        AxpYbqRow("30 poses, 10 % outliers, robust, noise given", 0.23, weighted, 0.25 * widen[2], "mm"),
+        _row("30 poses, 10 % outliers, plain least squares", 0.73, plain, None, "mm"),
+        _row("30 poses, 10 % outliers, robust, noise not given", 0.23, unweighted, 0.25 * widen[1], "mm"),
+        _row("30 poses, 10 % outliers, robust, noise given", 0.23, weighted, 0.25 * widen[2], "mm"),
     ]
 
 
@@ -215,7 +196,7 @@ def with_outliers(rng: np.random.Generator, recording: Recording, fraction: floa
     return Recording(recording.A, recording.B, P, recording.v, recording.names)
 
 
-def _scales(runs: int) -> list[AxpYbqRow]:
+def _scales(runs: int) -> list[dict[str, Any]]:
     """30 poses, the pixels 1 and 3 % larger than believed."""
     rows = []
     for percent, known in ((1, 0.33), (3, 0.78)):
@@ -230,8 +211,8 @@ def _scales(runs: int) -> list[AxpYbqRow]:
 
         (blind, found), widen = _rms(one, runs, 100 + percent)
         rows += [
-            AxpYbqRow(f"30 poses, pixels {percent} % off, not estimated", known, blind, None, "mm"),
-            AxpYbqRow(f"30 poses, pixels {percent} % off, estimated", 0.239, found, SCALE_LIMIT_MM * widen[1], "mm"),
+            _row(f"30 poses, pixels {percent} % off, not estimated", known, blind, None, "mm"),
+            _row(f"30 poses, pixels {percent} % off, estimated", 0.239, found, SCALE_LIMIT_MM * widen[1], "mm"),
         ]
     return rows
 
@@ -264,10 +245,3 @@ def reproduction_text(found: Mapping[str, Any]) -> str:
     wider = f"; the limits are those of {RUNS} runs, widened for the chance of fewer runs"
     ending = f"{found['runs']} runs per row, seed {found['seed']}: {verdict}{'' if found['runs'] >= RUNS else wider}"
     return text([Section(f"compared with {COMPARED_WITH}", [grid(FIELDS, found["rows"])]), Section(ending, [])])
-
-
-def reproduction_summary(result: AxpYbqTables) -> dict[str, Any]:
-    """The specified numbers beside ours as plain values, for ``--json``."""
-    rows = [{**asdict(row), "holds": row.passed} for row in result.rows]
-    answer = {"rows": rows, "runs": result.runs, "seed": result.seed, "holds": result.passed}
-    return {"compared_with": COMPARED_WITH, **answer}

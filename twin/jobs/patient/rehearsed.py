@@ -16,7 +16,7 @@ from puncture_twin.twin.jobs.patient.run import FILM, ROOMS, RoomCount, Run
 from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
 from puncture_twin.twin.jobs.terminal import write_json
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
-from puncture_twin.twin.rehearsal.plan_truth import error_scale, median_truth, plan_truth
+from puncture_twin.twin.rehearsal.plan_truth import error_rank, median_truth, plan_truth
 
 if TYPE_CHECKING:
     from puncture_twin.planning.anatomy.anatomy import Anatomy
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from puncture_twin.planning.plan.plan import Plan
     from puncture_twin.planning.search.context import CaseContext
     from puncture_twin.twin.plant.truth import Truth
-    from puncture_twin.twin.rehearsal.result import Rehearsal, Scale
+    from puncture_twin.twin.rehearsal.result import Rehearsal
 
 
 Wait = Callable[[], Any]
@@ -66,9 +66,8 @@ def rehearse_once(context: CaseContext, plan: Plan, rooms: RoomCount | None, see
     """A plan executed where the truth differs: the drawn one, or the median one of many rooms."""
     found = None if rooms is None else in_rooms(context, plan, rooms, seed)
     truth = plan_truth(context, plan, seed) if found is None else median_truth(found)
-    scale = error_scale(context, plan.insertion.q[-1], found)
     rehearsal = _execute(plan, context.case, context.anatomy, truth)
-    standing = None if scale is None else scale.of(rehearsal.tip_error_mm)
+    standing = error_rank(context, plan.insertion.q[-1], found, rehearsal.tip_error_mm)
     return replace(rehearsal, standing=standing, distribution=found)
 
 
@@ -85,7 +84,6 @@ class PendingRehearsal:
     run: Run
     begin: Begin
     rehearsal: Wait
-    scale: Scale | None
 
     def ended(self, out: Path, with_page: Callable[[Run], Run] | None = None) -> Run:
         """The run with what was measured and the film, once they are there; the numbers and the rooms are written.
@@ -95,10 +93,11 @@ class PendingRehearsal:
                 but where no encoder can be started.
         """
         shown, run, time = self._rooms_drawn(out), self.run, self.run.context.stages.time
+        assert run.plan is not None
         with time("rehearsal"):
             rehearsal: Rehearsal = self.rehearsal()
-        scale = self.scale
-        rehearsal = replace(rehearsal, standing=None if scale is None else scale.of(rehearsal.tip_error_mm))
+        standing = error_rank(run.context, run.plan.insertion.q[-1], run.distribution, rehearsal.tip_error_mm)
+        rehearsal = replace(rehearsal, standing=standing)
         film_at = self.begin(_film, rehearsal, run.plan, run.context.case, run.context.anatomy, out / FILM)
         document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
         measured = replace(run, rehearsal=rehearsal).with_files(write_json(document, out / "rehearsal.json"))
@@ -131,8 +130,7 @@ def begin_rehearsal(run: Run, rooms: RoomCount | None, begin: Begin) -> PendingR
     run = run if rooms is None else replace(run, distribution=in_rooms(context, plan, rooms))
     found = run.distribution
     truth = plan_truth(context, plan) if found is None else median_truth(found)
-    scale = error_scale(context, plan.insertion.q[-1], found)
-    return PendingRehearsal(run, begin, begin(_execute, plan, context.case, context.anatomy, truth), scale)
+    return PendingRehearsal(run, begin, begin(_execute, plan, context.case, context.anatomy, truth))
 
 
 def in_rooms(context: CaseContext, plan: Plan, count: RoomCount, seed: int | None = None) -> Distribution:

@@ -27,7 +27,6 @@ from puncture_twin.twin.jobs.selfcal.pictures import detection_sheet, workcell_p
 from puncture_twin.twin.jobs.selfcal.selfcal import (
     SelfcalRun,
     calibration_summary,
-    choice_summary,
     selfcal_recording,
     selfcal_twin,
 )
@@ -186,7 +185,7 @@ def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
         "name": run.name,
         "inputs": inputs_document(run.inputs),
         "candidates": None if run.candidates is None else run.candidates.counts,
-        "choice": None if run.choice is None else choice_summary(run.choice),
+        "choice": run.choice,
         "shots": [shot._asdict() for shot in run.shots],
         "trials": [trial_summary(trial) for trial in run.trials],
         "punctures": puncture_summary(run.punctures),

@@ -13,7 +13,7 @@ from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, choice_noise
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import Shot, ShotByShot
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, drawing, expected_tre_mm, find_candidates
 from puncture_twin.twin.guidance.ultrasound.puncture import predicted_tre
@@ -29,20 +29,6 @@ MOST_MISSED = "{file}: no needle in {missed} pictures, and one in {shown}: is th
 
 RANDOM_SETS = 50
 """Random choices that the informative one is compared with."""
-
-
-@dataclass(frozen=True)
-class Choice:
-    """Gain by choosing poses, as the Cramer-Rao bound over all candidates, mm."""
-
-    chosen_mm: float
-    random_mm: tuple[float, ...]
-    """Bounds of random choices of as many poses."""
-
-    @property
-    def median_random_mm(self) -> float:
-        """Median of the random ones."""
-        return float(np.median(self.random_mm))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +57,7 @@ class SelfcalRun:
     trials: tuple[SelfcalTrial, ...] = ()
     case: SelfcalCase | None = None
     candidates: CandidatePoses | None = None
-    choice: Choice | None = None
+    choice: dict[str, Any] | None = None
     stages: Stages = field(default_factory=Stages)
     files: tuple[Path, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -157,8 +143,8 @@ def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None =
     )
 
 
-def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisition) -> Choice:
-    """The expected error of the poses that were recorded, and of random choices of as many."""
+def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisition) -> dict[str, Any]:
+    """The gain by choosing poses: Cramer-Rao bounds over all candidates of those recorded and of random ones, mm."""
     noise, belief, poses = choice_noise(case), drawing(case), candidates.poses
     rng = np.random.default_rng(case.content.seed)
     rows = np.array([shot.candidate for shot in taken.shots])
@@ -167,7 +153,13 @@ def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisi
         return expected_tre_mm(poses.subset(some), noise, belief, poses, case.declared_arms)
 
     sets = [rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS)]
-    return Choice(expected(rows), tuple(expected(some) for some in sets))
+    chosen, drawn = expected(rows), [expected(some) for some in sets]
+    return {
+        "chosen_bound_mm": chosen,
+        "random_bound_median_mm": float(np.median(drawn)),
+        "random_bound_best_mm": min(drawn),
+        "random_sets": len(drawn),
+    }
 
 
 def calibration_summary(found: Calibration, recording: Recording) -> dict[str, Any]:
@@ -195,20 +187,10 @@ def calibration_summary(found: Calibration, recording: Recording) -> dict[str, A
 
 def noise_summary(found: Calibration) -> dict[str, float]:
     """The stated noise, or the estimated spread."""
-    if isinstance(found.noise, Noise):
-        stated = found.noise
-        return {
-            "robot_mm": stated.robot_mm,
-            "robot_deg": float(np.degrees(stated.robot_rad)),
-            "image_mm": stated.image_mm,
-            "direction_deg": float(np.degrees(stated.direction_rad)),
-            "off_plane_mm": stated.off_plane_mm,
-        }
-    spread = found.noise
+    names = {"inside_mm": "inside_image_mm", "across_mm": "across_image_mm"}
     return {
-        "inside_image_mm": spread.inside_mm,
-        "across_image_mm": spread.across_mm,
-        "direction_deg": float(np.degrees(spread.direction_rad)),
+        names.get(key, key.replace("_rad", "_deg")): float(np.degrees(value)) if key.endswith("_rad") else value
+        for key, value in found.noise._asdict().items()
     }
 
 
@@ -220,14 +202,4 @@ def arms_summary(found: Calibration) -> dict[str, Any] | None:
         "found_sd": found.arm_errors.tolist(),
         "chi2_per_freedom": found.chi_squared_ratio,
         "chi2_chance": found.chi_squared_chance(),
-    }
-
-
-def choice_summary(choice: Choice) -> dict[str, Any]:
-    """The bounds of a choice, mm."""
-    return {
-        "chosen_bound_mm": choice.chosen_mm,
-        "random_bound_median_mm": choice.median_random_mm,
-        "random_bound_best_mm": min(choice.random_mm),
-        "random_sets": len(choice.random_mm),
     }

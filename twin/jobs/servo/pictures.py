@@ -71,19 +71,22 @@ def _workcell_picture(session: Session, reached: Reached, camera: Camera) -> NDA
 
 
 def _annotate(axes: Axes, session: Session, reached: Reached, number: int) -> None:
-    workcell = session.workcell
+    workcell, at = session.workcell, f"seed {session.trial.seed}, at the end of target {reached.row.target}"
     camera, believed = workcell.cameras[number].pinhole(), session.calibration.cameras[number].pinhole()
     for name, marker in zip(
         workcell.case.markers.names, session.mapping.to_c(workcell.case.markers.points), strict=True
     ):
         ring(axes, believed.project(marker), 16, MARKER, name, 3)
     for target, point in zip(workcell.case.targets.names, workcell.targets_c, strict=True):
-        cross(axes, camera.project(point), 9 if target == reached.target else 3, TARGET)
+        cross(axes, camera.project(point), 9 if target == reached.row.target else 3, TARGET)
     if reached.servoed.visits:
         ring(axes, believed.project(reached.servoed.visits[-1].seen.ball_c), 18, BALL, width=3)
         _inset(axes, session, reached, number)
     lines = (
-        (f"camera {number + 1}: {workcell.case.name}, seed {session.seed}, at the end of target {reached.target}", INK),
+        (
+            f"camera {number + 1}: {workcell.case.name}, {at}",
+            INK,
+        ),
         ("orange ring: ball as measured", BALL),
         ("green cross: true targets, the large one served now", TARGET),
         ("blue rings: marker positions by the mapping", MARKER),
@@ -100,7 +103,7 @@ def _inset(axes: Axes, session: Session, reached: Reached, number: int) -> None:
     workcell, tool = session.workcell, session.workcell.case.file.tool
     camera, believed = workcell.cameras[number], session.calibration.cameras[number]
     seen, plan = reached.servoed.visits[-1].seen.ball_c, workcell.case.file.cameras
-    q_true, rng = reached.q_true, np.random.default_rng(session.seed)
+    q_true, rng = reached.q_true, np.random.default_rng(session.trial.seed)
     ball = ShownBall(workcell.ball_c(q_true), tool.ball_diameter_mm / 2, workcell.rod_c(q_true))
     half = round(INSET_HALF_PX * camera.width / WIDTH_PX)
     grey = render(
@@ -133,7 +136,7 @@ def draw_convergence(session: Session, path: Path) -> None:
         ]
         looks = np.arange(len(visits))
         longest = max(longest, len(visits) - 1)
-        (line,) = axes.plot(looks, true, "-", linewidth=1.2, label=one.target)
+        (line,) = axes.plot(looks, true, "-", linewidth=1.2, label=one.row.target)
         axes.plot(looks, one.servoed.errors_mm, "o", color=line.get_color(), markersize=4)
     _finish(axes, session, longest)
     write_png(figure, path)

@@ -13,29 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.strict_json import plain
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import Mapping as HeadMapping
-from puncture_twin.twin.guidance.stereo.servo_loop import Lost
-from puncture_twin.twin.guidance.stereo.session import Looked
-from puncture_twin.twin.jobs.servo.liu2007 import (
-    TABLE_1,
-    TABLE_2,
-    Liu2007Tables,
-    paper_columns,
-    paper_gain_mm,
-    paper_servo_only_at_least,
-)
-from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome
-from puncture_twin.twin.rehearsal.stereo_trials import (
-    ServoTrial,
-    Statistics,
-    TargetRow,
-    declaration_test,
-    needle_statistics,
-)
+from puncture_twin.twin.rehearsal.stereo_session import ServoTrial, declaration_test, needle_statistics
 from puncture_twin.twin.report.page.template import Card
 from puncture_twin.twin.report.present import (
     Block,
@@ -65,20 +49,20 @@ DOUBTED = 0.01
 """Chance of residuals so large below which the declaration is doubted, as in the CT case."""
 
 Facts = Mapping[str, Any]
-"""What `servo_facts` or `reproduction_facts` returns: mm, shares 0..1."""
+"""What `servo_facts` returns: mm, shares 0..1."""
 
 
-def servo_facts(case: ServoCase, trials: Sequence[ServoTrial], ours: Statistics) -> dict[str, Any]:
+def servo_facts(case: ServoCase, trials: Sequence[ServoTrial], ours: Facts) -> dict[str, Any]:
     """A case's sessions, each seed and all together."""
-    stops = Counter(row.stop for one in trials for row in one.rows)
+    stops = Counter(row.stop for one in trials for row in one.targets)
     return {
         "case": case.name,
         "inputs": inputs_document(case.inputs),
         "tolerance_mm": case.file.servo.tolerance_mm,
         "estimate": case.file.servo.estimate,
         "stops": dict(stops),
-        "statistics": {**ours._asdict(), "after_over_mapping": ours.after_over_mapping},
-        "sessions": [_session(one) for one in trials],
+        "statistics": ours,
+        "sessions": [{key: value for key, value in plain(one).items() if key != "declaration"} for one in trials],
         "needle": _needle(case, trials),
     }
 
@@ -86,10 +70,10 @@ def servo_facts(case: ServoCase, trials: Sequence[ServoTrial], ours: Statistics)
 def _needle(case: ServoCase, trials: Sequence[ServoTrial]) -> dict[str, Any]:
     """The needle against the anatomy, predicted beside realised, over all seeds."""
     test = declaration_test(trials)
-    rows = [row for one in trials for row in one.rows]
+    rows = [row for one in trials for row in one.targets]
     found = {phase: needle_statistics([getattr(row, f"needle_{phase}") for row in rows]) for phase in PHASES}
     return {
-        **{phase: None if one is None else one._asdict() for phase, one in found.items()},
+        **found,
         "hit_radius_mm": case.file.target.hit_radius_mm,
         "p_touch": None,
         "p_touch_note": NO_TOUCH,
@@ -99,53 +83,12 @@ def _needle(case: ServoCase, trials: Sequence[ServoTrial]) -> dict[str, Any]:
     }
 
 
-def reproduction_facts(result: Liu2007Tables) -> dict[str, Any]:
-    """The paper's tables, and our sessions in a room like the paper's."""
-    tilted = result.tilted
-    calibration = tilted.case.file.calibration.tilt_deg
-    return {
-        "holds": result.passed,
-        "conditions": [{"words": one.text, "holds": one.passed} for one in result.conditions],
-        "paper_gain_mm": paper_gain_mm(),
-        "gain": tilted.gain._asdict(),
-        "gain_with_the_rod_tilted_alike": result.straight.gain._asdict(),
-        "tilted_more_deg": 0.0 if calibration is None else calibration - tilted.case.file.tool.tilt_deg,
-        "paper": [{**column._asdict(), "holds": column.passed} for column in paper_columns()],
-        "paper_table_1_mm": list(TABLE_1),
-        "paper_table_2_mm": [list(row) for row in TABLE_2],
-        "paper_servo_only_at_least_mm": list(paper_servo_only_at_least()),
-        **servo_facts(tilted.case, tilted.trials, tilted.ours),
-    }
-
-
-def _session(one: ServoTrial) -> dict[str, Any]:
-    finished = not one.refused
-    return {
-        "seed": one.seed,
-        "refused": one.refused or None,
-        "stereo_mm": list(one.stereo_mm),
-        "calibration_rms_px": list(one.rms_px),
-        "fre_mm": one.fre_mm if finished else None,
-        "robot_residual_mm": one.robot_residual_mm if finished else None,
-        "targets": [_target(row) for row in one.rows],
-    }
-
-
-def _target(row: TargetRow) -> dict[str, Any]:
-    needles = {f"needle_{phase}": getattr(row, f"needle_{phase}") for phase in PHASES}
-    return {**row._asdict(), **{key: None if one is None else _outcome(one) for key, one in needles.items()}}
-
-
-def _outcome(one: NeedleOutcome) -> dict[str, Any]:
-    return {**one._asdict(), "half_axes_mm": list(one.half_axes_mm), "in_region": one.in_region}
-
-
 def recording_facts(
-    case: ServoCase, folder: Path, calibration: RobotCalibration, mapping: HeadMapping, looks: Sequence[Looked]
+    case: ServoCase, folder: Path, calibration: RobotCalibration, mapping: HeadMapping, looks: Sequence[Facts]
 ) -> dict[str, Any]:
     """What a recorded session says; mm and degrees."""
-    last = {one.target: one for one in looks}
-    within = [bool(np.linalg.norm(one.error_c) <= case.file.servo.tolerance_mm) for one in last.values()]
+    last = {one["target"]: one["error_mm"] for one in looks}
+    within = [error_mm is not None and error_mm <= case.file.servo.tolerance_mm for error_mm in last.values()]
     return {
         "case": case.name,
         "recording": str(folder),
@@ -155,23 +98,8 @@ def recording_facts(
         "robot_residual_mm": float(np.mean(calibration.robot_residual_mm)),
         "T_base_c": calibration.T_base_c.tolist(),
         "fre_mm": mapping.fre_mm,
-        "looks": [_looked(case, one) for one in looks],
+        "looks": list(looks),
         "converged": all(within),
-    }
-
-
-def _looked(case: ServoCase, one: Looked) -> dict[str, Any]:
-    radius, believed = case.file.target.hit_radius_mm, one.needle
-    lost = one.seen.reason if isinstance(one.seen, Lost) else None
-    return {
-        "target": one.target,
-        "joints_deg": np.degrees(one.q_command).tolist(),
-        "lost": lost,
-        "error_c_mm": None if lost else one.error_c.tolist(),
-        "error_mm": None if lost else float(np.linalg.norm(one.error_c)),
-        "needle_rms_mm": None if believed is None else believed.rms_mm,
-        "p_hit": None if believed is None or radius is None else believed.p_hit(radius),
-        "next_joints_deg": None if one.q_next is None else np.degrees(one.q_next).tolist(),
     }
 
 
@@ -203,24 +131,25 @@ class Pictures(NamedTuple):
     cameras: Sequence[Path]
 
 
-def servo_text(facts: Facts) -> str:
-    """The sections for a terminal, then the files."""
+def servo_text(facts: Facts, paper: Sequence[Section] = ()) -> str:
+    """The sections for a terminal, those of a paper first, then the files."""
     head = Section(f"case {facts['case']}", [])
-    return text([head, *sections(facts), *footer(facts["files"])])
+    return text([head, *paper, *sections(facts), *footer(facts["files"])])
 
 
-def write_servo_page(case: ServoCase, facts: Facts, pictures: Pictures, path: Path) -> Path:
+def write_servo_page(
+    case: ServoCase, facts: Facts, pictures: Pictures, path: Path, paper: Sequence[Section] = ()
+) -> Path:
     """Write ``servo.html``: the sections, and the pictures of the first seed, on one page that needs no network."""
     count = len(facts["sessions"][0]["targets"])
     title = f"{case.name}: visual servoing to {plural(count, 'target')}"
-    return write_page(path, title, _setup(case), _cards(facts), sections(facts, pictures), case.inputs)
+    return write_page(path, title, _setup(case), _cards(facts), [*paper, *sections(facts, pictures)], case.inputs)
 
 
 def sections(facts: Facts, pictures: Pictures | None = None) -> list[Section]:
-    """Everything that is shown: the paper, where it is compared, the first seed, all seeds, needle, calibration."""
+    """Everything that is shown: the first seed, all seeds, needle, calibration."""
     first = facts["sessions"][0]
     return [
-        *(_paper(facts) if "paper" in facts else ()),
         Section(f"every target of seed {first['seed']}, true errors in mm", _targets(first)),
         *(() if pictures is None else _shown(pictures)),
         Section("all seeds", [facts_table(STATISTICS, facts["statistics"])]),
@@ -357,12 +286,12 @@ def _both(needle: Facts, realised: str, predicted: str) -> list[str]:
 
 
 def _setup(case: ServoCase) -> str:
-    plan, robot, servo, arm = case.file.cameras, case.file.robot, case.file.servo, case.errors.stated()
+    plan, robot, servo, arm = case.file.cameras, case.file.robot, case.file.servo, case.errors
     return (
         f"Two cameras of {plan.size_px[0]} x {plan.size_px[1]} px, {plan.baseline_mm:g} mm apart, "
         f"{plan.distance_mm:g} mm away, noise {plan.noise_grey:g} grey levels; centre by {plan.centre}; "
-        f"{robot.model} off by {arm['link_mm']:g} mm, {arm['joint_deg']:g}°, play {arm['backlash_deg']:g}°, "
-        f"repeatability {arm['repeatability_deg']:g}°; measuring arm {case.errors.measuring_mm:g} mm an axis, "
+        f"{robot.model} off by {arm.link_mm:g} mm, {arm.joint_deg:g}°, play {arm.backlash_deg:g}°, "
+        f"repeatability {arm.repeatability_deg:g}°; measuring arm {arm.measuring_arm_mm:g} mm an axis, "
         f"12 points over {' x '.join(f'{mm:g}' for mm in case.file.calibration.size_mm)} mm; "
         f"tolerance {servo.tolerance_mm:g} mm; "
         f"estimate: {'joint' if servo.estimate == 'joint' else 'the chain'}."
@@ -378,63 +307,3 @@ def _cards(facts: Facts) -> list[Card]:
         Card("servo-only", number(ours["servo_only_mean"], 3, "mm"), f"mean; at most {most} mm"),
         Card("not confirmed", percent(ours["not_confirmed"]), f"within {tolerance:g} mm; median {steps:g} steps"),
     ]
-
-
-def _paper(facts: Facts) -> list[Section]:
-    """The paper's tables beside ours, what the servo is worth, and what the exit code demands."""
-    first, ours = facts["sessions"][0], facts["statistics"]
-    rows = [
-        {"theirs": dict(zip(("mapping", "before", "after"), theirs, strict=True)), "least": least, **row}
-        for theirs, least, row in zip(
-            facts["paper_table_2_mm"], facts["paper_servo_only_at_least_mm"], first["targets"], strict=False
-        )
-    ]
-    gains = [
-        f"{facts[key]['mean']:.2f} (standard error {facts[key]['error']:.2f})"
-        for key in ("gain", "gain_with_the_rod_tilted_alike")
-    ]
-    both = zip(facts["paper_table_1_mm"], first["stereo_mm"], strict=False)
-    points = ((f"{theirs:.2f}", f"{own:.2f}") for theirs, own in both)
-    words = (
-        "The paper's head, robot, points and targets are not ours: compare means, not rows. It did not measure the "
-        "error of the servo alone; by the triangle inequality it is at least |after − mapping|. Rows of the twin: "
-        f"seed {first['seed']}."
-    )
-    return [
-        Section("Liu et al. 2007, and ours", [words, (_means(facts), grid(_PAPER_ROW, rows))]),
-        Section("its ten points, stereo, mm", [Table(("paper", "ours"), tuple(points))]),
-        Section("gain of the servo", [
-            f"gain, before − after: {gains[0]} mm with the rod tilted {facts['tilted_more_deg']:.0f} deg more during "
-            f"the calibration than at the targets; {gains[1]} mm tilted alike; paper {facts['paper_gain_mm']:.2f} mm; "
-            f"after over mapping {ours['after_over_mapping']:.3f}, paper {1.00 / 1.06:.2f}, below 1 by chance",
-            "the tilt is our choice: the paper states none, and the cause of its robot's error is not known",
-        ]),
-        Section("demanded here (the exit code)", [Table((), tuple(
-            (one["words"], "holds" if one["holds"] else "DOES NOT HOLD") for one in facts["conditions"]))]),
-    ]  # fmt: skip
-
-
-_PAPER_ROW = (
-    Field("target", "target"),
-    *(Field(name, f"theirs.{name}", 2) for name in ("mapping", "before", "after")),
-    Field("servo-only", lambda row: f"≥ {row['least']:.2f}"),
-    Field("ours: mapping", "mapping_mm", 2),
-    *TARGET[3:7],
-)
-
-
-def _means(facts: Facts) -> Table:
-    """Mean and maximum of each column: as printed, by the paper's own rows, and over all targets of all our seeds."""
-    ours, rows = facts["statistics"], [row for one in facts["sessions"] for row in one["targets"]]
-    lines = []
-    for column in facts["paper"]:
-        name = column["name"]
-        most = ours["stereo_max"] if name == "stereo" else max(row[f"{name}_mm"] for row in rows)
-        note = "" if column["holds"] else " (differs from the rows)"
-        printed = "{printed_mean:.2f} / {printed_max:.2f}".format(**column) + note
-        by_rows = "{mean:.3f} / {max:.2f}".format(**column)
-        lines.append((name, printed, by_rows, f"{ours[f'{name}_mean']:.2f} / {most:.2f}"))
-    alone = f"{ours['servo_only_mean']:.3f} / {ours['servo_only_max']:.2f}"
-    lines.append(("servo-only", "not measured", "–", alone))
-    head = ("mean / maximum, mm", "paper, printed", "paper, by its rows", f"ours, {plural(ours['seeds'], 'seed')}")
-    return Table(head, tuple(lines))

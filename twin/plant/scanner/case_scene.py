@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.checks.markers import skin_fit
-from puncture_twin.twin.plant.outside_objects import OutsideObjects, Part, place_outside_objects
 from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, box, check_closed, rod
 
 METAL_HU = 8000.0
@@ -103,6 +102,27 @@ class TrueRod:
     forward_ct: Floats
 
 
+class Part(NamedTuple):
+    """One body outside of a patient; a later one fills the place of an earlier one.
+
+    Attributes:
+        name: What it is.
+        mesh: Closed, mm.
+        hu: What it is made of, Hounsfield units.
+        place: ``beneath`` the patient, as the bed; ``upon`` them, as arms and lines, which the body displaces;
+            ``within`` an arm, as its bones, which displace the body.
+    """
+
+    name: str
+    mesh: TriangleMesh
+    hu: float
+    place: Literal["beneath", "upon", "within"] = "upon"
+
+
+Placer = Callable[[TriangleMesh, float, np.random.Generator], tuple[Part, ...]]
+"""Of a skin in the scanner's frame, and the height along the bed that the image is about, mm."""
+
+
 @dataclass(frozen=True, eq=False)
 class CaseScene:
     """Content of the scanner, in its frame (LPS of the scan, mm).
@@ -138,7 +158,7 @@ def case_scene(
     *,
     marker: MarkerKind = "disc",
     needle: TrueRod | None = None,
-    outside_objects: OutsideObjects | None = None,
+    outside: Placer | None = None,
 ) -> CaseScene:
     """Place a case in the scanner.
 
@@ -149,7 +169,7 @@ def case_scene(
         rng: Draws each true marker in its cell.
         marker: What stands at each marker's place.
         needle: Drawn of metal, its usable length.
-        outside_objects: Arms, bed and lines outside of the patient.
+        outside: Places what lies outside of the patient.
 
     Raises:
         InputError: A structure's surface is open.
@@ -159,7 +179,7 @@ def case_scene(
     true = None if listed is None else _drawn_in_cells(case, listed, settings, rng)
     skin = anatomy.skin.mesh.transformed(T)
     target = apply(T, case.target_ct)
-    laid = () if outside_objects is None else place_outside_objects(skin, float(target[2]), outside_objects, rng)
+    laid = () if outside is None else outside(skin, float(target[2]), rng)
     solids = _body(case, anatomy)
     if true is not None:
         solids += _markers(true, skin_fit(true.points, anatomy.skin).normals_ct, marker)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Floats, Ints, rms
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, left_jacobian, pose, skew
 from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, coefficient_slope, distort
@@ -82,7 +82,7 @@ class Bundle:
     @property
     def rms_px(self) -> float:
         """Root mean square distance between seen and predicted pixels."""
-        return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))
+        return rms(self.residuals_px)
 
     def camera_covariance(self, camera: int) -> Floats:
         """Covariance of one camera's 14 parameters, shape (14, 14)."""

@@ -32,8 +32,6 @@ class Points(NamedTuple):
 
     points_c: Floats
     """Shape (n, 3), mm; NaN where a camera had no pixel."""
-    residual_px: Floats
-    """Root mean square reprojection error over the cameras, shape (n,): distance, px."""
     covariance: Floats
     """Shape (n, 3, 3), mm^2, from the pixels' covariances alone: the cameras are taken as true."""
 
@@ -64,10 +62,8 @@ def triangulate(cameras: Sequence[Camera], pixels: Floats, covariances: Floats |
         points = points + step
         if not np.any(np.abs(step) > CONVERGED_MM):
             break
-    residuals = np.stack([camera.project(points) for camera in cameras]) - pixels
-    residual = np.sqrt(np.mean(np.sum(residuals**2, axis=-1), axis=0))
     slope = _errors(cameras, points, pixels, whitening)[1]
-    return Points(points, np.asarray(residual), np.asarray(np.linalg.inv(slope.transpose(0, 2, 1) @ slope)))
+    return Points(points, np.asarray(np.linalg.inv(slope.transpose(0, 2, 1) @ slope)))
 
 
 def _linear(cameras: Sequence[Camera], pixels: Floats) -> Floats:

@@ -199,7 +199,7 @@ class JointModel:
 
     def _measured(self, x: Unknowns) -> tuple[Floats, Floats]:
         """Rows of the measuring arm's readings."""
-        k, sigma = len(self.observed.measured_c), max(self.observed.errors.measuring_mm, FLOOR_MM)
+        k, sigma = len(self.observed.measured_c), max(self.observed.errors.measuring_arm_mm, FLOOR_MM)
         J = np.zeros((k, 3, x.vector().size))
         _diagonal(J, 0, x.span("balls_c").start, np.tile(np.eye(3), (k, 1, 1)))
         roots = np.tile(np.eye(3) / sigma, (k, 1, 1))

@@ -25,6 +25,7 @@ from puncture_twin.planning.arm.kinematics import PARAMETERS, check_flanges, err
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.case.errors import ArmErrors
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 
@@ -36,24 +37,15 @@ PLAY_KNOWN = 0.25
 
 
 class DeclaredArm(NamedTuple):
-    """One arm: its nominal model, and standard deviations in mm and rad."""
+    """One arm: its nominal model, and what is declared of its errors; half the play stops a joint short."""
 
     model: UrModel
-    link_mm: float
-    """Deviation of every Denavit-Hartenberg length."""
-    twist_rad: float
-    """Deviation of every twist."""
-    joint_rad: float
-    """Deviation of every joint's zero."""
-    arrival_rad: float
-    """Deviation of every joint, anew at each arrival."""
-    play_rad: float = 0.0
-    """Half the width of every joint's play: how far it stops short of where it was sent; no deviation."""
+    errors: ArmErrors
 
     def deviations(self) -> Floats:
         """Deviations of the 23 parameters, shape (23,), mm and rad."""
-        sigma = np.zeros(N_ARM)
-        for kind, value in (("link", self.link_mm), ("twist", self.twist_rad), ("joint", self.joint_rad)):
+        sigma, errors = np.zeros(N_ARM), self.errors
+        for kind, value in (("link", errors.link_mm), ("twist", errors.twist), ("joint", errors.joint)):
             sigma[PARAMETERS[kind]] = value
         return sigma
 
@@ -65,11 +57,11 @@ class DeclaredArm(NamedTuple):
             turn: Direction in which each last rotated, shape (n, 6): 1, -1, or 0 where unknown.
         """
         J = error_jacobian(self.model, q, 0.0)
-        slopes, joints = J[..., :N_ARM] * self.deviations(), J[..., PARAMETERS["joint"]]
-        play = -self.play_rad * joints * turn[:, None, :]  # -half the width times the direction of rotation
-        if self.play_rad:
+        slopes, joints, half = J[..., :N_ARM] * self.deviations(), J[..., PARAMETERS["joint"]], self.errors.backlash / 2
+        play = -half * joints * turn[:, None, :]  # -half the width times the direction of rotation
+        if half:
             slopes = np.concatenate([slopes, PLAY_KNOWN * play], axis=2)
-        variance = self.arrival_rad**2 + self.play_rad**2 * (turn == 0.0)  # play is noise where its sign is unknown
+        variance = self.errors.repeatability**2 + half**2 * (turn == 0.0)  # play is noise where its sign is unknown
         arrival = (joints * variance[:, None, :]) @ np.swapaxes(joints, -1, -2)
         return FlangeMotions(slopes, play.sum(axis=2), arrival)
 
@@ -94,17 +86,17 @@ class DeclaredArms(NamedTuple):
 
     def scaled(self, factor: float) -> DeclaredArms:
         """Each deviation of both arms times a factor."""
-        return DeclaredArms(*(DeclaredArm(arm.model, *(factor * value for value in arm[1:])) for arm in self))
+        return DeclaredArms(*(arm._replace(errors=arm.errors.scaled(factor)) for arm in self))
 
 
-class ArmErrors(NamedTuple):
+class FlangeErrors(NamedTuple):
     """How both arms' errors move the flanges of a recording."""
 
     probe: FlangeMotions
     needle: FlangeMotions
 
 
-def arm_errors(declared: DeclaredArms, recording: Recording) -> ArmErrors:
+def arm_errors(declared: DeclaredArms, recording: Recording) -> FlangeErrors:
     """The errors of declared arms at a recording's joints.
 
     Raises:
@@ -119,7 +111,7 @@ def arm_errors(declared: DeclaredArms, recording: Recording) -> ArmErrors:
     unknown = np.zeros(q_probe.shape)
     turn_probe = unknown if recording.turn_probe is None else recording.turn_probe
     turn_needle = unknown if recording.turn_needle is None else recording.turn_needle
-    return ArmErrors(declared.probe.motions(q_probe, turn_probe), declared.needle.motions(q_needle, turn_needle))
+    return FlangeErrors(declared.probe.motions(q_probe, turn_probe), declared.needle.motions(q_needle, turn_needle))
 
 
 def corrected(T_base_flange: Floats, motion: Floats) -> Floats:
@@ -130,7 +122,7 @@ def corrected(T_base_flange: Floats, motion: Floats) -> Floats:
     return T
 
 
-def without_play(recording: Recording, errors: ArmErrors) -> Recording:
+def without_play(recording: Recording, errors: FlangeErrors) -> Recording:
     """The recording with its flanges where the declared play leaves them."""
     if not (errors.probe.play.any() or errors.needle.play.any()):
         return recording

@@ -102,7 +102,7 @@ def calibrate(
     # 3. What the recording cannot show, and the result with its covariance.
     cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None)
     cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
-    if arms is not None and recording.turn_probe is None and any(arm.play_rad > 0.0 for arm in arms):
+    if arms is not None and recording.turn_probe is None and any(arm.errors.backlash > 0.0 for arm in arms):
         cannot.append(PLAY_SIGN)
     found = calibration_of(*solved, tuple(cannot), arms)
     return found if needle_length_mm is None or known_tip is not None else with_length(found, needle_length_mm)

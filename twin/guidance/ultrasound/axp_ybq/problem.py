@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.rigid import skew
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import ArmErrors
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import FlangeErrors
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import DIRECTION, Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
     HALF_NORMAL,
@@ -58,7 +58,7 @@ class Problem(NamedTuple):
     """Which of the 19 parameters are free."""
     lean_rad: float = 0.0
     """How far a needle may lean out of the slice and still be seen; across, the image shows no more of a direction."""
-    arms: ArmErrors | None = None
+    arms: FlangeErrors | None = None
     """Errors of both arms, where they are declared."""
 
     @property

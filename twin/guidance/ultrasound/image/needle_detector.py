@@ -18,7 +18,6 @@ a needle that is tilted against the image plane the end that shows need not be t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -146,29 +145,25 @@ class Missed(StrEnum):
     NO_END = "no clear end of the needle in the image"
 
 
-@dataclass(frozen=True)
-class DetectorSettings:
-    """Thresholds of the detection, and the correction of the tip.
+LEAST_SCORE_MM = 9.0
+"""Sum along the segment, amplitude over background times mm, that makes a needle."""
 
-    Attributes:
-        least_score_mm: Sum along the segment, amplitude over background times mm, that makes a needle.
-        least_length_mm: Of the segment.
-        edge_mm: The tip is no nearer to the image's sides.
-        least_step: Fall of the amplitude at the tip, over background, that makes an end.
-        sure_step: Below it, the end is believed only where the search's own end agrees.
-        tip_bias: How far the detected tip lies beyond the true one along the shaft, on average, over the standard
-            deviation of the point spread in that direction; taken off. It comes from the tip's brightness: a property
-            of a needle in a machine, measured in the twin (benchmarks/detectors.py), to be measured anew elsewhere.
-        inclination_deg: Directions that are tried: angle to the probe's face, on either side.
-    """
+LEAST_LENGTH_MM = 6.0
+"""Of the segment."""
 
-    least_score_mm: float = 9.0
-    least_length_mm: float = 6.0
-    edge_mm: float = 1.5
-    least_step: float = 0.8
-    sure_step: float = 2.0
-    tip_bias: float = 0.4
-    inclination_deg: tuple[float, float] = (8.0, 82.0)
+EDGE_MM = 1.5
+"""The tip is no nearer to the image's sides."""
+
+LEAST_STEP, SURE_STEP = 0.8, 2.0
+"""Falls of the amplitude at the tip, over background: what makes an end, and below what the search's own must agree."""
+
+TIP_BIAS = 0.4
+"""How far the detected tip lies beyond the real one along the shaft, on average, over the standard deviation of the
+point spread in that direction. It comes from the tip's brightness: a property of a needle in a machine, measured in the
+twin (benchmarks/detectors.py), to be measured anew elsewhere."""
+
+INCLINATIONS = (float(np.radians(8.0)), float(np.radians(82.0)))
+"""Directions that are tried: angle to the probe's face, on either side."""
 
 
 class Detection(NamedTuple):
@@ -178,48 +173,45 @@ class Detection(NamedTuple):
     """Shape (2,), mm: (u, v), corrected for the bias."""
     direction_image: Floats
     """Unit, shape (2,): toward the tip."""
-    score_mm: float
-    """Sum along the visible segment of the amplitude over background, times mm."""
     contrast_db: float
     """Amplitude of the last piece of shaft over the background."""
     shaft_mm: float
     """Length of shaft that shows: the more, the better its direction is known."""
 
 
-def detect(image: Pixels, imager: Imager, settings: DetectorSettings | None = None) -> Detection | Missed:
+def detect(image: Pixels, imager: Imager, *, tip_bias: float = TIP_BIAS) -> Detection | Missed:
     """Detect the needle, or return why not.
 
     Args:
         image: Grey levels, shape (rows, columns).
         imager: Pixel, display range and point spread of the machine.
-        settings: What is believed.
+        tip_bias: What is taken off along the shaft, in point spreads.
 
     Raises:
         InputError: An image of another size than the imager's.
     """
-    settings = settings or DetectorSettings()
     if image.shape != (imager.rows, imager.columns):
         size = f"({imager.rows}, {imager.columns})"
         refuse(f"picture of shape {image.shape}", "needle detector", f"{size}, the imager's", "wrong_shape")
     relative = over_background(image, imager)
-    segment = _segment(relative, imager, settings)
+    segment = _segment(relative, imager)
     length = float(np.linalg.norm(segment.end - segment.start))
-    if segment.score < settings.least_score_mm:
+    if segment.score < LEAST_SCORE_MM:
         return Missed.NO_NEEDLE
-    if length < settings.least_length_mm:
+    if length < LEAST_LENGTH_MM:
         return Missed.TOO_SHORT
     line = _shaft_only(relative, imager, _ridge(relative, imager, segment))
     tip = _tip(relative, imager, line)
     disagree = abs(float((segment.end - line.point) @ line.direction) - tip.s)
-    if tip.step < settings.least_step or (tip.step < settings.sure_step and disagree > ENDS_AGREE_MM):
+    if tip.step < LEAST_STEP or (tip.step < SURE_STEP and disagree > ENDS_AGREE_MM):
         return Missed.NO_END
-    found = line.point + (tip.s - settings.tip_bias * _blur_along(imager, line)) * line.direction
+    found = line.point + (tip.s - tip_bias * _blur_along(imager, line)) * line.direction
     width, depth = imager.size_mm
-    high = np.array([width, depth]) - settings.edge_mm
-    if np.any(found < settings.edge_mm) or np.any(found > high):
+    high = np.array([width, depth]) - EDGE_MM
+    if np.any(found < EDGE_MM) or np.any(found > high):
         return Missed.TIP_AT_EDGE
     contrast = 20.0 * float(np.log10(max(1.0 + tip.step, 1e-6)))
-    return Detection(found, line.direction, segment.score, contrast, -line.start)
+    return Detection(found, line.direction, contrast, -line.start)
 
 
 def over_background(image: Pixels, imager: Imager) -> Floats:
@@ -231,11 +223,10 @@ def over_background(image: Pixels, imager: Imager) -> Floats:
     return np.asarray(imager.amplitude(image) / (MEAN_OVER_MEDIAN * imager.amplitude(grey)))
 
 
-def _segment(relative: Floats, imager: Imager, settings: DetectorSettings) -> Segment:
+def _segment(relative: Floats, imager: Imager) -> Segment:
     clipped = np.minimum(relative, BRIGHTEST) - 1.0 - EXPECTED
     small = np.asarray(cv2.GaussianBlur(clipped, (0, 0), COARSE / 1.5)[::COARSE, ::COARSE], dtype=np.float64)
-    low, high = np.radians(settings.inclination_deg)
-    right = np.arange(float(low), float(high), ANGLE_STEP, dtype=np.float64)
+    right = np.arange(*INCLINATIONS, ANGLE_STEP, dtype=np.float64)
     found = brightest_segment(small, np.concatenate([right, np.pi - right]))
     pixel = imager.pixel_mm * COARSE
     return Segment(found.start * pixel, found.end * pixel, found.score * pixel)

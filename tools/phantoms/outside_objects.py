@@ -15,6 +15,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.plant.scanner.case_scene import Part
 
 SHEATH_HU, WATER_HU, CORE_HU = 100.0, 0.0, 3000.0
 """Hounsfield units of plastic, of what flows in it, and of thin wires of copper with the plastic between; ours."""
@@ -33,21 +34,17 @@ class OutsideObjects(NamedTuple):
     bed: Bed = "none"
     lines: int = 0
 
+    def placed(self, skin: TriangleMesh, at_mm: float, rng: np.random.Generator) -> tuple[Part, ...]:
+        """Objects about a skin: the bed first, then arms, then lines.
 
-def place_outside_objects(
-    skin: TriangleMesh, at_mm: float, wanted: OutsideObjects, rng: np.random.Generator
-) -> tuple[Part, ...]:
-    """Objects about a skin: the bed first, then arms, then lines.
-
-    Args:
-        skin: In the scanner's frame, LPS mm: y to the back, z to the head.
-        at_mm: The height along the bed that the image is about.
-        wanted: What to draw.
-        rng: Draws it.
-    """
-    outline = Outline(skin)
-    found = [*bed(outline, wanted.bed, rng), *arms(outline, wanted.arms, at_mm, rng)]
-    return (*found, *lines(outline, wanted.lines, at_mm, rng))
+        Args:
+            skin: In the scanner's frame, LPS mm: y to the back, z to the head.
+            at_mm: The height along the bed that the image is about.
+            rng: Draws them.
+        """
+        outline = Outline(skin)
+        found = [*bed(outline, self.bed, rng), *arms(outline, self.arms, at_mm, rng)]
+        return (*found, *lines(outline, self.lines, at_mm, rng))
 
 
 def lines(outline: Outline, count: int, at_mm: float, rng: np.random.Generator) -> Iterator[Part]:
@@ -289,23 +286,6 @@ TUBE_SIDES = 24
 """Corners of a round section: at a radius of 50 mm the sides lie within 0.5 mm of the circle."""
 END_RINGS = 4
 """Rings of a round end."""
-
-
-class Part(NamedTuple):
-    """One body outside of a patient; a later one fills the place of an earlier one.
-
-    Attributes:
-        name: What it is.
-        mesh: Closed, mm.
-        hu: What it is made of, Hounsfield units.
-        place: ``beneath`` the patient, as the bed; ``upon`` them, as arms and lines, which the body displaces;
-            ``within`` an arm, as its bones, which displace the body.
-    """
-
-    name: str
-    mesh: TriangleMesh
-    hu: float
-    place: Literal["beneath", "upon", "within"] = "upon"
 
 
 def tube(points: Floats, radii: Floats, wide: Floats | None = None) -> TriangleMesh:

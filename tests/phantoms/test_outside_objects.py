@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
-from refusals import refused
 from scipy.spatial import cKDTree
 
-from puncture_twin.twin.jobs.experiment.scan_job import parse_beside
-from puncture_twin.twin.plant.outside_objects import Outline, OutsideObjects, drawn, place_outside_objects, tube
 from tools.phantoms.drawn.trunk import draw_trunk
+from tools.phantoms.outside_objects import Outline, OutsideObjects, drawn, tube
 
 SEEDS = range(4)
 
@@ -17,7 +15,7 @@ def laid(seed, **wanted):
     """A trunk's skin for trimesh, and what lies beside it by name."""
     rng = np.random.default_rng(seed)
     trunk = draw_trunk(rng)
-    parts = place_outside_objects(trunk.skin, float(trunk.target[2]), OutsideObjects(**wanted), rng)
+    parts = OutsideObjects(**wanted).placed(trunk.skin, float(trunk.target[2]), rng)
     return as_trimesh(trunk.skin), {one.name: one for one in parts}
 
 
@@ -129,12 +127,3 @@ def test_tube_and_section_have_their_volumes():
     assert np.ptp(flat.vertices[:, 0]) == pytest.approx(40.0) and np.ptp(flat.vertices[:, 1]) == pytest.approx(10.0)
     gutter = np.array([[-2.0, 0.0], [0.0, 1.0], [2.0, 0.0], [2.0, 1.0], [0.0, 2.0], [-2.0, 1.0]])
     assert as_trimesh(drawn(gutter, -3.0, 4.0)).volume == pytest.approx(4.0 * 1.0 * 7.0)
-
-
-@pytest.mark.parametrize(("arms", "bed", "said"), [("up", "none", "--arms"), ("none", "soft", "--bed")])
-def test_a_word_that_is_not_known_is_refused(arms, bed, said):
-    """With what is allowed; nothing asked for is None."""
-    with refused("unknown_choice", said):
-        parse_beside(arms, bed, 0)
-    assert parse_beside("none", "none", 0) is None
-    assert parse_beside("across", "pad", 2) == OutsideObjects("across", "pad", 2)
