@@ -20,9 +20,6 @@ AROUND_MM = 3.0
 BLUR_MM = 1.5
 """So far from its voxels a piece of metal still blurs into others; beyond, they show what it lies in."""
 
-TOUCHED = 1.01
-"""Voxels: the next one may be filled in part."""
-
 EDGE_MM = 1.5
 """mm by which the edges of wide metal protrude from the balls that fit into it."""
 
@@ -85,7 +82,12 @@ def metal_pieces(volume: Volume, level_hu: float = METAL_HU, without: Bools | No
 
 
 def metal_parts(
-    volume: Volume, metal: Metal, *, level_hu: float = METAL_HU, solid_hu: float = SOLID_HU, least: float = LEAST_PART
+    volume: Volume,
+    metal: Metal,
+    *,
+    level_hu: float = METAL_HU,
+    solid_hu: float = SOLID_HU,
+    reach_mm: Floats | float = BLUR_MM,
 ) -> Floats:
     """Part of each voxel of a piece's box that is metal, 0 to 1, as far as a clipped range allows.
 
@@ -95,34 +97,39 @@ def metal_parts(
     Args:
         level_hu: From where on other voxels of the box are metal too.
         solid_hu: Of a voxel that is wholly metal.
-        least: Below this a part is noise.
+        reach_mm: So far from its voxels metal blurs into others, or fills them in part; one number, or one an axis.
     """
     values = volume.values[metal.box].astype(np.float64)
-    every, outside = _sides(values, volume, metal, level_hu)
+    every, outside = _sides(values, volume, metal, level_hu, reach_mm)
     if not outside.any():
         return np.asarray(metal.voxels, dtype=np.float64)
-    background = metal_background(volume, metal, level_hu)
+    background = metal_background(volume, metal, level_hu, reach_mm)
     parts = (values - background) / (solid_hu - background)  # linear partial volume
     others = every & ~metal.voxels
     spacing = spacing_mm(volume)
     mine = ndimage.distance_transform_edt(~metal.voxels, spacing)
     strange = others.any() and mine >= ndimage.distance_transform_edt(~others, spacing)  # nearer to another piece
-    return np.where(outside | strange | (parts < least), 0.0, parts)
+    return np.where(outside | strange | (parts < LEAST_PART), 0.0, parts)
 
 
-def metal_background(volume: Volume, metal: Metal, level_hu: float = METAL_HU) -> Floats:
+def metal_background(
+    volume: Volume, metal: Metal, level_hu: float = METAL_HU, reach_mm: Floats | float = BLUR_MM
+) -> Floats:
     """What each voxel of a piece's box would show without metal, HU."""
     values = volume.values[metal.box].astype(np.float64)
-    _, outside = _sides(values, volume, metal, level_hu)
+    _, outside = _sides(values, volume, metal, level_hu, reach_mm)
+    if not outside.any():
+        return np.full_like(values, values.min())
     nearest = ndimage.distance_transform_edt(~outside, spacing_mm(volume), return_distances=False, return_indices=True)
     return np.asarray(_smooth(values, outside)[tuple(nearest)])
 
 
-def _sides(values: Floats, volume: Volume, metal: Metal, level_hu: float) -> tuple[Bools, Bools]:
-    """Of a piece's box: every voxel of metal, its own and others', and those that none blurs into, or fills in part."""
-    every, spacing = metal.voxels | (values > level_hu), spacing_mm(volume)
-    reach = np.maximum(BLUR_MM, TOUCHED * spacing)
-    return every, np.asarray(ndimage.distance_transform_edt(~every, spacing / reach) > 1.0)
+def _sides(
+    values: Floats, volume: Volume, metal: Metal, level_hu: float, reach_mm: Floats | float
+) -> tuple[Bools, Bools]:
+    """Of a piece's box: every voxel of metal, its own and others', and those that none reaches."""
+    every = metal.voxels | (values > level_hu)
+    return every, np.asarray(ndimage.distance_transform_edt(~every, spacing_mm(volume) / reach_mm) > 1.0)
 
 
 def full_part(volume: Volume) -> float:

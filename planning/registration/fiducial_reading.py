@@ -59,6 +59,8 @@ UNRESOLVED = 2.5
 """Voxels: what is no wider in the image shows no kind."""
 SKIN_EDGE_MM = 0.12
 """How far a marker is drawn along the skin's normal by what it hides of the skin's edge; metal is drawn less."""
+TOUCHED = 1.01
+"""Voxels from a marker: the next one may be filled in part."""
 ROUNDS = 7
 """Of Gauss-Newton; it settles after four or five."""
 SHIFT, SIZE, THICK, DENSITY, TILT = 0.5, 0.35, 0.7, 0.7, 0.25
@@ -183,14 +185,15 @@ def find_middle(box: Box) -> Middle | None:
     whole = (slice(0, mask.shape[0]), slice(0, mask.shape[1]), slice(0, mask.shape[2]))
     metal = Metal(whole, mask, np.zeros(3), float((sides * spacing).max()))
     full = min(1.0, box.ceiling_hu / solid)
-    parts = np.minimum(metal_parts(volume, metal, level_hu=level, solid_hu=solid), full)
+    reach = np.maximum(BLUR_MM, TOUCHED * spacing)
+    parts = np.minimum(metal_parts(volume, metal, level_hu=level, solid_hu=solid, reach_mm=reach), full)
     if not parts.any():
         return None
     centre = centroid(parts, whole, volume.T_ct_index)
     points = np.argwhere(parts > 0) @ volume.T_ct_index[:3, :3].T + volume.T_ct_index[:3, 3] - centre
     heavy = parts[parts > 0]
     spread = (points * heavy[:, None]).T @ points / heavy.sum()
-    return Middle(box, mask, centre, spread, peak, solid, metal_background(volume, metal, level))
+    return Middle(box, mask, centre, spread, peak, solid, metal_background(volume, metal, level, reach))
 
 
 def _joined(mask: Bools, at: Ints) -> Bools | None:

@@ -103,12 +103,6 @@ class Proposal:
     arm: str
     near_window_mm: float
 
-    @property
-    def distances_mm(self) -> Floats:
-        """Straight, of each to each, shape (n, n)."""
-        points = np.array([one.point_ct for one in self.places])
-        return np.asarray(np.linalg.norm(points[:, None] - points, axis=2))
-
 
 class _Skin(NamedTuple):
     """Places (n, 3) of the skin, mm, and normals out of it (n, 3)."""

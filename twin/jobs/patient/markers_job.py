@@ -196,7 +196,8 @@ def find_markers(source: Path, out: Path, stated: Stated, layout: Path | None, w
         lines = [f"{one.reading.shape.kind} {one.reading.shape.diameter_mm:.1f} mm" for one in run.seen.fiducials]
         points = np.array([one.position_ct for one in run.seen.fiducials])
         _write_lists(draft.folder, lists, NamedPoints(names, points, ct.space))
-        _draw(draft.folder, ct, names, points, lines)
+        hu_at = partial(nearest, ct.volume.values, np.asarray(np.linalg.inv(ct.volume.T_ct_index)))
+        _sheet(draft.folder, ct.name, names, points, lines, hu_at, ct.skin, NEAR_MM)
         run = replace(run, files=draft.final([draft.folder / name for name in written]))
         write_result(run.summary(), draft.folder / REPORT, out)
     return run
@@ -213,11 +214,6 @@ def _write_lists(folder: Path, lists: Sequence[str], points: NamedPoints) -> Non
     write_points(folder / lists[0], replace(points, points=to_lps(points.points, space)))
     for name in lists[1:]:
         (folder / name).write_text(markups_text("Fiducial", "markers", points.names, points.points), encoding="utf-8")
-
-
-def _draw(folder: Path, ct: SourceCt, names: Sequence[str], points_ct: Floats, lines: Sequence[str]) -> None:
-    T_index_ct = np.asarray(np.linalg.inv(ct.volume.T_ct_index))
-    _sheet(folder, ct.name, names, points_ct, lines, partial(nearest, ct.volume.values, T_index_ct), ct.skin, NEAR_MM)
 
 
 def _sheet(
