@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -235,14 +236,15 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     stated = parser.parse_args()
     rows: list[dict[str, Any]] = []
-    for seed in range(stated.first, stated.first + stated.scans):
-        one = control(np.random.default_rng(seed))
-        found = read(one)
-        row: dict[str, Any] = {"seed": seed, "extra": one.extra, "true_sagitta_mm": one.sagitta_mm,
-                               "spacing_mm": float(np.linalg.norm(one.volume.T_ct_index[:3, 2]))}  # fmt: skip
-        rows.append({**row, **({"refused": found} if isinstance(found, str) else errors(one, found))})
-    if stated.json:
-        stated.json.write_text("\n".join(map(json.dumps, rows)) + "\n", encoding="utf-8")
+    with nullcontext() if stated.json is None else stated.json.open("w", encoding="utf-8") as file:
+        for seed in range(stated.first, stated.first + stated.scans):
+            one = control(np.random.default_rng(seed))
+            found = read(one)
+            spacing_mm = float(np.linalg.norm(one.volume.T_ct_index[:3, 2]))
+            row = {"seed": seed, "extra": one.extra, "true_sagitta_mm": one.sagitta_mm, "spacing_mm": spacing_mm}
+            rows.append({**row, **({"refused": found} if isinstance(found, str) else errors(one, found))})
+            if file is not None:
+                print(json.dumps(rows[-1]), file=file, flush=True)
     print("\n".join(summary(rows)))
 
 

@@ -38,7 +38,7 @@ WINDOWS_MM = (14.0, 14.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 4.0, 4.0, 4.0)
 STEP_MM = 0.5
 CONTRAST_HU = 100.0
 """Least change of grey values that counts as a surface."""
-SHOWN_HU = (-400.0, 500.0)
+SHOWN_HU = (-1000.0, 500.0)
 """Values beyond say no more about where a surface is."""
 NEAR_MM = 2.5
 """A surface is found where it lies so near to its fitted place."""
