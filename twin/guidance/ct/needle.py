@@ -94,6 +94,8 @@ UNSURE_MM = 1.5
 
 UNKNOWN = np.full((6, 6), np.nan)
 """Covariance of what was not fitted."""
+AS_BRIGHT = 0.5
+"""Of a needle's brightness: long, thin metal below it that is not a needle's image is bone."""
 FARTHEST_MM = 3.0
 """The tip of a rod that was fitted lies so near to where its metal ends: else it is not its image."""
 
@@ -221,6 +223,9 @@ def read_needle(
         said += "; the one near the planned line is read: ({:.0f}, {:.0f}, {:.0f})".format(*chosen[0].tip_ct)
         findings = [Finding("two_needles", Severity.WARNING, said, {"needles": len(found)})]
     needle, hidden = chosen
+    if planned is not None and len(found) == 1 and not _of_plan(needle, *planned):
+        said = f"the needle lies more than {OF_PLAN_MM:g} mm or {OF_PLAN_DEG:g} degrees off the planned line"
+        findings = [Finding("far_from_plan", Severity.WARNING, said)]
     if needle.unclear:
         at = "({:.0f}, {:.0f}, {:.0f}) mm".format(*needle.tip_ct)
         what = (
@@ -273,8 +278,7 @@ def _needles(
                 continue
             found = _fitted(volume, whole, _toward(line, ends[0]), diameter_mm, hidden)
             if found is None and level == METAL_HU:  # never passed over in silence
-                path = np.stack([ends[0], 2 * line.middle - ends[0]])
-                found = FoundNeedle(ends[0], _toward(line, ends[0]).forward, line.width_mm, UNKNOWN, path, unclear=True)
+                found = _unclear(line, ends[0])
             if found is not None and not any(_same(one, found.path_ct) for one in known):
                 known.append(found._replace(leaves=ends[1]))
                 yield known[-1], hidden
@@ -466,9 +470,13 @@ THIN_MM = 1.2
 
 
 def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidden: Bools) -> FoundNeedle | None:
-    """The thin rod whose blurred and clipped image is nearest to the voxels about it; None where none is like them."""
+    """The thin rod whose blurred and clipped image is nearest to the voxels about it.
+
+    None where they are too dark for a needle; one that is unclear where they are not its image.
+    """
     start, full = _tip(volume, metal, line, diameter_mm), full_part(volume)
     parts = np.minimum(metal_parts(volume, metal), full).ravel()
+    typical = float(parts[metal.voxels.ravel()].mean())
     index = np.argwhere(np.ones(metal.voxels.shape, dtype=bool)) + [axis.start for axis in metal.box]
     places, shown = apply(volume.T_ct_index, index.astype(float)), ~hidden[tuple(index.T)]
     begun = np.zeros(7)
@@ -481,7 +489,7 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
         curve = _Curve(axes, *_layers(volume, axes), diameter_mm, full)
         image = curve.parts(np.zeros(11), local)
         bright = image > LEAST_METAL * image.max(initial=0.0)  # what a needle would show here: bone is far below
-        if not bright.any() or seen[bright].sum() < GAINS[0] / 2 * image[bright].sum():
+        if not bright.any() or typical < GAINS[0] / 2 * float(image[bright].mean()):
             return None
         starts = [begun, *(begun + more for more in _across(volume, axes, local[bright]) if not again)]
         straight = min((_settled(curve, one, local, seen) for one in starts), key=lambda fit: float(fit.cost))
@@ -504,13 +512,19 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
         or abs(ahead) > FARTHEST_MM + reach
         or not (GAINS[0] < gain < GAINS[1] and BLURS[0] < blur < BLURS[1])
     ):
-        return None
+        return _unclear(line, start) if typical > AS_BRIGHT * float(image[bright].mean()) else None
     forward = np.concatenate([[1.0], x[3:5]]) @ axes
     forward /= np.linalg.norm(forward)
     s = -np.linspace(0.0, length, 2 + int(bent) * int(length / 5.0))
     path = start + (np.column_stack([s, curve.off(x, s)]) + x[:3]) @ axes
     cov = _covariance(volume, fit, axes, forward, length)
     return FoundNeedle(path[0], forward, line.width_mm, cov, path, sagitta if bent else 0.0)
+
+
+def _unclear(line: _Line, tip_ct: Floats) -> FoundNeedle:
+    """Long, thin and dense metal that is not the image of a needle."""
+    path = np.stack([tip_ct, 2 * line.middle - tip_ct])
+    return FoundNeedle(tip_ct, _toward(line, tip_ct).forward, line.width_mm, UNKNOWN, path, unclear=True)
 
 
 def _about(local: Floats, seen: Floats, reach: float, width_mm: float) -> tuple[Bools, Floats]:
