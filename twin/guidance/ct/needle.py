@@ -518,6 +518,9 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
     s = -np.linspace(0.0, length, 2 + int(bent) * int(length / 5.0))
     path = start + (np.column_stack([s, curve.off(x, s)]) + x[:3]) @ axes
     cov = _covariance(volume, fit, axes, forward, length)
+    if length < SHORTEST_BENT_MM:  # too short to be called bent: its end may lean by what a bend would
+        lean = min(4.0 * sagitta / length, MOST_LEAN)
+        cov[3:, 3:] += lean**2 * (np.eye(3) - np.outer(forward, forward))
     return FoundNeedle(path[0], forward, line.width_mm, cov, path, sagitta if bent else 0.0)
 
 
@@ -570,6 +573,8 @@ def _settled(curve: _Curve, begun: Floats, local: Floats, seen: Floats) -> Optim
     return least_squares(misfit, begun, x_scale=SCALES[: len(begun)], method="lm", max_nfev=most)
 
 
+MOST_LEAN = 0.1
+"""Of a short needle's end against its chord, rad."""
 STRAIGHTENED = 2
 """Times that a straight rod is fitted: the first line through metal may hold something beside it."""
 SHORTEST_BENT_MM, BETTER = 40.0, 0.8
