@@ -12,7 +12,7 @@ What is long, thin and dense is a needle only if it has the image of such a rod,
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -212,16 +212,10 @@ def read_needle(
     found = list(_needles(volume, target_ct, diameter_mm, inside, markers))
     if not found:
         _refuse_none(volume, ", that enters the body")
-    chosen, findings = found[0], []
+    findings: list[Finding] = []
+    chosen = found[0]
     if len(found) > 1:
-        alike = [] if planned is None else [one for one in found if _of_plan(one[0], *planned)]
-        tips = "; ".join("({:.0f}, {:.0f}, {:.0f})".format(*one[0].tip_ct) for one in found)
-        said = f"{len(found)} needles enter the body, with tips at {tips} mm in the scan"
-        if len(alike) != 1:
-            refuse(said, volume.path, "one needle, or --plan whose line is near to only one", "two_needles")
-        chosen = alike[0]
-        said += "; the one near the planned line is read: ({:.0f}, {:.0f}, {:.0f})".format(*chosen[0].tip_ct)
-        findings = [Finding("two_needles", Severity.WARNING, said, {"needles": len(found)})]
+        chosen, findings = _chosen(volume, found, planned)
     needle, hidden = chosen
     if planned is not None and len(found) == 1 and not _of_plan(needle, *planned):
         said = f"the needle lies more than {OF_PLAN_MM:g} mm or {OF_PLAN_DEG:g} degrees off the planned line"
@@ -248,6 +242,23 @@ def read_needle(
 def _refuse_none(volume: Volume, how: str) -> None:
     allowed = f"a straight or slightly bent piece of metal of {SHORTEST_MM:g} mm or more{how}"
     raise InputError("no needle in the image", where=volume.path, allowed=allowed, code="needle_not_seen")
+
+
+def _chosen(
+    volume: Volume, found: Sequence[tuple[FoundNeedle, Bools]], planned: tuple[Floats, Floats] | None
+) -> tuple[tuple[FoundNeedle, Bools], list[Finding]]:
+    """Of several needles the only one near the planned line, and the warning that there are others.
+
+    Raises:
+        InputError: None is, or two are.
+    """
+    alike = [] if planned is None else [one for one in found if _of_plan(one[0], *planned)]
+    tips = "; ".join("({:.0f}, {:.0f}, {:.0f})".format(*one[0].tip_ct) for one in found)
+    said = f"{len(found)} needles enter the body, with tips at {tips} mm in the scan"
+    if len(alike) != 1:
+        refuse(said, volume.path, "one needle, or --plan whose line is near to only one", "two_needles")
+    said += "; the one near the planned line is read: ({:.0f}, {:.0f}, {:.0f})".format(*alike[0][0].tip_ct)
+    return alike[0], [Finding("two_needles", Severity.WARNING, said, {"needles": len(found)})]
 
 
 def _of_plan(needle: FoundNeedle, tip_ct: Floats, forward_ct: Floats) -> bool:
