@@ -658,6 +658,35 @@ def scan(
 
 
 @app.command()
+def confirm(
+    case: Annotated[Path | None, typer.Argument(metavar="CASE", help="Case file, or the folder that holds it.")] = None,
+    scan: Annotated[
+        Path | None, typer.Option("--scan", metavar="SCAN", help="Control CT: DICOM folder, NIfTI or NRRD.")
+    ] = None,
+    plan: Annotated[
+        Path | None, typer.Option("--plan", metavar="plan.json", help="The plan that was executed, to compare.")
+    ] = None,
+    learn: Annotated[
+        list[Path] | None,
+        typer.Option("--learn", metavar="confirm.json", help="Compare [errors] with confirmations; repeatable."),
+    ] = None,
+    out_dir: OutOfCaseOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the needle in a control CT; check the line that it takes; state the next aim. Exit 1 if it must move."""
+    from puncture_twin.twin.jobs.patient import confirm_job
+
+    source = confirm_job.confirm_source(case, scan, learn or [])
+    if source is None or scan is None:
+        learned = confirm_job.learn(learn or [])
+        finish("confirm --learn", learned, learned.summary(), learned.text(), as_json)
+        return
+    with prepared(source) as context:
+        done = confirm_job.confirm_case(context, scan, out_folder(out_dir, source, "confirm"), plan)
+    finish("confirm", done, done.summary(), done.text(), as_json)
+
+
+@app.command()
 def reproduce(
     paper: Annotated[str, typer.Argument(metavar="chen2019|liu2007|axp-ybq", help="Paper to reproduce.")],
     out_dir: OutOfCaseOption = None,

@@ -9,6 +9,7 @@ from .api import (
     check_folder as check_folder,
     check_many as check_many,
     compare as compare,
+    confirm as confirm,
     export as export,
     init_case as init_case,
     load_case as load_case,

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from puncture_twin.twin.jobs.batch.jobs import Merged
     from puncture_twin.twin.jobs.choosing.compare_job import Comparison
     from puncture_twin.twin.jobs.experiment.touch_job import TouchRun
+    from puncture_twin.twin.jobs.patient.confirm_job import Confirmed
     from puncture_twin.twin.jobs.patient.export_jobs import ExportedTable
     from puncture_twin.twin.jobs.patient.path_exports import PathExport
     from puncture_twin.twin.rehearsal.result import Rehearsal
@@ -647,6 +648,23 @@ def touch(
     from puncture_twin.twin.jobs.experiment.touch_job import touch
 
     return touch(context, stated_choice("touch", context, theta_deg, beta_deg, candidate, window, entry), seed)
+
+
+@checked
+def confirm(context: CaseContext, scan: Path | str, *, plan: Path | str | None = None) -> Confirmed:
+    """The needle in a control CT: where it is, what the line that it takes comes near to, and what to do next.
+
+    Args:
+        context: From `prepare`.
+        scan: A DICOM folder or a file in it, NIfTI or NRRD; of the same patient, in any frame.
+        plan: The ``plan.json`` that was executed, to compare.
+
+    Raises:
+        InputError: A scan that cannot be read, or tied to the case; no needle, two of them, or a tip that is not seen.
+    """
+    from puncture_twin.twin.jobs.patient.confirm_job import confirm_needle
+
+    return confirm_needle(context, Path(scan), None if plan is None else Path(plan))
 
 
 @checked

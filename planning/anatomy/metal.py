@@ -59,11 +59,14 @@ def wide_metal(volume: Volume, diameter_mm: float) -> Bools:
     Wide is what a ball fits into that is wider than the rod's own image.
     """
     metal, spacing = volume.values > METAL_HU, spacing_mm(volume)
-    radius = diameter_mm / 2 + BLUR_MM
-    core = ndimage.distance_transform_edt(np.pad(metal, 1), spacing)[1:-1, 1:-1, 1:-1] > radius  # erosion
-    if not core.any():
-        return np.zeros_like(metal)
-    return np.asarray(ndimage.distance_transform_edt(~core, spacing) <= radius + EDGE_MM + BLUR_MM)
+    radius, wide = diameter_mm / 2 + BLUR_MM, np.zeros(metal.shape, np.bool_)
+    reach = np.ceil((radius + EDGE_MM + BLUR_MM) / spacing).astype(int) + 1
+    for found in ndimage.find_objects(ndimage.label(metal)[0]):  # boxes: metal is a small part of an image
+        box = tuple(slice(max(one.start - more, 0), one.stop + more) for one, more in zip(found, reach, strict=True))
+        core = ndimage.distance_transform_edt(np.pad(metal[box], 1), spacing)[1:-1, 1:-1, 1:-1] > radius  # erosion
+        if core.any():
+            wide[box] |= ndimage.distance_transform_edt(~core, spacing) <= radius + EDGE_MM + BLUR_MM
+    return wide
 
 
 def metal_pieces(volume: Volume, level_hu: float = METAL_HU, without: Bools | None = None) -> Iterator[Metal]:

@@ -9,7 +9,21 @@ COMMANDS = [
     *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "live", "export", "register"],
     *["touch", "pivot", "markers"],
     *["calibrate", "calibrate hand-eye", "batch", "batch run", "batch status", "batch merge", "batch compare"],
-    *["schema", "init", "selfcal", "servo", "reproduce", "scan", "", "serch", "x" * 3000, "--help", "-h", "--version"],
+    *[
+        "schema",
+        "init",
+        "selfcal",
+        "servo",
+        "reproduce",
+        "scan",
+        "confirm",
+        "",
+        "serch",
+        "x" * 3000,
+        "--help",
+        "-h",
+        "--version",
+    ],
 ]
 """Not ``demo``, which needs nothing and takes a minute, nor ``batch plan``, which takes any folder."""
 
@@ -23,6 +37,9 @@ OPTIONS = {
     "--targets": "path",
     "--case": "path",
     "--from": "path",
+    "--scan": "path",
+    "--learn": "path",
+    "--plan": "path",
     "--recording": "path",
     "--shots": "path",
     "--noise": "word",

@@ -54,7 +54,7 @@ def given(context, tmp_path_factory):
         "case": CARTON / "case_m.toml", "cost": candidates.path.length,
         "theta_deg": 10.0, "beta_deg": 20.0, "one": candidates.best, "other": candidates.pick(0),
         "target_ct": TARGET, "format_name": "csv", "source": plan, "folder": tmp / "folder", "path": tmp / "nothing",
-        "cohort": tmp / "no_cohort", "target": TARGET,
+        "cohort": tmp / "no_cohort", "target": TARGET, "scan": tmp / "no_scan",
     }  # fmt: skip
 
 
@@ -102,8 +102,9 @@ def values(given):
     }
 
 
-WITHOUT = {"write_plan", "write_points", "read_certificate", "read_volume"}
-"""They return nothing, or what another one of the list returns; a volume is shown below."""
+WITHOUT = {"write_plan", "write_points", "read_certificate", "read_volume", "confirm"}
+"""They return nothing, or what another one of the list returns; a volume is shown below, and a
+confirmation where one is made (test_confirm.py)."""
 
 
 def test_everything_that_a_function_returns_shows_itself(values):

@@ -15,6 +15,7 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.base.output.manifest import MANIFEST_NAME, problems
 from puncture_twin.run_twin import app
 from puncture_twin.twin.jobs.exit_codes import INTERRUPTED
+from puncture_twin.twin.plant.scanner.writers import write_nifti
 
 PROGRAM = """
 import os, signal, sys, threading
@@ -34,7 +35,7 @@ sys.exit(code if sent.is_set() else %d)
 ENDED_BEFORE = 77
 """The program's exit code where the command ended before it was interrupted: the machine is too fast."""
 
-QUICK = {"register", "verify", "init", "pivot", "batch", "schema", "calibrate"}
+QUICK = {"register", "verify", "init", "pivot", "batch", "schema", "calibrate", "confirm"}
 """Commands that take less than the second after which the others are interrupted."""
 
 WRITING = {
@@ -49,6 +50,7 @@ WRITING = {
     "servo",
     "reproduce",
     "scan",
+    "confirm",
     "touch",
     "markers",
 }
@@ -75,6 +77,9 @@ def typed(tmp_path_factory):
         shutil.copy(mesh, meshes)
     write_pairs(here / "pairs.csv", hand_eye_problem(np.random.default_rng(1), 20)[0])
     angles = ["--theta", "0", "--beta", "0"]
+    control = write_nifti(
+        here / "control.nii.gz", np.full((60, 60, 40), -1000, np.int16), np.diag([3.0, 3.0, 3.0, 1.0])
+    )
     return {
         "demo": [],
         "init": [str(meshes), "--target=-90,-10,60"],
@@ -91,6 +96,7 @@ def typed(tmp_path_factory):
         "batch": ["plan", str(cohort)],
         "scan": [case],
         "markers": [case, "--propose", "3"],
+        "confirm": [case, "--scan", str(control)],
         "touch": [case],
         "pivot": [case, str(here / "joints.csv")],  # it reads the case first
         "selfcal": [str(here / "selfcal")],

@@ -93,6 +93,8 @@ RULES: Mapping[str, Rule] = MappingProxyType(
         "calibrate hand-eye": Rule("never: poses that do not determine the calibration, or contradict it, are refused"),
         "servo": Rule("a servo did not converge", _unless(lambda job: job.passed)),
         "scan": Rule(NEVER),
+        "confirm": Rule("the line is not safe, or the needle had better be moved", _unless(lambda done: done.yes)),
+        "confirm --learn": Rule(NEVER),
         "reproduce": Rule("one of the paper's numbers is outside its limits", _unless(lambda result: result.passed)),
         "batch plan": Rule(NEVER),
         "batch run": Rule("a case of the part has no verdict (3 if the program failed on one)", _code_of_batch),

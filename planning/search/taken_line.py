@@ -1,0 +1,271 @@
+"""The line that a needle really takes: its verdict, structure by structure, and what to do next.
+
+A planned direction starts in the target; a needle that is in the patient starts in its tip, and may be bent. Each piece
+of its path is measured by the same engine, against the same structures and margins, from the piece's own end:
+
+    clearance_j = min over pieces (distance of the piece from j) - needle radius
+    safe: clearance_j - SURE sd_j >= margin_j for every j,    sd_j^2 = g' Sigma6 g,  g = (n; s u x n)
+
+with Sigma6 the covariance of the tip as it was read, s the depth from it. What is nearer than that is not called safe.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from puncture_twin.planning.anatomy.skin import SkinPaths, skin_paths
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.reasons import Reason
+from puncture_twin.planning.base.strict_json import or_null
+from puncture_twin.planning.clearance.engine import Clearances, measure, normals_of
+from puncture_twin.planning.registration.fits import carried
+from puncture_twin.planning.search.constraints import first_broken
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.uncertainty.hit import hit_in_mesh, hit_model, mean_over_faces, proximity, touch_chance
+
+SURE = 2.0
+"""Standard deviations of the reading that a clearance must exceed its margin by: then the line is called safe."""
+SAFE, UNCERTAIN = "safe", "uncertain"
+"""A line that is safe by as much, and one that breaks no margin but might by what its reading may err."""
+WANTED_HIT = 0.95
+"""Chance to hit with which a needle is accepted, where the case states none."""
+BETTER = 0.02
+"""By which a chance must be larger for a needle to be moved again."""
+TURN_SD = np.radians(0.5)
+"""Standard deviation of a direction that is aimed anew at the skin, in each plane, rad."""
+LEAST_MM = 0.5
+"""A smaller step is none."""
+
+
+class Clear(NamedTuple):
+    """How near the needle comes to a structure, mm.
+
+    Attributes:
+        depth_mm: From the tip, along the needle, of the nearest point.
+        sd_mm: Of the clearance, by what the reading may err; NaN where they intersect.
+        margin_mm: NaN of what may be crossed.
+        p_touch: To first order, with what the surface itself may lie off; NaN where they intersect.
+    """
+
+    name: str
+    clearance_mm: float
+    sd_mm: float
+    margin_mm: float
+    depth_mm: float
+    p_touch: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether it keeps its margin by `SURE` standard deviations."""
+        return bool(np.isnan(self.margin_mm)) or self.clearance_mm - SURE * self.sd_mm >= self.margin_mm
+
+    def document(self) -> dict[str, Any]:
+        """Plain values."""
+        return {name: value if isinstance(value, str) else or_null(value) for name, value in self._asdict().items()}
+
+
+@dataclass(frozen=True, eq=False)
+class LineCheck:
+    """The verdict of a line.
+
+    Attributes:
+        verdict: `SAFE`, `UNCERTAIN`, or a code of `Reason`.
+        structure: Which one decides; empty where none does.
+        each: Every structure, nearest to its margin first.
+        entry_ct: Shape (3,), where it enters the skin; NaN where it does not.
+        inserted_mm: From there to the tip.
+    """
+
+    verdict: str
+    structure: str
+    each: tuple[Clear, ...]
+    entry_ct: Floats
+    inserted_mm: float
+
+    @property
+    def safe(self) -> bool:
+        """Whether it keeps every margin, the reading's error counted."""
+        return self.verdict == SAFE
+
+
+def check_line(context: CaseContext, path_ct: Floats, cov_ct: Floats) -> LineCheck:
+    """Check a needle where it lies.
+
+    Args:
+        context: Of the case; its arm is not asked.
+        path_ct: Shape (m, 3), LPS mm, from the tip outward; beyond its last point it goes on straight.
+        cov_ct: Shape (6, 6), of the tip and of the direction, as rotation.
+    """
+    case, checked = context.case, context.anatomy.checked
+    steps = np.diff(path_ct, axis=0)
+    sizes = np.linalg.norm(steps, axis=1)
+    starts = np.concatenate([[0.0], np.cumsum(sizes)[:-1]])
+    best, violated = _nearest(context, path_ct, cov_ct, starts)
+    paths = _skin(context, path_ct, steps / sizes[:, None], starts, sizes)
+    found = Clearances(best["clearance"][None], best["depth"][None], violated[None])
+    broken = first_broken(paths, found, checked, needle=case.needle, max_skin_angle=np.pi)
+    margins = [one.margin_mm if one.demands_margin else np.nan for one in checked]
+    columns = zip(best["clearance"], best["sd"], margins, best["depth"], best["touch"], strict=True)
+    each = [Clear(one.name, *map(float, column)) for one, column in zip(checked, columns, strict=True)]
+    each.sort(key=lambda one: (np.isnan(one.margin_mm), one.clearance_mm - np.nan_to_num(one.margin_mm)))
+    verdict, structure = str(broken.reason[0]), str(broken.structure[0])
+    if not verdict:
+        unsure = min(
+            (one for one in each if not one.sure), key=lambda one: one.clearance_mm - one.margin_mm, default=None
+        )
+        verdict, structure = (SAFE, "") if unsure is None else (UNCERTAIN, unsure.name)
+    return LineCheck(verdict, structure, tuple(each), paths.entry_ct[0], float(paths.path_length[0]))
+
+
+def _nearest(context: CaseContext, path_ct: Floats, cov_ct: Floats, starts: Floats) -> tuple[dict[str, Floats], Bools]:
+    """Of each structure the least clearance of all pieces, its depth, deviation and chance to touch; which is violated.
+
+    Args:
+        starts: Shape (m - 1,), where each piece begins, mm behind the tip.
+    """
+    case, checked, engine = context.case, context.anatomy.checked, context.engine
+    steps = np.diff(path_ct, axis=0)
+    sizes = np.linalg.norm(steps, axis=1)
+    errors = context.pose_error or case.errors
+    voxels = [one.voxel_ct for one in checked]
+    surfaces = np.array([np.zeros((3, 3)) if errors is None else errors.surface_cov_ct(one) for one in voxels])
+    k = len(checked)
+    best = {name: np.full(k, np.inf) for name in ("clearance", "depth", "sd", "touch")}
+    violated = np.zeros(k, bool)
+    for row, (begin, outward) in enumerate(zip(path_ct[:-1], steps / sizes[:, None], strict=True)):
+        last = row == len(sizes) - 1
+        length = max(case.needle.length_mm - starts[row], sizes[row]) if last else sizes[row]
+        axes = engine.measure(begin, outward[None], np.full((1, k), length), shown=False)
+        own = measure(engine, checked, begin, outward[None], length=length, radius=case.needle.radius_mm, axes=axes)
+        normal = normals_of(engine.triangles, begin, outward[None], axes)
+        depth = starts[row] + own.depth
+        surface = np.sqrt(np.einsum("nka,kab,nkb->nk", np.nan_to_num(normal), surfaces, np.nan_to_num(normal)))
+        bare, whole = (
+            proximity(axes.distance, depth, normal, outward[None], cov_ct[None], off) for off in (0.0, surface)
+        )
+        touch = touch_chance(whole, case.needle.radius_mm)
+        nearer = own.clearance[0] < best["clearance"]
+        for name, found in (("clearance", own.clearance), ("depth", depth), ("sd", bare.deviation), ("touch", touch)):
+            best[name] = np.where(nearer, found[0], best[name])
+        violated |= own.violated[0]
+    return best, violated
+
+
+def _skin(context: CaseContext, path_ct: Floats, outward: Floats, starts: Floats, sizes: Floats) -> SkinPaths:
+    """The skin along a path of pieces, as one path of `skin_paths`: its last crossing is the entry."""
+    found: list[tuple[float, Floats, float]] = []
+    unknown = np.nan
+    for row, (begin, along) in enumerate(zip(path_ct[:-1], outward, strict=True)):
+        last = row == len(sizes) - 1
+        farthest = max(context.case.needle.length_mm - starts[row], 1.0) if last else sizes[row]
+        one = skin_paths(context.anatomy.skin, begin, along[None], farthest)
+        if one.path_length[0] <= farthest:
+            found.append((starts[row] + float(one.path_length[0]), one.entry_ct[0], float(one.skin_angle[0])))
+        again = float(one.reentry_depth[0])
+        if again <= farthest:
+            found.append((starts[row] + again, begin + again * along, np.nan))
+        if one.unknown_depth[0] <= farthest:
+            unknown = starts[row] + float(one.unknown_depth[0])
+    depth, entry, angle = found[0] if found else (np.nan, np.full(3, np.nan), np.nan)
+    again = found[1][0] if len(found) > 1 else np.nan
+    return SkinPaths(entry[None], *(np.array([one]) for one in (depth, angle, again, unknown)))
+
+
+class Aim(NamedTuple):
+    """Something to do next, and what comes of it.
+
+    Attributes:
+        kind: ``accept``, ``deeper`` (x mm; below 0 back), ``turn`` (to the skin and on by an angle) or ``withdraw``.
+        by_mm: How much deeper, along the needle; of a turn how far back first.
+        turn_deg: Between the needle and the line from its entry to the target.
+        p_hit: The chance that the tip is in the target then, by what is known of the reading; NaN where unknown.
+        lateral_mm: By which the tip, or its line, passes the target then.
+        verdict: Of the line that the needle takes then.
+    """
+
+    kind: str
+    by_mm: float
+    turn_deg: float
+    p_hit: float
+    lateral_mm: float
+    verdict: str
+    structure: str
+
+    @property
+    def allowed(self) -> bool:
+        """Whether its line is safe."""
+        return self.verdict == SAFE
+
+    def document(self) -> dict[str, Any]:
+        """Plain values."""
+        return {name: value if isinstance(value, str) else or_null(value) for name, value in self._asdict().items()}
+
+
+def next_aims(context: CaseContext, path_ct: Floats, forward_ct: Floats, cov_ct: Floats, now: LineCheck) -> list[Aim]:
+    """Everything that can be done with a needle, the best first.
+
+    Args:
+        path_ct: As for `check_line`, which gave ``now``.
+        forward_ct: Shape (3,), unit, the direction in which it goes on.
+        cov_ct: Shape (6, 6), at the tip.
+    """
+    target, tip = context.case.target_ct, path_ct[0]
+    away = target - tip
+    deeper = float(away @ forward_ct)
+    lateral = float(np.linalg.norm(away - deeper * forward_ct))
+    aims = [Aim("accept", 0.0, 0.0, hit_chance(context, tip, cov_ct[:3, :3]), lateral, now.verdict, now.structure)]
+    if abs(deeper) >= LEAST_MM:
+        end = tip + deeper * forward_ct
+        X = carried(tip, end)
+        cov = X @ cov_ct @ X.T
+        ahead = [end, *path_ct] if deeper > 0 else [end, *path_ct[(path_ct - end) @ forward_ct < -LEAST_MM]]
+        then = check_line(context, np.array(ahead), cov) if len(ahead) > 1 else now
+        chance = hit_chance(context, end, cov[:3, :3])
+        aims.append(Aim("deeper", deeper, 0.0, chance, lateral, then.verdict, then.structure))
+    if np.isfinite(now.entry_ct).all():
+        span = now.entry_ct - target
+        depth = float(np.linalg.norm(span))
+        outward = span / depth
+        across = np.eye(3) - np.outer(outward, outward)
+        cov = cov_ct.copy()
+        cov[:3, :3] += (depth * TURN_SD) ** 2 * across
+        cov[3:, 3:] += TURN_SD**2 * across
+        then = check_line(context, np.stack([target, now.entry_ct]), cov)
+        turn = float(np.degrees(np.arccos(np.clip(-forward_ct @ outward, -1.0, 1.0))))
+        chance = hit_chance(context, target, cov[:3, :3])
+        aims.append(Aim("turn", now.inserted_mm, turn, chance, 0.0, then.verdict, then.structure))
+    return _ranked(context, aims, now)
+
+
+def _ranked(context: CaseContext, aims: list[Aim], now: LineCheck) -> list[Aim]:
+    """The least change first that is safe and hits as often as wanted; else the safe one that hits most."""
+    wanted = context.case.search.min_hit or WANTED_HIT
+    allowed = [one for one in aims if one.allowed]
+    if not allowed:
+        out = Aim("withdraw", now.inserted_mm, 0.0, float("nan"), float("nan"), now.verdict, now.structure)
+        return [out, *aims]
+    most = max(np.nan_to_num(one.p_hit) for one in allowed)
+    first = next(one for one in allowed if np.nan_to_num(one.p_hit) >= min(wanted, most - BETTER))
+    return [first, *(one for one in aims if one is not first)]
+
+
+def hit_chance(context: CaseContext, tip_ct: Floats, cov_ct: Floats) -> float:
+    """The chance that a tip (3,), read with a covariance (3, 3), is in the target; NaN of an open mesh."""
+    case, target = context.case, context.anatomy.structure(context.case.target_structure)
+    if case.hit_radius_mm is None and not target.mesh.closed:
+        return float("nan")
+    errors, surface = context.pose_error or case.errors, 0.0
+    if case.errors is not None and case.hit_radius_mm is not None:
+        cov_ct = cov_ct + case.errors.target_cov_ct
+    elif errors is not None:
+        surface = mean_over_faces(target.mesh, errors.surface_cov_ct(target.voxel_ct))
+    rays = hit_model(case.hit_radius_mm, target.mesh, case.target_ct, tip_ct - case.target_ct).rays
+    assert rays is not None
+    return float(hit_in_mesh(rays, np.asarray(cov_ct)[None], None, surface)[0])
+
+
+NOT_SAFE = {Reason.TOO_CLOSE.value: "too close to", Reason.UNKNOWN_REGION.value: "in an unknown region:"}
+"""Words of a verdict before its structure."""

@@ -1,0 +1,119 @@
+"""Control scans whose truth is known: the needle that is read, what is refused, and the frame that is tied."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from refusals import refused
+
+from benchmarks.confirm import MUST_REFUSE, control, errors, read
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.rigid import apply, inverse, pose, rotation_angle
+from puncture_twin.twin.guidance.ct.tie import body_of, tie_frames
+
+CODES = {
+    "second": {"two_needles"},
+    "no needle": {"needle_not_seen"},
+    "cut": {"tip_outside_image"},
+    "bolt": {"tip_hidden", "needle_unclear"},
+}
+
+
+def drawn(count, **stated):
+    """Scans of one kind, each of its own seed."""
+    return [control(np.random.default_rng(900 + seed), **stated) for seed in range(count)]
+
+
+def test_tip_and_axis_of_straight_needles():
+    """Any slices, streaks, blur and tilt: half a voxel and a third of a degree, and seldom outside what is stated."""
+    scans = [one for spacing in (1.5, 3.0) for one in drawn(4, extra="none", bent=False, spacing=spacing)]
+    found = [errors(one, read(one)) for one in scans]
+    flat = [one["axis_sd_deg"] > 0.4 for one in found]  # in few slices: said, not known
+    assert np.sqrt(np.mean([one["tip_voxels"] ** 2 for one in found])) < 0.5
+    assert np.sqrt(np.mean([one["axis_deg"] ** 2 for one, few in zip(found, flat, strict=True) if not few])) < 0.3
+    assert all(one["axis_square"] < 13.8 for one in found) and sum(flat) <= 2
+    assert sum(one["tip_square"] > 16.3 for one in found) <= 1  # once in a thousand, of chi-squared
+    assert sum(one["sagitta_mm"] > 0 for one in found) <= 1
+
+
+def test_bent_needles():
+    """Called bent, and the end's direction is the end's, not the chord's."""
+    found = [(one, errors(one, read(one))) for one in drawn(3, extra="none", bent=True, spacing=1.5)]
+    assert all(seen["sagitta_mm"] > 0.2 for _, seen in found)
+    assert np.sqrt(np.mean([seen["tip_mm"] ** 2 for _, seen in found])) < 0.3
+    assert np.sqrt(np.mean([seen["axis_deg"] ** 2 for _, seen in found])) < 0.6
+
+
+@pytest.mark.parametrize("extra", ["wire", "vessel"])
+def test_what_is_no_needle(extra):
+    """A wire on the skin and a vessel with contrast are passed over: the needle beside them is read."""
+    for one in drawn(1, extra=extra, bent=False, spacing=2.0):
+        assert errors(one, read(one))["tip_mm"] < 0.5
+
+
+@pytest.mark.parametrize("extra", sorted(MUST_REFUSE))
+def test_what_is_said_and_never_guessed(extra):
+    """No needle, two alike, a tip beyond the image, a tip at other metal."""
+    for one in drawn(2, extra=extra, spacing=2.0):
+        if one.extra == extra:  # a tip across a corner is in the image
+            assert read(one) in CODES[extra]
+
+
+def test_of_two_needles_the_plans_is_read():
+    """The other one lies elsewhere, at another angle."""
+    one = control(np.random.default_rng(902), extra="far second", bent=False, spacing=2.0)
+    assert errors(one, read(one))["tip_mm"] < 0.5
+
+
+def body(one, markers=None):
+    """What the case of a scan knows."""
+    return body_of(one.skin, one.bones, [one.skin, *one.bones], one.tip, markers, 0.04 * np.eye(3))
+
+
+def off(one, tie):
+    """How far the target is mapped from where it belongs, mm, and by how much too far rotated, degrees."""
+    gap = apply(inverse(tie.T_scan_ct), apply(one.T_scan_ct, one.tip)) - one.tip
+    return gap, float(np.degrees(rotation_angle(tie.T_scan_ct[:3, :3] @ one.T_scan_ct[:3, :3].T)))
+
+
+def test_frames_are_tied_by_markers_and_by_the_body():
+    """A patient who has moved by some millimetres and degrees: within what is stated, and it is said in one frame."""
+    one = control(np.random.default_rng(0), extra="none", spacing=2.0)
+    by_body, by_markers = (tie_frames(one.volume, body(one, known), same_frame=True) for known in (None, one.markers))
+    assert (by_body.how, by_markers.how) == ("body", "markers")
+    for tie in (by_body, by_markers):
+        gap, turn = off(one, tie)
+        assert np.linalg.norm(gap) < 1.2 and turn < 0.8
+        assert gap @ np.linalg.solve(tie.cov_ct[:3, :3], gap) < 16.3
+        assert [said.code for said in tie.findings] == ["patient_moved"]
+
+
+def test_another_frame_is_found_again():
+    """The scan's frame lies elsewhere: markers by their distances, or the body by a search."""
+    one = control(np.random.default_rng(3), extra="none", spacing=2.0, moved=False)
+    away = pose(np.eye(3), np.array([310.0, -45.0, 620.0]))
+    moved = replace(
+        one, volume=Volume(one.volume.values, away @ one.volume.T_ct_index, one.volume.path), T_scan_ct=away
+    )
+    for known in (one.markers, None):
+        tie = tie_frames(moved.volume, body(moved, known), same_frame=False)
+        assert np.linalg.norm(off(moved, tie)[0]) < 1.2
+        assert np.isnan(tie.moved_mm)
+
+
+def test_a_mirrored_scan_is_refused():
+    """Left and right changed places in the image: markers or not."""
+    one = control(np.random.default_rng(4), extra="none", spacing=2.0)
+    mirrored = Volume(one.volume.values[::-1], one.volume.T_ct_index, one.volume.path)
+    for known in (one.markers, None):
+        with refused("mirrored"):
+            tie_frames(mirrored, body(one, known), same_frame=True)
+
+
+def test_another_body_is_refused():
+    """A block, where the case has a trunk."""
+    one = control(np.random.default_rng(5), extra="none", spacing=2.0)
+    values = np.full(one.volume.values.shape, -1000, np.int16)
+    values[30:-30, 30:-30, 10:-10] = 40
+    with refused("frames_not_tied"):
+        tie_frames(Volume(values, one.volume.T_ct_index, one.volume.path), body(one), same_frame=True)

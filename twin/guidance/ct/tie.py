@@ -1,0 +1,416 @@
+"""The frame of a control scan tied to a case's: by the markers that both show, or by skin and bone.
+
+A surface of the case lies in the scan where grey values change along its normal n by half of what they change in all.
+With q_i = T p_i, c their middle and d_i the distance of that place along n_i:
+
+    min sum w_i (n_i . (t + r x (q_i - c)) - d_i)^2      Gauss-Newton over shift t and rotation r, w by Tukey
+
+The fit is held to the same surfaces mirrored: a body that lies better so is another patient's, or was turned over. The
+needle's own metal, and the markers', show no surface.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
+
+from puncture_twin.planning.anatomy.metal import METAL_HU, centroid, metal_pieces, metal_weights
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
+from puncture_twin.planning.evidence.edges import Sample, sample_surfaces
+from puncture_twin.planning.formats.points import NamedPoints
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rotation_angle
+from puncture_twin.planning.registration.fits import carried, design, fit_rigid, least_squares_map
+
+SAMPLES, COARSE_SAMPLES = 1800, 500
+"""Points of the surfaces: of the fit, and of the search for where it starts."""
+WINDOWS_MM = (14.0, 14.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 4.0, 4.0, 4.0)
+"""How far along its normal a surface is looked for, step by step."""
+STEP_MM = 0.5
+CONTRAST_HU = 100.0
+"""Least change of grey values that counts as a surface."""
+SHOWN_HU = (-1000.0, 500.0)
+"""Values beyond say no more about where a surface is."""
+NEAR_MM = 2.5
+"""A surface is found where it lies so near to its fitted place."""
+LEAST_FOUND, LEAST_SEEN = 0.6, 120
+"""Least fraction of the surfaces in the image that are found, and least number of points of them."""
+MIRRORED = 0.8
+"""Misfit over that of the mirrored surfaces, above which nobody can tell which of them the scan shows."""
+UNSURE_MM = 3.0
+"""A tie whose standard deviation at the target is larger is none."""
+PATCH_SD = 0.7
+"""By how much of the residuals a patch of the surface errs as a whole: contours are not independent point by point."""
+LEAST_MM, LEAST_DEG = 0.4, 0.2
+"""Standard deviations of a fit to surfaces that more points do not lessen: how two scans are segmented."""
+INNER_MM, LEAST_OF_ORGAN, MOST_OF_ORGAN, OF_MARKER = 3.0, 40, 20.0, 20.0
+"""Of the evidence that a symmetric body is not mirrored: how far from an organ's surface grey values are compared, on
+how many points at least; and the most that an organ, and a marker, says."""
+SEARCH_MM, SEARCH_STEP_MM = 60.0, 12.0
+"""Shifts that are tried where no frame is shared."""
+MARKER_MM = 12.0
+"""A marker lies no farther from where the body says."""
+SIDES_MM = 4.0
+"""Distances between markers agree so well, where they are recognised by them."""
+LARGEST_MM = 25.0
+"""A larger piece of metal is no marker."""
+MARKER_SD_VOXEL = 0.15
+"""Of a marker's middle, in voxels along each axis."""
+LOOSE = 3.0
+"""Residuals of markers this many times what is declared: one has moved, and the body ties the frames instead."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """What a case knows of a patient and a scan shows again; LPS mm of the case.
+
+    Attributes:
+        sample: Points on skin and bones.
+        organs: Points on every structure.
+        markers: Those of the registration, or None.
+        marker_cov: Shape (3, 3), mm², of their reading in the case's CT.
+        target_ct: Shape (3,), where the tie must be known.
+    """
+
+    sample: Sample
+    organs: Sample
+    markers: NamedPoints | None
+    marker_cov: Floats
+    target_ct: Floats
+
+
+def body_of(
+    skin: TriangleMesh,
+    bones: Sequence[TriangleMesh],
+    organs: Sequence[TriangleMesh],
+    target_ct: Floats,
+    markers: NamedPoints | None,
+    cov: Floats,
+) -> Body:
+    """The body of surfaces and markers; arguments as the attributes of `Body`."""
+    return Body(
+        sample_surfaces([skin, *bones], 4 * SAMPLES), sample_surfaces(organs, 4 * SAMPLES), markers, cov, target_ct
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Tie:
+    """Where the case's frame lies in a scan.
+
+    Attributes:
+        T_scan_ct: Shape (4, 4).
+        cov_ct: Shape (6, 6), of its inverse at the target: shift (mm) and rotation (rad), axes of the case.
+        how: ``markers`` or ``body``.
+        residual_mm: Root mean square of the markers, or of the surfaces that were found.
+        found: Fraction of the surfaces in the image that were found.
+        moved_mm: How far the target lies from where one frame would have it, and
+        moved_deg: the rotation; NaN where the scan has a frame of its own.
+    """
+
+    T_scan_ct: Floats
+    cov_ct: Floats
+    target_ct: Floats
+    how: str
+    residual_mm: float
+    found: float
+    moved_mm: float
+    moved_deg: float
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def sd_mm(self) -> float:
+        """Standard deviation at the target in its worst direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.cov_ct[:3, :3])[-1]))
+
+    def cov_at(self, point_ct: Floats) -> Floats:
+        """Covariance of the inverse at another point (3,)."""
+        X = carried(self.target_ct, point_ct)
+        return np.asarray(X @ self.cov_ct @ X.T)
+
+
+class _Fit(NamedTuple):
+    """A fit of surfaces.
+
+    `misfit_mm` counts each point in the image, at `NEAR_MM` at most; `cov` is of T at `center`.
+    """
+
+    T: Floats
+    misfit_mm: float
+    residual_mm: float
+    found: float
+    seen: int
+    center: Floats
+    cov: Floats
+
+
+def tie_frames(volume: Volume, body: Body, *, same_frame: bool) -> Tie:
+    """Tie a scan to a case.
+
+    Args:
+        volume: The scan, LPS mm.
+        body: Of the case.
+        same_frame: Whether the scan states the case's own frame of reference. That is a guess until the body agrees.
+
+    Raises:
+        InputError: Neither markers nor surfaces tie them, or the body lies mirrored as well.
+    """
+    picture = _Picture(volume)
+    own = [np.eye(4)] if same_frame else []
+    pieces = _small_metal(volume)
+    starts = [*own, *_by_distances(body.markers, pieces), *(() if own else _searched(picture, body))]
+    fits = [_fitted(picture, body.sample, start) for start in starts]
+    best = min(fits, key=lambda fit: fit.misfit_mm, default=None)
+    if own and (best is None or not _believed(best)):
+        fits += [_fitted(picture, body.sample, start) for start in _searched(picture, body)]
+        best = min(fits, key=lambda fit: fit.misfit_mm)
+    allowed = "a scan of the same patient that shows skin and bone of the case, or three of its markers"
+    if best is None or not _believed(best):
+        shown = (
+            "" if best is None else f": {best.found:.0%} of {best.seen} points of skin and bone lie where they should"
+        )
+        refuse(f"the scan does not fit the case's body{shown}", volume.path, allowed, "frames_not_tied")
+    flipped, T_flipped = _mirrored(picture, body.sample, best.T)
+    if best.misfit_mm > MIRRORED * flipped.misfit_mm:  # as symmetric as that: organs and markers tell
+        here, there = (_evidence(picture, body, T, pieces) for T in (best.T, T_flipped))
+        if MIRRORED * best.misfit_mm > flipped.misfit_mm or not here * MIRRORED > there:
+            said = f"{best.misfit_mm:.2f} mm off, mirrored {flipped.misfit_mm:.2f} mm"
+            refuse(f"the body fits the scan mirrored as well ({said})", volume.path, allowed, "mirrored")
+    return _checked(_by_markers(volume, body, best, pieces, same_frame), volume, allowed)
+
+
+def _believed(fit: _Fit) -> bool:
+    return fit.found >= LEAST_FOUND and fit.seen >= LEAST_SEEN
+
+
+def _checked(tie: Tie, volume: Volume, allowed: str) -> Tie:
+    if not tie.sd_mm <= UNSURE_MM:
+        what = f"skin and bone in the scan tie it to the case at the target by {tie.sd_mm:.1f} mm (standard deviation)"
+        refuse(what, volume.path, f"{UNSURE_MM:g} mm at most: {allowed}", "frames_not_tied")
+    return tie
+
+
+class _Picture:
+    """A scan between its voxels; NaN at metal and outside."""
+
+    def __init__(self, volume: Volume) -> None:
+        self.values = volume.values
+        self.T_index_ct = np.linalg.inv(volume.T_ct_index)
+        corners = np.array(list(itertools.product(*((0, n - 1) for n in volume.values.shape))), dtype=float)
+        self.bounds = apply(volume.T_ct_index, corners)
+
+    def at(self, points: Floats) -> Floats:
+        """Values at points (..., 3), clipped to `SHOWN_HU`."""
+        index = np.moveaxis(apply(self.T_index_ct, points.reshape(-1, 3)), 1, 0)
+        near = np.clip(np.rint(index).astype(int), 0, np.array(self.values.shape)[:, None] - 1)
+        outside = (np.abs(index - near) > 0.51).any(axis=0)
+        found = ndimage.map_coordinates(self.values, index, np.float64, order=1, mode="nearest")
+        found[outside | (found > METAL_HU)] = np.nan
+        return np.asarray(np.clip(found, *SHOWN_HU).reshape(points.shape[:-1]))
+
+
+def _edges(picture: _Picture, points: Floats, normals: Floats, window_mm: float) -> Floats:
+    """How far along each normal the surface lies, shape (n,), mm: NaN where none is seen, infinite outside."""
+    steps = np.arange(-window_mm, window_mm + STEP_MM / 2, STEP_MM)
+    profile = picture.at(points[:, None] + steps[:, None] * normals[:, None])
+    unseen = np.isnan(profile).any(axis=1)
+    profile = np.nan_to_num(profile)
+    half = len(steps) // 2
+    high, low = profile[:, : half + 1].max(axis=1), profile[:, half:].min(axis=1)
+    level = ((high + low) / 2)[:, None]
+    falls = (profile[:, :-1] >= level) & (profile[:, 1:] < level)
+    drop = np.maximum(profile[:, :-1] - profile[:, 1:], 1e-9)
+    places = steps[:-1] + STEP_MM * np.clip((profile[:, :-1] - level) / drop, 0.0, 1.0)
+    places = np.where(falls, places, np.inf)
+    nearest = places[np.arange(len(places)), np.abs(places).argmin(axis=1)]
+    found = np.where((high - low >= CONTRAST_HU) & np.isfinite(nearest), nearest, np.nan)
+    return np.where(unseen, np.inf, found)
+
+
+def _fitted(picture: _Picture, sample: Sample, start: Floats) -> _Fit:
+    """Skin and bone fitted from a start."""
+    points, normals = sample.placed(start)
+    low, high = picture.bounds.min(axis=0), picture.bounds.max(axis=0)
+    near = np.flatnonzero(((points > low - 5.0) & (points < high + 5.0)).all(axis=1))
+    rows = near[:: max(1, len(near) // SAMPLES)]
+    some = Sample(sample.points_ct[rows], sample.normals_ct[rows], sample.structure[rows], sample.patch[rows])
+    T = start
+    if len(rows) < LEAST_SEEN:
+        return _Fit(T, np.inf, np.inf, 0.0, len(rows), np.zeros(3), np.full((6, 6), np.inf))
+    for window in WINDOWS_MM:
+        points, normals = some.placed(T)
+        off = _edges(picture, points, normals, window)
+        good = np.isfinite(off)
+        if good.sum() < LEAST_SEEN:
+            break
+        step, center, *_ = _step(points[good], normals[good], off[good], some.patch[good])
+        turn = exp_rotation(step[3:])
+        T = pose(turn @ T[:3, :3], turn @ (T[:3, 3] - center) + center + step[:3])
+    points, normals = some.placed(T)
+    off = _edges(picture, points, normals, WINDOWS_MM[-1])
+    seen, good = ~np.isposinf(off), np.isfinite(off)
+    if good.sum() < LEAST_SEEN or seen.sum() == 0:
+        return _Fit(T, np.inf, np.inf, 0.0, int(seen.sum()), np.zeros(3), np.full((6, 6), np.inf))
+    capped = np.minimum(np.abs(np.where(good, off, np.inf)[seen]), NEAR_MM)
+    inliers = good & (np.abs(off) < NEAR_MM)
+    _, center, cov = _step(points[good], normals[good], off[good], some.patch[good])
+    return _Fit(
+        T,
+        float(np.sqrt(np.mean(capped**2))),
+        float(np.sqrt(np.mean(off[inliers] ** 2))),
+        float(inliers.sum() / seen.sum()),
+        int(seen.sum()),
+        center,
+        cov,
+    )
+
+
+def _step(points: Floats, normals: Floats, off: Floats, patch: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
+    """The motion (6,) about a centre (3,) that brings surfaces to where they are seen, and its covariance."""
+    center = points.mean(axis=0)
+    A = np.concatenate([normals, np.cross(points - center, normals)], axis=1)
+    scale = max(1.4826 * float(np.median(np.abs(off - np.median(off)))), 0.2)
+    ratio = off / (4.685 * scale)
+    weights = np.where(np.abs(ratio) < 1, (1 - ratio**2) ** 2, 0.0)
+    normal = np.linalg.inv(A.T @ (weights[:, None] * A) + 1e-9 * np.eye(6))
+    step = normal @ (A.T @ (weights * off))
+    left = off - A @ step
+    variance = float((weights * left**2).sum() / max(weights.sum() - 6, 1.0))
+    sums = np.zeros((int(patch.max()) + 1, 6))
+    np.add.at(sums, patch, weights[:, None] * A)
+    shared = normal @ (sums.T @ sums) @ normal  # patches err as a whole
+    cov = variance * (normal + PATCH_SD**2 * shared)
+    cov += np.diag([LEAST_MM**2] * 3 + [np.radians(LEAST_DEG) ** 2] * 3)
+    return step, center, cov
+
+
+def _mirrored(picture: _Picture, sample: Sample, T: Floats) -> tuple[_Fit, Floats]:
+    """The best fit of the surfaces mirrored about their middle, and where it puts the case, (4, 4)."""
+    points, _ = sample.placed(T)
+    low, high = picture.bounds.min(axis=0), picture.bounds.max(axis=0)
+    middle = sample.points_ct[((points > low) & (points < high)).all(axis=1)].mean(axis=0)
+    fits = []
+    for axis in range(3):
+        flip = np.eye(4)
+        flip[axis, axis], flip[axis, 3] = -1.0, 2 * middle[axis]
+        fit = _fitted(picture, sample.moved(flip), T)
+        fits.append((fit, fit.T @ flip))
+    return min(fits, key=lambda one: one[0].misfit_mm)
+
+
+def _evidence(picture: _Picture, body: Body, T: Floats, pieces: Floats) -> float:
+    """How plainly grey values change at the organs, in standard errors, and markers that are where they should be."""
+    points, normals = body.organs.placed(T)
+    step = picture.at(points - INNER_MM * normals) - picture.at(points + INNER_MM * normals)
+    known, total = np.isfinite(step), 0.0
+    for number in np.unique(body.organs.structure):
+        own = step[known & (body.organs.structure == number)]
+        if len(own) > LEAST_OF_ORGAN:
+            total += min(abs(float(own.mean())) / (float(own.std()) / np.sqrt(len(own)) + 1e-9), MOST_OF_ORGAN)
+    if body.markers is not None and len(pieces):
+        gaps = np.linalg.norm(apply(T, body.markers.points)[:, None] - pieces, axis=2).min(axis=1)
+        total += OF_MARKER * float((gaps < SIDES_MM).sum())
+    return total
+
+
+def _searched(picture: _Picture, body: Body) -> Iterator[Floats]:
+    """The shift from which skin and bone show most contrast: about the frame's own, and with the middles together."""
+    some = body.sample.thinned(COARSE_SAMPLES * 4)
+    middle = picture.bounds.mean(axis=0)
+    steps = np.arange(-SEARCH_MM, SEARCH_MM + 1.0, SEARCH_STEP_MM)
+    tried = []
+    for about in (np.zeros(3), middle - body.target_ct):
+        for shift in itertools.product(steps, repeat=3):
+            move = about + shift
+            points = some.points_ct[::4] + move
+            inner, outer = (picture.at(points + side * 4.0 * some.normals_ct[::4]) for side in (-1.0, 1.0))
+            fall = inner - outer
+            known = np.isfinite(fall)
+            score = np.mean(np.clip(fall[known], -600, 600)) * np.sqrt(known.mean()) if known.sum() > 60 else -np.inf
+            tried.append((float(score), move))
+    tried.sort(key=lambda one: -one[0])
+    yield from (pose(np.eye(3), move) for _, move in tried[:3])
+
+
+def _small_metal(volume: Volume) -> Floats:
+    """Middles of the pieces of metal that may be markers, shape (n, 3), LPS mm."""
+    found = [piece for piece in metal_pieces(volume) if piece.size_mm <= LARGEST_MM and piece.voxels.sum() > 1]
+    middles = [centroid(metal_weights(volume, piece), piece.box, volume.T_ct_index) for piece in found]
+    return np.array([one for one in middles if np.isfinite(one).all()]).reshape(-1, 3)
+
+
+def _by_distances(markers: NamedPoints | None, pieces: Floats) -> Iterator[Floats]:
+    """The placements that bring three markers or more to pieces of metal, by the distances between them."""
+    if markers is None or len(markers.points) < 3 or not 3 <= len(pieces) <= 40:
+        return
+    points = markers.points
+    a, b, c = max(itertools.combinations(range(len(points)), 3), key=lambda rows: _area(points[list(rows)]))
+    known = np.linalg.norm(points[[a, b, c]] - points[[b, c, a]], axis=1)
+    gaps = np.linalg.norm(pieces[:, None] - pieces, axis=2)
+    found = []
+    for i, j in zip(*np.nonzero(np.abs(gaps - known[0]) < SIDES_MM), strict=True):
+        fits = (np.abs(gaps[j] - known[1]) < SIDES_MM) & (np.abs(gaps[i] - known[2]) < SIDES_MM)
+        for k in np.flatnonzero(fits & (np.arange(len(pieces)) != i) & (np.arange(len(pieces)) != j)):
+            T = fit_rigid(points[[a, b, c]], pieces[[i, j, k]])
+            left = np.linalg.norm(apply(T, points)[:, None] - pieces, axis=2).min(axis=1)
+            found.append((float(np.minimum(left, SIDES_MM).sum()), T))
+    yield from (T for _, T in sorted(found, key=lambda one: one[0])[:3])
+
+
+def _area(corners: Floats) -> float:
+    return float(np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])))
+
+
+def _by_markers(volume: Volume, body: Body, fit: _Fit, pieces: Floats, same_frame: bool) -> Tie:
+    """The tie by three markers or more that the scan shows where the body has them; else by the body."""
+    findings: list[Finding] = []
+    R = fit.T[:3, :3]
+    if body.markers is not None and len(pieces):
+        expected = apply(fit.T, body.markers.points)
+        distance = np.linalg.norm(expected[:, None] - pieces, axis=2)
+        rows, columns = linear_sum_assignment(np.minimum(distance, 10 * MARKER_MM))
+        kept = distance[rows, columns] < MARKER_MM
+        rows, columns = rows[kept], columns[kept]
+        if len(rows) >= 3 and _area(body.markers.points[rows][:3]) > 100.0:
+            known, seen = body.markers.points[rows], pieces[columns]
+            T = fit_rigid(known, seen)
+            voxel = MARKER_SD_VOXEL * volume.T_ct_index[:3, :3]
+            each = body.marker_cov + R.T @ voxel @ voxel.T @ R
+            left = apply(np.linalg.inv(T), seen) - known
+            expected_ms = float(np.trace(each)) * (1 - 2 / len(rows))
+            size = float(np.mean((left**2).sum(axis=1))) / expected_ms
+            if size < LOOSE**2:
+                center = known.mean(axis=0)
+                L = carried(center, body.target_ct) @ least_squares_map(design(known, center))
+                cov = max(size, 1.0) * L @ np.kron(np.eye(len(rows)), each) @ L.T
+                residual = float(np.sqrt(np.mean((left**2).sum(axis=1))))
+                return _tie(T, cov, body, "markers", residual, fit.found, same_frame, findings)
+            times = f"{np.sqrt(size):.1f} times as far from their places as declared"
+            said = f"markers lie {times}: skin and bone tie the frames"
+            findings.append(Finding("markers_moved", Severity.WARNING, said, {"times": float(np.sqrt(size))}))
+    X = carried(fit.center, apply(fit.T, body.target_ct))
+    turn = np.kron(np.eye(2), R)
+    cov = turn.T @ X @ fit.cov @ X.T @ turn
+    return _tie(fit.T, cov, body, "body", fit.residual_mm, fit.found, same_frame, findings)
+
+
+def _tie(
+    T: Floats, cov: Floats, body: Body, how: str, residual: float, found: float, same_frame: bool, said: list[Finding]
+) -> Tie:
+    """With what one frame of reference says beforehand; a patient who has moved is reported."""
+    moved_mm = moved_deg = np.nan
+    if same_frame:
+        moved_mm = float(np.linalg.norm(apply(T, body.target_ct) - body.target_ct))
+        moved_deg = float(np.degrees(rotation_angle(T[:3, :3])))
+        if moved_mm > 2 * np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1]) + 1.0:
+            text = f"the patient has moved by {moved_mm:.1f} mm and {moved_deg:.1f} degrees since the case's CT"
+            said = [*said, Finding("patient_moved", Severity.WARNING, text, {"moved_mm": moved_mm})]
+    return Tie(T, np.asarray(cov), body.target_ct, how, residual, found, moved_mm, moved_deg, tuple(said))

@@ -1,0 +1,466 @@
+"""`confirm CASE --scan SCAN`: where the needle is in a control CT, what its line touches, and what to do next.
+
+`confirm --learn FILES`: by how much the errors of many confirmations exceed what was predicted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import ndimage
+from scipy.special import chdtri
+
+from puncture_twin.planning.anatomy.default_roles import BONES, plain_name
+from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.errors import Finding, refuse
+from puncture_twin.planning.base.output.manifest import read_output
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.provenance import Input, InputFiles, inputs_document
+from puncture_twin.planning.base.strict_json import array, fitting, or_null, parse_json
+from puncture_twin.planning.base.text import Facts, Shown
+from puncture_twin.planning.case.named_files import CaseVolumes
+from puncture_twin.planning.formats.points import NamedPoints
+from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.containment import inside_each
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import apply, inverse
+from puncture_twin.planning.plan.plan import Plan
+from puncture_twin.planning.plan.plan_check import check_inputs
+from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.taken_line import SURE, UNCERTAIN, Aim, LineCheck, check_line, next_aims
+from puncture_twin.twin.guidance.ct.needle import FoundNeedle, needle_error, read_needle
+from puncture_twin.twin.guidance.ct.tie import Body, Tie, body_of, tie_frames
+from puncture_twin.twin.jobs.patient.main_job import read_noted_plan
+from puncture_twin.twin.jobs.terminal import write_result
+from puncture_twin.twin.report import present
+from puncture_twin.twin.report.page.template import Card
+from puncture_twin.twin.report.present import Field, Section, facts, grid, number, percent, vector
+
+PAGE, PICTURE, REPORT = FILES = ("confirm.html", "confirm.png", "confirm.json")
+MAX_REPORT_BYTES = 5_000_000
+FEW = 10
+"""Fewer needles say little about the size of errors."""
+SHOWN = 8
+"""Structures in the text; the page and the JSON have all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Confirmed(Shown):
+    """A needle in a control CT, in the case's frame (LPS mm).
+
+    Attributes:
+        plan: To which it is compared, or None.
+        needle: Its covariance is that of the reading and of the frames' tie together.
+        aims: What can be done, the best first.
+    """
+
+    context: CaseContext
+    plan: Plan | None
+    volume: Volume
+    tie: Tie
+    needle: FoundNeedle
+    line: LineCheck
+    aims: tuple[Aim, ...]
+    findings: tuple[Finding, ...]
+    read: tuple[Input, ...]
+    files: tuple[Path, ...] = ()
+
+    def _title(self) -> str:
+        return f"The needle of {self.context.case.name}, confirmed"
+
+    def _facts(self) -> Facts:
+        yield "line", f"{self.line.verdict} {self.line.structure}".strip()
+        yield "tip, CT", vector(self.needle.tip_ct.tolist(), 1, "mm")
+        yield "next", aim_text(self.aims[0])
+
+    @property
+    def yes(self) -> bool:
+        """Whether the needle's line is safe and its tip is best left where it is."""
+        return self.line.safe and self.aims[0].kind == "accept"
+
+    def against(self, tip_ct: Floats, forward_ct: Floats) -> dict[str, float]:
+        """Errors of the tip from a point (3,), along and across a direction (3,), and of the direction."""
+        split = needle_error(self.needle.tip_ct, forward_ct, tip_ct)
+        angle = float(np.degrees(np.arccos(np.clip(self.needle.forward_ct @ forward_ct, -1.0, 1.0))))
+        return {"tip_mm": split.tip_to_target_mm, "lateral_mm": split.lateral_mm, "depth_mm": split.depth_mm,
+                "angle_deg": angle}  # fmt: skip
+
+    def predicted(self) -> dict[str, Any] | None:
+        """The error against the plan beside what was predicted of it; None without a plan or declared errors."""
+        error = self.context.pose_error
+        if self.plan is None or error is None:
+            return None
+        cov = error.covariance_ct(self.plan.insertion.q[-1:])[0, :3, :3] + self.needle.cov_ct[:3, :3]
+        off = self.needle.tip_ct - self.plan.target_ct
+        square = float(off @ np.linalg.solve(cov, off))
+        return {
+            "off_mm": off.tolist(),
+            "cov_mm2": cov.tolist(),
+            "rms_mm": float(np.sqrt(np.trace(cov))),
+            "deviations": float(np.sqrt(square)),
+            "region_deviations": error.fit.test.region_factor,
+            "inside": bool(square <= error.fit.test.region_factor**2),
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm, degrees, chances 0..1."""
+        needle, target = self.needle, self.context.case.target_ct
+        at_target, predicted, plan = self.against(target, needle.forward_ct), self.predicted(), self.plan
+        of_plan = None if plan is None else self.against(plan.target_ct, -plan.outward_ct)
+        return {
+            **self.context.provenance(),
+            "inputs": inputs_document((*self.read, *self.context.case.inputs)),
+            "tip_ct_mm": needle.tip_ct.tolist(),
+            "axis_ct": needle.forward_ct.tolist(),
+            "tip_cov_mm2": needle.cov_ct[:3, :3].tolist(),
+            "axis_cov_rad2": needle.cov_ct[3:, 3:].tolist(),
+            "path_ct_mm": needle.path_ct.tolist(),
+            "bent": needle.sagitta_mm > 0,
+            "sagitta_mm": needle.sagitta_mm,
+            "lateral_mm": at_target["lateral_mm"],
+            "depth_mm": at_target["depth_mm"],
+            "angle_deg": None if of_plan is None else of_plan["angle_deg"],
+            "against_plan": of_plan,
+            "verdict": self.line.verdict,
+            "structure": self.line.structure,
+            "entry_ct_mm": [or_null(one) for one in self.line.entry_ct],
+            "inserted_mm": or_null(self.line.inserted_mm),
+            "structures": [one.document() for one in self.line.each],
+            "in_predicted_region": None if predicted is None else predicted["inside"],
+            "predicted": predicted,
+            "next_aim": self.aims[0].document(),
+            "aims": [one.document() for one in self.aims],
+            "frames": {
+                "tied_by": self.tie.how, "residual_mm": self.tie.residual_mm, "sd_mm": self.tie.sd_mm,
+                "surfaces_found": self.tie.found, "moved_mm": or_null(self.tie.moved_mm),
+                "moved_deg": or_null(self.tie.moved_deg), "T_scan_ct": self.tie.T_scan_ct.tolist(),
+            },
+            "findings": [one.document() for one in (*self.context.anatomy.findings, *self.findings)],
+            "files": [str(path) for path in self.files],
+        }  # fmt: skip
+
+    def text(self) -> str:
+        """What a terminal shows."""
+        return present.text([*self.sections(SHOWN), *present.footer(self.files, [o.sentence for o in self.findings])])
+
+    def sections(self, most: int | None = None) -> list[Section]:
+        """What terminal and page show; of structures so many, or all."""
+        needle, tie, said = self.needle, self.tie, self.predicted()
+        at_target = self.against(self.context.case.target_ct, needle.forward_ct)
+        split = "tip {tip_mm:.1f} mm off: {lateral_mm:.1f} across, {depth_mm:+.1f} along"
+        rows = [
+            ("tip", f"{vector(needle.tip_ct.tolist(), 1, 'mm')}, ± {needle.tip_sd_mm:.2f} mm (sd, worst direction)"),
+            ("direction", f"{vector(needle.forward_ct.tolist(), 3)}, ± {np.degrees(needle.axis_sd):.2f}°"),
+            ("shape", f"bent, sagitta {needle.sagitta_mm:.1f} mm" if needle.sagitta_mm > 0 else "straight"),
+            (
+                "frames",
+                f"tied by {tie.how}, residual {tie.residual_mm:.2f} mm (rms), ± {tie.sd_mm:.2f} mm at the target",
+            ),
+            ("against the target", split.format(**at_target)),
+        ]
+        if self.plan is not None:
+            of_plan = self.against(self.plan.target_ct, -self.plan.outward_ct)
+            rows.append(("against the plan", f"{split.format(**of_plan)}; direction {of_plan['angle_deg']:.1f}° off"))
+        if said is not None:
+            inside = "{deviations:.1f} of {region_deviations:.1f} deviations".format(**said)
+            where = "inside" if said["inside"] else "outside"
+            rows.append(("predicted", f"{said['rms_mm']:.1f} mm (rms); {where} the 95 % region ({inside})"))
+        return [
+            Section("the needle in the scan", [facts(rows)]),
+            Section(f"the line that it takes: {self._verdict()}", [grid(STRUCTURES, self.line.each[:most]), LINE_TEXT]),
+            Section(f"next: {aim_text(self.aims[0])}", [grid(AIMS, self.aims), AIM_TEXT]),
+        ]
+
+    def _verdict(self) -> str:
+        line = self.line
+        if line.safe:
+            return f"safe, by {SURE:g} standard deviations of the reading or more"
+        named = f": {line.structure}" if line.structure else ""
+        unsure = ", its margin may be broken by what the reading errs" if line.verdict == UNCERTAIN else ""
+        return f"not safe, {line.verdict}{named}{unsure}"
+
+
+LINE_TEXT = (
+    "Clearance of the needle as it lies from tip to flange, bent pieces one by one; ±: by what the reading and the "
+    "frames' tie may err (standard deviation). A line is safe only if every margin is kept by two of them. Structures "
+    "are those of the planning CT: what has moved since is not seen."
+)
+AIM_TEXT = (
+    "Chances count the reading, the frames' tie, and how exactly target and contours are known; not what tissue does "
+    "on the way. Deeper: along the needle's own end. Turn: back to the skin, and from the same entry to the target, "
+    "aimed to half a degree."
+)
+
+
+STRUCTURES = (
+    Field("structure", lambda one: one.name), Field("clearance", lambda one: one.clearance_mm, 1, "mm"),
+    Field("±", lambda one: one.sd_mm, 2, "mm"), Field("margin", lambda one: one.margin_mm, 1, "mm"),
+    Field("from the tip", lambda one: one.depth_mm, 0, "mm"),
+    Field("chance to touch", lambda one: "" if np.isnan(one.p_touch) else percent(one.p_touch)),
+)  # fmt: skip
+AIMS = (
+    Field("what", lambda one: aim_text(one)),
+    Field("chance to hit", lambda one: "–" if np.isnan(one.p_hit) else percent(one.p_hit)),
+    Field("passes the target by", lambda one: one.lateral_mm, 1, "mm"),
+    Field("line", lambda one: f"{one.verdict} {one.structure}".strip()),
+)
+
+
+def aim_text(aim: Aim) -> str:
+    """What to do, in words."""
+    if aim.kind == "accept":
+        return "accept"
+    if aim.kind == "deeper":
+        return f"deeper by {aim.by_mm:.1f} mm" if aim.by_mm > 0 else f"back by {-aim.by_mm:.1f} mm"
+    if aim.kind == "turn":
+        return f"withdraw by {number(aim.by_mm, 0)} mm to the skin and turn by {aim.turn_deg:.1f}°"
+    return "withdraw, and plan again: no line from this entry is safe"
+
+
+def confirm_needle(context: CaseContext, scan: Path, plan_path: Path | None = None) -> Confirmed:
+    """Read a control scan of a case's patient with the needle in, and check its line.
+
+    Args:
+        scan: A DICOM folder or a file in it, NIfTI, or NRRD.
+        plan_path: The plan that was executed.
+
+    Raises:
+        InputError: A scan that cannot be read or tied to the case, no needle, two of them, a tip that is not seen, or
+            a plan of another case.
+    """
+    read: list[Input] = []
+    plan = None
+    if plan_path is not None:
+        source, plan = read_noted_plan(plan_path, context.watcher.note)
+        check_inputs(plan, context.case, plan_path)
+        read.append(source)
+    with context.stages.time("scan"):
+        volume, frame, inputs = _scan(scan)
+    with context.stages.time("frames"):
+        own = "" if context.anatomy.scan is None else _frame_of(context.anatomy.scan.source.surfaces.source)
+        body = _body(context)
+        tie = tie_frames(volume, body, same_frame=bool(frame) and frame == own)
+    with context.stages.time("needle"):
+        T, back = tie.T_scan_ct, inverse(tie.T_scan_ct)
+        skin, target = context.anatomy.skin.mesh, apply(tie.T_scan_ct, context.case.target_ct)
+        planned = None if plan is None else (apply(T, plan.target_ct), -T[:3, :3] @ plan.outward_ct)
+        diameter = context.case.needle.diameter_mm
+        markers = None if body.markers is None else apply(T, body.markers.points)
+        inside = partial(_inside, skin, back)
+        seen, findings = read_needle(volume, target, diameter, inside, planned, markers)
+        needle = seen.moved(back, tie.cov_at(apply(back, seen.tip_ct)))
+    with context.stages.time("line"):
+        line = check_line(context, needle.path_ct, needle.cov_ct)
+        aims = next_aims(context, needle.path_ct, needle.forward_ct, needle.cov_ct, line)
+    said = (*tie.findings, *findings)
+    return Confirmed(context, plan, volume, tie, needle, line, tuple(aims), said, (*read, *inputs))
+
+
+def confirm_case(context: CaseContext, scan: Path, out: Path, plan_path: Path | None = None) -> Confirmed:
+    """`confirm_needle`, with its page, picture and report as one set of files."""
+    done = confirm_needle(context, scan, plan_path)
+    made_from = {one.path: one.sha256 for one in done.read if one.role == "plan"}
+    inputs, seconds = (*done.read, *context.case.inputs), context.stages.seconds
+    with writing(
+        out, "confirm", inputs=inputs, seconds=seconds, names=FILES, made_from=made_from, note=context.watcher.note
+    ) as draft:
+        draw_confirmed(done, draft.folder / PICTURE)
+        _write_page(done, draft.folder)
+        done = replace(done, files=draft.final(tuple(draft.folder / name for name in FILES)))
+        write_result(done.summary(), draft.folder / REPORT, out)
+    return done
+
+
+def _inside(skin: TriangleMesh, T_ct_scan: Floats, points: Floats) -> Bools:
+    return inside_each(skin, apply(T_ct_scan, points))
+
+
+def _scan(path: Path) -> tuple[Volume, str, tuple[Input, ...]]:
+    """The control scan, its frame of reference ("" where none is stated), and its files."""
+    place = path.resolve()
+    files = InputFiles(place.parent)
+    volumes = CaseVolumes(files, place.parent / "--scan")
+    volumes.read("ct", place.name, key="--scan")
+    source = volumes.source(place.name)
+    read = tuple(Input(f"control {one.role}", one.path, one.sha256) for one in files.inputs)
+    return source.volume(), _frame_of(source), read
+
+
+def _frame_of(source: object) -> str:
+    return str(getattr(source, "frame_of_reference", ""))
+
+
+def _body(context: CaseContext) -> Body:
+    """Skin, bones and markers of a case, by which a scan is tied to it."""
+    case, anatomy = context.case, context.anatomy
+    bones = [one.mesh for one in anatomy.structures if BONES & set(plain_name(one.name).split()) or "spine" in one.name]
+    registration = None if context.placement is None else context.placement.registration
+    markers, cov = None, np.zeros((3, 3))
+    if registration is not None:
+        pairs = registration.markers
+        markers = NamedPoints(tuple(pairs.names), pairs.points_ct, case.space)
+        cov = np.eye(3) * 0.25 if case.errors is None else case.errors.marker_cov_ct
+    organs = [one.mesh for one in anatomy.structures]
+    return body_of(anatomy.skin.mesh, bones, organs, case.target_ct, markers, cov)
+
+
+def _write_page(done: Confirmed, folder: Path) -> None:
+    best, line = done.aims[0], done.line
+    cards = [
+        Card("line", line.verdict, line.structure, not line.safe),
+        Card("next", best.kind, aim_text(best), best.kind == "withdraw"),
+        Card("chance to hit now", percent(next((one.p_hit for one in done.aims if one.kind == "accept"), 0.0)), ""),
+    ]
+    warned = [present.Warn(tuple(one.sentence for one in done.findings))] if done.findings else []
+    shown = present.picture(folder / PICTURE, "slices along the needle")
+    picture = Section("slices of the control scan", [shown, *warned, PICTURE_TEXT])
+    inputs = (*done.read, *done.context.case.inputs)
+    under = f"{done.context.case.name}: the needle in the control scan"
+    present.write_page(folder / PAGE, "Confirmation", under, cards, [*done.sections(), picture], inputs,
+                       origin=present.origin_section(None))  # fmt: skip
+
+
+PICTURE_TEXT = (
+    "Cyan: the needle as it was read; magenta, dashed: the planned line; green cross: target. Outlines are those of "
+    "the planning CT, carried to the scan."
+)
+PIXELS, INCHES, DPI = 320, 9.0, 100
+WINDOW_HU = (-160.0, 240.0)
+
+
+def draw_confirmed(done: Confirmed, path: Path) -> Path:
+    """Draw the control scan in the axial plane of the tip, along the real needle twice, and across it at its tip."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
+
+    from puncture_twin.planning.base.reasons import css
+    from puncture_twin.twin.report.figures import halo, write_png
+    from puncture_twin.twin.report.palette import SKIN, organ_colours
+    from puncture_twin.twin.report.slices.planes import needle_planes, outline
+
+    anatomy, needle = done.context.anatomy, done.needle
+    colours = organ_colours(tuple(one.name for one in anatomy.structures))
+    T_index_ct = np.linalg.inv(done.volume.T_ct_index) @ done.tie.T_scan_ct
+    figure = Figure(figsize=(INCHES, INCHES), dpi=DPI)
+    rim = halo(3, "black")
+    planes = needle_planes(needle.tip_ct, -needle.forward_ct, done.line.inserted_mm)
+    for axes, plane in zip(figure.subplots(2, 2).ravel(), planes, strict=True):
+        index = apply(T_index_ct, plane.points_ct(PIXELS)).T
+        shown = ndimage.map_coordinates(done.volume.values, index, np.float64, order=1, cval=-1024.0)
+        (x, y), half, (low, high) = plane.centre, plane.half_mm, WINDOW_HU
+        extent = (x - half, x + half, y - half, y + half)
+        axes.imshow(shown.reshape(PIXELS, PIXELS), cmap="gray", vmin=low, vmax=high, extent=extent)
+        for one in anatomy.structures:
+            lines = list(outline(one.mesh, plane))
+            axes.add_collection(LineCollection(lines, colors=css(colours[one.name]), linewidths=0.8))
+        axes.add_collection(LineCollection(list(outline(anatomy.skin.mesh, plane)), colors=css(SKIN), linewidths=0.8))
+        axes.plot(*plane.place(needle.path_ct).T, color="cyan", linewidth=1.0, path_effects=rim)
+        axes.plot(*plane.place(needle.tip_ct), "x", color="cyan", path_effects=rim)
+        if done.plan is not None:
+            ends = np.stack([done.plan.target_ct, done.plan.entry_ct])
+            axes.plot(*plane.place(ends).T, "--", color="magenta", linewidth=1.0, path_effects=rim)
+        axes.plot(*plane.place(done.context.case.target_ct), "+", color="#38d39f", markersize=12, path_effects=rim)
+        axes.set(xlim=extent[:2], ylim=extent[2:])
+        axes.set_title(plane.name.replace("target", "tip"), fontsize=9)
+        axes.tick_params(labelsize=7)
+    figure.tight_layout()
+    write_png(figure, path)
+    return path
+
+
+class Learned(NamedTuple):
+    """By how much errors exceed what was predicted, of n needles.
+
+    Attributes:
+        factor: Of every standard deviation: 1 where the declaration is right.
+        low: Of its 95 % interval, and
+        high: the same.
+        mean_mm: Shape (3,), the mean error, LPS.
+        rms_mm: Realised, and
+        predicted_rms_mm: what was predicted of it.
+        inside: How many were in their 95 % region.
+    """
+
+    needles: int
+    factor: float
+    low: float
+    high: float
+    mean_mm: tuple[float, ...]
+    rms_mm: float
+    predicted_rms_mm: float
+    inside: int
+    inputs: tuple[Input, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {**self._asdict(), "mean_mm": list(self.mean_mm), "inputs": inputs_document(self.inputs)}
+
+    def text(self) -> str:
+        """What a terminal shows."""
+        size = "too small" if self.low > 1 else "too large" if self.high < 1 else "neither too small nor too large"
+        few = f"; so few say little: {FEW} or more narrow the interval" if self.needles < FEW else ""
+        factor = (
+            f"{self.factor:.2f} times what is declared (95 %: {self.low:.2f} to {self.high:.2f}): it is {size}{few}"
+        )
+        rows = [
+            ("needles", f"{self.needles}, {self.inside} in their predicted 95 % region"),
+            ("tip against plan", f"{self.rms_mm:.2f} mm (rms), predicted {self.predicted_rms_mm:.2f} mm"),
+            ("mean error, LPS", vector(self.mean_mm, 2, "mm")),
+            ("errors", factor),
+        ]
+        return present.text([Section("what these needles say of [errors]", [facts(rows)])])
+
+
+def learn(paths: Sequence[Path]) -> Learned:
+    """Estimate the size of a case's errors from confirmations: sum d' S^-1 d = f^2 chi-squared with 3 n degrees.
+
+    Args:
+        paths: Of ``confirm.json``, each with a plan and declared errors.
+
+    Raises:
+        InputError: A file that is none, or says no prediction; or one that is named twice.
+    """
+    offs, covs, inside, inputs = [], [], 0, []
+    allowed = "confirm.json of a case with [errors], markers and --plan"
+    for path in paths:
+        read = read_output(path, max_bytes=MAX_REPORT_BYTES)
+        document = parse_json(read.data, where=path, allowed=allowed)
+        with fitting(path, allowed):
+            stated = document["predicted"]
+            offs.append(array(stated["off_mm"], (3,)))
+            covs.append(array(stated["cov_mm2"], (3, 3)))
+            inside += stated["inside"] is True
+        inputs.append(read.input("confirmation"))
+    if len({one.sha256 for one in inputs}) < len(inputs):
+        refuse("one confirmation is named twice", "--learn", "each needle once", "duplicate_name")
+    off, n = np.array(offs), 3 * len(offs)
+    square = float(sum(d @ np.linalg.solve(cov, d) for d, cov in zip(offs, covs, strict=True)))
+    low, high = (float(np.sqrt(square / chdtri(n, tail))) for tail in (0.025, 0.975))
+    predicted = float(np.sqrt(np.mean([np.trace(cov) for cov in covs])))
+    rms, mean = float(np.sqrt(np.mean((off**2).sum(axis=1)))), tuple(off.mean(axis=0).tolist())
+    return Learned(len(offs), float(np.sqrt(square / n)), low, high, mean, rms, predicted, inside, tuple(inputs))
+
+
+def confirm_source(case: Path | None, scan: Path | None, learned: Sequence[Path]) -> Path | None:
+    """The case that is confirmed; None where confirmations are learned from.
+
+    Raises:
+        InputError: Neither, or both.
+    """
+    if learned:
+        if case is not None or scan is not None:
+            refuse(
+                "--learn takes no case and no scan",
+                "--learn",
+                "confirm --learn confirm.json ...",
+                "conflicting_options",
+            )
+        return None
+    if case is None or scan is None:
+        refuse("a case and its control scan are needed", "confirm", "confirm CASE --scan SCAN", "missing_option")
+    return case
