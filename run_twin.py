@@ -490,6 +490,7 @@ def export(
         ),
     ],
     case: Annotated[Path | None, typer.Option("--case", help="Case of the plan: checks the plan again.")] = None,
+    scan: Annotated[Path | None, typer.Option("--scan", help="Of confirm.json: the control scan, for dicom.")] = None,
     out_dir: OutOfCaseOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -499,7 +500,7 @@ def export(
     refuse_format(format_name)
     folder = out_folder(out_dir, source, f"export-{format_name}")
     with progress_display() as progress:
-        done = export_source(source, case, format_name, folder, choice, progress)
+        done = export_source(source, case, format_name, folder, choice, progress, scan)
     finish("export", done.found, done.summary, done.text, as_json)
 
 

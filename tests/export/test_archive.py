@@ -1,5 +1,6 @@
 """What the scan's archive is given: regions on the scan's own slices, numbers and lines as they are; of its study."""
 
+import hashlib
 import io
 import json
 import shutil
@@ -24,6 +25,7 @@ from puncture_twin.planning.export.archive import (
     surface_points,
 )
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.run_twin import main
 
 SHAPE = (40, 36, 12)
@@ -198,3 +200,53 @@ def test_a_series_without_a_frame_of_reference_is_refused(folder, tmp_path, caps
     assert main(["export", str(case), "--format", "dicom", "--out", str(out), "--json"]) == 2
     assert json.loads(capsys.readouterr().out)["error"]["code"] == "no_frame_of_reference"
     assert not out.exists()
+
+
+def confirmation(place, folder, ends):
+    """What `confirm` writes of a needle between two points of a scan, as far as its export reads it."""
+    T_scan_ct = pose(exp_rotation(np.array([0.2, -0.1, 0.3])), np.array([12.0, -7.0, 30.0]))
+    control = [
+        {"role": "control ct", "path": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+        for path in sorted(folder.iterdir())
+    ]
+    written = {
+        "inputs": control,
+        "frames": {"T_scan_ct": T_scan_ct.tolist()},
+        "diameter_mm": 2.0,
+        "angle_deg": None,
+        "path_ct_mm": apply(inverse(T_scan_ct), ends).tolist(),
+        "verdict": "safe",
+        "structure": "",
+        "lateral_mm": 1.25,
+        "depth_mm": -4.5,
+        "inserted_mm": 80.0,
+        "sagitta_mm": 0.0,
+        "in_predicted_region": True,
+        "next_aim": {"kind": "deeper", "by_mm": 4.5, "turn_deg": 0.0, "p_hit": 0.97, "lateral_mm": 1.25},
+    }
+    (place / "confirm.json").write_text(json.dumps(written))
+    return place / "confirm.json"
+
+
+def test_a_confirmed_needle_goes_to_its_scans_study(tmp_path, capsys):
+    """Its voxels lie about the needle in the scan's frame, the numbers are the confirmation's; another scan is not."""
+    folder = tmp_path / "scan"
+    world.write_series(folder, world.series(world.phantom(SHAPE) % 2000))
+    ends = (world.affine() @ [[33, 6], [28, 5], [9, 2], [1, 1]])[:3].T
+    source = confirmation(tmp_path, folder, ends)
+    order = ["export", str(source), "--format", "dicom", "--out", str(tmp_path / "dicom"), "--json", "--scan"]
+    assert main([*order, str(folder)]) == 0
+    volume = hd.seg.segread(tmp_path / "dicom" / NAMES[0]).get_volume()
+    points = volume.map_indices_to_reference(np.argwhere(volume.array.reshape(volume.spatial_shape) > 0))
+    forward = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    lever = points - ends[0]
+    across = np.linalg.norm(lever - (lever @ forward)[:, None] * forward, axis=1)
+    assert len(points) > 100 and across.max() < 1.0 + np.linalg.norm(volume.spacing) / 2
+    read = report_content((tmp_path / "dicom" / NAMES[1]).read_bytes())
+    assert read.quantities["depth_mm"] == (-4.5, "mm") and read.quantities["next_by_mm"] == (4.5, "mm")
+    assert "angle_deg" not in read.quantities and np.allclose(read.lines["needle"], ends, atol=1e-4)
+    assert dict(read.sentences) | {"verdict": "safe", "next": "deeper"} == dict(read.sentences)
+    changed = min(folder.iterdir())
+    changed.write_bytes(changed.read_bytes()[:-1] + bytes([changed.read_bytes()[-1] ^ 1]))
+    assert main([*order, str(folder)]) == 2
+    assert '"input_changed"' in capsys.readouterr().out

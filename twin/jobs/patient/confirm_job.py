@@ -120,6 +120,7 @@ class Confirmed(Shown):
             "tip_cov_mm2": needle.cov_ct[:3, :3].tolist(),
             "axis_cov_rad2": needle.cov_ct[3:, 3:].tolist(),
             "path_ct_mm": needle.path_ct.tolist(),
+            "diameter_mm": self.context.case.needle.diameter_mm,
             "bent": needle.sagitta_mm > 0,
             "sagitta_mm": needle.sagitta_mm,
             "lateral_mm": at_target["lateral_mm"],

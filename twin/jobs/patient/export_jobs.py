@@ -27,6 +27,7 @@ from puncture_twin.planning.base.provenance import Input, inputs_document, read_
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.budget.guidance import check_ways
+from puncture_twin.planning.export.archive import DICOM
 from puncture_twin.planning.export.exporter import Exported, format_names
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
 from puncture_twin.planning.plan.plan import Plan
@@ -37,7 +38,7 @@ from puncture_twin.planning.search.choice import BEST, Choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.twin.jobs.patient.main_job import case_of, export, is_plan, plan_case, read_noted_plan, search_case
-from puncture_twin.twin.jobs.patient.path_exports import PATH_FORMATS, PathExport, export_path
+from puncture_twin.twin.jobs.patient.path_exports import PATH_FORMATS, PathExport, export_confirmation, export_path
 from puncture_twin.twin.jobs.patient.summaries import export_summary
 from puncture_twin.twin.report.present import Section, text
 
@@ -266,12 +267,19 @@ def refuse_format(name: str) -> None:
 
 
 def export_source(
-    source: Path, case: Path | None, format_name: str, out: Path, choice: Choice, watcher: Watcher
+    source: Path,
+    case: Path | None,
+    format_name: str,
+    out: Path,
+    choice: Choice,
+    watcher: Watcher,
+    scan: Path | None = None,
 ) -> Export:
     """Write a case's plan, or a plan that is there, or what else of a case a format holds.
 
     Args:
-        source: A case, a plan or, for tables, a table or its folder.
+        source: A case, a plan, for tables a table or its folder, or a confirmation.
+        scan: The control scan of a confirmation.
 
     Raises:
         InputError: A source of which the format is not, or see the functions that write.
@@ -284,6 +292,12 @@ def export_source(
             table = out / TABLE
         written = export_candidates(table, format_name, out, watcher.note)
         return Export(written, written.summary(), written.text())
+    if scan is not None:
+        if format_name != DICOM or choice != BEST or case is not None:
+            allowed = f"--format {DICOM} alone, with a confirm.json"
+            refuse("a control scan belongs to a confirmation", "--scan", allowed, "conflicting_options")
+        confirmed = export_confirmation(source, scan, out, watcher.note)
+        return Export(confirmed, confirmed.summary(), confirmed.text())
     planned_case = case_of(source, case, choice)
     if format_name in (MOVEIT, *PATH_FORMATS) and planned_case is None:
         refuse(f"{format_name} shows the case", source, "export plan.json --case CASE", "missing_option")

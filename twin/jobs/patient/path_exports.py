@@ -5,7 +5,7 @@ The arm is not needed; without it Slicer gets no transform.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,13 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import refuse, require_extra
 from puncture_twin.planning.base.files import atomic
+from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
-from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.provenance import Input, InputFiles, inputs_document, read_inputs
+from puncture_twin.planning.base.strict_json import array, fitting, number, parse_json
 from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.case.named_files import CaseVolumes
 from puncture_twin.planning.export import archive, slicer
 from puncture_twin.planning.export.archive import (
     DICOM,
@@ -30,6 +33,8 @@ from puncture_twin.planning.export.archive import (
 )
 from puncture_twin.planning.export.slicer import SLICER, SceneContent, entry_area, slicer_files
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
+from puncture_twin.planning.formats.guard import guard_transform
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.plan.plan_check import check_plan
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.choice import Choice, choose, choose_stated, with_file_read
@@ -46,6 +51,12 @@ OF_ONE_SEARCH = frozenset({"rank", "window", "cost", "pareto"})
 """Columns that compare a direction with the others of its search: they say nothing of it alone."""
 UNITS = {"_mm": "mm", "_deg": "deg"}
 """Endings of columns to units."""
+CONFIRMATION = "a confirm.json of this version"
+MAX_CONFIRMATION_BYTES = 5_000_000
+CONFIRMED = ("lateral_mm", "depth_mm", "angle_deg", "inserted_mm", "sagitta_mm")
+STATED = ("verdict", "structure", "in_predicted_region")
+AIMED = ("by_mm", "turn_deg", "p_hit", "lateral_mm")
+"""Numbers and words of a confirmation, and numbers of what it says is to be done next."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -129,6 +140,51 @@ def export_path(
     return PathExport(format_name, written, name, said, tuple(context.anatomy.warnings), inputs)
 
 
+def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str], None]) -> PathExport:
+    """Write the needle that `confirm` read, on the slices of its control scan.
+
+    Args:
+        source: Its ``confirm.json``.
+        scan: The scan, whose bytes must be those that were confirmed.
+
+    Raises:
+        InputError: No confirmation, another scan than its own, or one that is no DICOM series.
+    """
+    require_extra("dicom", f"--format {DICOM}")
+    read = read_output(source, max_bytes=MAX_CONFIRMATION_BYTES)
+    document = parse_json(read.data, where=source, allowed=CONFIRMATION)
+    with fitting(source, CONFIRMATION):
+        own = {one.sha256 for one in read_inputs(document["inputs"]) if one.role.startswith("control")}
+        T_scan_ct = guard_transform(document["frames"]["T_scan_ct"], where=f"{source}: T_scan_ct")
+        path = apply(T_scan_ct, array(document["path_ct_mm"], (len(document["path_ct_mm"]), 3)))
+        radius_mm, aim = number(document["diameter_mm"]) / 2, document["next_aim"]
+        numbers = {name: document[name] for name in CONFIRMED} | {f"next_{name}": aim[name] for name in AIMED}
+        quantities = tuple(_quantity(name, number(value)) for name, value in numbers.items() if value is not None)
+        words = {name: document[name] for name in ("verdict", "structure", "in_predicted_region")} | {
+            "next": aim["kind"]
+        }
+    place = scan.resolve()
+    files = InputFiles(place.parent)
+    volumes = CaseVolumes(files, place.parent / "--scan")
+    volumes.read("ct", place.name, key="--scan")
+    series = volumes.series(place.name)
+    if series is None:
+        what = "no DICOM series: there is no study that the objects could belong to"
+        refuse(what, scan, "the control scan as DICOM", "no_dicom_series")
+    if {one.sha256 for one in files.inputs} != own:
+        refuse("it is not the scan that was confirmed", scan, "the one that confirm --scan was given", "input_changed")
+    said = (("use", NO_DEVICE), *((name, str(value)) for name, value in words.items() if value not in (None, "")))
+    rod = Region("needle in the scan", "needle", rod_points(path, radius_mm, archive.finest_mm(series)))
+    made = archive_files(series, ArchiveContent("Needle confirmed", (rod,), {"needle": path}, quantities, said))
+    inputs = (read.input("confirmation"), *files.inputs)
+    with writing(out, f"export {DICOM}", inputs=inputs, names=archive.NAMES, note=note) as draft:
+        for file, content in made.items():
+            with atomic(draft.folder / file) as temporary:
+                temporary.write_bytes(content)
+    written = draft.final(tuple(draft.folder / file for file in made))
+    return PathExport(DICOM, written, f"needle, {words['verdict']}", (NO_DEVICE,), (), inputs)
+
+
 def _series(case: Case) -> CtSeries:
     """The DICOM series that is the case's CT.
 
@@ -173,6 +229,11 @@ def _row(pick: Pick) -> tuple[tuple[Quantity, ...], tuple[tuple[str, str], ...]]
     known = {name: value for name, value in row.items() if value not in (None, "") and name not in OF_ONE_SEARCH}
     numbers = {name: float(value) for name, value in known.items() if type(value) in (int, float)}
     return (
-        tuple(Quantity(name, value, UNITS.get(f"_{name.rpartition('_')[2]}", "")) for name, value in numbers.items()),
+        tuple(_quantity(name, value) for name, value in numbers.items()),
         tuple((name, str(value)) for name, value in known.items() if name not in numbers),
     )
+
+
+def _quantity(name: str, value: float) -> Quantity:
+    """A number with the unit that its name ends with."""
+    return Quantity(name, value, UNITS.get(f"_{name.rpartition('_')[2]}", ""))
