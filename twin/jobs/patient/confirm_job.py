@@ -330,6 +330,8 @@ PICTURE_TEXT = (
     "Cyan: the needle as it was read; magenta, dashed: the planned line; green cross: target. Outlines are those of "
     "the planning CT, carried to the scan."
 )
+EDGES = {(0.06, 0.56): (-1, 0), (0.94, 0.56): (1, 0), (0.5, 0.03): (0, -1), (0.5, 0.97): (0, 1)}
+"""Where the patient's directions are written on a panel, as fractions of it, and along which of its axes."""
 PIXELS, INCHES, DPI = 320, 9.0, 100
 WINDOW_HU = (-160.0, 240.0)
 
@@ -342,7 +344,7 @@ def draw_confirmed(done: Confirmed, path: Path) -> Path:
     from puncture_twin.planning.base.reasons import css
     from puncture_twin.twin.report.figures import halo, write_png
     from puncture_twin.twin.report.palette import SKIN, organ_colours
-    from puncture_twin.twin.report.slices.planes import needle_planes, outline
+    from puncture_twin.twin.report.slices.planes import letters, needle_planes, outline
 
     anatomy, needle = done.context.anatomy, done.needle
     colours = organ_colours(tuple(one.name for one in anatomy.structures))
@@ -360,16 +362,25 @@ def draw_confirmed(done: Confirmed, path: Path) -> Path:
             lines = list(outline(one.mesh, plane))
             axes.add_collection(LineCollection(lines, colors=css(colours[one.name]), linewidths=0.8))
         axes.add_collection(LineCollection(list(outline(anatomy.skin.mesh, plane)), colors=css(SKIN), linewidths=0.8))
-        axes.plot(*plane.place(needle.path_ct).T, color="cyan", linewidth=1.0, path_effects=rim)
-        axes.plot(*plane.place(needle.tip_ct), "x", color="cyan", path_effects=rim)
+        axes.plot(*plane.place(needle.path_ct).T, color="cyan", linewidth=0.8, label="needle as read")
+        axes.plot(*plane.place(needle.tip_ct), "x", color="cyan", path_effects=rim, label="its tip")
         if done.plan is not None:
             ends = np.stack([done.plan.target_ct, done.plan.entry_ct])
-            axes.plot(*plane.place(ends).T, "--", color="magenta", linewidth=1.0, path_effects=rim)
-        axes.plot(*plane.place(done.context.case.target_ct), "+", color="#38d39f", markersize=12, path_effects=rim)
+            axes.plot(*plane.place(ends).T, "--", color="magenta", linewidth=0.8, label="planned line")
+        target = plane.place(done.context.case.target_ct)
+        axes.plot(*target, "+", color="#38d39f", markersize=12, path_effects=rim, label="target")
         axes.set(xlim=extent[:2], ylim=extent[2:])
         axes.set_title(plane.name.replace("target", "tip"), fontsize=9)
+        axes.set_xlabel("mm", fontsize=7, labelpad=1)
         axes.tick_params(labelsize=7)
-    figure.tight_layout()
+        for at, toward in EDGES.items():
+            letter = letters(done.context.case.space, toward[0] * plane.right + toward[1] * plane.up)
+            look = {"color": "white", "ha": "center", "va": "center", "weight": "bold", "path_effects": rim}
+            axes.text(*at, letter, transform=axes.transAxes, **look)
+    figure.tight_layout(rect=(0, 0.03, 1, 1))
+    handles, named = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, named, loc="lower left", ncols=4, fontsize=8, facecolor="0.35", labelcolor="white")
+    figure.text(0.99, 0.012, "research software, not a medical device", fontsize=8, color="0.4", ha="right")
     write_png(figure, path)
     return path
 
