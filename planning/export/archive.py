@@ -11,6 +11,7 @@ import hashlib
 import io
 import itertools
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -104,10 +105,12 @@ def archive_files(scan: CtSeries, content: ArchiveContent) -> dict[str, bytes]:
         refuse(what, scan.path, "a series as the scanner exports it", "no_frame_of_reference")
     sources = _sources(scan)
     masks = [_mask(scan, region) for region in content.regions]
-    files = {
-        SEGMENTS: _bytes(_segmentation(sources, scan, content, masks)),
-        REPORT: _bytes(_report(sources, scan, content)),
-    }
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*person name")  # the scan's patient may have one name alone
+        files = {
+            SEGMENTS: _bytes(_segmentation(sources, scan, content, masks)),
+            REPORT: _bytes(_report(sources, scan, content)),
+        }
     _check_segments(files[SEGMENTS], scan, content.regions, masks)
     _check_report(files[REPORT], content)
     return files
