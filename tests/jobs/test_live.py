@@ -23,7 +23,7 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import INTERRUPTED
 from puncture_twin.twin.jobs.live.messages import Header, Message, Stamp, packed
-from puncture_twin.twin.jobs.live.planner import NO_STRUCTURE, Planner, Question
+from puncture_twin.twin.jobs.live.planner import NO_STRUCTURE, Planner, Question, slack_mm
 
 ABDOMEN = folder() / "abdomen"
 RAS = np.array([-1.0, -1.0, 1.0])
@@ -170,6 +170,18 @@ def test_a_needle_beside_the_line_is_not_called_safe(context, planner, paths):
     assert narrow[2] < 1.8
     assert verdict(planner, toward(context, *narrow[:2], off_mm=0.0))["verdict"] == "safe"
     assert verdict(planner, toward(context, *narrow[:2], off_mm=narrow[2] + 0.05))["verdict"] == "not aimed"
+
+
+def test_what_breath_and_bending_take_is_not_spare():
+    """10 mm and 4 mm of clearance over margins of 3 and 1; 5 mm at the breath's worst; 1.5 mm of bending."""
+    clearance = SimpleNamespace(distance=np.array([[10.0, 4.0, 0.2]]), margins=np.array([3.0, 1.0, np.nan]))
+    breath = SimpleNamespace(clearance=np.array([5.0]))
+    for breathing, bent, expected in ((None, None, 3.0), (breath, None, 2.0), (None, 1.5, 1.5), (breath, 1.5, 0.5)):
+        deflection = None if bent is None else np.array([bent])
+        found = SimpleNamespace(clearance=clearance, breathing=breathing, deflection=deflection)
+        assert slack_mm(found) == expected
+    unknown = SimpleNamespace(clearance=np.array([np.nan]))
+    assert np.isnan(slack_mm(SimpleNamespace(clearance=clearance, breathing=unknown, deflection=None)))
 
 
 def test_a_needle_held_the_wrong_way_round_is_another_direction(context, planner, paths):

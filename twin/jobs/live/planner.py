@@ -32,6 +32,7 @@ from puncture_twin.planning.budget.guidance import explained_ways
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import AngleGrid, angles, outward
 from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, explain_choice
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, finite
@@ -272,7 +273,7 @@ class Planner:
             "target_ras_mm": _ras(case.target_ct),
             "off_line_mm": off,
             "ahead_mm": ahead,
-            "slack_mm": finite(_slack(found)),
+            "slack_mm": finite(slack_mm(found.candidates)),
             "entry_ras_mm": point,
             "joints_deg": np.degrees(q).tolist() if np.isfinite(q).all() else None,
             "check": {key: value for key, value in found.summary().items() if key not in LEFT_OUT},
@@ -290,14 +291,21 @@ def _verdict_text(found: Explanation, off_mm: float, ahead_mm: float) -> str:
     """The verdict of the needle as it is held."""
     if not found.safe:
         return found.verdict
-    aimed = off_mm <= min(AIMED_MM, _slack(found)) and ahead_mm >= -AIMED_MM
+    aimed = off_mm <= AIMED_MM and off_mm <= slack_mm(found.candidates) and ahead_mm >= -AIMED_MM
     return found.candidates.safe_text if aimed else NOT_AIMED
 
 
-def _slack(found: Explanation) -> float:
-    """By how much the path keeps more than each margin, at least, mm; inf where no structure demands one."""
-    clearance = found.candidates.clearance
-    return float(np.nanmin(np.append(clearance.distance[0] - clearance.margins, np.inf)))
+def slack_mm(candidates: Candidates) -> float:
+    """By how much the first path keeps more than each margin, at least: beside what the needle may bend.
+
+    Over the breath, the least clearance is held against the largest margin, since it is known of no structure. inf
+    where nothing demands a margin, NaN where it is not known.
+    """
+    clearance, breathing = candidates.clearance, candidates.breathing
+    found = np.nanmin(np.append(clearance.distance[0] - clearance.margins, np.inf))
+    if breathing is not None:
+        found = np.minimum(found, breathing.clearance[0] - np.nanmax(np.append(clearance.margins, 0.0)))
+    return float(found if candidates.deflection is None else found - candidates.deflection[0])
 
 
 def _ras(point_ct: Floats) -> list[float]:
