@@ -168,6 +168,11 @@ class Planner:
         best = 0 if checked.best is None else checked.best.row
         explained(at, float(checked.theta[best]), float(checked.beta[best])).summary()
 
+    def begin(self) -> None:
+        """Make what the thread that answers has of its own, before it is asked."""
+        if self._context.reach is not None:
+            _ = self._context.reach.checker
+
     def session(self) -> Session:
         """Of a client that has said nothing yet: the case's target."""
         return Session(self._context)

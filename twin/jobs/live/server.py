@@ -196,6 +196,7 @@ def serve(listener: socket.socket, planner: Planner) -> None:
 
 def _compute(exchange: Exchange, planner: Planner) -> None:
     """One question after the other, until there are no more."""
+    planner.begin()
     while (question := exchange.take()) is not None:
         for found in _found(planner, question):
             if isinstance(found, Question):
