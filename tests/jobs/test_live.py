@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from case_world import changed
+from case_world import ball, changed, write_case
 from igtl_client import Talk, point, text, tools, transform
 from places import ROOT
 from refusals import refused
@@ -170,6 +170,18 @@ def test_a_needle_beside_the_line_is_not_called_safe(context, planner, paths):
     assert narrow[2] < 1.8
     assert verdict(planner, toward(context, *narrow[:2], off_mm=0.0))["verdict"] == "safe"
     assert verdict(planner, toward(context, *narrow[:2], off_mm=narrow[2] + 0.05))["verdict"] == "not aimed"
+
+
+def test_a_tip_beyond_the_target_is_held_against_what_lies_behind(tmp_path):
+    """A ball 0.5 mm farther behind the target than its margin: 0.4 mm beyond the target is safe, 0.6 mm is too near."""
+    path = write_case(tmp_path)
+    radius, margin = load_case(path).needle.radius_mm, 3.0
+    ball(tmp_path / "rib.stl", 5.0, (0.0, 0.0, -(5.0 + margin + radius + 0.5)))  # a corner of it is on the axis
+    planner = Planner(pt.prepare(path, arm=False))
+    for beyond, off, expected in ((0.0, 0.0, True), (0.4, 0.0, True), (0.6, 0.0, False), (0.4, 0.4, False)):
+        said = verdict(planner, needle([off, 0.0, -beyond], [0.0, 0.0, -1.0]))
+        assert said["slack_mm"] == pytest.approx(0.5, abs=1e-3) and said["check"]["verdict"].startswith("safe")
+        assert said["verdict"].startswith("safe") == expected and (said["verdict"] == "not aimed") != expected
 
 
 def test_what_breath_and_bending_take_is_not_spare():

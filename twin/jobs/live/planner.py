@@ -8,8 +8,9 @@ A message is about one of three subjects, by its name:
 
 The needle's axis is z, from hub to tip; with f the target, p the tip and z the axis, its direction outward is -z, and
 its line passes the target at the distance |(f - p) - ((f - p)'z) z|. A verdict is that of the parallel path through the
-target. A needle beside it by no more than the least slack of that path keeps every margin, since no point of it lies
-farther from the path; one that is beside it by more, or by more than `AIMED_MM`, is "not aimed", however safe that is.
+target. With its tip a = max((p - f)'z, 0) beyond the target and d beside it, no point of the needle lies farther from the
+path than sqrt(d^2 + a^2): by no more than the least slack of that path, and it keeps every margin. One that is off by
+more, or by more than `AIMED_MM`, is "not aimed", however safe that is.
 
 What cannot be answered takes the place of the answer: a map without cells, a verdict "refused", no entry. So nothing
 that was said of an earlier target or needle stands where the newest is expected.
@@ -293,10 +294,11 @@ def explained(context: CaseContext, theta: float, beta: float) -> Explanation:
 
 
 def _verdict_text(found: Explanation, off_mm: float, ahead_mm: float) -> str:
-    """The verdict of the needle as it is held."""
+    """The verdict of the needle as it is held: beside its path, beyond the path's end, or both."""
     if not found.safe:
         return found.verdict
-    aimed = off_mm <= AIMED_MM and off_mm <= slack_mm(found.candidates) and ahead_mm >= -AIMED_MM
+    farthest = float(np.hypot(off_mm, max(-ahead_mm, 0.0)))  # a point of the needle from the path, up to its hub
+    aimed = farthest <= AIMED_MM and farthest <= slack_mm(found.candidates)
     return found.candidates.safe_text if aimed else NOT_AIMED
 
 
