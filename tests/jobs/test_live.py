@@ -227,6 +227,7 @@ def test_a_refused_target_leaves_nothing_of_the_one_before(context, planner, pat
     assert verdict(planner, pose, session=session)["verdict"] == "safe"
     far = asked(planner, "POINT", "Target", point((900.0, 0.0, 0.0)), session)
     assert is_empty(far) == "target_misplaced"
+    assert "(900.0, 0.0, 0.0 mm RAS)" in document(far, "SafeMapInfo")["error"]["sentence"]  # as it was sent
     assert verdict(planner, pose, session=session)["error"]["code"] == "no_target"
     assert verdict(planner, pose)["verdict"] == "safe"  # another client has a target of its own
     for content, code in [

@@ -32,7 +32,7 @@ from puncture_twin.planning.base.errors import InputError, PlanningError, refuse
 from puncture_twin.planning.budget.guidance import explained_ways
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import AngleGrid, angles, outward
-from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.geometry.spaces import Space, point_text, to_lps
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, explain_choice
 from puncture_twin.planning.search.context import CaseContext
@@ -205,7 +205,11 @@ class Planner:
             yield self._status(session, message.kind, message.stamp)
         elif question.subject == "target":
             target_ras = read_place(message)
-            session.context = self._context.at(to_lps(target_ras[None], Space.RAS)[0])
+            target_ct = to_lps(target_ras[None], Space.RAS)[0]
+            try:
+                session.context = self._context.at(target_ct)
+            except InputError as error:  # says where the case's space has the point: beside it stands what was sent
+                raise error.at(f"{message.kind} Target ({point_text(target_ct, Space.RAS)})") from error
             yield from self._map(safe_map(session.context), message.stamp)
             if session.needle is not None:
                 yield session.needle
