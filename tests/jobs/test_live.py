@@ -43,16 +43,15 @@ def planner(context):
 
 
 def asked(planner, kind, name, content, session=None, stamp=STAMP):
-    """The answers to one message, by name; questions that arise are answered too."""
+    """The answers to one message, by name; a new target's needle is answered too."""
     subject, session = planner.subject(Header(2, kind, name, 0, 0, len(content), 0)), session or planner.session()
-    waiting, found = [Question(1, session, subject, stamp, Message(kind, name, stamp, content))], {}
-    while waiting:
-        question = waiting.pop()
+    question, found = Question(1, session, subject, stamp, Message(kind, name, stamp, content)), {}
+    while question is not None:
         try:
-            for one in planner.answers(question):
-                waiting.append(one) if isinstance(one, Question) else found.update({one.name: one.data})
+            found |= {one.name: one.data for one in planner.answers(question)}
         except pt.InputError as error:
             found |= {one.name: one.data for one in planner.refused(question.subject, question.stamp, error)}
+        question = planner.needle(session) if question.subject == "target" else None
     for data in found.values():
         assert struct.unpack(">II", data[34:42]) == (stamp.seconds, stamp.fraction)
         assert struct.unpack(">HHII", data[58:70])[3] == stamp.number

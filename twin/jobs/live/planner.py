@@ -8,9 +8,9 @@ A message is about one of three subjects, by its name:
 
 The needle's axis is z, from hub to tip; with f the target, p the tip and z the axis, its direction outward is -z, and
 its line passes the target at the distance |(f - p) - ((f - p)'z) z|. A verdict is that of the parallel path through the
-target. With its tip a = max((p - f)'z, 0) beyond the target and d beside it, no point of the needle lies farther from the
-path than sqrt(d^2 + a^2): by no more than the least slack of that path, and it keeps every margin. One that is off by
-more, or by more than `AIMED_MM`, is "not aimed", however safe that is.
+target. With its tip a = max((p - f)'z, 0) beyond the target and d beside it, no point of the needle lies farther from
+the path than sqrt(d^2 + a^2): by no more than the least slack of that path, and it keeps every margin. One that is off
+by more, or by more than `AIMED_MM`, is "not aimed", however safe that is.
 
 What cannot be answered takes the place of the answer: a map without cells, a verdict "refused", no entry. So nothing
 that was said of an earlier target or needle stands where the newest is expected.
@@ -187,7 +187,11 @@ class Planner:
             return "target"
         return "needle" if kind == "TDATA" or (kind, name) == ("TRANSFORM", "Needle") else None
 
-    def answers(self, question: Question) -> Iterator[Answer | Question]:
+    def needle(self, session: Session) -> Question | None:
+        """What a client has last asked of its needle, which a new target answers anew; None where it was refused."""
+        return None if session.context is None else session.needle
+
+    def answers(self, question: Question) -> Iterator[Answer]:
         """The answers to a message, as they are found.
 
         Raises:
@@ -211,8 +215,6 @@ class Planner:
             except InputError as error:  # says where the case's space has the point: beside it stands what was sent
                 raise error.at(f"{message.kind} Target ({point_text(target_ct, Space.RAS)})") from error
             yield from self._map(safe_map(session.context), message.stamp)
-            if session.needle is not None:
-                yield session.needle
         else:
             tip_ras, axis_ras = read_pose(message, "Needle")
             yield from self._verdict(session, tip_ras, axis_ras, message.stamp)
