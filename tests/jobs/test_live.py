@@ -266,6 +266,14 @@ def test_a_pose_that_no_needle_has_is_refused(planner, matrix, code):
     assert (said["verdict"], said["error"]["code"], found["POINT Entry"]) == ("refused", code, b"")
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_signalling_nan_is_refused_without_a_warning(planner):
+    """Some processors warn of it where a number is made wider."""
+    for kind, name, subject in (("TRANSFORM", "Needle", "Verdict"), ("TRANSFORM", "Target", "SafeMapInfo")):
+        found = document(asked(planner, kind, name, b"\x7f\xa0\0\1" * 12), subject)
+        assert found["error"]["code"] == "not_finite"
+
+
 def test_of_a_stranger_nothing_is_wanted(planner):
     """Only three names, each with its types."""
     for kind, name in (("IMAGE", "Target"), ("POINT", "Needle"), ("POINT", "F"), ("STRING", "Text"), ("STATUS", "x")):

@@ -171,6 +171,15 @@ def test_what_is_no_message_ends_its_connection_with_one_line(running, sent, cap
     assert len(lines) <= 2 and all(len(line.splitlines()) == 1 for line in lines)
 
 
+def test_a_message_whose_time_is_over_is_not_read_on(running, monkeypatch):
+    """Not even where its next bytes are there already, as of one that drips they always are."""
+    monkeypatch.setattr(server, "MESSAGE_S", -1.0)
+    with Talk(running.port) as talk:
+        talk.send("STRING", "Query", text("late"))
+        assert talk.ended()
+    assert not running.planner.begun
+
+
 def test_random_bytes_never_end_the_server(running):
     """Messages with bytes changed or cut, several in one, and noise: 300 connections."""
     rng = np.random.default_rng(20260101)

@@ -334,7 +334,10 @@ class Client:
         """
         data = bytearray()
         while len(data) < size:
-            self._in.settimeout(max(until - time.monotonic(), 1e-3))
+            left = until - time.monotonic()
+            if left <= 0.0:
+                raise TimeoutError
+            self._in.settimeout(left)
             more = self._in.recv(size - len(data))
             if not more:
                 raise ConnectionError("ended within a message")
