@@ -131,9 +131,8 @@ class InputFiles:
         Raises:
             InputError: It is missing, no plain file, empty, too large or not readable.
         """
-        if name in self._held:
-            content = self._held[name]
-        else:
+        content = self._held.get(name)
+        if content is None:
             content = read_input(self._existing(name, key, where), max_bytes=max_bytes, where=str(self._folder / name))
         return self.add(role, name, content)
 
@@ -147,8 +146,9 @@ class InputFiles:
         Raises:
             InputError: It has changed since.
         """
-        if name in self._held:
-            return self._held[name]
+        held = self._held.get(name)  # looked at once: another thread may let go of it
+        if held is not None:
+            return held
         known = self.sha256(name)
         content = read_input(self._folder / name, max_bytes=1 << 40, where=str(self._folder / name))
         if content_input("", name, content).sha256 != known:

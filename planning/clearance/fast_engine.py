@@ -132,9 +132,10 @@ class FastEngine:
 
     def _placed_about(self, target: Floats) -> tuple[PlacedSurface, ...]:
         """All surfaces placed about a target; those of the last target are cached."""
-        if self._placed is None or not np.array_equal(self._placed[0], target):
-            self._placed = (target.copy(), tuple(placed_surface(blocks, target) for blocks in self.blocks))
-        return self._placed[1]
+        placed = self._placed  # looked at once: another thread may ask about another target
+        if placed is None or not np.array_equal(placed[0], target):
+            placed = self._placed = (target.copy(), tuple(placed_surface(blocks, target) for blocks in self.blocks))
+        return placed[1]
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """FCL collision of a capsule with one structure; see `ClearanceEngine`.

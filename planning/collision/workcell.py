@@ -5,7 +5,10 @@ Obstacles and gantry are boxes for the arm and solids for the needle, which is c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from threading import get_ident
 
 import numpy as np
 
@@ -13,7 +16,7 @@ from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.arm.tool import Box, Tool, gantry_boxes
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import NO_MEMORY, Memory, user_cache
+from puncture_twin.planning.base.cache.array_cache import Memory, user_cache
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Gantry, Obstacle
@@ -50,38 +53,38 @@ def patient_surface(anatomy: Anatomy) -> TriangleMesh:
     return anatomy.skin.mesh if outside is None else joined([anatomy.skin.mesh, outside])
 
 
-def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory = NO_MEMORY) -> FastChecker:
+def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> FastChecker:
     """The collision checker of the case's workcell, with the patient where ``T_base_ct`` says.
-
-    It depends on no target: of one patient and one arm it is made once where ``memory`` keeps it.
 
     Raises:
         InputError: The robot's base, or the gantry's wall, is in the patient.
     """
     check_gantry(case, anatomy.skin.mesh)
-    skin = anatomy.skin.mesh
-    boxes = case_boxes(case, T_base_ct)
-    model, tool = case.robot.model, case_tool(case)
+    surfaces = anatomy.skin.mesh, outside_surface(anatomy)
+    placed, placed_outside = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in surfaces)
+    model, tool, boxes = case.robot.model, case_tool(case), case_boxes(case, T_base_ct)
+    try:
+        return FastChecker(
+            model, tool, boxes, placed, outside=placed_outside, padding_mm=ARM_PADDING_MM, cache=user_cache()
+        )
+    except InputError as error:
+        if not error.code.startswith("base_in"):
+            raise
+        raise error.at(f"{case.path}: {_placing_key(case)}") from error
 
-    def make() -> FastChecker:
-        surfaces = skin, outside_surface(anatomy)
-        placed, placed_outside = (None if mesh is None else mesh.transformed(T_base_ct) for mesh in surfaces)
-        try:
-            return FastChecker(
-                model, tool, boxes, placed, outside=placed_outside, padding_mm=ARM_PADDING_MM, cache=user_cache()
-            )
-        except InputError as error:
-            if not error.code.startswith("base_in"):
-                raise
-            raise error.at(f"{case.path}: {_placing_key(case)}") from error
 
-    if memory is NO_MEMORY:
-        return make()
-    stated = tuple((box.name, box.T_base_box.tobytes(), box.size_mm) for box in boxes)
-    meshes = [skin, *(one.mesh for one in anatomy.surroundings if one.role is Role.UNKNOWN)]
-    place = np.ascontiguousarray(T_base_ct, np.float64).tobytes()
-    key = (__name__, model, tool, stated, tuple(mesh.digest for mesh in meshes), place, ARM_PADDING_MM)
-    return memory.get(key, make, lambda _: CHECKER_BYTES + TREE_COPIES * sum(mesh.nbytes for mesh in meshes))
+def own_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory) -> Callable[[], FastChecker]:
+    """Gives each thread a `case_checker` of its own, since none is for several: FCL's bodies are moved to be asked.
+
+    It depends on no target: of one patient and one arm a thread's is made once, as long as ``memory`` keeps it.
+    """
+    stated = tuple((box.name, box.T_base_box.tobytes(), box.size_mm) for box in case_boxes(case, T_base_ct))
+    meshes = [anatomy.skin.mesh, *(one.mesh for one in anatomy.surroundings if one.role is Role.UNKNOWN)]
+    place, digests = np.ascontiguousarray(T_base_ct, np.float64).tobytes(), tuple(mesh.digest for mesh in meshes)
+    key = (__name__, case.robot.model, case_tool(case), stated, digests, place, ARM_PADDING_MM)
+    size = CHECKER_BYTES + TREE_COPIES * sum(mesh.nbytes for mesh in meshes)
+    make = partial(case_checker, case, anatomy, T_base_ct)
+    return lambda: memory.get((*key, get_ident()), make, lambda _: size)
 
 
 def _placing_key(case: Case) -> str:

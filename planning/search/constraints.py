@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import repeat
 from typing import Any
@@ -134,10 +134,19 @@ def _first_of(candidates: Candidates, reasons: tuple[Reason, ...]) -> int | None
 
 @dataclass(frozen=True, eq=False)
 class ArmReach:
-    """The arm in its workcell, as the check of candidates needs it, and where the patient is."""
+    """The arm in its workcell, as the check of candidates needs it, and where the patient is.
 
-    checker: CellChecker
+    Attributes:
+        own_checker: Gives the thread that asks its checker: none is for several at once.
+    """
+
+    own_checker: Callable[[], CellChecker]
     T_base_ct: Floats
+
+    @property
+    def checker(self) -> CellChecker:
+        """The checker of the calling thread."""
+        return self.own_checker()
 
 
 def with_reach(case: Case, candidates: Candidates, reach: ArmReach, progress: Count | None = None) -> Candidates:

@@ -8,7 +8,7 @@ checks and explains single directions, and gives errors and provenance. A search
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -31,7 +31,7 @@ from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked, FclEngine, HeldEngine, cross_check
-from puncture_twin.planning.collision.workcell import case_checker, with_surroundings
+from puncture_twin.planning.collision.workcell import own_checker, with_surroundings
 from puncture_twin.planning.evidence.checks import findings
 from puncture_twin.planning.reach.standoff import axis_lengths, case_axis_lengths
 from puncture_twin.planning.registration.placement import Placement, load_placement
@@ -85,7 +85,7 @@ class CaseContext(Shown):
     chance: ChanceModel | None
     watcher: Watcher
     stages: Stages
-    memory: Memory = field(default_factory=lambda: Memory(AT_BYTES))
+    memory: Memory
 
     def _title(self) -> str:
         return f"Case {self.case.name}, prepared"
@@ -315,6 +315,7 @@ def _answering(
     cache: Cache,
 ) -> CaseContext:
     """What questions are answered with: clearance engine, arm's checker, model of errors."""
+    memory = Memory(AT_BYTES) if cache.memory is NO_MEMORY else cache.memory
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
         count = partial(watcher.count, COUNTED[engine] if isinstance(engine, str) else COUNTED["fast"])
@@ -327,11 +328,12 @@ def _answering(
                 clearance_engine = HeldEngine(engine(meshes, count), clearance_engine)
         reach = None
         if arm and placement is not None:
-            reach = ArmReach(case_checker(case, anatomy, placement.T_base_ct, cache.memory), placement.T_base_ct)
+            T_base_ct = placement.T_base_ct
+            reach = ArmReach(own_checker(case, anatomy, T_base_ct, memory), T_base_ct)
+            _ = reach.checker  # what cannot be is refused now
         error = None if reach is None or placement is None else pose_error(case, placement.registration)
         chance = chance_model(case, anatomy, clearance_engine, error)
-    made = CaseContext(case, anatomy, placement, clearance_engine, reach, chance, watcher, stages)
-    return made if cache.memory is NO_MEMORY else replace(made, memory=cache.memory)
+    return CaseContext(case, anatomy, placement, clearance_engine, reach, chance, watcher, stages, memory)
 
 
 def _with_findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache) -> Anatomy:

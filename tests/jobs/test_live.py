@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from case_world import changed
+from case_world import ball, changed, write_case
 from igtl_client import Talk, point, text, tools, transform
 from places import ROOT
 from refusals import refused
@@ -43,16 +43,15 @@ def planner(context):
 
 
 def asked(planner, kind, name, content, session=None, stamp=STAMP):
-    """The answers to one message, by name; questions that arise are answered too."""
+    """The answers to one message, by name; a new target's needle is answered too."""
     subject, session = planner.subject(Header(2, kind, name, 0, 0, len(content), 0)), session or planner.session()
-    waiting, found = [Question(1, session, subject, stamp, Message(kind, name, stamp, content))], {}
-    while waiting:
-        question = waiting.pop()
+    question, found = Question(1, session, subject, stamp, Message(kind, name, stamp, content)), {}
+    while question is not None:
         try:
-            for one in planner.answers(question):
-                waiting.append(one) if isinstance(one, Question) else found.update({one.name: one.data})
+            found |= {one.name: one.data for one in planner.answers(question)}
         except pt.InputError as error:
             found |= {one.name: one.data for one in planner.refused(question.subject, question.stamp, error)}
+        question = planner.needle(session) if question.subject == "target" else None
     for data in found.values():
         assert struct.unpack(">II", data[34:42]) == (stamp.seconds, stamp.fraction)
         assert struct.unpack(">HHII", data[58:70])[3] == stamp.number
@@ -172,6 +171,18 @@ def test_a_needle_beside_the_line_is_not_called_safe(context, planner, paths):
     assert verdict(planner, toward(context, *narrow[:2], off_mm=narrow[2] + 0.05))["verdict"] == "not aimed"
 
 
+def test_a_tip_beyond_the_target_is_held_against_what_lies_behind(tmp_path):
+    """A ball 0.5 mm farther behind the target than its margin: 0.4 mm beyond the target is safe, 0.6 mm is too near."""
+    path = write_case(tmp_path)
+    radius, margin = load_case(path).needle.radius_mm, 3.0
+    ball(tmp_path / "rib.stl", 5.0, (0.0, 0.0, -(5.0 + margin + radius + 0.5)))  # a corner of it is on the axis
+    planner = Planner(pt.prepare(path, arm=False))
+    for beyond, off, expected in ((0.0, 0.0, True), (0.4, 0.0, True), (0.6, 0.0, False), (0.4, 0.4, False)):
+        said = verdict(planner, needle([off, 0.0, -beyond], [0.0, 0.0, -1.0]))
+        assert said["slack_mm"] == pytest.approx(0.5, abs=1e-3) and said["check"]["verdict"].startswith("safe")
+        assert said["verdict"].startswith("safe") == expected and (said["verdict"] == "not aimed") != expected
+
+
 def test_what_breath_and_bending_take_is_not_spare():
     """10 mm and 4 mm of clearance over margins of 3 and 1; 5 mm at the breath's worst; 1.5 mm of bending."""
     clearance = SimpleNamespace(distance=np.array([[10.0, 4.0, 0.2]]), margins=np.array([3.0, 1.0, np.nan]))
@@ -215,6 +226,7 @@ def test_a_refused_target_leaves_nothing_of_the_one_before(context, planner, pat
     assert verdict(planner, pose, session=session)["verdict"] == "safe"
     far = asked(planner, "POINT", "Target", point((900.0, 0.0, 0.0)), session)
     assert is_empty(far) == "target_misplaced"
+    assert "(900.0, 0.0, 0.0 mm RAS)" in document(far, "SafeMapInfo")["error"]["sentence"]  # as it was sent
     assert verdict(planner, pose, session=session)["error"]["code"] == "no_target"
     assert verdict(planner, pose)["verdict"] == "safe"  # another client has a target of its own
     for content, code in [
@@ -252,6 +264,14 @@ def test_a_pose_that_no_needle_has_is_refused(planner, matrix, code):
     found = asked(planner, "TRANSFORM", "Needle", transform(matrix))
     said = document(found, "Verdict")
     assert (said["verdict"], said["error"]["code"], found["POINT Entry"]) == ("refused", code, b"")
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_signalling_nan_is_refused_without_a_warning(planner):
+    """Some processors warn of it where a number is made wider."""
+    for kind, name, subject in (("TRANSFORM", "Needle", "Verdict"), ("TRANSFORM", "Target", "SafeMapInfo")):
+        found = document(asked(planner, kind, name, b"\x7f\xa0\0\1" * 12), subject)
+        assert found["error"]["code"] == "not_finite"
 
 
 def test_of_a_stranger_nothing_is_wanted(planner):

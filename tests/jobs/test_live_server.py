@@ -34,6 +34,12 @@ class Slow:
         """By name."""
         return {"Query": "status", "Target": "target", "Needle": "needle"}.get(header.name)
 
+    def begin(self):
+        """Nothing is made."""
+
+    def needle(self, _):
+        """None is known."""
+
     def answers(self, question):
         """After a while."""
         if question.message is None:
@@ -165,6 +171,15 @@ def test_what_is_no_message_ends_its_connection_with_one_line(running, sent, cap
     assert len(lines) <= 2 and all(len(line.splitlines()) == 1 for line in lines)
 
 
+def test_a_message_whose_time_is_over_is_not_read_on(running, monkeypatch):
+    """Not even where its next bytes are there already, as of one that drips they always are."""
+    monkeypatch.setattr(server, "MESSAGE_S", -1.0)
+    with Talk(running.port) as talk:
+        talk.send("STRING", "Query", text("late"))
+        assert talk.ended()
+    assert not running.planner.begun
+
+
 def test_random_bytes_never_end_the_server(running):
     """Messages with bytes changed or cut, several in one, and noise: 300 connections."""
     rng = np.random.default_rng(20260101)
@@ -200,6 +215,28 @@ def test_the_newest_message_counts_and_nothing_queues(running):
     assert ended - sent < 2.0
     assert stamps == sorted(set(stamps)) and len(stamps) <= 2 + (ended - begun) / 0.05
     assert [number for _, _, number in running.planner.begun] == stamps
+
+
+def test_a_target_that_moves_faster_than_its_map_leaves_the_needle_its_turn(running):
+    """Both at 500 Hz before a planner that takes 20 ms: they are answered in turns, and the last are the last sent."""
+    running.planner.waits_s = 0.02
+    with Talk(running.port) as talk:
+        reader = threading.Thread(target=talk.ended)
+        reader.start()
+        for number in range(200):
+            for name in ("Target", "Needle"):
+                talk.send("TRANSFORM", name, transform(np.eye(4)), stamp=(0, number))
+            time.sleep(0.002)
+        sent = len(running.planner.begun)
+        time.sleep(0.3)
+        talk.socket.shutdown(socket.SHUT_RDWR)
+        reader.join(5.0)
+    numbers = {"target": [], "needle": []}
+    for _, subject, number in running.planner.begun:
+        numbers[subject].append(number)
+    assert all(one == sorted(set(one)) and one[-1] == 199 for one in numbers.values())
+    needles = [subject for _, subject, _ in running.planner.begun[:sent]].count("needle")
+    assert abs(2 * needles - sent) <= 2 and sent > 6
 
 
 def test_one_client_that_floods_does_not_keep_another_waiting(running):
@@ -314,7 +351,6 @@ def test_questions_take_turns_and_a_target_comes_before_a_needle():
         exchange.open(client)
         for subject in ("needle", "target", "needle"):
             exchange.ask(Question(client, None, subject, stamp))
-    exchange.ask(Question(2, None, "needle", (1, 0, 1, 0)), newest=False)
     exchange.ask(Question(3, None, "needle", stamp))  # a client that is gone
     taken = [exchange.take() for _ in range(4)]
     assert [(one.client, one.subject) for one in taken] == [(1, "target"), (2, "target"), (1, "needle"), (2, "needle")]

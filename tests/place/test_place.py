@@ -6,6 +6,7 @@ import csv
 import json
 import shutil
 import time
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -389,7 +390,7 @@ def _same_as_the_search(here, best):
     pasted.write_text(text[:start] + text[end:] + "\n" + mount + "\n")
     context = prepare(pasted)
     found = organ_candidates(context.case, context.anatomy, context.engine, context.case.directions())
-    reached = with_reach(context.case, found, ArmReach(context.reach.checker, context.reach.T_base_ct))
+    reached = with_reach(context.case, found, context.reach)
     assert int((reached.arm.reachable == 1).sum()) == best["held"] and int(found.safe.sum()) == best["asked"]
 
 
@@ -455,7 +456,7 @@ def best_share(grid, one):
     """The share of a placement, checked in every direction from the pose that is written."""
     context, candidates = grid
     T = mount_pose(one.mount, context.case.space, context.case.path)
-    reached = with_reach(context.case, candidates, ArmReach(case_checker(context.case, context.anatomy, T), T))
+    reached = with_reach(context.case, candidates, ArmReach(partial(case_checker, context.case, context.anatomy, T), T))
     wanted = wanted_directions(context.case, candidates)
     return float(wanted.weight[reached.arm.reachable[candidates.safe] == 1].sum())
 

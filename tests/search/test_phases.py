@@ -1,6 +1,7 @@
 """Directions of a body that breathes, against a plain oracle that moves every mesh and searches anew at each phase."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -210,7 +211,7 @@ def test_the_arm_is_checked_where_the_breath_puts_target_and_skin():
     body = replace(context.anatomy, skin=replace(skin, mesh=skin.mesh.transformed(moved)))
     paths = skin_paths(body.skin, there.target_ct, organs.outward_ct, case.needle.length_mm)
     path = replace(organs.path, length=paths.path_length, skin_angle=paths.skin_angle)
-    oracle = with_reach(there, replace(static, path=path), ArmReach(case_checker(there, body, base), base))
+    oracle = with_reach(there, replace(static, path=path), ArmReach(partial(case_checker, there, body, base), base))
     np.testing.assert_array_equal(found.safe, static.safe & oracle.safe)
     assert 0 < found.safe.sum() < static.safe.sum()
     new = static.safe & ~found.safe
@@ -233,15 +234,15 @@ def test_the_arm_is_checked_against_an_obstacle_where_its_stated_weight_puts_it(
     case = replace(bare, obstacles=(*bare.obstacles, box))
     anatomy = with_surroundings(replace(context.anatomy, surroundings=()), case, base)
     organs = organ_candidates(replace(bare, breathing=None), context.anatomy, context.engine, bare.directions())
-    static = with_reach(case, organs, ArmReach(case_checker(case, anatomy, base), base))
-    found = with_breathing_reach(case, anatomy, static, ArmReach(case_checker(case, anatomy, base), base))
+    static = with_reach(case, organs, ArmReach(partial(case_checker, case, anatomy, base), base))
+    found = with_breathing_reach(case, anatomy, static, ArmReach(partial(case_checker, case, anatomy, base), base))
     skin = anatomy.skin
     body = replace(anatomy, skin=replace(skin, mesh=skin.mesh.transformed(pose(np.eye(3), by))))
 
     def with_box_at(center_mm):
         there = replace(case, target_ct=case.target_ct + by)
         there = replace(there, obstacles=(*bare.obstacles, replace(box, center_mm=center_mm)))
-        return static.safe & with_reach(there, static, ArmReach(case_checker(there, body, base), base)).safe
+        return static.safe & with_reach(there, static, ArmReach(partial(case_checker, there, body, base), base)).safe
 
     np.testing.assert_array_equal(found.safe, with_box_at(center + shift))
     assert np.any(with_box_at(center) & ~found.safe)  # a box that stayed would have left them safe

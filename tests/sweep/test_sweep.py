@@ -91,7 +91,9 @@ def test_a_box_on_the_way_stops_the_arm(context, plan):
     from puncture_twin.planning.collision.workcell import case_checker
 
     checker = case_checker(case, context.anatomy, context.placement.T_base_ct)
-    blocked = dataclasses.replace(context, case=case, reach=dataclasses.replace(context.reach, checker=checker))
+    blocked = dataclasses.replace(
+        context, case=case, reach=dataclasses.replace(context.reach, own_checker=lambda: checker)
+    )
     try:
         stopped = plan_sweep(blocked, tuple(START), tuple(END), seed=1, progress=quiet)
     except NoAnswerError as error:

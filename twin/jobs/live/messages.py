@@ -170,7 +170,8 @@ def _matrix(content: bytes, message: Message) -> Floats:
     """Shape (3, 4): rotation and translation; it travels column by column."""
     if len(content) != 48:
         _refuse_content(message, f"{len(content)} bytes", "12 numbers of 4 bytes", "wrong_shape")
-    return np.frombuffer(content, ">f4").astype(float).reshape(4, 3).T
+    with np.errstate(invalid="ignore"):  # of a signalling NaN, which is refused later
+        return np.frombuffer(content, ">f4").astype(float).reshape(4, 3).T
 
 
 def _finite(values: Floats, message: Message) -> Floats:

@@ -8,8 +8,9 @@ A message is about one of three subjects, by its name:
 
 The needle's axis is z, from hub to tip; with f the target, p the tip and z the axis, its direction outward is -z, and
 its line passes the target at the distance |(f - p) - ((f - p)'z) z|. A verdict is that of the parallel path through the
-target. A needle beside it by no more than the least slack of that path keeps every margin, since no point of it lies
-farther from the path; one that is beside it by more, or by more than `AIMED_MM`, is "not aimed", however safe that is.
+target. With its tip a = max((p - f)'z, 0) beyond the target and d beside it, no point of the needle lies farther from
+the path than sqrt(d^2 + a^2): by no more than the least slack of that path, and it keeps every margin. One that is off
+by more, or by more than `AIMED_MM`, is "not aimed", however safe that is.
 
 What cannot be answered takes the place of the answer: a map without cells, a verdict "refused", no entry. So nothing
 that was said of an earlier target or needle stands where the newest is expected.
@@ -31,7 +32,7 @@ from puncture_twin.planning.base.errors import InputError, PlanningError, refuse
 from puncture_twin.planning.budget.guidance import explained_ways
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import AngleGrid, angles, outward
-from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.geometry.spaces import Space, point_text, to_lps
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, explain_choice
 from puncture_twin.planning.search.context import CaseContext
@@ -168,6 +169,11 @@ class Planner:
         best = 0 if checked.best is None else checked.best.row
         explained(at, float(checked.theta[best]), float(checked.beta[best])).summary()
 
+    def begin(self) -> None:
+        """Make what the thread that answers has of its own, before it is asked."""
+        if self._context.reach is not None:
+            _ = self._context.reach.checker
+
     def session(self) -> Session:
         """Of a client that has said nothing yet: the case's target."""
         return Session(self._context)
@@ -181,7 +187,11 @@ class Planner:
             return "target"
         return "needle" if kind == "TDATA" or (kind, name) == ("TRANSFORM", "Needle") else None
 
-    def answers(self, question: Question) -> Iterator[Answer | Question]:
+    def needle(self, session: Session) -> Question | None:
+        """What a client has last asked of its needle, which a new target answers anew; None where it was refused."""
+        return None if session.context is None else session.needle
+
+    def answers(self, question: Question) -> Iterator[Answer]:
         """The answers to a message, as they are found.
 
         Raises:
@@ -199,10 +209,12 @@ class Planner:
             yield self._status(session, message.kind, message.stamp)
         elif question.subject == "target":
             target_ras = read_place(message)
-            session.context = self._context.at(to_lps(target_ras[None], Space.RAS)[0])
+            target_ct = to_lps(target_ras[None], Space.RAS)[0]
+            try:
+                session.context = self._context.at(target_ct)
+            except InputError as error:  # says where the case's space has the point: beside it stands what was sent
+                raise error.at(f"{message.kind} Target ({point_text(target_ct, Space.RAS)})") from error
             yield from self._map(safe_map(session.context), message.stamp)
-            if session.needle is not None:
-                yield session.needle
         else:
             tip_ras, axis_ras = read_pose(message, "Needle")
             yield from self._verdict(session, tip_ras, axis_ras, message.stamp)
@@ -288,10 +300,11 @@ def explained(context: CaseContext, theta: float, beta: float) -> Explanation:
 
 
 def _verdict_text(found: Explanation, off_mm: float, ahead_mm: float) -> str:
-    """The verdict of the needle as it is held."""
+    """The verdict of the needle as it is held: beside its path, beyond the path's end, or both."""
     if not found.safe:
         return found.verdict
-    aimed = off_mm <= AIMED_MM and off_mm <= slack_mm(found.candidates) and ahead_mm >= -AIMED_MM
+    farthest = float(np.hypot(off_mm, max(-ahead_mm, 0.0)))  # a point of the needle from the path, up to its hub
+    aimed = farthest <= AIMED_MM and farthest <= slack_mm(found.candidates)
     return found.candidates.safe_text if aimed else NOT_AIMED
 
 

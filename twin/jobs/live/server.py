@@ -88,12 +88,11 @@ class Exchange:
             self._asked.notify()
             self._given.notify_all()
 
-    def ask(self, question: Question, *, newest: bool = True) -> None:
-        """Put a question in place of an older one; one that is not the newest gives way to one that waits."""
+    def ask(self, question: Question) -> None:
+        """Put a question in place of an older one."""
         with self._lock:
             if question.client in self._answers:
-                waiting = self._questions.setdefault(question.client, {})
-                waiting[question.subject] = question if newest else waiting.get(question.subject, question)
+                self._questions.setdefault(question.client, {})[question.subject] = question
                 self._asked.notify()
 
     def take(self) -> Question | None:
@@ -103,11 +102,19 @@ class Exchange:
             if self._closed:
                 return None
             client = next(iter(self._questions))
-            waiting = self._questions.pop(client)
-            question = waiting.pop(min(waiting, key=SUBJECTS.index))
-            if waiting:
-                self._questions[client] = waiting
-            return question
+            return self._taken(client, min(self._questions[client], key=SUBJECTS.index))
+
+    def take_of(self, client: int, subject: str) -> Question | None:
+        """What a client asks about a subject, out of turn; None where it does not."""
+        with self._lock:
+            return self._taken(client, subject) if subject in self._questions.get(client, {}) else None
+
+    def _taken(self, client: int, subject: str) -> Question:
+        waiting = self._questions.pop(client)
+        question = waiting.pop(subject)
+        if waiting:
+            self._questions[client] = waiting
+        return question
 
     def give(self, client: int, answer: Answer) -> None:
         """Put an answer in place of an older one of its name."""
@@ -195,16 +202,26 @@ def serve(listener: socket.socket, planner: Planner) -> None:
 
 
 def _compute(exchange: Exchange, planner: Planner) -> None:
-    """One question after the other, until there are no more."""
+    """One question after the other, until there are no more.
+
+    A target is followed by its client's needle at once: one that moves faster than its map is made would be asked about
+    forever, and the needle never.
+    """
+    planner.begin()
     while (question := exchange.take()) is not None:
-        for found in _found(planner, question):
-            if isinstance(found, Question):
-                exchange.ask(found, newest=False)
-            else:
-                exchange.give(question.client, found)
+        _answer(exchange, planner, question)
+        if question.subject == "target":
+            needle = exchange.take_of(question.client, "needle") or planner.needle(question.session)
+            if needle is not None:
+                _answer(exchange, planner, needle)
 
 
-def _found(planner: Planner, question: Question) -> Iterator[Answer | Question]:
+def _answer(exchange: Exchange, planner: Planner, question: Question) -> None:
+    for answer in _found(planner, question):
+        exchange.give(question.client, answer)
+
+
+def _found(planner: Planner, question: Question) -> Iterator[Answer]:
     """The answers, or why there are none."""
     try:
         yield from planner.answers(question)
@@ -317,7 +334,10 @@ class Client:
         """
         data = bytearray()
         while len(data) < size:
-            self._in.settimeout(max(until - time.monotonic(), 1e-3))
+            left = until - time.monotonic()
+            if left <= 0.0:
+                raise TimeoutError
+            self._in.settimeout(left)
             more = self._in.recv(size - len(data))
             if not more:
                 raise ConnectionError("ended within a message")
