@@ -283,6 +283,9 @@ def rehearse(
             "--guidance", metavar="WAY", help="What leads the needle in the trials: ct, us, ...; a list compares."
         ),
     ] = None,
+    steps: Annotated[
+        int | None, typer.Option("--steps", metavar="N", help="With --guidance ct: scan and correct after each step.")
+    ] = None,
     sweep: Annotated[bool, typer.Option("--sweep", help="Rotate the needle about the target, outside.")] = False,
     to: Annotated[
         str | None,
@@ -292,13 +295,14 @@ def rehearse(
 ) -> None:
     """Execute a plan in the twin; report where the tip ended. The ground truth differs from the belief."""
     require_extra("twin", "rehearse")
-    from puncture_twin.planning.budget.guidance import ways_of
+    from puncture_twin.planning.budget.guidance import stepped, ways_of
     from puncture_twin.twin.jobs.experiment.sweep_job import sweep_case, sweep_end, sweep_text
     from puncture_twin.twin.jobs.patient import main_job
     from puncture_twin.twin.jobs.patient.run import room_count
 
     ways = () if guidance is None else ways_of(guidance)
-    rooms = room_count(seeds, physics, ways[0] if ways else None)
+    stepped(",".join(ways), steps)
+    rooms = room_count(seeds, physics, ways[0] if ways else None, steps)
     folder = out_folder(out_dir, source, "rehearse")
     if sweep or to is not None:
         end = sweep_end(source, to, sweep=sweep, alone=rooms is None and case is None)

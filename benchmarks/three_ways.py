@@ -2,6 +2,7 @@
 
 python -m benchmarks.three_ways                200 rooms a way and situation, a minute
 python -m benchmarks.three_ways --rooms 20000  for coverage and calibration: minutes
+python -m benchmarks.three_ways --steps        the table of control scans alone; no picture
 python -m benchmarks.three_ways --picture FILE the error clouds instead of docs/pictures/three_ways.png
 
 The embedded abdomen, its best direction, with two cameras and a probe whose places the program proposes, and what they
@@ -24,7 +25,7 @@ from puncture_twin import api as pt
 from puncture_twin.meshes import folder
 from puncture_twin.planning.budget.guidance import sight_of
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.settings import Motion, Stereo, Ultrasound
+from puncture_twin.planning.case.settings import ControlScan, Motion, Stereo, Ultrasound
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import CaseContext
@@ -107,11 +108,37 @@ def rows(context: CaseContext, plan: Plan, rooms: int, seed: int = 7) -> Iterato
             yield Row(name, way, rehearse_trials(there, plan.outward_ct, q, rooms, seed, way, sight))
 
 
+STEPS = (1, 2, 3, 5, 10)
+
+
+def stepwise(context: CaseContext, plan: Plan, rooms: int, seed: int = 7) -> Iterator[str]:
+    """Rows of a table: control scans after so many steps, the same patients in each situation."""
+    yield "situation | steps | tip error | predicted | in region | hits | passes | scans | mSv | min | corrections"
+    moving_min = (plan.approach.duration_s + plan.insertion.duration_s) / 60.0
+    cases = situations(context.case)
+    unseen = replace(cases[SHOWN], control_scan=ControlScan(2.0, target_seen=False, dose_msv=0.9, seconds=120.0))
+    shown = {name: cases[name] for name in ("as declared", SHOWN, "target moves 3 mm to any side")}
+    for name, case in {**shown, f"{SHOWN}, unseen": unseen}.items():
+        there = prepared(context, case)
+        for steps in (None, *STEPS):
+            found = rehearse_trials(there, plan.outward_ct, plan.insertion.q[-1], rooms, seed, "ct", steps=steps)
+            said, one = found.summary(), found.stepwise
+            cells = (f"{found.realised_rms_mm:.2f}", f"{found.predicted_rms_mm:.2f}", f"{said['coverage_95']:.3f}",
+                     f"{said['hit_share']:.3f}")  # fmt: skip
+            cost = ("0", "0", "0", f"{moving_min:.1f}", "-")
+            if one is not None:
+                sizes = ", ".join("-" if mm is None else f"{mm:.2f}" for mm in one.correction_mm)
+                minutes = moving_min + one.seconds / 60.0
+                cost = (f"{one.passes:.2f}", f"{one.scans:.2f}", f"{one.dose_msv:.1f}", f"{minutes:.1f}", sizes)
+            yield " | ".join((name, str(steps or "open loop"), *cells, *cost))
+
+
 def main() -> None:
     """Rehearse, print, draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rooms", type=int, default=200)
     parser.add_argument("--picture", type=Path, default=REPOSITORY / "docs" / "pictures" / "three_ways.png")
+    parser.add_argument("--steps", action="store_true")
     options = parser.parse_args()
     context = pt.prepare(folder() / "abdomen" / "case.toml")
     probe = Ultrasound(context.case.robot.model, None, (0.3, 0.5), (0.08, 0.5), 0.07, 150.0, 40.0)
@@ -119,6 +146,10 @@ def main() -> None:
     context = prepared(context, case)
     theta, beta = DIRECTION_DEG
     plan = pt.plan(context, theta_deg=theta, beta_deg=beta)
+    if options.steps:
+        for line in stepwise(context, plan, options.rooms):
+            print(line, flush=True)
+        return
     shown: dict[str, Distribution] = {}
     last = ""
     for row in rows(context, plan, options.rooms):

@@ -554,6 +554,7 @@ def rehearse(
     seeds: int | None = None,
     physics: int = 0,
     guidance: str | None = None,
+    steps: int | None = None,
 ) -> Rehearsal:
     """Execute a plan in the twin, where the ground truth differs from the belief.
 
@@ -566,10 +567,11 @@ def rehearse(
         guidance: How the needle is led in the rooms: ct, stereo, us, us+tip, ct+stereo, ct+us, ct+us+tip or all, by the
             devices that the case declares, or assumed ones, in bodies that move as it declares; None by the markers, in
             bodies at rest.
+        steps: Of ct: after each of so many, 1 to 10, a control scan is read and the needle corrected.
 
     Raises:
         InputError: A plan that does not hold in this case, many rooms of a case without declared errors or markers,
-            unknown guidance or some without ``seeds``, or the extra ``twin`` is not installed.
+            unknown guidance, steps of another than ct, some without ``seeds``, or the extra ``twin`` is not installed.
         NoAnswerError: The arm reaches the target in none of the rooms.
     """
     from puncture_twin.planning.base.errors import require_extra
@@ -578,7 +580,7 @@ def rehearse(
     from puncture_twin.twin.jobs.patient.rehearsed import rehearse_once
     from puncture_twin.twin.jobs.patient.run import room_count
 
-    rooms = room_count(seeds, physics, guidance)
+    rooms = room_count(seeds, physics, guidance, steps)
     return rehearse_once(context, _own_plan(context, plan, "rehearse: plan"), rooms, seed)
 
 

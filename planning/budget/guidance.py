@@ -28,8 +28,8 @@ from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.breathing.breathing import position_at
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.settings import stereo_of, ultrasound_of
-from puncture_twin.planning.case.tables import StereoSection, UltrasoundSection
+from puncture_twin.planning.case.settings import ControlScan, stereo_of, ultrasound_of
+from puncture_twin.planning.case.tables import ControlScanSection, StereoSection, UltrasoundSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.reach.standoff import case_axis_lengths, case_paths, standoffs
@@ -44,6 +44,8 @@ from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.guided import (
     ALIKE_MM,
     CAMERAS,
+    READS,
+    SCANS,
     WAYS,
     WHOLLY,
     Follows,
@@ -67,7 +69,7 @@ def declared_ways(case: Case) -> tuple[str, ...]:
     return tuple(way for way, used in WAYS.items() if not used & lacking)
 
 
-_DEVICES = MappingProxyType({"cameras": "stereo", "target": "ultrasound", "tip": "ultrasound"})
+_DEVICES = MappingProxyType({"cameras": "stereo", "target": "ultrasound", "tip": "ultrasound", "scan": "control_scan"})
 """Tables of a case that declare what a way reads."""
 
 
@@ -79,6 +81,24 @@ def check_way(way: str) -> None:
     """
     if way not in WAYS:
         refuse(f"guidance '{way}' is not known", "--guidance", ", ".join(WAYS), "unknown_guidance")
+
+
+MOST_STEPS = 10
+
+
+def stepped(way: str | None, steps: int | None) -> str | None:
+    """The way that reads a control scan after each of so many steps; without steps, the way as it is.
+
+    Raises:
+        InputError: Steps of another way than ct, or too few or many.
+    """
+    if steps is None:
+        return way
+    if way != "ct":
+        refuse("a control scan after each step is for one way", "--steps", "--guidance ct", "conflicting_options")
+    if not 1 <= steps <= MOST_STEPS:
+        refuse(f"{steps} steps", "--steps", f"1 to {MOST_STEPS} steps", "out_of_range")
+    return SCANS
 
 
 def ways_of(text: str) -> tuple[str, ...]:
@@ -100,7 +120,7 @@ def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
 
     Balls that do not fit on the needle are assumed at half of its shaft and at its hub.
     """
-    needed, said = {_DEVICES[device] for device in WAYS[way] if device in _DEVICES}, []
+    needed, said = {_DEVICES[device] for device in READS[way] if device in _DEVICES}, []
     if "stereo" in needed and case.stereo is None:
         cameras = stereo_of(StereoSection(), case.space, case.path)
         assert cameras is not None
@@ -118,6 +138,13 @@ def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
         )
         said.append(f"[ultrasound] target read to {target}, tip to {tip}, calibrated to {probe.calibration_sd_mm:g} mm")
         case = replace(case, ultrasound=probe)
+    if "control_scan" in needed and case.control_scan is None:
+        scan = ControlScan(**ControlScanSection().model_dump())
+        said.append(
+            f"[control_scan] slices of {scan.slice_mm:g} mm that show the target, {scan.dose_msv:g} mSv and "
+            f"{scan.seconds:g} s each"
+        )
+        case = replace(case, control_scan=scan)
     return case, tuple(f"assumed: {one}" for one in said)
 
 
@@ -173,7 +200,7 @@ def sight_of(context: CaseContext, plan: Plan, *ways: str) -> Sight:
     Raises:
         InputError: The case states a place for them that cannot be used.
     """
-    used, cameras, probe, lost = frozenset[str]().union(*(WAYS[way] for way in ways)), None, None, ""
+    used, cameras, probe, lost = frozenset[str]().union(*(READS[way] for way in ways)), None, None, ""
     if "cameras" in used and context.case.stereo is not None:
         try:
             cameras = camera_view(context, plan)
@@ -192,6 +219,7 @@ def guided_model(
     outward_ct: Floats,
     q: Floats,
     sight: Sight | None = None,
+    steps: int | None = None,
 ) -> GuidedModel:
     """What guidance knows of one insertion.
 
@@ -203,6 +231,7 @@ def guided_model(
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
         sight: What the devices see of it; None hides nothing, and has the picture along the body.
+        steps: After each of so many a control scan is read, and nothing else looks; None scans nothing.
     """
     R, breathing = registration.T_base_ct[:3, :3], case.breathing
     breath, skin_weight = np.zeros((3, 2)), 0.0
@@ -214,23 +243,26 @@ def guided_model(
         markers=registration.markers.names,
         points_base=apply(registration.T_base_ct, registration.markers.points_ct),
         q_insertion=q,
-        looks=_looks(case, anatomy, error, outward_ct, q, sight or Sight()),
+        looks=_looks(case, anatomy, error, outward_ct, q, sight or Sight(), steps),
         motion=R @ motion @ R.T,
         breath=R @ breath,
         skin_weight=skin_weight,
-        stereo=case.stereo,
-        ultrasound=case.ultrasound,
+        stereo=case.stereo if steps is None else None,
+        ultrasound=case.ultrasound if steps is None else None,
+        scan=None if steps is None else case.control_scan,
         across=R @ _across(outward_ct, sight or Sight()),
     )
 
 
 def _looks(
-    case: Case, anatomy: Anatomy, error: PoseError, outward_ct: Floats, q: Floats, sight: Sight
+    case: Case, anatomy: Anatomy, error: PoseError, outward_ct: Floats, q: Floats, sight: Sight, steps: int | None
 ) -> tuple[Look, ...]:
     paths = case_paths(case, anatomy.skin, outward_ct[None])
     length = float(paths.path_length[0])
     standoff = float(standoffs(case.needle, length, paths.skin_angle[0]))
-    outs = [standoff, *(length * (1 - step / (LOOKS - 1)) for step in range(1, LOOKS))]
+    parts = LOOKS - 1 if steps is None else steps
+    outs = [length * (1 - step / parts) for step in range(1, parts + 1)]
+    outs = [standoff, *outs] if steps is None else outs
     T, looks = flange_pose(error.model, q), []
     for out in outs:
         at = T.copy()
@@ -336,7 +368,7 @@ def lost_sight(model: GuidedModel, way: str) -> tuple[str, ...]:
         f"{_where(look)}: {what} out of sight: {why}"
         for look in model.looks
         for what, why in look.hidden.items()
-        if device_of(what) in WAYS[way] and why != OUTSIDE
+        if device_of(what) in READS[way] and why != OUTSIDE
     )
 
 

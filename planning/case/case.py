@@ -36,6 +36,7 @@ from puncture_twin.planning.case.named_files import (
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
 from puncture_twin.planning.case.settings import (
     Axis,
+    ControlScan,
     CtSettings,
     Gantry,
     Motion,
@@ -94,6 +95,7 @@ class Case(Shown):
         breathing: How the body moves with the breath, or None where the case does not say.
         stereo: The two cameras in the room, or None.
         ultrasound: The probe on an arm of its own, or None.
+        control_scan: What is known of CTs with the needle in, or None.
         motion: How the target has moved since the scan, or None where the case does not say.
         bending: How the needle bends, and in what, or None where the case does not say.
         own_target: Whether the target lies in no structure: its own is then the ball of the hit radius about it, which
@@ -132,6 +134,7 @@ class Case(Shown):
     breathing: Breathing | None = None
     stereo: Stereo | None = None
     ultrasound: Ultrasound | None = None
+    control_scan: ControlScan | None = None
     motion: Motion | None = None
     bending: Bending | None = None
     own_target: bool = False
@@ -286,6 +289,7 @@ def case_of(
         breathing=breathing_of(content.breathing, space, path),
         stereo=stereo_of(content.stereo, space, path),
         ultrasound=ultrasound_of(content.ultrasound, space, path),
+        control_scan=None if content.control_scan is None else ControlScan(**content.control_scan.model_dump()),
         motion=motion_of(content.motion),
         bending=bending_of(content.needle, content.tissue, path),
     )

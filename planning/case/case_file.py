@@ -18,6 +18,7 @@ from puncture_twin.planning.case.tables import (
     MAX_LABEL_MAPS,
     MAX_STRUCTURES,
     BreathingSection,
+    ControlScanSection,
     CtSection,
     ErrorsSection,
     GantrySection,
@@ -110,6 +111,7 @@ class CaseFile(Section):
     motion: MotionSection | None = None
     stereo: StereoSection | None = None
     ultrasound: UltrasoundSection | None = None
+    control_scan: ControlScanSection | None = None
     tissue: Annotated[dict[Text, TissueSection], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
     rehearsal: RehearsalSection = RehearsalSection()
     end: EndSection | None = None

@@ -14,7 +14,7 @@ Where the patient lies for the robot, as a case states it: by markers, or by a t
 
 The table ``[breathing]`` of a case. See docs/concepts/breathing.md.
 
-``[stereo]``, ``[ultrasound]`` and ``[motion]``: the devices that see needle and target in the room, and what moves.
+``[stereo]``, ``[ultrasound]``, ``[control_scan]`` and ``[motion]``: what sees needle and target, and what moves.
 
 ``[[obstacle]]`` and ``[gantry]``: what is located around the patient.
 
@@ -640,6 +640,15 @@ class UltrasoundSection(Section):
     calibration_sd_mm: Deviation = 0.07
     depth_mm: Annotated[Number, Field(ge=20, le=400)] = 150.0
     width_mm: Annotated[Number, Field(ge=10, le=200)] = 40.0
+
+
+class ControlScanSection(Section):
+    """A CT of a few cm with the needle in: its slices, whether it shows the target, what it costs."""
+
+    slice_mm: Annotated[Number, Field(ge=0.5, le=5)] = 2.0
+    target_seen: Annotated[bool, Strict()] = True
+    dose_msv: Annotated[Number, Field(ge=0, le=50)] = 0.9
+    seconds: Annotated[Number, Field(gt=0, le=3600)] = 120.0
 
 
 class MotionSection(Section):

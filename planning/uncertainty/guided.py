@@ -12,6 +12,8 @@ are linear in both:
                [I, -[b]x] needle_k + A_b frame + n              and balls b behind the tip
     picture  = target + calibration + n                  ultrasound: the target,
                needle_k + calibration + n                and the tip
+    scan     = motion + breath + reading in the CT + n   a control scan, in the CT's frame: the target,
+               needle_k - A_t pose + n                   and the tip
 
 All readings stacked are z = H x + F u. A way uses some of them. What it estimates is t = tip - target = a x + b u;
 the tip is moved by -K z, with the weights K of the least error among those that no flat part enters:
@@ -26,7 +28,8 @@ the direction that the registration gave it: in every way
     e = needle - anatomy + G z,   G = [-K; (X L)_rotation],   Sigma6 = (E + G H)(E + G H)'.
 
 After the last look the arm arrives anew. Errors in reading an ultrasound picture last as long as its plane: looking
-again does not average them. Cameras err anew with each picture.
+again does not average them. So lasts what takes another point of a control scan for the target. Cameras err anew with
+each picture, and so does a tip that is read in a control scan.
 """
 
 from __future__ import annotations
@@ -42,7 +45,8 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.strict_json import or_null
-from puncture_twin.planning.case.settings import Stereo, Ultrasound
+from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.case.settings import ControlScan, Stereo, Ultrasound
 from puncture_twin.planning.registration.fits import design
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
@@ -57,6 +61,11 @@ WAYS: Mapping[str, frozenset[str]] = {
     "all": frozenset({"touch", "cameras", "target", "tip"}),
 }
 """Ways of guidance, by the devices whose readings each uses; ultrasound reads a target and a tip."""
+
+SCANS = "ct+scans"
+
+READS: Mapping[str, frozenset[str]] = {**WAYS, SCANS: frozenset({"touch", "scan"})}
+"""The ways, and the one that needs a number of steps: after each, a control scan reads tip and target."""
 
 LEVER_MM = 100.0
 """Flat rotations are counted in mm at this distance, so that the columns of F are of one size."""
@@ -75,6 +84,8 @@ STOP_DRAWS = 20_000
 """Draws of the estimates after all looks together: a chance to be stopped is known to .004."""
 
 CAMERAS = "cameras"
+
+SCANNED_TIP, SCANNED_TARGET = "scanned tip", "scanned target"
 
 FLAT = ("pose", "frame")
 """The patient's pose and the cameras' frame: shift and rotation at the target, of which nothing is known beforehand."""
@@ -101,6 +112,22 @@ def _root(cov: Floats) -> Floats:
 def picture_root(sd_mm: tuple[float, float], across: Floats) -> Floats:
     """S with S S' the covariance of a point read in a picture, shape (3, 3), in the axes of the plane's normal (3,)."""
     return sd_mm[0] * np.eye(3) + (sd_mm[1] - sd_mm[0]) * np.outer(across, across)
+
+
+TIP_MM, TIP_ACROSS = 0.07, 0.045
+"""Deviation of a straight needle's tip that `twin/guidance/ct` reads in a control scan: in the plane, mm per axis, and
+across it, mm by the square of a slice in mm; the largest of 30 virtual scans each of 1, 2, 3 and 5 mm."""
+
+
+def scan_roots(scan: ControlScan, errors: ErrorModel) -> tuple[Floats, Floats]:
+    """S with S S' the covariance of tip and target read in a control scan, shape (3, 3) each, CT axes.
+
+    The target is read as in the CT, but across the slices no better than anything is that may lie anywhere in one.
+    """
+    tip = np.diag([TIP_MM, TIP_MM, max(TIP_MM, TIP_ACROSS * scan.slice_mm**2)])
+    cov = errors.target_cov_ct.copy()
+    cov[2, 2] = max(cov[2, 2], scan.slice_mm**2 / 12.0)
+    return tip, _root(cov)
 
 
 class Look(NamedTuple):
@@ -134,9 +161,9 @@ class Reading(NamedTuple):
     """Some rows of z."""
 
     device: str
-    """touch, cameras, target or tip."""
+    """touch, cameras, target, tip or scan."""
     name: str
-    """touch, ``marker <name>``, ``ball <mm behind the tip> mm``, target or tip."""
+    """touch, ``marker <name>``, ``ball <mm behind the tip> mm``, target, tip, ``scanned target`` or ``scanned tip``."""
     look: int
     """-1 for the touches, which precede all looks."""
     rows: Rows
@@ -158,6 +185,7 @@ class GuidedModel:
         stereo: The cameras, or None.
         ultrasound: The probe, or None.
         across: Shape (3,), unit: the normal of its picture.
+        scan: What is read in control scans, or None.
     """
 
     error: PoseError
@@ -171,6 +199,7 @@ class GuidedModel:
     stereo: Stereo | None = None
     ultrasound: Ultrasound | None = None
     across: Floats | None = None
+    scan: ControlScan | None = None
 
     def _at(self, points_base: Floats) -> Floats:
         """A, shape (3 m, 6): how a shift and rotation at the target move points (m, 3)."""
@@ -209,6 +238,7 @@ class GuidedModel:
             found += self._seen_by_cameras(look, number, needle)
             tip = _times(np.eye(6)[:3], _sum(needle, self._bent(look.q, look.inserted)))
             found += self._in_pictures(number, tip)
+            found += self._in_scan(look, number, tip)
         return tuple(one for one in found if one.look < 0 or not self.looks[one.look].hides(one))
 
     def _touches(self) -> Rows:
@@ -259,16 +289,34 @@ class GuidedModel:
             found.append(Reading(name, name, number, _sum(rows, own)))
         return found
 
+    def _in_scan(self, look: Look, number: int, tip: Rows) -> list[Reading]:
+        """Couch and patient are where they were at the CT, but for the motion: what it shows is in the CT's frame."""
+        if self.scan is None:
+            return []
+        T, R = flange_pose(self.error.model, look.q), self.error.fit.R_base_ct
+        there = T[:3, 3] + self.error.tip_mm * T[:3, 2]
+        tip_root, target_root = (R @ root for root in scan_roots(self.scan, self.error.errors))
+        own = {"pose": -self._at(there[None]), f"{SCANNED_TIP} {number}": tip_root}
+        found = [Reading("scan", SCANNED_TIP, number, _sum(tip, own))]
+        if self.scan.target_seen:
+            rows = _sum(self.target, {"pose": -np.eye(6)[:3], SCANNED_TARGET: target_root})
+            found.append(Reading("scan", SCANNED_TARGET, number, rows))
+        return found
+
+    def corrects(self, way: str) -> bool:
+        """Whether a way reads anything but touches; those alone give the registration, and nothing to correct."""
+        return {one.device for one in self.readings if one.device in READS[way]} != {"touch"}
+
     def looks_of(self, way: str) -> dict[str, int]:
-        """How often a way reads each kind of device: touches, pairs of camera pictures, ultrasound pictures."""
+        """How often a way reads each kind of device: touches, camera pairs, ultrasound pictures, and control scans."""
         taken = {
-            (one.device if one.device in ("touch", CAMERAS) else "picture", one.look)
+            (one.device if one.device in ("touch", CAMERAS, "scan") else "picture", one.look)
             for one in self.readings
-            if one.device in WAYS[way]
+            if one.device in READS[way]
         }  # target and tip are read in one picture
         kinds = [kind for kind, _ in taken]
         return {"touches": len(self.markers) * kinds.count("touch"), "camera_pairs": kinds.count(CAMERAS),
-                "pictures": kinds.count("picture")}  # fmt: skip
+                "pictures": kinds.count("picture"), "scans": kinds.count("scan")}  # fmt: skip
 
     @cached_property
     def end(self) -> Rows:
@@ -299,10 +347,10 @@ class GuidedModel:
         H, F, rows = self._stacked
         a, b = self.matrices(_sum(_times(np.eye(6)[:3], self.end), _times(-np.eye(3), self.target)))
         last = len(self.looks) - 1 if last is None else last
-        used = np.flatnonzero([one.device in WAYS[way] and one.look <= last for one, _ in rows])
+        used = np.flatnonzero([one.device in READS[way] and one.look <= last for one, _ in rows])
         gain = np.zeros((6, len(rows)))
         gain[:, [one.device == "touch" for one, _ in rows]] = self.error.fit.map_at(self.error.target_base)
-        if way != "ct":
+        if self.corrects(way):
             K = _weights(H[used], F[used], a, b)
             if K is None:
                 return None
@@ -319,7 +367,7 @@ class GuidedModel:
         H, F, rows = self._stacked
         resting = _times(-np.eye(3), {"pose": np.eye(6)[:3]})
         a, b = self.matrices(_sum(_times(np.eye(6)[:3], self.end), resting))
-        used = [one.look < 0 or (one.device in WAYS[way] and one.look <= last) for one, _ in rows]
+        used = [one.look < 0 or (one.device in READS[way] and one.look <= last) for one, _ in rows]
         weights = np.zeros((3, len(rows)))
         K = _weights(H[used], F[used], a, b)
         assert K is not None  # touches determine a pose
@@ -341,9 +389,9 @@ class GuidedModel:
     def stop_chance(self, way: str, corridor_mm: float) -> float:
         """The chance that, after any of its looks, a way estimates its needle farther from the plan than a corridor.
 
-        No flat part enters those estimates. ct corrects nothing, and is never stopped.
+        No flat part enters those estimates. What corrects nothing, as ct, is never stopped.
         """
-        if way == "ct":
+        if not self.corrects(way):
             return 0.0
         looked = [found for last in range(len(self.looks)) if (found := self.guided(way, last)) is not None]
         aside = np.concatenate([one.aside @ self._stacked[0] for one in looked])
@@ -375,13 +423,16 @@ _SOURCE_OF = {
     "seen": "cameras",
     "pictured": "pictures",
     "calibration": "pictures",
+    "scanned": "scans",
 }
 """Sources by the first word of a row's: those of all looks together."""
 
 
 def device_of(name: str) -> str:
     """The device that gives a look's reading of a name."""
-    return name if name in ("target", "tip") else "cameras"
+    if name in (SCANNED_TIP, SCANNED_TARGET):
+        return "scan"
+    return name if name in ("target", "tip") else CAMERAS
 
 
 def ball_name(behind_mm: float) -> str:

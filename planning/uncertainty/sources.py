@@ -82,6 +82,7 @@ SOURCES: Mapping[str, Source] = MappingProxyType(
         "motion": Source("motion of the target since the scan", "motion.target_sd_mm and [breathing]", "mm"),
         "cameras": Source("points seen by the cameras", "stereo.sd_mm", "mm"),
         "pictures": Source("ultrasound pictures", "ultrasound.target_sd_mm, tip_sd_mm, calibration_sd_mm", "mm"),
+        "scans": Source("readings of the control scans", "control_scan.slice_mm and [errors] target_mm", "mm"),
         "surface": Source("surfaces of the structures", "surface_mm", "mm"),
     }
 )

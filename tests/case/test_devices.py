@@ -10,6 +10,7 @@ from refusals import refused
 
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.case_file import case_schema
+from puncture_twin.planning.case.settings import ControlScan
 
 EVERY_KEY = """[stereo]
 cameras_mm = [[-250.0, -900.0, 300.0], [250.0, -900.0, 300.0]]
@@ -26,6 +27,11 @@ width_mm = 60.0
 position_mm = [-600.0, 20.0, -30.0]
 x_axis = [1.0, 0.0, 0.0]
 z_axis = [0.0, -1.0, 0.0]
+[control_scan]
+slice_mm = 3.0
+target_seen = false
+dose_msv = 0.4
+seconds = 90.0
 [motion]
 target_sd_mm = [0.2, 0.3, 1.1]
 """
@@ -42,17 +48,18 @@ def read(tmp_path):
 def test_a_case_without_them_declares_none(read):
     """Neither a device nor a motion is assumed."""
     case = read("")
-    assert case.stereo is case.ultrasound is case.motion is None
+    assert case.stereo is case.ultrasound is case.control_scan is case.motion is None
 
 
 def test_the_defaults_are_those_of_the_reference(read):
     """Cameras and mount are to be proposed."""
-    case = read("[stereo]\n[ultrasound]")
+    case = read("[stereo]\n[ultrasound]\n[control_scan]")
     assert case.stereo.cameras_ct is None and case.ultrasound.T_base_ct_mount is None
     assert (case.stereo.balls_mm, case.stereo.sd_mm) == ((80.0, 160.0), 0.03)
     probe = case.ultrasound
     assert (probe.model.name, probe.target_sd_mm, probe.tip_sd_mm) == ("ur3", (0.3, 0.5), (0.08, 0.5))
     assert (probe.calibration_sd_mm, probe.depth_mm, probe.width_mm) == (0.07, 150.0, 40.0)
+    assert case.control_scan == ControlScan(slice_mm=2.0, target_seen=True, dose_msv=0.9, seconds=120.0)
 
 
 def test_every_key_is_read(read):
@@ -63,6 +70,7 @@ def test_every_key_is_read(read):
     probe = case.ultrasound
     assert (probe.model.name, probe.target_sd_mm, probe.tip_sd_mm) == ("ur5", (0.6, 1.0), (0.3, 1.0))
     assert (probe.calibration_sd_mm, probe.depth_mm, probe.width_mm) == (0.1, 120.0, 60.0)
+    assert case.control_scan == ControlScan(slice_mm=3.0, target_seen=False, dose_msv=0.4, seconds=90.0)
     T_ct_base = np.linalg.inv(probe.T_base_ct_mount)
     assert T_ct_base[:3, 3] == pytest.approx([-600.0, 20.0, -30.0])
     assert T_ct_base[:3, 2] == pytest.approx([0.0, -1.0, 0.0], abs=1e-12)
@@ -96,6 +104,9 @@ def test_places_of_a_ras_case_are_turned_to_lps(read):
         ("width_mm = 60.0", "width_mm = 6.0", "bad_value", "width_mm"),
         ("[-600.0, 20.0, -30.0]", "[-0.6, 0.02, -0.03]", "wrong_unit", "ultrasound.mount"),
         ("z_axis = [0.0, -1.0, 0.0]", "z_axis = [2.0, 0.0, 0.0]", "axes_parallel", "ultrasound.mount"),
+        ("slice_mm = 3.0", "slice_mm = 0.0", "bad_value", "slice_mm"),
+        ("target_seen = false", "target_seen = 0", "bad_value", "target_seen"),
+        ("seconds = 90.0", "minutes = 1.5", "unknown_key", "seconds"),
         ("[0.2, 0.3, 1.1]", "[0.2, 0.3, -1.1]", "bad_value", "motion"),
         ("target_sd_mm = [0.2, 0.3, 1.1]", "", "missing_key", "target_sd_mm"),
     ],

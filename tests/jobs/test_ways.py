@@ -16,7 +16,10 @@ from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import OK
 from puncture_twin.twin.jobs.patient import ways_job as ways
 from puncture_twin.twin.jobs.patient.main_job import checked_plan
+from puncture_twin.twin.jobs.patient.rehearsed import in_rooms
+from puncture_twin.twin.jobs.patient.run import room_count
 from puncture_twin.twin.rehearsal.distribution import rehearse_trials
+from puncture_twin.twin.report import patient
 
 DEVICES = "touch_mm = 0.2\n[motion]\ntarget_sd_mm = [0.4, 0.4, 1.0]\n[stereo]\n[ultrasound]\n"
 SEEDS = 300
@@ -49,7 +52,12 @@ def test_each_way_has_the_numbers_of_its_own_run(compared, plan):
         for name, value in alone.summary().items():
             close = isinstance(value, float)
             assert row[name] == (pytest.approx(value, rel=1e-9, abs=1e-12) if close else value), (way, name)
-        assert row["looks"] == {"touches": 6 * ("ct" in way), "camera_pairs": 0, "pictures": 3 * ("us" in way)}
+        assert row["looks"] == {
+            "touches": 6 * ("ct" in way),
+            "camera_pairs": 0,
+            "pictures": 3 * ("us" in way),
+            "scans": 0,
+        }
         moving = one_plan.approach.duration_s + one_plan.insertion.duration_s
         assert row["seconds"] == pytest.approx(moving + 30.0 * row["looks"]["pictures"])
 
@@ -140,6 +148,26 @@ def test_failing_is_worse_than_erring(plan, tmp_path):
     assert (last.rating, last.why, last.failed) == ("worse", "more trials fail", 1.0)
     ways.Compared(context, one_plan, ways.rated([none, found]), {}, ()).write(tmp_path)
     assert "ct: worse" in (tmp_path / "ways.html").read_text()
+
+
+@pytest.mark.parametrize("options", [["--guidance", "us"], ["--guidance", "ct,us"], []])
+def test_steps_of_another_way_are_refused_in_one_line(tmp_path, capfd, options):
+    """Ultrasound, a list, and no guidance at all; nothing is written."""
+    case = ball(tmp_path, errors="touch_mm = 0.2\n")
+    command = ["rehearse", case, *options, "--seeds", 10, "--steps", 3, "--out", tmp_path / "out"]
+    refused_command(command, capfd, "conflicting_options", "--steps")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_plan_is_rehearsed_in_steps(plan):
+    """Error, passes, dose and minutes beside the open loop, in the object and in the table of page and terminal."""
+    found = in_rooms(*plan, room_count(50, 0, "ct", 2)).summary()
+    assert (found["steps"], found["passes"], found["scans"], found["dose_msv"]) == (2, 2.0, 2.0, 1.8)
+    assert 4.0 < found["minutes"] == pytest.approx(4.0 + found["open_loop"]["minutes"])
+    assert found["realised_rms_mm"] < found["open_loop"]["realised_rms_mm"]
+    shown = {row[0]: row[1] for row in patient.rooms(found)[0].rows}
+    assert shown["open loop: tip error, rms, mm"] == f"{found['open_loop']['realised_rms_mm']:.3f}"
+    assert shown["control scans, and their dose, mSv"] == "2.00: 1.80"
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Devices in the rooms of many trials at once, at the level of positions: cameras, and a probe on an arm of its own."""
+"""Devices in the rooms of many trials at once, at the level of positions: cameras, a probe on its arm, a CT."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.case.settings import Stereo, Ultrasound
-from puncture_twin.planning.geometry.rigid import exp_rotation, pose
-from puncture_twin.planning.uncertainty.guided import picture_root
+from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.case.settings import ControlScan, Stereo, Ultrasound
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
+from puncture_twin.planning.uncertainty.guided import picture_root, scan_roots
 
 FAR_MM = 1500.0
 """Of the cameras from the arm's base, per axis: their frame is of their own, and nobody knows it."""
@@ -71,3 +72,36 @@ class RoomProbe:
     def tip(self, points_base: Floats) -> Floats:
         """Tips (n, 3) as the pictures show them."""
         return points_base + self.tip_off
+
+
+@dataclass(frozen=True, eq=False)
+class RoomScanner:
+    """A CT in each of n rooms, its frame that of the first CT; what is taken for the target is so in all its scans.
+
+    Attributes:
+        T_ct_base: Shape (4, 4), mm: where the couch really is.
+        tip_root: Shape (3, 3), mm, CT axes: S with S S' the covariance of a tip's reading.
+        target_off: Shape (n, 3), mm: what target readings are off by.
+        rng: Of the tips' readings.
+    """
+
+    T_ct_base: Floats
+    tip_root: Floats
+    target_off: Floats
+    rng: np.random.Generator
+
+    @classmethod
+    def placed(
+        cls, device: ControlScan, errors: ErrorModel, T_base_ct: Floats, count: int, rng: np.random.Generator
+    ) -> RoomScanner:
+        """Scanners in so many rooms."""
+        tip, target = scan_roots(device, errors)
+        return cls(inverse(T_base_ct), tip, rng.normal(size=(count, 3)) @ target, rng)
+
+    def tip(self, points_base: Floats) -> Floats:
+        """Tips (n, 3) as the scans show them, mm, CT frame."""
+        return np.asarray(apply(self.T_ct_base, points_base) + self.rng.normal(size=points_base.shape) @ self.tip_root)
+
+    def target(self, points_ct: Floats) -> Floats:
+        """Targets (n, 3), mm, CT frame, as the scans show them."""
+        return points_ct + self.target_off

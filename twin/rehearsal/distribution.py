@@ -25,9 +25,11 @@ from puncture_twin.planning.budget.guidance import (
     guided_error,
     guided_model,
     lost_sight,
+    stepped,
 )
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.case.settings import ControlScan
 from puncture_twin.planning.clearance.engine import normals_of
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.reach.standoff import case_axis_lengths
@@ -39,13 +41,43 @@ from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_
 from puncture_twin.planning.uncertainty.hit import LEAST_VARIANCE, mean_over_faces
 from puncture_twin.planning.uncertainty.pose_error import Bend, ErrorBudget, PoseError, error_budget, pose_error
 from puncture_twin.planning.uncertainty.sources import not_modelled
-from puncture_twin.twin.rehearsal.guided_trials import Way, guided_trials
+from puncture_twin.twin.rehearsal.guided_trials import GuidedTrials, Way, guided_trials
 from puncture_twin.twin.rehearsal.trials import Moving, Puncture, Trials, draw_trials, draw_truths
 
 CONTACT_MM = 1e-6
 """Distance of an axis from a surface that counts as contact."""
 
 ALLOWED = "a case with [errors] and markers: trials are drawn from them"
+
+
+class Stepwise(NamedTuple):
+    """What control scans on the way in gave and cost, a trial on average; their open loop has the same patients."""
+
+    steps: int
+    passes: float
+    """Corrections that were executed."""
+    correction_mm: tuple[float | None, ...]
+    """Rms of each step's, of the trials that were not stopped."""
+    scans: float
+    dose_msv: float
+    """Of these scans, without the planning CT's."""
+    seconds: float
+    """From the beginning of a scan until the needle goes on, all scans."""
+    open_loop: Distribution
+    moving_s: float = 0.0
+    """Approach and insertion."""
+
+    def document(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        own = ("realised_rms_mm", "predicted_rms_mm", "coverage_95", "hit_share", "mean_p_hit", "touch_share")
+        said = self.open_loop.summary()
+        open_loop = {name: said[name] for name in own} | {"dose_msv": 0.0, "minutes": self.moving_s / 60.0}
+        return {
+            **{name: getattr(self, name) for name in ("steps", "passes", "scans", "dose_msv")},
+            "minutes": (self.moving_s + self.seconds) / 60.0,
+            "correction_mm": list(self.correction_mm),
+            "open_loop": open_loop,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +107,7 @@ class Distribution:
         hidden: What was out of sight, a sentence each.
         looks: How often the way reads each kind of device.
         assumed: Devices of the way that the case does not declare, a sentence each.
+        stepwise: What control scans gave and cost, where there are some.
     """
 
     seed: int
@@ -99,6 +132,7 @@ class Distribution:
     hidden: tuple[str, ...] = ()
     looks: Mapping[str, int] = field(default_factory=dict)
     assumed: tuple[str, ...] = ()
+    stepwise: Stepwise | None = None
 
     def __len__(self) -> int:
         return len(self.trials.tip_ct)
@@ -158,7 +192,8 @@ class Distribution:
 
     def _guided(self) -> dict[str, Any]:
         said = {"lost_sight": list(self.hidden), "assumed": list(self.assumed), "looks": dict(self.looks)}
-        return {"guidance": self.guidance, "stopped": self.stopped, "p_stop": self.p_stop, **said}
+        steps = {} if self.stepwise is None else self.stepwise.document()
+        return {"guidance": self.guidance, "stopped": self.stopped, "p_stop": self.p_stop, **said, **steps}
 
 
 def _fraction(trials: Bools) -> float | None:
@@ -173,6 +208,7 @@ def rehearse_trials(
     seed: int,
     guidance: str | None = None,
     sight: Sight | None = None,
+    steps: int | None = None,
 ) -> Distribution:
     """Rehearse one direction in many trials, each with a truth of its own.
 
@@ -185,31 +221,51 @@ def rehearse_trials(
         guidance: One of `WAYS`, in bodies that move as the case declares: every way has the same patients by a seed.
             None is by registration, in bodies at rest. Devices that the case does not declare are assumed.
         sight: What its devices see of the insertion; None hides nothing.
+        steps: Of ct: after each of so many equal ones, the last at the target, a control scan is read and the needle
+            corrected.
 
     Raises:
-        InputError: The case declares no errors, has no markers, or the way is unknown.
+        InputError: The case declares no errors, has no markers, or the way is unknown, or has no steps.
         NoAnswerError: What the way's devices see does not determine the needle against the target.
     """
     query = _query(context, outward_ct, q_insertion)
     rng = np.random.default_rng(seed)
-    if guidance is None:
+    led = stepped(guidance, steps)
+    if guidance is None or led is None:
         return _measured(context, query, draw_trials(query.puncture, query.truth, count, rng), rng, seed)
     check_way(guidance)
-    case, assumed = equipped(context.case, guidance)
+    case, assumed = equipped(context.case, led)
     context = replace(context, case=case)
-    way, moving = _way(context, query, guidance, sight)
+    way, moving = _way(context, query, led, sight, steps)
     truths = draw_truths(query.puncture, query.truth, count, rng, moving)
     done = guided_trials(query.puncture, truths, query.truth, way, np.random.default_rng([seed, 4]))
-    return replace(_measured(context, query, done.trials, rng, seed, (way, done.stopped)), assumed=assumed)
+    found = replace(_measured(context, query, done.trials, rng, seed, (way, done.stopped)), assumed=assumed)
+    if steps is None:
+        return found
+    open_loop = rehearse_trials(context, outward_ct, q_insertion, count, seed, guidance, sight)
+    return replace(found, stepwise=_stepwise(case.control_scan, steps, done, open_loop))
 
 
-def _way(context: CaseContext, query: _Query, name: str, sight: Sight | None = None) -> tuple[Way, Moving]:
+def _stepwise(scan: ControlScan | None, steps: int, done: GuidedTrials, open_loop: Distribution) -> Stepwise:
+    """Of trials; one that was stopped had its last scan where the correction was refused."""
+    assert scan is not None
+    went = np.isfinite(done.moved_mm)
+    sizes = tuple(rms(column[own]) if own.any() else None for column, own in zip(done.moved_mm.T, went.T, strict=True))
+    passes = went.sum(axis=1)
+    scans = float(np.where(done.stopped, passes + 1, steps).mean())
+    return Stepwise(steps, float(passes.mean()), sizes, scans, scans * scan.dose_msv, scans * scan.seconds,
+                    open_loop)  # fmt: skip
+
+
+def _way(
+    context: CaseContext, query: _Query, name: str, sight: Sight | None = None, steps: int | None = None
+) -> tuple[Way, Moving]:
     """One way of guidance of a query's puncture, and what moves in the truth."""
     case, puncture = context.case, query.puncture
     assert context.placement is not None and context.placement.registration is not None
     registration = context.placement.registration
     model = guided_model(
-        case, context.anatomy, query.believed, registration, puncture.outward_ct, puncture.q_insertion, sight
+        case, context.anatomy, query.believed, registration, puncture.outward_ct, puncture.q_insertion, sight, steps
     )
     chance = chance_model(case, context.anatomy, context.engine, query.believed)
     assert chance is not None

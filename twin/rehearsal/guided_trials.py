@@ -17,8 +17,16 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.planning.uncertainty.guided import CAMERAS, GuidedModel, Look, ball_name, marker_name
-from puncture_twin.twin.plant.room_devices import RoomCameras, RoomProbe
+from puncture_twin.planning.uncertainty.guided import (
+    CAMERAS,
+    SCANNED_TARGET,
+    SCANNED_TIP,
+    GuidedModel,
+    Look,
+    ball_name,
+    marker_name,
+)
+from puncture_twin.twin.plant.room_devices import RoomCameras, RoomProbe, RoomScanner
 from puncture_twin.twin.plant.true_needle import TrueNeedle, true_needle
 from puncture_twin.twin.rehearsal.trials import (
     Puncture,
@@ -52,11 +60,15 @@ class Way:
 
 
 class GuidedTrials(NamedTuple):
-    """Trials, which of them were stopped: shape (n,), and how far from its plan each believes to be: (n, 3), mm."""
+    """Trials, which of them were stopped: shape (n,), and how far from its plan each believes to be: (n, 3), mm.
+
+    ``moved_mm``, shape (n, corrections): how far each correction moved the needle; NaN where it was not executed.
+    """
 
     trials: Trials
     stopped: Bools
     aside_base: Floats
+    moved_mm: Floats
 
 
 def guided_trials(
@@ -69,16 +81,18 @@ def guided_trials(
         truths: Of the n trials, as every way has them.
         errors: What they were drawn from.
         way: Of guidance.
-        rng: Of the devices, and of the arrivals after the first.
+        rng: Of the devices, and of the arrivals before the last.
     """
     count, model = len(truths.eta), way.model
-    if way.name == "ct":
-        return GuidedTrials(open_loop(puncture, truths), np.zeros(count, bool), np.zeros((count, 3)))
+    if not model.corrects(way.name):
+        return GuidedTrials(
+            open_loop(puncture, truths), np.zeros(count, bool), np.zeros((count, 3)), np.empty((count, 0))
+        )
     T_base_ct = registered(puncture, truths)
     turned = T_base_ct[:, :3, :3] @ model.error.fit.R_base_ct.T  # the gain is of the nominal patient's axes
     room = _Room(puncture, truths, model, T_base_ct, *_devices(puncture, truths, model, rng))
     drift = _drift(errors, truths.arrival, rng)
-    moved, aside = np.zeros((count, 3)), np.zeros((count, 3))
+    moved, aside, moves = np.zeros((count, 3)), np.zeros((count, 3)), list[Floats]()
     stopped, reached = np.zeros(count, bool), np.ones(count, bool)
     found: Readings = {("touch", -1): (truths.touched_base - apply_each(T_base_ct, truths.read_ct)).reshape(count, -1)}
     for number, look in enumerate(model.looks):
@@ -95,31 +109,35 @@ def guided_trials(
                 np.einsum("nab,nb->na", turned, z @ rows[:, : z.shape[1]].T) for rows in (known.gain[:3], known.aside)
             )
             stopped |= np.linalg.norm(off, axis=1) > way.corridor_mm
+            moves.append(np.where(stopped, np.nan, np.linalg.norm(wanted - moved, axis=1)))
             moved, aside = np.where(stopped[:, None], (moved, aside), (wanted, off))
     q, there = commanded(puncture, T_base_ct, moved)
-    arrival = rng.normal(size=(count, 6)) * errors.arm.repeatability
-    needle = true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
-    return GuidedTrials(ended(puncture, truths, T_base_ct, needle, reached & there), stopped, aside)
+    needle = true_needle(puncture.model, q + truths.arrival, truths.eta, puncture.tip_mm)
+    done = ended(puncture, truths, T_base_ct, needle, reached & there)
+    return GuidedTrials(done, stopped, aside, np.reshape(moves, (len(moves), count)).T)
 
 
-def _drift(errors: ErrorModel, first: Floats, rng: np.random.Generator) -> Floats:
-    """What drifted since the touches, given drift and first arrival together, shape (n, 6), rad."""
+def _drift(errors: ErrorModel, last: Floats, rng: np.random.Generator) -> Floats:
+    """What drifted since the touches, given drift and last arrival together, shape (n, 6), rad."""
     drift, anew = errors.arm.drift, errors.arm.repeatability
     whole = np.hypot(drift, anew)
     if whole == 0.0:
-        return np.zeros_like(first)
-    return np.asarray(first * (drift / whole) ** 2 + rng.normal(size=first.shape) * drift * anew / whole)
+        return np.zeros_like(last)
+    return np.asarray(last * (drift / whole) ** 2 + rng.normal(size=last.shape) * drift * anew / whole)
 
 
 def _devices(
     puncture: Puncture, truths: Truths, model: GuidedModel, rng: np.random.Generator
-) -> tuple[RoomCameras | None, RoomProbe | None]:
+) -> tuple[RoomCameras | None, RoomProbe | None, RoomScanner | None]:
     """The devices of each trial's room, in their true places."""
-    count = len(truths.eta)
-    cameras = None if model.stereo is None else RoomCameras.placed(model.stereo, count, rng)
-    if model.ultrasound is None or model.across is None:
-        return cameras, None
-    return cameras, RoomProbe.placed(model.ultrasound, model.across, count, rng)
+    count, cameras, probe, scanner = len(truths.eta), None, None, None
+    if model.stereo is not None:
+        cameras = RoomCameras.placed(model.stereo, count, rng)
+    if model.ultrasound is not None and model.across is not None:
+        probe = RoomProbe.placed(model.ultrasound, model.across, count, rng)
+    if model.scan is not None:
+        scanner = RoomScanner.placed(model.scan, model.error.errors, puncture.T_base_ct, count, rng)
+    return cameras, probe, scanner
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +150,7 @@ class _Room:
     T_base_ct: Floats
     cameras: RoomCameras | None
     probe: RoomProbe | None
+    scanner: RoomScanner | None
 
     def look(self, look: Look, number: int, q: Floats, needle: TrueNeedle) -> Readings:
         """What the devices read, less what is expected with the arm commanded to q (n, 6).
@@ -145,7 +164,12 @@ class _Room:
         nominal = flange_pose(self.puncture.model, q)
         axis = nominal[:, :3, 2]
         tip = nominal[:, :3, 3] + self.puncture.tip_mm * axis
-        found = {**self._by_cameras(look, needle, tip, axis), **self._by_probe(look, needle, tip)}
+        found = self._by_cameras(look, needle, tip, axis)
+        puncture = self.puncture
+        if puncture.bend is not None:
+            grown = max(look.inserted, 0.0) ** 2
+            needle = bent(needle, puncture.bend._replace(tip_mm=grown * puncture.bend.tip_mm), self.truths.side)
+        found |= self._by_probe(needle, tip) | self._by_scanner(needle, tip)
         return {(name, number): value for name, value in found.items() if name not in look.hidden}
 
     def _by_cameras(self, look: Look, needle: TrueNeedle, tip: Floats, axis: Floats) -> dict[str, Floats]:
@@ -165,13 +189,21 @@ class _Room:
         there = apply_each(T_base_cameras, markers) - expected
         return {**{name: there[:, row] for row, name in enumerate(names)}, **seen}
 
-    def _by_probe(self, look: Look, needle: TrueNeedle, tip: Floats) -> dict[str, Floats]:
+    def _by_probe(self, needle: TrueNeedle, tip: Floats) -> dict[str, Floats]:
         if self.probe is None:
             return {}
         puncture, truths = self.puncture, self.truths
         target = apply(puncture.T_base_ct, truths.target_ct + truths.motion_ct + truths.breath_ct)
         expected = self.T_base_ct[:, :3, :3] @ puncture.target_ct + self.T_base_ct[:, :3, 3]
-        if puncture.bend is not None:
-            grown = max(look.inserted, 0.0) ** 2
-            needle = bent(needle, puncture.bend._replace(tip_mm=grown * puncture.bend.tip_mm), truths.side)
         return {"target": self.probe.target(target) - expected, "tip": self.probe.tip(needle.tip_base) - tip}
+
+    def _by_scanner(self, needle: TrueNeedle, tip: Floats) -> dict[str, Floats]:
+        if self.scanner is None:
+            return {}
+        R, t, truths = self.T_base_ct[:, :3, :3], self.T_base_ct[:, :3, 3], self.truths
+        there = self.scanner.tip(needle.tip_base)
+        found = {SCANNED_TIP: np.einsum("nab,nb->na", R, there) + t - tip}
+        if self.model.scan is not None and self.model.scan.target_seen:
+            target = self.scanner.target(truths.target_ct + truths.motion_ct + truths.breath_ct)
+            found[SCANNED_TARGET] = np.einsum("nab,nb->na", R, target - self.puncture.target_ct)
+        return found

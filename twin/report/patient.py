@@ -235,9 +235,24 @@ def rooms(found: Mapping[str, Any] | None) -> list[Block]:
     )
     rows = [("tip error, rms, mm", f"{found['realised_rms_mm']:.3f}", f"{found['predicted_rms_mm']:.3f}")]
     rows += [(text, _percent(fraction), _percent(chance)) for text, fraction, chance in shares]
+    rows += _stepwise_rows(found) if "steps" in found else []
     led = f", guidance {found['guidance']}" if "guidance" in found else ""
     head = (f"{plural(found['rooms'], 'trial')}, seed {found['seed']}{led}", "realised", "predicted")
     return [Table(head, tuple(rows)), Warn(tuple(_reserves(found))), *_sources(found)]
+
+
+def _stepwise_rows(found: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """The same patients without control scans, and what these cost; predictions where there are some."""
+    alone, sizes = found["open_loop"], ", ".join(number(mm, 2) for mm in found["correction_mm"] if mm is not None)
+    rms = "-" if alone["realised_rms_mm"] is None else f"{alone['realised_rms_mm']:.3f}"
+    hits = "-" if alone["hit_share"] is None else _percent(alone["hit_share"])
+    return [
+        ("open loop: tip error, rms, mm", rms, f"{alone['predicted_rms_mm']:.3f}"),
+        ("open loop: hit the target", hits, _percent(alone["mean_p_hit"])),
+        (f"corrections of {plural(found['steps'], 'step')} (rms, mm: {sizes})", number(found["passes"], 2), "-"),
+        ("control scans, and their dose, mSv", f"{number(found['scans'], 2)}: {number(found['dose_msv'], 2)}", "-"),
+        ("minutes (open loop)", f"{number(found['minutes'], 1)} ({number(alone['minutes'], 1)})", "-"),
+    ]
 
 
 def _percent(fraction: float) -> str:

@@ -10,11 +10,14 @@ from uncertainty_world import ball
 
 from puncture_twin import api as pt
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.budget.guidance import corridor_mm, declared_ways, equipped, guided_error, lost_sight
+from puncture_twin.planning.budget.guidance import Sight, corridor_mm, declared_ways, equipped, guided_error, lost_sight
+from puncture_twin.planning.case.settings import ControlScan
+from puncture_twin.planning.uncertainty import guided
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.twin.jobs.patient.run import room_count
+from puncture_twin.twin.plant import room_devices
 from puncture_twin.twin.plant.room_devices import RoomCameras
 from puncture_twin.twin.rehearsal import distribution
 from puncture_twin.twin.rehearsal.distribution import rehearse_trials
@@ -270,3 +273,114 @@ def test_a_way_needs_trials():
     for rooms, physics in ((None, 0), (10, 2)):
         with refused("conflicting_options"):
             room_count(rooms, physics, "ct")
+
+
+class Nothing(Sight):
+    """Streaks over all of every control scan."""
+
+    def hidden(self, out_mm):
+        """Neither tip nor target."""
+        return dict.fromkeys(("scanned tip", "scanned target"), "streaks")
+
+
+MOVED = "[motion]\ntarget_sd_mm = [0.4, 0.4, 1.0]\n"
+
+
+@pytest.fixture(scope="module")
+def scanned(tmp_path_factory):
+    """A prepared case whose target moves, one direction, and a function to have other control scans in it."""
+    context, outward, q = prepared(tmp_path_factory.mktemp("scanned"), MOVED)
+
+    def with_scans(**stated):
+        scan = ControlScan(**{"slice_mm": 2.0, "target_seen": True, "dose_msv": 0.9, "seconds": 120.0} | stated)
+        return replace(context, case=replace(context.case, control_scan=scan)), outward, q
+
+    return with_scans
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+@pytest.mark.parametrize("stated", [{}, {"target_seen": False, "slice_mm": 5.0}])
+def test_a_needle_corrected_after_each_scan_errs_as_predicted(scanned, steps, stated):
+    """Predicted over realised and the region, less than the open loop of the same patients; all steps are counted."""
+    found = rehearse_trials(*scanned(**stated), 2000, 3, "ct", steps=steps)
+    alone, said = rehearse_trials(*scanned(), 2000, 3, "ct"), found.summary()
+    assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.03)
+    assert found.in_region.mean() == pytest.approx(0.95, abs=0.01)
+    assert (said["guidance"], said["steps"], said["passes"], said["scans"]) == ("ct+scans", steps, steps, steps)
+    assert said["dose_msv"] == pytest.approx(0.9 * steps) and said["minutes"] == pytest.approx(2.0 * steps)
+    np.testing.assert_array_equal(found.stepwise.open_loop.trials.tip_ct, alone.trials.tip_ct)
+    assert said["open_loop"]["realised_rms_mm"] == alone.realised_rms_mm > found.realised_rms_mm + 0.2
+    assert len(said["correction_mm"]) == steps and said["looks"]["scans"] == steps
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_scans_leave_their_readings_error_alone(scanned, monkeypatch, steps):
+    """Of an arm that arrives alike each time; 1 um of tip and target per axis: arm, markers and motion are all seen.
+
+    Realised are a few hundredths of a millimetre, where the belief is linear and the truth is not.
+    """
+    context, outward, q = scanned()
+    errors = context.case.errors
+    alike = replace(errors, arm=replace(errors.arm, repeatability=0.0))
+    context = replace(context, case=replace(context.case, errors=alike))
+    for module in (guided, room_devices):
+        monkeypatch.setattr(module, "scan_roots", lambda scan, errors: (1e-3 * np.eye(3), 1e-3 * np.eye(3)))
+    found = rehearse_trials(context, outward, q, 200, 3, "ct", steps=steps)
+    if steps == 1:
+        assert found.predicted_rms_mm == pytest.approx(6e-6**0.5, rel=0.01)
+    assert 3e-6**0.5 < found.predicted_rms_mm < 2.5e-3
+    assert found.realised_rms_mm < 0.03 < 1.0 < found.stepwise.open_loop.realised_rms_mm
+
+
+def test_scans_that_show_nothing_are_the_open_loop(scanned):
+    """To the bit, at the same dose; and it is said what is out of sight."""
+    context, outward, q = scanned()
+    found = rehearse_trials(context, outward, q, 300, 3, "ct", Nothing(), steps=3)
+    alone = rehearse_trials(context, outward, q, 300, 3, "ct")
+    np.testing.assert_array_equal(found.trials.tip_ct, alone.trials.tip_ct)
+    assert found.predicted_rms_mm == alone.predicted_rms_mm and found.p_hit == alone.p_hit
+    said = found.summary()
+    assert (said["passes"], said["scans"], said["dose_msv"], said["stopped"]) == (0.0, 3.0, pytest.approx(2.7), 0)
+    assert len(said["lost_sight"]) == 6 and "streaks" in said["lost_sight"][0]
+
+
+def test_worse_scans_never_help(scanned):
+    """Thicker slices, and a target that they do not show."""
+    stated = ({"slice_mm": 0.5}, {}, {"slice_mm": 5.0}, {"slice_mm": 5.0, "target_seen": False})
+    found = [rehearse_trials(*scanned(**one), 1, 3, "ct", steps=2).predicted_rms_mm for one in stated]
+    assert found == sorted(found) and found[0] < found[-1] - 0.3
+
+
+def test_scans_in_a_breathing_body_err_as_predicted(tmp_path):
+    """Scanned and inserted at one position of the breath, which the target's reading shows."""
+    insertion = prepared(tmp_path, MOVED + BREATH)
+    found = rehearse_trials(*insertion, 2000, 3, "ct", steps=3)
+    assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.03)
+    assert found.assumed[0].startswith("assumed: [control_scan] slices of 2 mm that show the target")
+
+
+def test_a_correction_after_a_scan_stays_in_the_corridor(tmp_path):
+    """A target that moved far: stopped as often as predicted, which is no hit; no scan follows where it was stopped."""
+    insertion = prepared(tmp_path, "[motion]\ntarget_sd_mm = [9.0, 9.0, 9.0]\n")
+    found = rehearse_trials(*insertion, 1500, 3, "ct", steps=3)
+    said, stopped = found.summary(), found.stopped / 1500
+    assert 0.2 < stopped < 0.8 and said["p_stop"] == pytest.approx(stopped, abs=0.025)
+    assert said["mean_p_hit"] == pytest.approx(said["hit_share"], abs=0.025)
+    assert said["scans"] - said["passes"] == pytest.approx(stopped) and said["scans"] < 3.0 - stopped
+    assert said["open_loop"]["hit_share"] < said["hit_share"] + stopped
+
+
+def test_steps_are_of_ct_alone(scanned):
+    """Of another way, of none, of too few or many, or as a way of their own: refused."""
+    for way, steps, code in (
+        ("us", 3, "conflicting_options"),
+        (None, 3, "conflicting_options"),
+        ("ct", 0, "out_of_range"),
+        ("ct", 11, "out_of_range"),
+        ("ct+scans", None, "unknown_guidance"),
+    ):
+        with refused(code):
+            room_count(10, 0, way, steps)
+        with refused(code):
+            rehearse_trials(*scanned(), 1, 3, way, steps=steps)
+    assert room_count(10, 0, "ct", 10).steps == 10

@@ -145,7 +145,10 @@ def in_rooms(context: CaseContext, plan: Plan, count: RoomCount, seed: int | Non
         sight = None
         if (way := count.guidance) is not None:
             sight = sight_of(replace(context, case=equipped(context.case, way)[0]), plan, way)
-        found = rehearse_trials(context, plan.outward_ct, q, count.rooms, seed, count.guidance, sight)
+        found = rehearse_trials(context, plan.outward_ct, q, count.rooms, seed, count.guidance, sight, count.steps)
+    if found.stepwise is not None:
+        moving_s = plan.approach.duration_s + plan.insertion.duration_s
+        found = replace(found, stepwise=found.stepwise._replace(moving_s=moving_s))
     if not (count.physics and len(found)):
         return found
     from puncture_twin.twin.rehearsal.plan_truth import physics_trials

@@ -11,7 +11,7 @@ import numpy as np
 from puncture_twin.planning.base.errors import Severity, refuse
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.text import plural
-from puncture_twin.planning.budget.guidance import check_way
+from puncture_twin.planning.budget.guidance import check_way, stepped
 from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.plan.plan import Plan
@@ -46,19 +46,24 @@ FILM, ROOMS = "rehearsal.mp4", "rooms.png"
 
 
 class RoomCount(NamedTuple):
-    """How many rooms are rehearsed, how many of them in the simulator too, and the way of guidance, if one is asked."""
+    """How many rooms are rehearsed, how many in the simulator too, the way of guidance if any, and its steps."""
 
     rooms: int
     physics: int = 0
     guidance: str | None = None
+    steps: int | None = None
 
 
-def room_count(rooms: int | None, physics: int, guidance: str | None = None) -> RoomCount | None:
+def room_count(
+    rooms: int | None, physics: int, guidance: str | None = None, steps: int | None = None
+) -> RoomCount | None:
     """How many rooms are wanted; None for none beside the one that is executed.
 
     Raises:
-        InputError: More in the simulator than there are, or guidance that is unknown, or without trials.
+        InputError: More in the simulator than there are, guidance that is unknown, or without trials, or steps of
+            another than ct.
     """
+    stepped(guidance, steps)
     if guidance is not None:
         check_way(guidance)
         if rooms is None or physics:
@@ -66,7 +71,7 @@ def room_count(rooms: int | None, physics: int, guidance: str | None = None) -> 
             refuse(what, "--guidance", "--guidance WAY --seeds N, without --physics", "conflicting_options")
     if physics > (rooms or 0):
         refuse("--physics runs some of the trials", "--physics", "--seeds N --physics K, K <= N", "conflicting_options")
-    return None if rooms is None else RoomCount(rooms, physics, guidance)
+    return None if rooms is None else RoomCount(rooms, physics, guidance, steps)
 
 
 @dataclass(frozen=True, eq=False)
