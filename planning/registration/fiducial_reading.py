@@ -42,6 +42,8 @@ LEAST_MM, LARGEST_MM = 1.0, 15.0
 """Diameters of markers."""
 TISSUE_HU = 50.0
 """Muscle, and about what skin and fat have at most: the level at which a marker ends lies between this and its own."""
+AIR_HU = -1000.0
+"""By the scale's definition."""
 CLIPPED = 0.97
 """Of the image's greatest value: a voxel from here on may have been clipped."""
 FINE_MM, MOST_FINE = 0.5, 8
@@ -195,9 +197,14 @@ class Middle:
         return float((axes[1] + slack) / (axes[2] + slack))
 
     @property
-    def thin(self) -> Floats:
-        """The direction in which it is thinnest, shape (3,), unit."""
-        return np.asarray(np.linalg.eigh(self.spread - _blur(self.box.volume))[1][:, 0])
+    def outward(self) -> Floats:
+        """The direction in which what it lies in falls off to air, shape (3,), unit; in air alone where it is thin."""
+        points = np.argwhere(self.clear) @ self.box.volume.T_ct_index[:3, :3].T
+        values = self.box.volume.values[self.clear]
+        if np.ptp(values) < -AIR_HU / 2:
+            return np.asarray(np.linalg.eigh(self.spread - _blur(self.box.volume))[1][:, 0])
+        slope = np.linalg.lstsq(points - points.mean(axis=0), values.mean() - values)[0]
+        return np.asarray(slope / np.linalg.norm(slope))
 
     @property
     def wide_mm(self) -> float:
