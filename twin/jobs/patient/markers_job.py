@@ -256,7 +256,7 @@ class _Sheet(NamedTuple):
 
 def _written(run: Run, sheet: _Sheet, out: Path, csv: str, inputs: tuple[Input, ...], watcher: Watcher) -> Run:
     """A run with its files; Slicer knows no space of a case's own, and gets no list of it."""
-    lists = (csv,) if sheet.points.space is Space.LOCAL else (csv, csv.replace(".csv", MARKUPS))
+    lists: tuple[str, ...] = (csv,) if sheet.points.space is Space.LOCAL else (csv, csv.replace(".csv", MARKUPS))
     names = (*lists, PICTURE, REPORT)
     with writing(out, "markers", inputs=inputs, names=names, note=watcher.note) as draft:
         sheet.write(draft.folder, lists)
