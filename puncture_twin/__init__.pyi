@@ -13,6 +13,7 @@ from .api import (
     export as export,
     init_case as init_case,
     load_case as load_case,
+    markers as markers,
     place as place,
     plan as plan,
     prepare as prepare,

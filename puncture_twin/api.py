@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from puncture_twin.twin.jobs.experiment.touch_job import TouchRun
     from puncture_twin.twin.jobs.patient.confirm_job import Confirmed
     from puncture_twin.twin.jobs.patient.export_jobs import ExportedTable
+    from puncture_twin.twin.jobs.patient.markers_job import MarkersRun
     from puncture_twin.twin.jobs.patient.path_exports import PathExport
     from puncture_twin.twin.rehearsal.result import Rehearsal
 
@@ -288,6 +289,37 @@ def register(
     pairs = marker_pairs.match(named_points(markers_ct, "register"), named_points(markers_base, "register"), use=None)
     target = named_points({"target": target_ct}, "register: target_ct").points[0]
     return registration.register(pairs, method=method, target_ct=target, fle_mm=fle_mm)
+
+
+@checked
+def markers(
+    source: Path | str,
+    *,
+    kind: str | None = None,
+    diameter_mm: float | None = None,
+    count: int | None = None,
+    layout: Points | None = None,
+) -> MarkersRun:
+    """The markers on the skin of a CT; ``points`` go to `write_points` or `register`, ``doubtful`` may be more of them.
+
+    Args:
+        source: A folder or file with a CT, or a case with one.
+        kind: ``ball``, ``disc`` or ``ring``, of all markers.
+        diameter_mm: Of all markers, 1 to 15.
+        count: How many there are.
+        layout: Names them by their distances, in any frame, mm.
+
+    Raises:
+        InputError: No CT, what no marker is, or a mirrored layout.
+        NoAnswerError: No markers, too few or many, or several sizes; it says what was seen.
+    """
+    from puncture_twin.planning.base.progress import Silent
+    from puncture_twin.planning.formats.points import named_points
+    from puncture_twin.planning.registration.fiducials import Stated
+    from puncture_twin.twin.jobs.patient.markers_job import look_for_markers
+
+    named = None if layout is None else named_points(layout, "markers: layout")
+    return look_for_markers(Path(source), Stated(kind, diameter_mm, count), named, "markers: layout", Silent())
 
 
 @checked

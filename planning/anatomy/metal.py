@@ -106,25 +106,19 @@ def metal_parts(
     every, outside = _sides(values, volume, metal, level_hu, reach_mm)
     if not outside.any():
         return np.asarray(metal.voxels, dtype=np.float64)
-    background = metal_background(volume, metal, level_hu, reach_mm)
+    spacing = spacing_mm(volume)
+    nearest = ndimage.distance_transform_edt(~outside, spacing, return_distances=False, return_indices=True)
+    background = _smooth(values, outside)[tuple(nearest)]
     parts = (values - background) / (solid_hu - background)  # linear partial volume
     others = every & ~metal.voxels
-    spacing = spacing_mm(volume)
     mine = ndimage.distance_transform_edt(~metal.voxels, spacing)
     strange = others.any() and mine >= ndimage.distance_transform_edt(~others, spacing)  # nearer to another piece
     return np.where(outside | strange | (parts < LEAST_PART), 0.0, parts)
 
 
-def metal_background(
-    volume: Volume, metal: Metal, level_hu: float = METAL_HU, reach_mm: Floats | float = BLUR_MM
-) -> Floats:
-    """What each voxel of a piece's box would show without metal, HU."""
-    values = volume.values[metal.box].astype(np.float64)
-    _, outside = _sides(values, volume, metal, level_hu, reach_mm)
-    if not outside.any():
-        return np.full_like(values, values.min())
-    nearest = ndimage.distance_transform_edt(~outside, spacing_mm(volume), return_distances=False, return_indices=True)
-    return np.asarray(_smooth(values, outside)[tuple(nearest)])
+def clear_of_metal(volume: Volume, metal: Metal, level_hu: float, reach_mm: Floats | float) -> Bools:
+    """The voxels of a piece's box that no metal reaches."""
+    return _sides(volume.values[metal.box], volume, metal, level_hu, reach_mm)[1]
 
 
 def _sides(

@@ -19,13 +19,14 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial.distance import cdist
 
 from puncture_twin.planning.anatomy.metal import (
     BLUR_MM,
     SOLID_HU,
     Metal,
     centroid,
-    metal_background,
+    clear_of_metal,
     metal_parts,
     spacing_mm,
 )
@@ -41,6 +42,8 @@ LEAST_MM, LARGEST_MM = 1.0, 15.0
 """Diameters of markers."""
 TISSUE_HU = 50.0
 """Muscle, and about what skin and fat have at most: the level at which a marker ends lies between this and its own."""
+AIR_HU = -1000.0
+"""By the scale's definition."""
 CLIPPED = 0.97
 """Of the image's greatest value: a voxel from here on may have been clipped."""
 FINE_MM, MOST_FINE = 0.5, 8
@@ -58,9 +61,13 @@ AS_NEAR = 1.4
 UNRESOLVED = 2.5
 """Voxels: what is no wider in the image shows no kind."""
 SKIN_EDGE_MM = 0.12
-"""How far a marker is drawn along the skin's normal by what it hides of the skin's edge; metal is drawn less."""
+"""How far contrast is drawn along the skin's normal where the skin is no plane; metal is drawn less."""
 TOUCHED = 1.01
 """Voxels from a marker: the next one may be filled in part."""
+DEEP, ASIDE_MM = 0.4, 4.0
+"""About a voxel that a marker hides others tell of its background: as deep in the skin (voxels), and so far aside."""
+MOST_OTHERS = 2000
+"""Of these voxels, spread over all."""
 ROUNDS = 7
 """Of Gauss-Newton; it settles after four or five."""
 SHIFT, SIZE, THICK, DENSITY, TILT = 0.5, 0.35, 0.7, 0.7, 0.25
@@ -73,8 +80,9 @@ STATED = 0.07
 THICK_MM = 2.5
 BLUR_SIGMA_MM, BLUR_KNOWN = 0.45, 0.12
 """Of reconstruction and pixel together, in the plane, mm."""
-FLOOR = (0.02, 0.02)
-"""Standard deviation that no reading is below: mm, and part of a voxel along each axis."""
+FLOOR_MM, LACKING = 0.01, 0.25
+"""Standard deviation that no reading is below, and how far what a drawing lacks may move it, part of a voxel along each
+axis: it is no noise, which a mean would lessen."""
 
 
 class Shape(NamedTuple):
@@ -84,6 +92,13 @@ class Shape(NamedTuple):
     diameter_mm: float
     thick_mm: float
     normal: Floats
+
+    def half_mm(self, along: Floats) -> float:
+        """How far it reaches from its centre in a direction (3,), unit."""
+        if self.kind == "ball":
+            return self.diameter_mm / 2
+        cos = float(np.clip(abs(self.normal @ along), 0.0, 1.0))
+        return self.thick_mm / 2 * cos + self.diameter_mm / 2 * float(np.sqrt(1 - cos**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +111,7 @@ class Reading:
         contrast_hu: Its greatest value above soft tissue's; of clipped metal at least so much.
         clipped: Whether the image's range clips it.
         misfit: Root mean square of what its drawing lacks, over that of its contrast; 0 is a perfect marker.
+        others: Kinds whose drawing is about as near.
     """
 
     centre_ct: Floats
@@ -104,6 +120,12 @@ class Reading:
     contrast_hu: float
     clipped: bool
     misfit: float
+    others: tuple[Kind, ...] = ()
+
+    @property
+    def kinds(self) -> tuple[Kind, ...]:
+        """What it may be."""
+        return (self.shape.kind, *self.others)
 
 
 class Box(NamedTuple):
@@ -113,12 +135,14 @@ class Box(NamedTuple):
         volume: The voxels of the box, as an image of its own, float64.
         peak: Shape (3,), index of its densest voxel.
         ceiling_hu: Where the whole image clips; infinite where it does not.
+        cut: Whether the image ends at the thing.
     """
 
     volume: Volume
     peak: Ints
     ceiling_hu: float
     noise_hu: float
+    cut: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +153,7 @@ class Middle:
         centre_ct: Shape (3,), LPS mm.
         spread: Shape (3, 3), mm², second moment about it.
         solid_hu: Of what it is made.
-        background: Shape of the box, HU: what it would show without.
+        clear: Of the box: which voxels it does not reach.
     """
 
     box: Box
@@ -138,7 +162,27 @@ class Middle:
     spread: Floats
     peak_hu: float
     solid_hu: float
-    background: Floats
+    clear: Bools
+
+    @property
+    def near(self) -> Bools:
+        """Of the box: the voxels that it fills or blurs into."""
+        return np.asarray(ndimage.binary_dilation(self.voxels, np.ones((3, 3, 3)), iterations=2))
+
+    def background(self, normal: Floats) -> Floats:
+        """What the voxels near it would show without, shape (n,), HU, by others that lie as deep in the skin.
+
+        Args:
+            normal: Shape (3,), unit, of the skin.
+        """
+        A = self.box.volume.T_ct_index[:3, :3]
+        along = DEEP * float(np.linalg.norm(A.T @ normal))
+        metric = np.eye(3) / ASIDE_MM + (1 / along - 1 / ASIDE_MM) * np.outer(normal, normal)
+        others = np.argwhere(self.clear)
+        others = others[:: 1 + len(others) // MOST_OTHERS]
+        squares = cdist(np.argwhere(self.near) @ A.T @ metric, others @ A.T @ metric, "sqeuclidean")
+        weights = np.exp((squares.min(axis=1, keepdims=True) - squares) / 2)
+        return np.asarray(weights @ self.box.volume.values[tuple(others.T)] / weights.sum(axis=1))
 
     @property
     def clipped(self) -> bool:
@@ -153,9 +197,14 @@ class Middle:
         return float((axes[1] + slack) / (axes[2] + slack))
 
     @property
-    def thin(self) -> Floats:
-        """The direction in which it is thinnest, shape (3,), unit."""
-        return np.asarray(np.linalg.eigh(self.spread - _blur(self.box.volume))[1][:, 0])
+    def outward(self) -> Floats:
+        """The direction in which what it lies in falls off to air, shape (3,), unit; in air alone where it is thin."""
+        points = np.argwhere(self.clear) @ self.box.volume.T_ct_index[:3, :3].T
+        values = self.box.volume.values[self.clear]
+        if np.ptp(values) < -AIR_HU / 2:
+            return np.asarray(np.linalg.eigh(self.spread - _blur(self.box.volume))[1][:, 0])
+        slope = np.linalg.lstsq(points - points.mean(axis=0), values.mean() - values)[0]
+        return np.asarray(slope / np.linalg.norm(slope))
 
     @property
     def wide_mm(self) -> float:
@@ -193,7 +242,7 @@ def find_middle(box: Box) -> Middle | None:
     points = np.argwhere(parts > 0) @ volume.T_ct_index[:3, :3].T + volume.T_ct_index[:3, 3] - centre
     heavy = parts[parts > 0]
     spread = (points * heavy[:, None]).T @ points / heavy.sum()
-    return Middle(box, mask, centre, spread, peak, solid, metal_background(volume, metal, level, reach))
+    return Middle(box, mask, centre, spread, peak, solid, clear_of_metal(volume, metal, level, reach))
 
 
 def _joined(mask: Bools, at: Ints) -> Bools | None:
@@ -221,27 +270,28 @@ def read_marker(
         kinds: Those that it may be.
         diameter_mm: As a person states it.
     """
-    if len(kinds) > 1 and middle.wide_mm < UNRESOLVED * float(spacing_mm(middle.box.volume).min()):
-        kinds = ("ball",)
-    every = list[Reading]()
-    for kind in kinds:
-        every.append(_fitted(middle, kind, normal, diameter_mm))
+    unresolved = middle.wide_mm < UNRESOLVED * float(spacing_mm(middle.box.volume).min())
+    every, background = list[Reading](), middle.background(normal)
+    for kind in kinds[:1] if unresolved else kinds:
+        every.append(_fitted(_Drawing.of(middle, kind, normal, diameter_mm, background)))
         if every[-1].misfit < SURE:
             break
     every.sort(key=_rank)
     best = every[0]
-    off = [one.centre_ct - best.centre_ct for one in every if _rank(one) < AS_NEAR * _rank(best)]
-    return replace(best, cov_ct=best.cov_ct + sum(np.outer(one, one) for one in off) / len(off))
+    near = [one for one in every if _rank(one) < AS_NEAR * _rank(best)]
+    off = np.array([one.centre_ct - best.centre_ct for one in near])
+    others = kinds if unresolved else tuple(one.shape.kind for one in near[1:])
+    return replace(best, cov_ct=best.cov_ct + off.T @ off / len(off), others=others)
 
 
 def _rank(reading: Reading) -> float:
     return reading.misfit * PLAIN[reading.shape.kind]
 
 
-def _fitted(middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | None) -> Reading:
+def _fitted(drawing: _Drawing) -> Reading:
     """The marker of a kind whose drawing is nearest to the image."""
-    drawing, noise = _Drawing.of(middle, kind, normal, diameter_mm), middle.box.noise_hu
-    start, known = drawing.start, drawing.known
+    middle, start, known = drawing.middle, drawing.start, drawing.known
+    noise = middle.box.noise_hu
 
     def linearised(p: Floats) -> System[Floats]:
         image = drawing.image(p)
@@ -257,11 +307,11 @@ def _fitted(middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | Non
         return System(residuals(p, image), np.vstack([np.column_stack(slopes) / sd, np.diag(1 / known)]), cost)
 
     fit = gauss_newton(start, linearised, np.add, lambda _, step: bool(np.abs(step[:3]).max() < SETTLED_MM), ROUNDS)
-    p, shape = fit.estimate, drawing.shape(fit.estimate)
-    cov = np.linalg.inv(fit.system.information)[:3, :3] + _unknown(middle, shape, drawing.solid_hu(p), normal)
-    off = float(np.sqrt(np.mean((drawing.seen - drawing.image(p)) ** 2)))
+    p = fit.estimate
+    misfit = float(np.sqrt(np.mean((drawing.seen - drawing.image(p)) ** 2))) / drawing.contrast_hu
+    cov = np.linalg.inv(fit.system.information)[:3, :3] + drawing.unknown(p, misfit)
     hu = middle.peak_hu - TISSUE_HU
-    return Reading(middle.centre_ct + p[:3], cov, shape, hu, middle.clipped, off / drawing.contrast_hu)
+    return Reading(middle.centre_ct + p[:3], cov, drawing.shape(p), hu, middle.clipped, misfit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,6 +325,7 @@ class _Drawing:
         start: Shape (p,), of the unknowns.
         known: Shape (p,), how well each is known beforehand, standard deviations.
         near: Shape of the box: the voxels that are compared.
+        background: Of them, shape (n,), HU.
     """
 
     middle: Middle
@@ -283,17 +334,17 @@ class _Drawing:
     start: Floats
     known: Floats
     near: Bools
+    background: Floats
 
     @classmethod
-    def of(cls, middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | None) -> _Drawing:
+    def of(cls, middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | None, background: Floats) -> _Drawing:
         size = diameter_mm or (np.sqrt(1.25) if kind == "ball" else 1.0) * middle.wide_mm
         start = np.concatenate([np.zeros(3), np.log([middle.solid_hu, size]), [BLUR_SIGMA_MM, np.log(THICK_MM), 0, 0]])
         of_size = SIZE if diameter_mm is None else STATED
         shift = SHIFT * spacing_mm(middle.box.volume)
         known = np.array([*shift, DENSITY, of_size, BLUR_KNOWN, THICK, TILT, TILT])
         count = 6 if kind == "ball" else 9
-        near = ndimage.binary_dilation(middle.voxels, np.ones((3, 3, 3)), iterations=2)
-        return cls(middle, kind, normal, start[:count], known[:count], near)
+        return cls(middle, kind, normal, start[:count], known[:count], middle.near, background)
 
     @property
     def seen(self) -> Floats:
@@ -303,7 +354,7 @@ class _Drawing:
     @property
     def contrast_hu(self) -> float:
         """Root mean square of what is seen above what lies about it."""
-        return float(np.sqrt(np.mean((self.seen - self.middle.background[self.near]).clip(0.0) ** 2)))
+        return float(np.sqrt(np.mean((self.seen - self.background).clip(0.0) ** 2)))
 
     @property
     def steps(self) -> Floats:
@@ -323,22 +374,20 @@ class _Drawing:
 
     def image(self, p: Floats) -> Floats:
         """As a scanner shows it, shape (n,), HU."""
-        box, background = self.middle.box, self.middle.background
+        box = self.middle.box
         part = filled(box.volume, self.shape(p), self.middle.centre_ct + p[:3])
         sigma = abs(p[5]) / spacing_mm(box.volume)[:2]
-        part = ndimage.gaussian_filter(part, [*sigma, 0.0], mode="nearest")
-        image = background + part * (self.solid_hu(p) - background)
-        return np.asarray(np.minimum(image, box.ceiling_hu)[self.near])
+        part = ndimage.gaussian_filter(part, [*sigma, 0.0], mode="nearest")[self.near]
+        return np.minimum(self.background + part * (self.solid_hu(p) - self.background), box.ceiling_hu)
 
-
-def _unknown(middle: Middle, shape: Shape, solid_hu: float, normal: Floats) -> Floats:
-    """What no drawing knows of a centre, shape (3, 3), mm²: within a voxel that is wider, and at the skin's edge."""
-    spacing = spacing_mm(middle.box.volume)
-    axes = middle.box.volume.T_ct_index[:3, :3] / spacing
-    free = np.maximum(0.0, spacing**2 - shape.diameter_mm**2) / 12
-    along = FLOOR[0] ** 2 + (FLOOR[1] * spacing) ** 2 + free
-    edge = SKIN_EDGE_MM * min(1.0, 1000.0 / solid_hu)
-    return np.asarray(axes @ np.diag(along) @ axes.T + edge**2 * np.outer(normal, normal))
+    def unknown(self, p: Floats, misfit: float) -> Floats:
+        """What no drawing knows of a centre, shape (3, 3), mm²: in a voxel that is wider, and at the skin's edge."""
+        spacing = spacing_mm(self.middle.box.volume)
+        axes = self.middle.box.volume.T_ct_index[:3, :3] / spacing
+        free = np.maximum(0.0, spacing**2 - self.shape(p).diameter_mm ** 2) / 12
+        along = FLOOR_MM**2 + (LACKING * misfit * spacing) ** 2 + free
+        edge = SKIN_EDGE_MM * min(1.0, 1000.0 / self.solid_hu(p))
+        return np.asarray(axes @ np.diag(along) @ axes.T + edge**2 * np.outer(self.normal, self.normal))
 
 
 def filled(volume: Volume, shape: Shape, centre_ct: Floats) -> Floats:

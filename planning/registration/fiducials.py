@@ -35,6 +35,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 from puncture_twin.planning.registration.fiducial_reading import (
+    CLIPPED,
     LARGEST_MM,
     LEAST_MM,
     TISSUE_HU,
@@ -54,8 +55,8 @@ AROUND_MM = 4.0
 """About a candidate, so much is looked at."""
 MOST_VERTICES = 100_000
 """Of the skin, by which candidates are near it; on a trunk they are 3 mm apart."""
-LEAST_VOXELS, LEAST_SINGLE_HU = 3, 600.0
-"""A single voxel of less is noise."""
+LEAST_VOXELS = 3
+"""Fewer may be noise where it reaches so far."""
 LEAST_CLIPPED = 4
 """Voxels of one greatest value: dense things have noise where they are not clipped."""
 LEAST_CONTRAST_HU, LEAST_CONTRAST_SD = 150.0, 6.0
@@ -64,6 +65,8 @@ MOST_MISFIT = 0.38
 """Of an image from the drawing of a marker: balls, discs and rings have up to .3, an L or a bone's end more."""
 LEAST_ROUND = 0.42
 """Of two axes: a piece of wire has a tenth."""
+NEARLY = 0.7
+"""What has so much of what a marker has is doubtful."""
 OFF_SKIN_MM, UNDER_SKIN_MM, IN_SKIN_MM = 5.0, 4.0, 1.0
 """How far beyond its own size a marker may lie off the skin, of metal under it, and of other contrast under it."""
 SIZE_ALIKE = 0.3
@@ -79,7 +82,8 @@ ROW_MM = 10.0
 LAYOUT_MM = 2.0
 """Root mean square by which a layout may be off: skin gives way."""
 LEAST_OF_LAYOUT = 4
-"""Three of a layout fit many places by chance; so many are needed where some of it are not seen."""
+"""Three of a layout fit many places by chance; so many are needed where some of it are not seen. A layout of three must
+fit twice as well where more than three are seen."""
 
 
 @dataclass(frozen=True)
@@ -126,11 +130,29 @@ class Fiducial:
         return np.sqrt(np.diag(self.reading.cov_ct))
 
 
+class Passed(NamedTuple):
+    """A dense thing that is not taken for a marker.
+
+    Attributes:
+        point_ct: Shape (3,), LPS mm.
+        nearly: Whether it lacks little: a person should look at it.
+    """
+
+    point_ct: Floats
+    why: str
+    nearly: bool
+
+
 class Seen(NamedTuple):
-    """What looks like a marker, and how many dense things at the skin do not, by reason."""
+    """What looks like a marker, and the dense things near the skin that do not."""
 
     fiducials: tuple[Fiducial, ...]
-    passed: Counter[str]
+    passed: tuple[Passed, ...]
+
+    @property
+    def doubtful(self) -> list[Passed]:
+        """What may be a marker that was missed."""
+        return [one for one in self.passed if one.nearly]
 
 
 def look_for_fiducials(volume: Volume, skin: Skin, stated: Stated = NOTHING_STATED) -> Seen:
@@ -141,28 +163,53 @@ def look_for_fiducials(volume: Volume, skin: Skin, stated: Stated = NOTHING_STAT
     """
     kinds = tuple(one for one in get_args(Kind) if stated.kind in (None, one))
     noise, ceiling = noise_hu(volume.values), clipped_at(volume.values)
-    found: list[tuple[Reading, float]] = []
-    passed: Counter[str] = Counter()
+    found, passed, voxel = list[Fiducial](), list[Passed](), float(spacing_mm(volume).max())
     for box in _candidates(volume, skin, ceiling, noise):
         middle = find_middle(box)
-        why = _no_candidate(middle, noise)
-        if middle is None or why:
-            passed[why] += 1
+        if middle is not None and _among(middle.centre_ct, found, voxel):
             continue
-        gap, normal = _at_skin(middle.centre_ct, skin)
-        if not _on_skin(middle, gap):
-            passed["not on the skin"] += 1
-            continue
-        if any(np.linalg.norm(middle.centre_ct - one.centre_ct) < one.shape.diameter_mm / 2 for one, _ in found):
-            continue
-        reading = read_marker(middle, normal, kinds, stated.diameter_mm)
-        if why := _unlike(reading):
-            passed[why] += 1
-        else:
-            found.append((reading, gap))
-    rows = order_along_body(np.array([one.centre_ct for one, _ in found]).reshape(-1, 3))
-    named = (Fiducial(f"M{number}", *found[row]) for number, row in enumerate(rows, start=1))
-    return Seen(tuple(named), passed)
+        one = _looked_at(box, middle, skin, kinds, stated.diameter_mm)
+        if isinstance(one, Passed):
+            passed.append(one)
+        elif not _among(one.position_ct, found, voxel):
+            found.append(one)
+    rows = order_along_body(np.array([one.position_ct for one in found]).reshape(-1, 3))
+    others = tuple(one for one in passed if not _among(one.point_ct, found, voxel))
+    return Seen(_numbered([found[row] for row in rows]), others)
+
+
+def _among(point_ct: Floats, found: Sequence[Fiducial], voxel_mm: float) -> bool:
+    """Whether a point lies in a marker that was found, or as near as voxels tell."""
+    return any(
+        np.linalg.norm(point_ct - one.position_ct) < max(one.reading.shape.diameter_mm, voxel_mm) / 2 for one in found
+    )
+
+
+def _looked_at(
+    box: Box, middle: Middle | None, skin: Skin, kinds: tuple[Kind, ...], diameter_mm: float | None
+) -> Fiducial | Passed:
+    """A thing as a marker, or why it is none."""
+    peak_hu, point = float(box.volume.values[tuple(box.peak)]), apply(box.volume.T_ct_index, box.peak.astype(float))
+    if middle is None:
+        nearly = (box.cut or peak_hu >= METAL_HU) and -UNDER_SKIN_MM <= _at_skin(point, skin)[0] <= LARGEST_MM
+        return Passed(point, "cut by the image" if box.cut else "part of something larger", nearly)
+    point, contrast = middle.centre_ct, middle.peak_hu - TISSUE_HU
+    least = max(LEAST_CONTRAST_HU, LEAST_CONTRAST_SD * box.noise_hu)
+    gap, normal = _at_skin(point, skin)
+    if not _on_skin(box, middle.peak_hu, middle.wide_mm / 2, gap):
+        return Passed(point, "not on the skin", nearly=False)
+    if contrast < least:
+        return Passed(point, "too faint", contrast > NEARLY * least)
+    if middle.roundness < LEAST_ROUND:
+        return Passed(point, "long, as wires and clips are", middle.roundness > NEARLY * LEAST_ROUND)
+    reading = read_marker(middle, normal, kinds, diameter_mm)
+    if not LEAST_MM / 1.5 <= reading.shape.diameter_mm <= LARGEST_MM * 1.15:
+        return Passed(point, "too small or too large", nearly=True)
+    if reading.misfit > MOST_MISFIT:
+        return Passed(point, "no ball, disc or ring", reading.misfit < MOST_MISFIT / NEARLY)
+    if not _on_skin(box, middle.peak_hu, reading.shape.half_mm(normal), gap):
+        return Passed(point, "under the skin or off it", nearly=True)
+    return Fiducial("", reading, gap)
 
 
 def noise_hu(values: NDArray[Any]) -> float:
@@ -198,9 +245,8 @@ def _candidates(volume: Volume, skin: Skin, ceiling_hu: float, noise: float) -> 
         ends = np.array([[(one.start, one.stop) for one in box] for _, box in pieces])
         sides = np.ptp(ends, axis=2)
         small = np.all((sides - 1) * spacing <= LARGEST_MM + 2.0, axis=1)
-        small &= (sizes[1:] >= LEAST_VOXELS) | (level >= LEAST_SINGLE_HU)
-        inner = np.all((ends[..., 0] + first > 0) & (ends[..., 1] + first < volume.values.shape), axis=1)
-        rows = np.flatnonzero(small & inner)
+        small &= (sizes[1:] >= LEAST_VOXELS) | (level >= TISSUE_HU + LEAST_CONTRAST_SD * noise)
+        rows = np.flatnonzero(small)
         middles = apply(volume.T_ct_index, (ends[rows].sum(axis=2) - 1) / 2 + first)
         near, _ = tree.query(middles, distance_upper_bound=LARGEST_MM + OFF_SKIN_MM)
         for row in rows[np.isfinite(near)].tolist():
@@ -229,31 +275,15 @@ def box_about(volume: Volume, ends: Ints, peak: Ints, ceiling_hu: float, noise: 
     part = volume.values[tuple(map(slice, low, high))].astype(np.float64)
     T = np.array(volume.T_ct_index)
     T[:3, 3] = apply(volume.T_ct_index, low.astype(float))
-    return Box(Volume(part, T, volume.path), peak - low, ceiling_hu, noise)
+    cut = bool(np.any((ends[:, 0] <= 0) | (ends[:, 1] >= volume.values.shape)))
+    return Box(Volume(part, T, volume.path), peak - low, ceiling_hu, noise, cut)
 
 
-def _no_candidate(middle: Middle | None, noise: float) -> str:
-    """Why a thing is no marker, by its middle alone, or empty."""
-    if middle is None:
-        return "part of something larger"
-    if middle.peak_hu - TISSUE_HU < max(LEAST_CONTRAST_HU, LEAST_CONTRAST_SD * noise):
-        return "too faint"
-    return "long, as wires and clips are" if middle.roundness < LEAST_ROUND else ""
-
-
-def _unlike(reading: Reading) -> str:
-    """Why a thing is no marker, by its drawing, or empty."""
-    if not LEAST_MM / 1.5 <= reading.shape.diameter_mm <= LARGEST_MM * 1.15:
-        return "too small or too large"
-    return "no ball, disc or ring" if reading.misfit > MOST_MISFIT else ""
-
-
-def _on_skin(middle: Middle, gap_mm: float) -> bool:
+def _on_skin(box: Box, peak_hu: float, half_mm: float, gap_mm: float) -> bool:
     """Whether a thing lies on the skin, or of metal just under it; the skin may pass behind or over it."""
-    half = middle.wide_mm / 2
-    metal = middle.clipped or middle.peak_hu >= METAL_HU
-    under = UNDER_SKIN_MM if metal else IN_SKIN_MM + float(np.min(spacing_mm(middle.box.volume))) / 2
-    return -half - under <= gap_mm <= half + OFF_SKIN_MM
+    metal = peak_hu >= min(METAL_HU, CLIPPED * box.ceiling_hu)
+    under = UNDER_SKIN_MM if metal else IN_SKIN_MM + float(np.min(spacing_mm(box.volume))) / 2
+    return -half_mm - under <= gap_mm <= half_mm + OFF_SKIN_MM
 
 
 def _at_skin(point_ct: Floats, skin: Skin) -> tuple[float, Floats]:
@@ -316,8 +346,12 @@ def choose_fiducials(
     size = stated.diameter_mm
     alike = [one for one in seen.fiducials if size is None or _same_size(one.reading.shape.diameter_mm, size, voxel_mm)]
     if layout is not None:
-        return Seen(named_by_layout(alike, layout, where), seen.passed)
-    return Seen(_numbered(_one_kind(alike, stated, seen, voxel_mm)), seen.passed)
+        chosen, why = named_by_layout(alike, layout, where), "no part of the layout"
+    else:
+        chosen, why = _numbered(_one_kind(alike, stated, seen, voxel_mm)), "of another size or kind"
+    taken = {one.reading for one in chosen}
+    others = [Passed(one.position_ct, why, nearly=True) for one in seen.fiducials if one.reading not in taken]
+    return Seen(chosen, (*seen.passed, *others))
 
 
 def _numbered(fiducials: Sequence[Fiducial]) -> tuple[Fiducial, ...]:
@@ -335,7 +369,8 @@ def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen, voxel_mm: f
         NoAnswerError: They are not.
     """
     if not alike:
-        others = ", ".join(f"{count} {why}" for why, count in seen.passed.most_common(3))
+        counted = Counter(one.why for one in seen.passed)
+        others = ", ".join(f"{count} {why}" for why, count in counted.most_common(3))
         what = "no marker on the skin" + (f"; dense things at the skin: {others}" if others else "")
         if seen.fiducials:
             what = f"no marker as stated; seen: {seen_text(seen.fiducials)}"
@@ -357,22 +392,24 @@ def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen, voxel_mm: f
     return group
 
 
-def _groups(alike: Sequence[Fiducial], voxel_mm: float) -> list[list[Fiducial]]:
-    """Markers of one size and density each, in the order given."""
+def _groups(fiducials: Sequence[Fiducial], voxel_mm: float) -> list[list[Fiducial]]:
+    """Markers of one kind, size and density each, in the order given."""
     groups: list[list[Fiducial]] = []
-    for one in alike:
-        size, hu = one.reading.shape.diameter_mm, one.reading.contrast_hu
-        for group in groups:
-            others = [other.reading for other in group]
-            unlike = size > voxel_mm and any(
-                max(hu, o.contrast_hu) > CONTRAST_ALIKE * min(hu, o.contrast_hu) for o in others
-            )
-            if not unlike and all(_same_size(size, o.shape.diameter_mm, voxel_mm) for o in others):
-                group.append(one)
-                break
-        else:
+    for one in fiducials:
+        mine = (group for group in groups if all(_alike(one.reading, other.reading, voxel_mm) for other in group))
+        group = next(mine, None)
+        if group is None:
             groups.append([one])
+        else:
+            group.append(one)
     return groups
+
+
+def _alike(one: Reading, other: Reading, voxel_mm: float) -> bool:
+    """Whether two may be of one kind; what is no larger than a voxel has no density of its own."""
+    sizes, (less, more) = (one.shape.diameter_mm, other.shape.diameter_mm), sorted([one.contrast_hu, other.contrast_hu])
+    as_dense = more <= CONTRAST_ALIKE * less or min(sizes) <= voxel_mm
+    return as_dense and bool({*one.kinds} & {*other.kinds}) and _same_size(*sizes, voxel_mm)
 
 
 def seen_text(fiducials: Sequence[Fiducial]) -> str:
@@ -398,16 +435,17 @@ def named_by_layout(alike: Sequence[Fiducial], layout: NamedPoints, where: str |
         if count < len(names) and count < LEAST_OF_LAYOUT:
             break
         fits = _fits(points, seen, count, where)
-        mirrored |= bool(fits) and fits[0].mirrored
+        chance = count == MIN_MARKERS < len(alike)
+        near = [one for one in fits if one.rms_mm <= (LAYOUT_MM / 2 if chance else LAYOUT_MM)]
+        mirrored |= bool(near) and near[0].mirrored
         proper = [one for one in fits if not one.mirrored]
-        if mirrored or not proper:
+        if mirrored or not near:
             continue
-        if len(proper) > 1 and proper[1].rms_mm < BETTER * max(proper[0].rms_mm, LAYOUT_MM / BETTER**2):
-            raise NoAnswerError(
-                f"the layout fits in {len(proper)} ways (rms {proper[0].rms_mm:.2f} and {proper[1].rms_mm:.2f} mm): "
-                f"{seen_text(alike)}",
-                code="markers_ambiguous",
-            )
+        likely = [one for one in proper if one.rms_mm < BETTER * max(proper[0].rms_mm, LAYOUT_MM / BETTER**2)]
+        if len(likely) > 1:
+            rms = f"rms {likely[0].rms_mm:.2f} and {likely[1].rms_mm:.2f} mm"
+            what = f"the layout fits in {len(likely)} ways ({rms}): {seen_text(alike)}"
+            raise NoAnswerError(what, code="markers_ambiguous")
         return tuple(
             replace(alike[column], name=names[row])
             for row, column in zip(proper[0].rows, proper[0].columns, strict=True)
@@ -428,8 +466,8 @@ class _Fit(NamedTuple):
 
 
 def _fits(points: Floats, seen: Floats, count: int, where: str | Path) -> list[_Fit]:
-    """Every way to put so many points of a layout on markers within `LAYOUT_MM`, the best first."""
-    bound, found = count * LAYOUT_MM**2, []
+    """Every way to put so many points of a layout on markers that a fit within `LAYOUT_MM` may be mistaken for."""
+    bound, found = count * (BETTER * LAYOUT_MM) ** 2, []
     for rows in itertools.combinations(range(len(points)), count):
         x = points[list(rows)] - points[list(rows)].mean(axis=0)
         orders = matching(x, seen, bound)
@@ -439,7 +477,9 @@ def _fits(points: Floats, seen: Floats, count: int, where: str | Path) -> list[_
         rss = np.stack([rigid_rss(x, y), rigid_rss(x * [1.0, 1.0, -1.0], y)])
         for order, (proper, mirror) in zip(orders.tolist(), rss.T.tolist(), strict=True):
             if min(proper, mirror) <= bound:
-                flipped = proper > bound or proper > BETTER**2 * (mirror + count * LAYOUT_MM**2 / BETTER**2)
+                flipped = proper > count * LAYOUT_MM**2 >= mirror or proper > BETTER**2 * (
+                    mirror + count * LAYOUT_MM**2 / BETTER**2
+                )
                 rms = float(np.sqrt(min(proper, mirror if flipped else proper) / count))
                 found.append(_Fit(rms, rows, tuple(order), flipped))
     return sorted(found)

@@ -8,6 +8,7 @@ from case_world import coarse_carton
 from marker_world import Markers, scanned, scene
 from refusals import refused_command
 
+import puncture_twin as pt
 from puncture_twin.planning.formats.points import NamedPoints, read_points, write_points
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.run_twin import main
@@ -43,6 +44,10 @@ def test_markers_are_written_for_case_and_slicer(patient, tmp_path, capsys):
     assert sorted(nearest) == [0, 1, 2, 3, 4] and np.all(np.abs(position - true[nearest]) < 4 * sd)
     for name in ("markers_ct.csv", "markers_ct.mrk.json"):
         assert np.array_equal(read_points(tmp_path / name, default_space=Space.LPS).points, position)
+    assert found["doubtful"] == []
+    api = pt.markers(here / "ct.nii.gz", count=5)
+    assert api.points.names == tuple(one["name"] for one in found["markers"])
+    assert np.allclose(api.points.points, position) and "<td" in api._repr_html_()
     listed = json.loads((tmp_path / "manifest.json").read_text())["entries"]["markers"]["files"]
     assert {"markers_ct.csv", "markers_ct.mrk.json", "markers.png", "markers.json"} <= set(listed)
 

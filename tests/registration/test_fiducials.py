@@ -13,6 +13,7 @@ from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.registration.fiducial_reading import Reading, Shape
 from puncture_twin.planning.registration.fiducials import (
     Fiducial,
+    Seen,
     choose_fiducials,
     find_fiducials,
     look_for_fiducials,
@@ -20,7 +21,7 @@ from puncture_twin.planning.registration.fiducials import (
     noise_hu,
     order_along_body,
 )
-from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball
+from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, rod
 
 KINDS = [
     (Markers("ball", 8.0), 2.5, 0.8),
@@ -57,8 +58,37 @@ def test_centres_are_as_sure_as_they_say(scans):
         normalised += [error @ np.linalg.solve(cov, error) for error, cov in zip(errors, covs, strict=True)]
         assert np.sqrt(np.mean(errors[:, :2] ** 2)) < 0.12
         assert np.sqrt(np.mean(errors[:, 2] ** 2)) < 0.06 * spacing
-    assert 0.3 < np.mean(normalised) / 3 < 1.5
+    assert 0.15 < np.mean(normalised) / 3 < 1.5
     assert np.mean(np.array(normalised) < 7.815) >= 0.9  # the 95 % point of three degrees
+
+
+@pytest.mark.parametrize(
+    ("markers", "spacing", "most_mm"),
+    [(Markers("ball", 3.0, 8000.0, off_mm=-3.5), 1.5, 0.04), (Markers("ball", 8.0, 500.0, off_mm=-4.0), 5.0, 0.25)],
+)
+def test_the_skin_does_not_draw_a_marker_aside(markers, spacing, most_mm):
+    """Metal wholly under it and contrast half in it, whose background is skin to one side: 95 % regions hold."""
+    true, seen = found_in(markers, ScanSettings(spacing, 0.85, 20.0, seed=4), others=False)
+    errors, covs, false = matched(true, seen.fiducials)
+    assert len(errors) >= 5 and not false
+    assert np.sqrt(np.mean(errors[:, :2] ** 2)) < most_mm
+    assert max(e @ np.linalg.solve(c, e) for e, c in zip(errors, covs, strict=True)) < 11.345  # 99 %
+
+
+def test_a_marker_that_the_image_cuts_is_doubtful_and_a_disc_under_the_skin_is_none():
+    """The image ends at the middle of one, and where another does; the disc, of contrast, is 3 mm under the skin."""
+    rng = np.random.default_rng(9)
+    true, solids = scene(Markers(count=5), rng, others=False)
+    place, inward = true[2], -true[2] / np.linalg.norm(true[2])
+    disc = Solid("disc", rod(place + 7.3 * inward, place + 9.3 * inward, 10.0), 400.0)
+    solids = [one for number, one in enumerate(solids) if number != 3]  # the body first, then the markers
+    volume, skin = body_of(scanned([*solids, disc], ScanSettings(1.5, 0.8), rng))
+    last = int((true[4, 2] - volume.T_ct_index[2, 3]) / 1.5)
+    seen = look_for_fiducials(Volume(volume.values[:, :, : last + 1], volume.T_ct_index, volume.path), skin)
+    errors, _, false = matched(true[[1, 3]], seen.fiducials)
+    assert (len(errors), false) == (2, 0)
+    cut = [one.point_ct for one in seen.doubtful if one.why == "cut by the image"]
+    assert min(np.linalg.norm(one - true[4]) for one in cut) < 6.0
 
 
 def test_kind_and_size_are_read(scans):
@@ -147,9 +177,9 @@ LAYOUT = np.array([[0.0, 0, 0], [60, 5, 0], [10, 90, 12], [75, 80, 30], [30, 40,
 NAMES = tuple("ABCDE")
 
 
-def fiducials(points):
-    """Balls of 8 mm there, under other names."""
-    shape = Shape("ball", 8.0, 1.0, np.array([0.0, -1, 0]))
+def fiducials(points, kind="ball"):
+    """Balls or discs of 8 mm there, under other names."""
+    shape = Shape(kind, 8.0, 1.0, np.array([0.0, -1, 0]))
     return [
         Fiducial(f"M{k}", Reading(p, np.eye(3) * 0.01, shape, 900.0, False, 0.1), 4.0) for k, p in enumerate(points)
     ]
@@ -197,6 +227,43 @@ def test_a_layout_that_fits_in_two_ways_is_not_guessed():
     zigzag = np.array([[0.0, 0, 0], [40, 20, 0], [90, 0, 0], [130, 20, 0], [180, 0, 0]])
     with refused("markers_ambiguous", by=NoAnswerError):
         named_by_layout(fiducials(moved(zigzag, rng)), NamedPoints(tuple("ABC"), zigzag[:3], None), "layout")
+
+
+def test_a_layout_that_is_nearly_symmetric_never_names_them_wrong():
+    """Where the skin gave way by 1.5 mm an axis the right names may fit less well than others."""
+    names = 0
+    for seed in range(80):
+        rng = np.random.default_rng(seed)
+        layout = np.array([[0.0, 0, 0], [60, 0, 0], [60, 80, 0], [0, 80, 0]]) + rng.normal(0, [3.0, 3.0, 0.0], (4, 3))
+        R = exp_rotation(rng.normal(size=3))
+        try:
+            seen = fiducials((layout + rng.normal(0, 0.3 + 1.2 * (seed % 2), (4, 3))) @ R.T)
+            named = named_by_layout(seen, NamedPoints(tuple("ABCD"), layout, None), "layout")
+        except NoAnswerError:
+            continue
+        names += 1
+        assert [one.position_ct.tolist() for one in named] == [one.position_ct.tolist() for one in seen]
+    assert names > 30
+
+
+def test_three_of_a_layout_beside_other_things_must_fit_well():
+    """Three that fit to 1.5 mm are named where nothing else is seen, and are chance where something is."""
+    triangle = np.array([[0.0, 0, 0], [140, 0, 0], [30, 60, 0]])
+    triangle -= triangle.mean(axis=0)
+    off = triangle * (1 + 1.5 / np.sqrt(np.mean(np.sum(triangle**2, axis=1))))
+    layout = NamedPoints(tuple("ABC"), triangle, None)
+    assert [one.name for one in named_by_layout(fiducials(off), layout, "layout")] == list("ABC")
+    with refused("layout_not_seen", by=NoAnswerError):
+        named_by_layout(fiducials(np.vstack([off, [[200.0, 10, 40]]])), layout, "layout")
+
+
+def test_discs_as_large_as_the_balls_are_told_apart():
+    """As electrodes are: not one list; what a count leaves out is doubtful."""
+    both = Seen((*fiducials(LAYOUT), *fiducials(LAYOUT[:3] + 200.0, "disc")), ())
+    with refused("markers_unclear", by=NoAnswerError):
+        choose_fiducials(both, Stated(), 1.0, where="test")
+    chosen = choose_fiducials(both, Stated(count=5), 1.0, where="test")
+    assert [one.reading.shape.kind for one in chosen.fiducials] == ["ball"] * 5 and len(chosen.doubtful) == 3
 
 
 def test_a_layout_of_other_distances_is_not_seen():

@@ -72,7 +72,7 @@ def _fine(weights: Floats, piece: Metal, volume: Volume, ceiling_hu: float, nois
     middle = find_middle(box_about(volume, ends, peak, ceiling_hu, noise))
     if middle is None:
         return centroid(weights, piece.box, volume.T_ct_index)
-    return read_marker(middle, middle.thin).centre_ct
+    return read_marker(middle, middle.outward).centre_ct
 
 
 def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[Metal]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from puncture_twin.planning.base.files import is_folder, is_plain_file
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.text import Shown, first_few
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.export.slicer import markups_text
 from puncture_twin.planning.formats.points import NamedPoints, read_points, write_points
@@ -32,7 +34,7 @@ from puncture_twin.planning.search.bedside import slice_numbers
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.marker_places import MarkerPlace, Proposal, propose_markers
 from puncture_twin.twin.jobs.terminal import write_result
-from puncture_twin.twin.report.present import Field, Section, facts, footer, grid, number, text
+from puncture_twin.twin.report.present import Field, Section, facts, footer, grid, number, text, vector
 
 FOUND, PROPOSED, MARKUPS = "markers_ct.csv", "markers_proposed.csv", ".mrk.json"
 """Never one name for both: a person puts a marker some mm beside its proposed place."""
@@ -40,6 +42,7 @@ PICTURE, REPORT = "markers.png", "markers.json"
 NEAR_MM, WIDE_MM = 40.0, 160.0
 """Half a side of each slice: of a marker that is there, and of a place that a person must find on the body."""
 CASE = "case.toml"
+Run = TypeVar("Run", "MarkersRun", "ProposalRun")
 ALLOWED = "a folder with one CT, a CT file (NIfTI, NRRD, a DICOM folder), or a case with one"
 
 
@@ -107,14 +110,21 @@ def read_source(source: Path, watcher: Watcher) -> SourceCt:
     return SourceCt(source.name, Volume(image.hu, image.T_ct_index, source), skin, Space.LPS, place.files.inputs)
 
 
-@dataclass(frozen=True, eq=False)
-class MarkersRun:
+@dataclass(frozen=True, eq=False, repr=False)
+class MarkersRun(Shown):
     """Markers that were found, and the files that were written."""
 
     source: SourceCt
     seen: Seen
     layout: NamedPoints | None
     files: tuple[Path, ...] = ()
+
+    @property
+    def points(self) -> NamedPoints:
+        """Their names and centres, LPS mm (or the case's local frame)."""
+        found = self.seen.fiducials
+        space = Space.LOCAL if self.source.space is Space.LOCAL else Space.LPS
+        return NamedPoints(tuple(one.name for one in found), np.array([one.position_ct for one in found]), space)
 
     @property
     def not_seen(self) -> list[str]:
@@ -130,26 +140,34 @@ class MarkersRun:
             "markers": [_row(one, self.source.space) for one in self.seen.fiducials],
             "distances_mm": distances_mm([one.position_ct for one in self.seen.fiducials]).tolist(),
             "not_seen": self.not_seen,
-            "passed_over": dict(self.seen.passed),
+            "doubtful": [
+                {"position_mm": to_lps(one.point_ct[None], self.source.space)[0].tolist(), "why": one.why}
+                for one in self.seen.doubtful
+            ],
+            "passed_over": dict(Counter(one.why for one in self.seen.passed)),
             "inputs": inputs_document(self.source.inputs),
             "files": [str(path) for path in self.files],
         }
 
     def text(self) -> str:
         """For the terminal."""
-        rows = self.summary()["markers"]
+        found = self.summary()
+        rows = found["markers"]
         head = f"{len(rows)} markers in {self.source.name}, mm {self.source.space}"
         warnings = [f"{one} of the layout is not seen, or has moved" for one in self.not_seen]
+        if doubtful := found["doubtful"]:
+            each = [f"{vector(one['position_mm'], 1)} {one['why']}" for one in doubtful]
+            warnings.append(f"may be a marker too: {first_few(each)}")
         return text([Section(head, [grid(FIELDS, rows)]), *footer(self.files, warnings)])
 
 
 def _row(one: Fiducial, space: Space) -> dict[str, Any]:
-    shape = one.reading.shape
+    shape, signs = one.reading.shape, np.diag(to_lps(np.ones((1, 3)), space)[0])
     return {
         "name": one.name,
         "position_mm": to_lps(one.position_ct[None], space)[0].tolist(),
         "sd_mm": one.sd_mm.tolist(),
-        "covariance_mm2": (_signs(space) @ one.reading.cov_ct @ _signs(space)).tolist(),
+        "covariance_mm2": (signs @ one.reading.cov_ct @ signs).tolist(),
         "kind": shape.kind,
         "diameter_mm": shape.diameter_mm,
         "contrast_hu": one.reading.contrast_hu,
@@ -157,10 +175,6 @@ def _row(one: Fiducial, space: Space) -> dict[str, Any]:
         "misfit": one.reading.misfit,
         "off_skin_mm": one.gap_mm,
     }
-
-
-def _signs(space: Space) -> Floats:
-    return np.diag(to_lps(np.ones((1, 3)), space)[0])
 
 
 def distances_mm(points: Sequence[Floats]) -> Floats:
@@ -179,57 +193,76 @@ FIELDS = (
 )
 
 
-def find_markers(source: Path, out: Path, stated: Stated, layout: Path | None, watcher: Watcher) -> MarkersRun:
-    """Find the markers of a CT; write their list, the list for Slicer, a picture and the report.
+def look_for_markers(
+    source: Path, stated: Stated, layout: NamedPoints | None, where: str | Path, watcher: Watcher
+) -> MarkersRun:
+    """Find the markers of a CT.
+
+    Args:
+        where: Of the layout, for a refusal.
 
     Raises:
         InputError: Nothing that can be read, or a mirrored layout.
         NoAnswerError: No markers, too few or many, or several sizes.
     """
-    wanted = None if layout is None else read_points(layout, default_unit=Unit.MM)
     ct = read_source(source, watcher)
     watcher.step("markers", "looking")
-    run = MarkersRun(ct, find_fiducials(ct.volume, ct.skin, stated, wanted, where=layout or source), wanted)
-    names, lists = tuple(one.name for one in run.seen.fiducials), _list_names(FOUND, ct.space)
-    written = (*lists, PICTURE, REPORT)
-    with writing(out, "markers", inputs=ct.inputs, names=written, note=watcher.note) as draft:
-        lines = [f"{one.reading.shape.kind} {one.reading.shape.diameter_mm:.1f} mm" for one in run.seen.fiducials]
-        points = np.array([one.position_ct for one in run.seen.fiducials])
-        _write_lists(draft.folder, lists, NamedPoints(names, points, ct.space))
-        hu_at = partial(nearest, ct.volume.values, np.asarray(np.linalg.inv(ct.volume.T_ct_index)))
-        _sheet(draft.folder, ct.name, names, points, lines, hu_at, ct.skin, NEAR_MM)
-        run = replace(run, files=draft.final([draft.folder / name for name in written]))
+    return MarkersRun(ct, find_fiducials(ct.volume, ct.skin, stated, layout, where=where), layout)
+
+
+def find_markers(source: Path, out: Path, stated: Stated, layout: Path | None, watcher: Watcher) -> MarkersRun:
+    """Find the markers of a CT; write their list, the list for Slicer, a picture and the report.
+
+    Raises:
+        InputError: As `look_for_markers`.
+        NoAnswerError: As `look_for_markers`.
+    """
+    wanted = None if layout is None else read_points(layout, default_unit=Unit.MM)
+    run = look_for_markers(source, stated, wanted, layout or source, watcher)
+    shapes = [one.reading.shape for one in run.seen.fiducials]
+    sheet = _Sheet(
+        run.source.name,
+        replace(run.points, space=run.source.space),
+        [f"{one.kind} {one.diameter_mm:.1f} mm" for one in shapes],
+        partial(nearest, run.source.volume.values, np.asarray(np.linalg.inv(run.source.volume.T_ct_index))),
+        run.source.skin,
+        NEAR_MM,
+    )
+    return _written(run, sheet, out, FOUND, run.source.inputs, watcher)
+
+
+class _Sheet(NamedTuple):
+    """What is drawn and listed: points in LPS, or the local frame, whose ``space`` is that of the CSV."""
+
+    name: str
+    points: NamedPoints
+    lines: Sequence[str]
+    hu_at: Callable[[Floats], Floats] | None
+    skin: Skin
+    half_mm: float
+
+    def write(self, folder: Path, lists: Sequence[str]) -> None:
+        """The points as the case reads them, as Slicer does, and as a picture."""
+        from puncture_twin.twin.report.slices.points import Mark, write_points_sheet  # with matplotlib
+
+        names, points, space = self.points.names, self.points.points, self.points.space or Space.LPS
+        write_points(folder / lists[0], replace(self.points, points=to_lps(points, space)))
+        for name in lists[1:]:
+            (folder / name).write_text(markups_text("Fiducial", "markers", names, points), encoding="utf-8")
+        marks = [Mark(*one) for one in zip(names, points, self.lines, strict=True)]
+        title = f"{self.name}: {len(marks)} markers"
+        write_points_sheet(folder / PICTURE, title, marks, self.hu_at, self.skin.mesh, self.half_mm)
+
+
+def _written(run: Run, sheet: _Sheet, out: Path, csv: str, inputs: tuple[Input, ...], watcher: Watcher) -> Run:
+    """A run with its files; Slicer knows no space of a case's own, and gets no list of it."""
+    lists: tuple[str, ...] = (csv,) if sheet.points.space is Space.LOCAL else (csv, csv.replace(".csv", MARKUPS))
+    names = (*lists, PICTURE, REPORT)
+    with writing(out, "markers", inputs=inputs, names=names, note=watcher.note) as draft:
+        sheet.write(draft.folder, lists)
+        run = replace(run, files=draft.final([draft.folder / name for name in names]))
         write_result(run.summary(), draft.folder / REPORT, out)
     return run
-
-
-def _list_names(name: str, space: Space) -> tuple[str, ...]:
-    """As the case reads it, and as Slicer does, which knows no space of its own."""
-    return (name,) if space is Space.LOCAL else (name, name.replace(".csv", MARKUPS))
-
-
-def _write_lists(folder: Path, lists: Sequence[str], points: NamedPoints) -> None:
-    """Points in LPS, or the local frame, whose ``space`` is that of the CSV."""
-    space = points.space or Space.LPS
-    write_points(folder / lists[0], replace(points, points=to_lps(points.points, space)))
-    for name in lists[1:]:
-        (folder / name).write_text(markups_text("Fiducial", "markers", points.names, points.points), encoding="utf-8")
-
-
-def _sheet(
-    folder: Path,
-    name: str,
-    names: Sequence[str],
-    points_ct: Floats,
-    lines: Sequence[str],
-    hu_at: Callable[[Floats], Floats] | None,
-    skin: Skin,
-    half_mm: float,
-) -> None:
-    from puncture_twin.twin.report.slices.points import Shown, write_points_sheet  # with matplotlib
-
-    shown = [Shown(*one) for one in zip(names, points_ct, lines, strict=True)]
-    write_points_sheet(folder / PICTURE, f"{name}: {len(shown)} markers", shown, hu_at, skin.mesh, half_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,14 +334,8 @@ def propose_places(context: CaseContext, out: Path, count: int) -> ProposalRun:
     candidates = context.search()
     with context.stages.time("marker places"):
         run = ProposalRun(context, propose_markers(context, candidates, count))
-    case, places = context.case, run.proposal.places
-    lists = _list_names(PROPOSED, case.space)
-    written = (*lists, PICTURE, REPORT)
-    with writing(out, "markers", inputs=case.inputs, names=written, note=context.watcher.note) as draft:
-        names, points = tuple(one.name for one in places), np.array([one.point_ct for one in places])
-        _write_lists(draft.folder, lists, NamedPoints(names, points, case.space))
-        hu_at = None if context.anatomy.scan is None else context.anatomy.scan.hu_at
-        _sheet(draft.folder, case.name, names, points, ["proposed"] * len(places), hu_at, context.anatomy.skin, WIDE_MM)
-        run = replace(run, files=draft.final([draft.folder / name for name in written]))
-        write_result(run.summary(), draft.folder / REPORT, out)
-    return run
+    case, anatomy, places = context.case, context.anatomy, run.proposal.places
+    points = NamedPoints(tuple(one.name for one in places), np.array([one.point_ct for one in places]), case.space)
+    hu_at = None if anatomy.scan is None else anatomy.scan.hu_at
+    sheet = _Sheet(case.name, points, ["proposed"] * len(places), hu_at, anatomy.skin, WIDE_MM)
+    return _written(run, sheet, out, PROPOSED, case.inputs, context.watcher)

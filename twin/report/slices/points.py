@@ -25,7 +25,7 @@ YELLOW: Rgb = (255, 211, 77)
 WITHOUT_CT: Rgb = (44, 47, 54)
 
 
-class Shown(NamedTuple):
+class Mark(NamedTuple):
     """A point (3,), LPS mm, its name, and a line about it."""
 
     name: str
@@ -36,7 +36,7 @@ class Shown(NamedTuple):
 def write_points_sheet(
     path: Path,
     title: str,
-    points: Sequence[Shown],
+    points: Sequence[Mark],
     hu_at: Callable[[Floats], Floats] | None,
     skin: TriangleMesh,
     half_mm: float,
