@@ -50,6 +50,7 @@ CASES = {
     ),
     "check": (SimpleNamespace(safe=True), SimpleNamespace(safe=False)),
     "compare": (SimpleNamespace(safe=True), SimpleNamespace(safe=False)),
+    "confirm": (SimpleNamespace(yes=True), SimpleNamespace(yes=False)),
     "touch": (SimpleNamespace(suffices=True), SimpleNamespace(suffices=False)),
     "pivot": tuple(SimpleNamespace(pivot=SimpleNamespace(large=large)) for large in (False, True)),
     "servo": (SimpleNamespace(passed=True), SimpleNamespace(passed=False)),
