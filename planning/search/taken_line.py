@@ -158,23 +158,14 @@ def _nearest(context: CaseContext, path_ct: Floats, covs_ct: Floats, starts: Flo
 
 
 def _skin(context: CaseContext, path_ct: Floats, outward: Floats, starts: Floats, sizes: Floats) -> SkinPaths:
-    """The skin along a path of pieces, as one path of `skin_paths`: its last crossing is the entry."""
-    found: list[tuple[float, Floats, float]] = []
-    unknown = np.nan
+    """The skin along a path of pieces; from the piece that leaves the body on it is straight."""
     for row, (begin, along) in enumerate(zip(path_ct[:-1], outward, strict=True)):
-        last = row == len(sizes) - 1
-        farthest = max(context.case.needle.length_mm - starts[row], 1.0) if last else sizes[row]
-        one = skin_paths(context.anatomy.skin, begin, along[None], farthest)
-        if one.path_length[0] <= farthest:
-            found.append((starts[row] + float(one.path_length[0]), one.entry_ct[0], float(one.skin_angle[0])))
-        again = float(one.reentry_depth[0])
-        if again <= farthest:
-            found.append((starts[row] + again, begin + again * along, np.nan))
-        if one.unknown_depth[0] <= farthest:
-            unknown = starts[row] + float(one.unknown_depth[0])
-    depth, entry, angle = found[0] if found else (np.nan, np.full(3, np.nan), np.nan)
-    again = found[1][0] if len(found) > 1 else np.nan
-    return SkinPaths(entry[None], *(np.array([one]) for one in (depth, angle, again, unknown)))
+        rest = max(context.case.needle.length_mm - starts[row], 1.0)
+        one = skin_paths(context.anatomy.skin, begin, along[None], rest)
+        if np.fmin(one.path_length[0], one.unknown_depth[0]) <= sizes[row]:
+            break
+    depths = (starts[row] + depth for depth in (one.reentry_depth, one.unknown_depth))
+    return SkinPaths(one.entry_ct, starts[row] + one.path_length, one.skin_angle, *depths)
 
 
 class Aim(NamedTuple):

@@ -52,12 +52,8 @@ SLENDER = 8.0
 """Length over width: a rib is bent, and so wider."""
 BLUR_SIGMA_MM = 0.5
 """Assumed of reconstruction and pixel together, in the plane, before it is fitted."""
-
-
 LEVELS_HU = (METAL_HU, 1000.0, 600.0, 400.0)
 """From what on voxels are taken for metal: thick slices dilute it."""
-
-
 FITTED_MM = 120.0
 """Behind the tip, so much of a needle is fitted."""
 GROWTHS = 4
@@ -94,14 +90,15 @@ LEAST_VOXEL, LEAST_DEG = 0.06, 0.05
 blurs a scan is no exact Gaussian."""
 FEW_SLICES = 4.0
 """A needle through fewer slices is not known to less than these across them."""
-CORRELATED, CORRELATED_BENT = 2.0, 8.0
+CORRELATED, CORRELATED_BENT = 2.0, 16.0
 """By which factor residuals of neighbouring voxels, which streaks and kernel share, widen the fit's variances: those of
 a straight line, and those of a curve, which follows them further."""
+MISLED = 6.0
+"""By which factor the evidence of a bend counts less: stairs of slices look like one, as no Gaussian blurs them."""
 MARKER_MM = 6.0
 """So far about a marker's middle its metal shows."""
 UNSURE_MM = 1.5
 """A tip known worse than this is not read: streaks, or other metal, hide where it ends."""
-
 UNKNOWN = np.full((2, 6, 6), np.nan)
 """Covariance of both ends of what was not fitted."""
 AS_BRIGHT = 0.5
@@ -395,8 +392,7 @@ def _check_tip(volume: Volume, found: FoundNeedle, hidden: Bools, target_ct: Flo
 
 
 def _whole(volume: Volume, metal: Metal, line: _Line, hidden: Bools) -> tuple[Metal, _Line]:
-    """The whole needle, where thick slices dilute it and show it only in pieces at first, and a bend leads off its line.
-    """
+    """The whole needle, where thick slices dilute it and show it only in pieces at first, and a bend leads off its line."""
     at = np.argwhere((volume.values > LEVELS_HU[-1]) & ~hidden)
     places = apply(volume.T_ct_index, at.astype(float))
     for _ in range(GROWTHS):
@@ -523,7 +519,7 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
         starts = [begun, *(begun + more for more in _across(volume, axes, local[bright]) if not again)]
         straight = min((_settled(curve, one, local, seen) for one in starts), key=lambda fit: float(fit.cost))
         if again + 1 < STRAIGHTENED:  # once more about the line that was found
-            start = start + straight.x[1:3] @ axes[1:]  # not along it: a straight rod ends where a bent needle leaves it
+            start = start + straight.x[1:3] @ axes[1:]  # not along it, where a bent needle leaves a straight rod
             forward = np.concatenate([[1.0], straight.x[3:5]]) @ axes
             line = line._replace(forward=forward / np.linalg.norm(forward))
             begun = straight.x * [1, 0, 0, 0, 0, 1, 1]
@@ -554,8 +550,8 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
 def _end(places: Floats, line: _Line) -> Floats:
     """Where metal (n, 3) ends, (3,): beside the line, if it bends away."""
     along = (places - line.middle) @ line.forward
-    last = places[along > along.max() - LARGEST_GAP_MM]
-    return np.asarray(last.mean(axis=0) + (along.max() - along[along > along.max() - LARGEST_GAP_MM].mean()) * line.forward)
+    last = along > along.max() - LARGEST_GAP_MM
+    return np.asarray(places[last].mean(axis=0) + (along.max() - along[last].mean()) * line.forward)
 
 
 def _unclear(line: _Line, tip_ct: Floats) -> FoundNeedle:
@@ -632,7 +628,7 @@ def _weighed(straight: OptimizeResult, fit: OptimizeResult, noise: float, count:
     cov[:7, :7] = _noise(straight, count) ** 2 * np.linalg.pinv(straight.jac.T @ straight.jac)
     cov_bent = noise**2 * np.linalg.pinv(fit.jac.T @ fit.jac)
     kept = np.linalg.slogdet(cov_bent[7:, 7:] / np.outer(BEND_SD, BEND_SD))[1]
-    odds = (float(straight.cost) - float(fit.cost)) / noise**2 + kept / 2  # logarithm
+    odds = (float(straight.cost) - float(fit.cost)) / noise**2 / MISLED + kept / 2  # logarithm
     bent = bool(odds > 0)
     gap = fit.x - plain
     chance = float(expit(odds))
