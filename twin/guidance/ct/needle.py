@@ -392,17 +392,13 @@ def _check_tip(volume: Volume, found: FoundNeedle, hidden: Bools, target_ct: Flo
 
 
 def _whole(volume: Volume, metal: Metal, line: _Line, hidden: Bools) -> tuple[Metal, _Line]:
-    """The whole needle, where thick slices dilute it and show it only in pieces at first, and a bend leads off its line."""
+    """The whole needle, where thick slices dilute it and show it only in pieces at first."""
     at = np.argwhere((volume.values > LEVELS_HU[-1]) & ~hidden)
     places = apply(volume.T_ct_index, at.astype(float))
     for _ in range(GROWTHS):
         points = places - line.middle
         along = points @ line.forward
-        aside, own = points - along[:, None] * line.forward, (_places(volume, metal) - line.middle) / LEVER_MM
-        terms = np.vander(own @ line.forward, 3)
-        bends = np.linalg.lstsq(terms, LEVER_MM * (own - np.outer(own @ line.forward, line.forward)), rcond=None)[0]
-        aside -= np.vander(along / LEVER_MM, 3) @ bends
-        across = np.linalg.norm(aside, axis=1)
+        across = np.linalg.norm(points - along[:, None] * line.forward, axis=1)
         near = across <= WIDE_MM + 0.5 + line.width_mm + WIDEST_SLICE * float(spacing_mm(volume).max())
         kept, along = at[near], along[near]
         order = np.argsort(along)
@@ -504,7 +500,8 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
     typical = float(parts[metal.voxels.ravel()].mean())
     index = np.argwhere(np.ones(metal.voxels.shape, dtype=bool)) + [axis.start for axis in metal.box]
     places, shown = apply(volume.T_ct_index, index.astype(float)), ~hidden[tuple(index.T)]
-    start, begun = _end(places[metal.voxels.ravel() & (parts > typical / 2)], line), np.zeros(7)
+    heavy = places[metal.voxels.ravel() & (parts > typical / 2)] - line.middle
+    start, begun = line.middle + float((heavy @ line.forward).max()) * line.forward, np.zeros(7)
     for again in range(STRAIGHTENED):
         axes = np.concatenate([line.forward[None], np.linalg.svd(line.forward[None])[2][1:]])
         local = (places - start) @ axes.T
@@ -545,13 +542,6 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
     covs, forward = _covariances(volume, x, cov, axes, s)
     sagitta = float(np.linalg.norm(np.cross(path - path[0], (path[-1] - path[0]) / length), axis=1).max())
     return FoundNeedle(path[0], forward, line.width_mm, path, covs, sagitta if bent and sagitta > BENT_MM else 0.0)
-
-
-def _end(places: Floats, line: _Line) -> Floats:
-    """Where metal (n, 3) ends, (3,): beside the line, if it bends away."""
-    along = (places - line.middle) @ line.forward
-    last = along > along.max() - LARGEST_GAP_MM
-    return np.asarray(places[last].mean(axis=0) + (along.max() - along[last].mean()) * line.forward)
 
 
 def _unclear(line: _Line, tip_ct: Floats) -> FoundNeedle:
@@ -607,7 +597,7 @@ def _settled(curve: _Curve, begun: Floats, local: Floats, seen: Floats, noise: f
     return least_squares(misfit, begun, x_scale=SCALES[: len(begun)], method="lm", max_nfev=most)
 
 
-STRAIGHTENED, BENT_AGAIN = 2, 3
+STRAIGHTENED, BENT_AGAIN = 2, 2
 """Times that a straight rod is fitted, as the first line through metal may hold something beside it; and a bent one."""
 SCALES = np.array([1.0, 1.0, 1.0, 0.02, 0.02, 0.3, 0.3, 1.0, 1.0, 1.0, 1.0])
 """Of what is fitted."""
