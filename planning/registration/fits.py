@@ -77,6 +77,12 @@ def carried(center_base: Floats, point_base: Floats) -> Floats:
     return X
 
 
+def carried_along(points: Floats, cov: Floats) -> Floats:
+    """Sigma6 at each of points (m, 3) of a rigid body, shape (m, 6, 6), of that at the first, (6, 6)."""
+    X = np.stack([carried(points[0], point) for point in points])
+    return np.asarray(X @ cov @ X.transpose(0, 2, 1))
+
+
 def fit_rigid(points_ct: Floats, points_base: Floats) -> Floats:
     """T_base_ct that minimises the squared residuals over rotations (Arun 1987, by SVD; det = +1 after Umeyama 1991).
 

@@ -4,9 +4,9 @@ A planned direction starts in the target; a needle that is in the patient starts
 of its path is measured by the same engine, against the same structures and margins, from the piece's own end:
 
     clearance_j = min over pieces (distance of the piece from j) - needle radius
-    safe: clearance_j - SURE sd_j >= margin_j for every j,    sd_j^2 = g' Sigma6 g,  g = (n; s u x n)
+    safe: clearance_j - SURE sd_j >= margin_j for every j and piece,    sd_j^2 = g' Sigma6 g,  g = (n; s u x n)
 
-with Sigma6 the covariance of the tip as it was read, s the depth from it. What is nearer than that is not called safe.
+with Sigma6 the covariance of the piece's end as it was read, s the depth from there. Nearer is not called safe.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.strict_json import or_null
 from puncture_twin.planning.clearance.engine import Clearances, measure, normals_of
-from puncture_twin.planning.registration.fits import carried
+from puncture_twin.planning.registration.fits import carried_along
 from puncture_twin.planning.search.constraints import first_broken
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.hit import hit_in_mesh, hit_model, mean_over_faces, proximity, touch_chance
@@ -45,7 +45,8 @@ class Clear(NamedTuple):
 
     Attributes:
         depth_mm: From the tip, along the needle, of the nearest point.
-        sd_mm: Of the clearance, by what the reading may err; NaN where they intersect.
+        sd_mm: Of the clearance, by what the reading may err, of the piece that may come nearest; NaN where they
+            intersect.
         margin_mm: NaN of what may be crossed.
         p_touch: To first order, with what the surface itself may lie off; NaN where they intersect.
     """
@@ -91,19 +92,19 @@ class LineCheck:
         return self.verdict == SAFE
 
 
-def check_line(context: CaseContext, path_ct: Floats, cov_ct: Floats) -> LineCheck:
+def check_line(context: CaseContext, path_ct: Floats, covs_ct: Floats) -> LineCheck:
     """Check a needle where it lies.
 
     Args:
         context: Of the case; its arm is not asked.
         path_ct: Shape (m, 3), LPS mm, from the tip outward; beyond its last point it goes on straight.
-        cov_ct: Shape (6, 6), of the tip and of the direction, as rotation.
+        covs_ct: Shape (m, 6, 6), of each point and of the direction there, as rotation.
     """
     case, checked = context.case, context.anatomy.checked
     steps = np.diff(path_ct, axis=0)
     sizes = np.linalg.norm(steps, axis=1)
     starts = np.concatenate([[0.0], np.cumsum(sizes)[:-1]])
-    best, violated = _nearest(context, path_ct, cov_ct, starts)
+    best, violated = _nearest(context, path_ct, covs_ct, starts)
     paths = _skin(context, path_ct, steps / sizes[:, None], starts, sizes)
     found = Clearances(best["clearance"][None], best["depth"][None], violated[None])
     broken = first_broken(paths, found, checked, needle=case.needle, max_skin_angle=np.pi)
@@ -120,7 +121,7 @@ def check_line(context: CaseContext, path_ct: Floats, cov_ct: Floats) -> LineChe
     return LineCheck(verdict, structure, tuple(each), paths.entry_ct[0], float(paths.path_length[0]))
 
 
-def _nearest(context: CaseContext, path_ct: Floats, cov_ct: Floats, starts: Floats) -> tuple[dict[str, Floats], Bools]:
+def _nearest(context: CaseContext, path_ct: Floats, covs_ct: Floats, starts: Floats) -> tuple[dict[str, Floats], Bools]:
     """Of each structure the least clearance of all pieces, its depth, deviation and chance to touch; which is violated.
 
     Args:
@@ -133,7 +134,7 @@ def _nearest(context: CaseContext, path_ct: Floats, cov_ct: Floats, starts: Floa
     voxels = [one.voxel_ct for one in checked]
     surfaces = np.array([np.zeros((3, 3)) if errors is None else errors.surface_cov_ct(one) for one in voxels])
     k = len(checked)
-    best = {name: np.full(k, np.inf) for name in ("clearance", "depth", "sd", "touch")}
+    best = {name: np.full(k, np.inf) for name in ("clearance", "depth", "sure")} | {"touch": np.zeros(k)}
     violated = np.zeros(k, bool)
     for row, (begin, outward) in enumerate(zip(path_ct[:-1], steps / sizes[:, None], strict=True)):
         last = row == len(sizes) - 1
@@ -141,37 +142,30 @@ def _nearest(context: CaseContext, path_ct: Floats, cov_ct: Floats, starts: Floa
         axes = engine.measure(begin, outward[None], np.full((1, k), length), shown=False)
         own = measure(engine, checked, begin, outward[None], length=length, radius=case.needle.radius_mm, axes=axes)
         normal = normals_of(engine.triangles, begin, outward[None], axes)
-        depth = starts[row] + own.depth
         surface = np.sqrt(np.einsum("nka,kab,nkb->nk", np.nan_to_num(normal), surfaces, np.nan_to_num(normal)))
         bare, whole = (
-            proximity(axes.distance, depth, normal, outward[None], cov_ct[None], off) for off in (0.0, surface)
+            proximity(axes.distance, own.depth, normal, outward[None], covs_ct[row][None], off)
+            for off in (0.0, surface)
         )
-        touch = touch_chance(whole, case.needle.radius_mm)
         nearer = own.clearance[0] < best["clearance"]
-        for name, found in (("clearance", own.clearance), ("depth", depth), ("sd", bare.deviation), ("touch", touch)):
-            best[name] = np.where(nearer, found[0], best[name])
+        best["depth"] = np.where(nearer, starts[row] + own.depth[0], best["depth"])
+        best["clearance"] = np.minimum(own.clearance[0], best["clearance"])
+        best["sure"] = np.minimum(best["sure"], own.clearance[0] - SURE * bare.deviation[0])
+        best["touch"] = np.maximum(best["touch"], touch_chance(whole, case.needle.radius_mm)[0])
         violated |= own.violated[0]
+    best["sd"] = (best["clearance"] - best.pop("sure")) / SURE
     return best, violated
 
 
 def _skin(context: CaseContext, path_ct: Floats, outward: Floats, starts: Floats, sizes: Floats) -> SkinPaths:
-    """The skin along a path of pieces, as one path of `skin_paths`: its last crossing is the entry."""
-    found: list[tuple[float, Floats, float]] = []
-    unknown = np.nan
+    """The skin along a path of pieces; from the piece that leaves the body on it is straight."""
     for row, (begin, along) in enumerate(zip(path_ct[:-1], outward, strict=True)):
-        last = row == len(sizes) - 1
-        farthest = max(context.case.needle.length_mm - starts[row], 1.0) if last else sizes[row]
-        one = skin_paths(context.anatomy.skin, begin, along[None], farthest)
-        if one.path_length[0] <= farthest:
-            found.append((starts[row] + float(one.path_length[0]), one.entry_ct[0], float(one.skin_angle[0])))
-        again = float(one.reentry_depth[0])
-        if again <= farthest:
-            found.append((starts[row] + again, begin + again * along, np.nan))
-        if one.unknown_depth[0] <= farthest:
-            unknown = starts[row] + float(one.unknown_depth[0])
-    depth, entry, angle = found[0] if found else (np.nan, np.full(3, np.nan), np.nan)
-    again = found[1][0] if len(found) > 1 else np.nan
-    return SkinPaths(entry[None], *(np.array([one]) for one in (depth, angle, again, unknown)))
+        rest = max(context.case.needle.length_mm - starts[row], 1.0)
+        one = skin_paths(context.anatomy.skin, begin, along[None], rest)
+        if np.fmin(one.path_length[0], one.unknown_depth[0]) <= sizes[row]:
+            break
+    depths = (starts[row] + depth for depth in (one.reentry_depth, one.unknown_depth))
+    return SkinPaths(one.entry_ct, starts[row] + one.path_length, one.skin_angle, *depths)
 
 
 class Aim(NamedTuple):
@@ -204,25 +198,25 @@ class Aim(NamedTuple):
         return {name: value if isinstance(value, str) else or_null(value) for name, value in self._asdict().items()}
 
 
-def next_aims(context: CaseContext, path_ct: Floats, forward_ct: Floats, cov_ct: Floats, now: LineCheck) -> list[Aim]:
+def next_aims(context: CaseContext, path_ct: Floats, covs_ct: Floats, forward_ct: Floats, now: LineCheck) -> list[Aim]:
     """Everything that can be done with a needle, the best first.
 
     Args:
-        path_ct: As for `check_line`, which gave ``now``.
+        path_ct: As for `check_line`, which gave ``now``; and
+        covs_ct: the same.
         forward_ct: Shape (3,), unit, the direction in which it goes on.
-        cov_ct: Shape (6, 6), at the tip.
     """
-    target, tip = context.case.target_ct, path_ct[0]
+    target, tip, cov_ct = context.case.target_ct, path_ct[0], covs_ct[0]
     away = target - tip
     deeper = float(away @ forward_ct)
     lateral = float(np.linalg.norm(away - deeper * forward_ct))
     aims = [Aim("accept", 0.0, 0.0, hit_chance(context, tip, cov_ct[:3, :3]), lateral, now.verdict, now.structure)]
     if abs(deeper) >= LEAST_MM:
         end = tip + deeper * forward_ct
-        X = carried(tip, end)
-        cov = X @ cov_ct @ X.T
-        ahead = [end, *path_ct] if deeper > 0 else [end, *path_ct[(path_ct - end) @ forward_ct < -LEAST_MM]]
-        then = check_line(context, np.array(ahead), cov) if len(ahead) > 1 else now
+        cov = carried_along(np.stack([tip, end]), cov_ct)[1]
+        kept = (path_ct - end) @ forward_ct < -LEAST_MM
+        ahead, covs = (np.concatenate([first[None], all_[kept]]) for first, all_ in ((end, path_ct), (cov, covs_ct)))
+        then = check_line(context, ahead, covs) if kept.any() else now
         chance = hit_chance(context, end, cov[:3, :3])
         aims.append(Aim("deeper", deeper, 0.0, chance, lateral, then.verdict, then.structure))
     if np.isfinite(now.entry_ct).all():
@@ -233,7 +227,8 @@ def next_aims(context: CaseContext, path_ct: Floats, forward_ct: Floats, cov_ct:
         cov = cov_ct.copy()
         cov[:3, :3] += (depth * TURN_SD) ** 2 * across
         cov[3:, 3:] += TURN_SD**2 * across
-        then = check_line(context, np.stack([target, now.entry_ct]), cov)
+        path = np.stack([target, now.entry_ct])
+        then = check_line(context, path, carried_along(path, cov))
         turn = float(np.degrees(np.arccos(np.clip(-forward_ct @ outward, -1.0, 1.0))))
         chance = hit_chance(context, target, cov[:3, :3])
         aims.append(Aim("turn", now.inserted_mm, turn, chance, 0.0, then.verdict, then.structure))

@@ -7,10 +7,14 @@ import pytest
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
+from puncture_twin.planning.registration.fits import carried_along
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.taken_line import SAFE, UNCERTAIN, check_line, hit_chance, next_aims
 
-EXACT = np.zeros((6, 6))
+
+def exact(path):
+    """Covariances of a path that is known."""
+    return np.zeros((len(path), 6, 6))
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +37,15 @@ def straight(context, outward, off=(0.0, 0.0, 0.0)):
     return np.stack([tip, tip + 60.0 * outward])
 
 
-@pytest.mark.parametrize("pieces", [1, 4])
+@pytest.mark.parametrize("pieces", [1, 12])
 def test_a_needle_on_a_direction_has_that_directions_clearances(context, pieces):
     """In one piece or in many: every structure's clearance is that of `check`, and so is the verdict."""
     theta, beta = np.radians([25.0, 60.0, 40.0]), np.radians([30.0, 200.0, 120.0])
     candidates = context.check(theta, beta)
     for row, outward in enumerate(candidates.outward_ct):
-        steps = np.linspace(0.0, 60.0, pieces + 1)
-        line = check_line(context, context.case.target_ct + np.outer(steps, outward), EXACT)
+        steps = np.linspace(0.0, 60.0 if pieces == 1 else context.case.needle.length_mm, pieces + 1)  # out of the skin
+        path = context.case.target_ct + np.outer(steps, outward)
+        line = check_line(context, path, exact(path))
         known = dict(zip(candidates.clearance.structures, candidates.clearance.distance[row], strict=True))
         outside = {one.name for one in context.anatomy.surroundings}  # a plan's needle comes from farther out
         found = {one.name: one.clearance_mm for one in line.each}
@@ -58,7 +63,7 @@ def test_clearance_of_a_bent_needle_is_that_of_its_points(context, best):
     s = np.linspace(0.0, 80.0, 17)
     side = np.cross(best, [0.0, 0.0, 1.0])
     path = context.case.target_ct + np.outer(s, best) + np.outer(0.002 * s**2, side / np.linalg.norm(side))
-    line = check_line(context, path, EXACT)
+    line = check_line(context, path, exact(path))
     end = path[-1] + np.linspace(0.0, context.case.needle.length_mm, 300)[:, None] * (path[-1] - path[-2]) / 5.0
     dense = np.concatenate([a + np.linspace(0, 1, 40)[:, None] * (b - a) for a, b in pairwise(path)])
     dense = np.concatenate([dense, end[np.linalg.norm(end - path[-1], axis=1) < 100.0]])
@@ -72,23 +77,43 @@ def test_clearance_of_a_bent_needle_is_that_of_its_points(context, best):
 def test_what_the_reading_errs_is_no_safety(context, best):
     """A clear line is safe, not so if its reading might be off by its slack: and one through a rib never."""
     path = straight(context, best)
-    known = check_line(context, path, EXACT)
+    known = check_line(context, path, exact(path))
     assert known.verdict == SAFE and all(one.sure for one in known.each)
     slack = known.each[0].clearance_mm - known.each[0].margin_mm
-    unsure = check_line(context, path, np.diag([slack**2] * 3 + [0.0] * 3))
+    unsure = check_line(context, path, carried_along(path, np.diag([slack**2] * 3 + [0.0] * 3)))
     assert (unsure.verdict, unsure.safe) == (UNCERTAIN, False)
     rib = context.anatomy.structure("ribs_right").mesh
     through = rib.vertices[np.argmin(np.linalg.norm(rib.vertices - context.case.target_ct, axis=1))]
     outward = through - context.case.target_ct
-    hit = check_line(context, straight(context, outward / np.linalg.norm(outward)), EXACT)
+    path = straight(context, outward / np.linalg.norm(outward))
+    hit = check_line(context, path, exact(path))
     assert not hit.safe and hit.structure == "ribs_right"
     assert hit.each[0].clearance_mm < 0
+
+
+def test_what_is_known_worse_elsewhere_than_where_it_is_nearest(context, best):
+    """A bend that is unknown at the tip, far from the nearest structure: each piece keeps its margin by its own error.
+
+    Oracle: the line moved by two standard deviations along its tip's end breaks a margin or does not.
+    """
+    steps = np.linspace(0.0, 60.0, 7)
+    path = context.case.target_ct + np.outer(steps, best)
+    known = check_line(context, path, exact(path))
+    near = known.each[0]
+    for row in range(len(path)):
+        covs = exact(path)
+        covs[row, :3, :3] = 400.0 * np.eye(3)
+        line = check_line(context, path, covs)
+        one = next(one for one in line.each if one.name == near.name)
+        assert one.clearance_mm == near.clearance_mm and one.sd_mm >= 0
+        assert line.verdict == (SAFE if row == len(path) - 1 and not one.sd_mm else UNCERTAIN)
 
 
 def test_a_tip_outside_of_the_body_has_no_safe_line(context, best):
     """The needle lies in front of the skin."""
     tip = context.case.target_ct + 140.0 * best
-    line = check_line(context, np.stack([tip, tip + 60.0 * best]), EXACT)
+    path = np.stack([tip, tip + 60.0 * best])
+    line = check_line(context, path, exact(path))
     assert not line.safe and np.isnan(line.inserted_mm)
 
 
@@ -113,7 +138,8 @@ def test_next_aims(context, best):
 
     def aims(off):
         path = straight(context, best, off)
-        return next_aims(context, path, -best, cov, check_line(context, path, cov))
+        covs = carried_along(path, cov)
+        return next_aims(context, path, covs, -best, check_line(context, path, covs))
 
     assert aims(np.zeros(3))[0].kind == "accept"
     short = aims(25.0 * best)[0]
@@ -121,6 +147,7 @@ def test_next_aims(context, best):
     beside = aims(30.0 * side)
     turn = next(one for one in beside if one.kind == "turn")
     assert beside[0] is turn or not turn.allowed
-    entry = check_line(context, straight(context, best, 30.0 * side), cov).entry_ct - context.case.target_ct
+    path = straight(context, best, 30.0 * side)
+    entry = check_line(context, path, exact(path)).entry_ct - context.case.target_ct
     known = np.degrees(np.arccos(best @ entry / np.linalg.norm(entry)))
     assert turn.turn_deg == pytest.approx(known) and turn.p_hit > 0.9

@@ -1,10 +1,12 @@
 """Needles found in a CT: axis, tip and bend of the blurred rod whose image is nearest to the voxels, with covariance.
 
 A rod of radius r along a curve c(s), s <= 0 behind its tip, is blurred by a Gaussian, clipped, and compared with every
-voxel about it. Free are its tip, its direction, the blur's size, the metal's density, and where that explains more than
-noise does, how it bends:
+voxel about it. Free are its tip, its direction, the blur's size, the metal's density, and how it bends:
 
-    c(s) = tip + s f + (b s^2 + d s^3) across f
+    c(s) = tip + s f + (b s^2 + d s^3) across f,    b, d = 0, or ~ N(0, as needles bend), with even odds
+
+Straight and bent fits are weighed by their evidence; the covariance is that of both, so that a bend which the image
+neither shows nor excludes is in it.
 
 What is long, thin and dense is a needle only if it has the image of such a rod, and comes from outside of the body.
 """
@@ -18,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, least_squares, minimize_scalar
-from scipy.special import ndtr
+from scipy.special import expit, ndtr
 
 from puncture_twin.planning.anatomy.metal import (
     AROUND_MM,
@@ -36,25 +38,22 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import Finding, InputError, Severity, refuse
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply, skew
+from puncture_twin.planning.registration.fits import carried_along
 
 SHORTEST_MM = 20.0
 """A shorter piece of metal is no needle."""
 SHAFT_MM = 12.0
 """Behind the foremost voxel of metal, and beyond it, so far the needle is looked at."""
 WIDE_MM = 2.5
-"""About the axis of a needle, so far; of a wide rod half of its width."""
+"""About the axis of a needle, so far."""
 WIDEST_SLICE = 0.6
 """Fraction of a slice's thickness: one slice at least is so near to the axis."""
 SLENDER = 8.0
 """Length over width: a rib is bent, and so wider."""
 BLUR_SIGMA_MM = 0.5
 """Assumed of reconstruction and pixel together, in the plane, before it is fitted."""
-
-
 LEVELS_HU = (METAL_HU, 1000.0, 600.0, 400.0)
 """From what on voxels are taken for metal: thick slices dilute it."""
-
-
 FITTED_MM = 120.0
 """Behind the tip, so much of a needle is fitted."""
 GROWTHS = 4
@@ -78,22 +77,30 @@ SAME_MM, SAME_DEG = 4.0, 10.0
 """Two pieces of one needle: so near to its axis, and so parallel."""
 OF_PLAN_MM, OF_PLAN_DEG = 15.0, 15.0
 """Of two needles the plan's is the only one whose axis is so near to the planned tip, and so parallel to its line."""
-BENT_MM, BENT_SD = 0.3, 4.0
-"""A smaller sagitta, or one of fewer standard deviations, is not called a bend."""
+BENT_MM = 0.3
+"""A smaller sagitta is not called a bend."""
+LEVER_MM = 50.0
+"""At which a bend is counted."""
+BEND_SD = np.array([2.0, 2.0, 0.5, 0.5])
+"""How far needles bend at that, mm, square and cube, each across two axes; ours: a sagitta of 2 mm over 95 mm."""
+PIECE_MM = 10.0
+"""A needle's path is given in pieces no longer than this."""
 LEAST_VOXEL, LEAST_DEG = 0.06, 0.05
 """Standard deviations that no fit undercuts: of the tip along each voxel axis, in voxels, and of the direction. What
 blurs a scan is no exact Gaussian."""
 FEW_SLICES = 4.0
 """A needle through fewer slices is not known to less than these across them."""
-CORRELATED = 2.0
-"""By which factor residuals of neighbouring voxels, which streaks and kernel share, widen the fit's variances."""
+CORRELATED, CORRELATED_BENT = 2.0, 16.0
+"""By which factor residuals of neighbouring voxels, which streaks and kernel share, widen the fit's variances: those of
+a straight line, and those of a curve, which follows them further."""
+MISLED = 6.0
+"""By which factor the evidence of a bend counts less: stairs of slices look like one, as no Gaussian blurs them."""
 MARKER_MM = 6.0
 """So far about a marker's middle its metal shows."""
 UNSURE_MM = 1.5
 """A tip known worse than this is not read: streaks, or other metal, hide where it ends."""
-
-UNKNOWN = np.full((6, 6), np.nan)
-"""Covariance of what was not fitted."""
+UNKNOWN = np.full((2, 6, 6), np.nan)
+"""Covariance of both ends of what was not fitted."""
 AS_BRIGHT = 0.5
 """Of a needle's brightness: long, thin metal below it that is not a needle's image is bone."""
 FARTHEST_MM = 3.0
@@ -118,9 +125,10 @@ class FoundNeedle(NamedTuple):
         tip_ct: Shape (3,).
         forward_ct: Shape (3,), unit, the direction in which it ends.
         width_mm: Root mean square distance of its metal from the axis.
-        cov_ct: Shape (6, 6), of the tip (mm) and of the direction as a rotation (rad); none about the axis.
-        path_ct: Shape (m, 3), from the tip to where it is seen last: a straight one's two ends.
-        sagitta_mm: Largest distance of its middle from the chord; 0 for a straight one.
+        path_ct: Shape (m, 3), from the tip to where it is seen last.
+        covs_ct: Shape (m, 6, 6), of each point of the path (mm) and of the direction there as a rotation (rad); none
+            about the axis.
+        sagitta_mm: Largest distance of its middle from the chord; 0 where it is not plainly bent.
         leaves: Whether the end that should be the tip is where the image ends.
         unclear: Whether it is long, thin metal that enters the body, but shows no image of a needle.
     """
@@ -128,11 +136,16 @@ class FoundNeedle(NamedTuple):
     tip_ct: Floats
     forward_ct: Floats
     width_mm: float
-    cov_ct: Floats
     path_ct: Floats
+    covs_ct: Floats
     sagitta_mm: float = 0.0
     leaves: bool = False
     unclear: bool = False
+
+    @property
+    def cov_ct(self) -> Floats:
+        """Sigma6 of the tip and the direction in which it ends, shape (6, 6)."""
+        return np.asarray(self.covs_ct[0])
 
     @property
     def tip_sd_mm(self) -> float:
@@ -152,9 +165,9 @@ class FoundNeedle(NamedTuple):
             cov_T: Shape (6, 6), of that motion at the moved tip, shift (mm) and rotation (rad), axes of b.
         """
         R = np.kron(np.eye(2), T_b_ct[:3, :3])
-        cov = R @ self.cov_ct @ R.T + (0.0 if cov_T is None else cov_T)
-        tip, path = apply(T_b_ct, self.tip_ct), apply(T_b_ct, self.path_ct)
-        return self._replace(tip_ct=tip, forward_ct=T_b_ct[:3, :3] @ self.forward_ct, cov_ct=cov, path_ct=path)
+        path = apply(T_b_ct, self.path_ct)
+        covs = R @ self.covs_ct @ R.T + (0.0 if cov_T is None else carried_along(path, cov_T))
+        return self._replace(tip_ct=path[0], forward_ct=T_b_ct[:3, :3] @ self.forward_ct, covs_ct=covs, path_ct=path)
 
 
 def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = None) -> FoundNeedle:
@@ -183,8 +196,8 @@ def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = N
         _refuse_none(volume, "")
     metal = min(rods, key=lambda piece: float(np.linalg.norm(_places(volume, piece) - target_ct, axis=1).min()))
     line = _toward(_axis(volume, metal), target_ct)
-    end = _tip(volume, metal, line, None)
-    return FoundNeedle(end, line.forward, line.width_mm, UNKNOWN, np.stack([end, line.middle]))
+    end = _tip(volume, metal, line)
+    return FoundNeedle(end, line.forward, line.width_mm, np.stack([end, line.middle]), UNKNOWN)
 
 
 def read_needle(
@@ -422,8 +435,8 @@ def _axis(volume: Volume, metal: Metal) -> _Line:
     return _Line(middle, axes[0], float(np.hypot(sizes[1], sizes[2])))
 
 
-def _tip(volume: Volume, metal: Metal, line: _Line, diameter_mm: float | None) -> Floats:
-    """The end of the rod whose blurred and clipped image is nearest to the voxels about the axis."""
+def _tip(volume: Volume, metal: Metal, line: _Line) -> Floats:
+    """The end of the wide rod whose blurred and clipped image is nearest to the voxels about the axis."""
     parts, full = metal_parts(volume, metal), full_part(volume)
     index = np.argwhere(np.ones(parts.shape, dtype=bool))
     points = apply(volume.T_ct_index, index + np.array([axis.start for axis in metal.box], dtype=float)) - line.middle
@@ -431,11 +444,10 @@ def _tip(volume: Volume, metal: Metal, line: _Line, diameter_mm: float | None) -
     across = np.linalg.norm(points - along[:, None] * line.forward, axis=1)
     typical = float(np.quantile(parts[metal.voxels], 0.9))  # thick slices dilute it
     end = float(along[parts.ravel() > min(full, typical) / 2].max())
-    thin = diameter_mm is not None
-    wide = max(WIDE_MM if thin else line.width_mm / 2, WIDEST_SLICE * float(spacing_mm(volume).max()))
+    wide = max(line.width_mm / 2, WIDEST_SLICE * float(spacing_mm(volume).max()))
     near = (across <= wide) & (np.abs(along - end) <= SHAFT_MM)
     seen, points = np.minimum(parts.ravel()[near], full), points[near]
-    image = _Rod(line.forward, _blur(volume), diameter_mm)
+    image = _Rod(line.forward, _blur(volume), None)
 
     def misfit(tip: float) -> float:
         return float(np.sum((np.minimum(image.parts(points - tip * line.forward), full) - seen) ** 2))
@@ -474,8 +486,6 @@ class _Curve(NamedTuple):
         return np.asarray(np.minimum(np.exp(x[6]) / len(self.layers) * image, self.full))
 
 
-LEVER_MM = 50.0
-"""At which a bend is counted."""
 THIN_MM = 1.2
 """Slices up to this blur as a Gaussian does; of thicker ones a needle shows where it enters and leaves them."""
 
@@ -485,12 +495,13 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
 
     None where they are too dark for a needle; one that is unclear where they are not its image.
     """
-    start, full = _tip(volume, metal, line, diameter_mm), full_part(volume)
+    full = full_part(volume)
     parts = np.minimum(metal_parts(volume, metal), full).ravel()
     typical = float(parts[metal.voxels.ravel()].mean())
     index = np.argwhere(np.ones(metal.voxels.shape, dtype=bool)) + [axis.start for axis in metal.box]
     places, shown = apply(volume.T_ct_index, index.astype(float)), ~hidden[tuple(index.T)]
-    begun = np.zeros(7)
+    heavy = places[metal.voxels.ravel() & (parts > typical / 2)] - line.middle
+    start, begun = line.middle + float((heavy @ line.forward).max()) * line.forward, np.zeros(7)
     for again in range(STRAIGHTENED):
         axes = np.concatenate([line.forward[None], np.linalg.svd(line.forward[None])[2][1:]])
         local = (places - start) @ axes.T
@@ -505,18 +516,20 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
         starts = [begun, *(begun + more for more in _across(volume, axes, local[bright]) if not again)]
         straight = min((_settled(curve, one, local, seen) for one in starts), key=lambda fit: float(fit.cost))
         if again + 1 < STRAIGHTENED:  # once more about the line that was found
-            start = start + straight.x[:3] @ axes
+            start = start + straight.x[1:3] @ axes[1:]  # not along it, where a bent needle leaves a straight rod
             forward = np.concatenate([[1.0], straight.x[3:5]]) @ axes
             line = line._replace(forward=forward / np.linalg.norm(forward))
-            begun = np.concatenate([np.zeros(5), straight.x[5:7]])
+            begun = straight.x * [1, 0, 0, 0, 0, 1, 1]
     length = min(FITTED_MM, float(-local[seen > full / 4][:, 0].min(initial=-SHORTEST_MM)))
-    begun = np.concatenate([[0.0], bends[3], bends[2] / LEVER_MM, straight.x[5:7], bends[1], bends[0]])
-    fit = _settled(curve, begun, local, seen)
-    sagitta, sd = _sagitta(curve, fit, length)
-    bent = length >= SHORTEST_BENT_MM and fit.cost < BETTER * straight.cost and sagitta > max(BENT_MM, BENT_SD * sd)
-    fit = fit if bent else straight
-    x = np.concatenate([fit.x, np.zeros(11 - len(fit.x))])
-    unlike, (blur, gain) = 2 * fit.cost / max(float(seen @ seen), 1e-9), np.exp(x[5:7])
+    seen_bend = np.concatenate([[0.0], bends[3], bends[2] / LEVER_MM, straight.x[5:7], bends[1], bends[0]])
+    starts = [np.concatenate([straight.x, np.zeros(4)]), seen_bend]
+    noise = _noise(straight, len(seen))
+    for _ in range(BENT_AGAIN):  # a bend that is not yet fitted looks like noise
+        fit = min((_settled(curve, one, local, seen, noise) for one in starts), key=lambda one: float(one.cost))
+        starts, noise = [fit.x], _noise(fit, len(seen))
+    x, cov, bent = _weighed(straight, fit, noise, len(seen))
+    left = curve.parts(x, local) - seen
+    unlike, (blur, gain) = float(left @ left) / max(float(seen @ seen), 1e-9), np.exp(x[5:7])
     ahead = float(local[seen > 0.5 * min(full, float(seen.max()))][:, 0].max(initial=-np.inf) - x[0])
     if (
         unlike > UNLIKE
@@ -524,21 +537,17 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
         or not (GAINS[0] < gain < GAINS[1] and BLURS[0] < blur < BLURS[1])
     ):
         return _unclear(line, start) if typical > AS_BRIGHT * float(image[bright].mean()) else None
-    forward = np.concatenate([[1.0], x[3:5]]) @ axes
-    forward /= np.linalg.norm(forward)
-    s = -np.linspace(0.0, length, 2 + int(bent) * int(length / 5.0))
+    s = -np.linspace(0.0, length, 1 + int(np.ceil(length / PIECE_MM)))
     path = start + (np.column_stack([s, curve.off(x, s)]) + x[:3]) @ axes
-    cov = _covariance(volume, fit, axes, forward, length)
-    if length < SHORTEST_BENT_MM:  # too short to be called bent: its end may lean by what a bend would
-        lean = min(4.0 * sagitta / length, MOST_LEAN)
-        cov[3:, 3:] += lean**2 * (np.eye(3) - np.outer(forward, forward))
-    return FoundNeedle(path[0], forward, line.width_mm, cov, path, sagitta if bent else 0.0)
+    covs, forward = _covariances(volume, x, cov, axes, s)
+    sagitta = float(np.linalg.norm(np.cross(path - path[0], (path[-1] - path[0]) / length), axis=1).max())
+    return FoundNeedle(path[0], forward, line.width_mm, path, covs, sagitta if bent and sagitta > BENT_MM else 0.0)
 
 
 def _unclear(line: _Line, tip_ct: Floats) -> FoundNeedle:
     """Long, thin and dense metal that is not the image of a needle."""
     path = np.stack([tip_ct, 2 * line.middle - tip_ct])
-    return FoundNeedle(tip_ct, _toward(line, tip_ct).forward, line.width_mm, UNKNOWN, path, unclear=True)
+    return FoundNeedle(tip_ct, _toward(line, tip_ct).forward, line.width_mm, path, UNKNOWN, unclear=True)
 
 
 def _about(local: Floats, seen: Floats, reach: float, width_mm: float) -> tuple[Bools, Floats]:
@@ -573,56 +582,73 @@ def _layers(volume: Volume, axes: Floats) -> tuple[Floats, Floats]:
     return _blur(volume, count), np.outer(steps, axes @ volume.T_ct_index[:3, 2])
 
 
-def _settled(curve: _Curve, begun: Floats, local: Floats, seen: Floats) -> OptimizeResult:
-    """The numbers from a start (7,) or (11,) that bring the image of points (n, 3) nearest to what is seen (n,)."""
+def _settled(curve: _Curve, begun: Floats, local: Floats, seen: Floats, noise: float = 0.0) -> OptimizeResult:
+    """The numbers from a start (7,) or (11,) that bring the image of points (n, 3) nearest to what is seen (n,).
+
+    Of 11 the bends are held to `BEND_SD`, which weighs as much as a voxel of so much noise.
+    """
     zeros = np.zeros(11 - len(begun))
 
     def misfit(x: Floats) -> Floats:
-        return curve.parts(np.concatenate([x, zeros]), local) - seen
+        left = curve.parts(np.concatenate([x, zeros]), local) - seen
+        return left if len(zeros) else np.concatenate([left, noise * x[7:] / BEND_SD])
 
     most = MOST_CALLS * len(begun)
     return least_squares(misfit, begun, x_scale=SCALES[: len(begun)], method="lm", max_nfev=most)
 
 
-MOST_LEAN = 0.1
-"""Of a short needle's end against its chord, rad."""
-STRAIGHTENED = 2
-"""Times that a straight rod is fitted: the first line through metal may hold something beside it."""
-SHORTEST_BENT_MM, BETTER = 40.0, 0.8
-"""A shorter needle is not called bent, nor one whose misfit that lessens by a smaller factor."""
+STRAIGHTENED, BENT_AGAIN = 2, 2
+"""Times that a straight rod is fitted, as the first line through metal may hold something beside it; and a bent one."""
 SCALES = np.array([1.0, 1.0, 1.0, 0.02, 0.02, 0.3, 0.3, 1.0, 1.0, 1.0, 1.0])
 """Of what is fitted."""
 
 
-def _variances(fit: OptimizeResult) -> Floats:
-    """Covariance of what was fitted."""
-    J, left = fit.jac, fit.fun
-    return np.asarray(CORRELATED * (left @ left) / max(len(left) - J.shape[1], 1) * np.linalg.pinv(J.T @ J))
+def _noise(fit: OptimizeResult, count: int) -> float:
+    """Standard deviation of so many voxels' residuals, widened by what neighbours share."""
+    left, factor = fit.fun[:count], CORRELATED if len(fit.x) == 7 else CORRELATED_BENT
+    return float(np.sqrt(factor * (left @ left) / max(count - len(fit.x), 1)))
 
 
-def _sagitta(curve: _Curve, fit: OptimizeResult, length: float) -> tuple[float, float]:
-    """Largest distance of the curve from its chord, and that distance's standard deviation, mm."""
-    s = -np.linspace(0.0, length, 25)
-    u = s / LEVER_MM
-    terms = np.column_stack([u**2, u**3])
-    terms = terms - np.outer(s / s[-1], terms[-1])
-    bends = fit.x[7:11].reshape(2, 2)  # square and cube, each across two axes
-    off = np.linalg.norm(terms @ bends, axis=1)
-    at = int(off.argmax())
-    cov = _variances(fit)[7:11, 7:11]
-    weights = np.kron(terms[at], np.eye(2))
-    return float(off[at]), float(np.sqrt(max(np.linalg.eigvalsh(weights @ cov @ weights.T)[-1], 0.0)))
+def _weighed(straight: OptimizeResult, fit: OptimizeResult, noise: float, count: int) -> tuple[Floats, Floats, bool]:
+    """The likelier of a straight and a bent fit (11,), the covariance of both (11, 11), and whether it is the bent one.
+
+    Evidence of a fit by Laplace: exp(-chi^2 / 2), of the bent one times the root of det S / det S_0 of its bends.
+    """
+    plain, cov = np.concatenate([straight.x, np.zeros(4)]), np.zeros((11, 11))
+    cov[:7, :7] = _noise(straight, count) ** 2 * np.linalg.pinv(straight.jac.T @ straight.jac)
+    cov_bent = noise**2 * np.linalg.pinv(fit.jac.T @ fit.jac)
+    kept = np.linalg.slogdet(cov_bent[7:, 7:] / np.outer(BEND_SD, BEND_SD))[1]
+    odds = (float(straight.cost) - float(fit.cost)) / noise**2 / MISLED + kept / 2  # logarithm
+    bent = bool(odds > 0)
+    gap = fit.x - plain
+    chance = float(expit(odds))
+    both = (1 - chance) * cov + chance * cov_bent
+    both += np.outer(gap, gap) * (1 - chance if bent else chance)
+    return fit.x if bent else plain, both, bent
 
 
-def _covariance(volume: Volume, fit: OptimizeResult, axes: Floats, forward: Floats, length: float) -> Floats:
-    """Sigma6 of the tip and the direction, shape (6, 6), LPS.
+def _covariances(volume: Volume, x: Floats, cov: Floats, axes: Floats, s: Floats) -> tuple[Floats, Floats]:
+    """Sigma6 of places s (m,) of the curve and of its direction there, (m, 6, 6), LPS; and the tip's direction (3,)."""
+    moves = [0, 1, 2, 3, 4, 7, 8, 9, 10]
+    cov, two = cov[np.ix_(moves, moves)], np.eye(2)
+    covs, forward, length = np.empty((len(s), 6, 6)), axes[0], float(-s[-1])
+    for row in range(len(s) - 1, -1, -1):
+        u = s[row] / LEVER_MM
+        slopes = np.kron([1.0, 2 * u / LEVER_MM, 3 * u**2 / LEVER_MM], two)
+        forward = np.concatenate([[1.0], slopes @ x[moves[3:]]]) @ axes
+        forward /= np.linalg.norm(forward)
+        to_6 = np.zeros((6, 9))
+        to_6[:3, :3], to_6[:3, 3:] = axes.T, axes[1:].T @ np.kron([s[row], u**2, u**3], two)
+        to_6[3:, 3:] = skew(forward) @ axes[1:].T @ slopes  # a slope turns about what is across both
+        covs[row] = to_6 @ cov @ to_6.T + _least(volume, forward, length)
+    return covs, forward
+
+
+def _least(volume: Volume, forward: Floats, length: float) -> Floats:
+    """What no fit undercuts, shape (6, 6).
 
     A needle that lies in few slices may lie anywhere across them: what a slice shows says not at which depth.
     """
-    cov = _variances(fit)[:5, :5]
-    to_6 = np.zeros((6, 5))
-    to_6[:3, :3] = axes.T
-    to_6[3:, 3:] = skew(forward) @ axes[1:].T  # a slope turns about what is across both
     edges = LEAST_VOXEL * volume.T_ct_index[:3, :3]
     across = np.eye(3) - np.outer(forward, forward)
     least = np.zeros((6, 6))
@@ -634,7 +660,7 @@ def _covariance(volume: Volume, fit: OptimizeResult, axes: Floats, forward: Floa
     least[:3, :3] += np.outer(aside, aside)
     lean = np.cross(forward, aside) * 2.0 / length
     least[3:, 3:] += np.outer(lean, lean)
-    return np.asarray(to_6 @ cov @ to_6.T + least)
+    return least
 
 
 class _Rod(NamedTuple):

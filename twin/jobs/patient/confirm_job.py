@@ -256,8 +256,8 @@ def confirm_needle(context: CaseContext, scan: Path, plan_path: Path | None = No
         seen, findings = read_needle(volume, target, diameter, inside, planned, markers)
         needle = seen.moved(back, tie.cov_at(apply(back, seen.tip_ct)))
     with context.stages.time("line"):
-        line = check_line(context, needle.path_ct, needle.cov_ct)
-        aims = next_aims(context, needle.path_ct, needle.forward_ct, needle.cov_ct, line)
+        line = check_line(context, needle.path_ct, needle.covs_ct)
+        aims = next_aims(context, needle.path_ct, needle.covs_ct, needle.forward_ct, line)
     said = (*tie.findings, *findings)
     return Confirmed(context, plan, volume, tie, needle, line, tuple(aims), said, (*read, *inputs))
 
