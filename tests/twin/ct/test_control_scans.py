@@ -47,6 +47,12 @@ def test_bent_needles(seed, spacing):
     assert seen["tip_square"] < 16.3 and seen["axis_square"] < 13.8
 
 
+def test_two_lines_of_one_image_are_not_one_needle():
+    """In two thick slices a needle that leans to one side looks as one that leans to the other: neither is guessed."""
+    one = control(np.random.default_rng(5008), extra="none", bent=False)
+    assert read(one) == "tip_hidden"
+
+
 @pytest.mark.parametrize("extra", ["wire", "vessel"])
 def test_what_is_no_needle(extra):
     """A wire on the skin and a vessel with contrast are passed over: the needle beside them is read."""

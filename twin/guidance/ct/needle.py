@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.optimize import OptimizeResult, least_squares, minimize_scalar
 from scipy.special import expit, ndtr
 
@@ -98,7 +99,7 @@ MISLED = 6.0
 MARKER_MM = 6.0
 """So far about a marker's middle its metal shows."""
 UNSURE_MM = 1.5
-"""A tip known worse than this is not read: streaks, or other metal, hide where it ends."""
+"""A tip known worse than this is not read: streaks, other metal or thick slices hide where it ends."""
 UNKNOWN = np.full((2, 6, 6), np.nan)
 """Covariance of both ends of what was not fitted."""
 AS_BRIGHT = 0.5
@@ -245,7 +246,8 @@ def read_needle(
         )
     _check_tip(volume, needle, hidden, target_ct)
     if needle.tip_sd_mm > UNSURE_MM:
-        what = f"streaks hide the needle's tip: it is known to {needle.tip_sd_mm:.1f} mm (standard deviation) only"
+        sd = f"{needle.tip_sd_mm:.1f} mm (standard deviation)"
+        what = f"streaks or thick slices hide the needle's tip: it is known to {sd} only"
         refuse(
             what, volume.path, f"a tip known to {UNSURE_MM:g} mm: thinner slices, or another gantry tilt", "tip_hidden"
         )
@@ -514,7 +516,10 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
         if not bright.any() or typical < GAINS[0] / 2 * float(image[bright].mean()):
             return None
         starts = [begun, *(begun + more for more in _across(volume, axes, local[bright]) if not again)]
-        straight = min((_settled(curve, one, local, seen) for one in starts), key=lambda fit: float(fit.cost))
+        fits = [_settled(curve, one, local, seen) for one in starts]
+        straight = min(fits, key=lambda fit: float(fit.cost))
+        if not again:
+            modes = _modes(fits, straight, axes, len(seen))
         if again + 1 < STRAIGHTENED:  # once more about the line that was found
             start = start + straight.x[1:3] @ axes[1:]  # not along it, where a bent needle leaves a straight rod
             forward = np.concatenate([[1.0], straight.x[3:5]]) @ axes
@@ -528,6 +533,8 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
         fit = min((_settled(curve, one, local, seen, noise) for one in starts), key=lambda one: float(one.cost))
         starts, noise = [fit.x], _noise(fit, len(seen))
     x, cov, bent = _weighed(straight, fit, noise, len(seen))
+    basis = block_diag(axes, axes[1:])
+    cov[:5, :5] += basis @ modes @ basis.T
     left = curve.parts(x, local) - seen
     unlike, (blur, gain) = float(left @ left) / max(float(seen @ seen), 1e-9), np.exp(x[5:7])
     ahead = float(local[seen > 0.5 * min(full, float(seen.max()))][:, 0].max(initial=-np.inf) - x[0])
@@ -573,6 +580,16 @@ def _across(volume: Volume, axes: Floats, bright: Floats) -> Iterator[Floats]:
         for place, lean in itertools.product((-0.35, 0.0, 0.35), repeat=2):
             if place or lean:
                 yield np.concatenate([[0.0], place * aside[1:], 2 * lean * aside[1:] / length, [0.0, 0.0]])
+
+
+def _modes(fits: Sequence[OptimizeResult], best: OptimizeResult, axes: Floats, count: int) -> Floats:
+    """What other lines that explain an image as well differ by: covariance of shift and slope, (6, 6), LPS.
+
+    A needle in two slices may lean to either side of the plane between them: both lines have one image.
+    """
+    odds = np.exp([(float(best.cost) - float(fit.cost)) / _noise(best, count) ** 2 for fit in fits])
+    gaps = np.array([fit.x[:5] - best.x[:5] for fit in fits]) @ block_diag(axes, axes[1:])
+    return np.asarray(gaps.T @ (odds[:, None] * gaps) / odds.sum())
 
 
 def _layers(volume: Volume, axes: Floats) -> tuple[Floats, Floats]:
