@@ -28,6 +28,12 @@ from puncture_twin.twin.jobs.live.planner import NO_STRUCTURE, Planner, Question
 ABDOMEN = folder() / "abdomen"
 RAS = np.array([-1.0, -1.0, 1.0])
 STAMP = Stamp(2, 1000, 2**31, 77)
+PROGRAM = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what is in the background without it
+from puncture_twin.run_twin import main
+sys.exit(main(sys.argv[1:]))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -307,14 +313,17 @@ def served(tmp_path_factory):
     shutil.copytree(ABDOMEN, case)
     text = (case / "case.toml").read_text(encoding="utf-8")
     (case / "case.toml").write_text(changed(text, ("step_deg = 2.0", "step_deg = 10.0")), encoding="utf-8")
-    command = [sys.executable, str(ROOT / "run_twin.py"), "live", str(case), "--port", "0"]
+    command = [sys.executable, "-c", PROGRAM, "live", str(case), "--port", "0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         line = next((line for line in process.stderr if line.startswith("live: ")), "")
         port = int(line.split("port ")[1].split(";")[0])
         yield SimpleNamespace(port=port, case=case)
         with Talk(port):
             process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=30)
+            try:
+                out, err = process.communicate(timeout=60)
+            finally:
+                process.kill()
         assert (process.returncode, out, err.splitlines()[-1:]) == (INTERRUPTED, "", ["interrupted"])
         socket.create_server(("127.0.0.1", port)).close()  # the port is free
 
