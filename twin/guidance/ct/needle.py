@@ -526,12 +526,7 @@ def _fitted(volume: Volume, metal: Metal, line: _Line, diameter_mm: float, hidde
             line = line._replace(forward=forward / np.linalg.norm(forward))
             begun = straight.x * [1, 0, 0, 0, 0, 1, 1]
     length = min(FITTED_MM, float(-local[seen > full / 4][:, 0].min(initial=-SHORTEST_MM)))
-    seen_bend = np.concatenate([[0.0], bends[3], bends[2] / LEVER_MM, straight.x[5:7], bends[1], bends[0]])
-    starts = [np.concatenate([straight.x, np.zeros(4)]), seen_bend]
-    noise = _noise(straight, len(seen))
-    for _ in range(BENT_AGAIN):  # a bend that is not yet fitted looks like noise
-        fit = min((_settled(curve, one, local, seen, noise) for one in starts), key=lambda one: float(one.cost))
-        starts, noise = [fit.x], _noise(fit, len(seen))
+    fit, noise = _bent(curve, straight, bends, local, seen)
     x, cov, bent = _weighed(straight, fit, noise, len(seen))
     basis = block_diag(axes, axes[1:])
     cov[:5, :5] += basis @ modes @ basis.T
@@ -624,6 +619,19 @@ def _noise(fit: OptimizeResult, count: int) -> float:
     """Standard deviation of so many voxels' residuals, widened by what neighbours share."""
     left, factor = fit.fun[:count], CORRELATED if len(fit.x) == 7 else CORRELATED_BENT
     return float(np.sqrt(factor * (left @ left) / max(count - len(fit.x), 1)))
+
+
+def _bent(
+    curve: _Curve, straight: OptimizeResult, bends: Floats, local: Floats, seen: Floats
+) -> tuple[OptimizeResult, float]:
+    """The bent fit, begun from the straight one and from the bend of the brightest voxels (4, 2); and its noise."""
+    seen_bend = np.concatenate([[0.0], bends[3], bends[2] / LEVER_MM, straight.x[5:7], bends[1], bends[0]])
+    starts = [np.concatenate([straight.x, np.zeros(4)]), seen_bend]
+    noise = _noise(straight, len(seen))
+    for _ in range(BENT_AGAIN):  # a bend that is not yet fitted looks like noise
+        fit = min((_settled(curve, one, local, seen, noise) for one in starts), key=lambda one: float(one.cost))
+        starts, noise = [fit.x], _noise(fit, len(seen))
+    return fit, noise
 
 
 def _weighed(straight: OptimizeResult, fit: OptimizeResult, noise: float, count: int) -> tuple[Floats, Floats, bool]:

@@ -293,7 +293,7 @@ def export_source(
         written = export_candidates(table, format_name, out, watcher.note)
         return Export(written, written.summary(), written.text())
     if scan is not None:
-        if format_name != DICOM or choice != BEST or case is not None:
+        if format_name != DICOM or choice != BEST or case is not None or not is_plan(source):
             allowed = f"--format {DICOM} alone, with a confirm.json"
             refuse("a control scan belongs to a confirmation", "--scan", allowed, "conflicting_options")
         confirmed = export_confirmation(source, scan, out, watcher.note)
