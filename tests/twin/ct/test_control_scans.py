@@ -8,6 +8,7 @@ from refusals import refused
 
 from benchmarks.confirm import MUST_REFUSE, control, errors, read
 from puncture_twin.planning.formats.volumes.volume_files import Volume
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, inverse, pose, rotation_angle
 from puncture_twin.twin.guidance.ct.tie import body_of, tie_frames
 
@@ -126,3 +127,12 @@ def test_another_body_is_refused():
     values[30:-30, 30:-30, 10:-10] = 40
     with refused("frames_not_tied"):
         tie_frames(Volume(values, one.volume.T_ct_index, one.volume.path), body(one), same_frame=True)
+
+
+@pytest.mark.parametrize("size", [(1.08, 0.93, 1.05), (1.15, 1.15, 1.15), (0.9, 1.1, 1.0)])
+def test_a_body_of_another_size_is_refused(size):
+    """Another patient's skin and bones are found near enough one by one; together they say that it is another's."""
+    one = control(np.random.default_rng(11), extra="none", spacing=2.0)
+    skin, *bones = (TriangleMesh(mesh.vertices * np.array(size), mesh.faces) for mesh in (one.skin, *one.bones))
+    with refused("other_body"):
+        tie_frames(one.volume, body(replace(one, skin=skin, bones=tuple(bones))), same_frame=True)

@@ -46,6 +46,8 @@ LEAST_FOUND, LEAST_SEEN = 0.6, 120
 """Least fraction of the surfaces in the image that are found, and least number of points of them."""
 MIRRORED = 0.8
 """Misfit over that of the mirrored surfaces, above which nobody can tell which of them the scan shows."""
+MOST_STRETCH = 0.05
+"""Of a body that alone ties the frames: quiet breath changes it by less, and what changes more has moved its organs."""
 UNSURE_MM = 3.0
 """A tie whose standard deviation at the target is larger is none."""
 PATCH_SD = 0.7
@@ -184,7 +186,14 @@ def tie_frames(volume: Volume, body: Body, *, same_frame: bool) -> Tie:
         if MIRRORED * best.misfit_mm > flipped.misfit_mm or not here * MIRRORED > there:
             said = f"{best.misfit_mm:.2f} mm off, mirrored {flipped.misfit_mm:.2f} mm"
             refuse(f"the body fits the scan mirrored as well ({said})", volume.path, allowed, "mirrored")
-    return _checked(_by_markers(volume, body, best, pieces, same_frame), volume, allowed)
+    tie = _checked(_by_markers(volume, body, best, pieces, same_frame), volume, allowed)
+    stretch = _stretch(picture, body.sample, best.T) if tie.how == "body" else np.zeros(3)
+    if np.abs(stretch).max() > MOST_STRETCH:
+        sizes = ", ".join(f"{100 * one:+.0f} %" for one in stretch)
+        refuse(
+            f"the scan's body has another size than the case's ({sizes} along LPS)", volume.path, allowed, "other_body"
+        )
+    return tie
 
 
 def _believed(fit: _Fit) -> bool:
@@ -271,6 +280,26 @@ def _fitted(picture: _Picture, sample: Sample, start: Floats) -> _Fit:
         center,
         cov,
     )
+
+
+def _stretch(picture: _Picture, sample: Sample, T: Floats) -> Floats:
+    """By what fraction the body in a scan is longer than the case's along each axis, shape (3,).
+
+    A fit looks for each surface nearby, so another patient's may be found near enough; from farther off all of them
+    agree on another size. Least squares as `_step`, with n_k (p - c)_k for each axis k.
+    """
+    points, normals = sample.thinned(SAMPLES).placed(T)
+    off = _edges(picture, points, normals, WINDOWS_MM[0])
+    good = np.isfinite(off)
+    points, normals, off = points[good], normals[good], off[good]
+    lever = points - points.mean(axis=0)
+    A, x = np.concatenate([normals, np.cross(lever, normals), normals * lever], axis=1), np.zeros(9)
+    for _ in range(20):  # Tukey's weights settle
+        left = off - A @ x
+        scale = max(1.4826 * float(np.median(np.abs(left))), 0.3)
+        weights = np.maximum(1 - (left / (4.685 * scale)) ** 2, 0.0) ** 2
+        x = np.linalg.solve(A.T @ (weights[:, None] * A) + 1e-6 * np.eye(9), A.T @ (weights * off))
+    return np.asarray(x[6:])
 
 
 def _step(points: Floats, normals: Floats, off: Floats, patch: NDArray[np.intp]) -> tuple[Floats, Floats, Floats]:
