@@ -92,7 +92,7 @@ simulator:
 	@$(BIN)/python -c "import pybullet" 2>/dev/null || { command -v g++ >/dev/null && \
 	  echo "building the simulator: PyBullet has no wheel for this Python (8 minutes; needs g++ and python3-dev)" && \
 	  $(BIN)/pip install --quiet --constraint constraints.txt pybullet; } || \
-	  echo "NO SIMULATOR: demo, rehearse, servo, selfcal, reproduce and their tests need it; all else works. apt install g++ python3-dev, or PYTHON=python3.11"
+	  echo "NO SIMULATOR: demo plans only; rehearse, servo, selfcal, reproduce and their tests need it; all else works. apt install g++ python3-dev, or PYTHON=python3.11"
 
 # The page is tested in one: Debian's where it may be installed, else Playwright's own.
 browser:
@@ -101,11 +101,11 @@ browser:
 	  $(BIN)/playwright install chromium >/dev/null 2>&1 || \
 	  echo "NO BROWSER IS HERE: the page's tests in one are skipped, and fail where CI is set; apt install chromium"
 
-# Compiled here, not while a person waits for a first answer; by a search where there is no simulator. What is not compiled here is where it is first used.
+# Compiled here, not while a person waits for a first answer. What is not compiled here is where it is first used.
 kernels:
 	@echo "compiling the kernels (a minute)"
 	@out=$$(mktemp -d) && export PUNCTURE_TWIN_CACHE=$$out/cache && \
-	  { { $(BIN)/python run_twin.py demo --out $$out/demo || $(BIN)/python run_twin.py search meshes/abdomen --out $$out/demo; } && \
+	  { $(BIN)/python run_twin.py demo --out $$out/demo && \
 	    $(BIN)/python run_twin.py check meshes/abdomen --theta 64 --beta 98; } > $$out/log 2>&1 || \
 	  { tail -n 1 $$out/log; echo "kernels will be compiled where they are first used"; }; rm -rf $$out
 

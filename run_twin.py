@@ -63,7 +63,6 @@ def _without_command(context: typer.Context, version: VersionOption = False) -> 
 @app.command()
 def demo(out_dir: OutOption = Path("out/demo"), as_json: JsonOption = False) -> None:
     """Search, plan, rehearse and report on the embedded abdomen."""
-    require_extra("twin", "demo")
     from puncture_twin.twin.jobs.patient import main_job
 
     with prepared(meshes_folder() / "abdomen") as context:

@@ -38,7 +38,7 @@ def test_planner_map_and_page_need_no_extra():
 
 
 @pytest.mark.parametrize(
-    "arguments", [["demo"], ["rehearse", "nowhere"], ["servo", "nowhere"], ["selfcal"], ["reproduce", "chen2019"]]
+    "arguments", [["rehearse", "nowhere"], ["servo", "nowhere"], ["selfcal"], ["reproduce", "chen2019"]]
 )
 def test_a_missing_extra_is_one_line(arguments, monkeypatch, capsys):
     """A command that needs it names it, says how to get it, and ends with exit code 2 before it does anything."""

@@ -12,12 +12,14 @@ from case_world import coarse_carton
 from PIL import Image
 from refusals import refused_command
 
+from puncture_twin.planning.base import errors
 from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.base.output.manifest import problems, read_manifest
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED
-from puncture_twin.twin.jobs.patient.main_job import rehearse_case
+from puncture_twin.twin.jobs.options import prepared
+from puncture_twin.twin.jobs.patient.main_job import demo_case, rehearse_case
 from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, progress_display
 from puncture_twin.twin.report.scene.film import FilmTimes
 
@@ -41,6 +43,16 @@ def run(capfd, *arguments):
     code = main([*map(str, arguments), "--json"])
     out = capfd.readouterr().out
     return code, json.loads(out) if out else None
+
+
+def test_a_demo_without_the_simulator_plans(carton, tmp_path, monkeypatch, capfd):
+    """It says what it leaves out, and writes what a plan writes."""
+    monkeypatch.setattr(errors, "find_spec", lambda name: None if name == "pybullet" else name)
+    with prepared(carton) as context:
+        run = demo_case(context, tmp_path)
+    assert run.plan is not None and run.rehearsal is None
+    assert {"plan.json", "report.html"} <= {path.name for path in tmp_path.iterdir()}
+    assert "warning: planned, not rehearsed: demo: it needs the extra 'twin'" in capfd.readouterr().err
 
 
 def test_a_rehearsal_writes_every_file(rehearsed):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse, require_extra
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.output.publish import Draft
@@ -151,7 +151,15 @@ def rehearsed_case(source: Path, case: Path | None, choice: Choice) -> Path:
 
 
 def demo_case(context: CaseContext, out: Path) -> Run:
-    """`rehearse_case`, in `DEMO_ROOMS` rooms where the case declares errors and has markers."""
+    """`rehearse_case`, in `DEMO_ROOMS` rooms where the case declares errors and has markers.
+
+    Without the simulator it is `plan_case`, and a note says so: whoever has no compiler sees the rest at once.
+    """
+    try:
+        require_extra("twin", "demo")
+    except InputError as missing:
+        context.watcher.note(f"warning: planned, not rehearsed: {missing}")
+        return plan_case(context, out)
     rooms = None if context.chance is None else RoomCount(DEMO_ROOMS)
     return rehearse_case(context, out, rooms)
 
