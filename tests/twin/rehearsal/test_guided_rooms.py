@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from case_world import changed
 from refusals import refused
+from second_plant import PicturingProbe, PinholePair, Uniform, needle_by_screws
 from uncertainty_world import ball
 
 from puncture_twin import api as pt
+from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.budget.guidance import Sight, corridor_mm, declared_ways, equipped, guided_error, lost_sight
 from puncture_twin.planning.case.settings import ControlScan
@@ -19,7 +21,8 @@ from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.twin.jobs.patient.run import room_count
 from puncture_twin.twin.plant import room_devices
 from puncture_twin.twin.plant.room_devices import RoomCameras
-from puncture_twin.twin.rehearsal import distribution
+from puncture_twin.twin.plant.true_needle import true_needle
+from puncture_twin.twin.rehearsal import distribution, guided_trials as guiding, trials
 from puncture_twin.twin.rehearsal.distribution import rehearse_trials
 from puncture_twin.twin.rehearsal.guided_trials import guided_trials
 from puncture_twin.twin.rehearsal.trials import draw_truths
@@ -61,6 +64,31 @@ def test_every_way_errs_as_predicted(insertion, way):
     off = [abs(hit_in_ball(found.cov_ct[None], mm)[0] - (found.tip_error_mm < mm).mean()) for mm in radii]
     assert np.mean(off) <= 0.01
     assert found.summary()["guidance"] == way and found.summary()["stopped"] == 0
+
+
+def test_the_second_arm_is_the_first_one():
+    """Two constructions of one erring arm agree to a nanometre, at any joints and any errors."""
+    rng = np.random.default_rng(0)
+    model, q, eta = ur_model("ur3"), rng.uniform(-3, 3, (50, 6)), 0.02 * rng.normal(size=(50, 28))
+    ours, theirs = true_needle(model, q, eta, 210.0), needle_by_screws(model, q, eta, 210.0)
+    np.testing.assert_allclose(theirs.tip_base, ours.tip_base, atol=1e-6)
+    np.testing.assert_allclose(theirs.R_base_needle, ours.R_base_needle, atol=1e-12)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_what_is_predicted_happens_in_another_plant(insertion, way, monkeypatch):
+    """Within 5 %: there no error is normal, and those of the cameras differ by direction."""
+    for module in (guiding, trials):
+        monkeypatch.setattr(module, "true_needle", needle_by_screws)
+    monkeypatch.setattr(guiding, "RoomCameras", PinholePair)
+    monkeypatch.setattr(guiding, "RoomProbe", PicturingProbe)
+    query = distribution._query(*insertion)
+    one, moving = distribution._way(insertion[0], query, way)
+    truths = draw_truths(query.puncture, query.truth, 3000, Uniform(1), moving)
+    found = guided_trials(query.puncture, truths, query.truth, one, Uniform(2)).trials
+    realised = np.sqrt(np.mean(np.sum((found.tip_ct - found.target_ct) ** 2, axis=1)))
+    predicted = np.sqrt(np.trace(guided_error(one.model, way).tip_covariance(insertion[2][None])[0]))
+    assert predicted / realised == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_patient_registered_askew_is_led_in_its_own_axes(tmp_path):
