@@ -11,6 +11,7 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy, surface_distance
 from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.text import Facts, Shown, brief
@@ -119,6 +120,7 @@ class Explanation(Shown):
             "clearance_mm": self.clearances(),
             "reachable": None if row.arm.reachable[0] < 0 else bool(row.arm.reachable[0]),
             "reach_margin": finite(row.arm.margin[0]),
+            "at_target": self._at_target(),
             "safe_cone_deg": finite(np.degrees(row.safe_cone[0])),
             "cost": finite(row.ranking.cost[0]),
             "along_path": [
@@ -137,6 +139,15 @@ class Explanation(Shown):
             **self._breathing(),
             **({"guidance": [one.document() for one in self.guidance]} if self.guidance else {}),
         }
+
+    def _at_target(self) -> dict[str, list[float]] | None:
+        """Joints, and both ends of the needle as the robot's controller prints them, when the tip is at the target."""
+        q = self.candidates.arm.q_insertion[0]
+        if not np.isfinite(q).all():
+            return None
+        T = flange_pose(self.case.robot.model, q)
+        tip = T[:3, 3] + self.case.needle.length_mm * T[:3, 2]
+        return {"q_deg": np.degrees(q).tolist(), "tip_base_mm": tip.tolist(), "flange_base_mm": T[:3, 3].tolist()}
 
     def _breathing(self) -> dict[str, Any]:
         """The key ``breathing``, of a case that declares its breathing."""
@@ -299,15 +310,19 @@ class Explanation(Shown):
         return clearance.structures[int(np.argmin(demanded))] if np.isfinite(demanded).any() else ""
 
     def _rest(self) -> list[str]:
-        return [f"  {self._arm()}", *(f"  warning: {warning}" for warning in self.anatomy.warnings)]
+        return [*(f"  {line}" for line in self._arm()), *(f"  warning: {warning}" for warning in self.anatomy.warnings)]
 
-    def _arm(self) -> str:
+    def _arm(self) -> list[str]:
         row = self.candidates
         if not row.arm_checked:
-            return f"arm {row.arm_note}"
+            return [f"arm {row.arm_note}"]
         no_need = "not computed: the organs reject the direction"
         reached = {-1: no_need, 0: "no", 1: f"yes, margin {row.arm.margin[0]:.2f}"}
-        return f"arm reaches it: {reached[int(row.arm.reachable[0])]}"
+        lines = [f"arm reaches it: {reached[int(row.arm.reachable[0])]}"]
+        if (there := self._at_target()) is not None:
+            tip, flange = (", ".join(f"{mm:.1f}" for mm in there[f"{end}_base_mm"]) for end in ("tip", "flange"))
+            lines.append(f"at the target      tip ({tip}), flange ({flange}) mm in the robot's base")
+        return lines
 
 
 def decimals(structure: Structure) -> int:

@@ -2,10 +2,13 @@
 
 import json
 
+import numpy as np
 import pytest
 from case_world import coarse_carton
 
+import puncture_twin as pt
 from puncture_twin.meshes import folder
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import OK
 
@@ -51,3 +54,15 @@ def test_a_robot_with_a_place_is_no_warning(capfd):
     arguments = ["--theta", "0", "--beta", "0", "--no-arm", "--json"]
     assert main(["check", str(folder() / "carton" / "case_m.toml"), *arguments]) == OK
     assert "states a robot" not in capfd.readouterr().out
+
+
+def test_both_ends_of_the_needle_are_told_in_the_robots_axes():
+    """The tip is where the registration puts the target, the flange on the direction's line, a needle's length off."""
+    context = pt.prepare(folder() / "abdomen")
+    explained = pt.check(context, 64, 98)
+    there, T = explained.summary()["at_target"], context.placement.T_base_ct
+    np.testing.assert_allclose(there["tip_base_mm"], apply(T, context.case.target_ct), atol=1e-3)
+    away = T[:3, :3] @ explained.candidates.outward_ct[0] * context.case.needle.length_mm
+    np.testing.assert_allclose(np.subtract(there["flange_base_mm"], there["tip_base_mm"]), away, atol=1e-3)
+    assert "at the target      tip (" in explained.text()
+    assert pt.check(pt.prepare(folder() / "abdomen", arm=False), 64, 98).summary()["at_target"] is None
