@@ -22,7 +22,7 @@ from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
 from puncture_twin.twin.guidance.stereo.planned import calibration_frame, head_pose, planned_cameras
 from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection, ServoCase
 from puncture_twin.twin.plant.ball_image import BallScene, render
-from puncture_twin.twin.plant.truth import PlantArm, TrueArm, draw_true_arm
+from puncture_twin.twin.plant.truth import Gears, PlantArm, TrueArm, draw_true_arm
 
 LINE_OF_SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
 """Where on the ball's disc a line of sight ends: fraction of the radius, and how many around."""
@@ -272,6 +272,8 @@ def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
     T_c_m = T_c_base @ head_pose(case)
     moved = np.concatenate([rng.normal(0.0, errors.head_turn, 3), rng.normal(0.0, errors.head_shift_mm, 3)])
     after = rotated_about(T_c_m, apply(T_c_m, case.markers.points.mean(axis=0)), moved)
+    if errors.gear_deg > 0.0:
+        arm = arm._replace(gears=Gears(np.radians(errors.gear_deg), errors.gear_cycles, rng.uniform(-np.pi, np.pi, 6)))
     return StereoWorkcell(case, arm, T_c_base, cameras, T_c_m, after, tool)
 
 

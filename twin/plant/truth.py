@@ -182,6 +182,24 @@ def _read(case: Case, name: str, space: Space | None) -> NamedPoints:
     return parse_points(case.files.content(name), case.folder / name, default_space=space)
 
 
+class Gears(NamedTuple):
+    """Repeatable errors of a true arm's gears."""
+
+    amplitude: float
+    """rad, at the output; 0 for none."""
+    cycles: float
+    """Periods per turn of the joint."""
+    phase: Floats
+    """Shape (6,), rad."""
+
+    def off(self, q: Floats) -> Floats:
+        """By how much each joint of (..., 6), rad, is turned too far."""
+        return np.asarray(self.amplitude * np.sin(self.cycles * q + self.phase))
+
+
+NO_GEARS = Gears(0.0, 0.0, np.zeros(6))
+
+
 class TrueArm(NamedTuple):
     """One arm, drawn."""
 
@@ -191,10 +209,11 @@ class TrueArm(NamedTuple):
     """Full width of every joint's play, rad."""
     repeatability: float
     """Deviation of every joint, drawn anew at each arrival, rad."""
+    gears: Gears = NO_GEARS
 
     def flange_pose(self, q_true: Floats) -> Floats:
-        """T_base_flange, shape (..., 4, 4), mm, of true configurations (..., 6), rad."""
-        return np.ascontiguousarray(self.true.link_poses(q_true)[..., 6, :, :])
+        """T_base_flange, shape (..., 4, 4), mm, of true configurations (..., 6), rad, to which the gears add theirs."""
+        return np.ascontiguousarray(self.true.link_poses(q_true + self.gears.off(q_true))[..., 6, :, :])
 
     def settle(self, q_command: Floats, q_before: Floats, rng: np.random.Generator) -> Floats:
         """Joints at rest, shape (6,), rad.

@@ -133,6 +133,9 @@ class TargetRow(NamedTuple):
     """The needle where the robot alone brought it; None where it could not start, or nothing can be predicted."""
     needle_servoed: NeedleOutcome | None = None
     """The needle at the servo's last look, if there was one."""
+    calibrated_mm: float | None = None
+    """True ball to true target where the arm, corrected by the joint estimate of its errors, would bring it unseen; its
+    repeatability aside. None where the estimate does not settle."""
 
 
 class DeclarationTest(NamedTuple):
@@ -295,11 +298,13 @@ def _try_stereo(
 def _reach(plant: StereoPlant, arm: Arm, guide: Guide, aims: Aims, row: int, seed: int) -> Reached:
     """Move from the hovering point onto the target by the robot alone, then by the servo."""
     workcell, number = plant.workcell, aims.numbers[row]
-    true_target, unseen, seen = workcell.targets_c[number], None, None
+    true_target, unseen, seen, calibrated = workcell.targets_c[number], None, None, None
     done = aims.bring(row, arm)
     first = len(plant.rests) - 1
     if done is None:
         unseen = _outcome(plant, guide.needle_unseen(aims.q_aim[row]), number)
+        if (q := guide.corrected_jp(aims.q_aim[row])) is not None:
+            calibrated = float(np.linalg.norm(workcell.ball_c(q) - true_target))
     before = float(np.linalg.norm(workcell.ball_c(plant.rests[-1]) - true_target))
     if done is None:
         done = aims.correct(row, guide, arm)
@@ -310,8 +315,8 @@ def _reach(plant: StereoPlant, arm: Arm, guide: Guide, aims: Aims, row: int, see
     )
     name, expected = workcell.case.targets.names[number], float(aims.expected_tre_mm[row])
     errors = TargetRow(
-        seed, name, mapping, expected, before, after, only, done.steps, str(done.stop), unseen, seen
-    )  # fmt: skip
+        seed, name, mapping, expected, before, after, only, done.steps, str(done.stop), unseen, seen, calibrated
+    )
     return Reached(errors, done, tuple(plant.rests[first : first + len(done.visits)]), plant.rests[-1])
 
 
@@ -365,6 +370,7 @@ def statistics(trials: Sequence[ServoTrial]) -> dict[str, Any]:
         raise NoAnswerError(what, code="no_session")
     stereo = np.concatenate([one.stereo_mm for one in trials])
     mapping, expected, before, after, only = np.array([row[2:7] for row in rows]).T
+    calibrated = [row.calibrated_mm for row in rows if row.calibrated_mm is not None]
     found = {
         "seeds": len(trials),
         "targets": len(rows),
@@ -375,6 +381,7 @@ def statistics(trials: Sequence[ServoTrial]) -> dict[str, Any]:
         "expected_tre_rms": rms(expected),
         "mapping_rms": rms(mapping),
         "before_mean": before.mean(),
+        "calibrated_mean": np.mean(calibrated) if calibrated else None,
         "after_mean": after.mean(),
         "servo_only_mean": only.mean(),
         "servo_only_max": only.max(),
@@ -382,7 +389,7 @@ def statistics(trials: Sequence[ServoTrial]) -> dict[str, Any]:
         "not_confirmed": np.mean([row.stop != ServoStop.CONVERGED for row in rows]),
         "after_over_mapping": after.mean() / mapping.mean(),  # 1 is the floor
     }
-    return {key: value if isinstance(value, int) else float(value) for key, value in found.items()}
+    return {key: value if isinstance(value, int | None) else float(value) for key, value in found.items()}
 
 
 def needle_statistics(outcomes: Sequence[NeedleOutcome | None]) -> dict[str, Any] | None:

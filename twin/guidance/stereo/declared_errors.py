@@ -35,6 +35,10 @@ class ServoErrors(ArmErrors):
 
     Attributes:
         arm: Whose numbers link, twist and joint take where none are stated.
+        gear_deg: Amplitude of each gear's error, a sine over its joint.
+        gear_cycles: Periods of that sine per turn of the joint: 200 of a harmonic drive of 1:100, twice a turn of its
+            motor (Tuttle, "Understanding and modeling the behavior of a harmonic drive gear transmission", MIT
+            AITR-1365, 1992).
         ball_offset_mm: Of the ball's centre against where the controller has it on the flange; the cameras see it.
         tip_offset_mm: Of the needle's tip against the ball's centre, flange axes; no camera sees it.
         needle_direction_deg: Of the needle, about each of the flange's x and y axes.
@@ -48,6 +52,8 @@ class ServoErrors(ArmErrors):
     """
 
     arm: Literal["calibrated", "nominal"] = "calibrated"
+    gear_deg: Degrees = 0.0
+    gear_cycles: Annotated[Number, Field(ge=1, le=1000)] = 200.0
     ball_offset_mm: Millimetres = 0.3
     tip_offset_mm: Millimetres = 0.3
     needle_direction_deg: Degrees = 0.2
@@ -88,8 +94,12 @@ class ServoErrors(ArmErrors):
 
     @property
     def arrival(self) -> float:
-        """Deviation of every joint at one arrival, rad; play leaves a joint at either edge, so half of it counts."""
-        return float(np.hypot(self.repeatability, self.backlash / 2))
+        """Deviation of every joint at one arrival, rad.
+
+        Play leaves a joint at either edge, so half of it counts. A gear's error is a sine of the joint, of which no two
+        arrivals have the same phase: it is as good as drawn anew.
+        """
+        return float(np.linalg.norm([self.repeatability, self.backlash / 2, np.radians(self.gear_deg) / np.sqrt(2.0)]))
 
     def arm_deviations(self) -> Floats:
         """Deviations of the 26 parameters that move the ball, shape (26,), ordered as `error_jacobian`; mm, rad."""

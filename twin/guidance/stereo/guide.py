@@ -15,7 +15,7 @@ from puncture_twin.twin.guidance.stereo.joint.needle_error import NeedleError, o
 from puncture_twin.twin.guidance.stereo.planned import carried_rod, planned_cameras
 from puncture_twin.twin.guidance.stereo.robot_calibration import RobotCalibration
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ball_base
+from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ball_base, ball_jacobian
 from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Seen
 
 
@@ -82,6 +82,17 @@ class Guide:
     def needle_unseen(self, q_command: Floats) -> NeedleError | None:
         """Predicted needle at commanded joints (6,), rad; None where the estimate does not settle."""
         return self._believed(lambda found: open_loop_error(found, q_command, self.target_m))
+
+    def corrected_jp(self, q_command: Floats) -> Floats | None:
+        """Joints (6,), rad, near the commanded ones that bring the ball onto the target by the arm's estimated errors.
+
+        That is what calibrating the arm is worth without looking again; None where the estimate does not settle.
+        """
+        if (believed := self.needle_unseen(q_command)) is None:
+            return None
+        R_base_m = self._calibration.T_base_c[:3, :3] @ self._mapping.T_c_m[:3, :3]
+        missed = np.append(R_base_m @ believed.offset_m, np.zeros(3))
+        return np.asarray(q_command - np.linalg.solve(ball_jacobian(self._held, q_command), missed))
 
     def needle_seen(self) -> NeedleError | None:
         """Predicted needle after the last image with its ball; None where the estimate does not settle."""

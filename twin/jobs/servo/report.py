@@ -167,6 +167,7 @@ TARGET = (
     Field("mapping", "mapping_mm", 2),
     Field("expected", "expected_tre_mm", 2),
     Field("before", "before_mm", 2),
+    Field("calibrated", "calibrated_mm", 2),
     Field("after", "after_mm", 2),
     Field("servo-only", "servo_only_mm", 3),
     Field("corrections", "steps"),
@@ -187,6 +188,7 @@ STATISTICS = (
     Field("mapping, rms", "mapping_rms", 3, "mm"),
     Field("error expected by the mapping, rms", "expected_tre_rms", 3, "mm"),
     Field("before, mean", "before_mean", 3, "mm"),
+    Field("calibrated arm without servo, mean", "calibrated_mean", 3, "mm"),
     Field("after, mean", "after_mean", 3, "mm"),
     Field("after over mapping (its floor is 1)", "after_over_mapping", 3),
     Field("servo-only, mean and maximum", lambda ours: _mean_and_most(ours, "servo_only")),
@@ -206,8 +208,8 @@ def _targets(first: Facts) -> list[Block]:
         return [Warn((f"not possible: {first['refused']}",))]
     words = (
         "mapping: estimated to true target; expected: its own estimate (rms); before: true ball to true target after "
-        "the robot alone; after: the same after the servo; servo-only: true ball to estimated "
-        "target, the part due to the servo"
+        "the robot alone; calibrated: the same, the arm's errors estimated; after: the same after the servo; "
+        "servo-only: true ball to estimated target, the part due to the servo"
     )
     return [grid(TARGET, first["targets"]), words]
 
