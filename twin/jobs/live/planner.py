@@ -39,6 +39,8 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, finite
 from puncture_twin.planning.search.safe_map import NOT_TESTED, SafeMap, safe_map
 from puncture_twin.twin.jobs.live.messages import (
+    READY,
+    TIMED_OUT,
     Header,
     Message,
     Stamp,
@@ -233,12 +235,15 @@ class Planner:
             yield _text("Error", stamp, document)
 
     def _status(self, session: Session, kind: str, stamp: Stamp) -> Answer:
+        fault = None if session.needle is None else session.needle.fault
         if kind == "GET_STATUS":
-            return _answer("STATUS", "Status", stamp, status_content("ready"))
+            content = status_content(READY, "ready") if fault is None else status_content(TIMED_OUT, str(fault))
+            return _answer("STATUS", "Status", stamp, content)
         context = session.context
         document = {
             "case": self._context.case.name,
             "target_ras_mm": None if context is None else _ras(context.case.target_ct),
+            "needle": None if session.needle is None else "known" if fault is None else fault.code,
             "arm": self._context.arm,
             "structures": [one.name for one in self._context.anatomy.checked],
             "warnings": list(self._context.anatomy.warnings),
