@@ -19,6 +19,7 @@ that was said of an earlier target or needle stands where the newest is expected
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -166,6 +167,7 @@ class Planner:
             context.at(context.case.target_ct + ELSEWHERE_MM * np.random.default_rng().uniform(size=3))
         self._context = at = context.at(context.case.target_ct)  # shows no progress
         free = safe_map(at)
+        deque(self._map(free, Stamp(1, 0, 0, 0)), maxlen=0)  # packed and summed, as an answer is
         rows = np.append(np.flatnonzero(~free.blocked), 0)[:: 1 + len(free.blocked) // WARM]
         checked = at.check(free.directions.theta[rows], free.directions.beta[rows])  # compilers run now, not later
         best = 0 if checked.best is None else checked.best.row
