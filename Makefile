@@ -106,7 +106,9 @@ kernels:
 	@echo "compiling the kernels (a minute)"
 	@out=$$(mktemp -d) && export PUNCTURE_TWIN_CACHE=$$out/cache && \
 	  { $(BIN)/python run_twin.py demo --out $$out/demo && \
-	    $(BIN)/python run_twin.py check meshes/abdomen --theta 64 --beta 98; } > $$out/log 2>&1 || \
+	    $(BIN)/python run_twin.py check meshes/abdomen --theta 64 --beta 98 && \
+	    $(BIN)/python -c "from puncture_twin.twin.jobs.live import planner as live; import puncture_twin as pt; live.Planner(pt.prepare('meshes/abdomen'))"; \
+	  } > $$out/log 2>&1 || \
 	  { tail -n 1 $$out/log; echo "kernels will be compiled where they are first used"; }; rm -rf $$out
 
 # In out/wheels: for every machine.

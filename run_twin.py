@@ -466,6 +466,9 @@ def live(
     host: Annotated[
         str, typer.Option("--host", help="Address to listen at; others than loopback are warned of.")
     ] = "127.0.0.1",
+    pose_s: Annotated[
+        int, typer.Option("--pose-s", min=1, max=86400, help="Seconds for which a needle's pose counts.")
+    ] = 2,
     arm: ArmOption = None,
 ) -> None:
     """Answer navigation programs by OpenIGTLink until Ctrl-C. Safe map of a target, verdict of a needle's pose."""
@@ -476,7 +479,7 @@ def live(
         with prepared(case, arm=arm) as context:
             planner = Planner(context)
         print_whole("live: {} on {}, port {}; Ctrl-C ends".format(context.case.name, *listener.getsockname()[:2]))
-        serve(listener, planner)
+        serve(listener, planner, pose_s)
 
 
 @app.command()

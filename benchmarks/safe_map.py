@@ -27,7 +27,7 @@ from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.verdict_map import VerdictMap
 from puncture_twin.planning.reach.standoff import case_axis_lengths
 from puncture_twin.planning.search.context import CaseContext, prepare
-from puncture_twin.planning.search.safe_map import first_blocking
+from puncture_twin.planning.search.search import first_blocking
 from tools.hostile_scenes import KINDS, make_scene
 
 OFFSETS_MM = (0.0, 1e-12, 3e-10, 3e-9, 1e-7, 5e-5, 2e-4, 0.05)

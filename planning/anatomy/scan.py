@@ -83,9 +83,11 @@ class Scan:
                 meshes, faces = self._outside_meshes(replace(image, beyond_mm=BEYOND_LONG_MM), mask)
             return {**_of_meshes(meshes), "open": np.array([face in faces for face in FACES])}
 
-        kept = self._kept_arrays({"what": "outside", "air_hu": air_hu}, make)
-        mesh, couch = _to_meshes(kept)
-        return Outside(mesh, couch, tuple(itertools.compress(FACES, kept["open"])))
+        def read(stored: Arrays) -> Outside:
+            mesh, couch = _to_meshes(stored)
+            return Outside(mesh, couch, tuple(itertools.compress(FACES, stored["open"])))
+
+        return self.source.kept(self._of({"what": "outside", "air_hu": air_hu}), make, read, by=__name__)
 
     def _outside_meshes(self, image: OutsideImage, mask: Bools) -> tuple[list[TriangleMesh | None], tuple[Face, ...]]:
         """What is not known to be free; of it what lies beyond tables; and the open faces."""

@@ -22,7 +22,7 @@ from puncture_twin.planning.anatomy.body.cut_ends import (
 )
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown
 from puncture_twin.planning.anatomy.skin import Skin, skin_from_label, skin_from_mesh, skin_of_image
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.cache.source_stamp import source_stamp
@@ -148,9 +148,18 @@ class VolumeSurfaces:
             stated: The sides at which the body was cut, where a person says so.
         """
         content = self._kept(f"content {label}", lambda: self._content(label), _to_content)
-        cut = cut_ends(content, organs, whole=shown.phantom) if stated is None else stated_ends(stated)
+        cut = self._cut_ends(label, content, tuple(organs), shown) if stated is None else stated_ends(stated)
         notes = end_warnings(content, cut, shown.phantom and stated is None)
         return Imaged(self, content.box(cut), label, notes, replace(shown, whole=bool(content.inside)))
+
+    def _cut_ends(
+        self, label: int | None, content: Content, organs: Sequence[tuple[TriangleMesh, float]], shown: Shown
+    ) -> Bools:
+        by = ((mesh.digest, voxel_mm) for mesh, voxel_mm in organs)
+        key = (*self._key(f"ends {label}"), shown.phantom, *by)
+        return self.cache.memory.get(
+            key, lambda: cut_ends(content, organs, whole=shown.phantom), lambda ends: ends.nbytes
+        )
 
     def _content(self, label: int | None) -> Arrays:
         if label is None:

@@ -65,15 +65,26 @@ class Beyond(NamedTuple):
     findings: tuple[Finding, ...]
 
 
-def beyond_images(case: Case, skin: Skin, scan: Scan | None) -> Beyond:
-    """Solids assumed beyond the image of a case's skin, and beyond a CT that is smaller than a skin from elsewhere."""
+def beyond_images(case: Case, skin: Skin, scan: Scan | None, memory: Memory = NO_MEMORY) -> Beyond:
+    """Solids assumed beyond the image of a case's skin, and beyond a CT that is smaller than a skin from elsewhere.
+
+    Args:
+        memory: Holds each solid: of one patient it is the same for every target.
+    """
     ends = [] if skin.field_of_view is None else [(skin.field_of_view, skin.mesh.vertices)]
     of_scan = None if scan is None else scan.end()
     ends = [end for end in [*ends, *([] if of_scan is None else [of_scan])] if end[0].cut.any()]
     if not ends:
         return Beyond((), ())
     found = [assumed(case, view, skin) for view, _ in ends]
-    mesh = joined([beyond_image(*end, one.wider_mm, _breath(case)) for end, one in zip(ends, found, strict=True)])
+    breath = _breath(case)
+
+    def make() -> TriangleMesh:
+        return joined([beyond_image(*end, one.wider_mm, breath) for end, one in zip(ends, found, strict=True)])
+
+    views = tuple(part.tobytes() for view, _ in ends for part in (view.T_ct_box, view.size_mm, view.cut))
+    key = (__name__, BEYOND_IMAGE, skin.mesh.digest, views, *(one.wider_mm for one in found), breath.tobytes())
+    mesh = make() if of_scan is not None else memory.get(key, make, lambda solid: solid.nbytes)
     solid = Structure(BEYOND_IMAGE, Role.UNKNOWN, case.ct.margin_mm, mesh, "beyond the image", True, np.zeros((3, 3)))
     own = "; set cut in the skin's table, [] if all of it is skin" if case.skin_section.mesh else ""
     said = [_finding(view, one, own) for (view, _), one in zip(ends, found, strict=True)]

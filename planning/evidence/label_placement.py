@@ -343,10 +343,11 @@ def label_placement(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
         return
     edges = cache(lambda: edge_image(*scan.voxels))
     for source in sources(case, anatomy, scan):
+        given = (source.axes, *source.middles, source.first, source.voxel_mm, source.in_units, source.grid_slip)
         made_from = {
             "what": "edges",
             "meshes": [f"{name} {mesh.digest}" for name, mesh in source.meshes.items()],
-            "placements": [placement.T.tolist() for placement in source.placements()],
+            "placed_by": [np.asarray(one).tolist() for one in given],
         }
         found = scan.source.kept(made_from, partial(_assessed, edges, source), _read, by=__name__)
         yield from _findings(case, scan, source, found)

@@ -288,14 +288,14 @@ def _binned(directions: Floats) -> tuple[Ints, Ints, int]:
 def _visit(vertices, faces, origin, binned, length, ray, depth, face, sense):  # type: ignore[no-untyped-def]  # numba infers
     """Count the crossings, and write them as far as the output arrays are long."""
     rays, lengths, order, starts, bins = binned
-    found, per_radian = 0, bins / np.pi
+    found, per_radian, cap = 0, bins / np.pi, _cap(rays, lengths)
     for f in range(len(faces)):
         a, b, c = (
             _seen(vertices, faces[f, 0], origin),
             _seen(vertices, faces[f, 1], origin),
             _seen(vertices, faces[f, 2], origin),
         )
-        if _beyond(a, b, c, length):
+        if _beyond(a, b, c, length) or _off_cap(a, b, c, cap):
             continue
         center, radius = _cone(a, b, c)
         polar = np.arccos(min(1.0, max(-1.0, center[2])))
@@ -336,6 +336,43 @@ def _beyond(a, b, c, length):  # type: ignore[no-untyped-def]  # numba infers
     to_b = _length(b[0] - a[0], b[1] - a[1], b[2] - a[2])
     to_c = _length(c[0] - a[0], c[1] - a[1], c[2] - a[2])
     return _length(a[0], a[1], a[2]) - 3.0 * max(to_b, to_c) > length + SAME_CROSSING_MM
+
+
+@allocation_free()
+def _off_cap(a, b, c, cap):  # type: ignore[no-untyped-def]  # numba infers
+    """Whether no ray is inside of a triangle's cone, told without angles; False where that is not plain.
+
+    Let s be the longer side from a corner a, and 4 s <= |a|: so the corners are seen within 2.03 s / |a| of each other,
+    as is the cone's axis, and each ray in the cone within d = 4.1 s / |a| of a. All rays are within H of the cap's
+    axis, so none is in the cone where cos(angle of a to it) < cos(H + d), of which
+
+        cos(H + d) >= cos H (1 - d^2 / 2) - sin H d,    or cos H - sin H d where cos H < 0.
+
+    The cone's own slack is below 2e-6.
+    """
+    axis, cosine, sine = cap
+    to_b, to_c = (b[0] - a[0], b[1] - a[1], b[2] - a[2]), (c[0] - a[0], c[1] - a[1], c[2] - a[2])
+    side2, away2 = max(_along(to_b, to_b), _along(to_c, to_c)), _along(a, a)
+    if 16.0 * side2 > away2:
+        return False
+    away, side = np.sqrt(away2), np.sqrt(side2)
+    least = cosine * away if cosine < 0.0 else cosine * (away - 8.5 * side2 / away)
+    return _along(a, axis) < least - sine * 4.1 * side - 3e-6 * away
+
+
+@allocation_free()
+def _cap(rays, lengths):  # type: ignore[no-untyped-def]  # numba infers
+    """A cone about all rays: its axis, cosine and sine of its half-angle; all directions where they have no middle."""
+    x, y, z = 0.0, 0.0, 0.0
+    for k in range(len(rays)):
+        x, y, z = x + rays[k, 0], y + rays[k, 1], z + rays[k, 2]
+    size, cosine = _length(x, y, z), 1.0
+    if not size > 1e-6 * len(rays):
+        return (0.0, 0.0, 1.0), -1.0, 0.0
+    axis = x / size, y / size, z / size
+    for k in range(len(rays)):
+        cosine = min(cosine, _along(axis, rays[k]) / lengths[k])
+    return axis, cosine, np.sqrt(max(0.0, 1.0 - cosine * cosine))
 
 
 @allocation_free()

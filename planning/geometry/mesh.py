@@ -328,25 +328,28 @@ def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) 
 
     The triangle's own where those about one of its corners have no common side.
     """
-    marked = np.zeros(len(mesh.vertices), bool)
-    marked[mesh.faces[face]] = True
-    around = np.flatnonzero(marked[mesh.faces].any(axis=1))
+    number = np.full(len(mesh.vertices), -1)  # of each vertex among those that are used
+    number[mesh.faces[face]] = 0
+    used = np.flatnonzero(number == 0)
+    number[used] = np.arange(len(used))
+    around = np.flatnonzero(np.maximum.reduce(number[mesh.faces.T]) >= 0)
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[around]], 1, 0)
     areas = np.cross(b - a, c - a)
-    corners, at_vertex = mesh.faces[around].T.reshape(-1), np.empty_like(mesh.vertices)
+    corners, at_vertex = number[mesh.faces[around]].T.reshape(-1), np.empty((len(used), 3))
 
     def about_vertices(part: Floats) -> Floats:
-        return np.asarray(np.bincount(corners, weights=np.tile(part, 3), minlength=len(at_vertex)))
+        return np.asarray(np.bincount(corners[corners >= 0], np.tile(part, 3)[corners >= 0], len(used)))
 
     for axis, part in enumerate(areas.T):
         at_vertex[:, axis] = about_vertices(part)
     kept, whole = np.linalg.norm(at_vertex, axis=1), about_vertices(np.linalg.norm(areas, axis=1))
     crossed = TriangleMesh(mesh.vertices, mesh.faces[face])
     weights, own = _corner_weights(crossed.triangles, points), _normals(crossed)
-    normals = _unit(at_vertex)[mesh.faces[face]]
+    corner = number[mesh.faces[face]]
+    normals = _unit(at_vertex)[corner]
     signs = np.where(np.einsum("ijk,ik->ij", normals, own) < 0.0, -1.0, 1.0)
     blended = _unit(np.einsum("ij,ij,ijk->ik", weights, signs, normals))
-    coherent = (kept >= COHERENT * whole)[mesh.faces[face]].all(axis=1)
+    coherent = (kept >= COHERENT * whole)[corner].all(axis=1)
     return np.where(coherent[:, None], blended, own)
 
 

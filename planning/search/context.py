@@ -41,7 +41,7 @@ from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.constraints import ArmReach
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import breath_warnings
-from puncture_twin.planning.search.search import organ_candidates, search
+from puncture_twin.planning.search.search import organ_safe, search
 from puncture_twin.planning.search.sides import Side, sides_of, sides_text
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, uncertainty_breakdown
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel, chance_model
@@ -181,7 +181,7 @@ class CaseContext(Shown):
                 chance=self.chance,
                 progress=partial(self.watcher.count, "directions of the arm"),
             )
-            others = tuple(alternatives(self.case, self.anatomy, self.engine, candidates))
+            others = tuple(alternatives(self.case, self.anatomy, self.engine, candidates, self.memory))
         return replace(candidates, arm_note=self.arm, findings=others, provenance=self.provenance())
 
     def check(self, theta: Floats | float, beta: Floats | float) -> Candidates:
@@ -348,9 +348,11 @@ def _with_findings(case: Case, anatomy: Anatomy, placement: Placement | None, ca
     return replace(anatomy, warnings=warnings, findings=collected)
 
 
-def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates) -> Iterator[Finding]:
+def alternatives(
+    case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates, memory: Memory
+) -> Iterator[Finding]:
     """Findings on what else would be safe for the organs, from the ranked candidates of the case."""
-    more = safe_without_beyond(case, anatomy, candidates)
+    more = safe_without_beyond(case, anatomy, candidates, memory)
     if more:
         text = f"{plural(more, 'more direction')} would be safe for the organs with [ct] beyond_mm = 0"
         yield Finding("hangs_on_beyond_image", Severity.NOTE, text, {"directions": more})
@@ -358,7 +360,7 @@ def alternatives(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidat
         yield _needle_catalogue(case, anatomy, engine, candidates)
 
 
-def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) -> int:
+def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates, memory: Memory) -> int:
     """How many directions are unsafe only for the body that is assumed beyond the image: safe if it ends there."""
     clearance, named = candidates.clearance, candidates.verdict.structure == BEYOND_IMAGE
     others = ~np.isnan(clearance.margins) & (np.array(clearance.structures) != BEYOND_IMAGE)
@@ -366,9 +368,11 @@ def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates) ->
     if not len(rows) or case.ct.beyond_mm == 0.0:
         return 0
     narrow = replace(case, ct=replace(case.ct, beyond_mm=0.0))
-    (solid,), path = beyond_images(narrow, anatomy.skin, anatomy.scan).structures, candidates.path
+    (solid,), path = beyond_images(narrow, anatomy.skin, anatomy.scan, memory).structures, candidates.path
     lengths = axis_lengths(case, [solid], path.length[rows], path.skin_angle[rows])
-    axes = FastEngine([solid.mesh]).measure(case.target_ct, candidates.outward_ct[rows], lengths, shown=False)
+    axes = FastEngine([solid.mesh], memory=memory).measure(
+        case.target_ct, candidates.outward_ct[rows], lengths, shown=False
+    )
     return int((axes.distance >= case.needle.radius_mm + solid.margin_mm).sum())
 
 
@@ -376,7 +380,7 @@ def _needle_catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, can
     """How many directions are safe with each needle, and the shortest that fits the best path of each window."""
     directions = Directions(candidates.theta, candidates.beta, candidates.outward_ct, candidates.grid)
     safe = {
-        length: organ_candidates(replace(case, needle=case.needle.of_length(length)), anatomy, engine, directions).safe
+        length: organ_safe(replace(case, needle=case.needle.of_length(length)), anatomy, engine, directions)
         for length in sorted(case.needle.lengths_mm)
     }
     text = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())

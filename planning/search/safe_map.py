@@ -9,28 +9,22 @@ Of many points of a lesion, which one has the widest window: one map a point, wi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse
 from puncture_twin.planning.base.text import Facts, Shown, brief, plural
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
-from puncture_twin.planning.clearance.engine import ClearanceEngine, measure
-from puncture_twin.planning.clearance.fast_engine import FastEngine
-from puncture_twin.planning.clearance.verdict_map import VerdictMap
 from puncture_twin.planning.formats.guard import guard_points, points_array
 from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.parts import voxels_inside
 from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.reach.standoff import axis_lengths, case_paths
-from puncture_twin.planning.search.constraints import skin_allows
 from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.search.search import first_blocking
 from puncture_twin.planning.search.windows import SQUARE_DEGREES, connected
 
 NOT_TESTED_OF_WINDOWS = "bending, breathing, arm, chances"
@@ -86,49 +80,6 @@ def safe_map(context: CaseContext) -> SafeMap:
     case, anatomy, directions = context.case, context.anatomy, context.case.directions()
     structure = first_blocking(case, anatomy, context.engine, directions).structure
     return SafeMap(case.target_ct, directions, tuple(one.name for one in anatomy.checked), structure >= 0, structure)
-
-
-class Blocking(NamedTuple):
-    """What blocks the directions of a grid.
-
-    Attributes:
-        structure: Shape (n,), the first of ``anatomy.checked`` whose margin a direction breaks; -1 where none.
-        enters: Shape (n,), which of the directions that no structure of the body blocks enter through the skin as the
-            case demands: seen, short enough, at a small enough angle.
-    """
-
-    structure: Ints32
-    enters: Bools
-
-    @property
-    def open(self) -> Bools:
-        """Which directions enter and are not blocked, shape (n,)."""
-        return np.asarray(self.enters & (self.structure < 0))
-
-
-def first_blocking(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Blocking:
-    """What blocks the directions of a grid at a case's target: structures in the order of ``anatomy.checked``.
-
-    Args:
-        engine: Prepared for the meshes of ``anatomy.checked``; any but the fast one is asked for its own distances.
-    """
-    outward, grid, inside, radius = directions.outward_ct, directions.grid, anatomy.structures, case.needle.radius_mm
-    if fast := grid is not None and isinstance(engine, FastEngine):
-        found = VerdictMap(case.target_ct, grid, outward, case.T_ct_entry[:3, :3])
-        for number, one in enumerate(inside):
-            found.add(engine, number, one, np.full(len(outward), case.needle.length_mm), radius)
-    free = np.flatnonzero(found.free) if fast else np.arange(len(outward))
-    paths = case_paths(case, anatomy.skin, outward[free])
-    enters = np.zeros(len(outward), bool)
-    enters[free] = skin_allows(paths, case.needle, case.search.max_skin_angle)
-    lengths = np.full((len(outward), len(anatomy.checked)), case.needle.length_mm)
-    lengths[free] = axis_lengths(case, anatomy.checked, paths.path_length, paths.skin_angle)
-    if not fast:
-        broken = measure(engine, anatomy.checked, case.target_ct, outward, length=lengths, radius=radius).violated
-        return Blocking(np.where(broken.any(axis=1), broken.argmax(axis=1), -1).astype(np.int32), enters)
-    for number, one in enumerate(anatomy.surroundings, start=len(inside)):
-        found.add(engine, number, one, lengths[:, number], radius)
-    return Blocking(found.structure, enters)
 
 
 @dataclass(frozen=True, eq=False)

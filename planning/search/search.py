@@ -1,26 +1,30 @@
 """The batch search: a case in, one checked row per direction out.
 
 `search` is the list of its stages. `organ_candidates`, the first, needs no arm: path, clearance and verdict of every
-direction for skin and organs.
+direction for skin and organs. `first_blocking` and `organ_safe` give verdicts alone, without distances.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine, measure
+from puncture_twin.planning.clearance.fast_engine import FastEngine
+from puncture_twin.planning.clearance.verdict_map import VerdictMap
 from puncture_twin.planning.geometry.containment import contains, crossings
 from puncture_twin.planning.reach.standoff import axis_lengths, case_axis_lengths, case_paths
 from puncture_twin.planning.search.bending import with_bending
 from puncture_twin.planning.search.candidate_chances import with_best_refined, with_chances, with_joint_chances
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking
-from puncture_twin.planning.search.constraints import ArmReach, first_broken, with_reach
+from puncture_twin.planning.search.constraints import ArmReach, first_broken, skin_allows, with_reach
 from puncture_twin.planning.search.phases import with_breathing, with_breathing_reach
 from puncture_twin.planning.search.ranking import ranked, with_grid_cone
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
@@ -104,6 +108,59 @@ def organ_candidates(
     bound = None if case.bending is None else case.bending.bound(needle.longest_path_mm)
     candidates = with_bending(anatomy, candidates, bound)
     return with_breathing(case, anatomy, engine, candidates, bound)
+
+
+class Blocking(NamedTuple):
+    """What blocks the directions of a grid.
+
+    Attributes:
+        structure: Shape (n,), the first of ``anatomy.checked`` whose margin a direction breaks; -1 where none.
+        enters: Shape (n,), which of the directions that no structure of the body blocks enter through the skin as the
+            case demands: seen, short enough, at a small enough angle.
+    """
+
+    structure: Ints32
+    enters: Bools
+
+    @property
+    def open(self) -> Bools:
+        """Which directions enter and are not blocked, shape (n,)."""
+        return np.asarray(self.enters & (self.structure < 0))
+
+
+def first_blocking(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Blocking:
+    """What blocks the directions of a grid at a case's target: structures in the order of ``anatomy.checked``.
+
+    Args:
+        engine: Prepared for the meshes of ``anatomy.checked``; any but the fast one is asked for its own distances.
+    """
+    outward, grid, inside, radius = directions.outward_ct, directions.grid, anatomy.structures, case.needle.radius_mm
+    if fast := grid is not None and isinstance(engine, FastEngine):
+        found = VerdictMap(case.target_ct, grid, outward, case.T_ct_entry[:3, :3])
+        for number, one in enumerate(inside):
+            found.add(engine, number, one, np.full(len(outward), case.needle.length_mm), radius)
+    free = np.flatnonzero(found.free) if fast else np.arange(len(outward))
+    paths = case_paths(case, anatomy.skin, outward[free])
+    enters = np.zeros(len(outward), bool)
+    enters[free] = skin_allows(paths, case.needle, case.search.max_skin_angle)
+    lengths = np.full((len(outward), len(anatomy.checked)), case.needle.length_mm)
+    lengths[free] = axis_lengths(case, anatomy.checked, paths.path_length, paths.skin_angle)
+    if not fast:
+        broken = measure(engine, anatomy.checked, case.target_ct, outward, length=lengths, radius=radius).violated
+        return Blocking(np.where(broken.any(axis=1), broken.argmax(axis=1), -1).astype(np.int32), enters)
+    for number, one in enumerate(anatomy.surroundings, start=len(inside)):
+        found.add(engine, number, one, lengths[:, number], radius)
+    return Blocking(found.structure, enters)
+
+
+def organ_safe(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Bools:
+    """Which directions of a grid `organ_candidates` finds safe, shape (n,); what is blocked is not measured."""
+    safe = first_blocking(case, anatomy, engine, directions).open
+    if case.bending is not None or case.breathing is not None:
+        rows = np.flatnonzero(safe)
+        left = Directions(directions.theta[rows], directions.beta[rows], directions.outward_ct[rows])
+        safe[rows] = organ_candidates(case, anatomy, engine, left).safe
+    return safe
 
 
 def tissue_crossed(

@@ -249,6 +249,26 @@ def test_a_refused_target_leaves_nothing_of_the_one_before(context, planner, pat
     assert verdict(planner, pose, session=session)["error"]["code"] == "no_target"
 
 
+def test_a_needle_without_a_newer_pose_has_no_verdict(context, planner, paths):
+    """Nor for a new target; the status says so in both ways, until a pose comes."""
+    pose, session, target = toward(context, *paths[0, :2]), planner.session(), RAS * context.case.target_ct
+
+    def status():
+        said = document(asked(planner, "STRING", "Query", text("?"), session), "Status")["needle"]
+        code = struct.unpack(">H", asked(planner, "GET_STATUS", "", b"", session)["STATUS Status"][:2])[0]
+        return said, code
+
+    assert status() == (None, 1)
+    assert verdict(planner, pose, session=session)["verdict"] == "safe" and status() == ("known", 1)
+    with refused("needle_silent"):
+        list(planner.answers(session.needle._replace(message=None, fault=refusal("needle_silent"))))
+    assert status() == ("needle_silent", 7)
+    found = asked(planner, "POINT", "Target", point(target), session)
+    assert document(found, "Verdict")["error"]["code"] == "needle_silent" and found["POINT Entry"] == b""
+    assert document(found, "SafeMapInfo")["blocked"] > 0
+    assert verdict(planner, pose, session=session)["verdict"] == "safe" and status() == ("known", 1)
+
+
 def refusal(code):
     """Any."""
     return pt.InputError("damaged", where="here", allowed="none", code=code)

@@ -1,10 +1,12 @@
 """The sockets of `live`: what is no message, floods, stalls or dies costs its sender alone; the newest counts."""
 
+import ctypes
 import json
 import logging
 import resource
 import socket
 import struct
+import sys
 import threading
 import time
 from contextlib import suppress
@@ -60,8 +62,9 @@ class Slow:
 class Running:
     """A server in a thread; `stop` ends it as Ctrl-C does."""
 
-    def __init__(self, planner):
+    def __init__(self, planner, pose_s=server.POSE_S):
         self.planner, self.listener, self.ends = planner, bound("127.0.0.1", 0), False
+        self.pose_s = pose_s
         self.port = self.listener.getsockname()[1]
         self.thread = threading.Thread(target=self.run)
         self.thread.start()
@@ -82,7 +85,7 @@ class Running:
     def run(self):
         """Until it is stopped."""
         with pytest.raises(KeyboardInterrupt):
-            serve(self, self.planner)
+            serve(self, self.planner, self.pose_s)
 
     def stop(self):
         """End, and wait for it."""
@@ -298,6 +301,112 @@ def test_one_client_too_many_is_not_heard_and_a_place_is_free_again(running):
     assert answers_well(running.port)
     for talk in talks:
         talk.socket.close()
+
+
+ACCEPT_NOTHING = struct.pack("HHBBI", 0x06, 0, 0, 0, 0)
+"""A filter of one instruction: of every packet that comes to a socket, keep 0 bytes."""
+
+
+def vanish(talk):
+    """Let a client's machine go without a word: nothing that is sent to it arrives, or is acknowledged."""
+    code = ctypes.create_string_buffer(ACCEPT_NOTHING)
+    program = struct.pack("HL", 1, ctypes.addressof(code))
+    talk.socket.setsockopt(socket.SOL_SOCKET, getattr(socket, "SO_ATTACH_FILTER", 26), program)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a socket filter of Linux")
+@pytest.mark.parametrize("waits", [False, True], ids=["silent", "answers_on_their_way"])
+def test_clients_that_vanish_leave_their_places(running, monkeypatch, waits):
+    """All of them at once, without a last word: others are served after the time in which the system probes them."""
+    monkeypatch.setattr(server, "VANISHED_S", 4.0)
+    talks = [Talk(running.port) for _ in range(server.MOST_CLIENTS)]
+    for talk in talks:
+        talk.send("STRING", "Query", text("x"))
+        assert talk.receive().content == text("x")
+    with Talk(running.port) as late:
+        assert late.ended()  # no place is free
+    for talk in talks:
+        vanish(talk)
+        if waits:
+            talk.send("STRING", "Query", text("x"))
+    begun = time.monotonic()
+    while not place_is_free(running.port):
+        assert time.monotonic() - begun < 20.0
+        time.sleep(0.2)
+    assert time.monotonic() - begun > 1.0
+    for talk in talks:
+        talk.socket.close()
+
+
+def place_is_free(port):
+    """Whether one more client is answered."""
+    with suppress(ConnectionError):
+        return answers_well(port)
+    return False
+
+
+def test_a_client_that_only_listens_keeps_its_place(running, monkeypatch):
+    """Its machine is there: a navigation program says nothing while nobody moves the target."""
+    monkeypatch.setattr(server, "VANISHED_S", 1.0)
+    with Talk(running.port) as quiet:
+        time.sleep(3.5)
+        quiet.send("STRING", "Query", text("still here"))
+        assert quiet.receive().content == text("still here")
+
+
+def test_a_tracker_that_stops_leaves_no_verdict_behind():
+    """After the time for which a pose counts: once, to its own client alone; a new pose is answered again."""
+    running = Running(Slow(), pose_s=0.5)
+    try:
+        with Talk(running.port) as tracked, Talk(running.port) as other:
+            other.send("STRING", "Query", text("x"))
+            assert other.receive().content == text("x")
+            for turn in range(2):
+                for number in range(10):  # for longer than a pose counts
+                    tracked.send("TRANSFORM", "Needle", transform(np.eye(4)), stamp=(turn, number))
+                    assert tracked.receive().stamp == (turn, number)
+                    time.sleep(0.08)
+                sent = time.monotonic()
+                said = tracked.receive()
+                assert said.stamp == (turn, 9) and time.monotonic() - sent < 5.0
+                assert said.document == {"subject": "needle", "code": "needle_silent"}
+            for talk in (tracked, other):
+                talk.socket.settimeout(0.8)
+                with pytest.raises(TimeoutError):
+                    talk.receive()
+    finally:
+        running.stop()
+
+
+def test_a_flood_of_others_does_not_hide_that_a_tracker_stopped():
+    """And a pose that still waits when it counts no longer is not answered as if it were new."""
+    running, stop = Running(Slow(), pose_s=0.3), threading.Event()
+    running.planner.waits_s = 0.05
+
+    def send_on():
+        with Talk(running.port) as talk:
+            while not stop.is_set():
+                talk.send(message("STRING", "Query", text("flood")))
+
+    floods = [threading.Thread(target=send_on) for _ in range(3)]
+    for one in floods:
+        one.start()
+    try:
+        with Talk(running.port) as tracked:
+            tracked.send("TRANSFORM", "Needle", transform(np.eye(4)), stamp=(0, 1))
+            assert tracked.until("Refused").document["code"] == "needle_silent"
+            running.planner.waits_s = 0.5
+            time.sleep(0.1)
+            tracked.send("TRANSFORM", "Needle", transform(np.eye(4)), stamp=(0, 2))
+            said = tracked.receive()
+            assert (said.name, said.stamp) == ("Refused", (0, 2))
+    finally:
+        stop.set()
+        running.planner.waits_s = 0.0
+        for one in floods:
+            one.join(10.0)
+        running.stop()
+    assert ("needle", 2) not in [one[1:] for one in running.planner.begun]
 
 
 def test_a_log_that_many_write_to_stays_short(running, caplog):

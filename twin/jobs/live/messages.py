@@ -51,7 +51,9 @@ UINT16, LITTLE, RAS = 5, 2, 1
 MESH = struct.Struct(">10I")
 SCALAR = struct.Struct(">BBI")
 POINT_SCALAR = 0x00
-STATUS_OK = struct.Struct(">Hq20s")
+STATUS = struct.Struct(">Hq20s")
+READY, TIMED_OUT = 1, 7
+"""Codes of a STATUS."""
 
 
 class Stamp(NamedTuple):
@@ -253,9 +255,9 @@ def quad_bytes(quads: Ints) -> bytes:
     return np.insert(quads, 0, 4, axis=1).astype(">u4").tobytes()
 
 
-def status_content(text: str) -> bytes:
-    """Of a STATUS that says: well."""
-    return STATUS_OK.pack(1, 0, b"") + text.encode() + b"\0"
+def status_content(code: int, text: str) -> bytes:
+    """Of a STATUS."""
+    return STATUS.pack(code, 0, b"") + text.encode() + b"\0"
 
 
 def checksum(data: bytes) -> int:

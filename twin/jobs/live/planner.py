@@ -19,6 +19,7 @@ that was said of an earlier target or needle stands where the newest is expected
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, finite
 from puncture_twin.planning.search.safe_map import NOT_TESTED, SafeMap, safe_map
 from puncture_twin.twin.jobs.live.messages import (
+    READY,
+    TIMED_OUT,
     Header,
     Message,
     Stamp,
@@ -164,6 +167,7 @@ class Planner:
             context.at(context.case.target_ct + ELSEWHERE_MM * np.random.default_rng().uniform(size=3))
         self._context = at = context.at(context.case.target_ct)  # shows no progress
         free = safe_map(at)
+        deque(self._map(free, Stamp(1, 0, 0, 0)), maxlen=0)  # packed and summed, as an answer is
         rows = np.append(np.flatnonzero(~free.blocked), 0)[:: 1 + len(free.blocked) // WARM]
         checked = at.check(free.directions.theta[rows], free.directions.beta[rows])  # compilers run now, not later
         best = 0 if checked.best is None else checked.best.row
@@ -233,12 +237,15 @@ class Planner:
             yield _text("Error", stamp, document)
 
     def _status(self, session: Session, kind: str, stamp: Stamp) -> Answer:
+        fault = None if session.needle is None else session.needle.fault
         if kind == "GET_STATUS":
-            return _answer("STATUS", "Status", stamp, status_content("ready"))
+            content = status_content(READY, "ready") if fault is None else status_content(TIMED_OUT, str(fault))
+            return _answer("STATUS", "Status", stamp, content)
         context = session.context
         document = {
             "case": self._context.case.name,
             "target_ras_mm": None if context is None else _ras(context.case.target_ct),
+            "needle": None if session.needle is None else "known" if fault is None else fault.code,
             "arm": self._context.arm,
             "structures": [one.name for one in self._context.anatomy.checked],
             "warnings": list(self._context.anatomy.warnings),

@@ -16,6 +16,7 @@ wait, answers all of them from one queue, and prints a traceback for each messag
 from __future__ import annotations
 
 import logging
+import math
 import socket
 import threading
 import time
@@ -36,7 +37,7 @@ MOST_KEPT = 65_536
 
 CHUNK = 65_536
 MOST_AT_ONCE, REST_S = 20, 0.005
-"""So many messages, or chunks that are passed over, before a client is not read for a while: 4,000 in a second."""
+"""So many messages, or as many bytes as a chunk, before a client is not read for a while: 4,000 in a second, 13 MB."""
 
 MESSAGE_S = 5.0
 """A message that has begun is whole after this time, or its sender is gone."""
@@ -44,8 +45,11 @@ MESSAGE_S = 5.0
 STALL_S = 10.0
 """An answer that is not taken in this time has no reader."""
 
-SILENT_S = 1e6
-"""How long a client may say nothing."""
+VANISHED_S, PROBES = 20.0, 4
+"""A client whose machine acknowledges nothing in this time is gone; one that is silent is probed so often in it."""
+
+POSE_S = 2.0
+"""A pose counts so long: a tracker that stopped leaves no verdict behind."""
 
 SEND_BUFFER = 262_144
 """Bytes that the system keeps for a client: what waits there cannot be replaced by what is newer."""
@@ -57,9 +61,15 @@ USED = "the messages of docs/reference/live.md"
 
 
 class Exchange:
-    """What waits between clients and planner: the newest question of each subject, in turn for each client."""
+    """What waits between clients and planner: the newest question of each subject, in turn for each client.
 
-    def __init__(self) -> None:
+    Args:
+        pose_s: A needle without a newer pose for so long is asked about by the exchange itself, as one that is refused.
+    """
+
+    def __init__(self, pose_s: float = POSE_S) -> None:
+        self._pose_s = pose_s
+        self._posed: dict[int, tuple[float, Question]] = {}
         self._lock, self._closed = threading.Lock(), False
         self._asked, self._given = threading.Condition(self._lock), threading.Condition(self._lock)
         self._questions: dict[int, dict[str, Question]] = {}
@@ -77,6 +87,7 @@ class Exchange:
         """Keep nothing of a client that is gone; False where that was known."""
         with self._lock:
             self._questions.pop(client, None)
+            self._posed.pop(client, None)
             self._given.notify_all()
             return self._answers.pop(client, None) is not None
 
@@ -93,16 +104,33 @@ class Exchange:
         with self._lock:
             if question.client in self._answers:
                 self._questions.setdefault(question.client, {})[question.subject] = question
+                if question.subject == "needle":
+                    self._posed.pop(question.client, None)  # the oldest is the first
+                    self._posed[question.client] = time.monotonic(), question
                 self._asked.notify()
 
     def take(self) -> Question | None:
         """The first subject of the client that waits longest, which then waits anew; None where there are no more."""
         with self._lock:
-            self._asked.wait_for(lambda: self._questions or self._closed)
-            if self._closed:
-                return None
-            client = next(iter(self._questions))
-            return self._taken(client, min(self._questions[client], key=SUBJECTS.index))
+            while not self._closed:
+                since, posed = next(iter(self._posed.values()), (math.inf, None))
+                left = since + self._pose_s - time.monotonic()
+                if posed is not None and left <= 0.0:
+                    return self._silent(posed)
+                if self._questions:
+                    client = next(iter(self._questions))
+                    return self._taken(client, min(self._questions[client], key=SUBJECTS.index))
+                self._asked.wait(min(left, threading.TIMEOUT_MAX))
+            return None
+
+    def _silent(self, posed: Question) -> Question:
+        """What takes the place of a pose that counts no longer, whether it was answered or not."""
+        del self._posed[posed.client]
+        if "needle" in self._questions.get(posed.client, {}):
+            self._taken(posed.client, "needle")
+        what, allowed = f"no pose for {self._pose_s:g} s", "poses that go on coming, or a longer --pose-s"
+        silent = InputError(what, where="OpenIGTLink Needle", allowed=allowed, code="needle_silent")
+        return posed._replace(message=None, fault=silent)
 
     def take_of(self, client: int, subject: str) -> Question | None:
         """What a client asks about a subject, out of turn; None where it does not."""
@@ -173,13 +201,14 @@ def bound(host: str, port: int) -> socket.socket:
     return listener
 
 
-def serve(listener: socket.socket, planner: Planner) -> None:
+def serve(listener: socket.socket, planner: Planner, pose_s: float = POSE_S) -> None:
     """Answer clients until it is interrupted; the port is free then.
 
     Args:
         listener: From `bound`; closed at the end.
+        pose_s: How long a needle's pose counts.
     """
-    exchange, log, clients = Exchange(), Log(), dict[int, Client]()
+    exchange, log, clients = Exchange(pose_s), Log(), dict[int, Client]()
     computing = threading.Thread(target=_compute, args=(exchange, planner), daemon=True)
     computing.start()
     try:
@@ -232,6 +261,20 @@ def _found(planner: Planner, question: Question) -> Iterator[Answer]:
         yield from planner.refused(question.subject, question.stamp, PlanningError(f"the program failed: {error!r}"))
 
 
+def _notice_the_vanished(connection: socket.socket) -> None:
+    """Let the system end a connection whose other machine is gone without a word: it would keep its place for hours."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    probe_s = max(1, round(VANISHED_S / PROBES))
+    for name, value in (
+        ("TCP_KEEPIDLE", probe_s),
+        ("TCP_KEEPINTVL", probe_s),
+        ("TCP_KEEPCNT", PROBES - 1),
+        ("TCP_USER_TIMEOUT", round(1e3 * VANISHED_S)),  # of answers that are on their way
+    ):
+        if hasattr(socket, name):  # not every system has each
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
 class Client:
     """One connection."""
 
@@ -241,11 +284,11 @@ class Client:
         self.open = True
         self._number, self._in, self._out, self._where = number, connection, connection.dup(), where
         self._in.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._in.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         self._in.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
+        _notice_the_vanished(self._in)
         self._out.settimeout(STALL_S)  # of its own
         self._planner, self._exchange, self._log = planner, exchange, log
-        self._session, self._logged = planner.session(), set[str]()
+        self._session, self._logged, self._read_since = planner.session(), set[str](), 0.0
 
     def start(self) -> None:
         """Read and send from now on."""
@@ -280,27 +323,29 @@ class Client:
         try:
             while (data := self._exchange.answer(self._number)) is not None:
                 self._out.sendall(data)
-        except TimeoutError:
-            self._end("not_reading", f"has not taken an answer in {STALL_S:g} s")
         except OSError as error:
-            self._end("broken", f"the connection broke ({error.strerror})")
+            self._broken(error, "not_reading", f"has not taken an answer in {STALL_S:g} s")
 
     def _read(self) -> None:
         try:
-            for number in count(1):
-                self._in.settimeout(SILENT_S)
-                first = self._in.recv(1)
-                if not first:
-                    self._end("gone", "")
-                    return
+            while first := self._first():
                 self._read_message(first, time.monotonic() + MESSAGE_S)
-                if number % MOST_AT_ONCE == 0:
-                    time.sleep(REST_S)
-        except TimeoutError:
-            self._end("half_a_message", f"a message is not whole after {MESSAGE_S:g} s")
+            self._end("gone", "")
         except InputError as error:  # what follows is not known to be a message
             self._end(error.code, str(error))
         except OSError as error:
+            self._broken(error, "half_a_message", f"a message is not whole after {MESSAGE_S:g} s")
+
+    def _first(self) -> bytes:
+        """The next message's first byte, whenever it comes; none at the end."""
+        self._in.settimeout(None)
+        return self._in.recv(1)
+
+    def _broken(self, error: OSError, code: str, late: str) -> None:
+        """End it after an error; that of a wait which was too long has no number of the system's."""
+        if isinstance(error, TimeoutError) and error.errno is None:
+            self._end(code, late)
+        else:
             self._end("broken", f"the connection broke ({error.strerror or error})")
 
     def _read_message(self, first: bytes, until: float) -> None:
@@ -342,13 +387,17 @@ class Client:
             if not more:
                 raise ConnectionError("ended within a message")
             data += more
+        self._rest(size)
         return bytes(data)
+
+    def _rest(self, size: int) -> None:
+        """Wait a while, where enough was read since the last time: a body as large as a chunk is enough alone."""
+        self._read_since += max(size / CHUNK, 0.5 / MOST_AT_ONCE)  # a message has two parts
+        if self._read_since >= 1.0:
+            self._read_since = 0.0
+            time.sleep(REST_S)
 
     def _pass_over(self, size: int) -> None:
         """Read so many bytes and keep none; each part has the time of a message."""
-        for number in count(1):
-            if size <= 0:
-                return
+        while size > 0:
             size -= len(self._exactly(min(size, CHUNK), time.monotonic() + MESSAGE_S))
-            if number % MOST_AT_ONCE == 0:
-                time.sleep(REST_S)
