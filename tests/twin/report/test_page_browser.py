@@ -121,14 +121,14 @@ def test_choosing_moves_everything(page, case, candidates):
 
 def test_slices_are_shown_in_every_window(page):
     """The CT's bytes become greys of each window."""
-    greys = "[...document.querySelector('#slices-a .ct').getContext('2d').getImageData(0, 0, 480, 480).data]"
+    pixels = "document.querySelector('#slices-a .ct').getContext('2d').getImageData(0, 0, 480, 480).data"
+    largest = f"{pixels}.reduce((most, value, k) => k % 4 ? most : Math.max(most, value), 0)"
     for tone in ("lung", "bone", "brain", "abdomen"):
         page.locator(f"#tones [data-tone={tone}]").click()
         page.wait_for_function(f"document.getElementById('slices-a').dataset.tone === '{tone}'")
-        shades = np.array(page.evaluate(greys)).reshape(-1, 4)[:, 0]
         level, width = TONES[tone]
         brightest = 255 * min(1.0, (299 - level) / width + 0.5)  # the densest voxels, to half a step of the table
-        assert abs(int(shades.max()) - brightest) <= 255 * 12 / width + 1
+        assert abs(page.evaluate(largest) - brightest) <= 255 * 12 / width + 1
 
 
 def test_the_focus_is_visible(page):
