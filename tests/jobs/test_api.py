@@ -23,7 +23,6 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 
 HEAVY = ("numba", "pybullet", "matplotlib", "trimesh", "scipy", "ompl", "fcl", "pyarrow", "SimpleITK", "plotly")
@@ -47,21 +46,6 @@ def test_importing_it_loads_nothing_heavy_and_prints_nothing():
     code = f"import sys, puncture_twin as pt; pt.register; print([name for name in {HEAVY} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
-
-
-def test_search_gives_what_the_context_gives(context):
-    """No second way to an answer."""
-    ours, theirs = pt.search(context), prepare(folder() / "carton" / "case_m.toml", arm=False).search()
-    assert np.array_equal(ours.verdict.reason, theirs.verdict.reason)
-    assert np.array_equal(ours.ranking.cost, theirs.ranking.cost, equal_nan=True)
-
-
-def test_check_takes_degrees(context):
-    """And gives the verdict of the same row of the search."""
-    candidates = pt.search(context)
-    for row in (0, len(candidates) // 2):
-        explained = pt.check(context, np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row]))
-        assert explained.safe == candidates.safe[row]
 
 
 def test_what_it_returns_prints_as_one_line(context):
