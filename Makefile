@@ -22,9 +22,9 @@ export PYTHONDONTWRITEBYTECODE :=
 demo: install simulator
 	$(BIN)/python run_twin.py demo --out $(OUT)
 
-test: install simulator browser lint
+test: install simulator browser
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync=target lint $(if $(CI),versions)
 	$(BIN)/pytest -q -n auto --dist loadfile
-	@[ -z "$$CI" ] || $(MAKE) --no-print-directory versions
 
 # Beside this environment: the newest Python, and the lowest version of every part (two minutes; in CI a part of make test).
 versions: install

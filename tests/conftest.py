@@ -1,6 +1,7 @@
 """What many tests share."""
 
 import gc
+import os
 from importlib.util import find_spec
 
 import numpy as np
@@ -92,9 +93,12 @@ def box():
 
 @pytest.fixture(autouse=True, scope="session")
 def own_cache(tmp_path_factory):
-    """Tests neither see nor fill the user's cache."""
+    """Tests neither see nor fill the user's cache; all processes of a run share one, as those of a user do."""
+    run = tmp_path_factory.getbasetemp()
+    shared = (run.parent if "PYTEST_XDIST_WORKER" in os.environ else run) / "cache"
+    shared.mkdir(mode=0o700, exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PUNCTURE_TWIN_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("PUNCTURE_TWIN_CACHE", str(shared))
         yield
 
 

@@ -18,7 +18,6 @@ from puncture_twin.twin.plant.scanner.image import Solid, ball, box, rod, scan_s
 
 RADII = np.array([52.0, 42.0, 70.0])
 """Half axes of the body, an ellipsoid, mm."""
-PIXEL = 0.8
 
 
 def on_skin(theta, z):

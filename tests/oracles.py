@@ -131,3 +131,9 @@ def measure_displaced(engine, origins_ct, outward_ct, length):
     """Distances (n, k) of needles from (n, 3) along (n, 3), mm: the engine itself, asked of one after the other."""
     pairs = zip(origins_ct, outward_ct, strict=True)
     return np.array([engine.measure(origin, along[None], length).distance[0] for origin, along in pairs])
+
+
+def units(rng, count):
+    """Random directions, (count, 3)."""
+    directions = rng.normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)

@@ -1,4 +1,8 @@
-"""Bad input through the command line: exit code 2, one line (what, where, what is allowed), nothing written."""
+"""Bad input through the command line: exit code 2, one line (what, where, what is allowed), nothing written.
+
+What each reader refuses is asked of the reader itself, in tests/formats; here stands one fault of each kind of file,
+and all that a case alone makes wrong.
+"""
 
 import gzip
 import json
@@ -47,16 +51,6 @@ def opened(path, radius, wound_at_random=False, shells=1):
         faces = np.where(flip, faces[:, ::-1], faces)
     parts = [trimesh.Trimesh(mesh.vertices * (1 + k / 5), faces, process=False) for k in range(shells)]
     trimesh.util.concatenate(parts).export(path)
-
-
-def flat(path):
-    """A triangle without area."""
-    trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False).export(path)
-
-
-def inflated(path):
-    """The content of a gzip file."""
-    return gzip.decompress(path.read_bytes())
 
 
 @pytest.fixture
@@ -173,7 +167,6 @@ PLY = (
     "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
     "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n10 0 0\n0 10 0\n3 0 1 2\n"
 )
-STL_TEXT = "solid x\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 10 0 0\nvertex 0 10 0\nendloop\nendfacet\n"
 NAN = struct.pack("<f", float("nan"))
 
 BREAKS = {
@@ -249,86 +242,29 @@ BREAKS = {
     ),
     # meshes
     "stl: cut in the middle": (cut("rib.stl", 0.5), "size_mismatch rib.stl"),
-    "stl: cut by one byte": (lambda f: cut("rib.stl", (f / "rib.stl").stat().st_size - 1)(f), "size_mismatch rib.stl"),
-    "stl: header only": (cut("rib.stl", 84), "size_mismatch rib.stl"),
-    "stl: false count": (patch("rib.stl", 80, struct.pack("<I", 7)), "size_mismatch rib.stl"),
-    "stl: claims four billion": (patch("rib.stl", 80, struct.pack("<I", 0xFFFFFFFF)), "size_mismatch rib.stl"),
-    "stl: zero triangles": (overwrite("rib.stl", b"\0" * 84), "size_mismatch rib.stl"),
     "stl: a NaN vertex": (patch("rib.stl", 84 + 12, NAN), "not_finite"),
-    "stl: an infinite vertex": (patch("rib.stl", 84 + 12, struct.pack("<f", np.inf)), "not_finite"),
-    "stl: a vertex at 1e30": (patch("rib.stl", 84 + 12, struct.pack("<f", 1e30)), "too_far"),
-    "stl: empty file": (overwrite("rib.stl", b""), "file_size rib.stl"),
-    "stl: binary garbage": (overwrite("rib.stl", bytes(range(256)) * 20), "size_mismatch rib.stl"),
-    "stl: text garbage": (overwrite("rib.stl", "not a mesh at all\n" * 50), "size_mismatch rib.stl"),
-    "stl: text without its end": (overwrite("rib.stl", STL_TEXT), "file_cut rib.stl"),
     "stl: a folder": (lambda f: ((f / "rib.stl").unlink(), (f / "rib.stl").mkdir()), "no_such_file rib.stl"),
     "stl: in metres": (lambda f: ball(f / "rib.stl", 0.00005, (0.04, 0, 0.04)), "implausible_size"),
-    "stl: no area": (
-        lambda f: trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False).export(f / "rib.stl"),
-        "implausible_size",
-    ),
     "mesh: unknown kind": (mesh_file("rib.step", "ISO-10303-21;"), "unknown_format rib.step"),
-    "obj: index out of range": (mesh_file("rib.obj", OBJ + "f 1 2 99\n"), "index_out_of_range rib.obj"),
-    "obj: index zero": (mesh_file("rib.obj", OBJ + "f 0 1 2\n"), "index_out_of_range rib.obj"),
-    "obj: a NaN vertex": (mesh_file("rib.obj", OBJ.replace("v 10 0 0", "v nan 0 0")), "not_finite rib.obj"),
     "obj: half a line": (mesh_file("rib.obj", OBJ[:-4]), "file_cut rib.obj"),
-    "obj: no faces": (mesh_file("rib.obj", "v 0 0 0\nv 1 0 0\n"), "empty rib.obj"),
     "ply: fewer faces than promised": (mesh_file("rib.ply", PLY.replace("face 1", "face 5")), "file_cut rib.ply"),
-    "ply: index out of range": (mesh_file("rib.ply", PLY.replace("3 0 1 2", "3 0 1 7")), "index_out_of_range rib.ply"),
-    "ply: header only": (mesh_file("rib.ply", PLY.split("0 0 0")[0]), "file_cut rib.ply"),
     "glb: false length": (
         mesh_file("rib.glb", b"glTF" + struct.pack("<II", 2, 99999) + b"\0" * 40),
         "size_mismatch rib.glb",
     ),
-    "glb: garbage": (mesh_file("rib.glb", b"glTF" + bytes(range(200))), "wrong_format rib.glb"),
     "vtp: not XML": (mesh_file("rib.vtp", "<VTKFile"), "xml_damaged rib.vtp"),
     # label maps
     "nifti: cut": (cut("labels.nii.gz", 0.6), "size_mismatch labels.nii.gz"),
-    "nifti: cut inside": (
-        label_file(
-            "cut.nii", lambda f: (f / "cut.nii").write_bytes(gzip.decompress((f / "labels.nii.gz").read_bytes())[:-500])
-        ),
-        "size_mismatch cut.nii",
-    ),
-    "nifti: garbage": (overwrite("labels.nii.gz", b"\x1f\x8b" + bytes(500)), "file_damaged labels.nii.gz"),
-    "nifti: empty": (overwrite("labels.nii.gz", b""), "file_size labels.nii.gz"),
-    "nifti: claims terabytes": (
-        patch_gz("labels.nii.gz", 42, struct.pack("<3h", 32000, 32000, 32000)),
-        "too_many labels.nii.gz",
-    ),
-    "nifti: four dimensions": (
-        patch_gz("labels.nii.gz", 40, struct.pack("<5h", 4, 100, 100, 100, 2)),
-        "wrong_dimension labels.nii.gz",
-    ),
-    "nifti: a NaN affine": (patch_gz("labels.nii.gz", 280, NAN * 12), "not_finite labels.nii.gz"),
-    "nifti: a zero affine": (patch_gz("labels.nii.gz", 280, bytes(48)), "implausible_spacing labels.nii.gz"),
-    "nifti: no space said": (patch_gz("labels.nii.gz", 252, bytes(4)), "space_not_stated labels.nii.gz"),
-    "nifti: unknown type": (patch_gz("labels.nii.gz", 70, struct.pack("<h", 9999)), "unknown_type labels.nii.gz"),
     "nrrd: another file's data": (
         header_line(b"encoding: raw", b"encoding: raw\ndata file: /etc/passwd"),
         "outside_folder labels.nrrd",
-    ),
-    "nrrd: data outside the folder": (
-        header_line(b"encoding: raw", b"encoding: raw\ndata file: ../touch.raw"),
-        "outside_folder labels.nrrd",
-    ),
-    "nrrd: cut": (label_file("labels.nrrd", cut("labels.nrrd", 0.7)), "size_mismatch labels.nrrd"),
-    "nrrd: no space": (header_line(b"space: left-posterior-superior\n", b""), "missing_key labels.nrrd"),
-    "nrrd: sizes of terabytes": (
-        header_line(b"sizes: 100 100 100", b"sizes: 99999 99999 99999"),
-        "too_many labels.nrrd",
     ),
     "label map: unknown kind": (
         label_file("labels.dcm", overwrite("labels.dcm", b"DICM")),
         "unknown_format labels.dcm",
     ),
     # markers
-    "markers: empty": (overwrite("touch.csv", ""), "file_size touch.csv"),
-    "markers: other columns": (replace("touch.csv", "x_mm,y_mm", "x,y"), "mixed_units touch.csv"),
     "markers: in metres": (replace("touch.csv", "x_mm,y_mm,z_mm", "x_m,y_m,z_m"), "wrong_unit"),
-    "markers: not a number": (replace("touch.csv", "B,50", "B,5O"), "not_a_number touch.csv"),
-    "markers: NaN": (replace("touch.csv", "B,50", "B,nan"), "not_finite touch.csv"),
-    "markers: a name twice": (replace("touch.csv", "B,50", "A,50"), "duplicate_name"),
     "markers: a name missing": (replace("touch.csv", "B,50", "Z,50"), "markers_missing"),
     "markers: too few": (
         lambda f: [overwrite(n, MARKERS[:39])(f) for n in ("touch.csv", "markers_ct.csv")],
@@ -363,11 +299,6 @@ def test_a_broken_input_is_refused(name, folder, tmp_path, capfd):
     spoil(folder)
     refused_command(["search", folder, "--no-arm", "--out", tmp_path / "out"], capfd, *message.split())
     assert not (tmp_path / "out").exists()
-
-
-def test_there_are_enough_ways_to_be_wrong():
-    """The list is as long as it must be."""
-    assert len(BREAKS) >= 60
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 from case_world import ORGAN, SKIN, case_text, structure, write_balls, write_labels
 from places import ROOT
+
+from puncture_twin.planning.base.numba_kernels import nb
 
 CASE = case_text(
     SKIN,
@@ -22,13 +25,14 @@ CASE = case_text(
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small case beside two empty cache folders."""
+    """A small case, the kernels that are compiled already, and no surfaces."""
     here = tmp_path_factory.mktemp("kept")
     write_balls(here, "skin", "organ")
     labels = np.zeros((100, 100, 100), np.uint8)
     labels[48:52, 28:32, 48:52] = 3
     write_labels(here / "labels.nii.gz", labels)
     (here / "case.toml").write_text(CASE)
+    shutil.copytree(nb.config.CACHE_DIR, here / "kernels" / Path(nb.config.CACHE_DIR).name)
     return here
 
 
@@ -58,8 +62,8 @@ def test_a_search_survives_damage_of_what_is_kept(world: Path) -> None:
     """Kernels and surfaces cut in half: no error, the same numbers, a line for each kind, and then silence again."""
     first, said = search(world)
     assert said == []
-    assert damage(world / "kernels", ".nbi", every=7) > 1
-    assert damage(world / "kernels", ".nbc", every=5) > 1
+    assert damage(world / "kernels", ".nbi", every=25) > 1
+    assert damage(world / "kernels", ".nbc", every=25) > 1
     assert damage(world / "surfaces", ".arrays") > 0
     again, said = search(world)
     assert again == first

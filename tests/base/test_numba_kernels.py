@@ -118,13 +118,12 @@ def test_numba_alone_misses_such_an_edit(project):
     assert answer(project, alone + ASKED) == ["2", "1"]
 
 
-@pytest.mark.parametrize("library", numba_kernels.COMPILERS)
-def test_other_compilers_are_noticed(project, library):
+def test_other_compilers_are_noticed(project):
     """What one version has compiled is not what another would: each has a folder."""
-    other = "import importlib.metadata as m\nreal = m.version\n"
-    other += f"m.version = lambda n: '0' if n == {library!r} else real(n)\n"
     place = "from puncture_twin.planning.base.numba_kernels import nb\nprint(nb.config.CACHE_DIR)"
-    assert answer(project, place) != answer(project, other + place)
+    other = "import importlib.metadata as m\nreal = m.version\nm.version = lambda n: '0' if n == {!r} else real(n)\n"
+    changed = [other.format(library) for library in numba_kernels.COMPILERS]
+    assert len({answer(project, before + place)[0] for before in ("", *changed)}) == 1 + len(changed)
 
 
 def test_a_kernel_taken_in_as_an_attribute_counts_too(project):
@@ -177,7 +176,7 @@ def test_a_bit_that_flips_in_a_kept_kernel_is_seen(project):
     assert answer(project) == ["2", "1"]
 
 
-@pytest.mark.parametrize("content", ["", "{", "[1]", '{"a": 1}', "null"])
+@pytest.mark.parametrize("content", ["{", '{"a": 1}'])
 def test_a_list_of_sums_that_cannot_be_read_is_written_anew(project, content):
     """Nothing is known of the files then; what they hold is as good."""
     assert answer(project) == ["2", "0"]

@@ -114,14 +114,6 @@ def test_own_files_are_never_touched(planned):
     assert read(planned / "plan.json").data == b"q"
 
 
-def test_a_file_that_no_manifest_lists_is_not_overwritten(tmp_path):
-    """It is somebody's own, whatever it is called."""
-    (tmp_path / "map.png").write_text("mine")
-    with refused("foreign_file", "map.png"):
-        write(tmp_path, "search", {}, names=("map.png",))
-    assert names(tmp_path) == {"map.png"}
-
-
 @pytest.mark.parametrize("kind", ["file", "link"])
 def test_a_sub_folder_that_is_somebody_elses_is_refused(tmp_path, kind):
     """A file where a sub-folder must be, or a link that leads out: refused before any work, and the old set stays."""

@@ -11,7 +11,7 @@ import pytest
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.progress import Silent, Stages
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, rate_text
+from puncture_twin.twin.report.progress import BarDisplay, LineDisplay, progress_display, rate_text
 
 
 def test_stages_are_announced_when_they_begin_and_added_up():
@@ -73,7 +73,8 @@ def test_bars_say_what_lines_say(now):
     """Also there a rate has time behind it: of 9,000 done in a microsecond nobody knows how fast they go on."""
     stream = io.StringIO()
     stream.isatty = lambda: True
-    with BarDisplay(stream) as display:
+    with progress_display(stream) as display:
+        assert isinstance(display, BarDisplay)
         display.count("directions", 0, 9000)
         now[0] = 1e-6
         display.count("directions", 5000, 9000)

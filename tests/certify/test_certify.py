@@ -408,7 +408,7 @@ def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new
 def test_a_false_reason_is_refused(carton, reason):
     """A cell that is too close does not break another constraint."""
     context, found = carton
-    row = int(np.flatnonzero(found.reason == "too_close")[-1])
+    row = int(np.flatnonzero(found.reason == "too_close")[0])
     reasons = found.reason.copy()
     reasons[row] = reason
     with refused("cell_not_proven", reason):

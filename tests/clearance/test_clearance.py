@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from oracles import units
 
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.clearance.engine import measure
@@ -9,12 +10,6 @@ from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 LENGTH = 150.0
-
-
-def units(rng, count):
-    """Random directions."""
-    directions = rng.normal(size=(count, 3))
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def organ(mesh, margin=0.0, role=Role.AVOID):

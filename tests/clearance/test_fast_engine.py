@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from oracles import segment_mesh_distance
+from oracles import segment_mesh_distance, units
 from refusals import refused
 
 from puncture_twin.planning.clearance.fast_engine import FastEngine
@@ -12,12 +12,6 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 LENGTH = 150.0
 TIGHT_MM = 1e-9
 """Far above rounding of float64, far below any length that matters."""
-
-
-def units(rng, count):
-    """Random directions."""
-    directions = rng.normal(size=(count, 3))
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def soup(rng, count, spread=60.0, size=6.0):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 from hypothesis import given, settings, strategies as st
-from oracles import segment_mesh_distance
+from oracles import segment_mesh_distance, units
 from places import DATA
 
 from puncture_twin import meshes
@@ -17,12 +17,6 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 LENGTH = 210.0
 RADII_MM = (0.5, 3.0, 5.5)
 HUBMAP = DATA / "hubmap_vh_male"
-
-
-def units(rng, count):
-    """Random directions."""
-    directions = rng.normal(size=(count, 3))
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 @pytest.fixture(scope="module")

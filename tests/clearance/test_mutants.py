@@ -1,6 +1,5 @@
 """The mutator itself, on a few faults: `make mutants` runs them all."""
 
-import ast
 import importlib
 import inspect
 import sys
@@ -21,43 +20,6 @@ from tools.mutation import mutants, mutated
 SOURCE = inspect.getsource(puncture_twin.planning.reach.standoff)
 FILE = str(puncture_twin.planning.reach.standoff.__file__)
 NEEDLE = Needle(200.0, 150.0, 1.2, None, 10.0, 30.0)
-
-CHANGES = (
-    ("x < 1", {"x <= 1", "x >= 1", "x < 2", "x < 0"}),
-    ("x + y", {"x - y"}),
-    ("x and y", {"x or y"}),
-    ("not x", {"x"}),
-    ("True", {"False"}),
-    ("2.0", {"4.0", "1.0"}),
-    ("min(x, y)", {"max(x, y)"}),
-    ("np.argmin(x)", {"np.argmax(x)"}),
-    ("x[0]", {"x[1]", "x[-1]"}),
-    ("'text'", set()),
-    ("x if y else z", {"x if not y else z"}),
-)
-
-
-@pytest.mark.parametrize(("before", "after"), CHANGES)
-def test_each_kind_of_fault(before, after):
-    """What may be changed in an expression is changed, one place at a time, and nothing else."""
-    made = {mutant.change.split(" -> ")[1] for mutant in mutants(f"v = {before}", "made.py")}
-    whole = {ast.unparse(ast.parse(text)) for text in after}
-    parts = {"2", "0", "1", "-1"}
-    assert {m for m in made if m not in parts} == {w for w in whole if w not in {"x < 2", "x < 0", "x[1]", "x[-1]"}}
-    assert len(list(mutants(f"v = {before}", "made.py"))) == len(after)
-
-
-def test_statements_are_left_out_and_returns_emptied():
-    """A raise, a call and a change in place; a return value; not a name's first value, nor a docstring."""
-    source = 'def f(x):\n    """Text."""\n    y = x\n    if y:\n        raise E\n    y[a] = y\n    g(y)\n    return y\n'
-    made = [mutant.change for mutant in mutants(source, "made.py")]
-    assert made == [
-        "if y: raise E -> if not y: raise E",
-        "raise E -> pass",
-        "y[a] = y -> pass",
-        "g(y) -> pass",
-        "return y -> return None",
-    ]
 
 
 def test_a_fault_acts_where_the_function_was_imported_and_is_gone_afterwards():

@@ -111,15 +111,6 @@ def test_many_points_are_inside_where_each_of_them_is(rng, ball, winding):
     assert inside_each(mesh, points[:0]).shape == (0,)
 
 
-def test_beside_a_face_of_a_box_is_outside_however_near(box):
-    """Beyond one side alone, within the others."""
-    mesh = box([40.0, 20.0, 10.0])
-    beyond = np.array([[20.5, 0, 0], [0, -10.5, 0], [0, 0, 5.5], [-20.5, 9, 4], [0, 10.5, 0], [0, 0, -5.5]])
-    assert not inside_each(mesh, beyond).any()
-    assert inside_each(mesh, 0.9 * beyond).all()
-    assert all(side_of(mesh, point) is Side.OUTSIDE for point in beyond)
-
-
 def test_an_open_surface_has_no_inside_for_many_points_either(ball):
     """It is refused where one point's side is not known."""
     mesh = ball(50, subdivisions=1)

@@ -44,19 +44,6 @@ def test_skew_is_the_cross_product():
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_exponential_is_a_rotation_about_its_vector(angle):
-    """It keeps its axis, its inverse is the exponential of the opposite, and Rodrigues' formula gives the same."""
-    for w in rotation_vectors(angle):
-        R = rotations.exp_rotation(w)
-        assert_rotation(R)
-        np.testing.assert_allclose(R @ w, w, atol=1e-14)
-        np.testing.assert_allclose(R @ rotations.exp_rotation(-w), np.eye(3), atol=1e-14)
-        W = rotations.skew(w)
-        sine, versine = (np.sin(angle) / angle, 2 * (np.sin(angle / 2) / angle) ** 2) if angle else (1.0, 0.5)
-        np.testing.assert_allclose(R, np.eye(3) + sine * W + versine * W @ W, atol=1e-14)
-
-
-@pytest.mark.parametrize("angle", ANGLES)
 def test_logarithm_undoes_the_exponential(angle):
     """To rounding, near the identity and near a half turn."""
     w = rotation_vectors(angle)

@@ -23,7 +23,6 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 
 HEAVY = ("numba", "pybullet", "matplotlib", "trimesh", "scipy", "ompl", "fcl", "pyarrow", "SimpleITK", "plotly")
@@ -33,6 +32,12 @@ HEAVY = ("numba", "pybullet", "matplotlib", "trimesh", "scipy", "ompl", "fcl", "
 def context():
     """The carton, organs alone."""
     return pt.prepare(folder() / "carton" / "case_m.toml", arm=False)
+
+
+@pytest.fixture(scope="module")
+def candidates(context):
+    """All of its directions."""
+    return pt.search(context)
 
 
 def test_every_name_is_there_with_a_docstring():
@@ -49,24 +54,9 @@ def test_importing_it_loads_nothing_heavy_and_prints_nothing():
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
 
 
-def test_search_gives_what_the_context_gives(context):
-    """No second way to an answer."""
-    ours, theirs = pt.search(context), prepare(folder() / "carton" / "case_m.toml", arm=False).search()
-    assert np.array_equal(ours.verdict.reason, theirs.verdict.reason)
-    assert np.array_equal(ours.ranking.cost, theirs.ranking.cost, equal_nan=True)
-
-
-def test_check_takes_degrees(context):
-    """And gives the verdict of the same row of the search."""
-    candidates = pt.search(context)
-    for row in (0, len(candidates) // 2):
-        explained = pt.check(context, np.degrees(candidates.theta[row]), np.degrees(candidates.beta[row]))
-        assert explained.safe == candidates.safe[row]
-
-
-def test_what_it_returns_prints_as_one_line(context):
+def test_what_it_returns_prints_as_one_line(context, candidates):
     """A prompt is not flooded with arrays: the name of the type, and what is in it."""
-    candidates, marker = pt.search(context), folder() / "carton" / "markers_ct.csv"
+    marker = folder() / "carton" / "markers_ct.csv"
     rejected = int(np.flatnonzero(~candidates.safe)[0])
     checked = pt.check(context, *np.degrees((candidates.theta[rejected], candidates.beta[rejected])))
     values = {
@@ -91,9 +81,8 @@ def test_a_value_that_is_half_made_still_prints():
     assert "TriangleMesh object at" in repr(half)
 
 
-def test_rerank_orders_the_safe_ones_alone(context):
+def test_rerank_orders_the_safe_ones_alone(candidates):
     """Rejected candidates keep rank 0 whatever their cost, and no verdict changes."""
-    candidates = pt.search(context)
     mine = pt.rerank(candidates, -candidates.path.length)
     assert np.array_equal(mine.safe, candidates.safe)
     assert (mine.ranking.rank[~mine.safe] == 0).all()
@@ -102,9 +91,8 @@ def test_rerank_orders_the_safe_ones_alone(context):
 
 
 @pytest.mark.parametrize("cost", [np.zeros(3), "nan", "complex"], ids=["another shape", "not a number", "complex"])
-def test_rerank_refuses_a_cost_that_orders_nothing(context, cost):
+def test_rerank_refuses_a_cost_that_orders_nothing(candidates, cost):
     """One line that says what is allowed."""
-    candidates = pt.search(context)
     if isinstance(cost, str):
         cost = np.full(len(candidates), np.nan if cost == "nan" else 1.0 + 2.0j)
     with refused("wrong_type" if cost.dtype.kind == "c" else "wrong_shape"):
@@ -250,9 +238,8 @@ def test_a_case_whose_files_have_changed_is_not_made_into_another(tmp_path):
         case.replace(needle={"diameter_mm": 1.4})
 
 
-def test_many_directions_are_what_the_search_says_of_each(context):
+def test_many_directions_are_what_the_search_says_of_each(context, candidates):
     """Verdict, path and clearance of every row; only rank, cone and window belong to the whole grid."""
-    candidates = pt.search(context)
     rows = np.random.default_rng(3).permutation(len(candidates))[:200]
     found = pt.check_many(context, candidates.theta_deg[rows], candidates.beta_deg[rows])
     assert np.array_equal(found.verdict.reason, candidates.verdict.reason[rows])
@@ -287,9 +274,14 @@ def arm_context(tmp_path_factory):
     return pt.prepare(coarse_carton(tmp_path_factory.mktemp("arm") / "carton"))
 
 
-def test_a_direction_is_the_same_however_it_is_chosen(context):
+@pytest.fixture(scope="module")
+def reached(arm_context):
+    """Its directions, and which of them the arm reaches."""
+    return pt.search(arm_context)
+
+
+def test_a_direction_is_the_same_however_it_is_chosen(context, candidates):
     """By angles, as a candidate, as a window's best, by its entry, or as the best."""
-    candidates = pt.search(context)
     best = candidates.best
     angles = {"theta_deg": best.theta_deg, "beta_deg": best.beta_deg}
     entry = candidates.path.entry_ct[best.row]
@@ -300,42 +292,40 @@ def test_a_direction_is_the_same_however_it_is_chosen(context):
     assert pt.check(context, candidate=other).candidates.at(0) == candidates.at(other.row)
 
 
-def test_a_plan_is_of_what_was_chosen(arm_context):
+def test_a_plan_is_of_what_was_chosen(arm_context, reached):
     """Without a choice of the best that the arm can come to; a rejected direction has none."""
-    candidates = pt.search(arm_context)
-    other = candidates.pick(int(candidates.ranked[1]))
+    other = reached.pick(int(reached.ranked[1]))
     mine = pt.plan(arm_context, candidate=other)
     assert np.allclose((mine.theta_deg, mine.beta_deg), (other.theta_deg, other.beta_deg))
-    best = pt.plan(arm_context, candidates)
-    assert np.allclose((best.theta_deg, best.beta_deg), (candidates.best.theta_deg, candidates.best.beta_deg))
-    rejected = candidates.pick(int(np.flatnonzero(~candidates.safe)[0]))
+    best = pt.plan(arm_context, reached)
+    assert np.allclose((best.theta_deg, best.beta_deg), (reached.best.theta_deg, reached.best.beta_deg))
+    rejected = reached.pick(int(np.flatnonzero(~reached.safe)[0]))
     with refused("direction_rejected", by=pt.NoAnswerError):
         pt.plan(arm_context, candidate=rejected)
 
 
-def test_two_choices_or_an_arm_that_is_switched_off_are_refused(arm_context, context):
+def test_two_choices_or_an_arm_that_is_switched_off_are_refused(arm_context, reached, context, candidates):
     """The one because nobody knows which is meant; the other says what to do."""
-    best = pt.search(context).best
+    best = candidates.best
     for two in ({"window": 1, "candidate": best}, {"theta_deg": 1.0, "beta_deg": 2.0, "window": 1}):
         with refused("conflicting_options"):
             pt.check(context, **two)
     with refused("one_angle"):
         pt.plan(arm_context, theta_deg=10.0)
     with refused("out_of_range"):
-        pt.plan(arm_context, window=10_000)
+        pt.plan(arm_context, reached, window=10_000)
     with refused("no_base"):
         pt.plan(context, candidate=best)
     with refused("no_base"):
         pt.touch(context, candidate=best)
     with refused("out_of_range"):
-        pt.search(context).pick(-1)
+        candidates.pick(-1)
 
 
-def test_a_context_goes_to_other_processes_and_is_used_by_threads(arm_context):
+def test_a_context_goes_to_other_processes_and_is_used_by_threads(arm_context, reached):
     """Each gives what this process gives, the arm's answer too."""
-    candidates = pt.search(arm_context)
-    parts = np.array_split(np.random.default_rng(1).permutation(len(candidates))[:16], 4)
-    angles = [(candidates.theta_deg[rows], candidates.beta_deg[rows]) for rows in parts]
+    parts = np.array_split(np.random.default_rng(1).permutation(len(reached))[:16], 4)
+    angles = [(reached.theta_deg[rows], reached.beta_deg[rows]) for rows in parts]
     expected = [pt.check_many(arm_context, *one) for one in angles]
     with ThreadPoolExecutor(4) as pool:
         threads = list(pool.map(lambda one: pt.check_many(arm_context, *one), angles))
@@ -345,9 +335,8 @@ def test_a_context_goes_to_other_processes_and_is_used_by_threads(arm_context):
     assert same_candidates(sent, expected[1])
 
 
-def test_the_table_is_the_commands_table(context, tmp_path):
+def test_the_table_is_the_commands_table(candidates, tmp_path):
     """As a DataFrame, and as a file: what `run-twin search` writes, its provenance too."""
-    candidates = pt.search(context)
     assert main(["search", str(folder() / "carton" / "case_m.toml"), "--no-arm", "--no-pictures",
                  "--out", str(tmp_path / "command")]) == 0  # fmt: skip
     ours, theirs = candidates.write(tmp_path / "api"), tmp_path / "command" / "candidates.parquet"
@@ -361,18 +350,17 @@ def test_the_table_is_the_commands_table(context, tmp_path):
             candidates.write(nowhere)
 
 
-def test_windows_and_the_best_are_the_searchs(context):
+def test_windows_and_the_best_are_the_searchs(candidates):
     """By number; what is best is the first of the ranks, and lies in the first window."""
-    candidates = pt.search(context)
     assert [window.number for window in candidates.windows] == list(range(1, len(candidates.windows) + 1))
     assert candidates.windows[0].best == candidates.best.row == candidates.ranked[0]
     assert sum(window.directions for window in candidates.windows) == candidates.safe.sum()
     assert pt.rerank(candidates, -candidates.ranking.cost).best.row == candidates.ranked[-1]
 
 
-def test_the_map_is_a_picture(context, tmp_path):
+def test_the_map_is_a_picture(candidates, tmp_path):
     """For a notebook, and as a file."""
-    shown = pt.search(context).plot_map()
+    shown = candidates.plot_map()
     assert "<img" in shown._repr_html_()
     with Image.open(shown.write(tmp_path / "map.png")) as picture:
         assert picture.width == picture.height > 300
@@ -429,7 +417,7 @@ def test_an_engine_that_finds_more_clearance_than_there_is_ends_with_an_error(co
         pt.check(pickle.loads(pickle.dumps(theirs)), 30.0, 100.0)
 
 
-def test_a_path_of_another_case_is_not_taken_for_one_of_this(context, tmp_path):
+def test_a_path_of_another_case_is_not_taken_for_one_of_this(context, candidates, tmp_path):
     """The angles of a candidate, or the clearances of a checked direction, are another path about another target."""
     case = context.case
     for change in ({"target_ct": case.target_ct + (0.4, 0.0, 0.0)}, {"needle": {"diameter_mm": 1.4}}):
@@ -446,29 +434,28 @@ def test_a_path_of_another_case_is_not_taken_for_one_of_this(context, tmp_path):
             with refused("input_changed"):
                 ask()
         back = pt.prepare(other.case.replace(target_ct=case.target_ct, needle={"diameter_mm": case.needle.diameter_mm}))
-        assert same_candidates(pt.search(pt.prepare(back.case, arm=False)), pt.search(context))
+        assert same_candidates(pt.search(pt.prepare(back.case, arm=False)), candidates)
     assert not list(tmp_path.iterdir())
-    best = pt.search(context).best
+    best = candidates.best
     for wrong, code in (((best.candidates, 10**9), "out_of_range"), (("x", 0), "wrong_type")):
         with refused(code):
             pt.check(context, candidate=type(best)(*wrong))
 
 
-def test_what_is_planned_is_checked_anew(arm_context):
+def test_what_is_planned_is_checked_anew(arm_context, reached):
     """Candidates whose verdicts were changed are an order of preference, and make no rejected direction safe."""
-    found = pt.search(arm_context)
-    rejected = np.flatnonzero(found.verdict.reason == "too_close")[:1]
-    reason, rank = found.verdict.reason.copy(), np.zeros(len(found), np.int32)
+    rejected = np.flatnonzero(reached.verdict.reason == "too_close")[:1]
+    reason, rank = reached.verdict.reason.copy(), np.zeros(len(reached), np.int32)
     reason[rejected], rank[rejected] = "", 1
-    verdict, ranking = replace(found.verdict, reason=reason), replace(found.ranking, rank=rank)
+    verdict, ranking = replace(reached.verdict, reason=reason), replace(reached.ranking, rank=rank)
     with pytest.raises(NoAnswerError):
-        pt.plan(arm_context, replace(found, verdict=verdict, ranking=ranking))
+        pt.plan(arm_context, replace(reached, verdict=verdict, ranking=ranking))
 
 
-def test_a_plan_of_another_case_is_neither_rehearsed_nor_shown(arm_context, tmp_path):
+def test_a_plan_of_another_case_is_neither_rehearsed_nor_shown(arm_context, reached, tmp_path):
     """And one of another seed is: it is what `plan` was asked for."""
     case = arm_context.case
-    plan = pt.plan(arm_context, seed=3)
+    plan = pt.plan(arm_context, reached, seed=3)
     other = pt.prepare(case.replace(target_ct=case.target_ct + (0.4, 0.0, 0.0)))
     for ask in (
         lambda: pt.rehearse(other, plan),

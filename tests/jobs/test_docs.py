@@ -15,8 +15,6 @@ from puncture_twin.planning.export.exporter import GROUP
 from puncture_twin.run_twin import app
 
 PAGES = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
-GENERATED = {"rooms/"}
-"""What exists in the built site alone."""
 
 LINK = re.compile(r"\]\(([^)\s]+)\)")
 FILE = re.compile(r"`((?:planning|twin|tests|benchmarks|docs|examples|meshes|puncture_twin)/[\w./-]*\w)`")

@@ -27,14 +27,9 @@ def loaded(*arguments):
 @pytest.mark.parametrize(
     ("arguments", "code"),
     [
-        (["--help"], 0),
-        (["--version"], 0),
         (["rehearse", "--help"], 0),
-        (["search", "case.toml", "--setp", "1"], 2),
         (["search", "case.toml", "--certify-size", "0"], 2),
-        (["register", "a.csv", "--space", "XYZ"], 2),
         (["demo", "--out", "run_twin.py"], 2),
-        (["movie"], 2),
     ],
     ids=lambda value: "_".join(value) if isinstance(value, list) else None,
 )

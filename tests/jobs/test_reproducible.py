@@ -10,6 +10,8 @@ from places import ROOT
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.output.manifest import TIMINGS_NAME
+from puncture_twin.run_twin import main
+from puncture_twin.twin.jobs.exit_codes import OK
 
 COMMANDS = {"search": ["--no-arm", "--certify", "--certify-size", "4"], "rehearse": []}
 """To rehearse a case is to plan it first, into the same folder."""
@@ -23,40 +25,36 @@ EXPERIMENT = {
 }
 """Commands of the experiment, and what each writes at least."""
 
-ENVIRONMENTS = (
-    {"PYTHONHASHSEED": "1", "TZ": "UTC", "LC_ALL": "C", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
-    {"PYTHONHASHSEED": "77", "TZ": "Asia/Tokyo", "LC_ALL": "de_DE.UTF-8", "NUMBA_NUM_THREADS": "2"},
-)
+OTHER = {
+    "PYTHONHASHSEED": "77",
+    "TZ": "Asia/Tokyo",
+    "LC_ALL": "de_DE.UTF-8",
+    "NUMBA_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "PYTHONPATH": str(ROOT),
+}
+"""Beside this process' own: another clock, language, order of sets, and one thread."""
 
 
-CORES = sorted(os.sched_getaffinity(0))
-
-
-def start(words, case, out, environment, working_folder):
-    """A command in a process of its own, in one of the environments; the one with one thread has one core."""
-    cores = CORES[: int(environment["NUMBA_NUM_THREADS"])]
-    program = ROOT / "run_twin.py"
-    paths = [str(program.parent), os.environ.get("PYTHONPATH", "")]
-    return subprocess.Popen(
-        [sys.executable, str(program), words[0], str(case), "--out", str(out), *words[1:]],
-        cwd=working_folder,
-        env={**os.environ, **environment, "PYTHONPATH": os.pathsep.join(paths)},
-        preexec_fn=lambda: os.sched_setaffinity(0, cores),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+def elsewhere(words, case, out):
+    """A command in a process of its own, in the other environment and the case's folder, on one core."""
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "run_twin.py"), words[0], case.name, "--out", str(out), *words[1:]],
+        cwd=case.parent,
+        env={**os.environ, **OTHER},
+        preexec_fn=lambda: os.sched_setaffinity(0, {min(os.sched_getaffinity(0))}),
+        capture_output=True,
+        timeout=600,
+        check=False,
     )
+    assert done.returncode == 0, done.stderr
 
 
 def twice(words, case, tmp_path):
-    """The names of the files that a command writes in both environments, and those that differ."""
+    """The names of the files that a command writes here and elsewhere, and those that differ."""
     first, second = tmp_path / "first", tmp_path / "second"
-    runs = [
-        start(words, case.name, first, ENVIRONMENTS[0], case.parent),
-        start(words, case, second, ENVIRONMENTS[1], tmp_path),
-    ]
-    for run in runs:
-        said = run.communicate(timeout=600)
-        assert run.returncode == 0, said
+    elsewhere(words, case, first)
+    assert main([words[0], str(case), "--out", str(second), *words[1:]]) == OK
     names, others = (
         {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()} for out in (first, second)
     )

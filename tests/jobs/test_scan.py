@@ -86,18 +86,8 @@ def test_a_needle_is_read_in_a_control_ct(tmp_path, capsys):
     tip = target + [0.5, 1.0, 2.0]
     end = {"tip_ct_mm": tip.tolist(), "direction_ct": forward.tolist(), "target_ct_mm": target.tolist()}
     (tmp_path / "rehearsal.json").write_text(json.dumps({"needle_end": end}))
-    command = [
-        "scan",
-        str(of_wood(tmp_path)),
-        "--out",
-        str(tmp_path / "ct"),
-        "--spacing",
-        "2",
-        "--pixel",
-        "1",
-        "--json",
-    ]
-    assert main([*command, "--rehearsal", str(tmp_path / "rehearsal.json")]) == 0
+    words = ["--spacing", "2", "--pixel", "1", "--rehearsal", str(tmp_path / "rehearsal.json"), "--json"]
+    assert main(["scan", str(of_wood(tmp_path)), "--out", str(tmp_path / "ct"), *words]) == 0
     needle = json.loads(capsys.readouterr().out)["needle"]
     assert needle["true"]["tip_to_target_mm"] == pytest.approx(np.linalg.norm(tip - target))
     assert needle["true"]["depth_mm"] == pytest.approx((tip - target) @ forward)

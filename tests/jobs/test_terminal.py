@@ -28,18 +28,19 @@ def test_without_a_command_the_help_is_printed(capsys):
 
 
 @pytest.mark.parametrize("command", [[], ["search"], ["export"]])
-def test_a_narrow_terminal_gets_the_whole_help(command):
+def test_a_narrow_terminal_gets_the_whole_help(command, monkeypatch, capsys):
     """Every option is there, in 40 columns too; without colours where nobody wants them."""
-    narrow = {**os.environ, "COLUMNS": "40", "NO_COLOR": "1"}
-    arguments = [sys.executable, "-c", PROGRAM, *command, "--help"]
-    done = subprocess.run(arguments, env=narrow, capture_output=True, check=True, text=True, cwd=ROOT)
-    wide = subprocess.run(
-        arguments, env={**narrow, "COLUMNS": "200"}, capture_output=True, check=True, text=True, cwd=ROOT
-    )
-    options = set(re.findall(r"--[a-z][a-z-]+", wide.stdout))
-    assert {"--help"} <= options
-    assert options <= set(re.findall(r"--[a-z][a-z-]+", done.stdout))
-    assert "\x1b" not in done.stdout and "…" not in done.stdout
+    monkeypatch.setenv("NO_COLOR", "1")
+    shown = []
+    for columns in ("200", "40"):
+        monkeypatch.setenv("COLUMNS", columns)
+        assert main([*command, "--help"]) == 0
+        shown.append(capsys.readouterr().out)
+    wide, narrow = shown
+    options = set(re.findall(r"--[a-z][a-z-]+", wide))
+    assert {"--help"} <= options <= set(re.findall(r"--[a-z][a-z-]+", narrow))
+    assert len(narrow.splitlines()) > len(wide.splitlines())
+    assert "\x1b" not in narrow and "…" not in narrow
 
 
 def run_unread(code, *arguments):
@@ -58,7 +59,7 @@ def run_unread(code, *arguments):
 PROGRAM = "from puncture_twin.run_twin import program\nprogram()"
 
 
-@pytest.mark.parametrize("arguments", [[], ["search", "--help"], ["--version"], ONE, [*ONE, "--json"]])
+@pytest.mark.parametrize("arguments", [["search", "--help"], [*ONE, "--json"]])
 def test_an_output_that_nobody_reads_ends_as_the_shell_has_it(arguments):
     """141, never 1 (which is an answer), and no traceback."""
     code, said = run_unread(PROGRAM, *arguments)
@@ -92,11 +93,8 @@ def test_a_disk_that_takes_no_more_is_told_in_one_line(name, capsys):
 @pytest.mark.parametrize(
     ("words", "completed"),
     [
-        (["se"], {"search", "selfcal", "servo"}),
         (["batch", "co"], {"compare"}),
         (["check", "--th"], {"--theta"}),
-        (["export", "--c"], {"--case"}),
-        (["--i"], {"--install-completion"}),
     ],
 )
 def test_a_shell_completes_commands_and_options(words, completed):
@@ -110,7 +108,7 @@ def test_a_shell_completes_commands_and_options(words, completed):
     assert (done.returncode, done.stderr, set(done.stdout.split())) == (0, "", completed)
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize("shell", ["bash", "fish"])
 def test_each_shell_is_told_how_to_ask(shell):
     """The script that --install-completion installs names the variable by which it asks."""
     done = run_as_installed({"_RUN_TWIN_COMPLETE": f"source_{shell}"})
@@ -158,15 +156,12 @@ def test_a_search_writes_there_without_out(tmp_path, monkeypatch, capsys):
     capsys.readouterr()
 
 
-COMPARED = ["compare", str(CARTON), "--theta", "0", "--beta", "0", "--theta", "10", "--beta", "0", "--no-arm"]
-
-
-@pytest.mark.parametrize("command", [ONE, COMPARED], ids=["check", "compare"])
-def test_neither_width_nor_colour_changes_what_is_printed(command):
+def test_neither_width_nor_colour_changes_what_is_printed():
     """A narrow terminal wraps; no line and no table is broken by us, and nothing is coloured."""
+    compared = ["compare", str(CARTON), "--theta", "0", "--beta", "0", "--theta", "10", "--beta", "0", "--no-arm"]
     shown = [
         subprocess.run(
-            [sys.executable, "-c", PROGRAM, *command],
+            [sys.executable, "-c", PROGRAM, *compared],
             env={**os.environ, **extra},
             capture_output=True,
             check=True,
@@ -180,8 +175,7 @@ def test_neither_width_nor_colour_changes_what_is_printed(command):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/dev/full is of Linux")
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ONE, [*ONE, "--json"]])
+@pytest.mark.parametrize(("arguments", "unbuffered"), [(["--version"], ""), (["--help"], "1"), (ONE, "")])
 def test_a_full_disk_under_stdout_is_told_in_one_line(arguments, unbuffered):
     """Exit code 3, the reason, no traceback."""
     with Path("/dev/full").open("w") as full:

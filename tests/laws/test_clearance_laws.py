@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from oracles import PlainEngine, ray_crossings, segment_mesh_distance
+from oracles import PlainEngine, ray_crossings, segment_mesh_distance, units
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.anatomy.structure import Role, Structure
@@ -30,12 +30,6 @@ def judged(engine):
     if engine is PlainEngine:
         pytest.skip("measures distances alone")
     return engine
-
-
-def units(rng, count):
-    """Random directions."""
-    directions = rng.normal(size=(count, 3))
-    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
 def soup(rng, count, spread=50.0, size=15.0):

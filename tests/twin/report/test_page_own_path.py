@@ -4,6 +4,7 @@ The image's slices are tilted as by a gantry and run from the left, so the block
 """
 
 import re
+from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -51,18 +52,23 @@ def browser():
         yield browser
 
 
-@pytest.fixture(scope="module", params=["CT", "no CT"])
-def page(request, browser, patient, tmp_path_factory):
-    """The page, with its CT and without."""
+@contextmanager
+def page_of(browser, patient, path, has_ct):
+    """The page, with its CT or without."""
     case, anatomy, found = patient
-    path = tmp_path_factory.mktemp("page") / "report.html"
     shown = world.make_anatomy()
-    shown.scan = anatomy.scan if request.param == "CT" else None
+    shown.scan = anatomy.scan if has_ct else None
     write_page(Shown(case, shown, found, world.make_plan(case, found), subject=Subject(case, shown, found.best)), path)
     with opened(browser, path.as_uri(), 1300) as page:
         page.wait_for_function("document.body.dataset.ready === 'true'")
         drawn(page)
-        page.has_ct = request.param == "CT"
+        yield page
+
+
+@pytest.fixture(scope="module")
+def page(browser, patient, tmp_path_factory):
+    """With its CT."""
+    with page_of(browser, patient, tmp_path_factory.mktemp("page") / "report.html", True) as page:
         yield page
 
 
@@ -82,17 +88,20 @@ def in_box(points, case, found):
     return ((points >= low) & (points <= high)).all(axis=1)
 
 
-def test_what_the_page_does_not_hold_is_hatched(page, patient):
+@pytest.mark.parametrize("has_ct", [True, False])
+def test_what_the_page_does_not_hold_is_hatched(browser, patient, has_ct, tmp_path):
     """Of a rejected direction each pixel beyond the box is hatched, with or without a CT; those in it are the CT's."""
     case, anatomy, found = patient
-    row = choose(page, found, 60, 180)
+    with page_of(browser, patient, tmp_path / "report.html", has_ct) as page:
+        row = choose(page, found, 60, 180)
+        drawings = page.evaluate(SHOWN)
     planes = needle_planes(case.target_ct, found.outward_ct[row], found.path.length[row])
-    for (base, _), plane in zip(page.evaluate(SHOWN), planes, strict=True):
+    for (base, _), plane in zip(drawings, planes, strict=True):
         points, shown = plane.points_ct(PIXELS), picture(base).reshape(-1, 3)
         held = in_box(points, case, found)
         hatched = (shown == GROUND).all(axis=1) | (shown == HATCH).all(axis=1)
         assert (hatched != ~held)[~held].mean() < 1e-2 if (~held).any() else True, plane.name
-        if page.has_ct:
+        if has_ct:
             grey = TONES["abdomen"].grey(anatomy.scan.hu_at(points)).astype(int)
             assert (np.abs(shown[held, 0] - grey[held]) > GREYS).mean() < 2e-3, plane.name
         else:
@@ -125,11 +134,10 @@ def test_a_resting_pointer_reads_what_is_drawn_now(page, patient):
     page.wait_for_function("document.querySelector('#slices-a output').textContent !== '0 mm'")
     after = page.locator("#cursor").inner_text()
     assert re.search(place, after)[1] != before
-    if page.has_ct:
-        right, front, head = (float(mm) for mm in re.search(place, after.replace("−", "-"))[1].split(","))
-        hu, doubt = map(float, re.match(r"(\S+) ± (\d+) HU", after.replace("−", "-")).groups())
-        near = np.array([-right, -front, head]) + np.stack(np.meshgrid(*[[-0.5, 0, 0.5]] * 3), -1).reshape(-1, 3)
-        assert np.abs(anatomy.scan.hu_at(near) - hu).min() <= doubt + 0.5
+    right, front, head = (float(mm) for mm in re.search(place, after.replace("−", "-"))[1].split(","))
+    hu, doubt = map(float, re.match(r"(\S+) ± (\d+) HU", after.replace("−", "-")).groups())
+    near = np.array([-right, -front, head]) + np.stack(np.meshgrid(*[[-0.5, 0, 0.5]] * 3), -1).reshape(-1, 3)
+    assert np.abs(anatomy.scan.hu_at(near) - hu).min() <= doubt + 0.5
     page.locator("#slices-centre").click()
 
 

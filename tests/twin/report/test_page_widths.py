@@ -67,6 +67,14 @@ def page(request, browser, address):
         yield page
 
 
+@pytest.fixture(scope="module")
+def desk(browser, address):
+    """The page on a desk alone: what it cuts and reads does not hang on the window."""
+    with opened(browser, address, WIDTHS[-1]) as page:
+        drawn(page)
+        yield page
+
+
 def same_slices(page, patient, row, off_mm=0.0):
     """Every slice of a row as ``slices.png`` has it: the CT to `GREYS`, lines where its are, outlines to so much."""
     case, anatomy, candidates = patient
@@ -171,37 +179,37 @@ def test_a_click_chooses_and_everything_follows(page):
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 
-def test_dates_film_and_fractions_are_there(page):
+def test_dates_film_and_fractions_are_there(desk):
     """When it was made, that the scan's day is not stated, a link to the film, parts of the solid angle."""
-    said = page.locator("header").inner_text()
+    said = desk.locator("header").inner_text()
     assert "Made on 20" in said and "scan date not stated" in said
-    assert page.locator("a[href='rehearsal.mp4']").count() == 1
-    assert "of solid angle" in page.locator(".mapside").inner_text()
+    assert desk.locator("a[href='rehearsal.mp4']").count() == 1
+    assert "of solid angle" in desk.locator(".mapside").inner_text()
 
 
-def test_slices_of_what_is_chosen_are_those_of_the_program(page, patient):
+def test_slices_of_what_is_chosen_are_those_of_the_program(desk, patient):
     """By the map, a slider and a row of the table, safe or not: pixels of CT, needle, margin, region and outlines."""
     candidates = patient[2]
-    box = page.locator("#map-image").bounding_box()
-    page.locator("#map-image").click(position={"x": 0.3 * box["width"], "y": 0.62 * box["height"]})
+    box = desk.locator("#map-image").bounding_box()
+    desk.locator("#map-image").click(position={"x": 0.3 * box["width"], "y": 0.62 * box["height"]})
     clicked = (
-        page.evaluate("+document.getElementById('command').textContent.match(/theta (\\S+)/)[1]"),
-        page.evaluate("+document.getElementById('command').textContent.match(/beta (\\S+)/)[1]"),
+        desk.evaluate("+document.getElementById('command').textContent.match(/theta (\\S+)/)[1]"),
+        desk.evaluate("+document.getElementById('command').textContent.match(/beta (\\S+)/)[1]"),
     )
     row = row_of(candidates, *clicked)
-    drawn(page, row)
-    same_slices(page, patient, row)
-    page.locator("#theta").focus()
+    drawn(desk, row)
+    same_slices(desk, patient, row)
+    desk.locator("#theta").focus()
     for _ in range(6):
-        page.keyboard.press("ArrowLeft")
+        desk.keyboard.press("ArrowLeft")
     slid = row_of(candidates, clicked[0] - 30, clicked[1])
-    drawn(page, slid)
-    same_slices(page, patient, slid)
-    page.locator("button.pick").first.click()
-    best = int(page.locator("button.pick").first.get_attribute("data-row"))
-    drawn(page, best)
-    same_slices(page, patient, best)
-    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    drawn(desk, slid)
+    same_slices(desk, patient, slid)
+    desk.locator("button.pick").first.click()
+    best = int(desk.locator("button.pick").first.get_attribute("data-row"))
+    drawn(desk, best)
+    same_slices(desk, patient, best)
+    assert desk.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 
 def test_lighter_surfaces_are_drawn_where_the_program_draws_the_checked_ones(browser, patient, tmp_path):
@@ -233,16 +241,16 @@ def plane_of(patient, row, number):
     return needle_planes(case.target_ct, candidates.outward_ct[row], candidates.path.length[row])[number]
 
 
-def test_the_cursor_reads_units_and_structure(page, patient):
+def test_the_cursor_reads_units_and_structure(desk, patient):
     """At pixels of an axial slice: the CT's value within what is stated, and the structure that holds the point."""
     case, anatomy, _ = patient
-    page.locator("button.pick").first.click()
-    row = int(page.locator("button.pick").first.get_attribute("data-row"))
-    drawn(page, row)
+    desk.locator("button.pick").first.click()
+    row = int(desk.locator("button.pick").first.get_attribute("data-row"))
+    drawn(desk, row)
     points = plane_of(patient, row, 0).points_ct(PIXELS).reshape(PIXELS, PIXELS, 3)
     for column, line in ((240, 250), (200, 380), (60, 380), (20, 30)):
-        at_pixel(page, 0, column, line)
-        said, point = page.locator("#cursor").inner_text(), points[line, column]
+        at_pixel(desk, 0, column, line)
+        said, point = desk.locator("#cursor").inner_text(), points[line, column]
         hu, doubt = map(float, re.match(r"(\S+) ± (\d+) HU", said.replace("−", "-")).groups())
         wanted = anatomy.scan.hu_at(point[None])[0]
         assert abs(hu - wanted) <= doubt + 0.5, said
@@ -253,22 +261,22 @@ def test_the_cursor_reads_units_and_structure(page, patient):
         assert place in said
 
 
-def test_a_scrolled_slice_is_that_of_the_place(page, patient):
+def test_a_scrolled_slice_is_that_of_the_place(desk, patient):
     """The wheel moves one plane along its normal; its CT is the program's there, and the others stay."""
     _, anatomy, _ = patient
-    page.locator("button.pick").first.click()
-    row = int(page.locator("button.pick").first.get_attribute("data-row"))
-    page.locator("#slices-centre").click()
-    drawn(page, row)
-    slider = page.locator("#slices-a input[type=range]").first
+    desk.locator("button.pick").first.click()
+    row = int(desk.locator("button.pick").first.get_attribute("data-row"))
+    desk.locator("#slices-centre").click()
+    drawn(desk, row)
+    slider = desk.locator("#slices-a input[type=range]").first
     slider.fill("20")
-    page.wait_for_function("document.querySelector('#slices-a output').textContent === '20 mm'")
+    desk.wait_for_function("document.querySelector('#slices-a output').textContent === '20 mm'")
     plane = plane_of(patient, row, 0)
     moved = replace(plane, at_ct=plane.at_ct + 20.0 * plane.normal)
     grey = TONES["abdomen"].grey(anatomy.scan.hu_at(moved.points_ct(PIXELS)).reshape(PIXELS, PIXELS)).astype(int)
-    assert (np.abs(picture(page.evaluate(SHOWN)[0][0])[..., 0] - grey) > GREYS).mean() < 1e-3
-    assert "20 mm from the target, toward the feet" in page.locator("#slices-a figcaption").first.inner_text()
-    page.locator("#slices-centre").click()
+    assert (np.abs(picture(desk.evaluate(SHOWN)[0][0])[..., 0] - grey) > GREYS).mean() < 1e-3
+    assert "20 mm from the target, toward the feet" in desk.locator("#slices-a figcaption").first.inner_text()
+    desk.locator("#slices-centre").click()
 
 
 def test_a_path_of_ones_own_has_no_verdict_of_its_own(page, patient):
