@@ -37,8 +37,7 @@ from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
 from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
-from puncture_twin.twin.report.raster.compositing import RasterShot, Shells, compose
-from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface, opaque_shot, shells_of
+from puncture_twin.twin.report.raster.render import MAX_SHELLS, Layer, MovingPicture, Surface, picture
 from puncture_twin.twin.report.scene import film, film_text, scene_picture
 from puncture_twin.twin.report.scene.film import draw_film
 from puncture_twin.twin.report.scene.film_text import model_note
@@ -252,8 +251,7 @@ def sphere_view(width=200, height=160):
     camera = ViewCamera(
         centre - 400 * np.eye(3)[1], centre + np.array([10.0, 0.0, 5.0]), np.array([0, 0, 1.0]), 0.5, width, height
     )
-    rows, columns = (g.ravel() for g in np.mgrid[0:height, 0:width])
-    rays = camera.directions(rows, columns).astype(float)
+    rays = world.rays(camera)
     towards = rays @ (centre - camera.eye)
     beside = np.dot(centre - camera.eye, centre - camera.eye) - towards**2
     with np.errstate(invalid="ignore"):
@@ -264,35 +262,23 @@ def sphere_view(width=200, height=160):
 def test_depth_and_outline_of_a_ball(ball):
     """What is drawn agrees with the analytic sphere within the mesh's sagitta."""
     centre, camera, near, _ = sphere_view()
-    shot = opaque_shot(Layer([Surface(ball(60.0, centre, 5), (200, 40, 40))]), camera)
-    struck = np.isfinite(shot.depth)
+    (depth,), _ = world.samples(Layer([Surface(ball(60.0, centre, 5), (200, 40, 40))]), camera)
+    struck = np.isfinite(depth)
     assert struck.sum() == pytest.approx(np.isfinite(near).sum(), rel=0.005)
     both = struck & np.isfinite(near)
-    assert np.abs(shot.depth - near)[both].max() < 2.0  # grazing rays magnify the sagitta of 0.03 mm
-    assert np.median(np.abs(shot.depth - near)[both]) < 0.03
+    assert np.abs(depth - near)[both].max() < 2.0  # grazing rays magnify the sagitta of 0.03 mm
+    assert np.median(np.abs(depth - near)[both]) < 0.03
 
 
 def test_a_veil_has_both_shells(ball):
     """A see-through ball is hit twice, in front and behind, at the analytic depths."""
     centre, camera, near, far = sphere_view()
-    shells = shells_of(Layer([Surface(ball(60.0, centre, 5), (200, 40, 40), 0.3)]), camera)
-    assert len(shells.depth) == 2
-    inner = np.isfinite(shells.depth[1]) & (far - near > 40)
+    depth, _ = world.samples(Layer([Surface(ball(60.0, centre, 5), (200, 40, 40), 0.3)]), camera, MAX_SHELLS)
+    assert np.isfinite(depth).any(axis=(1, 2)).sum() == 2
+    inner = np.isfinite(depth[1]) & (far - near > 40)
     assert inner.sum() > 1000
-    assert np.abs(shells.depth[0] - near)[inner].max() < 0.3
-    assert np.abs(shells.depth[1] - far)[inner].max() < 0.3
-
-
-def test_a_veil_behind_something_opaque_is_not_drawn():
-    """Blending respects depth, and is Porter and Duff's over."""
-    opaque = RasterShot(np.full((2, 2, 3), 100, np.float32), np.full((2, 2), 50, np.float32))
-    for depth, wanted in ((40, 0.25 * 200 + 0.75 * 100), (60, 100)):
-        shell = Shells(
-            colour=np.full((1, 2, 2, 3), 200, np.float32),
-            alpha=np.full((1, 2, 2), 0.25, np.float32),
-            depth=np.full((1, 2, 2), depth, np.float32),
-        )
-        assert (compose(opaque, shell) == round(wanted)).all()
+    assert np.abs(depth[0] - near)[inner].max() < 0.3
+    assert np.abs(depth[1] - far)[inner].max() < 0.3
 
 
 def test_a_moved_body_looks_like_a_body_that_stands_there(ball, rng):
@@ -303,18 +289,9 @@ def test_a_moved_body_looks_like_a_body_that_stands_there(ball, rng):
     T[:3, 3] = [20.0, 10.0, -5.0]
     camera = ViewCamera(np.array([0, -300.0, 0]), np.zeros(3), np.array([0, 0, 1.0]), 0.5, 120, 90)
     moving = MovingPicture(Layer([]), Layer([]), [Layer([Surface(mesh, (90, 120, 200))])], camera)
-    moving.at([T])
-    still = opaque_shot(Layer([Surface(mesh.transformed(T), (90, 120, 200))]), camera.finer(2))
-    shot, box = moving.shot, moving.changed
-    struck = np.isfinite(still.depth)
     # Rays through a shared edge may fall to either triangle: a few pixels differ by rounding.
-    assert (struck == np.isfinite(shot.depth)).mean() > 0.999
-    both = struck & np.isfinite(shot.depth)
-    assert np.abs(still.depth[both] - shot.depth[both]).max() < 0.05
-    assert (np.abs(still.colour - shot.colour)[both].max(axis=1) < 2).mean() > 0.99
-    changed = np.zeros_like(struck)
-    changed[box.slices] = True
-    assert not (np.isfinite(shot.depth) & ~changed).any()
+    stands = picture(Layer([Surface(mesh.transformed(T), (90, 120, 200))]), Layer([]), camera)
+    assert (np.abs(moving.at([T]).astype(int) - stands).max(axis=2) < 2).mean() > 0.995
 
 
 def test_a_body_behind_another_stays_hidden(ball):
@@ -323,8 +300,7 @@ def test_a_body_behind_another_stays_hidden(ball):
     wall, T = Layer([Surface(ball(40.0), (250, 0, 0))]), np.eye(4)
     T[1, 3] = 150.0
     moving = MovingPicture(wall, Layer([]), [Layer([Surface(ball(20.0), (0, 0, 250))])], camera)
-    moving.at([T])
-    assert np.array_equal(moving.shot.colour, opaque_shot(wall, camera.finer(2)).colour)
+    assert np.array_equal(moving.at([T]), picture(wall, Layer([]), camera))
 
 
 def test_camera_round_trip(rng):
@@ -333,9 +309,10 @@ def test_camera_round_trip(rng):
     camera = camera_around(points, np.array([0.3, 1, -0.4]), np.array([0, 0, 1.0]), fov=0.5, width=300, height=200)
     seen = camera.project(points)
     assert (seen[:, :2] >= 0).all() and (seen[:, :2] <= [300, 200]).all()
-    rays = camera.directions(seen[:, 1] - 0.5, seen[:, 0] - 0.5)
-    way = points - camera.eye
-    assert np.einsum("ij,ij->i", rays, way / np.linalg.norm(way, axis=1)[:, None]).min() > 1 - 1e-6
+    column, row = np.floor(seen[:, :2]).astype(int).T
+    rays = world.rays(camera).reshape(200, 300, 3)[row, column]  # through the middle of the pixel
+    way = (points - camera.eye) / np.linalg.norm(points - camera.eye, axis=1)[:, None]
+    assert np.linalg.norm(rays - way, axis=1).max() < 0.75 / camera.scale
 
 
 def test_the_corridor_is_where_the_safe_directions_are(case, candidates):
@@ -476,29 +453,28 @@ def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
     try:
         for count in (1, len(cores)):
             os.sched_setaffinity(0, sorted(cores)[:count])
-            whole = ((film_text.Part(0, 0, frame),) for frame in frames)
-            film_text.write_mp4(frames[0], whole, tmp_path / f"{count}.mp4", film.FRAMES_PER_SECOND)
+            size = film.WIDTH, film.HEIGHT
+            film_text.write_mp4(frames, size, tmp_path / f"{count}.mp4", film.FRAMES_PER_SECOND)
     finally:
         os.sched_setaffinity(0, cores)
     assert (tmp_path / "1.mp4").read_bytes() == (tmp_path / f"{len(cores)}.mp4").read_bytes()
 
 
-def test_a_frame_is_its_ground_with_the_parts_put_on(rng):
-    """As a picture, and as the encoder takes it: parts converted alone are those of the whole, converted."""
-    ground = rng.integers(0, 256, (32, 48, 3), dtype=np.uint8)
-    parts = [film_text.Part(4, 6, ground[:10, :20] ^ 255), film_text.Part(40, 0, ground[:32, :8] // 2)]
-    whole = film_text.put_on(ground, parts)
-    assert np.array_equal(whole[6:16, 4:24], parts[0].pixels) and np.array_equal(whole[:, 40:], parts[1].pixels)
-
-
-def test_frames_of_a_film_cut_off_are_not_counted(tmp_path, rng):
+def test_a_film_of_which_frames_are_lost_is_no_film(tmp_path, rng, monkeypatch):
     """An encoder on a full disk ends without a word: what it left must not pass for the film."""
-    ground, path = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8), tmp_path / "film.mp4"
-    film_text.write_mp4(ground, [()] * 7, path, 15)
-    written = path.read_bytes()
-    assert film_text.frames_in(written) == 7 == imageio_ffmpeg.count_frames_and_secs(str(path))[0]
-    assert [film_text.frames_in(written[:n]) for n in (0, 7, 100, len(written) // 2, len(written) - 1)] == [0] * 5
-    assert film_text.frames_in(b"no film " * 100) == 0
+    frames, path = [rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)] * 7, tmp_path / "film.mp4"
+    film_text.write_mp4(frames, (64, 48), path, 15)
+    assert len(decoded(path)[1]) == 7
+    usual = imageio_ffmpeg.count_frames_and_secs
+
+    def cut_off(file):
+        FilePath(file).write_bytes(FilePath(file).read_bytes()[:-1000])
+        return usual(file)
+
+    monkeypatch.setattr(film_text.imageio_ffmpeg, "count_frames_and_secs", cut_off)
+    with pytest.raises(RuntimeError):
+        film_text.write_mp4(frames, (64, 48), tmp_path / "cut.mp4", 15)
+    assert [one.name for one in tmp_path.iterdir()] == ["film.mp4"]
 
 
 @pytest.mark.parametrize(

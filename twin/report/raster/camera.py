@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.numba_kernels import nb
@@ -62,14 +61,6 @@ class ViewCamera:
         with np.errstate(divide="ignore", invalid="ignore"):
             column, row = self.width / 2 + self.scale * x / z, self.height / 2 - self.scale * y / z
         return np.stack([column, row, z], axis=1)
-
-    def directions(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Unit rays through pixel centres, shape (n, 3), CT frame."""
-        axes = self.axes.astype(np.float32)
-        x = ((columns + 0.5 - self.width / 2) / self.scale).astype(np.float32)
-        y = ((self.height / 2 - rows - 0.5) / self.scale).astype(np.float32)
-        rays = x[:, None] * axes[0] + y[:, None] * axes[1] + axes[2]
-        return np.asarray(rays / np.sqrt(1 + x * x + y * y)[:, None], dtype=np.float32)
 
 
 SPARE = 1.05

@@ -192,25 +192,6 @@ def _draw_one(bodies, f, planes, span, grid, corner, before, inverse, triangle):
                     value, mine = known, other
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def depth_before(depth, grid, corner):
-    """1/z of depths along the rays, shape (h, w), float32: 0 where the depth is infinite.
-
-    Args:
-        depth: Shape (h, w), mm.
-        grid: Samples per unit of x and y, rows, columns of the whole picture.
-        corner: Row and column of the picture at which ``depth`` begins.
-    """
-    scale, height, width = grid
-    inverse = np.empty(depth.shape, dtype=np.float32)
-    for i in range(depth.shape[0]):
-        y = (height / 2 - (corner[0] + i) - 0.5) / scale
-        for j in range(depth.shape[1]):
-            x = (corner[1] + j + 0.5 - width / 2) / scale
-            inverse[i, j] = np.sqrt(1 + x * x + y * y) / depth[i, j]
-    return inverse
-
-
 @nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _row(points, i):
     return points[i, 0], points[i, 1], points[i, 2]
