@@ -1,7 +1,6 @@
 """The pictures' compiled core against slower engines: Embree for what is seen, plain numpy for the rest."""
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
@@ -9,12 +8,10 @@ import report_world as world
 from embreex.mesh_construction import TriangleMesh as EmbreeMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from puncture_twin.planning.arm.links import visual_links
-from puncture_twin.planning.arm.ur import UR_MODELS
-from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.map.map_raster import map_raster, row_colours
 from puncture_twin.twin.report.map_view import MapCells, map_view
-from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
+from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import (
     LIGHT,
     MAX_SHELLS,
@@ -26,8 +23,6 @@ from puncture_twin.twin.report.raster.render import (
     picture,
 )
 from puncture_twin.twin.report.raster.shading import corner_normals, lit
-from puncture_twin.twin.report.scene.scene_parts import SceneBody, faces_outwards
-from puncture_twin.twin.report.scene.scene_picture import render_bodies
 
 SIZE = 90, 120
 
@@ -119,56 +114,6 @@ def test_of_two_surfaces_in_one_place_the_first_is_seen():
         layer = Layer([Surface(first, (9, 9, 9)), Surface(second, (9, 9, 9))])
         for most in (1, MAX_SHELLS):
             assert (layer.bodies[world.samples(layer, camera, most)[1][0][inner]] == 0).mean() > 0.97
-
-
-SIDES = np.vstack([np.eye(3), -np.eye(3), [[0.6, 0.48, 0.64], [-0.6, 0.48, -0.64]]])
-
-
-@pytest.mark.parametrize(
-    "model", [model for model in UR_MODELS.values() if model.shipped], ids=lambda model: model.name
-)
-def test_the_arms_that_ship_look_the_same_without_what_faces_away(model):
-    """Their links are solid: from all around, of a thousand samples at most one differs, at seams of two parts."""
-    for link, toward in product(visual_links(model), SIDES):
-        mesh = link.mesh
-        camera = camera_around(mesh.vertices, toward, np.array([0.1, 0.2, 1.0]), fov=0.5, width=160, height=120)
-        surfaces = [Surface(mesh, (200, 200, 200), solid=solid) for solid in (False, True)]
-        whole, front = (world.samples(Layer([surface]), camera)[0] for surface in surfaces)
-        seen = np.isfinite(whole)
-        assert seen.mean() > 0.05
-        assert (whole[seen] != front[seen]).mean() < 1e-3
-
-
-def inside_out(mesh):
-    """The same with every triangle turned over."""
-    return TriangleMesh(mesh.vertices, mesh.faces[:, ::-1])
-
-
-def test_which_surfaces_hide_their_backs(ball):
-    """Closed ones of which every piece faces outwards; a hollow is wound like a piece that does not."""
-    near, far, small = ball(30.0), ball(20.0, (0, 0, 90)), ball(10.0)
-    assert faces_outwards(near) and faces_outwards(joined([near, far])) and faces_outwards(joined([near, small]))
-    lacking = TriangleMesh(near.vertices, near.faces[1:])
-    turned = TriangleMesh(near.vertices, np.vstack([near.faces[1:], near.faces[:1, ::-1]]))
-    pieces = [inside_out(near), joined([near, inside_out(far)]), joined([near, inside_out(small)])]
-    alone_inside_out = joined([near, alone(inside_out(far).triangles)])  # which repeats its corners
-    assert not any(faces_outwards(mesh) for mesh in (lacking, turned, *pieces, alone_inside_out))
-
-
-@pytest.mark.parametrize("eye", [(0, -300, 40), (250, 20, -30), (0, -5, 95), (1, 2, 3)])
-def test_a_scene_looks_the_same_without_what_faces_away(ball, eye):
-    """To the byte, with bodies that meet, one in another, a hollow one, one inside out, and from within two of them."""
-    hollow = joined([ball(20.0, (60, 0, 0)), inside_out(ball(8.0, (60, 0, 0)))])
-    shapes = [ball(30.0), ball(20.0, (0, 0, 90)), ball(30.0, (0, 60, 0)), ball(20.0), hollow]
-    shapes.append(inside_out(ball(25.0, (-70, 0, 0))))
-    bodies = [SceneBody("", "", mesh, (90 + 25 * k, 200 - 30 * k, 60)) for k, mesh in enumerate(shapes)]
-    bodies.append(SceneBody("", "", ball(150.0), (200, 0, 250), 0.3))
-    camera = camera_at(eye, (0, 20, 30))
-    wanted = picture(Layer([b.surface for b in bodies[:-1]]), Layer([bodies[-1].surface]), camera)
-    assert np.array_equal(render_bodies(bodies, camera), wanted)
-    within = [bool((np.abs(np.array(eye) - mesh.bounds.mean(axis=0)) < 25).all()) for mesh in shapes]
-    solid = [body.seen_from(camera.eye).solid for body in bodies]
-    assert solid == [not inside for inside in within[:4]] + [False, False, False]
 
 
 def shaded(layer, camera, depth, triangle):

@@ -15,7 +15,6 @@ import report_world as world
 import trimesh
 from matplotlib.text import Text
 from PIL import Image, ImageDraw
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.cache.array_cache import Cache
@@ -50,7 +49,7 @@ from puncture_twin.twin.report.scene.scene_parts import (
     patient,
 )
 from puncture_twin.twin.report.scene.scene_picture import draw_scene, families, render_bodies
-from puncture_twin.twin.report.scene.views import outermost, overview, up_ct
+from puncture_twin.twin.report.scene.views import overview, up_ct
 
 FRAMES = {
     "bed": ("LPS", None),
@@ -384,25 +383,6 @@ def test_the_overview_looks_down_from_beside_the_patient(name, anatomy):
         assert abs(up_ct(case) @ np.array(ANATOMICAL_LPS["head"])) < 0.5
     seen = camera.project(content)[:, :2]
     assert (seen >= -0.5).all() and (seen <= [90.5, 60.5]).all()
-
-
-def surface_points(kind, rng, ball):
-    """Points in the order of surfaces' corners; of some the few of every so many lie in one plane."""
-    if kind == "balls":
-        return np.concatenate([ball(60.0).vertices, ball(20.0, (55, 0, 0)).vertices, ball(9.0, (0, 0, 80)).vertices])
-    if kind == "box":  # most lie on its faces, as of a surface that the image cuts off
-        return np.clip(np.cumsum(rng.normal(0, 4, (9000, 3)), axis=0), -60.0, 60.0)
-    if kind == "one tip":
-        return np.concatenate([np.c_[rng.uniform(-50, 50, (1999, 2)), np.zeros(1999)], [[0.0, 0.0, 30.0]]])
-    return np.cumsum(rng.normal(0, 1, (7 if kind == "few" else 6000, 3)), axis=0)
-
-
-@pytest.mark.parametrize("kind", ["balls", "box", "one tip", "few", "walk"])
-def test_what_is_outermost_is_the_hull_of_all(kind, rng, ball):
-    """Though most points are not looked at."""
-    points = surface_points(kind, rng, ball)
-    wanted = points[ConvexHull(points).vertices]
-    assert np.array_equal(np.unique(outermost(points), axis=0), np.unique(wanted, axis=0))
 
 
 def test_the_cross_of_directions_points_the_right_way(monkeypatch, case):

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Floats, Ints32, Pixels
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.twin.report.raster.camera import ViewCamera, blocked
-from puncture_twin.twin.report.raster.raster import TIE, draw, outlines, sorted_by_band
+from puncture_twin.twin.report.raster.camera import ViewCamera
+from puncture_twin.twin.report.raster.raster import TIE, draw, outlines
 from puncture_twin.twin.report.raster.shading import all_alike, corner_normals, flat_normals, lit, rotated
 
 Floats32 = NDArray[np.float32]
@@ -60,15 +61,12 @@ class Surface:
         colour: RGB, 0..255.
         alpha: Opacity where one looks straight at it; only translucent surfaces use it.
         rim: How much more opaque it is where one sees it edge-on.
-        solid: Whether its triangles close it and face outwards, and nobody looks from within: then those that face
-            away are behind others, and drawing them, which is half of the work, changes nothing.
     """
 
     mesh: TriangleMesh
     colour: Rgb
     alpha: float = 1.0
     rim: float = 2.5
-    solid: bool = False
 
 
 class Layer:
@@ -87,7 +85,6 @@ class Layer:
         self.bodies: Ints32 = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(m.faces) for m in meshes])
         self.colours = np.array([s.colour for s in surfaces], dtype=np.float32).reshape(-1, 3)
         self.alphas = np.array([s.alpha for s in surfaces], dtype=np.float32)
-        self.solids = np.array([s.solid for s in surfaces], dtype=np.bool_)
         self.rims = np.array([s.rim for s in surfaces], dtype=np.float32)
 
     @cached_property
@@ -97,20 +94,14 @@ class Layer:
 
     def sees(self, eye: Floats, points: Floats) -> NDArray[np.bool_]:
         """Whether nothing of this layer lies between an eye and each point (n, 3), in the layer's frame."""
-        eye, points = np.array(eye, dtype=np.float64), np.array(points, dtype=np.float64, order="C")
-        mesh = self.vertices, self.faces, self._starts, self._boxes
-        return np.asarray(~blocked(*mesh, eye, points, LINE_OF_SIGHT_SLACK_MM))
-
-    @cached_property
-    def _boxes(self) -> Floats:
-        """About each surface, shape (b, 2, 3), mm."""
-        return np.array([s.mesh.bounds for s in self.surfaces]).reshape(-1, 2, 3)
-
-    @cached_property
-    def _starts(self) -> NDArray[np.int64]:
-        """Where the vertices and faces of each surface begin, and where the last ones end, shape (b + 1, 2)."""
-        counts = [(len(s.mesh.vertices), len(s.mesh.faces)) for s in self.surfaces]
-        return np.cumsum([(0, 0), *counts], axis=0)
+        way = points - eye
+        far = np.linalg.norm(way, axis=1)
+        nearest = np.full(len(points), np.inf)
+        for surface in self.surfaces:
+            found = crossings(surface.mesh, eye, way / far[:, None], float(far.max()))
+            hit = found.count > 0
+            nearest[hit] = np.minimum(nearest[hit], found.depth[found.first[hit]])
+        return np.asarray(nearest >= far - LINE_OF_SIGHT_SLACK_MM)
 
 
 class Drawn(NamedTuple):
@@ -164,21 +155,11 @@ class View:
         if T_ct_layer is not None:
             turn, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
         self.grid = camera.scale, camera.height, camera.width
-        self._camera, points = camera, rotated(layer.vertices, turn, eye)
+        points = rotated(layer.vertices, turn, eye)
         normals, flats = rotated(layer.normals, turn, np.zeros(3)), flat_normals(points, layer.faces)
         look = layer.faces, layer.bodies, normals, flats, layer.colours, layer.alphas, layer.rims
         self.look = Look(points, *look)
-        self.spans: Ints32 = outlines(points, layer.faces, layer.bodies, layer.solids, self.grid)
-
-    @cached_property
-    def _by_band(self) -> tuple[NDArray[np.int64], Ints32]:
-        starts, spans = sorted_by_band(self.spans, _band_rows(self._camera), len(_bands(self._camera)))
-        return starts, spans
-
-    def of_band(self, band: int) -> Ints32:
-        """The rows of ``spans`` that a band of the picture needs."""
-        starts, spans = self._by_band
-        return spans[starts[band] : starts[band + 1]]
+        self.spans: Ints32 = outlines(points, layer.faces, self.grid)
 
 
 def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> Pixels:
@@ -189,7 +170,7 @@ def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> Pixels:
     """
     fine = camera.finer(SAMPLES)
     solid, glass = View(opaque, fine), View(translucents, fine)
-    return np.concatenate(_in_bands(fine, lambda band, rows: _drawn_band(solid, glass, band, rows).pixels))
+    return np.concatenate(_in_bands(fine, lambda rows: _drawn_band(solid, glass, rows).pixels))
 
 
 class _Band(NamedTuple):
@@ -200,12 +181,12 @@ class _Band(NamedTuple):
     pixels: Pixels
 
 
-def _drawn_band(solid: View, glass: View, band: int, rows: slice) -> _Band:
+def _drawn_band(solid: View, glass: View, rows: slice) -> _Band:
     corner, size = (rows.start, 0), (rows.stop - rows.start, solid.grid[2])
     behind, shells = Drawn.empty(1, size), Drawn.empty(MAX_SHELLS, size)
     nothing = np.zeros(size, dtype=np.float32)
-    draw(*solid.look[:3], solid.of_band(band), solid.grid, corner, nothing, *behind)
-    draw(*glass.look[:3], glass.of_band(band), glass.grid, corner, behind.inverse[0], *shells)
+    draw(*solid.look[:3], solid.spans, solid.grid, corner, nothing, *behind)
+    draw(*glass.look[:3], glass.spans, glass.grid, corner, behind.inverse[0], *shells)
     return _Band(behind, shells, _finished(solid.look, glass.look, solid.grid, corner, behind, shells.triangle))
 
 
@@ -221,21 +202,12 @@ def _finished(
     return pixels
 
 
-def _band_rows(camera: ViewCamera) -> int:
-    return max(1, BAND // (camera.width * SAMPLES)) * SAMPLES
-
-
-def _bands(camera: ViewCamera) -> list[slice]:
-    """The picture's rows, band by band, whole pixels of ``SAMPLES`` rows, from the top."""
-    rows = _band_rows(camera)
-    return [slice(top, min(top + rows, camera.height)) for top in range(0, camera.height, rows)]
-
-
-def _in_bands(camera: ViewCamera, work: Callable[[int, slice], T]) -> list[T]:
-    """Call a function with number and rows of every band, on several processors, and collect its results."""
-    bands = _bands(camera)
+def _in_bands(camera: ViewCamera, work: Callable[[slice], T]) -> list[T]:
+    """Call a function with the rows of every band, whole pixels, on several processors, and collect its results."""
+    high = max(1, BAND // (camera.width * SAMPLES)) * SAMPLES
+    bands = [slice(top, min(top + high, camera.height)) for top in range(0, camera.height, high)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(work, range(len(bands)), bands))
+        return list(pool.map(work, bands))
 
 
 def _joined(arrays: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
@@ -255,7 +227,7 @@ class MovingPicture:
     def __init__(self, opaque: Layer, translucents: Layer, layers: Sequence[Layer], camera: ViewCamera) -> None:
         self._camera, self._layers = camera.finer(SAMPLES), tuple(layers)
         solid, glass = View(opaque, self._camera), View(translucents, self._camera)
-        bands = _in_bands(self._camera, lambda band, rows: _drawn_band(solid, glass, band, rows))
+        bands = _in_bands(self._camera, lambda rows: _drawn_band(solid, glass, rows))
         self._solid, self._glass = solid.look, glass.look
         self._behind, self._shells = (
             Drawn(*(np.concatenate(parts, axis=1) for parts in zip(*drawn, strict=True)))

@@ -159,9 +159,7 @@ class _Film(NamedTuple):
 
 def _moving_picture(bodies: list[SceneBody], camera: ViewCamera, layers: Sequence[Layer]) -> MovingPicture:
     """One view of bodies that stand still (CT frame) and of layers that move."""
-    opaque, translucent = (
-        [b.seen_from(camera.eye) for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False)
-    )
+    opaque, translucent = ([b.surface for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False))
     return MovingPicture(Layer(opaque), Layer(translucent), layers, camera)
 
 
