@@ -18,6 +18,8 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.search.candidates import ArmColumns, Candidates, Clearance, Path, Ranking, Verdict
 from puncture_twin.twin.report.page.page import Shown, write_page
+from puncture_twin.twin.report.raster.raster import draw
+from puncture_twin.twin.report.raster.render import Drawn, View
 from puncture_twin.twin.report.slices.panel import Subject
 
 TARGET = np.array([10.0, -20.0, 30.0])
@@ -296,3 +298,21 @@ def make_noisy_scan():
 def _ball(radius, centre, subdivisions=3):
     mesh = trimesh.creation.icosphere(subdivisions, radius)
     return TriangleMesh(np.asarray(mesh.vertices) + centre, np.asarray(mesh.faces))
+
+
+def rays(camera):
+    """Unit rays through the middles of a camera's samples, shape (h * w, 3), CT frame."""
+    rows, columns = (g.ravel() for g in np.mgrid[0 : camera.height, 0 : camera.width])
+    x, y = (columns + 0.5 - camera.width / 2) / camera.scale, (camera.height / 2 - rows - 0.5) / camera.scale
+    along = np.stack([x, y, np.ones_like(x)], axis=1) @ camera.axes
+    return along / np.linalg.norm(along, axis=1)[:, None]
+
+
+def samples(layer, camera, most=1):
+    """Depths along the rays, mm, infinite for nothing, and triangles, each (most, h, w), nearest first."""
+    view, size = View(layer, camera), (camera.height, camera.width)
+    drawn = Drawn.empty(most, size)
+    draw(*view.look[:3], view.spans, view.grid, (0, 0), np.zeros(size, dtype=np.float32), *drawn)
+    slant = 1.0 / (rays(camera) @ camera.axes[2]).reshape(size)
+    with np.errstate(divide="ignore"):
+        return slant / drawn.inverse, drawn.triangle

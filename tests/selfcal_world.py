@@ -4,6 +4,8 @@ import numpy as np
 
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import OPTIONAL, Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import needle_orientations
 from puncture_twin.twin.plant.simulated_recording import (
     ImagePose,
@@ -86,3 +88,19 @@ def cured(truth, recording, seen, suggestion):
         np.zeros(len(rows)),
     )
     return exact_recording(truth, A, wished)
+
+
+def tre(found, A, B, P):
+    """Length of Y B Q - A X P of a calibration where the true poses and the true tip are given, shape (n,), mm."""
+    return np.linalg.norm(tip_residuals(found.estimate, Recording(A, B, P)), axis=1)
+
+
+def joined(first, second):
+    """Two recordings, one after the other, numbered anew."""
+    A, B, P = (np.concatenate([getattr(one, key) for one in (first, second)]) for key in "ABP")
+    parts = {
+        key: np.concatenate([getattr(one, key) for one in (first, second)])
+        for key in OPTIONAL
+        if getattr(first, key) is not None and getattr(second, key) is not None
+    }
+    return Recording(A, B, P, pixels=first.pixels, **parts)

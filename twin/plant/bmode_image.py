@@ -24,9 +24,6 @@ from puncture_twin.twin.guidance.ultrasound.image.imager import Imager, NeedleEc
 Complexes = NDArray[np.complexfloating]
 """Single precision inside: the display has 256 greys."""
 
-RAYLEIGH_SNR = float(np.sqrt(np.pi / (4.0 - np.pi)))
-"""Mean over standard deviation of a Rayleigh envelope."""
-
 MARGIN_SIGMAS = 4.0
 """Scatterers are drawn so far beyond the image's edges: no edge thins the speckle, nothing wraps around."""
 

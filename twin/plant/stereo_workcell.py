@@ -145,28 +145,10 @@ class StereoWorkcell:
         ends = np.array([r * (np.cos(a) * across[:, 0] + np.sin(a) * across[:, 1]) for r, a in angles])
         rays = toward + ends
         lengths = np.linalg.norm(rays, axis=1)
-        nearby = self._head_about(camera.center_c, toward / np.linalg.norm(toward), radius_mm)
-        if nearby is None:
-            return 0.0
-        found = crossings(nearby, camera.center_c, rays / lengths[:, None])
+        found = crossings(self.head_c, camera.center_c, rays / lengths[:, None])
         nearest = np.full(len(rays), np.inf)
         nearest[found.count > 0] = found.depth[found.first[found.count > 0]]
         return float(np.mean(nearest < lengths - radius_mm))
-
-    @cached_property
-    def _head_triangles(self) -> tuple[Floats, Floats]:
-        """Middle (n, 3) of each of the head's triangles, and how far its corners are from there (n,), mm."""
-        corners = self.head_c.triangles
-        middles = corners.mean(axis=1)
-        return middles, np.asarray(np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1))
-
-    def _head_about(self, origin: Floats, direction: Floats, radius_mm: float) -> TriangleMesh | None:
-        """Triangles of the head that a cylinder about a line may intersect; None where there are none."""
-        middles, reach = self._head_triangles
-        offsets = middles - origin
-        aside = np.linalg.norm(offsets - (offsets @ direction)[:, None] * direction, axis=1)
-        near = aside <= radius_mm + reach
-        return TriangleMesh(self.head_c.vertices, self.head_c.faces[near]) if near.any() else None
 
 
 class StereoPlant(PlantArm):

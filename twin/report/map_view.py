@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, angles
 from puncture_twin.planning.search.candidates import Candidates
 
@@ -39,6 +38,9 @@ SAME_PLACE = np.radians(20.0)
 
 RING_SLACK = 1e-7
 """Two θ nearer than this (rad) are one ring of the grid."""
+
+RING = 8.0
+"""More than a turn: by it rings lie beside one another where all cells are in one order."""
 
 HALF_CELL_SLACK = 1e-6
 """Share by which rounding may widen half a cell."""
@@ -173,60 +175,22 @@ class MapCells:
     def rows(self, theta: Floats, beta: Floats) -> NDArray[np.int64]:
         """The candidate at each direction (rad, β in 0..2π), -1 outside the grid; same shape as ``theta``."""
         theta, beta = np.asarray(theta, dtype=float), np.asarray(beta, dtype=float)
-        cells = self.rows_in_order, self.beta, self.starts, self.heights, self.half_theta, self.half_beta
-        found = _find_rows(*cells, theta.ravel(), beta.ravel())
-        return np.asarray(found).reshape(theta.shape)
+        last, heights = len(self.heights) - 1, self.heights
+        above = np.minimum(np.searchsorted(heights, theta), last)
+        below = np.maximum(above - 1, 0)
+        ring = np.where(theta - heights[below] <= heights[above] - theta, below, above)
+        cells = np.repeat(np.arange(last + 1), np.diff(self.starts)) * RING + self.beta  # ascend along all rings
+        after = np.searchsorted(cells, ring * RING + beta)
+        begin, end = self.starts[ring], self.starts[ring + 1]
+        before, after = np.where(after > begin, after, end) - 1, np.where(after < end, after, begin)
+        ahead, behind = (np.abs(_turn_between(self.beta[one], beta)) for one in (after, before))
+        near = (np.minimum(ahead, behind) <= self.half_beta[ring]) & (np.abs(theta - heights[ring]) <= self.half_theta)
+        return np.where(near, self.rows_in_order[np.where(ahead < behind, after, before)], -1)
 
     def picture(self, view: MapView, size: int) -> NDArray[np.int64]:
         """The candidate under the middle of each pixel of a square picture of the disc, shape (size, size)."""
         middles = (np.arange(size) + 0.5) / size * 2 - 1
         return self.rows(*view.angles_at(np.stack(np.meshgrid(middles, -middles), axis=-1)))
-
-
-@nb.njit(cache=True)
-def _find_rows(rows, betas, starts, heights, half_theta, half_beta, theta, beta):  # type: ignore[no-untyped-def]  # numba infers
-    found = np.empty(len(theta), dtype=np.int64)
-    for i in range(len(theta)):
-        cell = _find_cell(betas, starts, heights, half_theta, half_beta, theta[i], beta[i])
-        found[i] = rows[cell] if cell >= 0 else -1
-    return found
-
-
-@nb.njit(cache=True)
-def _find_cell(betas, starts, heights, half_theta, half_beta, theta, beta):  # type: ignore[no-untyped-def]  # numba infers
-    """The cell of a direction: in the nearest ring that of the nearest azimuth; -1 where that is too far."""
-    ring = _first_not_below(heights, np.int64(0), len(heights), theta)
-    if ring == len(heights) or (ring > 0 and theta - heights[ring - 1] <= heights[ring] - theta):
-        ring -= 1
-    if abs(theta - heights[ring]) > half_theta:
-        return -1
-    begin, end = starts[ring], starts[ring + 1]
-    after = _first_not_below(betas, begin, end, beta)
-    before = after - 1 if after > begin else end - 1
-    after = after if after < end else begin
-    ahead, behind = _turn(betas[after] - beta), _turn(betas[before] - beta)
-    if min(ahead, behind) > half_beta[ring]:
-        return -1
-    return after if ahead < behind else before
-
-
-@nb.njit(cache=True)
-def _first_not_below(values, begin, end, value):  # type: ignore[no-untyped-def]  # numba infers
-    """Index of the first of ascending ``values[begin:end]`` that is not below a value; ``end`` if none is."""
-    while begin < end:
-        middle = (begin + end) // 2
-        if values[middle] < value:
-            begin = middle + 1
-        else:
-            end = middle
-    return begin
-
-
-@nb.njit(cache=True)
-def _turn(angle):  # type: ignore[no-untyped-def]  # numba infers
-    """The size of a difference of two angles in 0..2π."""
-    angle = abs(angle)
-    return angle if angle <= np.pi else abs(2 * np.pi - angle)
 
 
 def _turn_between(a: Any, b: Any) -> Any:

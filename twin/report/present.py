@@ -122,11 +122,10 @@ stands side by side."""
 
 
 class Section(NamedTuple):
-    """Blocks below a title; ``page`` is what the page has for a title instead."""
+    """Blocks below a title."""
 
     title: str
     blocks: Sequence[Block]
-    page: str = ""
 
 
 def grid(fields: Iterable[Field], rows: Iterable[Any], kind: str = "numbers") -> Table:

@@ -167,34 +167,6 @@ LIGHT_UP = 1.5
 """The light is above the camera: its direction is the camera's plus this much of up."""
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatedCamera:
-    """Place and view direction of a camera, and the image's size.
-
-    Attributes:
-        eye_mm: Shape (3,), world frame.
-        look_at_mm: Shape (3,), the middle of the image.
-        up: Shape (3,), what is up in the image, world frame.
-    """
-
-    eye_mm: NDArray[np.float64]
-    look_at_mm: NDArray[np.float64]
-    up: NDArray[np.float64]
-    width: int = 960
-    height: int = 540
-
-
-def picture(client: int, camera: SimulatedCamera) -> NDArray[np.uint8]:
-    """An image of the workcell as it is, shape (height, width, 3), RGB."""
-    view = pybullet.computeViewMatrix(
-        to_m(camera.eye_mm).tolist(), to_m(camera.look_at_mm).tolist(), camera.up.tolist()
-    )
-    projection = pybullet.computeProjectionMatrixFOV(FIELD_OF_VIEW_DEG, camera.width / camera.height, NEAR_M, FAR_M)
-    away = camera.eye_mm - camera.look_at_mm
-    light = away / np.linalg.norm(away) + LIGHT_UP * camera.up / np.linalg.norm(camera.up)
-    return _drawn(client, (camera.width, camera.height), view, projection, light)
-
-
 def pinhole_picture(
     client: int, size: tuple[int, int], K: NDArray[np.float64], T_camera_world: NDArray[np.float64]
 ) -> NDArray[np.uint8]:

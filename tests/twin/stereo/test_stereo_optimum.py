@@ -7,7 +7,7 @@ from servo_world import CASE, HELD, IMAGE_MM, simulate
 
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.twin.guidance.stereo.joint.joint_model import JointModel, adjust, bound, first_unknowns
+from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, JointModel, adjust, first_unknowns
 from puncture_twin.twin.guidance.stereo.servo_law import ball_base
 
 TARGET = CASE.targets.points[1]
@@ -31,6 +31,12 @@ def test_slopes_are_those_of_the_residuals(one):
         step = 1e-5 * np.eye(slopes.shape[1])[column]
         numeric = (model.linearised(x.moved(step)).residuals - model.linearised(x.moved(-step)).residuals) / 2e-5
         assert np.abs(numeric - slopes[:, column]).max() < 2e-5 * scale[column]
+
+
+def bound(observed, guess, at):
+    """The Cramer-Rao bound: Fisher's information at stated unknowns."""
+    model = JointModel(observed, guess)
+    return Adjusted(model, at, np.linalg.inv(model.linearised(at).information), 0.0, 0, 0)
 
 
 def test_it_reaches_the_bound():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refusals import refused
 from scipy.stats import binom
-from selfcal_world import as_estimate
+from selfcal_world import as_estimate, joined
 
 from benchmarks.selfcal_rooms import Kind, outcome, recorded, room_of
 from puncture_twin.planning.arm.kinematics import flange_pose
@@ -317,7 +317,7 @@ def test_joints_are_written_and_read(room, tmp_path):
     write_recording(told, tmp_path / "turns.csv")
     again = read_recording(tmp_path / "turns.csv").subset(np.arange(4, 20))
     np.testing.assert_array_equal(again.turn_probe, turn[0, 4:20])
-    np.testing.assert_array_equal(again.joined(again).turn_needle, np.tile(turn[1, 4:20], (2, 1)))
+    np.testing.assert_array_equal(joined(again, again).turn_needle, np.tile(turn[1, 4:20], (2, 1)))
 
 
 def test_a_way_to_turn_is_a_sign_of_joints(room):

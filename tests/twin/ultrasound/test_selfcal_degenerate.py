@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from refusals import refused
-from selfcal_world import DEGENERATE, as_estimate, cured, degenerate_set
+from selfcal_world import DEGENERATE, as_estimate, cured, degenerate_set, joined, tre
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.geometry.rigid import exp_rotation, pose
@@ -58,10 +58,10 @@ def test_the_proposed_poses_cure_it(name, seed):
     with refused("poses_too_alike") as caught:
         calibrate(noisy, noise=SPEC_NOISE)
     more = with_noise(rng, cured(truth, noisy, seen, caught.value.suggestion), SPEC_NOISE)
-    found = calibrate(noisy.joined(more), noise=SPEC_NOISE)
+    found = calibrate(joined(noisy, more), noise=SPEC_NOISE)
     assert found.condition >= LEAST_RATIO
     held, _ = simulate_recording(rng, 100, truth, noise=None)
-    assert np.sqrt(np.mean(found.tre(held.A, held.B, held.P) ** 2)) < 1.2
+    assert np.sqrt(np.mean(tre(found, held.A, held.B, held.P) ** 2)) < 1.2
 
 
 @pytest.mark.parametrize("name", DEGENERATE)

@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from refusals import refused
-from selfcal_world import as_estimate
+from selfcal_world import as_estimate, joined, tre
 
 from benchmarks.selfcal_rooms import DIRECTION_RAD, IMAGE_MM, compared, recorded, room_of
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
@@ -37,7 +37,7 @@ def test_sixty_percent_of_the_poses_do(rng, world):
         random, _ = simulate_recording(rng, 30, truth, noise=None)
         by_chance.append(expected_tre_mm(random, SPEC_NOISE, as_estimate(truth), held))
         found = calibrate(with_noise(rng, chosen, SPEC_NOISE), noise=SPEC_NOISE, direction=False)
-        real.append(np.mean(found.tre(held.A, held.B, held.P) ** 2))
+        real.append(np.mean(tre(found, held.A, held.B, held.P) ** 2))
     assert bound < np.median(by_chance)
     assert np.sqrt(np.mean(real)) < 1.1 * np.median(by_chance)
 
@@ -76,7 +76,7 @@ def test_what_is_recorded_counts(world):
     rest = candidates.subset(np.arange(12, 120))
     knowing = choose_poses(rest, 6, SPEC_NOISE, drawing, recorded=recorded)
     blind = choose_poses(rest, 6, SPEC_NOISE, drawing)
-    after = [expected_tre_mm(recorded.joined(rest.subset(c)), SPEC_NOISE, drawing, held) for c in (knowing, blind)]
+    after = [expected_tre_mm(joined(recorded, rest.subset(c)), SPEC_NOISE, drawing, held) for c in (knowing, blind)]
     assert after[0] < after[1]
 
 

@@ -106,12 +106,3 @@ def test_a_missing_file_is_refused(tmp_path):
     """A folder without a recording says which file it lacks."""
     with refused("no_such_file"):
         read_recording(tmp_path)
-
-
-def test_recordings_join_and_divide(recording):
-    """A subset and the rest make the whole again; different columns do not join."""
-    whole = recording.subset(np.arange(2)).joined(recording.subset(slice(2, 6)))
-    for key in "ABPv":
-        np.testing.assert_array_equal(getattr(whole, key), getattr(recording, key))
-    with refused("tables_differ"):
-        recording.joined(Recording(recording.A, recording.B, recording.P))

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from refusals import refused, refused_command
-from selfcal_world import as_estimate
+from selfcal_world import as_estimate, tre
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose
@@ -81,7 +81,7 @@ def test_shots_are_the_calibration_of_all_poses(taken):
     assert np.abs(found.parameter_error(batch.estimate) / sd).max() > 0.5  # the shots moved it
     np.testing.assert_allclose(np.diag(followed.covariance), np.diag(batch.covariance), rtol=0.02)
     unseen = exact_recording(truth, draw_probe_poses(np.random.default_rng(9), truth, 200), many(truth, 9))
-    before, since = (np.sqrt(np.mean(one.tre(unseen.A, unseen.B, unseen.P) ** 2)) for one in (found, followed))
+    before, since = (np.sqrt(np.mean(tre(one, unseen.A, unseen.B, unseen.P) ** 2)) for one in (found, followed))
     assert since < before
 
 

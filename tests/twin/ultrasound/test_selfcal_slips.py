@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from refusals import refused
+from selfcal_world import tre
 
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
@@ -105,7 +106,7 @@ def test_pixels_that_are_3_percent_off_are_said_and_counted():
         np.testing.assert_allclose(1 + np.array(one_step), 1 / 1.03, atol=0.02)
         np.testing.assert_allclose(1 + np.array(one_step), free.scale, atol=0.01)
         exact = simulate_recording(np.random.default_rng(500 + seed), 60, truth=truth, noise=None)[0]
-        real = np.sqrt(np.mean(found.tre(exact.A, exact.B, exact.P * 1.03) ** 2))
+        real = np.sqrt(np.mean(tre(found, exact.A, exact.B, exact.P * 1.03) ** 2))
         assert 0.6 < real / predicted_tre(found, wrong) < 1.6
         silent = predicted_tre(free, wrong)
         assert real > 1.8 * silent

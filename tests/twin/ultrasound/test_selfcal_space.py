@@ -86,7 +86,7 @@ def test_the_region_holds_the_truth():
     for seed in range(100):
         rng = np.random.default_rng([3, seed])
         exact, truth = in_space(rng, 24)
-        found = calibrate(noisy(rng, exact), noise=NOISE, start=as_estimate(truth), robust=False)
+        found = calibrate(noisy(rng, exact), noise=NOISE)
         e = found.parameter_error(as_estimate(truth))
         inside += e @ np.linalg.solve(found.covariance, e) <= found.region_limit()
     assert 90 <= inside <= 99

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from refusals import refused
 from scipy.stats import binom
-from selfcal_world import as_estimate
+from selfcal_world import as_estimate, tre
 
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import SHAFT_BIAS, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import tip_residuals
@@ -39,7 +39,7 @@ def test_confidence_regions_hold_what_they_promise(runs, level):
 
 def test_the_predicted_error_is_the_real_one(runs):
     """Over the runs the rms error at the tip is what each calibration predicted for those image points, to 10 %."""
-    real = [np.mean(found.tre(held.A, held.B, held.P) ** 2) for found, _, held in runs]
+    real = [np.mean(tre(found, held.A, held.B, held.P) ** 2) for found, _, held in runs]
     predicted = [np.mean(found.predicted_tre_mm(held.P, held.A) ** 2) for found, _, held in runs]
     assert np.sqrt(np.mean(real)) == pytest.approx(np.sqrt(np.mean(predicted)), rel=0.1)
 

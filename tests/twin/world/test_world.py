@@ -27,7 +27,7 @@ from puncture_twin.twin.world.client import (
     to_mm,
 )
 from puncture_twin.twin.world.execution import execute, touches
-from puncture_twin.twin.world.workcell import SimulatedCamera, load_box, load_surface, open_workcell, picture, thinned
+from puncture_twin.twin.world.workcell import load_box, load_surface, open_workcell, pinhole_picture, thinned
 
 REPO = ROOT
 TOOL = Tool(210.0, 150.0, 1.2, 30.0)
@@ -219,11 +219,12 @@ def test_large_surfaces_are_thinned_and_stay_in_place():
 
 def test_picture_shows_what_stands_there():
     """A ball of the skin's colour in the middle makes the middle reddish; the array is rows, columns, RGB."""
-    camera = SimulatedCamera(np.array([500.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]), 120, 80)
+    K, T = np.array([[97.0, 0, 59.5], [0, 97.0, 39.5], [0, 0, 1]]), np.eye(4)
+    T[:3] = [[0.0, 1, 0, 0], [0, 0, -1, 0], [-1, 0, 0, 500.0]]  # from x = 500 mm toward the origin
     with physics_client() as client:
-        empty = picture(client, camera)
+        empty = pinhole_picture(client, (120, 80), K, T)
         load_surface(client, sphere(60.0), np.eye(4), solid=False)
-        seen = picture(client, camera)
+        seen = pinhole_picture(client, (120, 80), K, T)
     assert seen.shape == (80, 120, 3)
     assert seen.dtype == np.uint8
     red, green, blue = seen[40, 60].astype(int)

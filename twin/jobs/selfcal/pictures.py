@@ -29,8 +29,7 @@ from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.annotate import write, write_image
 from puncture_twin.twin.report.figures import cross, figure_of, ring, write_png
 from puncture_twin.twin.report.raster.camera import camera_around
-from puncture_twin.twin.report.raster.compositing import compose
-from puncture_twin.twin.report.raster.render import Layer, Surface, opaque_shot, shells_of
+from puncture_twin.twin.report.raster.render import Layer, Surface, picture
 from puncture_twin.twin.report.scene.scene_parts import bar
 
 PX_PER_MM = 8
@@ -157,12 +156,8 @@ def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path:
     points = np.concatenate([s.mesh.vertices for s in opaque[1:]])
     toward, up = np.array([0.25, 1.0, -0.45]), np.array([0.0, 0.0, 1.0])
     camera = camera_around(points, toward, up, fov=0.5, width=WORKCELL_SIZE[0], height=WORKCELL_SIZE[1])
-    fine = camera.finer(2)
-    pixels = compose(opaque_shot(Layer(opaque), fine), shells_of(Layer(veiled), fine))
-    picture = Image.fromarray(np.ascontiguousarray(pixels))
-    if picture.size != WORKCELL_SIZE:
-        picture = picture.resize(WORKCELL_SIZE, Image.Resampling.LANCZOS)
-    draw = ImageDraw.Draw(picture)
+    image = Image.fromarray(picture(Layer(opaque), Layer(veiled), camera))
+    draw = ImageDraw.Draw(image)
     anchors = {
         f"probe arm ({case.content.probe_arm.model})": np.array([0.0, 0.0, 0.0]),
         f"needle arm ({case.content.needle_arm.model})": case.T_base1_base2[:3, 3],
@@ -171,7 +166,7 @@ def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path:
     for text, point in anchors.items():
         column, row, _ = camera.project(point[None])[0]
         write(draw, (column, row + 26), text, size=17, bold=True, anchor="mm", halo=3)
-    write_image(picture, path)
+    write_image(image, path)
     return path
 
 

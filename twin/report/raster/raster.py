@@ -31,14 +31,12 @@ WIDE = 8
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def outlines(points, faces, bodies, solids, grid):
+def outlines(points, faces, grid):
     """The rows and columns of samples that each triangle may cover.
 
     Args:
         points: Shape (n, 3), camera's frame, mm.
         faces: Shape (m, 3).
-        bodies: Shape (m,), the body of each triangle.
-        solids: Shape (b,), bool: bodies of which no triangle is drawn that faces away.
         grid: Samples per unit of x and y, rows, columns.
 
     Returns:
@@ -64,41 +62,11 @@ def outlines(points, faces, bodies, solids, grid):
             left, right, top, bottom = _cut_outline(points, faces[f], seen, grid)
         first, last = int(np.ceil(max(top - EDGE, 0.0))), int(np.floor(min(bottom + EDGE, height - 1.0)))
         begin, end = int(np.ceil(max(left - EDGE, 0.0))), int(np.floor(min(right + EDGE, width - 1.0)))
-        if first <= last and begin <= end and not (solids[bodies[f]] and _faces_away(points, a, b, c)):
+        if first <= last and begin <= end:
             spans[count, 0], spans[count, 1], spans[count, 2] = f, first, last
             spans[count, 3], spans[count, 4] = begin, end
             count += 1
     return spans[:count]
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _faces_away(points, a, b, c):
-    """Whether the eye is behind a triangle; the camera's frame is left-handed."""
-    x, y, z = _cross(_row(points, b), _row(points, c))
-    return points[a, 0] * x + points[a, 1] * y + points[a, 2] * z < 0.0
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def sorted_by_band(spans, rows, count):
-    """Which triangles each band of a picture needs.
-
-    Returns:
-        Where each band begins in the second array, shape (count + 1,); rows of ``spans``, band after band.
-    """
-    starts = np.zeros(count + 1, dtype=np.int64)
-    for s in range(len(spans)):
-        for band in range(spans[s, 1] // rows, spans[s, 2] // rows + 1):
-            starts[band + 1] += 1
-    for band in range(count):
-        starts[band + 1] += starts[band]
-    free = starts[:-1].copy()
-    needed = np.empty((starts[count], 5), dtype=np.int32)
-    for s in range(len(spans)):
-        for band in range(spans[s, 1] // rows, spans[s, 2] // rows + 1):
-            for k in range(spans.shape[1]):
-                needed[free[band], k] = spans[s, k]
-            free[band] += 1
-    return starts, needed
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -190,25 +158,6 @@ def _draw_one(bodies, f, planes, span, grid, corner, before, inverse, triangle):
                 if value > known:
                     inverse[k, i, j], triangle[k, i, j] = value, mine
                     value, mine = known, other
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def depth_before(depth, grid, corner):
-    """1/z of depths along the rays, shape (h, w), float32: 0 where the depth is infinite.
-
-    Args:
-        depth: Shape (h, w), mm.
-        grid: Samples per unit of x and y, rows, columns of the whole picture.
-        corner: Row and column of the picture at which ``depth`` begins.
-    """
-    scale, height, width = grid
-    inverse = np.empty(depth.shape, dtype=np.float32)
-    for i in range(depth.shape[0]):
-        y = (height / 2 - (corner[0] + i) - 0.5) / scale
-        for j in range(depth.shape[1]):
-            x = (corner[1] + j + 0.5 - width / 2) / scale
-            inverse[i, j] = np.sqrt(1 + x * x + y * y) / depth[i, j]
-    return inverse
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)

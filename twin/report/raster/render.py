@@ -2,14 +2,12 @@
 """Pictures without a screen: triangles drawn into a sample grid with depth, and shaded, by compiled code.
 
 Opaque surfaces give one hit per sample; translucent surfaces (skin, corridor) are seen through, with up to
-``MAX_SHELLS`` hits.
+``MAX_SHELLS`` hits. A film keeps the triangles that its samples show of what stands still, and draws what moves over
+them.
 
-What moves, drawn over what stands still, and taken away again: one picture after the other of the same view.
-
-The pixels of a picture, from the triangles that its samples show: lit, and blended from back to front; compiled.
-
-A pixel whose samples show the same smooth surfaces is lit and blended once. What is computed is rounded where what
-moves is drawn by way of arrays (`shade_nearest`, `shade_shells`, `recompose`): both make the same pixels.
+The pixels of a picture, from the triangles that its samples show: lit, and blended from back to front by the "over"
+operator of Porter and Duff, Compositing Digital Images (SIGGRAPH 1984); compiled. A pixel whose samples show the same
+smooth surfaces is lit and blended once.
 """
 
 from __future__ import annotations
@@ -17,44 +15,27 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats, Ints32
-from puncture_twin.planning.base.numba_kernels import allocation_free
+from puncture_twin.planning.base.arrays import Floats, Ints32, Pixels
+from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.base.reasons import Rgb
+from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.twin.report.raster.camera import ViewCamera, blocked
-from puncture_twin.twin.report.raster.compositing import (
-    NOWHERE,
-    SAMPLES,
-    PixelBox,
-    RasterShot,
-    Shells,
-    byte,
-    compose,
-    recompose,
-)
-from puncture_twin.twin.report.raster.raster import depth_before, draw, outlines, sorted_by_band
-from puncture_twin.twin.report.raster.shading import (
-    all_alike,
-    corner_normals,
-    flat_normals,
-    lit,
-    rotated,
-    shade_nearest,
-    shade_shells,
-)
+from puncture_twin.twin.report.raster.camera import ViewCamera
+from puncture_twin.twin.report.raster.raster import TIE, draw, outlines
+from puncture_twin.twin.report.raster.shading import all_alike, corner_normals, flat_normals, lit, rotated
 
 Floats32 = NDArray[np.float32]
 T = TypeVar("T")
 
-_SHELL_PARTS = ("colour", "alpha", "depth")
+SAMPLES = 2
+"""Samples per pixel side."""
 
 MAX_SHELLS = 4
 """Layers of a translucent surface that are drawn: skin in, skin out, twice."""
@@ -80,15 +61,12 @@ class Surface:
         colour: RGB, 0..255.
         alpha: Opacity where one looks straight at it; only translucent surfaces use it.
         rim: How much more opaque it is where one sees it edge-on.
-        solid: Whether its triangles close it and face outwards, and nobody looks from within: then those that face
-            away are behind others, and drawing them, which is half of the work, changes nothing.
     """
 
     mesh: TriangleMesh
     colour: Rgb
     alpha: float = 1.0
     rim: float = 2.5
-    solid: bool = False
 
 
 class Layer:
@@ -107,7 +85,6 @@ class Layer:
         self.bodies: Ints32 = np.repeat(np.arange(len(meshes), dtype=np.int32), [len(m.faces) for m in meshes])
         self.colours = np.array([s.colour for s in surfaces], dtype=np.float32).reshape(-1, 3)
         self.alphas = np.array([s.alpha for s in surfaces], dtype=np.float32)
-        self.solids = np.array([s.solid for s in surfaces], dtype=np.bool_)
         self.rims = np.array([s.rim for s in surfaces], dtype=np.float32)
 
     @cached_property
@@ -117,20 +94,14 @@ class Layer:
 
     def sees(self, eye: Floats, points: Floats) -> NDArray[np.bool_]:
         """Whether nothing of this layer lies between an eye and each point (n, 3), in the layer's frame."""
-        eye, points = np.array(eye, dtype=np.float64), np.array(points, dtype=np.float64, order="C")
-        mesh = self.vertices, self.faces, self._starts, self._boxes
-        return np.asarray(~blocked(*mesh, eye, points, LINE_OF_SIGHT_SLACK_MM))
-
-    @cached_property
-    def _boxes(self) -> Floats:
-        """About each surface, shape (b, 2, 3), mm."""
-        return np.array([s.mesh.bounds for s in self.surfaces]).reshape(-1, 2, 3)
-
-    @cached_property
-    def _starts(self) -> NDArray[np.int64]:
-        """Where the vertices and faces of each surface begin, and where the last ones end, shape (b + 1, 2)."""
-        counts = [(len(s.mesh.vertices), len(s.mesh.faces)) for s in self.surfaces]
-        return np.cumsum([(0, 0), *counts], axis=0)
+        way = points - eye
+        far = np.linalg.norm(way, axis=1)
+        nearest = np.full(len(points), np.inf)
+        for surface in self.surfaces:
+            found = crossings(surface.mesh, eye, way / far[:, None], float(far.max()))
+            hit = found.count > 0
+            nearest[hit] = np.minimum(nearest[hit], found.depth[found.first[hit]])
+        return np.asarray(nearest >= far - LINE_OF_SIGHT_SLACK_MM)
 
 
 class Drawn(NamedTuple):
@@ -139,172 +110,104 @@ class Drawn(NamedTuple):
     inverse: Floats32
     triangle: Ints32
 
-    def part(self, where: tuple[slice, slice]) -> Drawn:
-        """Rows and columns of it."""
-        return Drawn(self.inverse[:, *where], self.triangle[:, *where])
-
     @staticmethod
     def empty(most: int, shape: tuple[int, ...]) -> Drawn:
         """Nothing is drawn yet; at most so many surfaces a sample."""
         return Drawn(np.zeros((most, *shape), dtype=np.float32), np.full((most, *shape), -1, dtype=np.int32))
 
 
-class Posed(NamedTuple):
-    """Corners and their normals in a camera's frame, each (n, 3)."""
+class Look(NamedTuple):
+    """A layer as a camera has it before it, as `finish` takes it; b bodies."""
 
     points: Floats
+    """Shape (n, 3), of the corners, camera's frame, mm."""
+    faces: Ints32
+    """Shape (m, 3)."""
+    bodies: Ints32
+    """Shape (m,), the body of each triangle; ascending."""
     normals: Floats32
+    """Shape (n, 3), of the corners."""
+    flats: Floats32
+    """Shape (m, 3), of the triangles."""
+    colours: Floats32
+    """Shape (b, 3), 0..255."""
+    alphas: Floats32
+    """Shape (b,), opacity where one looks straight at them."""
+    rims: Floats32
+    """Shape (b,), how much more opaque where one sees them edge-on."""
 
-
-def posed(layer: Layer, camera: ViewCamera, T_ct_layer: Floats | None = None) -> Posed:
-    """A layer before a camera: at a pose, shape (4, 4), mm, or in the CT frame itself."""
-    turn, eye = camera.axes, np.asarray(camera.eye, dtype=float)
-    if T_ct_layer is not None:
-        turn, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
-    return Posed(rotated(layer.vertices, turn, eye), rotated(layer.normals, turn, np.zeros(3)))
+    def with_more(self, other: Look) -> Look:
+        """Both; of two in one place the bodies of this one are seen."""
+        faces, bodies = other.faces + np.int32(len(self.points)), other.bodies + np.int32(len(self.colours))
+        return Look(*map(np.concatenate, zip(self, other._replace(faces=faces, bodies=bodies), strict=True)))
 
 
 class View:
-    """A layer as a camera has it before it: corners in the camera's frame, and where each triangle lies.
+    """A layer before a camera, and where each of its triangles lies in the picture.
 
     Args:
         camera: The samples are its pixels.
+        T_ct_layer: Pose of the layer, shape (4, 4), mm; None is the CT frame itself.
     """
 
-    def __init__(self, layer: Layer, camera: ViewCamera, seen: Posed) -> None:
+    def __init__(self, layer: Layer, camera: ViewCamera, T_ct_layer: Floats | None = None) -> None:
+        turn, eye = camera.axes, np.asarray(camera.eye, dtype=float)
+        if T_ct_layer is not None:
+            turn, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
         self.grid = camera.scale, camera.height, camera.width
-        self._layer, self._camera = layer, camera
-        self._mesh = seen.points, layer.faces, layer.bodies
-        self._look = seen.normals, flat_normals(seen.points, layer.faces), layer.colours
-        self.spans = outlines(seen.points, layer.faces, layer.bodies, layer.solids, self.grid)
-
-    @property
-    def look(self) -> Any:
-        """As `finish` takes it."""
-        return *self._mesh, *self._look, self._layer.alphas, self._layer.rims
-
-    @cached_property
-    def _by_band(self) -> tuple[NDArray[np.int64], Ints32]:
-        starts, spans = sorted_by_band(self.spans, _band_rows(self._camera), len(_bands(self._camera)))
-        return starts, spans
-
-    def of_band(self, band: int) -> Ints32:
-        """The rows of ``spans`` that a band of the picture needs."""
-        starts, spans = self._by_band
-        return spans[starts[band] : starts[band + 1]]
-
-    def put_opaque(self, shot: RasterShot, corner: tuple[int, int], spans: Ints32) -> None:
-        """Draw what is opaque into a picture, where it is nearer than what is there; in place.
-
-        Args:
-            corner: Row and column of the whole picture at which it begins, multiples of ``SAMPLES``.
-        """
-        drawn = Drawn.empty(1, shot.depth.shape)
-        self.draw(depth_before(shot.depth, self.grid, corner), drawn, corner, spans)
-        self.shade(drawn, shot, corner)
-
-    def draw(self, hidden: Floats32, drawn: Drawn, corner: tuple[int, int], spans: Ints32) -> None:
-        """Find what every sample of a part of the picture shows.
-
-        Args:
-            hidden: Shape (h, w), of `depth_before`: what is there already.
-            corner: Row and column of the whole picture at which it begins.
-        """
-        draw(*self._mesh, spans, self.grid, corner, hidden, *drawn)
-
-    def shade(self, drawn: Drawn, shot: RasterShot, corner: tuple[int, int]) -> None:
-        """Colour and depth of the samples for which a triangle was found, in place; ``corner`` is even."""
-        place = tuple(LIGHT), self.grid, corner, drawn.inverse[0], drawn.triangle[0]
-        shade_nearest(*self._mesh, *self._look, *place, shot.colour, shot.depth)
-
-    def shells(self, before: Floats32, corner: tuple[int, int], spans: Ints32) -> Shells:
-        """What is see-through, as far as nothing opaque hides it.
-
-        Args:
-            before: Depth of what is opaque in a part of the picture, shape (h, w), mm along the ray.
-            corner: Row and column of the whole picture at which it begins, multiples of ``SAMPLES``.
-        """
-        drawn = Drawn.empty(MAX_SHELLS, before.shape)
-        self.draw(depth_before(before, self.grid, corner), drawn, corner, spans)
-        shells = Shells.empty(MAX_SHELLS, *before.shape)
-        look: Any = (*self._look, self._layer.alphas, self._layer.rims, tuple(LIGHT), self.grid, corner)
-        for shell in zip(*drawn, shells.colour, shells.alpha, shells.depth, strict=True):
-            samples: Any = shell
-            shade_shells(*self._mesh, *look, *samples)
-        return shells
+        points = rotated(layer.vertices, turn, eye)
+        normals, flats = rotated(layer.normals, turn, np.zeros(3)), flat_normals(points, layer.faces)
+        look = layer.faces, layer.bodies, normals, flats, layer.colours, layer.alphas, layer.rims
+        self.look = Look(points, *look)
+        self.spans: Ints32 = outlines(points, layer.faces, self.grid)
 
 
-def opaque_shot(layer: Layer, camera: ViewCamera) -> RasterShot:
-    """Everything opaque of one layer in the CT frame, at the camera's own resolution."""
-    view, shot = View(layer, camera, posed(layer, camera)), _background(camera.height, camera.width)
-
-    def draw_band(band: int, rows: slice) -> None:
-        view.put_opaque(RasterShot(shot.colour[rows], shot.depth[rows]), (rows.start, 0), view.of_band(band))
-
-    _in_bands(camera, draw_band)
-    return shot
-
-
-def shells_of(layer: Layer, camera: ViewCamera) -> Shells:
-    """The shells of a see-through layer: the nearest hit of every sample first, then the one behind it, and so on.
-
-    Args:
-        layer: The surfaces, CT frame.
-        camera: The samples are its pixels.
-    """
-    view = View(layer, camera, posed(layer, camera))
-    depth = np.full((camera.height, camera.width), np.inf, dtype=np.float32)
-    parts = _in_bands(camera, lambda band, rows: view.shells(depth[rows], (rows.start, 0), view.of_band(band)))
-    most = max(int(np.isfinite(part.depth).any(axis=(1, 2)).sum()) for part in parts)
-    joined = (np.concatenate([getattr(part, name)[:most] for part in parts], axis=1) for name in _SHELL_PARTS)
-    return Shells(*joined)
-
-
-def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> NDArray[np.uint8]:
+def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> Pixels:
     """A scene in the CT frame in pixels, shape (h, w, 3): what is opaque, and what is see-through over it.
 
     Args:
         camera: Its pixels are the picture's; each is the mean of ``SAMPLES`` by ``SAMPLES``.
     """
     fine = camera.finer(SAMPLES)
-    solid, glass = (View(layer, fine, posed(layer, fine)) for layer in (opaque, translucents))
-    return np.concatenate(_in_bands(fine, lambda band, rows: _pixels(solid, glass, band, rows)))
+    solid, glass = View(opaque, fine), View(translucents, fine)
+    return np.concatenate(_in_bands(fine, lambda rows: _drawn_band(solid, glass, rows).pixels))
 
 
-def _pixels(solid: View, glass: View, band: int, rows: slice) -> NDArray[np.uint8]:
-    """A band of a picture of what is opaque and of what is see-through before it, shape (h, w, 3)."""
+class _Band(NamedTuple):
+    """A band of a picture: what its samples show of what is opaque and of what is see-through, and its pixels."""
+
+    behind: Drawn
+    shells: Drawn
+    pixels: Pixels
+
+
+def _drawn_band(solid: View, glass: View, rows: slice) -> _Band:
     corner, size = (rows.start, 0), (rows.stop - rows.start, solid.grid[2])
     behind, shells = Drawn.empty(1, size), Drawn.empty(MAX_SHELLS, size)
-    solid.draw(np.zeros(size, dtype=np.float32), behind, corner, solid.of_band(band))
-    glass.draw(behind.inverse[0], shells, corner, glass.of_band(band))
+    nothing = np.zeros(size, dtype=np.float32)
+    draw(*solid.look[:3], solid.spans, solid.grid, corner, nothing, *behind)
+    draw(*glass.look[:3], glass.spans, glass.grid, corner, behind.inverse[0], *shells)
+    return _Band(behind, shells, _finished(solid.look, glass.look, solid.grid, corner, behind, shells.triangle))
+
+
+def _finished(
+    solid: Look, glass: Look, grid: tuple[float, int, int], corner: tuple[int, int], behind: Drawn, shells: Ints32
+) -> Pixels:
+    """The pixels (h, w, 3) of a part of a picture, from the triangles that its samples show."""
     held = np.zeros((1 + MAX_SHELLS, SAMPLES * SAMPLES, 4), dtype=np.float32)  # what is not there is blended at 0
-    pixels = np.empty((size[0] // SAMPLES, size[1] // SAMPLES, 3), dtype=np.uint8)
-    place: Any = tuple(LIGHT), solid.grid, corner
-    finish(solid.look, glass.look, *place, behind.triangle, shells.triangle, tuple(BACKGROUND), held, pixels)
+    high, wide = behind.triangle.shape[1:]
+    pixels = np.empty((high // SAMPLES, wide // SAMPLES, 3), dtype=np.uint8)
+    place: Any = tuple(LIGHT), grid, corner, behind.triangle, shells, tuple(BACKGROUND)
+    finish(tuple(solid), tuple(glass), *place, held, pixels)
     return pixels
 
 
-def _background(height: int, width: int) -> RasterShot:
-    colour = np.empty((height, width, 3), dtype=np.float32)
-    colour[:] = BACKGROUND
-    return RasterShot(colour, np.full((height, width), np.inf, dtype=np.float32))
-
-
-def _band_rows(camera: ViewCamera) -> int:
-    return max(1, BAND // (camera.width * SAMPLES)) * SAMPLES
-
-
-def _bands(camera: ViewCamera) -> list[slice]:
-    """The picture's rows, band by band, whole pixels of ``SAMPLES`` rows, from the top."""
-    rows = _band_rows(camera)
-    return [slice(top, min(top + rows, camera.height)) for top in range(0, camera.height, rows)]
-
-
-def _in_bands(camera: ViewCamera, work: Callable[[int, slice], T]) -> list[T]:
-    """Call a function with number and rows of every band, on several processors, and collect its results."""
-    bands = _bands(camera)
+def _in_bands(camera: ViewCamera, work: Callable[[slice], T]) -> list[T]:
+    """Call a function with the rows of every band, whole pixels, on several processors, and collect its results."""
+    high = max(1, BAND // (camera.width * SAMPLES)) * SAMPLES
+    bands = [slice(top, min(top + high, camera.height)) for top in range(0, camera.height, high)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(work, range(len(bands)), bands))
+        return list(pool.map(work, bands))
 
 
 def _joined(arrays: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
@@ -313,72 +216,47 @@ def _joined(arrays: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
 
 
 class MovingPicture:
-    """One view of what stands still, with bodies that move.
+    """One view of what stands still, with bodies that move; several threads may ask it at once.
 
     Args:
         opaque: What stands still, CT frame.
-        layers: What moves, each in its own frame. Of two in one place the first is seen.
+        layers: What moves, each in its own frame. Of two in one place the first is seen, and what stands before all.
         camera: Its pixels are the picture's.
     """
 
     def __init__(self, opaque: Layer, translucents: Layer, layers: Sequence[Layer], camera: ViewCamera) -> None:
         self._camera, self._layers = camera.finer(SAMPLES), tuple(layers)
-        self._together = Layer([surface for layer in layers for surface in layer.surfaces])
-        self._still, self._shells = opaque_shot(opaque, self._camera), shells_of(translucents, self._camera)
-        self._picture = compose(self._still, self._shells)
-        fine = self._camera
-        self._hidden = depth_before(self._still.depth, (fine.scale, fine.height, fine.width), (0, 0))
-        self._with_own_arrays()
-
-    @property
-    def still(self) -> NDArray[np.uint8]:
+        solid, glass = View(opaque, self._camera), View(translucents, self._camera)
+        bands = _in_bands(self._camera, lambda rows: _drawn_band(solid, glass, rows))
+        self._solid, self._glass = solid.look, glass.look
+        self._behind, self._shells = (
+            Drawn(*(np.concatenate(parts, axis=1) for parts in zip(*drawn, strict=True)))
+            for drawn in ([one.behind for one in bands], [one.shells for one in bands])
+        )
+        self.still: Pixels = np.concatenate([one.pixels for one in bands])
         """The picture without what moves, shape (h, w, 3)."""
-        return self._picture
 
-    def another(self) -> MovingPicture:
-        """A copy of this picture for another thread; what does not move is shared."""
-        made = copy(self)
-        made._with_own_arrays()
-        return made
-
-    def _with_own_arrays(self) -> None:
-        self._drawn = Drawn.empty(1, self._still.depth.shape)
-        self.shot = RasterShot(self._still.colour.copy(), self._still.depth.copy())
-        self.changed = NOWHERE
-
-    def at(self, T_ct_layers: Sequence[Floats]) -> NDArray[np.uint8]:
+    def at(self, T_ct_layers: Sequence[Floats]) -> Pixels:
         """The picture with what moves at its poses, each (4, 4), mm; shape (h, w, 3)."""
-        self._take_away()
-        seen = [posed(layer, self._camera, T) for layer, T in zip(self._layers, T_ct_layers, strict=True)]
-        joined = Posed(*(np.concatenate(parts) for parts in zip(*seen, strict=True)))
-        view = View(self._together, self._camera, joined)
-        self.changed = _box(view)
-        view.draw(self._hidden, self._drawn, (0, 0), view.spans)
-        view.shade(*self._parts(), (self.changed.y0, self.changed.x0))
-        picture = self._picture.copy()
-        recompose(picture, self.shot, self._shells, self._still.depth, self.changed)
+        views = [View(layer, self._camera, T) for layer, T in zip(self._layers, T_ct_layers, strict=True)]
+        look = self._solid.with_more(reduce(Look.with_more, (view.look for view in views)))
+        first = np.cumsum([len(self._solid.faces), *(len(view.look.faces) for view in views)])
+        moved = [view.spans + [[at, 0, 0, 0, 0]] for view, at in zip(views, first, strict=False)]
+        spans: Ints32 = np.concatenate(moved).astype(np.int32)
+        if len(spans) == 0:
+            return self.still
+        top, left = (int(one) // SAMPLES for one in spans[:, [1, 3]].min(axis=0))
+        bottom, right = (int(one) // SAMPLES + 1 for one in spans[:, [2, 4]].max(axis=0))
+        part = np.s_[:, top * SAMPLES : bottom * SAMPLES, left * SAMPLES : right * SAMPLES]
+        behind, shells = Drawn(*(one[part].copy() for one in self._behind)), Drawn(*(one[part] for one in self._shells))
+        grid, corner = views[0].grid, (top * SAMPLES, left * SAMPLES)
+        nothing = np.zeros(behind.inverse.shape[1:], dtype=np.float32)
+        draw(*look[:3], spans, grid, corner, nothing, *behind)
+        before = shells.inverse > behind.inverse + TIE * shells.inverse**2  # as `draw` hides what is behind
+        seen = np.where(before, shells.triangle, np.int32(-1))
+        picture = self.still.copy()
+        picture[top:bottom, left:right] = _finished(look, self._glass, grid, corner, behind, seen)
         return picture
-
-    def _take_away(self) -> None:
-        """What stands still, and nothing before it."""
-        drawn, shot = self._parts()
-        still = self._still.part(self.changed.slices)
-        shot.colour[:], shot.depth[:] = still.colour, still.depth
-        drawn.inverse[:], drawn.triangle[:] = 0.0, -1
-
-    def _parts(self) -> tuple[Drawn, RasterShot]:
-        """Where something changed."""
-        part = self.changed.slices
-        return self._drawn.part(part), self.shot.part(part)
-
-
-def _box(view: View) -> PixelBox:
-    """The part of a picture in which a view may show something, whole pixels."""
-    if len(view.spans) == 0:
-        return NOWHERE
-    first, last, begin, end = view.spans[:, 1:].T
-    top, left = (int(low.min()) // SAMPLES * SAMPLES for low in (first, begin))
-    return PixelBox(left, top, int(end.max()) + 1, int(last.max()) + 1)
 
 
 ALL = SAMPLES * SAMPLES
@@ -390,9 +268,8 @@ def finish(solid, glass, light, grid, corner, behind, shells, background, held, 
     """Light and blend every pixel of a part of a picture.
 
     Args:
-        solid: Of the opaque layer, points (n, 3), faces (m, 3), bodies (m,), normals (n, 3), flats (m, 3), colours
-            (b, 3), alphas (b,) and rims (b,), as `shade_shells` takes them.
-        glass: The same of the see-through layer.
+        solid: The parts of the `Look` of the opaque layer.
+        glass: Those of the see-through layer.
         light: Three numbers, unit, toward the lamp, camera's frame.
         grid: Samples per unit of x and y, rows, columns of the whole picture.
         corner: Row and column of the picture at which the part begins, in samples; multiples of ``SAMPLES``.
@@ -459,6 +336,12 @@ def _shade_one(held, layer, s, look, light, f, x, y):
     held[layer, s, 3] = min(1.0, alphas[body] * (1.0 + rims[body] * edge_on * edge_on * edge_on))
     for c in range(3):
         held[layer, s, c] = min(colours[body, c] * tone + shine, 255.0)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def byte(total):
+    """The mean of a pixel's samples as a byte."""
+    return np.uint8(min(max(np.round(total / SAMPLES**2), 0.0), 255.0))
 
 
 @allocation_free(nogil=True, error_model="numpy", forceinline=True)

@@ -1,41 +1,30 @@
 """``rehearsal.mp4``: the rehearsal as it happened in the twin, with time, phase and distances written into it.
 
-The patient and the room do not move, so each view's picture of them is made once; every frame then casts rays only
-where the arm is, and blends only what changed.
+The patient and the room do not move, so what each view's samples show of them is found once; every frame then draws
+the arm over it, and blends only where the arm is.
 """
 
 from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
-from queue import Queue
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.progress import Count
+from puncture_twin.planning.base.arrays import Floats, Pixels
+from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface
-from puncture_twin.twin.report.scene.film_text import (
-    BELOW,
-    Frame,
-    FrameText,
-    FrameWords,
-    Part,
-    Pixels,
-    model_note,
-    write_gif,
-    write_mp4,
-)
+from puncture_twin.twin.report.scene.film_text import BELOW, FilmFrames, write_gif, write_mp4
 from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, bar, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.views import close_up, overview
 
@@ -100,7 +89,7 @@ def film_times(total_s: float) -> FilmTimes:
     return FilmTimes(tuple(float(m) for m in moments), float(speed), round(STILL_S * FRAMES_PER_SECOND))
 
 
-def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path, progress: Count | None = None) -> Path:
+def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path, progress: Count = uncounted) -> Path:
     """Write the film; a GIF beside it when no H.264 encoder can be started.
 
     Args:
@@ -111,124 +100,66 @@ def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path, pr
         The file that was written.
     """
     times = film_times(float(rehearsal.times_s[-1]))
-    scene = _scene(rehearsal, plan, case, anatomy, times.speed)
-
-    def frames() -> Iterator[Frame]:
-        return _with_still(_frames(scene, times, progress), times.still_frames)
-
-    path = Path(path)
+    film, path = _Film.of(rehearsal, plan, case, anatomy, times.speed), Path(path)
     try:
-        write_mp4(scene.ground, frames(), path, FRAMES_PER_SECOND)
+        write_mp4(film.frames(times, progress), film.words.size, path, FRAMES_PER_SECOND)
     except (OSError, RuntimeError):  # no encoder on this machine, or one without H.264
         path = path.with_suffix(".gif")
-        write_gif(scene.ground, frames(), path, FRAMES_PER_SECOND)
+        write_gif(film.frames(times, progress), path, FRAMES_PER_SECOND)
     return path
 
 
-def _with_still(frames: Iterable[Frame], count: int) -> Iterator[Frame]:
-    """The frames, then the last so many times more."""
-    for frame in frames:
-        yield frame
-    yield from repeat(frame, count)
-
-
-class _Scene(NamedTuple):
-    """Ingredients of a film's frames: the image of what does not move (HEIGHT, WIDTH, 3), and what is drawn over it."""
-
-    ground: Pixels
-    views: _Views
-    words: FrameWords
-    poses: Callable[[int], list[Floats]]
-    """Of the links after the base, and the tool, T_ct_body, at a record of the rehearsal."""
-
-
-def _scene(rehearsal: Any, plan: Any, case: Any, anatomy: Any, speed: float) -> _Scene:
-    T_base_ct = rehearsal.T_base_ct_true
-    arm = ArmPicture(plan.model, T_base_ct)
-    base = arm.bodies(rehearsal.q[0])[0]
-    still = [*patient(anatomy, case), *room(case, T_base_ct), arm.plate, _planned_path(plan)]
-    cameras = _wide_camera(case, still, arm, rehearsal, plan), _near_camera(case, still, plan)
-    wide, near = (_tool_layer(case, camera) for camera in cameras)
-    views = _Views(
-        _moving_picture([*still, base], cameras[0], [*arm.layers[1:], wide]),
-        _moving_picture([b for b in still if b.group != "room"], cameras[1], [near]),
-    )
-    words = FrameWords(FrameText(rehearsal, plan, speed, demanding(anatomy), model_note(case)), cameras, case)
-    ground = np.array(words.still((WIDTH, HEIGHT)))
-    ground[:VIEW_HEIGHT, :VIEW_WIDTH] = views.wide.still
-
-    def poses(row: int) -> list[Floats]:
-        T_ct_flange = np.linalg.inv(T_base_ct) @ rehearsal.T_base_flange_true[row]
-        return [*arm.poses_ct(rehearsal.q[row])[1:], T_ct_flange]
-
-    return _Scene(ground, views, words, poses)
-
-
-def _frames(scene: _Scene, times: FilmTimes, progress: Count | None) -> Iterator[Frame]:
-    """The frames that move; pictures are drawn on threads, words here."""
-    rows = scene.words.rows(times.moments)
-    for number, pictures in enumerate(_drawn_ahead(scene.views, [scene.poses(row) for row in rows])):
-        row, moment = rows[number], times.moments[number]
-        yield (
-            Part(0, 0, scene.words.over_wide(pictures.wide, moment)),
-            Part(VIEW_WIDTH, 0, scene.words.over_near(pictures.near)),
-            Part(0, VIEW_HEIGHT, scene.words.below(row, moment)),
-        )
-        if progress is not None:
-            progress(number + 1, len(times.moments))
-
-
-class _Pictures(NamedTuple):
-    """The two views of a frame, each (h, w, 3)."""
-
-    wide: Pixels
-    near: Pixels
-
-
-class _Views(NamedTuple):
-    """The overview, with the links after the base and the tool, and the close-up with the tool alone."""
+class _Film(NamedTuple):
+    """The two views, with the links after the base and the tool, and with the tool alone, and the words about them."""
 
     wide: MovingPicture
     near: MovingPicture
+    words: FilmFrames
+    poses: Callable[[int], list[Floats]]
+    """Of the links after the base, and the tool, T_ct_body, at a record of the rehearsal."""
 
-    def at(self, poses: Sequence[Floats]) -> _Pictures:
-        """Both, with the links and at last the tool at their poses T_ct_body."""
-        return _Pictures(self.wide.at(poses), self.near.at(poses[-1:]))
+    @classmethod
+    def of(cls, rehearsal: Any, plan: Any, case: Any, anatomy: Any, speed: float) -> _Film:
+        """What does not move is drawn here, once."""
+        T_base_ct = rehearsal.T_base_ct_true
+        arm = ArmPicture(plan.model, T_base_ct)
+        base = arm.bodies(rehearsal.q[0])[0]
+        still = [*patient(anatomy, case), *room(case, T_base_ct), arm.plate, _planned_path(plan)]
+        cameras = _wide_camera(case, still, arm, rehearsal, plan), _near_camera(case, still, plan)
+        wide, near = (_tool_layer(case, camera) for camera in cameras)
 
-    def another(self) -> _Views:
-        """For another thread."""
-        return _Views(self.wide.another(), self.near.another())
+        def poses(row: int) -> list[Floats]:
+            T_ct_flange = np.linalg.inv(T_base_ct) @ rehearsal.T_base_flange_true[row]
+            return [*arm.poses_ct(rehearsal.q[row])[1:], T_ct_flange]
 
+        return cls(
+            _moving_picture([*still, base], cameras[0], [*arm.layers[1:], wide]),
+            _moving_picture([b for b in still if b.group != "room"], cameras[1], [near]),
+            FilmFrames(rehearsal, cameras, case, speed, demanding(anatomy)),
+            poses,
+        )
 
-def _drawn_ahead(views: _Views, poses: Sequence[Sequence[Floats]]) -> Iterator[_Pictures]:
-    """The pictures of all poses, in order; a few are drawn, by as many threads as there are cores, before one asks."""
-    threads = min(len(os.sched_getaffinity(0)), MOST_THREADS)
-    free: Queue[_Views] = Queue()
-    for own in (views, *(views.another() for _ in range(threads - 1))):
-        free.put(own)
+    def frames(self, times: FilmTimes, progress: Count) -> Iterator[Pixels]:
+        """The frames that move, drawn by as many threads as there are cores while others are encoded; then the last."""
+        threads = min(len(os.sched_getaffinity(0)), MOST_THREADS)
+        with ThreadPoolExecutor(threads) as pool:
+            waiting: deque[Future[Pixels]] = deque()
+            for number, moment in enumerate(times.moments):
+                waiting.append(pool.submit(self._frame, moment))
+                while len(waiting) > threads or (waiting and number == len(times.moments) - 1):
+                    frame = waiting.popleft().result()
+                    yield frame
+                progress(number + 1, len(times.moments))
+        yield from repeat(frame, times.still_frames)
 
-    def drawn(pose: Sequence[Floats]) -> _Pictures:
-        own = free.get()
-        try:
-            return own.at(pose)
-        finally:
-            free.put(own)
-
-    with ThreadPoolExecutor(threads) as pool:
-        waiting: deque[Future[_Pictures]] = deque()
-        for pose in poses:
-            waiting.append(pool.submit(drawn, pose))
-            if len(waiting) > threads:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+    def _frame(self, moment: float) -> Pixels:
+        poses = self.poses(self.words.row(moment))
+        return self.words.frame(moment, self.wide.at(poses), self.near.at(poses[-1:]))
 
 
 def _moving_picture(bodies: list[SceneBody], camera: ViewCamera, layers: Sequence[Layer]) -> MovingPicture:
     """One view of bodies that stand still (CT frame) and of layers that move."""
-    opaque, translucent = (
-        [b.seen_from(camera.eye) for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False)
-    )
+    opaque, translucent = ([b.surface for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False))
     return MovingPicture(Layer(opaque), Layer(translucent), layers, camera)
 
 

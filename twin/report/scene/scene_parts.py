@@ -1,15 +1,11 @@
-# mypy: disable-error-code="no-untyped-def"
 """The scene as coloured meshes in the CT frame, for image, film and page.
-
-Whether a surface hides its own back from whoever is outside of it.
 
 Simple bodies that the pictures need: needle, holder, ball, box, and the corridor of safe directions.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +16,6 @@ from puncture_twin.planning.arm.links import Link, visual_links
 from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.reasons import SAFE, Rgb
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.geometry.containment import hit_fraction
@@ -182,24 +177,13 @@ class SceneBody:
     mesh: TriangleMesh
     colour: Rgb
     alpha: float = 1.0
-    solid: bool = False
     frame: int = 0
 
     @property
     def surface(self) -> Surface:
         """For the ray caster; the corridor is flat colour, without the rim that makes a skin look like glass."""
         rim = 0.0 if self.group == "safe" else Surface.rim
-        return Surface(self.mesh, self.colour, self.alpha, rim, self.solid)
-
-    def seen_from(self, eye_ct: Floats) -> Surface:
-        """This part for an eye (3,), mm: solid where it looks solid, and the eye is not within its box."""
-        low, high = self.mesh.bounds
-        within = bool(np.all((low <= eye_ct) & (eye_ct <= high)))
-        return replace(self.surface, solid=not within and self._hides_its_back)
-
-    @cached_property
-    def _hides_its_back(self) -> bool:
-        return self.solid or (self.alpha >= 1 and faces_outwards(self.mesh))
+        return Surface(self.mesh, self.colour, self.alpha, rim)
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,13 +304,7 @@ class ArmPicture:
         own = () if tool is None else (Link("tool", FLANGE, (tool.mesh,)),)
         self._links = (*visual_links(self._model), *own)
         self._T_ct_base = np.linalg.inv(T_base_ct)
-        self.layers = tuple(
-            Layer([Surface(link.mesh, palette.ARM, solid=self._is_solid(link))]) for link in self._links
-        )
-
-    def _is_solid(self, link: Link) -> bool:
-        """Links of the arms that ship are; of an own arm and tool nobody knows."""
-        return self._model.urdf is None and link.name != "tool"
+        self.layers = tuple(Layer([Surface(link.mesh, palette.ARM)]) for link in self._links)
 
     def poses_ct(self, q: Floats) -> Floats:
         """T_ct_link of every layer, shape (k, 4, 4), mm, at a configuration (6,), rad."""
@@ -342,7 +320,6 @@ class ArmPicture:
                 "arm",
                 link.mesh.transformed(T),
                 palette.HOLDER if link.name == "tool" else palette.ARM,
-                solid=self._is_solid(link),
                 frame=link.frame,
             )
             for link, T in zip(self._links, poses, strict=True)
@@ -374,59 +351,3 @@ def _gantry(gantry: Any) -> SceneBody:
     radius = gantry.bore_diameter_mm / 2
     wall = ring(gantry.T_ct_gantry, radius, radius + gantry.wall_mm, gantry.thickness_mm)
     return SceneBody("gantry", "room", wall, palette.TABLE, GANTRY_OPACITY)
-
-
-def faces_outwards(mesh: TriangleMesh) -> bool:
-    """Whether a surface is closed, and every triangle that faces away from an eye outside of it is behind another.
-
-    No where it has a hollow, which is wound like a piece that is inside out.
-    """
-    return mesh.closed and mesh.wound_alike and bool(_every_piece_holds_volume(mesh.vertices, mesh.faces))
-
-
-@nb.njit(cache=True, error_model="numpy")
-def _every_piece_holds_volume(vertices, faces):
-    """Whether triangles that hang together by their corners enclose more than nothing, seen from their outside.
-
-    Where a surface repeats corners, its pieces may be open, and what they enclose is measured from its first corner:
-    of those of a closed surface that is inside out at least one holds less than nothing.
-
-    Args:
-        vertices: Shape (n, 3), mm, read-only.
-        faces: Shape (m, 3), read-only.
-    """
-    piece = np.arange(len(vertices))  # of each corner another one of the same piece, of one corner itself
-    for f in range(len(faces)):
-        a = _first_of(piece, faces[f, 0])
-        for k in range(1, 3):
-            b = _first_of(piece, faces[f, k])
-            a, b = min(a, b), max(a, b)
-            piece[b] = a
-    volume = np.zeros(len(vertices))
-    for f in range(len(faces)):
-        ax, ay, az = _from_first(vertices, faces[f, 0])
-        bx, by, bz = _from_first(vertices, faces[f, 1])
-        cx, cy, cz = _from_first(vertices, faces[f, 2])
-        holds = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-        volume[_first_of(piece, faces[f, 0])] += holds
-    least = np.inf
-    for f in range(len(faces)):
-        least = min(least, volume[_first_of(piece, faces[f, 0])])
-    return least > 0.0
-
-
-@nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _first_of(piece, corner):
-    while piece[corner] != corner:
-        piece[corner] = piece[piece[corner]]  # halves the way for whoever comes next
-        corner = piece[corner]
-    return corner
-
-
-@nb.njit(cache=True, error_model="numpy", forceinline=True)
-def _from_first(vertices, corner):
-    return (
-        vertices[corner, 0] - vertices[0, 0],
-        vertices[corner, 1] - vertices[0, 1],
-        vertices[corner, 2] - vertices[0, 2],
-    )

@@ -98,7 +98,7 @@ def draw_scene(
 
 def render_bodies(bodies: Sequence[SceneBody], camera: ViewCamera) -> NDArray[np.uint8]:
     """One view of a scene, anti-aliased: the opaque bodies, and the see-through ones over them."""
-    opaque, glass = ([b.seen_from(camera.eye) for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False))
+    opaque, glass = ([b.surface for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False))
     return picture(Layer(opaque), Layer(glass), camera)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
@@ -33,12 +33,6 @@ EXTENT_WEIGHT = 0.8
 PATH_SAMPLES = 24
 TARGET_WEIGHT = 8
 """The target counts as so many points of the path when one asks what a view hides."""
-
-EVERY, RUN = 32, 64
-"""Every so many-th point of a hull is looked at first; the others in runs of so many at once."""
-
-SAME_MM = 1e-9
-"""What stands out of a hull by less does so by rounding."""
 
 
 def up_ct(case: Any) -> Floats:
@@ -104,33 +98,6 @@ def close_up(case: Any, path_ct: Floats, radius: float, blockers: Layer, size: t
     return _best(options, up, content, focus, blockers, size)
 
 
-def outermost(points: Floats) -> Floats:
-    """The corners of the convex hull of points (n, 3), shape (m, 3).
-
-    A few points have nearly that hull. Points in a row lie near each other, as a surface has its corners: hardly any
-    such run stands out of the hull of the few, and only those that do are looked at point by point.
-    """
-    inner = _hull_of_some(points)
-    if inner is None:
-        return np.asarray(points[ConvexHull(points).vertices])
-    whole = len(points) // RUN * RUN
-    columns = np.ascontiguousarray(points[:whole].T).reshape(3, -1, RUN)  # numpy is slow along rows of three
-    low, high = columns.min(axis=2).T, columns.max(axis=2).T
-    normals, offsets = inner.equations[:, :3].T, inner.equations[:, 3]
-    farthest = (low + high) / 2 @ normals + (high - low) / 2 @ np.abs(normals) + offsets
-    out = points[:whole].reshape(-1, RUN, 3)[(farthest > SAME_MM).any(axis=1)].reshape(-1, 3)
-    points = np.concatenate([inner.points[inner.vertices], out, points[whole:]])
-    return np.asarray(points[ConvexHull(points).vertices])
-
-
-def _hull_of_some(points: Floats) -> ConvexHull | None:
-    """The hull of every so many-th of points (n, 3); None where they are too few, or lie in one plane."""
-    try:
-        return ConvexHull(points[::EVERY])
-    except QhullError:
-        return None
-
-
 def _across(direction: Floats) -> Floats:
     least = np.eye(3)[int(np.argmin(np.abs(direction)))]
     side = np.cross(direction, least)
@@ -141,7 +108,7 @@ def _best(
     options: list[Floats], up: Floats, content: Floats, focus: Floats, blockers: Layer, size: tuple[int, int]
 ) -> ViewCamera:
     """The option that sees most of the focus; among equals, the one that sees it longest in the picture."""
-    content = outermost(content)
+    content = content[ConvexHull(content).vertices]
     cameras = [
         camera_around(content, toward, up, fov=FOV, width=size[0], height=size[1])
         for toward in options

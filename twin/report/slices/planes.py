@@ -1,4 +1,3 @@
-# mypy: disable-error-code="no-untyped-def"
 """The planes in which a needle's path or an image is looked at: where each lies, what is right and up in it.
 
 Where a plane cuts surfaces, the needle, and the ellipsoid of the tip.
@@ -12,7 +11,6 @@ from functools import cached_property
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.map_view import body_directions
@@ -166,41 +164,22 @@ def outline(mesh: TriangleMesh, plane: Plane) -> Floats:
     """
     if not _is_seen(mesh, plane):
         return np.zeros((0, 2, 2))
-    return plane.place(_cut(mesh.vertices, mesh.faces, tuple(plane.normal), plane.at_ct @ plane.normal))
+    return plane.place(_cut(mesh, plane))
 
 
-@nb.njit(cache=True, error_model="numpy")
-def _cut(vertices, faces, normal, offset):
-    """Segments in which a plane cuts a mesh's triangles, shape (n, 2, 3), mm, in the order of the triangles.
-
-    Args:
-        vertices: Shape (v, 3), mm, read-only.
-        faces: Shape (m, 3), read-only.
-        offset: Of the plane's points along the normal, mm.
-    """
-    height = np.empty(len(vertices))
-    for v in range(len(vertices)):
-        x, y, z = vertices[v, 0] * normal[0], vertices[v, 1] * normal[1], vertices[v, 2] * normal[2]
-        height[v] = x + y + z - offset
-    first = np.empty(len(faces), dtype=np.int8)  # the corner that is alone on its side
-    count = 0
-    for f in range(len(faces)):
-        # a corner in the plane counts as below it: every triangle is cut in no edge or in two
-        a, b, c = height[faces[f, 0]] > 0, height[faces[f, 1]] > 0, height[faces[f, 2]] > 0
-        first[f] = (-1 if b == c else 2) if a == b else (1 if a == c else 0)
-        count += first[f] >= 0
-    ends = np.empty((count, 2, 3))
-    count = 0
-    for f in range(len(faces)):
-        if first[f] >= 0:
-            tip = faces[f, first[f]]
-            for k in range(2):
-                other = faces[f, (first[f] + 1 + k) % 3]
-                along = height[tip] / (height[tip] - height[other])
-                for axis in range(3):
-                    ends[count, k, axis] = vertices[tip, axis] * (1 - along) + vertices[other, axis] * along
-            count += 1
-    return ends
+def _cut(mesh: TriangleMesh, plane: Plane) -> Floats:
+    """Segments in which a plane cuts a mesh's triangles, shape (n, 2, 3), mm, in the order of the triangles."""
+    height = (mesh.vertices - plane.at_ct) @ plane.normal
+    above = (
+        height[mesh.faces] > 0
+    )  # a corner in the plane counts as below it: every triangle is cut in no edge or in two
+    count = above.sum(axis=1)
+    rows = np.flatnonzero((count == 1) | (count == 2))
+    alone = np.argmax(above[rows] == (count[rows] == 1)[:, None], axis=1)  # the corner that is alone on its side
+    tip = mesh.faces[rows, alone][:, None]
+    others = mesh.faces[rows[:, None], (alone[:, None] + (1, 2)) % 3]
+    along = (height[tip] / (height[tip] - height[others]))[..., None]
+    return np.asarray(mesh.vertices[tip] * (1 - along) + mesh.vertices[others] * along)
 
 
 def _is_seen(mesh: TriangleMesh, plane: Plane) -> bool:

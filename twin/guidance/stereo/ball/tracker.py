@@ -7,7 +7,6 @@ sphere of viewing directions. A ball that is absent, mostly hidden or too faint 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import cv2
@@ -42,36 +41,20 @@ KEPT_AWAY = 2
 """Spokes between a used edge and one off the circle: 10 degrees, 1.7 px at a radius of 10 px."""
 
 
-@dataclass(frozen=True)
-class TrackerSettings:
-    """Settings of the ball's measurement, and of when it is believed.
-
-    Attributes:
-        spokes: Edges wanted, evenly around the outline.
-        first_reach_px: How far from Hough's circle an edge may lie.
-        last_reach_px: How far from the measured circle.
-        inlier_px: An edge this near votes for a circle.
-        min_inliers: Fraction of all spokes that must agree.
-        min_visible: Fraction of the disc that must look like the ball.
-        radius_share: How far the radius may be from the predicted one.
-        min_contrast: Grey levels between ball and surroundings that make an edge.
-        noise_factor: The same in parts of the image's own noise; the larger counts.
-        model_px: Standard deviation, per axis, of what light, blur and rod do to the centre and the edges do not show.
-    """
-
-    spokes: int = 72
-    first_reach_px: float = 4.0
-    last_reach_px: float = 2.5
-    inlier_px: float = 0.35
-    min_inliers: float = 0.5
-    min_visible: float = 0.5
-    radius_fraction: float = 0.05
-    min_contrast: float = 12.0
-    noise_factor: float = 5.0
-    model_px: float = 0.014
-
-
-DEFAULT = TrackerSettings()
+SPOKES = 72
+"""Edges wanted, evenly around the outline."""
+FIRST_REACH_PX, LAST_REACH_PX = 4.0, 2.5
+"""How far from Hough's circle, and from the measured one, an edge may lie."""
+INLIER_PX = 0.35
+"""An edge this near votes for a circle."""
+MIN_INLIERS, MIN_VISIBLE = 0.5, 0.5
+"""Fraction of all spokes that must agree, and of the disc that must look like the ball."""
+RADIUS_FRACTION = 0.05
+"""How far the radius may be from the predicted one."""
+MIN_CONTRAST, NOISE_FACTOR = 12.0, 5.0
+"""Least contrast of an edge: grey levels, and parts of the image's own noise; the larger counts."""
+MODEL_PX = 0.014
+"""Standard deviation, per axis, of what light, blur and rod do to the centre and the edges do not show."""
 
 
 class DetectedBall(NamedTuple):
@@ -81,12 +64,8 @@ class DetectedBall(NamedTuple):
     """Shape (2,): the projection of the ball's centre, px."""
     covariance: Floats
     """Shape (2, 2), px^2."""
-    radius_px: float
-    """As ``Camera.ball_radius_px`` defines it."""
     inliers: int
-    """Edges on the circle; 0 for Hough alone."""
-    n_edges: int
-    """Edges wanted."""
+    """Of `SPOKES` edges, those on the circle; 0 for Hough alone."""
 
 
 class LostBall(NamedTuple):
@@ -125,7 +104,7 @@ def find_ball(
     if min(part.grey.shape) < 2 * radius:
         return LostBall("not_in_view")
     grey = grey_part(part.grey, np.array(part.offset, dtype=np.float64))
-    if _contrast(part.grey) < _threshold(grey, DEFAULT):
+    if _contrast(part.grey) < _threshold(grey):
         return LostBall("low_contrast")
     found = find_circles(part.grey, radius)
     centers = found.centers + part.offset
@@ -134,8 +113,8 @@ def find_ball(
         return LostBall("no_circle")
     if hough_only:
         best = int(np.flatnonzero(near)[0])
-        return DetectedBall(centers[best], HOUGH_SIGMA_PX**2 * np.eye(2), float(found.radii[best]), 0, 0)
-    return _best(grey, camera, FoundCircle(centers[near], found.radii[near]), radius, DEFAULT)
+        return DetectedBall(centers[best], HOUGH_SIGMA_PX**2 * np.eye(2), 0)
+    return _best(grey, camera, FoundCircle(centers[near], found.radii[near]), radius)
 
 
 def _cut(whole: GreyImage, center: Floats, half: float) -> GreyImage:
@@ -151,44 +130,40 @@ def _contrast(grey: NDArray[np.uint8]) -> float:
     return float(np.percentile(grey, 99.5) - np.percentile(grey, 0.5))
 
 
-def _threshold(grey: Grey, settings: TrackerSettings) -> float:
-    return max(settings.min_contrast, settings.noise_factor * grey.noise)
+def _threshold(grey: Grey) -> float:
+    return max(MIN_CONTRAST, NOISE_FACTOR * grey.noise)
 
 
-def _best(
-    grey: Grey, camera: Camera, found: FoundCircle, radius: float, settings: TrackerSettings
-) -> DetectedBall | LostBall:
+def _best(grey: Grey, camera: Camera, found: FoundCircle, radius: float) -> DetectedBall | LostBall:
     """The first circle that passes the test, or the reason of the one with most inliers."""
     lost = []
     for center in found.centers:
-        ball = _measure(grey, camera, center, radius, settings)
+        ball = _measure(grey, camera, center, radius)
         if isinstance(ball, DetectedBall):
             return ball
         lost.append(ball)
     return max(lost, key=lambda one: one.inliers)
 
 
-def _measure(
-    grey: Grey, camera: Camera, center: Floats, radius: float, settings: TrackerSettings
-) -> DetectedBall | LostBall:
+def _measure(grey: Grey, camera: Camera, center: Floats, radius: float) -> DetectedBall | LostBall:
     """Measure one circle: edges about Hough's place, the vote, then edges about the measured place until they agree."""
     direction = camera.rays(center)
-    spokes = Spokes(direction, radius / camera.local_scale(direction), settings.spokes, settings.first_reach_px)
-    fitted = _fit(grey, camera, spokes, radius, settings)
+    spokes = Spokes(direction, radius / camera.local_scale(direction), SPOKES, FIRST_REACH_PX)
+    fitted = _fit(grey, camera, spokes, radius)
     for _ in range(CLOSER):
         if isinstance(fitted, LostBall):
             return fitted
-        fitted = _fit(grey, camera, fitted.spokes._replace(reach_px=settings.last_reach_px), radius, settings)
+        fitted = _fit(grey, camera, fitted.spokes._replace(reach_px=LAST_REACH_PX), radius)
     if isinstance(fitted, LostBall):
         return fitted
-    if visible_fraction(grey, camera, fitted.spokes, fitted.on_circle, fitted.contrast) < settings.min_visible:
+    if visible_fraction(grey, camera, fitted.spokes, fitted.on_circle, fitted.contrast) < MIN_VISIBLE:
         return LostBall("few_inliers", fitted.inliers)
     direction = fitted.spokes.direction
     size = fitted.spokes.half_angle * camera.local_scale(direction)
     slope = camera.angle_slope(direction)
-    noise = fitted.covariance[:2, :2] / _independent(settings.spokes, size)
-    covariance = slope @ noise @ slope.T + settings.model_px**2 * np.eye(2)
-    return DetectedBall(camera.project(camera.center_c + direction), covariance, size, fitted.inliers, settings.spokes)
+    noise = fitted.covariance[:2, :2] / _independent(SPOKES, size)
+    covariance = slope @ noise @ slope.T + MODEL_PX**2 * np.eye(2)
+    return DetectedBall(camera.project(camera.center_c + direction), covariance, fitted.inliers)
 
 
 class _Fitted(NamedTuple):
@@ -207,24 +182,24 @@ class _Fitted(NamedTuple):
         return int(self.on_circle.sum())
 
 
-def _fit(grey: Grey, camera: Camera, spokes: Spokes, radius: float, settings: TrackerSettings) -> _Fitted | LostBall:
+def _fit(grey: Grey, camera: Camera, spokes: Spokes, radius: float) -> _Fitted | LostBall:
     edges = find_edges(grey, camera, spokes)
-    valid, faint = _believable(edges, _threshold(grey, settings))
+    valid, faint = _believable(edges, _threshold(grey))
     if faint:
         return LostBall("low_contrast", int(valid.sum()))
-    circle = consensus(edges.points, valid, edges.scales, settings.inlier_px)
+    circle = consensus(edges.points, valid, edges.scales, INLIER_PX)
     if circle is None:
         return LostBall("few_inliers")
-    on_circle = _agree(edges, valid, circle, settings.inlier_px)
-    if on_circle.sum() < settings.min_inliers * settings.spokes:
+    on_circle = _agree(edges, valid, circle, INLIER_PX)
+    if on_circle.sum() < MIN_INLIERS * SPOKES:
         return LostBall("few_inliers", int(on_circle.sum()))
     used = _away_from_others(on_circle)
-    fit = refit(edges.points[used], edges.scales[used], circle, settings.inlier_px)
-    on_circle = _agree(edges, valid, fit.circle, settings.inlier_px)
-    if on_circle.sum() < settings.min_inliers * settings.spokes:
+    fit = refit(edges.points[used], edges.scales[used], circle, INLIER_PX)
+    on_circle = _agree(edges, valid, fit.circle, INLIER_PX)
+    if on_circle.sum() < MIN_INLIERS * SPOKES:
         return LostBall("few_inliers", int(on_circle.sum()))
     axis, half_angle = cone(fit.circle, spokes.direction, tangent_axes(spokes.direction))
-    if abs(half_angle * camera.local_scale(axis) - radius) > settings.radius_fraction * radius:
+    if abs(half_angle * camera.local_scale(axis) - radius) > RADIUS_FRACTION * radius:
         return LostBall("wrong_radius", int(on_circle.sum()))
     measured = spokes._replace(direction=axis, half_angle=half_angle)
     return _Fitted(measured, fit.covariance, on_circle, float(np.median(edges.contrast[on_circle])))

@@ -311,7 +311,7 @@ class Offset(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """The joint estimate, or the truth with its bound.
+    """The joint estimate.
 
     Attributes:
         model: The problem.
@@ -381,21 +381,6 @@ def _freedom(system: System[Unknowns]) -> int:
 
 def _arrived(system: System[Unknowns], step: Floats) -> bool:
     return bool(np.abs(system.slopes @ step).max() < ARRIVED)
-
-
-def bound(observed: Observed, guess: Guess, at: Unknowns) -> Adjusted:
-    """The Cramer-Rao bound: Fisher's information at stated unknowns. ``observed`` says who measured what, and how well.
-
-    Args:
-        observed: The measurements, of which only the covariances, commands and counts matter.
-        guess: What the poses are counted from.
-        at: Where the information is taken.
-    """
-    model = JointModel(observed, guess)
-    system = model.linearised(at)
-    covariance = np.asarray(np.linalg.inv(system.information), dtype=np.float64)
-    chi2 = float(system.residuals @ system.residuals)
-    return Adjusted(model, at, covariance, chi2, _freedom(system), 0)
 
 
 FLANGE_ERRORS = PARAMETERS["joint"].stop

@@ -23,7 +23,7 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import SeenDirection, needle_direction
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import refitted
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability, require_observable
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit, robust_fit
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import robust_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem, Spread
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import RobustFit
@@ -58,9 +58,7 @@ def calibrate(
     known_tip: Floats | None = None,
     needle_length_mm: float | None = None,
     scale: bool = False,
-    robust: bool = True,
     direction: bool = True,
-    start: Estimate | None = None,
     arms: DeclaredArms | None = None,
 ) -> Calibration:
     """Solve A X P = Y B Q: closed form, then weighted least squares over the poses that agree.
@@ -69,16 +67,13 @@ def calibrate(
     tip in end2.
 
     Args:
-        recording: At least 16 poses (20 are better); 7 with ``known_tip``; one more where P has three coordinates;
-            unknowns / 3 + 1 with ``start``.
+        recording: At least 16 poses (20 are better); 7 with ``known_tip``; one more where P has three coordinates.
         noise: Of both arms and the image; None estimates the residuals' spread, inside and across the image.
         known_tip: t_Q, shape (3,), mm, frame end2, where it is known.
         needle_length_mm: Distance along the shaft from the flange's origin to the tip: determines a constant error of
             the detected tip along the shaft, which nothing else does.
         scale: Whether mm per unit of P, along both axes of the image, is estimated.
-        robust: Whether poses that disagree with the others are set aside.
         direction: Whether measured needle directions take part, where the recording has them.
-        start: Where the fit begins, instead of at the closed form.
         arms: Declared errors of both arms that repeat from pose to pose; the recording then needs joints. None takes
             all errors of the flanges for noise.
 
@@ -88,17 +83,15 @@ def calibrate(
     """
     if needle_length_mm is not None and not 0 < needle_length_mm < np.inf:
         refuse(f"needle length {needle_length_mm}", "needle_length_mm", "a positive number, mm", "not_positive")
-    _check(recording, known_tip, scale, start)
+    _check(recording, known_tip, scale)
     # 1. Where to begin.
     errors = None if arms is None else arm_errors(arms, recording)
     poses = recording if errors is None else without_play(recording, errors)
-    estimate = start or closed_form(poses, known_tip=known_tip, scale=scale)
-    if start is not None and known_tip is not None:
-        estimate = estimate._replace(t_Q=np.asarray(known_tip, dtype=np.float64))
+    estimate = closed_form(poses, known_tip=known_tip, scale=scale)
     # 2. The fit: outliers, observability, directions, noise.
     active = active_columns(tip=known_tip is None, scale=scale, direction=False)
     problem = Problem(poses, noise or UNWEIGHTED, active, arms=errors)
-    solved = _solve(problem, estimate, robust=robust, direction=direction and recording.v is not None)
+    solved = _solve(problem, estimate, direction=direction and recording.v is not None)
     # 3. What the recording cannot show, and the result with its covariance.
     cannot = [SHAFT_BIAS] * (needle_length_mm is None and known_tip is None)
     cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
@@ -108,7 +101,7 @@ def calibrate(
     return found if needle_length_mm is None or known_tip is not None else with_length(found, needle_length_mm)
 
 
-def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: Estimate | None) -> None:
+def _check(recording: Recording, known_tip: Floats | None, scale: bool) -> None:
     if recording.pixels and not scale:
         refuse("the tip is in pixels", "recording", "mm, or scale to estimate mm per pixel", "wrong_unit")
     if known_tip is not None and (np.shape(known_tip) != (3,) or not np.isfinite(known_tip).all()):
@@ -116,8 +109,6 @@ def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: E
     if scale and recording.P.shape[1] == 3:
         refuse("three coordinates and scale", "recording", "three coordinates in mm", "wrong_unit")
     least = (LEAST_POSES if known_tip is None else LEAST_POSES_KNOWN_TIP) + (recording.P.shape[1] == 3)
-    if start is not None:
-        least = len(active_columns(tip=known_tip is None, scale=scale, direction=False)) // 3 + 1
     if len(recording) < least:
         allowed = f"{least} or more" + (f", preferably {ADVISED_POSES}" if least >= LEAST_POSES else "")
         missed = f" (and {plural(len(recording.missed), 'picture')} without a needle)" if recording.missed else ""
@@ -125,7 +116,7 @@ def _check(recording: Recording, known_tip: Floats | None, scale: bool, start: E
 
 
 def _solve(
-    problem: Problem, start: Estimate, *, robust: bool, direction: bool
+    problem: Problem, start: Estimate, *, direction: bool
 ) -> tuple[Problem, RobustFit, Observability, SeenDirection]:
     """Fit the tips, require that all unknowns are observable, then fit again with directions and estimated noise.
 
@@ -134,7 +125,7 @@ def _solve(
         Degenerate: The poses cannot show every unknown.
     """
     recording = problem.recording
-    fit = (robust_fit if robust else plain_fit)(problem, start)
+    fit = robust_fit(problem, start)
     try:
         seen = needle_direction(fit.estimate, recording, fit.tip_kept)
     except InputError:  # directions say little of poses that show too little
@@ -147,7 +138,7 @@ def _solve(
         problem = problem._replace(active=active, lean_rad=seen.lean_rad)
     if isinstance(problem.noise, Spread) or problem.with_direction:
         before = fit.tip_kept
-        problem, fit = refitted(problem, fit, seen, recheck=robust)
+        problem, fit = refitted(problem, fit, seen)
         if not np.array_equal(before, fit.tip_kept):
             observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
     return problem, fit, observability, seen

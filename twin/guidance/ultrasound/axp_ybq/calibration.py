@@ -25,7 +25,6 @@ from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
     linearised_tip,
     needle_in_image,
     tip_points,
-    tip_residuals,
 )
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import SmallSample, small_sample
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability
@@ -168,16 +167,6 @@ class Calibration(Shown):
             rows = np.append(rows, np.arange(len(self.parameters), len(self.joint_covariance)))
         C = self.joint_covariance[np.ix_(rows, rows)]
         return np.asarray(J @ C @ J.transpose(0, 2, 1) + model.sigma)
-
-    def tre(self, A: Floats, B: Floats, P: Floats) -> Floats:
-        """Length of Y B Q - A X P where the true poses and the true tip are given, shape (n,), mm.
-
-        Args:
-            A: True T_base1_end1, shape (n, 4, 4), mm.
-            B: True T_base2_end2, shape (n, 4, 4), mm.
-            P: True tip in the image, shape (n, 2) or (n, 3), in the recording's unit.
-        """
-        return np.asarray(np.linalg.norm(tip_residuals(self.estimate, Recording(A, B, P)), axis=1))
 
     def predicted_tre_mm(self, points_image: Floats, A: Floats) -> Floats:
         """Expected (rms) distance of the tip from a target seen in the image, from the covariance alone.

@@ -37,21 +37,20 @@ SPREAD_ROUNDS = 2
 """How often the residuals' spread is found and the fit repeated with it; it settles to a few percent in two."""
 
 
-def refitted(problem: Problem, fit: RobustFit, seen: SeenDirection, *, recheck: bool) -> tuple[Problem, RobustFit]:
+def refitted(problem: Problem, fit: RobustFit, seen: SeenDirection) -> tuple[Problem, RobustFit]:
     """Fit again with the directions, and with the spread that the residuals themselves show where no noise is given.
 
     Args:
         problem: With the directions where they take part.
         fit: Of the tips alone.
         seen: The needle's direction at that fit.
-        recheck: Whether poses may change sides.
     """
     declared = not isinstance(problem.noise, Spread)
     if not declared:
         tips = problem._replace(active=problem.active[problem.active < DIRECTION.start])
         problem = problem._replace(noise=found_spreads(tips, fit).spread._replace(direction_rad=seen.spread_rad))
     for _ in range(SPREAD_ROUNDS):
-        fit = settled(problem, fit, recheck=recheck)
+        fit = settled(problem, fit)
         found = found_spreads(problem, fit)
         problem = problem._replace(noise=problem.noise if declared else found.spread, lean_rad=found.lean_rad)
     return problem, fit

@@ -54,13 +54,12 @@ LEAST_KEPT = 0.5
 """If more than half of the poses disagree, nobody can say which half is right."""
 
 
-def settled(problem: Problem, fit: RobustFit, *, recheck: bool = True) -> RobustFit:
+def settled(problem: Problem, fit: RobustFit) -> RobustFit:
     """Fit the poses that are used, check all poses against the fit, and repeat until none changes sides.
 
     Args:
         problem: It may have grown since the fit (directions, another spread).
         fit: Where to begin.
-        recheck: Whether poses may change sides at all.
 
     Raises:
         InputError: More than half of the poses disagree.
@@ -70,7 +69,7 @@ def settled(problem: Problem, fit: RobustFit, *, recheck: bool = True) -> Robust
         _check_enough(problem, kept[0])
         again = refine(problem, fit.estimate, *kept)
         fit = RobustFit(again.estimate, *kept, fit.iterations + again.iterations)
-        kept = agreeing(problem, fit) if recheck else kept
+        kept = agreeing(problem, fit)
         if all(np.array_equal(new, old) for new, old in zip(kept, fit[1:3], strict=True)):
             break
     return fit

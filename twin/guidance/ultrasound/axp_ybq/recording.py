@@ -156,24 +156,6 @@ class Recording(Shown):
             self.A[rows], self.B[rows], self.P[rows], names=names, pixels=self.pixels, missed=self.missed, **parts
         )
 
-    def joined(self, other: Recording) -> Recording:
-        """Two recordings, one after the other, numbered anew.
-
-        Raises:
-            InputError: One has directions or pixels and the other has not.
-        """
-        widths = [None if r.v is None else r.v.shape[1] for r in (self, other)]
-        if widths[0] != widths[1] or self.pixels != other.pixels or self.P.shape[1] != other.P.shape[1]:
-            refuse("two recordings with different columns", "recording", "the same columns", "tables_differ")
-        A, B, P = (np.concatenate([getattr(r, key) for r in (self, other)]) for key in "ABP")
-        parts: dict[str, Any] = {key: _both(getattr(self, key), getattr(other, key)) for key in OPTIONAL}
-        return Recording(A, B, P, pixels=self.pixels, **parts)
-
-
-def _both(first: Floats | None, second: Floats | None) -> Floats | None:
-    """Two optional arrays, one after the other, where both are there."""
-    return None if first is None or second is None else np.concatenate([first, second])
-
 
 def _angles(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
     array = joint_readings(
