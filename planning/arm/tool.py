@@ -28,7 +28,6 @@ class ToolBody:
         mesh: Its surface, mm, in the flange's frame.
         unit_mm: How many millimetres one unit of the file is.
         T_flange_file: Shape (4, 4), mm: the file's frame in the flange's.
-        key: Where it is stated, for errors.
     """
 
     mesh: TriangleMesh

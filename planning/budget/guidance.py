@@ -152,7 +152,6 @@ def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
     """The pose error of trials: touched in stated configurations, errors of the estimated size as if declared.
 
     Args:
-        error: Of a case.
         q_touch: Shape (N, 6), rad: known, or likely ones.
     """
     errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
@@ -225,9 +224,7 @@ def guided_model(
 
     Args:
         case: Declares the devices, and what moves.
-        anatomy: Its structures.
         error: Of the needle, as rehearsed.
-        registration: Of the case's markers.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
         sight: What the devices see of it; None hides nothing, and has the picture along the body.
@@ -290,7 +287,6 @@ def way_chances(
     """What each way would leave of an insertion, ct first, by the devices of a case; nothing where it declares none.
 
     Args:
-        context: The case.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
         sight: What the devices see; None hides nothing.

@@ -84,11 +84,8 @@ class Case(Shown):
     Attributes:
         target_ct: Shape (3,), the point to reach.
         T_ct_entry: Shape (4, 4), the entry frame, its origin on the target.
-        files: The case file and all that it names, read once.
         volumes: Those of them that are volumes: the CT and the label maps.
         stated_structures: How many structures the case says that it has, the skin among them.
-        region: Which part of the body it shows.
-        warnings: What the case file itself leaves open, one sentence each.
         hit_radius_mm: Within which of the target the tip hits; None counts the target's own mesh.
         errors: What is declared to err, or None.
         truth_errors: From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`.

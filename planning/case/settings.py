@@ -184,7 +184,6 @@ class RobotSettings:
         home: Shape (6,), rad, or None for the model's own.
         T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated, or None.
         stated: The section that states a transform, or None.
-        speeds: How fast its plans may move.
     """
 
     model: UrModel
@@ -219,7 +218,6 @@ class Ultrasound:
     """A probe on an arm of its own.
 
     Attributes:
-        model: Of the probe's arm.
         T_base_ct_mount: Shape (4, 4), mm, of that arm's base, or None where it is to be proposed.
         target_sd_mm: Standard deviation of the target's reading per axis of the image plane, and across it.
         tip_sd_mm: The same of the needle's tip.

@@ -170,7 +170,6 @@ class Table:
         kind: ``check``, ``window`` or ``plan``.
         at: Its number among those, from 0 on.
         line: Where it begins, from 1 on; None where nothing tells.
-        data: The whole file's bytes.
     """
 
     kind: str

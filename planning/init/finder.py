@@ -74,7 +74,6 @@ class Wanted:
         up: The axis of meshes that is up.
         ct: The CT, where there are several.
         segmentation: The label map or folder, where there are several.
-        overrides: What else a person states.
     """
 
     space: Space

@@ -375,8 +375,6 @@ class Plausibility(NamedTuple):
     """Agreement of a naming with the places of organs in a label map.
 
     Attributes:
-        rules: How many could be checked.
-        broken: How many of them do not hold.
         nameless: Labels present that the naming does not know.
     """
 

@@ -66,7 +66,6 @@ class Segmentation(Protocol):
     Attributes:
         source: The file or folder, relative to the case's.
         names: Label to name, of the structures that are there.
-        notes: What a person should be told, one sentence each.
         voxel_ct: Shape (3, 3), the edges of its voxels as columns, mm; None of meshes.
     """
 

@@ -66,12 +66,10 @@ class Request:
     """What the user wants.
 
     Attributes:
-        folder: Where the files are, and the case will be.
         target: ``X,Y,Z`` in mm, or None for ``target_label``.
         region: As a case states it, or None to be told by the structures.
         space_stated: Whether the user said in which space the target is.
         hit_radius_mm: Of the ball that the target is, if the user says that it lies in no structure; else None.
-        wanted: What the user says of the files.
     """
 
     folder: Path
@@ -88,7 +86,6 @@ class Start:
     """A new case, not yet written.
 
     Attributes:
-        notes: What a person should look at, one sentence each.
         seen: Markers that the CT shows where no list of them is given, as they are to be written beside the case.
     """
 
@@ -100,9 +97,6 @@ class Start:
 
 def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     """Find the files of a folder, and write the text of a case with them.
-
-    Args:
-        progress: Called with the name of each file that is read.
 
     Raises:
         InputError: All that keeps a case from being made, in one line.

@@ -57,10 +57,8 @@ class Approach:
         waypoints: Shape (k, 6), rad, k >= 2: straight joint segments from home to the goal.
         cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there.
         trajectory: The motion: rounded at the waypoints, within the limits of speed, acceleration and jerk.
-        goal_index: Which of the goals it ends at.
         checked_q: Shape (m, 6), rad: the states that FCL found free, in order; no body moves more than
             ``MAX_SWEEP_MM`` between two of them. For :func:`least_clearance`.
-        attempts: How many paths were planned.
     """
 
     waypoints: Floats
@@ -90,9 +88,7 @@ def plan_approach(
     Args:
         q_home: Shape (6,), rad, within the joint limits.
         q_goals: Shape (6,) or (g, 6), rad, within the joint limits.
-        seed: Of OMPL's generator. Same seed, same motion.
         max_samples: Of the planner, in each of its runs.
-        speeds: How fast joints and the needle's tip may move.
 
     Raises:
         InputError: If home or a goal is not six finite angles within the limits, or the scale makes no sense.

@@ -97,7 +97,6 @@ class Bending:
     """A needle with a bevel, and the tissues by the names of their structures.
 
     Attributes:
-        shaft: From the holder to the tip.
         alpha: By which the bevel's cut leaves the shaft's direction, rad.
         tissues: The pattern ``*`` is all that no structure names.
     """

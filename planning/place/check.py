@@ -75,10 +75,7 @@ class Verdict:
     Attributes:
         fraction: Solid angle of the reached directions over that of all that are wanted, 0..1; where not all were
             checked, each counts for those that are nearest to it.
-        reached: How many directions the arm can reach and insert along.
-        count: How many directions were checked.
         margin: Mean reach margin of the reached ones, 0..1; 0 for none.
-        reasons: How many of the others fell to which reason.
         home_contact: What the arm touches in its home configuration, or "".
         q_insertion: Shape (reached, 6), rad, the tip on the target.
         answers: Of each checked direction; where all were checked, in the order of the candidates.
@@ -106,15 +103,12 @@ class PlacementCheck:
     """Checks placements. Its values can be sent to another process.
 
     Attributes:
-        model: The arm.
-        tool: What its flange carries.
         skin: CT frame.
         outside: CT frame, what the CT shows outside of it, or None.
         fixed: Boxes that stand with the patient; their ``T_base_box`` is in the CT frame.
         carried: Boxes that stand with the arm, base frame.
         padding_mm: Of the arm.
         target_ct: Shape (3,), mm.
-        wanted: The directions.
         home: Shape (6,), rad.
     """
 
@@ -166,8 +160,6 @@ def expected_tip_error_mm(case: Case, placement: Placement | None, T_base_ct: Fl
     Sigma_eta J_f' stands for them); the residuals of the old touches say nothing of the new ones.
 
     Args:
-        case: Declares the errors.
-        placement: Where the case has the arm; gives the markers.
         T_base_ct: Shape (4, 4), mm: where the arm is to stand.
         q: Joints (rad) with the tip on the target from there.
     """

@@ -110,8 +110,6 @@ def clear_branches(
     The base is checked against the arm alone.
 
     Args:
-        spheres: The arm.
-        surroundings: What it must not touch.
         T_ct_base: Shape (4, 4), mm.
         frames: Shape (k, m, 7, 4, 4), mm, base frame: ``link_poses`` of k motions of m states.
 
@@ -360,7 +358,6 @@ def insertion_branches(
     """Every branch of many insertions, by kinematics alone; joint limits are not tested.
 
     Args:
-        model: The arm.
         target_base: Shape (3,), mm.
         outward_base: Shape (n, 3), unit.
         distances_mm: Shape (n, m): target to flange at each state.
@@ -378,11 +375,7 @@ class Estimator:
     """Estimates placements of one arm about one target. Its values can be sent to another process.
 
     Attributes:
-        model: The arm.
-        tool: What its flange carries.
-        surroundings: Patient and boxes around it.
         T_ct_bed: Shape (4, 4), mm, its origin the target.
-        wanted: The directions.
     """
 
     model: UrModel

@@ -70,7 +70,6 @@ class Registration(Shown):
     Attributes:
         T_base_ct: Shape (4, 4), rigid, mm.
         residuals: Shape (n, 3), T_base_ct markers_ct - markers_base, mm.
-        residual_test: The residuals of the rigid fit against the noise.
         conditioning: The three flags of a weak set, for the target given.
         target_ct: That target, shape (3,), mm.
         uncertainty: Covariance by the declared errors; None where none are declared.

@@ -91,8 +91,6 @@ class UrdfJoint:
 
     Attributes:
         kind: One of ``JOINTS``.
-        parent: Name of the link before it.
-        child: Name of the link that it moves.
         T_parent_child: Shape (4, 4), mm, at the angle zero.
         axis: Shape (3,), unit, in the child's frame.
         limits: Those of ``LIMITS`` that are stated: rad, rad/s, N m.

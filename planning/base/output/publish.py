@@ -212,7 +212,6 @@ class Draft:
         depends_on: Entries of the output folder that these files are made from.
         parts: Files that go to an entry of another name than the command's.
         seconds: How long each stage took, for ``timings.json``; read at the end.
-        note: Told what was removed that nobody might expect.
     """
 
     command: str

@@ -61,9 +61,7 @@ class DicomFile:
     """A DICOM file by its header.
 
     Attributes:
-        name: The file's name in its folder.
         sop_class: What the standard calls this class.
-        series_uid: The series that it belongs to.
         series: Its number and description, as a person knows it.
         frame_of_reference: The coordinates in which it lies, or the empty string.
         is_slice: Whether it is a CT image, and no scout or page of text.
@@ -191,9 +189,6 @@ class SeriesFiles:
 
 def choose_series(path: Path) -> SeriesFiles:
     """The files of the CT series that a path means.
-
-    Args:
-        path: A folder that holds one CT series, or a file of the series.
 
     Raises:
         InputError: No CT series there, several, or a file that is no slice of one.

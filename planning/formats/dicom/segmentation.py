@@ -83,7 +83,6 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
 
     Args:
         file: The file's key in ``content``.
-        content: Gives its bytes.
         ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
 
     Raises:

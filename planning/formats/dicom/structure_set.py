@@ -79,7 +79,6 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
 
     Args:
         file: The file's key in ``content``.
-        content: Gives its bytes.
 
     Raises:
         InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that

@@ -51,7 +51,6 @@ class Volume(Shown):
         values: Shape (ni, nj, nk), read-only; Hounsfield units for a CT.
         T_ct_index: Shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm. Its determinant
             may have either sign: index axes can be left-handed, the patient's axes are not touched by that.
-        fields: The file's own key/value remarks.
     """
 
     values: NDArray[Any]
@@ -160,7 +159,6 @@ class VolumeSource(Protocol):
     Attributes:
         files: Every file that decides a voxel or its place, as the content is wanted it.
         part: Which part of these files it is, where they hold several volumes.
-        notes: What a person should be told of how it was read, one sentence each.
         grid: Where the voxels lie, LPS mm.
     """
 
@@ -185,7 +183,6 @@ class VolumeFile:
 
     Attributes:
         files: That file, and the one beside it.
-        content: Gives the bytes of both.
     """
 
     path: Path

@@ -60,8 +60,6 @@ class Reading:
     Attributes:
         keys: Those that differ from the case's; empty as stated.
         T_base_ct: Shape (4, 4), mm.
-        impossible: Why nothing can be so, or empty.
-        unlikely: What hardly is so, or empty.
         rests_on: The obstacle of frame ``base`` that the patient lies on, or empty.
         tilt: Between the robot's z axis and up, rad.
     """
