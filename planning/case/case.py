@@ -23,16 +23,10 @@ from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.text import Facts, Shown, brief, did_you_mean
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.breathing.breathing import Breathing
+from puncture_twin.planning.case import named_files, tables
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, entry_frame, grid
 from puncture_twin.planning.case.errors import ErrorModel, errors_of
-from puncture_twin.planning.case.named_files import (
-    MASK_ROLE,
-    CaseVolumes,
-    read_named_files,
-    robot_warnings,
-    wholeness_warnings,
-)
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
 from puncture_twin.planning.case.settings import (
     Axis,
@@ -57,15 +51,6 @@ from puncture_twin.planning.case.settings import (
     search_of,
     stereo_of,
     ultrasound_of,
-)
-from puncture_twin.planning.case.tables import (
-    MarkerSection,
-    PlaceSection,
-    RankingSection,
-    RehearsalSection,
-    StructureSection,
-    StructuresSection,
-    tool_of,
 )
 from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.formats.labels.label_sources import structure_name
@@ -109,21 +94,21 @@ class Case(Shown):
     target_structure: str
     needle: Needle
     search: SearchSettings
-    ranking: RankingSection
+    ranking: tables.RankingSection
     T_ct_entry: Floats
-    structure: tuple[StructureSection, ...]
-    structures: tuple[StructuresSection, ...]
-    registration: MarkerSection | None
+    structure: tuple[tables.StructureSection, ...]
+    structures: tuple[tables.StructuresSection, ...]
+    registration: tables.MarkerSection | None
     robot: RobotSettings
     obstacles: tuple[Obstacle, ...]
-    rehearsal: RehearsalSection
+    rehearsal: tables.RehearsalSection
     files: InputFiles
-    volumes: CaseVolumes
+    volumes: named_files.CaseVolumes
     stated_structures: int
     region: str
     ct: CtSettings = field(default_factory=CtSettings)
     gantry: Gantry | None = None
-    place: PlaceSection = field(default_factory=PlaceSection)
+    place: tables.PlaceSection = field(default_factory=tables.PlaceSection)
     warnings: tuple[str, ...] = ()
     hit_radius_mm: float | None = None
     errors: ErrorModel | None = None
@@ -192,7 +177,7 @@ class Case(Shown):
         return self.path.parent
 
     @property
-    def skin_section(self) -> StructureSection:
+    def skin_section(self) -> tables.StructureSection:
         """The one structure that is the skin."""
         return next(section for section in self.structure if section.role == "skin")
 
@@ -206,7 +191,7 @@ class Case(Shown):
         if parts := self.volumes.masks(folder):
             return parts
         inside = PurePosixPath(folder)
-        files = [one.path for one in self.inputs if one.role.startswith(MASK_ROLE)]
+        files = [one.path for one in self.inputs if one.role.startswith(named_files.MASK_ROLE)]
         return {structure_name(file): file for file in files if PurePosixPath(file).parent == inside}
 
 
@@ -230,28 +215,28 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
 
 def _read(path: Path, files: InputFiles, options: CaseOptions, known: Case | None = None) -> Case:
     """Read a case; of one that differs from a known one by its target alone, the case file is looked at again."""
-    case_volumes = CaseVolumes(files, path) if known is None else known.volumes
+    case_volumes = named_files.CaseVolumes(files, path) if known is None else known.volumes
     stated = files.add(CASE_ROLE, path.name, files.held(path.name) or read_toml_bytes(path, ALLOWED_CASE))
     if options.sections:
         files.state(OPTIONS_ROLE, options.text.encode())
     change = partial(options.applied, where=path)
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md", change=change)
     if known is None:
-        whole = read_named_files(content, path, files, case_volumes)
+        whole = named_files.read_named_files(content, path, files, case_volumes)
     else:
         files.take(known.files, but=("target", OPTIONS_ROLE))
-        whole = wholeness_warnings(content, files, path)
+        whole = named_files.wholeness_warnings(content, files, path)
     return replace(case_of(content, path, files, case_volumes, whole), options=options)
 
 
 def case_of(
-    content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes, warnings: tuple[str, ...]
+    content: CaseFile, path: Path, files: InputFiles, case_volumes: named_files.CaseVolumes, warnings: tuple[str, ...]
 ) -> Case:
     """Make a case of its file and the files that it names, in LPS (or local) mm and radians."""
     space = Space(content.space)
     target = _target_of(content, path, space, files)
     robot = robot_of(content, space, path, files)
-    tool = tool_of(content.tool, files, path)
+    tool = tables.tool_of(content.tool, files, path)
     settings, placed = content.search, content.registration
     return Case(
         path=path,
@@ -268,7 +253,7 @@ def case_of(
         T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
         structure=content.structure,
         structures=content.structures,
-        registration=None if placed is None or placed.transform else MarkerSection(**placed.model_dump()),
+        registration=None if placed is None or placed.transform else tables.MarkerSection(**placed.model_dump()),
         robot=robot,
         tool=tool,
         rehearsal=content.rehearsal,
@@ -279,7 +264,7 @@ def case_of(
         place=content.place,
         stated_structures=content.stated_structures,
         region=content.region,
-        warnings=(*warnings, *robot_warnings(content, robot)),
+        warnings=(*warnings, *named_files.robot_warnings(content, robot)),
         hit_radius_mm=content.target.hit_radius_mm,
         errors=errors_of(content, content.errors, case_volumes, path),
         truth_errors=errors_of(content, content.rehearsal.errors, case_volumes, path, truth=True),

@@ -21,19 +21,10 @@ from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker, halving_order
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
+from puncture_twin.planning.motion import shortest
 from puncture_twin.planning.motion.follow import follow, rounded
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact
 from puncture_twin.planning.motion.rrt_connect import CLEARANCE_MM, Connected, SegmentContact
-from puncture_twin.planning.motion.shortest import (
-    MAX_SAMPLES,
-    RUNS,
-    UPPER_ARM,
-    Cut,
-    Path,
-    Task,
-    direct_path,
-    shortest_path,
-)
 from puncture_twin.planning.motion.trajectory import Trajectory
 
 ATTEMPTS = 6
@@ -80,7 +71,7 @@ def plan_approach(
     q_goals: Floats,
     *,
     seed: int,
-    max_samples: int = MAX_SAMPLES,
+    max_samples: int = shortest.MAX_SAMPLES,
     speeds: SpeedLimits = DEFAULT_SPEEDS,
 ) -> Approach:
     """Plan the shortest path that is found from home to any of the goals, and its motion in time.
@@ -100,7 +91,7 @@ def plan_approach(
     refused, ends = "", _Ends(checker, home, goals)
     for attempt in range(ATTEMPTS):
         contact_of = _segment_check(checker, RESOLUTION_RAD / 2**attempt)
-        path = _path(ends, contact_of, seed + RUNS * attempt, max_samples)
+        path = _path(ends, contact_of, seed + shortest.RUNS * attempt, max_samples)
         if isinstance(path, Connected):  # two trees that were not joined
             raise NoAnswerError(_why_none(path, ends, seed) + refused, code="no_approach")
         cuts = _cuts(contact_of, path.waypoints)
@@ -127,24 +118,24 @@ class _Ends:
         return _free_goals(self.checker, self.goals)
 
     @cached_property
-    def cut(self) -> Cut | None:
+    def cut(self) -> shortest.Cut | None:
         """The proof of which free goals are cut off from home; None for a checker whose boxes are not known."""
         if not isinstance(self.checker, CellChecker):
             return None
-        points, goals = self.checker.points_of(UPPER_ARM), self.goals[self.open_goals]
-        return Cut(self.checker.model, self.checker.boxes, points, self.home, goals)
+        points, goals = self.checker.points_of(shortest.UPPER_ARM), self.goals[self.open_goals]
+        return shortest.Cut(self.checker.model, self.checker.boxes, points, self.home, goals)
 
 
-def _path(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> Path | Connected:
+def _path(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> shortest.Path | Connected:
     """The direct path from home to a goal where it is free, else the shortest of a search."""
-    return direct_path(contact_of, ends.home, ends.goals) or _searched(ends, contact_of, seed, max_samples)
+    return shortest.direct_path(contact_of, ends.home, ends.goals) or _searched(ends, contact_of, seed, max_samples)
 
 
-def _searched(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> Path | Connected:
+def _searched(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> shortest.Path | Connected:
     """The shortest path that a search to the free goals finds; its ``goal_index`` is a row of all goals."""
     limits, clear_of = ends.checker.model.joint_limits, _shortcut_check(ends.checker)
-    task = Task(limits, contact_of, ends.home, ends.goals[ends.open_goals], ends.cut, clear_of)
-    path = shortest_path(task, seed=seed, max_samples=max_samples)
+    task = shortest.Task(limits, contact_of, ends.home, ends.goals[ends.open_goals], ends.cut, clear_of)
+    path = shortest.shortest_path(task, seed=seed, max_samples=max_samples)
     return path if isinstance(path, Connected) else path._replace(goal_index=int(ends.open_goals[path.goal_index]))
 
 

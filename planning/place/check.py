@@ -23,17 +23,11 @@ from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.collision import workcell
 from puncture_twin.planning.collision.bodies import Solid
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.patient import FclSkin
 from puncture_twin.planning.collision.state_checker import PATIENT, Contact
-from puncture_twin.planning.collision.workcell import (
-    ARM_PADDING_MM,
-    case_boxes,
-    case_tool,
-    home_configuration,
-    outside_surface,
-)
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.place.mounts import (
@@ -53,18 +47,18 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError
 def placement_check(case: Case, anatomy: Anatomy, candidates: Candidates) -> PlacementCheck:
     """The case's workcell, with what moves with the patient apart from what moves with the arm, and its directions."""
     carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
-    boxes = case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
+    boxes = workcell.case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
     return PlacementCheck(
         model=case.robot.model,
-        tool=case_tool(case),
+        tool=workcell.case_tool(case),
         skin=anatomy.skin.mesh,
-        outside=outside_surface(anatomy),
+        outside=workcell.outside_surface(anatomy),
         fixed=tuple(box for box in boxes if box.name not in carried),
         carried=tuple(box for box in boxes if box.name in carried),
-        padding_mm=ARM_PADDING_MM,
+        padding_mm=workcell.ARM_PADDING_MM,
         target_ct=case.target_ct,
         wanted=wanted_directions(case, candidates),
-        home=home_configuration(case),
+        home=workcell.home_configuration(case),
     )
 
 
