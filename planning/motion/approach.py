@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker, halving_order
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
@@ -82,11 +82,9 @@ def plan_approach(
         max_samples: Of the planner, in each of its runs.
 
     Raises:
-        InputError: If home or a goal is not six finite angles within the limits, or the scale makes no sense.
         NoAnswerError: If home or every goal is in collision, or no path was found; it names the contacts that blocked.
     """
-    home = _within_limits(checker, q_home, "home")[0]
-    goals = _within_limits(checker, q_goals, "goal")
+    home, goals = np.asarray(q_home, dtype=np.float64), np.atleast_2d(q_goals)
     _require_free(checker, home)
     refused, ends = "", _Ends(checker, home, goals)
     for attempt in range(ATTEMPTS):
@@ -182,16 +180,6 @@ def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:
                 break
             cut /= 2.0
     return cuts
-
-
-def _within_limits(checker: StateChecker, q: Floats, name: str) -> Floats:
-    rows = np.atleast_2d(np.asarray(q, dtype=np.float64))
-    if rows.ndim != 2 or rows.shape[1] != 6 or not checker.model.within_limits(rows).all() or len(rows) == 0:
-        limits = np.round(np.degrees(checker.model.joint_limits[:, 1])).astype(int).tolist()
-        refuse(
-            f"{name} = {rows.round(4).tolist()}", "approach", f"six angles within +-{limits} deg", "joint_beyond_limits"
-        )
-    return rows
 
 
 def _require_free(checker: StateChecker, home: Floats) -> None:

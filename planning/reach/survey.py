@@ -18,7 +18,6 @@ from puncture_twin.planning.arm.inverse_kinematics import EVERY_BRANCH, N_BRANCH
 from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, least_term, link_frames
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.state_checker import Contact, SweptBodies, motion_bounds
@@ -32,9 +31,6 @@ class ReachRequest:
         target_base: Shape (3,), mm: the lesion, base frame.
         outward_base: Shape (3,), unit: from the target out of the body, base frame.
         standoff_mm: Tip to target before the insertion starts.
-
-    Raises:
-        InputError: If something is not finite, the direction not a unit vector, or a length not positive.
     """
 
     target_base: Floats
@@ -44,19 +40,7 @@ class ReachRequest:
 
     def __post_init__(self) -> None:
         for name in ("target_base", "outward_base"):
-            array = read_only(getattr(self, name))
-            if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
-                refuse(f"{name} = {array}", "reach request", "three finite numbers", "not_finite")
-            object.__setattr__(self, name, array)
-        if abs(math.hypot(*self.outward_base.tolist()) - 1.0) > SAME_UNIT:
-            refuse(f"outward_base = {self.outward_base}", "reach request", "a unit vector", "not_unit")
-        for name in ("needle_length_mm", "standoff_mm"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                refuse(f"{name} = {getattr(self, name)}", "reach request", "finite and above 0", "not_positive")
-
-
-SAME_UNIT = 1e-9
-"""Tolerance of a unit direction's length."""
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
 @dataclass(frozen=True, eq=False)
