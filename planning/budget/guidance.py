@@ -28,7 +28,7 @@ from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.breathing.breathing import position_at
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.settings import ControlScan, stereo_of, ultrasound_of
+from puncture_twin.planning.case.settings import stereo_of, ultrasound_of
 from puncture_twin.planning.case.tables import ControlScanSection, StereoSection, UltrasoundSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.plan.plan import Plan
@@ -126,7 +126,7 @@ def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
         said.append(f"[ultrasound] target read to {target}, tip to {tip}, calibrated to {probe.calibration_sd_mm:g} mm")
         case = replace(case, ultrasound=probe)
     if "control_scan" in needed and case.control_scan is None:
-        scan = ControlScan(**ControlScanSection().model_dump())
+        scan = ControlScanSection()
         said.append(
             f"[control_scan] slices of {scan.slice_mm:g} mm that show the target, {scan.dose_msv:g} mSv and "
             f"{scan.seconds:g} s each"

@@ -23,35 +23,11 @@ from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.text import Facts, Shown, brief, did_you_mean
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.breathing.breathing import Breathing
-from puncture_twin.planning.case import named_files, tables
+from puncture_twin.planning.case import named_files, settings, tables
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, entry_frame, grid
 from puncture_twin.planning.case.errors import ErrorModel, errors_of
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
-from puncture_twin.planning.case.settings import (
-    Axis,
-    ControlScan,
-    CtSettings,
-    Gantry,
-    Motion,
-    Needle,
-    Obstacle,
-    RobotSettings,
-    SearchSettings,
-    Stereo,
-    Ultrasound,
-    axes_frame,
-    bending_of,
-    breathing_of,
-    ct_of,
-    gantry_of,
-    motion_of,
-    obstacle_of,
-    robot_of,
-    search_of,
-    stereo_of,
-    ultrasound_of,
-)
 from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.formats.labels.label_sources import structure_name
 from puncture_twin.planning.formats.points import parse_points
@@ -92,32 +68,32 @@ class Case(Shown):
     target_ct: Floats
     target_name: str
     target_structure: str
-    needle: Needle
-    search: SearchSettings
+    needle: settings.Needle
+    search: settings.SearchSettings
     ranking: tables.RankingSection
     T_ct_entry: Floats
     structure: tuple[tables.StructureSection, ...]
     structures: tuple[tables.StructuresSection, ...]
     registration: tables.MarkerSection | None
-    robot: RobotSettings
-    obstacles: tuple[Obstacle, ...]
+    robot: settings.RobotSettings
+    obstacles: tuple[settings.Obstacle, ...]
     rehearsal: tables.RehearsalSection
     files: InputFiles
     volumes: named_files.CaseVolumes
     stated_structures: int
     region: str
-    ct: CtSettings = field(default_factory=CtSettings)
-    gantry: Gantry | None = None
+    ct: settings.CtSettings = field(default_factory=settings.CtSettings)
+    gantry: settings.Gantry | None = None
     place: tables.PlaceSection = field(default_factory=tables.PlaceSection)
     warnings: tuple[str, ...] = ()
     hit_radius_mm: float | None = None
     errors: ErrorModel | None = None
     truth_errors: ErrorModel | None = None
     breathing: Breathing | None = None
-    stereo: Stereo | None = None
-    ultrasound: Ultrasound | None = None
-    control_scan: ControlScan | None = None
-    motion: Motion | None = None
+    stereo: settings.Stereo | None = None
+    ultrasound: settings.Ultrasound | None = None
+    control_scan: tables.ControlScanSection | None = None
+    motion: settings.Motion | None = None
     bending: Bending | None = None
     own_target: bool = False
     tool: ToolBody | None = None
@@ -235,9 +211,9 @@ def case_of(
     """Make a case of its file and the files that it names, in LPS (or local) mm and radians."""
     space = Space(content.space)
     target = _target_of(content, path, space, files)
-    robot = robot_of(content, space, path, files)
+    robot = settings.robot_of(content, space, path, files)
     tool = tables.tool_of(content.tool, files, path)
-    settings, placed = content.search, content.registration
+    searched, placed = content.search, content.registration
     return Case(
         path=path,
         name=content.name,
@@ -246,11 +222,11 @@ def case_of(
         target_name=content.target.name,
         target_structure=content.target.structure or content.target.name,
         own_target=content.target.structure is None,
-        needle=Needle(**content.needle.model_dump(include={*Needle.__dataclass_fields__})),
-        search=search_of(settings),
-        obstacles=tuple(obstacle_of(one, space) for one in content.obstacle),
+        needle=settings.Needle(**content.needle.model_dump(include={*settings.Needle.__dataclass_fields__})),
+        search=settings.search_of(searched),
+        obstacles=tuple(settings.obstacle_of(one, space) for one in content.obstacle),
         ranking=content.ranking,
-        T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
+        T_ct_entry=view_frame(entry_frame(searched.frame, space, where=path), target),
         structure=content.structure,
         structures=content.structures,
         registration=None if placed is None or placed.transform else tables.MarkerSection(**placed.model_dump()),
@@ -259,8 +235,8 @@ def case_of(
         rehearsal=content.rehearsal,
         files=files,
         volumes=case_volumes,
-        ct=ct_of(content.ct, trust_labels=settings.trust_labels),
-        gantry=None if content.gantry is None else gantry_of(content.gantry, space, path),
+        ct=settings.ct_of(content.ct, trust_labels=searched.trust_labels),
+        gantry=None if content.gantry is None else settings.gantry_of(content.gantry, space, path),
         place=content.place,
         stated_structures=content.stated_structures,
         region=content.region,
@@ -268,12 +244,12 @@ def case_of(
         hit_radius_mm=content.target.hit_radius_mm,
         errors=errors_of(content, content.errors, case_volumes, path),
         truth_errors=errors_of(content, content.rehearsal.errors, case_volumes, path, truth=True),
-        breathing=breathing_of(content.breathing, space, path),
-        stereo=stereo_of(content.stereo, space, path),
-        ultrasound=ultrasound_of(content.ultrasound, space, path),
-        control_scan=None if content.control_scan is None else ControlScan(**content.control_scan.model_dump()),
-        motion=motion_of(content.motion),
-        bending=bending_of(content.needle, content.tissue, path),
+        breathing=settings.breathing_of(content.breathing, space, path),
+        stereo=settings.stereo_of(content.stereo, space, path),
+        ultrasound=settings.ultrasound_of(content.ultrasound, space, path),
+        control_scan=content.control_scan,
+        motion=settings.motion_of(content.motion),
+        bending=settings.bending_of(content.needle, content.tissue, path),
     )
 
 
@@ -312,7 +288,7 @@ def bed_frame(case: Case) -> Floats:
     Raises:
         InputError: The two are parallel.
     """
-    R_ct_bed = axes_frame(up_axis(case), along_axis(case), Space.LPS, case.path, "place: up and along")
+    R_ct_bed = settings.axes_frame(up_axis(case), along_axis(case), Space.LPS, case.path, "place: up and along")
     return view_frame(R_ct_bed, case.target_ct)
 
 
@@ -333,7 +309,7 @@ def along_axis(case: Case) -> Vector:
     return _stated(case.place.along, case.space, along)
 
 
-def _stated(axis: Axis | None, space: Space, otherwise: Floats) -> Vector:
+def _stated(axis: settings.Axis | None, space: Space, otherwise: Floats) -> Vector:
     """An axis that the case states, or the default, in LPS (or the local frame)."""
     if isinstance(axis, str):
         return ANATOMICAL_LPS[axis]

@@ -215,16 +215,6 @@ class Ultrasound:
     width_mm: float
 
 
-@dataclass(frozen=True)
-class ControlScan:
-    """A CT with the needle in, its slices across the body; seconds until the needle goes on, effective dose in mSv."""
-
-    slice_mm: float
-    target_seen: bool
-    dose_msv: float
-    seconds: float
-
-
 @dataclass(frozen=True, eq=False)
 class Motion:
     """How the target, and what surrounds it, has moved since the scan: ``target_cov_ct``, shape (3, 3), mm^2."""
