@@ -6,7 +6,7 @@ A path along the needle is sampled so closely that what is true of its states is
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -113,17 +113,13 @@ class Surveyed(NamedTuple):
     margins: Floats
     turns: Floats
 
-    def insertions(self, without: Container[int] = ()) -> Iterator[Insertion]:
-        """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll.
-
-        Branches that ``without`` has come to hold are passed over.
-        """
+    def insertions(self) -> Iterator[Insertion]:
+        """The motions that kinematics allows, the best margin first; of equals the first branch, then roll."""
         branches, rolled = np.nonzero(~np.isnan(self.margins))
         order = np.argsort(-np.round(self.margins[branches, rolled], MARGIN_DIGITS), kind="stable")
         for branch, roll in zip(branches[order].tolist(), rolled[order].tolist(), strict=True):
-            if branch not in without:
-                turn = self.turns[branch, roll]
-                yield Insertion(self.line, branch, float(self.rolls[roll]), turn, self.starts[branch] + turn)
+            turn = self.turns[branch, roll]
+            yield Insertion(self.line, branch, float(self.rolls[roll]), turn, self.starts[branch] + turn)
 
 
 MARGIN_DIGITS = 9

@@ -119,12 +119,6 @@ class UrdfDocument:
     joints: tuple[UrdfJoint, ...]
     where: Path
 
-    @property
-    def addresses(self) -> tuple[str, ...]:
-        """Every mesh file that a collision shape names, once, as it is named."""
-        shapes = [shape for link in self.links.values() for shape in link.collisions]
-        return tuple(dict.fromkeys(shape.address for shape in shapes if shape.kind == "mesh"))
-
 
 def parse_urdf(data: bytes, where: Path) -> UrdfDocument:
     """The links and joints of a URDF.
