@@ -25,7 +25,8 @@ from puncture_twin import api as pt
 from puncture_twin.meshes import folder
 from puncture_twin.planning.budget.guidance import sight_of
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.settings import ControlScan, Motion, Stereo, Ultrasound
+from puncture_twin.planning.case.settings import Motion, Stereo, Ultrasound
+from puncture_twin.planning.case.tables import ControlScanSection
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import CaseContext
@@ -116,7 +117,9 @@ def stepwise(context: CaseContext, plan: Plan, rooms: int, seed: int = 7) -> Ite
     yield "situation | steps | tip error | predicted | in region | hits | passes | scans | mSv | min | corrections"
     moving_min = (plan.approach.duration_s + plan.insertion.duration_s) / 60.0
     cases = situations(context.case)
-    unseen = replace(cases[SHOWN], control_scan=ControlScan(2.0, target_seen=False, dose_msv=0.9, seconds=120.0))
+    unseen = replace(
+        cases[SHOWN], control_scan=ControlScanSection(slice_mm=2.0, target_seen=False, dose_msv=0.9, seconds=120.0)
+    )
     shown = {name: cases[name] for name in ("as declared", SHOWN, "target moves 3 mm to any side")}
     for name, case in {**shown, f"{SHOWN}, unseen": unseen}.items():
         there = prepared(context, case)

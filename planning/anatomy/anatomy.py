@@ -94,9 +94,6 @@ class Anatomy:
 def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE) -> Anatomy:
     """Read every structure of a case. What they say of each other and of the target: `planning.evidence.checks`.
 
-    Args:
-        progress: Called with the name of each structure as it is read.
-
     Raises:
         InputError: A file that cannot be trusted, or a label that no rule names.
     """

@@ -63,7 +63,6 @@ class Scan:
     """A CT beside the skin of its case. Its voxels are decoded only if something is not in the cache.
 
     Attributes:
-        source: What the scanner saw, in its file.
         skin: The skin, where it does not come from this CT.
     """
 

@@ -32,7 +32,6 @@ class Structure:
     """A named surface with a role.
 
     Attributes:
-        role: What it means to the needle.
         margin_mm: The clearance that it demands, where its role demands one.
         mesh: In the CT frame, mm.
         source: The file it comes from, and the label in it.

@@ -64,11 +64,7 @@ class Present(NamedTuple):
 
 @dataclass(frozen=True)
 class VolumeSurfaces:
-    """The surfaces of one label map or CT. Its voxels are decoded only if something is not in the cache.
-
-    Attributes:
-        source: The volume's file or files.
-    """
+    """The surfaces of one label map or CT. Its voxels are decoded only if something is not in the cache."""
 
     source: VolumeSource
     sha256: tuple[str, ...]
@@ -201,7 +197,6 @@ class Imaged:
         box: The part that was seen, voxels of the canonical order.
         label: Of the body; None where this is a CT.
         notes: What was left out, one sentence each.
-        shown: What a person says of it.
     """
 
     surfaces: VolumeSurfaces

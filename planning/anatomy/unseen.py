@@ -216,7 +216,6 @@ class BeyondLabels(NamedTuple):
     Attributes:
         mesh: Closed, LPS mm; None where every map holds the body within the needle's reach.
         margin_mm: What an organ that is not seen there may demand, and half a voxel.
-        warnings: One sentence a map that ends.
     """
 
     mesh: TriangleMesh | None

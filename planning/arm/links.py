@@ -277,9 +277,7 @@ def own_arm(data: bytes, where: Path, *, flange: str, read: Read, stated: Stated
     """The arm of a URDF, with the limits that the URDF states; its name is the robot's.
 
     Args:
-        data: The URDF's bytes.
         where: The file, to which its meshes are relative.
-        flange: Name of the link that carries the needle.
         read: Reads a mesh file by its address in the URDF.
         stated: Limits that the case states, for joints for which the URDF has none.
 

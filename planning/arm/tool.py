@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.links import convex_pieces
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
@@ -28,7 +28,6 @@ class ToolBody:
         mesh: Its surface, mm, in the flange's frame.
         unit_mm: How many millimetres one unit of the file is.
         T_flange_file: Shape (4, 4), mm: the file's frame in the flange's.
-        key: Where it is stated, for errors.
     """
 
     mesh: TriangleMesh
@@ -71,9 +70,6 @@ class Tool:
     Attributes:
         shaft_mm: Usable length: from the holder's end to the tip.
         body: What the flange carries besides them, or None.
-
-    Raises:
-        InputError: If a length is not finite and positive, or the shaft is longer than the needle.
     """
 
     needle_length_mm: float
@@ -81,15 +77,6 @@ class Tool:
     needle_diameter_mm: float
     holder_diameter_mm: float
     body: ToolBody | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("needle_length_mm", "shaft_mm", "needle_diameter_mm", "holder_diameter_mm"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0.0):
-                refuse(f"{name} = {value}", "tool", "finite and above 0", "not_positive")
-        if self.shaft_mm > self.needle_length_mm:
-            allowed = f"at most needle_length_mm = {self.needle_length_mm}"
-            refuse(f"shaft_mm = {self.shaft_mm}", "tool", allowed, "out_of_range")
 
     @property
     def holder_length_mm(self) -> float:
@@ -114,9 +101,6 @@ class Box:
     Attributes:
         T_base_box: Shape (4, 4), mm: the box's centre and axes in the base frame.
         size_mm: Full edge lengths along its axes.
-
-    Raises:
-        InputError: If the pose is not rigid or a size not positive.
     """
 
     name: str
@@ -124,15 +108,7 @@ class Box:
     size_mm: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        T = np.array(self.T_base_box, dtype=np.float64)
-        rigid = T.shape == (4, 4) and bool(np.isfinite(T).all())
-        rigid = rigid and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9) and np.linalg.det(T[:3, :3]) > 0
-        if not rigid:
-            refuse("T_base_box is not rigid", f"box {self.name!r}", "rotation and mm", "not_rigid")
-        if not all(np.isfinite(edge) and edge > 0.0 for edge in self.size_mm):
-            refuse(f"size_mm = {self.size_mm}", f"box {self.name!r}", "three lengths above 0", "not_positive")
-        T.setflags(write=False)
-        object.__setattr__(self, "T_base_box", T)
+        object.__setattr__(self, "T_base_box", read_only(self.T_base_box))
 
     @property
     def corners(self) -> Floats:
@@ -163,13 +139,7 @@ def gantry_boxes(
     Returns:
         Boxes named ``gantry_0`` ...: every point of the wall is in one of them, and every point nearer to the axis than
         cos(pi / ``SIDES``) times the bore's radius in none.
-
-    Raises:
-        InputError: If a length is not finite and positive, or the pose not rigid.
     """
-    for name, value in (("bore_diameter_mm", bore_diameter_mm), ("wall_mm", wall_mm), ("depth_mm", depth_mm)):
-        if not (np.isfinite(value) and value > 0.0):
-            refuse(f"{name} = {value}", "gantry", "finite and above 0", "not_positive")
     radius = bore_diameter_mm / 2.0
     inner, outer = radius * np.cos(np.pi / SIDES), radius + wall_mm
     size = (outer - inner, 2.0 * outer * np.tan(np.pi / SIDES), depth_mm)

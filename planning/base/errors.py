@@ -101,12 +101,7 @@ class SchemaError(ValueError):
 
 
 class NoAnswerError(PlanningError):
-    """The work was done and the answer is no. The command line exits with code 1.
-
-    Args:
-        message: What was not found.
-        code: Why not, as an `InputError` has it.
-    """
+    """The work was done and the answer is no. The command line exits with code 1."""
 
     def __init__(self, message: str, *, code: str, counts: Mapping[str, int] = MappingProxyType({})) -> None:
         self.code, self.counts = code, dict(counts)
@@ -185,7 +180,6 @@ class Finding:
     """One thing that the inputs say of each other.
 
     Attributes:
-        code: What kind of thing it is, in one word.
         severity: A refusal stops the work, a warning stands in every result, a note is for those who look.
         numbers: What was measured, by name with its unit.
         way_out: Of a refusal, what would be accepted.

@@ -155,9 +155,6 @@ def _shown(path: Path) -> str:
 def read_input(path: Path, *, max_bytes: int, where: str, allowed: str = "") -> bytes:
     """Read all bytes of a file.
 
-    Args:
-        max_bytes: A larger one is refused before it is read.
-
     Raises:
         InputError: If it is missing, no regular file, empty, too large, or not readable.
     """

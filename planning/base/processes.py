@@ -78,11 +78,7 @@ def working(jobs: int, pieces: int) -> Iterator[Callable[..., Iterable[Any]]]:
 
 
 def on_threads(work: Callable[[int], None], pieces: int, threads: int) -> Iterator[int]:
-    """Do pieces of work that let go of the interpreter, side by side; yields how many are done.
-
-    Args:
-        work: Called with the number of a piece.
-    """
+    """Do pieces of work that let go of the interpreter, side by side; yields how many are done."""
     threads = worker_count(threads, pieces)
     if threads == 1:
         for piece in range(pieces):

@@ -67,7 +67,6 @@ class Stages:
     """A stopwatch with names; seconds, in the order in which the stages ended.
 
     Attributes:
-        seconds: That each stage has taken so far.
         announce: Called with a stage's name when it begins, for whoever shows progress.
     """
 

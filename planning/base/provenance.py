@@ -125,7 +125,6 @@ class InputFiles:
 
         Args:
             name: As ``where`` states it.
-            max_bytes: A larger file is refused before it is read.
             key: Of ``where``, for errors.
 
         Raises:

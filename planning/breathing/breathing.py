@@ -28,7 +28,6 @@ class Breathing:
         amplitude_mm: b, of the target, from exhale to full inhale.
         direction_ct: Shape (3,), unit: whereto inhaling moves it.
         weights: Of everything else.
-        exponent: n of Lujan's curve.
         scanned_at: The position s in which the CT shows the body.
         gate: The needle goes in while s is at most this; None for any time.
     """
@@ -120,7 +119,6 @@ def position_at(fraction: Floats, position: float, exponent: int) -> Floats:
     Args:
         fraction: Any shape, each in 0..1.
         position: The greatest, such as the gate.
-        exponent: n of the curve.
 
     >>> position_at(np.array([0.0, 1.0]), 0.25, 4).round(12).tolist()
     [0.0, 0.25]

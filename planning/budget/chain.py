@@ -29,11 +29,9 @@ class BentPath:
     """A needle that bends, and the tissues of its path.
 
     Attributes:
-        case: The case.
         anatomy: Its structures, whose tissues the path passes.
         outward_ct: Shape (3,), unit, from the target along the needle.
         path_length: Target to skin, mm.
-        bending: Needle and tissues.
     """
 
     case: Case
@@ -61,8 +59,6 @@ def bent_path(case: Case, anatomy: Anatomy, outward_ct: Floats) -> BentPath | No
     """The path of one direction; None where the needle is straight, or the direction enters no skin.
 
     Args:
-        case: The case.
-        anatomy: Its structures.
         outward_ct: Shape (3,), unit.
     """
     if case.bending is None:
@@ -97,7 +93,6 @@ class Breath:
     """The breathing of a case, in its base frame.
 
     Attributes:
-        breathing: As declared.
         R_base_ct: Shape (3, 3).
     """
 
@@ -115,7 +110,6 @@ class Chain:
     """The chain from a target in the CT to a needle's tip: registration, arm, errors.
 
     Attributes:
-        model: The arm.
         tip_mm: Flange to tip.
         method: Of the registration: triad, rigid, weighted or joint.
         errors: As declared, times ``scale``.
@@ -174,7 +168,6 @@ def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: 
     """The chain of a case, with its breathing.
 
     Args:
-        case: With declared errors.
         registration: Of its markers, with the case's own declaration, to whose residuals the errors are scaled.
         q_insertion: Shape (6,), rad, the tip on the target.
         path: Of the needle there, where it bends.

@@ -28,7 +28,7 @@ from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.breathing.breathing import position_at
 from puncture_twin.planning.budget.chain import bent_path
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.settings import ControlScan, stereo_of, ultrasound_of
+from puncture_twin.planning.case.settings import stereo_of, ultrasound_of
 from puncture_twin.planning.case.tables import ControlScanSection, StereoSection, UltrasoundSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.plan.plan import Plan
@@ -40,21 +40,8 @@ from puncture_twin.planning.registration.residuals import NoiseTest
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import moving_weights
+from puncture_twin.planning.uncertainty import guided
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
-from puncture_twin.planning.uncertainty.guided import (
-    ALIKE_MM,
-    CAMERAS,
-    READS,
-    SCANS,
-    WAYS,
-    WHOLLY,
-    Follows,
-    GuidedError,
-    GuidedModel,
-    Look,
-    WayChance,
-    device_of,
-)
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 from puncture_twin.planning.visibility.cameras import CameraView, camera_view
 from puncture_twin.planning.visibility.probe import ProbeView, probe_view
@@ -66,7 +53,7 @@ LOOKS = 3
 def declared_ways(case: Case) -> tuple[str, ...]:
     """The ways whose devices a case declares, ct first."""
     lacking = {device for device, one in _DEVICES.items() if getattr(case, one) is None}
-    return tuple(way for way, used in WAYS.items() if not used & lacking)
+    return tuple(way for way, used in guided.WAYS.items() if not used & lacking)
 
 
 _DEVICES = MappingProxyType({"cameras": "stereo", "target": "ultrasound", "tip": "ultrasound", "scan": "control_scan"})
@@ -79,8 +66,8 @@ def check_way(way: str) -> None:
     Raises:
         InputError: Naming those that there are.
     """
-    if way not in WAYS:
-        refuse(f"guidance '{way}' is not known", "--guidance", ", ".join(WAYS), "unknown_guidance")
+    if way not in guided.WAYS:
+        refuse(f"guidance '{way}' is not known", "--guidance", ", ".join(guided.WAYS), "unknown_guidance")
 
 
 MOST_STEPS = 10
@@ -98,7 +85,7 @@ def stepped(way: str | None, steps: int | None) -> str | None:
         refuse("a control scan after each step is for one way", "--steps", "--guidance ct", "conflicting_options")
     if not 1 <= steps <= MOST_STEPS:
         refuse(f"{steps} steps", "--steps", f"1 to {MOST_STEPS} steps", "out_of_range")
-    return SCANS
+    return guided.SCANS
 
 
 def ways_of(text: str) -> tuple[str, ...]:
@@ -120,7 +107,7 @@ def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
 
     Balls that do not fit on the needle are assumed at half of its shaft and at its hub.
     """
-    needed, said = {_DEVICES[device] for device in READS[way] if device in _DEVICES}, []
+    needed, said = {_DEVICES[device] for device in guided.READS[way] if device in _DEVICES}, []
     if "stereo" in needed and case.stereo is None:
         cameras = stereo_of(StereoSection(), case.space, case.path)
         assert cameras is not None
@@ -139,7 +126,7 @@ def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
         said.append(f"[ultrasound] target read to {target}, tip to {tip}, calibrated to {probe.calibration_sd_mm:g} mm")
         case = replace(case, ultrasound=probe)
     if "control_scan" in needed and case.control_scan is None:
-        scan = ControlScan(**ControlScanSection().model_dump())
+        scan = ControlScanSection()
         said.append(
             f"[control_scan] slices of {scan.slice_mm:g} mm that show the target, {scan.dose_msv:g} mSv and "
             f"{scan.seconds:g} s each"
@@ -152,7 +139,6 @@ def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
     """The pose error of trials: touched in stated configurations, errors of the estimated size as if declared.
 
     Args:
-        error: Of a case.
         q_touch: Shape (N, 6), rad: known, or likely ones.
     """
     errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
@@ -181,13 +167,13 @@ class Sight:
         if self.probe is not None and self.probe.T_ct_image is None:
             found = dict.fromkeys(("target", "tip"), self.probe.sentence)
         if self.no_cameras:
-            found[CAMERAS] = self.no_cameras
+            found[guided.CAMERAS] = self.no_cameras
         if self.cameras is not None:
             row = int(np.abs(self.cameras.tip_to_target_mm - out_mm).argmin())
             named = zip(self.cameras.names, self.cameras.hidden[row], strict=True)
             behind = {name: f"behind the {by.replace('_', ' ')}" for name, by in named if by}
             markers = [name for name in self.cameras.names[self.cameras.balls :] if name not in behind]
-            found |= behind if len(markers) >= MIN_MARKERS else {**behind, CAMERAS: FEW_MARKERS}
+            found |= behind if len(markers) >= MIN_MARKERS else {**behind, guided.CAMERAS: FEW_MARKERS}
         return found
 
 
@@ -200,7 +186,7 @@ def sight_of(context: CaseContext, plan: Plan, *ways: str) -> Sight:
     Raises:
         InputError: The case states a place for them that cannot be used.
     """
-    used, cameras, probe, lost = frozenset[str]().union(*(READS[way] for way in ways)), None, None, ""
+    used, cameras, probe, lost = frozenset[str]().union(*(guided.READS[way] for way in ways)), None, None, ""
     if "cameras" in used and context.case.stereo is not None:
         try:
             cameras = camera_view(context, plan)
@@ -220,14 +206,12 @@ def guided_model(
     q: Floats,
     sight: Sight | None = None,
     steps: int | None = None,
-) -> GuidedModel:
+) -> guided.GuidedModel:
     """What guidance knows of one insertion.
 
     Args:
         case: Declares the devices, and what moves.
-        anatomy: Its structures.
         error: Of the needle, as rehearsed.
-        registration: Of the case's markers.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
         sight: What the devices see of it; None hides nothing, and has the picture along the body.
@@ -238,7 +222,7 @@ def guided_model(
     if breathing is not None:
         breath, skin_weight = breathing.spread_ct, moving_weights(case, breathing, anatomy).skin
     motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
-    return GuidedModel(
+    return guided.GuidedModel(
         error=error,
         markers=registration.markers.names,
         points_base=apply(registration.T_base_ct, registration.markers.points_ct),
@@ -256,7 +240,7 @@ def guided_model(
 
 def _looks(
     case: Case, anatomy: Anatomy, error: PoseError, outward_ct: Floats, q: Floats, sight: Sight, steps: int | None
-) -> tuple[Look, ...]:
+) -> tuple[guided.Look, ...]:
     paths = case_paths(case, anatomy.skin, outward_ct[None])
     length = float(paths.path_length[0])
     standoff = float(standoffs(case.needle, length, paths.skin_angle[0]))
@@ -271,7 +255,7 @@ def _looks(
         off = np.where(np.isnan(there).any(axis=1), np.inf, np.abs(there - q).max(axis=1))
         inserted = (length - out) / length
         hidden = sight.hidden(out) | ({} if inserted > 0 else {"tip": OUTSIDE})
-        looks.append(Look(there[off.argmin()], out, inserted, hidden))
+        looks.append(guided.Look(there[off.argmin()], out, inserted, hidden))
     return tuple(looks)
 
 
@@ -286,11 +270,10 @@ def _across(outward_ct: Floats, sight: Sight) -> Floats:
 
 def way_chances(
     context: CaseContext, outward_ct: Floats, q: Floats, sight: Sight | None = None
-) -> tuple[WayChance, ...]:
+) -> tuple[guided.WayChance, ...]:
     """What each way would leave of an insertion, ct first, by the devices of a case; nothing where it declares none.
 
     Args:
-        context: The case.
         outward_ct: Shape (3,), unit, from the target along the needle.
         q: Shape (6,), rad, the tip on the target.
         sight: What the devices see; None hides nothing.
@@ -310,10 +293,10 @@ def way_chances(
         try:
             left = guided_error(model, way)
         except NoAnswerError as refused:
-            found.append(WayChance(way, np.nan, np.nan, np.nan, lost or str(refused)))
+            found.append(guided.WayChance(way, np.nan, np.nan, np.nan, lost or str(refused)))
             continue
         rms_mm = float(np.sqrt(np.trace(left.tip_covariance(q[None])[0])))
-        found.append(WayChance(way, rms_mm, *guided_chances(model, way, chance, corridor), lost))
+        found.append(guided.WayChance(way, rms_mm, *guided_chances(model, way, chance, corridor), lost))
     return tuple(found)
 
 
@@ -351,35 +334,35 @@ def explained_ways(context: CaseContext, explained: Explanation) -> Explanation:
     return replace(explained, guidance=way_chances(context, row.outward_ct[0], q))
 
 
-def followers(case: Case, anatomy: Anatomy) -> tuple[Follows, ...]:
+def followers(case: Case, anatomy: Anatomy) -> tuple[guided.Follows, ...]:
     """How each of ``anatomy.checked`` follows the target; what is outside of the body does not but with the breath."""
     breath = np.ones(len(anatomy.checked))
     if case.breathing is not None:
         breath = moving_weights(case, case.breathing, anatomy).structures
     return tuple(
-        Follows(0.0 if one.outside else 1.0, weight)
+        guided.Follows(0.0 if one.outside else 1.0, weight)
         for one, weight in zip(anatomy.checked, breath.tolist(), strict=True)
     )
 
 
-def lost_sight(model: GuidedModel, way: str) -> tuple[str, ...]:
+def lost_sight(model: guided.GuidedModel, way: str) -> tuple[str, ...]:
     """What a way's devices do not see, where and why, a sentence each; that the tip is not yet in the body is none."""
     return tuple(
         f"{_where(look)}: {what} out of sight: {why}"
         for look in model.looks
         for what, why in look.hidden.items()
-        if device_of(what) in READS[way] and why != OUTSIDE
+        if guided.device_of(what) in guided.READS[way] and why != OUTSIDE
     )
 
 
 OUTSIDE = "it is not in the body yet"
 
 
-def _where(look: Look) -> str:
+def _where(look: guided.Look) -> str:
     return "at the target" if look.out_mm <= 0 else f"{look.out_mm:.0f} mm before the target"
 
 
-def guided_error(model: GuidedModel, way: str, follows: Follows = WHOLLY) -> GuidedError:
+def guided_error(model: guided.GuidedModel, way: str, follows: guided.Follows = guided.WHOLLY) -> guided.GuidedError:
     """The pose error that a way leaves, against anatomy that follows the target so.
 
     Raises:
@@ -389,17 +372,19 @@ def guided_error(model: GuidedModel, way: str, follows: Follows = WHOLLY) -> Gui
     if found is None:
         lost = "; ".join(lost_sight(model, way)) or "its readings leave the needle's place against the CT open"
         raise NoAnswerError(f"guidance '{way}' does not see enough: {lost}", code="lost_sight")
-    if follows != WHOLLY:
+    if follows != guided.WHOLLY:
         cov, breath = model.left(found.gain, follows)
         found = found._replace(cov=cov, breath=breath, tip_cov=cov[:3, :3])  # no picture shows this anatomy
-    return GuidedError(one.model, one.tip_mm, one.target_base, one.errors, one.fit, one.bend, found)
+    return guided.GuidedError(one.model, one.tip_mm, one.target_base, one.errors, one.fit, one.bend, found)
 
 
 PHASES = 8
 """Positions of the breath, of equal chances, over which chances are averaged: it is neither about 0 nor normal."""
 
 
-def at_phases(model: GuidedModel, way: str, chance: ChanceModel, follows: Follows = WHOLLY) -> list[ChanceModel]:
+def at_phases(
+    model: guided.GuidedModel, way: str, chance: ChanceModel, follows: guided.Follows = guided.WHOLLY
+) -> list[ChanceModel]:
     """The chances of a way's needle against such anatomy at each position of the breath in the gate, known there.
 
     Raises:
@@ -411,11 +396,11 @@ def at_phases(model: GuidedModel, way: str, chance: ChanceModel, follows: Follow
         s = position_at((np.arange(PHASES) + 0.5) / PHASES, gate, breathing.exponent)
         mean_mm, deviation_mm = breathing.direction_ct @ breathing.spread_ct
         moved_mm = (s - breathing.scanned_at) * breathing.amplitude_mm
-        deviations = (moved_mm - mean_mm) / max(deviation_mm, ALIKE_MM)
+        deviations = (moved_mm - mean_mm) / max(deviation_mm, guided.ALIKE_MM)
     return [chance.led(*error.about_breath(deviation)) for deviation in deviations.tolist()]
 
 
-def guided_chances(model: GuidedModel, way: str, chance: ChanceModel, corridor_mm: float) -> tuple[float, float]:
+def guided_chances(model: guided.GuidedModel, way: str, chance: ChanceModel, corridor_mm: float) -> tuple[float, float]:
     """The chance that a way's needle is not stopped, and hits, and the chance that it is stopped.
 
     Raises:

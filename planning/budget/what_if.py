@@ -37,7 +37,6 @@ class SourceCost:
     """One source of the expected error.
 
     Attributes:
-        source: As in `SOURCES`.
         alone_mm: The tip's rms error, were there no other.
         without_mm: Expected error with all sources but this one; the registration's weights stay.
     """
@@ -53,7 +52,6 @@ class Change:
 
     Attributes:
         group: slices, markers, touches, arm, tip, needle or breath.
-        what: In words.
         rms_mm: The tip's expected error then, all else as it is.
         point_ct: Shape (3,), mm, where the last of further markers sits; None for other changes.
     """
@@ -83,7 +81,6 @@ def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tupl
     """The changes of a chain, each alone.
 
     Args:
-        chain: As it is.
         skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
         bed_ct: Shape (3,), unit, across the CT's slices; None where it is not stated, and slices are left out.
     """

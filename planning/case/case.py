@@ -23,50 +23,11 @@ from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.text import Facts, Shown, brief, did_you_mean
 from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.breathing.breathing import Breathing
+from puncture_twin.planning.case import named_files, settings, tables
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, entry_frame, grid
 from puncture_twin.planning.case.errors import ErrorModel, errors_of
-from puncture_twin.planning.case.named_files import (
-    MASK_ROLE,
-    CaseVolumes,
-    read_named_files,
-    robot_warnings,
-    wholeness_warnings,
-)
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
-from puncture_twin.planning.case.settings import (
-    Axis,
-    ControlScan,
-    CtSettings,
-    Gantry,
-    Motion,
-    Needle,
-    Obstacle,
-    RobotSettings,
-    SearchSettings,
-    Stereo,
-    Ultrasound,
-    axes_frame,
-    bending_of,
-    breathing_of,
-    ct_of,
-    gantry_of,
-    motion_of,
-    obstacle_of,
-    robot_of,
-    search_of,
-    stereo_of,
-    ultrasound_of,
-)
-from puncture_twin.planning.case.tables import (
-    MarkerSection,
-    PlaceSection,
-    RankingSection,
-    RehearsalSection,
-    StructureSection,
-    StructuresSection,
-    tool_of,
-)
 from puncture_twin.planning.formats.guard import guard_points
 from puncture_twin.planning.formats.labels.label_sources import structure_name
 from puncture_twin.planning.formats.points import parse_points
@@ -84,11 +45,8 @@ class Case(Shown):
     Attributes:
         target_ct: Shape (3,), the point to reach.
         T_ct_entry: Shape (4, 4), the entry frame, its origin on the target.
-        files: The case file and all that it names, read once.
         volumes: Those of them that are volumes: the CT and the label maps.
         stated_structures: How many structures the case says that it has, the skin among them.
-        region: Which part of the body it shows.
-        warnings: What the case file itself leaves open, one sentence each.
         hit_radius_mm: Within which of the target the tip hits; None counts the target's own mesh.
         errors: What is declared to err, or None.
         truth_errors: From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`.
@@ -110,32 +68,32 @@ class Case(Shown):
     target_ct: Floats
     target_name: str
     target_structure: str
-    needle: Needle
-    search: SearchSettings
-    ranking: RankingSection
+    needle: settings.Needle
+    search: settings.SearchSettings
+    ranking: tables.RankingSection
     T_ct_entry: Floats
-    structure: tuple[StructureSection, ...]
-    structures: tuple[StructuresSection, ...]
-    registration: MarkerSection | None
-    robot: RobotSettings
-    obstacles: tuple[Obstacle, ...]
-    rehearsal: RehearsalSection
+    structure: tuple[tables.StructureSection, ...]
+    structures: tuple[tables.StructuresSection, ...]
+    registration: tables.MarkerSection | None
+    robot: settings.RobotSettings
+    obstacles: tuple[settings.Obstacle, ...]
+    rehearsal: tables.RehearsalSection
     files: InputFiles
-    volumes: CaseVolumes
+    volumes: named_files.CaseVolumes
     stated_structures: int
     region: str
-    ct: CtSettings = field(default_factory=CtSettings)
-    gantry: Gantry | None = None
-    place: PlaceSection = field(default_factory=PlaceSection)
+    ct: settings.CtSettings = field(default_factory=settings.CtSettings)
+    gantry: settings.Gantry | None = None
+    place: tables.PlaceSection = field(default_factory=tables.PlaceSection)
     warnings: tuple[str, ...] = ()
     hit_radius_mm: float | None = None
     errors: ErrorModel | None = None
     truth_errors: ErrorModel | None = None
     breathing: Breathing | None = None
-    stereo: Stereo | None = None
-    ultrasound: Ultrasound | None = None
-    control_scan: ControlScan | None = None
-    motion: Motion | None = None
+    stereo: settings.Stereo | None = None
+    ultrasound: settings.Ultrasound | None = None
+    control_scan: tables.ControlScanSection | None = None
+    motion: settings.Motion | None = None
     bending: Bending | None = None
     own_target: bool = False
     tool: ToolBody | None = None
@@ -195,7 +153,7 @@ class Case(Shown):
         return self.path.parent
 
     @property
-    def skin_section(self) -> StructureSection:
+    def skin_section(self) -> tables.StructureSection:
         """The one structure that is the skin."""
         return next(section for section in self.structure if section.role == "skin")
 
@@ -209,7 +167,7 @@ class Case(Shown):
         if parts := self.volumes.masks(folder):
             return parts
         inside = PurePosixPath(folder)
-        files = [one.path for one in self.inputs if one.role.startswith(MASK_ROLE)]
+        files = [one.path for one in self.inputs if one.role.startswith(named_files.MASK_ROLE)]
         return {structure_name(file): file for file in files if PurePosixPath(file).parent == inside}
 
 
@@ -233,29 +191,29 @@ def load_case(path: Path | str, options: CaseOptions = NO_OPTIONS) -> Case:
 
 def _read(path: Path, files: InputFiles, options: CaseOptions, known: Case | None = None) -> Case:
     """Read a case; of one that differs from a known one by its target alone, the case file is looked at again."""
-    case_volumes = CaseVolumes(files, path) if known is None else known.volumes
+    case_volumes = named_files.CaseVolumes(files, path) if known is None else known.volumes
     stated = files.add(CASE_ROLE, path.name, files.held(path.name) or read_toml_bytes(path, ALLOWED_CASE))
     if options.sections:
         files.state(OPTIONS_ROLE, options.text.encode())
     change = partial(options.applied, where=path)
     content = parse_toml(stated, path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md", change=change)
     if known is None:
-        whole = read_named_files(content, path, files, case_volumes)
+        whole = named_files.read_named_files(content, path, files, case_volumes)
     else:
         files.take(known.files, but=("target", OPTIONS_ROLE))
-        whole = wholeness_warnings(content, files, path)
+        whole = named_files.wholeness_warnings(content, files, path)
     return replace(case_of(content, path, files, case_volumes, whole), options=options)
 
 
 def case_of(
-    content: CaseFile, path: Path, files: InputFiles, case_volumes: CaseVolumes, warnings: tuple[str, ...]
+    content: CaseFile, path: Path, files: InputFiles, case_volumes: named_files.CaseVolumes, warnings: tuple[str, ...]
 ) -> Case:
     """Make a case of its file and the files that it names, in LPS (or local) mm and radians."""
     space = Space(content.space)
     target = _target_of(content, path, space, files)
-    robot = robot_of(content, space, path, files)
-    tool = tool_of(content.tool, files, path)
-    settings, placed = content.search, content.registration
+    robot = settings.robot_of(content, space, path, files)
+    tool = tables.tool_of(content.tool, files, path)
+    searched, placed = content.search, content.registration
     return Case(
         path=path,
         name=content.name,
@@ -264,34 +222,34 @@ def case_of(
         target_name=content.target.name,
         target_structure=content.target.structure or content.target.name,
         own_target=content.target.structure is None,
-        needle=Needle(**content.needle.model_dump(include={*Needle.__dataclass_fields__})),
-        search=search_of(settings),
-        obstacles=tuple(obstacle_of(one, space) for one in content.obstacle),
+        needle=settings.Needle(**content.needle.model_dump(include={*settings.Needle.__dataclass_fields__})),
+        search=settings.search_of(searched),
+        obstacles=tuple(settings.obstacle_of(one, space) for one in content.obstacle),
         ranking=content.ranking,
-        T_ct_entry=view_frame(entry_frame(settings.frame, space, where=path), target),
+        T_ct_entry=view_frame(entry_frame(searched.frame, space, where=path), target),
         structure=content.structure,
         structures=content.structures,
-        registration=None if placed is None or placed.transform else MarkerSection(**placed.model_dump()),
+        registration=None if placed is None or placed.transform else tables.MarkerSection(**placed.model_dump()),
         robot=robot,
         tool=tool,
         rehearsal=content.rehearsal,
         files=files,
         volumes=case_volumes,
-        ct=ct_of(content.ct, trust_labels=settings.trust_labels),
-        gantry=None if content.gantry is None else gantry_of(content.gantry, space, path),
+        ct=settings.ct_of(content.ct, trust_labels=searched.trust_labels),
+        gantry=None if content.gantry is None else settings.gantry_of(content.gantry, space, path),
         place=content.place,
         stated_structures=content.stated_structures,
         region=content.region,
-        warnings=(*warnings, *robot_warnings(content, robot)),
+        warnings=(*warnings, *named_files.robot_warnings(content, robot)),
         hit_radius_mm=content.target.hit_radius_mm,
         errors=errors_of(content, content.errors, case_volumes, path),
         truth_errors=errors_of(content, content.rehearsal.errors, case_volumes, path, truth=True),
-        breathing=breathing_of(content.breathing, space, path),
-        stereo=stereo_of(content.stereo, space, path),
-        ultrasound=ultrasound_of(content.ultrasound, space, path),
-        control_scan=None if content.control_scan is None else ControlScan(**content.control_scan.model_dump()),
-        motion=motion_of(content.motion),
-        bending=bending_of(content.needle, content.tissue, path),
+        breathing=settings.breathing_of(content.breathing, space, path),
+        stereo=settings.stereo_of(content.stereo, space, path),
+        ultrasound=settings.ultrasound_of(content.ultrasound, space, path),
+        control_scan=content.control_scan,
+        motion=settings.motion_of(content.motion),
+        bending=settings.bending_of(content.needle, content.tissue, path),
     )
 
 
@@ -330,7 +288,7 @@ def bed_frame(case: Case) -> Floats:
     Raises:
         InputError: The two are parallel.
     """
-    R_ct_bed = axes_frame(up_axis(case), along_axis(case), Space.LPS, case.path, "place: up and along")
+    R_ct_bed = settings.axes_frame(up_axis(case), along_axis(case), Space.LPS, case.path, "place: up and along")
     return view_frame(R_ct_bed, case.target_ct)
 
 
@@ -351,7 +309,7 @@ def along_axis(case: Case) -> Vector:
     return _stated(case.place.along, case.space, along)
 
 
-def _stated(axis: Axis | None, space: Space, otherwise: Floats) -> Vector:
+def _stated(axis: settings.Axis | None, space: Space, otherwise: Floats) -> Vector:
     """An axis that the case states, or the default, in LPS (or the local frame)."""
     if isinstance(axis, str):
         return ANATOMICAL_LPS[axis]

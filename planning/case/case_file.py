@@ -14,31 +14,7 @@ from pydantic import BeforeValidator, Field, Strict, model_validator
 
 from puncture_twin.planning.base.errors import SchemaError
 from puncture_twin.planning.base.text import unprintable_texts
-from puncture_twin.planning.case.tables import (
-    MAX_LABEL_MAPS,
-    MAX_STRUCTURES,
-    BreathingSection,
-    ControlScanSection,
-    CtSection,
-    ErrorsSection,
-    GantrySection,
-    MotionSection,
-    NeedleSection,
-    ObstacleSection,
-    PlaceSection,
-    RankingSection,
-    RegistrationSection,
-    RehearsalSection,
-    RobotSection,
-    SearchSection,
-    StereoSection,
-    StructureSection,
-    StructuresSection,
-    TargetSection,
-    TissueSection,
-    ToolSection,
-    UltrasoundSection,
-)
+from puncture_twin.planning.case import tables
 from puncture_twin.planning.case.toml_types import CaseName, Section, Text
 
 COUNT_KEY = "structures = N"
@@ -93,27 +69,29 @@ class CaseFile(Section):
     region: Annotated[Region, BeforeValidator(_stated_region)]
     name: CaseName
     space: Literal["LPS", "RAS", "local"]
-    target: TargetSection
-    needle: NeedleSection
-    search: SearchSection = SearchSection()
-    ranking: RankingSection = RankingSection()
-    structure: Annotated[tuple[StructureSection, ...], Field(max_length=MAX_STRUCTURES)] = ()
-    structures: Annotated[tuple[StructuresSection, ...], Field(max_length=MAX_LABEL_MAPS)] = ()
-    ct: CtSection = CtSection()
-    registration: RegistrationSection | None = None
-    robot: RobotSection = RobotSection()
-    tool: ToolSection | None = None
-    obstacle: Annotated[tuple[ObstacleSection, ...], Field(max_length=MAX_STRUCTURES)] = ()
-    gantry: GantrySection | None = None
-    place: PlaceSection = PlaceSection()
-    errors: ErrorsSection | None = None
-    breathing: BreathingSection | None = None
-    motion: MotionSection | None = None
-    stereo: StereoSection | None = None
-    ultrasound: UltrasoundSection | None = None
-    control_scan: ControlScanSection | None = None
-    tissue: Annotated[dict[Text, TissueSection], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
-    rehearsal: RehearsalSection = RehearsalSection()
+    target: tables.TargetSection
+    needle: tables.NeedleSection
+    search: tables.SearchSection = tables.SearchSection()
+    ranking: tables.RankingSection = tables.RankingSection()
+    structure: Annotated[tuple[tables.StructureSection, ...], Field(max_length=tables.MAX_STRUCTURES)] = ()
+    structures: Annotated[tuple[tables.StructuresSection, ...], Field(max_length=tables.MAX_LABEL_MAPS)] = ()
+    ct: tables.CtSection = tables.CtSection()
+    registration: tables.RegistrationSection | None = None
+    robot: tables.RobotSection = tables.RobotSection()
+    tool: tables.ToolSection | None = None
+    obstacle: Annotated[tuple[tables.ObstacleSection, ...], Field(max_length=tables.MAX_STRUCTURES)] = ()
+    gantry: tables.GantrySection | None = None
+    place: tables.PlaceSection = tables.PlaceSection()
+    errors: tables.ErrorsSection | None = None
+    breathing: tables.BreathingSection | None = None
+    motion: tables.MotionSection | None = None
+    stereo: tables.StereoSection | None = None
+    ultrasound: tables.UltrasoundSection | None = None
+    control_scan: tables.ControlScanSection | None = None
+    tissue: Annotated[dict[Text, tables.TissueSection], Field(max_length=tables.MAX_STRUCTURES)] = Field(
+        default_factory=dict
+    )
+    rehearsal: tables.RehearsalSection = tables.RehearsalSection()
     end: EndSection | None = None
 
     @property

@@ -133,7 +133,6 @@ class ErrorModel:
         marker_cov_ct: Shape (3, 3), mm^2: of one marker read in the CT.
         touch_mm: Of one touch, per axis of the base frame, besides the arm.
         target_cov_ct: Shape (3, 3), mm^2: of the target read in the CT.
-        arm: Of the arm and its needle.
         surface_mm: By which a whole structure's surface may lie off, along its normal; None where every structure's own
             voxels say it.
         found: Whether the markers' residuals give the size of all errors, and the declaration their shape.

@@ -27,29 +27,9 @@ from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.breathing.breathing import Breathing
+from puncture_twin.planning.case import tables
 from puncture_twin.planning.case.case_file import CaseFile
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, entry_frame
-from puncture_twin.planning.case.tables import (
-    AIR_HU,
-    DENSE_HU,
-    BreathingSection,
-    CtSection,
-    EntryAxes,
-    GantrySection,
-    LimitsSection,
-    MotionSection,
-    MountSection,
-    NeedleSection,
-    ObstacleSection,
-    RegistrationSection,
-    RobotSection,
-    SearchSection,
-    Stated,
-    StereoSection,
-    TissueSection,
-    UltrasoundSection,
-    stated_base_ct,
-)
 from puncture_twin.planning.case.toml_types import Anatomical, Vector
 from puncture_twin.planning.formats import itk_transform
 from puncture_twin.planning.formats.labels.naming import REST, ByName
@@ -128,13 +108,13 @@ class CtSettings:
     """
 
     file: str | None = None
-    air_hu: float = AIR_HU
-    dense_hu: float = DENSE_HU
+    air_hu: float = tables.AIR_HU
+    dense_hu: float = tables.DENSE_HU
     margin_mm: float = 2.0
     unnamed: str = "unknown"
     trust_labels: bool = False
-    arms: Stated | None = None
-    table: Stated | None = None
+    arms: tables.Stated | None = None
+    table: tables.Stated | None = None
     beyond_mm: float | None = None
 
     @property
@@ -184,13 +164,12 @@ class RobotSettings:
         home: Shape (6,), rad, or None for the model's own.
         T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated, or None.
         stated: The section that states a transform, or None.
-        speeds: How fast its plans may move.
     """
 
     model: UrModel
     home: Floats | None
     T_base_ct_mount: Floats | None
-    stated: RegistrationSection | None = None
+    stated: tables.RegistrationSection | None = None
     speeds: SpeedLimits = DEFAULT_SPEEDS
 
     @property
@@ -219,7 +198,6 @@ class Ultrasound:
     """A probe on an arm of its own.
 
     Attributes:
-        model: Of the probe's arm.
         T_base_ct_mount: Shape (4, 4), mm, of that arm's base, or None where it is to be proposed.
         target_sd_mm: Standard deviation of the target's reading per axis of the image plane, and across it.
         tip_sd_mm: The same of the needle's tip.
@@ -237,16 +215,6 @@ class Ultrasound:
     width_mm: float
 
 
-@dataclass(frozen=True)
-class ControlScan:
-    """A CT with the needle in, its slices across the body; seconds until the needle goes on, effective dose in mSv."""
-
-    slice_mm: float
-    target_seen: bool
-    dose_msv: float
-    seconds: float
-
-
 @dataclass(frozen=True, eq=False)
 class Motion:
     """How the target, and what surrounds it, has moved since the scan: ``target_cov_ct``, shape (3, 3), mm^2."""
@@ -254,7 +222,7 @@ class Motion:
     target_cov_ct: Floats
 
 
-def stereo_of(section: StereoSection | None, space: Space, path: Path) -> Stereo | None:
+def stereo_of(section: tables.StereoSection | None, space: Space, path: Path) -> Stereo | None:
     """The cameras; None where the case declares none.
 
     Raises:
@@ -272,7 +240,7 @@ def stereo_of(section: StereoSection | None, space: Space, path: Path) -> Stereo
     return Stereo(cameras, section.balls_mm, section.sd_mm)
 
 
-def ultrasound_of(section: UltrasoundSection | None, space: Space, path: Path) -> Ultrasound | None:
+def ultrasound_of(section: tables.UltrasoundSection | None, space: Space, path: Path) -> Ultrasound | None:
     """The probe and its arm; None where the case declares none.
 
     Raises:
@@ -285,18 +253,18 @@ def ultrasound_of(section: UltrasoundSection | None, space: Space, path: Path) -
     return Ultrasound(model=ur_model(section.model), T_base_ct_mount=mount, **stated)
 
 
-def motion_of(section: MotionSection | None) -> Motion | None:
+def motion_of(section: tables.MotionSection | None) -> Motion | None:
     """How the target moves; its covariance is diagonal, so LPS and RAS are the same. None where none is declared."""
     return None if section is None else Motion(read_only(np.diag(np.square(section.target_sd_mm))))
 
 
-def ct_of(section: CtSection, *, trust_labels: bool) -> CtSettings:
+def ct_of(section: tables.CtSection, *, trust_labels: bool) -> CtSettings:
     """The CT's table; ``beyond_mm = "all"`` is infinite."""
     beyond_mm = np.inf if section.beyond_mm == "all" else section.beyond_mm
     return CtSettings(**section.model_dump(exclude={"beyond_mm"}), trust_labels=trust_labels, beyond_mm=beyond_mm)
 
 
-def search_of(section: SearchSection) -> SearchSettings:
+def search_of(section: tables.SearchSection) -> SearchSettings:
     """The grid and the limits in radians."""
     return SearchSettings(
         theta=(np.radians(section.theta_deg[0]), np.radians(section.theta_deg[1])),
@@ -309,14 +277,14 @@ def search_of(section: SearchSection) -> SearchSettings:
     )
 
 
-def obstacle_of(section: ObstacleSection, space: Space) -> Obstacle:
+def obstacle_of(section: tables.ObstacleSection, space: Space) -> Obstacle:
     """A box; its centre is in the case's space where its frame is the CT's."""
     center = np.asarray(section.center_mm)
     center = center if section.frame == "base" else to_lps(center[None], space)[0]
     return Obstacle(section.name, section.frame, center, np.asarray(section.size_mm))
 
 
-def gantry_of(gantry: GantrySection, space: Space, path: Path) -> Gantry:
+def gantry_of(gantry: tables.GantrySection, space: Space, path: Path) -> Gantry:
     """The bore's pose: z along the axis, x to the top, and turned so that a positive tilt leans the top against z."""
     axes = axes_frame(gantry.axis or "head", gantry.up or "anterior", space, path, "gantry: axis and up")
     T = pose(axes, to_lps(np.asarray([gantry.center_mm]), space)[0])
@@ -338,7 +306,7 @@ another rotation than was meant, and 1 degree moves the needle's tip by 9 mm at 
 Axis = Anatomical | tuple[float, float, float]
 
 
-def mount_pose(mount: MountSection, space: Space, path: Path, *, key: str = "robot.mount") -> Floats:
+def mount_pose(mount: tables.MountSection, space: Space, path: Path, *, key: str = "robot.mount") -> Floats:
     """T_base_ct, shape (4, 4), from the base's origin and axes, as a case states them in its own space.
 
     Raises:
@@ -367,7 +335,7 @@ def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Floats:
         InputError: The two are parallel or zero; names ``key``.
     """
     try:
-        return entry_frame(EntryAxes(z=z, x=x), space, where=path)
+        return entry_frame(tables.EntryAxes(z=z, x=x), space, where=path)
     except InputError as error:
         raise InputError(f"{key} are parallel or zero", where=path, allowed="two axes", code="axes_parallel") from error
 
@@ -391,12 +359,12 @@ def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> 
     speeds = SpeedLimits(*(getattr(robot, name) for name in SpeedLimits._fields))
     if stated is not None and stated.transform is not None:
         T_file = itk_transform.parse_transform(files.content(stated.transform), path.parent / stated.transform)
-        mount = read_only(stated_base_ct(stated, T_file))
+        mount = read_only(tables.stated_base_ct(stated, T_file))
         return RobotSettings(model, home, mount, stated, speeds)
     return RobotSettings(model, home, mount, speeds=speeds)
 
 
-def arm_of(section: RobotSection, files: InputFiles, path: Path) -> UrModel:
+def arm_of(section: tables.RobotSection, files: InputFiles, path: Path) -> UrModel:
     """The arm's model; each file that decides it becomes an input of the case.
 
     Raises:
@@ -425,7 +393,7 @@ def _mesh(address: str, *, urdf: str, files: InputFiles, path: Path) -> bytes:
     return files.read(MESH_ROLE, name, max_bytes=meshes.MAX_FILE_BYTES, key=f"robot.urdf: mesh '{address}'", where=path)
 
 
-def stated_limits(section: LimitsSection | None) -> StatedLimits:
+def stated_limits(section: tables.LimitsSection | None) -> StatedLimits:
     """The limits in radians; nothing where the case states none."""
     if section is None:
         return NOTHING_STATED
@@ -441,7 +409,9 @@ SAME_MM = 0.03
 """By which ``diameter_mm`` may differ from its gauge: twice the usual tolerance of the chart."""
 
 
-def bending_of(needle: NeedleSection, tissue: Mapping[str, TissueSection], where: str | Path) -> Bending | None:
+def bending_of(
+    needle: tables.NeedleSection, tissue: Mapping[str, tables.TissueSection], where: str | Path
+) -> Bending | None:
     """The bending of a case's needle; None where it declares no tissue.
 
     Raises:
@@ -462,7 +432,7 @@ def bending_of(needle: NeedleSection, tissue: Mapping[str, TissueSection], where
     return Bending(_shaft(needle, where), float(np.radians(needle.bevel_deg)), ByName(tissues))
 
 
-def _shaft(needle: NeedleSection, where: str | Path) -> Shaft:
+def _shaft(needle: tables.NeedleSection, where: str | Path) -> Shaft:
     modulus = STEEL_GPA if needle.modulus_gpa is None else needle.modulus_gpa
     if needle.gauge is None:
         return Shaft(needle.shaft_mm, needle.diameter_mm, 0.0, modulus)
@@ -478,7 +448,7 @@ def _shaft(needle: NeedleSection, where: str | Path) -> Shaft:
     return Shaft(needle.shaft_mm, gauge.outer_mm, 0.0 if needle.solid else gauge.inner_mm, modulus)
 
 
-def breathing_of(section: BreathingSection | None, space: Space, where: str | Path) -> Breathing | None:
+def breathing_of(section: tables.BreathingSection | None, space: Space, where: str | Path) -> Breathing | None:
     """The breathing of a case; None where it declares none.
 
     Args:

@@ -513,7 +513,6 @@ def other_readings(section: RegistrationSection, T_base_ct: Floats) -> dict[str,
     """T_base_ct under other values of ``transform_maps`` and ``base_axes``, by these keys as text.
 
     Args:
-        section: As the case states it.
         T_base_ct: Shape (4, 4), mm, by its own keys.
     """
     T = RAS_OF_LPS @ T_base_ct if section.base_axes == "RAS" else T_base_ct
@@ -698,8 +697,6 @@ def tool_of(section: ToolSection | None, files: InputFiles, path: Path) -> ToolB
 
     Args:
         section: As the case states it. It is turned about the flange's x, y and z, in this order, then moved.
-        files: The case's files.
-        path: The case file, for errors.
 
     Raises:
         InputError: A file that cannot be used, or a unit that is not known.

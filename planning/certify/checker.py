@@ -106,7 +106,6 @@ def verify(
 
     Args:
         certificate: As read from a file; `read_certificate` has checked that the cells tile the cap.
-        case: The case that it must belong to.
         error: Of the case's needle; needed where the certificate states a chance to touch.
 
     Raises:

@@ -25,7 +25,6 @@ class Question:
     """The question of a certificate: everything but the surfaces that a verdict depends on; mm and rad.
 
     Attributes:
-        inputs: Every file of that case, with role and hash.
         target_ct: Shape (3,).
         R_ct_entry: Shape (3, 3).
         theta, beta: The cap: lowest and highest angle.

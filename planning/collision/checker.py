@@ -65,7 +65,7 @@ class CellChecker:
             more than 2 mm prove that the path between them touches neither patient nor box.
 
     Raises:
-        InputError: If the padding is negative, two boxes share a name, the patient's mesh is unusable, the base
+        InputError: If two boxes share a name, the patient's mesh is unusable, the base
             is in the patient, a shape of an own arm hangs on nothing,
             or an own tool does not hang on the flange.
     """
@@ -80,8 +80,6 @@ class CellChecker:
         outside: TriangleMesh | None = None,
         padding_mm: float = 0.0,
     ) -> None:
-        if not (np.isfinite(padding_mm) and padding_mm >= 0.0):
-            refuse(f"padding_mm = {padding_mm}", "cell", "0 or more", "out_of_range")
         self.model = model
         self.tool = tool
         self._bodies = arm_bodies(model, tool, padding_mm)

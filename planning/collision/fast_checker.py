@@ -19,16 +19,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.kernels import segments as segment_kernels
-from puncture_twin.planning.collision.kernels.segments import (
-    CONTACT,
-    HALVINGS,
-    NOT_FINITE,
-    QUERY,
-    Answer,
-    SegmentScratch,
-    segment_scratch,
-)
+from puncture_twin.planning.collision.kernels import segments, segments as segment_kernels
 from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES_OUTSIDE
 from puncture_twin.planning.collision.packed import ROUND
 from puncture_twin.planning.collision.patient import Check
@@ -149,9 +140,9 @@ class FastChecker(CellChecker):
         return SegmentChecker(self.model, self._tested, self._proofs, self._segment_scratch, clear_mm)
 
     @cached_property
-    def _segment_scratch(self) -> SegmentScratch:
+    def _segment_scratch(self) -> segments.SegmentScratch:
         """Scratch in which segments are checked, one after the other."""
-        return segment_scratch(self._proofs.scene, self._proofs.movers)
+        return segments.segment_scratch(self._proofs.scene, self._proofs.movers)
 
     def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:
         """The checks at ``q`` (6,), rad, that are left to FCL."""
@@ -197,8 +188,8 @@ QUESTIONS = 256
 class _Filled(NamedTuple):
     """Arrays that the compiled code fills."""
 
-    scratch: SegmentScratch
-    answer: Answer
+    scratch: segments.SegmentScratch
+    answer: segments.Answer
 
 
 class SegmentChecker:
@@ -215,7 +206,12 @@ class SegmentChecker:
     """
 
     def __init__(
-        self, model: UrModel, checks: Sequence[Check], proofs: Proofs, scratch: SegmentScratch, clear_mm: float = 0.0
+        self,
+        model: UrModel,
+        checks: Sequence[Check],
+        proofs: Proofs,
+        scratch: segments.SegmentScratch,
+        clear_mm: float = 0.0,
     ) -> None:
         self._model, self._checks, self._clear_mm = model, checks, clear_mm
         self._packed = (proofs.scene, proofs.movers, model.lengths)
@@ -239,15 +235,15 @@ class SegmentChecker:
                 *self._packed, start, end, answered, halvings, FINE_MM, self._clear_mm, self._order, *self._filled
             )
             status, check, answered, count = self._filled.answer.status.tolist()
-            if status == NOT_FINITE:
+            if status == segments.NOT_FINITE:
                 require_finite(np.stack([start, end]))
-            if status == CONTACT:
+            if status == segments.CONTACT:
                 return self._contact(check)
             if count > len(self._filled.answer.fractions):
                 self._filled = self._filled._replace(answer=_empty_answer(2 * count))
                 continue
             touching = self._touching(start, end, count)
-            if touching is not None or status != QUERY:
+            if touching is not None or status != segments.QUERY:
                 return touching
 
     def _touching(self, start: Floats, end: Floats, queries: int) -> Contact | None:
@@ -266,14 +262,16 @@ class SegmentChecker:
         return self._checks[check].contact
 
 
-def _empty_answer(questions: int) -> Answer:
-    return Answer(np.zeros(4, np.int64), np.empty(questions), np.empty(questions, np.int64))
+def _empty_answer(questions: int) -> segments.Answer:
+    return segments.Answer(np.zeros(4, np.int64), np.empty(questions), np.empty(questions, np.int64))
 
 
 def _halvings(step: Floats) -> int:
     """Number of halvings of a step (6,), rad, for all checks together; none of one that is no number."""
     length = math.sqrt(float(step @ step))
-    return min(HALVINGS, max(0, math.ceil(math.log2(length / LOOK_FIRST_RAD)))) if 0.0 < length < math.inf else 0
+    return (
+        min(segments.HALVINGS, max(0, math.ceil(math.log2(length / LOOK_FIRST_RAD)))) if 0.0 < length < math.inf else 0
+    )
 
 
 def halving_order(count: int) -> Floats:

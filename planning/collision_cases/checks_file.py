@@ -16,16 +16,7 @@ from pydantic import Field, StringConstraints, ValidationError, model_validator
 from puncture_twin.planning.base.errors import InputError, SchemaError, refuse
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.toml_file import parse_toml, read_toml_bytes
-from puncture_twin.planning.case.toml_types import (
-    Degrees180,
-    Degrees360,
-    NotNegative,
-    Number,
-    Positive,
-    Section,
-    Text,
-    Yes,
-)
+from puncture_twin.planning.case import toml_types
 
 ALLOWED = "[[check]], [[window]] or [[plan]] tables"
 KEYS = "docs/how-to/collision-cases.md"
@@ -39,13 +30,13 @@ TestName = Annotated[str, StringConstraints(pattern=r"^[^\s:\[\]/\\]([^:\[\]/\\]
 """What pytest can select a test by: without the signs of its own names."""
 
 Mark = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=80)]
-Chance = Annotated[Number, Field(ge=0, le=1)]
+Chance = Annotated[toml_types.Number, Field(ge=0, le=1)]
 
 
-class Expectation(Section):
+class Expectation(toml_types.Section):
     """Keys of every table: the case, and the test's name."""
 
-    case: Text | None = None
+    case: toml_types.Text | None = None
     name: TestName | None = None
     why: str = ""
     marks: tuple[Mark, ...] = ()
@@ -59,16 +50,16 @@ class Expectation(Section):
 class CheckSection(Expectation):
     """Expectation of one direction."""
 
-    theta_deg: Degrees180
-    beta_deg: Degrees360
+    theta_deg: toml_types.Degrees180
+    beta_deg: toml_types.Degrees360
     verdict: str = Field(pattern="^(safe|rejected)$")
     reason: Reason | None = None
     structure: str | None = None
-    clearance_mm: dict[str, Number] = Field(default_factory=dict)
-    tolerance_mm: Annotated[NotNegative, Field(le=MOST_TOLERANCE_MM)] = DEFAULT_TOLERANCE_MM
-    min_clearance_mm: Number | None = None
+    clearance_mm: dict[str, toml_types.Number] = Field(default_factory=dict)
+    tolerance_mm: Annotated[toml_types.NotNegative, Field(le=MOST_TOLERANCE_MM)] = DEFAULT_TOLERANCE_MM
+    min_clearance_mm: toml_types.Number | None = None
     max_touch: Chance | None = None
-    arm: Yes = False
+    arm: toml_types.Yes = False
 
     @property
     def usual_name(self) -> str:
@@ -79,10 +70,10 @@ class CheckSection(Expectation):
 class WindowSection(Expectation):
     """Expectation of the window that contains one direction."""
 
-    theta_deg: Degrees180
-    beta_deg: Degrees360
-    min_square_deg: Positive
-    arm: Yes = False
+    theta_deg: toml_types.Degrees180
+    beta_deg: toml_types.Degrees360
+    min_square_deg: toml_types.Positive
+    arm: toml_types.Yes = False
 
     @property
     def usual_name(self) -> str:
@@ -93,7 +84,7 @@ class WindowSection(Expectation):
 class PlanSection(Expectation):
     """Expectation of a plan that must still be valid."""
 
-    file: Text
+    file: toml_types.Text
 
     @property
     def usual_name(self) -> str:
@@ -101,10 +92,10 @@ class PlanSection(Expectation):
         return "plan-" + "-".join(Path(self.file).parts[-2:])
 
 
-class ChecksFile(Section):
+class ChecksFile(toml_types.Section):
     """Schema of a whole file of expectations."""
 
-    case: Text | None = None
+    case: toml_types.Text | None = None
     check: tuple[CheckSection, ...] = ()
     window: tuple[WindowSection, ...] = ()
     plan: tuple[PlanSection, ...] = ()

@@ -13,15 +13,7 @@ import numpy as np
 import pytest
 
 from puncture_twin.planning.base.errors import InputError
-from puncture_twin.planning.collision_cases.checks_file import (
-    CheckSection,
-    ChecksFile,
-    Expectation,
-    PlanSection,
-    WindowSection,
-    read_checks,
-    table_lines,
-)
+from puncture_twin.planning.collision_cases import checks_file
 from puncture_twin.planning.collision_cases.session import (
     ARM_PROPERTY,
     UPDATE,
@@ -47,7 +39,7 @@ LEAST_DIGIT_MM, CHANCE_DIGIT = 0.01, 0.01
 """Steps of a rewritten least clearance (mm) and of a rewritten chance (relative)."""
 
 
-def direction_finding(check: CheckSection, found: Explanation) -> Finding:
+def direction_finding(check: checks_file.CheckSection, found: Explanation) -> Finding:
     """Differences of one direction from what is expected."""
     differences = (*_verdict(check, found), *_clearances(check, found), *_least(check, found), *_touch(check, found))
     if not differences:
@@ -57,7 +49,7 @@ def direction_finding(check: CheckSection, found: Explanation) -> Finding:
     return Finding(differences, (*found.head(), *found.structure_lines()), f"full explanation: {command}")
 
 
-def _verdict(check: CheckSection, found: Explanation) -> Iterator[Difference]:
+def _verdict(check: checks_file.CheckSection, found: Explanation) -> Iterator[Difference]:
     row = found.candidates.verdict
     stated = (
         ("verdict", check.verdict, found.verdict),
@@ -69,7 +61,7 @@ def _verdict(check: CheckSection, found: Explanation) -> Iterator[Difference]:
             yield Difference(f"{what}: expected {want!r}, found {got!r}")
 
 
-def _clearances(check: CheckSection, found: Explanation) -> Iterator[Difference]:
+def _clearances(check: checks_file.CheckSection, found: Explanation) -> Iterator[Difference]:
     clearances = found.clearances()
     for name, want in check.clearance_mm.items():
         if name not in clearances:
@@ -80,7 +72,7 @@ def _clearances(check: CheckSection, found: Explanation) -> Iterator[Difference]
             yield Difference(line, _number(NewNumber(("clearance_mm", name), got, DIGIT * check.tolerance_mm)))
 
 
-def _least(check: CheckSection, found: Explanation) -> Iterator[Difference]:
+def _least(check: checks_file.CheckSection, found: Explanation) -> Iterator[Difference]:
     want, got = check.min_clearance_mm, float(found.candidates.least_clearance[0])
     if want is None or got >= want:
         return
@@ -88,7 +80,7 @@ def _least(check: CheckSection, found: Explanation) -> Iterator[Difference]:
     yield Difference(line, _number(NewNumber(("min_clearance_mm",), got, LEAST_DIGIT_MM, ROUND_FLOOR)))
 
 
-def _touch(check: CheckSection, found: Explanation) -> Iterator[Difference]:
+def _touch(check: checks_file.CheckSection, found: Explanation) -> Iterator[Difference]:
     want, chances = check.max_touch, found.candidates.chances
     if want is None:
         return
@@ -115,7 +107,7 @@ MOST_SHOWN = 6
 """Windows."""
 
 
-def window_finding(window: WindowSection, direction: Candidates, search: Candidates) -> Finding:
+def window_finding(window: checks_file.WindowSection, direction: Candidates, search: Candidates) -> Finding:
     """Differences of one window from what is expected."""
     windows = search.windows
     differences = tuple(_differences(window, direction, search, windows))
@@ -123,7 +115,7 @@ def window_finding(window: WindowSection, direction: Candidates, search: Candida
 
 
 def _differences(
-    window: WindowSection, direction: Candidates, search: Candidates, windows: Windows
+    window: checks_file.WindowSection, direction: Candidates, search: Candidates, windows: Windows
 ) -> Iterator[Difference]:
     if not direction.safe[0]:
         yield Difference(f"the direction is rejected: {reason_text(direction, 0)}")
@@ -137,7 +129,7 @@ def _differences(
         yield from _too_small(window, windows, int(windows.of_row[row]))
 
 
-def _too_small(window: WindowSection, windows: Windows, number: int) -> Iterator[Difference]:
+def _too_small(window: checks_file.WindowSection, windows: Windows, number: int) -> Iterator[Difference]:
     want, got = window.min_square_deg, windows.windows[number - 1].square_deg
     if not got >= want:
         line = f"its window {number}: expected at least {want:g} square degrees, found {got:.1f}"
@@ -170,14 +162,13 @@ class Table:
         kind: ``check``, ``window`` or ``plan``.
         at: Its number among those, from 0 on.
         line: Where it begins, from 1 on; None where nothing tells.
-        data: The whole file's bytes.
     """
 
     kind: str
     at: int
     line: int | None
     case: Path
-    expected: Expectation
+    expected: checks_file.Expectation
     data: bytes
 
 
@@ -187,7 +178,7 @@ class CollisionFile(pytest.File):
     def collect(self) -> Iterator[pytest.Item]:
         """One test per table."""
         try:
-            tables = list(_tables(*read_checks(self.path), self.path.parent))
+            tables = list(_tables(*checks_file.read_checks(self.path), self.path.parent))
         except InputError as error:
             raise self.CollectError(str(error)) from error
         names = unique_names(table.expected.name or table.expected.usual_name for table in tables)
@@ -204,10 +195,10 @@ class CollisionFile(pytest.File):
                 raise self.CollectError(f"{self.path}:{table.line or 1}: marks: {error}") from error
 
 
-def _tables(content: ChecksFile, data: bytes, folder: Path) -> Iterator[Table]:
+def _tables(content: checks_file.ChecksFile, data: bytes, folder: Path) -> Iterator[Table]:
     text = data.decode("utf-8")
     for kind, expectations in content.tables().items():
-        lines = dict(enumerate(table_lines(text, kind)))
+        lines = dict(enumerate(checks_file.table_lines(text, kind)))
         for at, expected in enumerate(expectations):
             yield Table(kind, at, lines.get(at), folder / str(expected.case or content.case), expected, data)
 
@@ -267,7 +258,7 @@ def check_in_python(config: pytest.Config, case: Path, keys: Mapping[str, Any]) 
     Raises:
         CollisionMismatchError: Something is not as expected.
     """
-    check = CheckSection(**keys)
+    check = checks_file.CheckSection(**keys)
     found = _explained(session_of(config), case, check)
     finding = direction_finding(check, found)
     if finding.differences:
@@ -275,26 +266,26 @@ def check_in_python(config: pytest.Config, case: Path, keys: Mapping[str, Any]) 
     return found
 
 
-def _explained(session: Session, case: Path, check: CheckSection) -> Explanation:
+def _explained(session: Session, case: Path, check: checks_file.CheckSection) -> Explanation:
     context = session.context(case, arm=check.arm)
     return context.explain(float(np.radians(check.theta_deg)), float(np.radians(check.beta_deg)))
 
 
 def _direction(session: Session, table: Table, folder: Path) -> Finding:
-    assert isinstance(table.expected, CheckSection)
+    assert isinstance(table.expected, checks_file.CheckSection)
     return direction_finding(table.expected, _explained(session, table.case, table.expected))
 
 
 def _window(session: Session, table: Table, folder: Path) -> Finding:
     expected = table.expected
-    assert isinstance(expected, WindowSection)
+    assert isinstance(expected, checks_file.WindowSection)
     context = session.context(table.case, arm=expected.arm)
     direction = context.check(float(np.radians(expected.theta_deg)), float(np.radians(expected.beta_deg)))
     return window_finding(expected, direction, session.search(table.case, arm=expected.arm))
 
 
 def _plan(session: Session, table: Table, folder: Path) -> Finding:
-    assert isinstance(table.expected, PlanSection)
+    assert isinstance(table.expected, checks_file.PlanSection)
     return plan_finding(folder / table.expected.file, session.context(table.case, arm=True))
 
 

@@ -32,7 +32,6 @@ class Session:
 
     Attributes:
         changes: File to what it held when it was read, and the numbers that changed.
-        lines: What was rewritten, for a person.
     """
 
     changes: dict[Path, tuple[bytes, list[Change]]] = field(default_factory=dict)

@@ -35,27 +35,7 @@ from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.evidence.edges import (
-    LEAST_SEEN,
-    LEAST_SHIFT_MM,
-    Compared,
-    EdgeImage,
-    Fit,
-    Placement,
-    Sample,
-    axes_text,
-    axis_slips,
-    compare,
-    edge_image,
-    fit_of,
-    least_shift_mm,
-    refined,
-    sample_surfaces,
-    scalings,
-    settled,
-    shifts,
-    turns,
-)
+from puncture_twin.planning.evidence import edges
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
 from puncture_twin.planning.geometry.spaces import Space
@@ -105,7 +85,7 @@ KINDS = {
     "grid": "the CT's own grid",
 }
 
-AS_IT_IS = Placement("shift", np.eye(4))
+AS_IT_IS = edges.Placement("shift", np.eye(4))
 OTHER_SPACE = np.diag([-1.0, -1.0, 1.0, 1.0])
 """LPS as RAS."""
 
@@ -140,24 +120,26 @@ class Source:
     in_units: bool = False
     grid_slip: Floats | None = None
 
-    def placements(self) -> list[Placement]:
+    def placements(self) -> list[edges.Placement]:
         """Every other place that is tried."""
-        middles = self.middles[: 1 if np.allclose(*self.middles, atol=LEAST_SHIFT_MM) else 2]
+        middles = self.middles[: 1 if np.allclose(*self.middles, atol=edges.LEAST_SHIFT_MM) else 2]
         corners = np.concatenate([mesh.bounds for mesh in self.meshes.values()])
         low, high = box_of(corners)
         across = np.abs(self.axes.T) @ (high - low)
         found = [
-            *shifts(self.axes, self.voxel_mm, across / 3.0),
-            *turns((low + high) / 2.0, self.axes),
-            *scalings([middles[0], self.first]),
-            *axis_slips(middles, self.axes),
+            *edges.shifts(self.axes, self.voxel_mm, across / 3.0),
+            *edges.turns((low + high) / 2.0, self.axes),
+            *edges.scalings([middles[0], self.first]),
+            *edges.axis_slips(middles, self.axes),
         ]
         if self.in_units:
             found += [
-                one for one in scalings([np.zeros(3)], UNITS, "unit") if one.T[0, 0] * across.max() > LEAST_EXTENT_MM
+                one
+                for one in edges.scalings([np.zeros(3)], UNITS, "unit")
+                if one.T[0, 0] * across.max() > LEAST_EXTENT_MM
             ]
         if self.grid_slip is not None:
-            found.append(Placement("grid", self.grid_slip))
+            found.append(edges.Placement("grid", self.grid_slip))
         return found
 
 
@@ -204,14 +186,14 @@ class Assessed(NamedTuple):
         return sure and strong and self.slip >= LEAST_SLIP[self.kind]
 
 
-def assess(image: EdgeImage, source: Source) -> Assessed:
+def assess(image: edges.EdgeImage, source: Source) -> Assessed:
     """Hold the surfaces of one source against the edges of the CT.
 
     What elsewhere has to beat is the best place so near that it is no slip: half a voxel by which labels are off, or a
     smoothed surface, must not let the mirror image of a symmetric body win.
     """
-    sample = sample_surfaces(list(source.meshes.values()))
-    compared = compare(image, sample, source.placements())
+    sample = edges.sample_surfaces(list(source.meshes.values()))
+    compared = edges.compare(image, sample, source.placements())
     ahead = compared.best
     if ahead.z > -WARNING_Z:  # a row of single steps may leave out what lies between them
         ahead = _ahead(image, sample, source, compared.best)
@@ -235,39 +217,41 @@ def assess(image: EdgeImage, source: Source) -> Assessed:
         odd=alone.anywhere(STRUCTURES),
         agreeing=alone.agreeing,
         unconfirmed=alone.anywhere(UNCONFIRMED),
-        unseen=alone.names_of(seen < LEAST_SEEN),
+        unseen=alone.names_of(seen < edges.LEAST_SEEN),
         uneven=float(there[both].sum() / here[both].sum()) if both.any() else 1.0,
     )
 
 
-def _ahead(image: EdgeImage, sample: Sample, source: Source, best: Fit) -> Fit:
+def _ahead(image: edges.EdgeImage, sample: edges.Sample, source: Source, best: edges.Fit) -> edges.Fit:
     """The place at which the surfaces lie best, near a better one or near where they are, against what is no slip."""
-    near = refined(image, sample, AS_IT_IS, most_mm=LEAST_SHIFT_MM / 2.0).T
-    here, found = settled(image, sample.moved(near)), [best]
+    near = edges.refined(image, sample, AS_IT_IS, most_mm=edges.LEAST_SHIFT_MM / 2.0).T
+    here, found = edges.settled(image, sample.moved(near)), [best]
     if best.z >= WARNING_Z:
-        place = best.placement if best.placement.kind == "grid" else refined(image, sample, best.placement)
-        found = [fit_of(place, sample, here, settled(image, sample.moved(place.T)))]
+        place = best.placement if best.placement.kind == "grid" else edges.refined(image, sample, best.placement)
+        found = [edges.fit_of(place, sample, here, edges.settled(image, sample.moved(place.T)))]
         if place.kind == "grid" and found[0].z >= WARNING_Z:
             return found[0]
-    place = refined(image, sample, AS_IT_IS)
+    place = edges.refined(image, sample, AS_IT_IS)
     if _slip(sample, place.T, source) >= LEAST_SLIP[place.kind]:
-        found.append(fit_of(place, sample, here, settled(image, sample.moved(place.T))))
+        found.append(edges.fit_of(place, sample, here, edges.settled(image, sample.moved(place.T))))
     return max(found, key=lambda fit: fit.z)
 
 
-def _is_peak(image: EdgeImage, sample: Sample, ahead: Fit, source: Source) -> bool:
+def _is_peak(image: edges.EdgeImage, sample: edges.Sample, ahead: edges.Fit, source: Source) -> bool:
     """Whether a place can be named: it is better beyond doubt, and every shift from there is worse."""
-    around = compare(image, sample.moved(ahead.placement.T), list(shifts(source.axes, source.voxel_mm))).best
+    around = edges.compare(
+        image, sample.moved(ahead.placement.T), list(edges.shifts(source.axes, source.voxel_mm))
+    ).best
     return ahead.z >= REFUSING_Z and around.z <= -WARNING_Z
 
 
-def _slip(sample: Sample, T: Floats, source: Source) -> float:
+def _slip(sample: edges.Sample, T: Floats, source: Source) -> float:
     """How far a map (4, 4) moves the surfaces, rms, each axis in its least shift that counts."""
-    moved = (apply(T, sample.points_ct) - sample.points_ct) @ source.axes / least_shift_mm(source.voxel_mm)
+    moved = (apply(T, sample.points_ct) - sample.points_ct) @ source.axes / edges.least_shift_mm(source.voxel_mm)
     return float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
 
 
-def _excluded(fit: Fit) -> bool:
+def _excluded(fit: edges.Fit) -> bool:
     """Whether the surfaces do not belong there. Out of the image nothing belongs, but a shift may be the image's."""
     return fit.z <= -WARNING_Z and (fit.z > -np.inf or fit.placement.kind != "shift")
 
@@ -280,7 +264,7 @@ class Alone(NamedTuple):
     """
 
     names: tuple[str, ...]
-    compared: Compared
+    compared: edges.Compared
     uneven: Floats
 
     def better(self, z: float, ratio: float, uneven: float) -> Bools:
@@ -305,7 +289,7 @@ class Alone(NamedTuple):
 
 
 def _alone(
-    image: EdgeImage, inner_ct: Floats, structure: NDArray[np.intp], fits: Sequence[Fit], here: Floats
+    image: edges.EdgeImage, inner_ct: Floats, structure: NDArray[np.intp], fits: Sequence[edges.Fit], here: Floats
 ) -> Floats:
     """Unevenness at each place to that as it is, shape (placements, structures).
 
@@ -326,10 +310,10 @@ def _outward(source: Source) -> Floats:
     return np.array([np.copysign(1.0, mesh.volume) for mesh in source.meshes.values()])
 
 
-def _unevenness(image: EdgeImage, inner_ct: Floats, structure: NDArray[np.intp], T: Floats) -> Floats:
+def _unevenness(image: edges.EdgeImage, inner_ct: Floats, structure: NDArray[np.intp], T: Floats) -> Floats:
     """Of each structure, placed by T (4, 4): the mean deviation of HU at its inner points (n, 3); NaN where unseen."""
     hu = np.split(image.hu_at(apply(T, inner_ct)), np.flatnonzero(np.diff(structure)) + 1)
-    return np.maximum([_deviation(one[np.isfinite(one)], LEAST_SEEN * len(one)) for one in hu], LEAST_HU)
+    return np.maximum([_deviation(one[np.isfinite(one)], edges.LEAST_SEEN * len(one)) for one in hu], LEAST_HU)
 
 
 def _deviation(hu: Floats, least: float) -> float:
@@ -341,7 +325,7 @@ def label_placement(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
     scan = anatomy.scan
     if scan is None or case.space is Space.LOCAL:
         return
-    edges = cache(lambda: edge_image(*scan.voxels))
+    image = cache(lambda: edges.edge_image(*scan.voxels))
     for source in sources(case, anatomy, scan):
         given = (source.axes, *source.middles, source.first, source.voxel_mm, source.in_units, source.grid_slip)
         made_from = {
@@ -349,12 +333,12 @@ def label_placement(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
             "meshes": [f"{name} {mesh.digest}" for name, mesh in source.meshes.items()],
             "placed_by": [np.asarray(one).tolist() for one in given],
         }
-        found = scan.source.kept(made_from, partial(_assessed, edges, source), _read, by=__name__)
+        found = scan.source.kept(made_from, partial(_assessed, image, source), _read, by=__name__)
         yield from _findings(case, scan, source, found)
 
 
-def _assessed(edges: Callable[[], EdgeImage], source: Source) -> Arrays:
-    return _stored(assess(edges(), source))
+def _assessed(image: Callable[[], edges.EdgeImage], source: Source) -> Arrays:
+    return _stored(assess(image(), source))
 
 
 def sources(case: Case, anatomy: Anatomy, scan: Scan) -> Iterator[Source]:
@@ -479,7 +463,9 @@ def slip_of(T: Floats, middle_ct: Floats) -> Slip:
     exchanged[order, range(3)] = signs
     rest = linear / scale @ exchanged.T
     shift = apply(T, middle_ct[None])[0] - middle_ct
-    return Slip(shift, scale, axes_text(order.tolist(), signs.tolist()), float(np.linalg.norm(log_rotation(rest))))
+    return Slip(
+        shift, scale, edges.axes_text(order.tolist(), signs.tolist()), float(np.linalg.norm(log_rotation(rest)))
+    )
 
 
 def _stored(found: Assessed) -> Arrays:

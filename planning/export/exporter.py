@@ -162,11 +162,7 @@ def read_csv(text: str, *, where: Path) -> SampledMotion:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Exported(Shown):
-    """A published file.
-
-    Attributes:
-        notes: What whoever runs it should know, one sentence each.
-    """
+    """A published file."""
 
     path: Path
     format_name: str
@@ -241,7 +237,6 @@ class Exporter(NamedTuple):
         write: ``write(plan, case_checked=bool)``: an ASCII text.
         read: ``read(text, where=path)``: the motion that the text holds, as a robot would take it.
         time_resolution_s: To which times are written.
-        notes: What whoever runs it should know, one sentence each.
     """
 
     ending: str

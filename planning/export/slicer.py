@@ -54,7 +54,6 @@ class SceneNode:
     """One node of a scene.
 
     Attributes:
-        kind: Of the node, by Slicer's name.
         file: Where it is stored, next to the scene.
     """
 
@@ -112,7 +111,6 @@ class SceneContent:
     """Content of the files for Slicer.
 
     Attributes:
-        name: Of the path, as Slicer lists it.
         entry_ct: Shape (3,), where the path enters the skin, mm.
         area: Through which safe paths enter.
         placement: Where the patient lies for the robot, or None.

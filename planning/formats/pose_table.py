@@ -48,12 +48,9 @@ def parse_table(
     """The rows of a table that has been read.
 
     Args:
-        content: The whole file.
-        path: Its name, for errors.
         groups: Columns that it may have behind the first one.
         fits: Whether the groups that are there belong together.
         example: Groups of a usual file, for the error.
-        first: Name of the first column.
         texts: Groups of one column that is text.
 
     Raises:

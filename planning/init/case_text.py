@@ -81,13 +81,11 @@ class CaseParts:
     """What a new case is made of.
 
     Attributes:
-        region: Which part of the body it shows.
         target_ct: Shape (3,), LPS mm.
         structure: Which holds the target, or None.
         hit_radius_mm: Of the ball that is hit, where none does.
         ct: The CT, or None.
         skin: What the skin is, for a person: the CT, or a structure.
-        sources: Each segmentation with what the case says of its structures.
         left_out: The files that a person states to be left out.
         keys: Key of the case to its value, where a person states it.
     """

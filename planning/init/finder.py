@@ -39,7 +39,7 @@ from puncture_twin.planning.formats.points import NamedPoints, read_points
 from puncture_twin.planning.formats.volumes.nrrd_header import is_layered
 from puncture_twin.planning.formats.volumes.volume_files import NIFTI_ENDINGS, NRRD_ENDINGS, Volume
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up
-from puncture_twin.planning.init.label_files import Mask, Masks, file_masks, is_named_by_table, label_file, mask_of
+from puncture_twin.planning.init.label_files import Mask, file_masks, is_named_by_table, label_file, mask_of, masks_of
 from puncture_twin.planning.init.overrides import Overrides
 from puncture_twin.planning.init.segmentation import Place, Segmentation, is_mesh, mesh_folder
 
@@ -74,7 +74,6 @@ class Wanted:
         up: The axis of meshes that is up.
         ct: The CT, where there are several.
         segmentation: The label map or folder, where there are several.
-        overrides: What else a person states.
     """
 
     space: Space
@@ -274,9 +273,8 @@ class _Looker:
         alone = len(masks) + len(empty) == len(names) and all(one.lower().endswith(MASK_ENDINGS) for one in names)
         alone = alone and not self._left_out
         self._only = "masks" if alone else ""
-        numbered = dict(enumerate(masks, start=1))
         said = () if alone or not empty else (f"empty masks: {', '.join(empty)}",)
-        self._found.segmentations.append(Masks(self._place, self._source, numbered, said, alone))
+        self._found.segmentations.append(masks_of(self._place, self._source, masks, said, whole_folder=alone))
 
     def _volume(self, name: str, masks: list[Mask], empty: list[str]) -> None:
         if not any(self._wanted.takes(kind, name) for kind in ("ct", "labels")):

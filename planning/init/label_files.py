@@ -13,7 +13,6 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,7 +33,16 @@ from puncture_twin.planning.formats.labels.labelmaps import NAME_ENDINGS, Box, L
 from puncture_twin.planning.formats.labels.naming import BUILT_IN, MAX_CSV_BYTES, names_for
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.init.segmentation import Assigned, Place, margin_line, quoted, rules_text, skin_text
+from puncture_twin.planning.init.segmentation import (
+    Assigned,
+    Place,
+    Segmentation,
+    in_boxes,
+    margin_line,
+    quoted,
+    rules_text,
+    skin_text,
+)
 
 NUMBERING_FOUND = "{source}: numbered as {naming}, inferred from the positions of its organs"
 NUMBERING_UNSURE = (
@@ -42,48 +50,7 @@ NUMBERING_UNSURE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class LabelFile:
-    """A label map in one file.
-
-    Attributes:
-        naming: As the case states it; None for names inside the file.
-        names: Label to name, of the labels present.
-    """
-
-    source: str
-    naming: str | None
-    names: Mapping[int, str]
-    notes: tuple[str, ...]
-    surfaces: VolumeSurfaces
-
-    @property
-    def voxel_ct(self) -> Floats:
-        """The edges of its voxels as columns, shape (3, 3), mm."""
-        return self.surfaces.voxel_ct
-
-    def near(self, point_ct: Floats) -> tuple[int, ...]:
-        """The labels whose box holds a point (3,), LPS mm."""
-        labels = self.surfaces.labelmap
-        return tuple(label for label, box in labels.boxes.items() if in_box(point_ct, box, labels.T_ct_index))
-
-    def surface(self, label: int) -> TriangleMesh:
-        """The surface of one label, LPS mm."""
-        return self.surfaces.label(label)
-
-    def skin(self, label: int) -> Skin:
-        """One label as the skin."""
-        return self.surfaces.imaged(label).skin()
-
-    def section(self, rows: Sequence[Assigned]) -> str:
-        """A ``[[structures]]`` of the map."""
-        naming = "" if self.naming is None else f"naming = {quoted(self.naming)}\n"
-        skins = (skin_text(row.name, self.source, row.label) for row in rows if row.kind == "skin")
-        return f"[[structures]]\nlabelmap = {quoted(self.source)}\n{naming}{rules_text(rows)}{''.join(skins)}"
-
-
-@dataclass(frozen=True, eq=False)
-class Mask:
+class Mask(NamedTuple):
     """One mask that is not empty.
 
     Attributes:
@@ -97,58 +64,40 @@ class Mask:
     T_ct_index: Floats
 
 
-@dataclass(frozen=True, eq=False)
-class Masks:
+def masks_of(
+    place: Place, source: str, found: Sequence[Mask], notes: tuple[str, ...], *, whole_folder: bool
+) -> Segmentation:
     """Masks of one folder, one file a structure.
 
-    Attributes:
-        masks: By number, those that are not empty.
+    Args:
         whole_folder: Whether the folder holds nothing else, so that the case can name it.
     """
+    masks = dict(enumerate(found, start=1))
 
-    place: Place
-    source: str
-    masks: Mapping[int, Mask]
-    notes: tuple[str, ...] = ()
-    whole_folder: bool = True
-    names: Mapping[int, str] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "names", {number: structure_name(one.file) for number, one in self.masks.items()})
-
-    @property
-    def voxel_ct(self) -> Floats:
-        """The edges of its voxels as columns, shape (3, 3), mm."""
-        return next(iter(self.masks.values())).T_ct_index[:3, :3]
-
-    def near(self, point_ct: Floats) -> tuple[int, ...]:
-        """The masks whose box holds a point (3,), LPS mm."""
-        return tuple(number for number, one in self.masks.items() if in_box(point_ct, one.box, one.T_ct_index))
-
-    def surface(self, label: int) -> TriangleMesh:
-        """The surface of one mask, LPS mm."""
-        mask = self.masks[label]
-        return self.place.volume(mask.file).label(mask.label)
-
-    def skin(self, label: int) -> Skin:
-        """One mask as the skin."""
-        mask = self.masks[label]
-        return self.place.volume(mask.file).imaged(mask.label).skin()
-
-    def section(self, rows: Sequence[Assigned]) -> str:
-        """A ``[[structures]]`` of the folder, or each mask as a ``[[structure]]``."""
-        if self.whole_folder:
-            masks = ((row.name, self.masks[row.label]) for row in rows if row.kind == "skin")
-            skins = (skin_text(name, mask.file, mask.label) for name, mask in masks)
-            return f"[[structures]]\nmasks = {quoted(self.source)}\n{rules_text(rows)}{''.join(skins)}"
-        return "\n".join(self._single(row) for row in rows if row.kind != "ignore")
-
-    def _single(self, row: Assigned) -> str:
-        mask = self.masks[row.label]
+    def single(row: Assigned) -> str:
+        mask = masks[row.label]
         return (
             f"[[structure]]\nname = {quoted(row.name)}\nlabelmap = {quoted(mask.file)}\nlabel = {mask.label}\n"
             f'role = "{row.kind}"\n{margin_line(row)}'
         )
+
+    def section(rows: Sequence[Assigned]) -> str:
+        if not whole_folder:
+            return "\n".join(single(row) for row in rows if row.kind != "ignore")
+        own = ((row.name, masks[row.label]) for row in rows if row.kind == "skin")
+        skins = (skin_text(name, mask.file, mask.label) for name, mask in own)
+        return f"[[structures]]\nmasks = {quoted(source)}\n{rules_text(rows)}{''.join(skins)}"
+
+    return Segmentation(
+        source,
+        {number: structure_name(one.file) for number, one in masks.items()},
+        near=lambda point_ct: tuple(n for n, one in masks.items() if in_box(point_ct, one.box, one.T_ct_index)),
+        surface=lambda label: place.volume(masks[label].file).label(masks[label].label),
+        skin=lambda label: place.volume(masks[label].file).imaged(masks[label].label).skin(),
+        section=section,
+        voxel_ct=found[0].T_ct_index[:3, :3],
+        notes=notes,
+    )
 
 
 def in_box(point_ct: Floats, box: Box, T_ct_index: Floats) -> bool:
@@ -165,7 +114,7 @@ def mask_of(file: str, labels: LabelMap) -> Mask | None:
     return Mask(file, label, box, labels.T_ct_index)
 
 
-def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str | None) -> LabelFile:
+def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str | None) -> Segmentation:
     """A label map with the names of its labels: stated, inside the file, in a table beside it, or TotalSegmentator's.
 
     Args:
@@ -185,7 +134,26 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
         shown = ", ".join(map(str, missing[:10]))
         allowed = "--naming with a name for each label"
         refuse(f"labels without a name: {shown}", place.folder / source, allowed, "labels_without_names")
-    return LabelFile(source, naming, {label: named[label] for label in present}, notes, surfaces)
+    stated = "" if naming is None else f"naming = {quoted(naming)}\n"
+
+    def near(point_ct: Floats) -> tuple[int, ...]:
+        labels = surfaces.labelmap
+        return tuple(label for label, box in labels.boxes.items() if in_box(point_ct, box, labels.T_ct_index))
+
+    def section(rows: Sequence[Assigned]) -> str:
+        skins = (skin_text(row.name, source, row.label) for row in rows if row.kind == "skin")
+        return f"[[structures]]\nlabelmap = {quoted(source)}\n{stated}{rules_text(rows)}{''.join(skins)}"
+
+    return Segmentation(
+        source,
+        {label: named[label] for label in present},
+        near=near,
+        surface=surfaces.label,
+        skin=lambda label: surfaces.imaged(label).skin(),
+        section=section,
+        voxel_ct=surfaces.voxel_ct,
+        notes=notes,
+    )
 
 
 def _found_naming(place: Place, source: str, labels: LabelMap, present: Sequence[int]) -> tuple[str, tuple[str, ...]]:
@@ -278,54 +246,7 @@ def _table(path: Path) -> bytes:
     return read_input(path, max_bytes=MAX_CSV_BYTES, where=str(path))
 
 
-@dataclass(frozen=True, eq=False)
-class FileMasks:
-    """The structures of one file.
-
-    Attributes:
-        key: Of the case: ``seg`` or ``rtstruct``.
-        parts: Name to its mask and the value of its voxels, of those that are not empty.
-    """
-
-    source: str
-    key: str
-    parts: Mapping[str, tuple[VolumeSurfaces, int]]
-    notes: tuple[str, ...]
-    names: Mapping[int, str] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "names", dict(enumerate(self.parts, start=1)))
-
-    @property
-    def voxel_ct(self) -> Floats:
-        """The edges of its voxels as columns, shape (3, 3), mm."""
-        return next(iter(self.parts.values()))[0].voxel_ct
-
-    def near(self, point_ct: Floats) -> tuple[int, ...]:
-        """The structures whose box holds a point (3,), LPS mm."""
-        boxes = {label: self.surface(label).bounds for label in self.names}
-        return tuple(n for n, (low, high) in boxes.items() if np.all((low <= point_ct) & (point_ct <= high)))
-
-    def surface(self, label: int) -> TriangleMesh:
-        """The surface of one structure, LPS mm."""
-        surfaces, value = self.parts[self.names[label]]
-        return surfaces.label(value)
-
-    def skin(self, label: int) -> Skin:
-        """None of them: a case takes its skin from a CT, a mesh, or a label of a map.
-
-        Raises:
-            InputError: Always.
-        """
-        what = f"'{self.names[label]}' cannot be the skin: it is one of the overlapping structures of a file"
-        refuse(what, self.source, "a CT, a mesh, or a label of a label map", "no_skin")
-
-    def section(self, rows: Sequence[Assigned]) -> str:
-        """A ``[[structures]]`` of the file."""
-        return f"[[structures]]\n{self.key} = {quoted(self.source)}\n{rules_text(rows)}"
-
-
-def file_masks(place: Place, source: str, key: str, ct: str | None) -> FileMasks:
+def file_masks(place: Place, source: str, key: str, ct: str | None) -> Segmentation:
     """The structures of a file: of DICOM on the slices of the CT, or segments of Slicer, of which some overlap.
 
     Args:
@@ -339,7 +260,26 @@ def file_masks(place: Place, source: str, key: str, ct: str | None) -> FileMasks
     place.volumes.read_masks(StructuresSection.model_validate({key: source}), ct)
     read = {name: place.surfaces(volume) for name, volume in place.volumes.masks(source).items()}
     parts = {name: (surfaces, value) for name, surfaces in read.items() for value in surfaces.mask().labels}
-    return FileMasks(source, key, parts, place.volumes.mask_notes(source))
+    names = dict(enumerate(parts, start=1))
+
+    def surface(label: int) -> TriangleMesh:
+        surfaces, value = parts[names[label]]
+        return surfaces.label(value)
+
+    def skin(label: int) -> Skin:
+        what = f"'{names[label]}' cannot be the skin: it is one of the overlapping structures of a file"
+        refuse(what, source, "a CT, a mesh, or a label of a label map", "no_skin")
+
+    return Segmentation(
+        source,
+        names,
+        near=lambda point_ct: in_boxes({label: surface(label).bounds for label in names}, point_ct),
+        surface=surface,
+        skin=skin,
+        section=lambda rows: f"[[structures]]\n{key} = {quoted(source)}\n{rules_text(rows)}",
+        voxel_ct=next((surfaces.voxel_ct for surfaces, _ in parts.values()), None),
+        notes=place.volumes.mask_notes(source),
+    )
 
 
 LEAST_RULES = 3
@@ -375,8 +315,6 @@ class Plausibility(NamedTuple):
     """Agreement of a naming with the places of organs in a label map.
 
     Attributes:
-        rules: How many could be checked.
-        broken: How many of them do not hold.
         nameless: Labels present that the naming does not know.
     """
 

@@ -1,4 +1,4 @@
-"""What every kind of segmentation answers, whatever file or folder it comes from: the seam of the finder.
+"""A segmentation, whatever file or folder it comes from.
 
 A folder of meshes as a segmentation: the unit is guessed by their extent, and told.
 
@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -60,40 +60,34 @@ class Assigned(NamedTuple):
     line: DefaultRole
 
 
-class Segmentation(Protocol):
-    """Structures of one file or folder.
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """Structures of one file or folder, whatever it is.
 
     Attributes:
         source: The file or folder, relative to the case's.
         names: Label to name, of the structures that are there.
-        notes: What a person should be told, one sentence each.
+        near: The labels whose box holds a point (3,), LPS mm.
+        surface: Of one structure, LPS mm.
+        skin: One structure as the skin of the body, with what the image cut; an `InputError` where it cannot be one.
+        section: The part of the case file that names all of its structures.
         voxel_ct: Shape (3, 3), the edges of its voxels as columns, mm; None of meshes.
+        notes: What a person should be told, one sentence each.
     """
 
-    @property
-    def source(self) -> str: ...  # noqa: D102  the class says it
-    @property
-    def names(self) -> Mapping[int, str]: ...  # noqa: D102
-    @property
-    def notes(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def voxel_ct(self) -> Floats | None: ...  # noqa: D102
+    source: str
+    names: Mapping[int, str]
+    near: Callable[[Floats], tuple[int, ...]]
+    surface: Callable[[int], TriangleMesh]
+    skin: Callable[[int], Skin]
+    section: Callable[[Sequence[Assigned]], str]
+    voxel_ct: Floats | None = None
+    notes: tuple[str, ...] = ()
 
-    def near(self, point_ct: Floats) -> tuple[int, ...]:
-        """The labels whose box holds a point (3,), LPS mm."""
 
-    def surface(self, label: int) -> TriangleMesh:
-        """The surface of one structure, LPS mm."""
-
-    def skin(self, label: int) -> Skin:
-        """One structure as the skin of the body, with what the image cut.
-
-        Raises:
-            InputError: It cannot be one.
-        """
-
-    def section(self, rows: Sequence[Assigned]) -> str:
-        """The part of the case file that names all of its structures."""
+def in_boxes(boxes: Mapping[int, Floats], point_ct: Floats) -> tuple[int, ...]:
+    """The labels whose box, shape (2, 3), holds a point (3,); LPS mm."""
+    return tuple(label for label, (low, high) in boxes.items() if np.all((low <= point_ct) & (point_ct <= high)))
 
 
 @dataclass(frozen=True)
@@ -187,70 +181,6 @@ BOTH_MM_AND_CM = (130.0, 250.0)
 """A diagonal between these is a child's or a limb's in mm, or an adult's in cm, ten times as wide."""
 
 
-@dataclass(frozen=True, eq=False)
-class MeshFolder:
-    """Meshes of one folder, one file a structure.
-
-    Attributes:
-        files: By number, relative to the case's folder.
-        space: Of all of them that do not state one.
-        up: The axis of all of them that is up; None where nobody says.
-        voxel_ct: None: meshes do not tell what they were made of.
-    """
-
-    place: Place
-    source: str
-    files: Mapping[int, str]
-    unit: Unit
-    space: Space
-    up: Up | None = None
-    notes: tuple[str, ...] = ()
-    voxel_ct: Floats | None = None
-    names: Mapping[int, str] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "names", {number: mesh_name(file) for number, file in self.files.items()})
-
-    @cached_property
-    def meshes(self) -> Mapping[int, TriangleMesh]:
-        """Each mesh in LPS mm."""
-        files = {number: self.place.folder / file for number, file in self.files.items()}
-        return {
-            number: read_mesh(file, unit=self.unit, space=self.space, space_is_default=True, up=self.up)
-            for number, file in files.items()
-        }
-
-    def near(self, point_ct: Floats) -> tuple[int, ...]:
-        """The meshes whose box holds a point (3,), LPS mm."""
-        boxes = {number: mesh.bounds for number, mesh in self.meshes.items()}
-        return tuple(n for n, (low, high) in boxes.items() if np.all((low <= point_ct) & (point_ct <= high)))
-
-    def surface(self, label: int) -> TriangleMesh:
-        """One mesh, LPS mm."""
-        return self.meshes[label]
-
-    def skin(self, label: int) -> Skin:
-        """One mesh as the skin, with flat ends as cuts."""
-        return skin_from_mesh(self.meshes[label], flat_ends(self.meshes[label]))
-
-    def section(self, rows: Sequence[Assigned]) -> str:
-        """A ``[[structure]]`` for each mesh."""
-        return "\n".join(self._single(row) for row in rows if row.kind != "ignore")
-
-    def _single(self, row: Assigned) -> str:
-        ends = flat_ends(self.meshes[row.label]) if row.kind == "skin" else ()
-        cut = (
-            f"cut = [{', '.join(map(quoted, ends))}]  # flat there: the scan ended; [] if all of it is skin\n"
-            if ends
-            else ""
-        )
-        up = "" if self.up is None else f'up = "{self.up}"\n'
-        return (
-            f"[[structure]]\nname = {quoted(row.name)}\nmesh = {quoted(self.files[row.label])}\n"
-            f'unit = "{self.unit}"\n{up}role = "{row.kind}"\n{margin_line(row)}{cut}'
-        )
-
-
 def mesh_name(file: str) -> str:
     """The name of the structure in a file: the file's own, without its ending.
 
@@ -262,7 +192,7 @@ def mesh_name(file: str) -> str:
 
 def mesh_folder(
     place: Place, source: str, names: Sequence[str], space: Space, stated: Unit | None, up: Up | None
-) -> MeshFolder:
+) -> Segmentation:
     """The meshes of a folder, in the unit that their extent tells.
 
     Args:
@@ -289,7 +219,34 @@ def mesh_folder(
         f"{source}: {len(names)} meshes in {unit} ({guess}) and {_spaces([one.space for one in extents], space)}, "
         f"together {diagonal * unit.mm:.0f} mm from corner to corner; mesh files do not state their unit"
     )
-    return MeshFolder(place, source, dict(enumerate(sorted(names), start=1)), unit, space, up, (said,))
+    files = dict(enumerate(sorted(names), start=1))
+
+    @cache
+    def meshes() -> Mapping[int, TriangleMesh]:
+        return {
+            number: read_mesh(place.folder / file, unit=unit, space=space, space_is_default=True, up=up)
+            for number, file in files.items()
+        }
+
+    def single(row: Assigned) -> str:
+        ends = flat_ends(meshes()[row.label]) if row.kind == "skin" else ()
+        listed = ", ".join(map(quoted, ends))
+        cut = f"cut = [{listed}]  # flat there: the scan ended; [] if all of it is skin\n" if ends else ""
+        turned = "" if up is None else f'up = "{up}"\n'
+        return (
+            f"[[structure]]\nname = {quoted(row.name)}\nmesh = {quoted(files[row.label])}\n"
+            f'unit = "{unit}"\n{turned}role = "{row.kind}"\n{margin_line(row)}{cut}'
+        )
+
+    return Segmentation(
+        source,
+        {number: mesh_name(file) for number, file in files.items()},
+        near=lambda point_ct: in_boxes({number: mesh.bounds for number, mesh in meshes().items()}, point_ct),
+        surface=lambda label: meshes()[label],
+        skin=lambda label: skin_from_mesh(meshes()[label], flat_ends(meshes()[label])),
+        section=lambda rows: "\n".join(single(row) for row in rows if row.kind != "ignore"),
+        notes=(said,),
+    )
 
 
 def _spaces(stated: Sequence[Space | None], space: Space) -> str:

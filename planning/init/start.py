@@ -22,19 +22,9 @@ from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.spaces import Space, point_text
+from puncture_twin.planning.init import segmentation
 from puncture_twin.planning.init.case_text import CaseParts, case_text
 from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Ct, Found, Markers, Wanted, find
-from puncture_twin.planning.init.segmentation import (
-    ALL_ROUND,
-    Outlines,
-    Place,
-    Segmentation,
-    SkinOf,
-    bordering,
-    carved_notes,
-    skin_of,
-    skin_problems,
-)
 from puncture_twin.planning.init.target import (
     Target,
     assign,
@@ -66,12 +56,10 @@ class Request:
     """What the user wants.
 
     Attributes:
-        folder: Where the files are, and the case will be.
         target: ``X,Y,Z`` in mm, or None for ``target_label``.
         region: As a case states it, or None to be told by the structures.
         space_stated: Whether the user said in which space the target is.
         hit_radius_mm: Of the ball that the target is, if the user says that it lies in no structure; else None.
-        wanted: What the user says of the files.
     """
 
     folder: Path
@@ -88,7 +76,6 @@ class Start:
     """A new case, not yet written.
 
     Attributes:
-        notes: What a person should look at, one sentence each.
         seen: Markers that the CT shows where no list of them is given, as they are to be written beside the case.
     """
 
@@ -101,15 +88,12 @@ class Start:
 def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     """Find the files of a folder, and write the text of a case with them.
 
-    Args:
-        progress: Called with the name of each file that is read.
-
     Raises:
         InputError: All that keeps a case from being made, in one line.
     """
     space, overrides = request.wanted.space, request.wanted.overrides
     point = None if request.target is None else parse_point(request.target, space)
-    found = find(Place(request.folder, cache, progress), request.wanted)
+    found = find(segmentation.Place(request.folder, cache, progress), request.wanted)
     names = [name for one in found.segmentations for name in one.names.values()]
     if not found.problems:
         overrides.check_names(names, [name for name, _ in found.passed])
@@ -122,12 +106,12 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         _refuse_outside(point, body.ct, skin, space)
     stated = dict(overrides.roles) | ({} if body.structure is None else {body.structure.name: "skin"})
     gone = frozenset(name for name, kind in stated.items() if kind != "unknown")
-    outlines = Outlines(found.segmentations, skin, gone)
+    outlines = segmentation.Outlines(found.segmentations, skin, gone)
     target = _target(request, point, outlines)
     region = request.region or likely_region(names, target.holding.target)
     left_out = outlines.at(target.point_ct)
-    border = bordering(target.holding.target, found.segmentations)
-    carved = {name for name, fraction in border.items() if fraction >= ALL_ROUND}
+    border = segmentation.bordering(target.holding.target, found.segmentations)
+    carved = {name for name, fraction in border.items() if fraction >= segmentation.ALL_ROUND}
     target = replace(target, holding=target.holding._replace(others=target.holding.others | carved))
     parts = CaseParts(
         name=request.folder.resolve().name,
@@ -145,12 +129,12 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         left_out=tuple(name for name, why in found.passed if why == LEFT_OUT),
         keys=overrides.keys,
     )
-    told = carved_notes(parts.rows, target.holding.target, border)
+    told = segmentation.carved_notes(parts.rows, target.holding.target, border)
     notes = (*_notes(request, found, target, parts), *of_seen, *told, *outlines.notes(target.point_ct))
     return Start(case_text(parts), parts, notes, seen)
 
 
-def _target(request: Request, point: Floats | None, outlines: Outlines) -> Target:
+def _target(request: Request, point: Floats | None, outlines: segmentation.Outlines) -> Target:
     if point is not None:
         space, radius = request.wanted.space, request.hit_radius_mm
         return typed_target(point, outlines, space, space_stated=request.space_stated, hit_radius_mm=radius)
@@ -166,7 +150,7 @@ class Body(NamedTuple):
     """
 
     ct: Ct | None
-    structure: SkinOf | None
+    structure: segmentation.SkinOf | None
 
     def skin(self) -> Skin:
         """The body's."""
@@ -196,11 +180,11 @@ def _checked(found: Found, point: Floats | None, request: Request) -> Body:
         problems.append(_problem(what, "several_cts", "--ct with the intended one"))
     if not found.segmentations and not problems:
         problems.append(_problem(f"no segmentation (label map, masks or meshes){_lies(found)}", "no_segmentation"))
-    skin = None if cts and stated is None else skin_of(found.segmentations, stated)
+    skin = None if cts and stated is None else segmentation.skin_of(found.segmentations, stated)
     if skin is None and not cts and not found.problems:
         problems.append(_no_skin(found))
     elif skin is not None and stated is None:
-        wrong = skin_problems(skin, found.segmentations)
+        wrong = segmentation.skin_problems(skin, found.segmentations)
         problems += [_problem(one, "no_skin", "--skin NAME with the structure that is the skin") for one in wrong]
     problems += [
         _problem(one, "doubled", "--segmentation with the intended one") for one in _doubled(found.segmentations)
@@ -250,7 +234,7 @@ def _holding(cts: Sequence[Ct], point: Floats | None) -> list[Ct]:
     return holding or list(cts)
 
 
-def _doubled(segmentations: Sequence[Segmentation]) -> Iterator[str]:
+def _doubled(segmentations: Sequence[segmentation.Segmentation]) -> Iterator[str]:
     """Names that two segmentations have: one of the two is meant."""
     counts = Counter(name for one in segmentations for name in set(one.names.values()))
     twice = [name for name, count in counts.items() if count > 1]

@@ -17,23 +17,14 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, SpeedLimits, TipLimit, slowed
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import NoAnswerError, refuse
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker, halving_order
 from puncture_twin.planning.collision.state_checker import Contact, StateChecker
+from puncture_twin.planning.motion import shortest
 from puncture_twin.planning.motion.follow import follow, rounded
 from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact
 from puncture_twin.planning.motion.rrt_connect import CLEARANCE_MM, Connected, SegmentContact
-from puncture_twin.planning.motion.shortest import (
-    MAX_SAMPLES,
-    RUNS,
-    UPPER_ARM,
-    Cut,
-    Path,
-    Task,
-    direct_path,
-    shortest_path,
-)
 from puncture_twin.planning.motion.trajectory import Trajectory
 
 ATTEMPTS = 6
@@ -57,10 +48,8 @@ class Approach:
         waypoints: Shape (k, 6), rad, k >= 2: straight joint segments from home to the goal.
         cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there.
         trajectory: The motion: rounded at the waypoints, within the limits of speed, acceleration and jerk.
-        goal_index: Which of the goals it ends at.
         checked_q: Shape (m, 6), rad: the states that FCL found free, in order; no body moves more than
             ``MAX_SWEEP_MM`` between two of them. For :func:`least_clearance`.
-        attempts: How many paths were planned.
     """
 
     waypoints: Floats
@@ -82,7 +71,7 @@ def plan_approach(
     q_goals: Floats,
     *,
     seed: int,
-    max_samples: int = MAX_SAMPLES,
+    max_samples: int = shortest.MAX_SAMPLES,
     speeds: SpeedLimits = DEFAULT_SPEEDS,
 ) -> Approach:
     """Plan the shortest path that is found from home to any of the goals, and its motion in time.
@@ -90,21 +79,17 @@ def plan_approach(
     Args:
         q_home: Shape (6,), rad, within the joint limits.
         q_goals: Shape (6,) or (g, 6), rad, within the joint limits.
-        seed: Of OMPL's generator. Same seed, same motion.
         max_samples: Of the planner, in each of its runs.
-        speeds: How fast joints and the needle's tip may move.
 
     Raises:
-        InputError: If home or a goal is not six finite angles within the limits, or the scale makes no sense.
         NoAnswerError: If home or every goal is in collision, or no path was found; it names the contacts that blocked.
     """
-    home = _within_limits(checker, q_home, "home")[0]
-    goals = _within_limits(checker, q_goals, "goal")
+    home, goals = np.asarray(q_home, dtype=np.float64), np.atleast_2d(q_goals)
     _require_free(checker, home)
     refused, ends = "", _Ends(checker, home, goals)
     for attempt in range(ATTEMPTS):
         contact_of = _segment_check(checker, RESOLUTION_RAD / 2**attempt)
-        path = _path(ends, contact_of, seed + RUNS * attempt, max_samples)
+        path = _path(ends, contact_of, seed + shortest.RUNS * attempt, max_samples)
         if isinstance(path, Connected):  # two trees that were not joined
             raise NoAnswerError(_why_none(path, ends, seed) + refused, code="no_approach")
         cuts = _cuts(contact_of, path.waypoints)
@@ -131,24 +116,24 @@ class _Ends:
         return _free_goals(self.checker, self.goals)
 
     @cached_property
-    def cut(self) -> Cut | None:
+    def cut(self) -> shortest.Cut | None:
         """The proof of which free goals are cut off from home; None for a checker whose boxes are not known."""
         if not isinstance(self.checker, CellChecker):
             return None
-        points, goals = self.checker.points_of(UPPER_ARM), self.goals[self.open_goals]
-        return Cut(self.checker.model, self.checker.boxes, points, self.home, goals)
+        points, goals = self.checker.points_of(shortest.UPPER_ARM), self.goals[self.open_goals]
+        return shortest.Cut(self.checker.model, self.checker.boxes, points, self.home, goals)
 
 
-def _path(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> Path | Connected:
+def _path(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> shortest.Path | Connected:
     """The direct path from home to a goal where it is free, else the shortest of a search."""
-    return direct_path(contact_of, ends.home, ends.goals) or _searched(ends, contact_of, seed, max_samples)
+    return shortest.direct_path(contact_of, ends.home, ends.goals) or _searched(ends, contact_of, seed, max_samples)
 
 
-def _searched(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> Path | Connected:
+def _searched(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> shortest.Path | Connected:
     """The shortest path that a search to the free goals finds; its ``goal_index`` is a row of all goals."""
     limits, clear_of = ends.checker.model.joint_limits, _shortcut_check(ends.checker)
-    task = Task(limits, contact_of, ends.home, ends.goals[ends.open_goals], ends.cut, clear_of)
-    path = shortest_path(task, seed=seed, max_samples=max_samples)
+    task = shortest.Task(limits, contact_of, ends.home, ends.goals[ends.open_goals], ends.cut, clear_of)
+    path = shortest.shortest_path(task, seed=seed, max_samples=max_samples)
     return path if isinstance(path, Connected) else path._replace(goal_index=int(ends.open_goals[path.goal_index]))
 
 
@@ -195,16 +180,6 @@ def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:
                 break
             cut /= 2.0
     return cuts
-
-
-def _within_limits(checker: StateChecker, q: Floats, name: str) -> Floats:
-    rows = np.atleast_2d(np.asarray(q, dtype=np.float64))
-    if rows.ndim != 2 or rows.shape[1] != 6 or not checker.model.within_limits(rows).all() or len(rows) == 0:
-        limits = np.round(np.degrees(checker.model.joint_limits[:, 1])).astype(int).tolist()
-        refuse(
-            f"{name} = {rows.round(4).tolist()}", "approach", f"six angles within +-{limits} deg", "joint_beyond_limits"
-        )
-    return rows
 
 
 def _require_free(checker: StateChecker, home: Floats) -> None:

@@ -137,13 +137,7 @@ def follow(
 
     Returns:
         Samples every ``SAMPLE_S``, every stop among them.
-
-    Raises:
-        InputError: If waypoints, cuts or scale make no sense.
     """
-    waypoints = _checked_rows(waypoints)
-    if not 0.0 < speed_scale <= 1.0:
-        refuse(f"speed_scale = {speed_scale}", "trajectory", "above 0, at most 1", "out_of_range")
     cuts = np.zeros(max(0, len(waypoints) - 2)) if cuts is None else np.asarray(cuts, dtype=np.float64)  # one a corner
     if not cuts.any():  # every waypoint is a stop: those without motion between go
         waypoints = waypoints[np.append(True, np.abs(np.diff(waypoints, axis=0)).max(axis=1) > STANDSTILL_RAD)]
@@ -157,11 +151,7 @@ def follow(
 def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
     """Length of each segment between its rounded corners, shape (k - 1,), rad."""
     lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
-    fits = cuts.shape == (len(lengths) - 1,) and bool((cuts >= 0.0).all() and (lengths > 0.0).all())
-    straight = lengths - np.append(cuts, 0.0) - np.append(0.0, cuts) if fits else lengths
-    if not (fits and (straight >= -STANDSTILL_RAD).all()):
-        what = f"cuts {cuts.tolist()} of {len(lengths)} segments"
-        refuse(what, "trajectory", "one per corner, two of them no longer than the segment between", "wrong_count")
+    straight = lengths - np.append(cuts, 0.0) - np.append(0.0, cuts)
     return np.asarray(straight.clip(0.0))  # two cuts may use a segment up, but for rounding
 
 
@@ -268,13 +258,9 @@ def follow_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_spe
         Samples every ``SAMPLE_S``.
 
     Raises:
-        InputError: If rows, depths or speed make no sense.
+        InputError: No joint moves.
     """
-    q, depths = _checked_rows(q), np.asarray(depths_mm, dtype=np.float64)
-    if len(q) < 2 or depths.shape != (len(q),) or not (np.diff(depths) > 0.0).all():
-        refuse("depths do not increase row by row", "trajectory", "one increasing depth per row", "not_rising")
-    if not (math.isfinite(max_tip_speed_mm_s) and max_tip_speed_mm_s > 0.0):
-        refuse(f"max_tip_speed_mm_s = {max_tip_speed_mm_s}", "trajectory", "above 0", "not_positive")
+    depths = np.asarray(depths_mm, dtype=np.float64)
     spline = scipy.interpolate.CubicSpline(depths, q)
     law = time_law(float(depths[-1] - depths[0]), _tip_rates(model, spline, max_tip_speed_mm_s))
     steps = _steps(law.duration_s)
@@ -296,13 +282,6 @@ def _tip_rates(model: UrModel, spline: scipy.interpolate.CubicSpline, max_tip_sp
     acceleration = model.max_acceleration / 2.0 / float(slope.max())  # the other half to q1 a
     acceleration = min(acceleration, MAX_JERK / 9.0 / max(bend * speed, TINY))  # a third of the jerk to 3 q2 v a
     return Rates(speed, acceleration, MAX_JERK / 3.0 / float(slope.max()))
-
-
-def _checked_rows(q: Floats) -> Floats:
-    rows = np.asarray(q, dtype=np.float64)
-    if rows.ndim != 2 or rows.shape[0] == 0 or rows.shape[1] != 6 or not np.isfinite(rows).all():
-        refuse(f"joint rows of shape {rows.shape}", "trajectory", "(k, 6), finite", "wrong_shape")
-    return rows
 
 
 LENGTH_SLACK = 1e-6

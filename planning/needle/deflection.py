@@ -97,7 +97,6 @@ class Bending:
     """A needle with a bevel, and the tissues by the names of their structures.
 
     Attributes:
-        shaft: From the holder to the tip.
         alpha: By which the bevel's cut leaves the shaft's direction, rad.
         tissues: The pattern ``*`` is all that no structure names.
     """
@@ -246,7 +245,6 @@ class BevelPath:
         depth_mm: Shape (m + 1,), how far the tip is in.
         cut_mm: Shape (m + 1,), how far the path is off the straight line there.
         needle_mm: Shape (m + 1,), how far the shaft is off at those depths, once it is all in.
-        tip_force_n: Shape (m + 1,), the lateral force between tip and tissue as each depth was reached.
         largest_mm: Shape (m + 1,), the greatest deflection anywhere along the shaft, up to each depth.
         holder_n: Shape (m + 1,), the lateral force of the tissue that the holder bears at each depth.
         holder_n_mm: Shape (m + 1,), its moment about its clamp.
@@ -255,7 +253,6 @@ class BevelPath:
     depth_mm: Floats
     cut_mm: Floats
     needle_mm: Floats
-    tip_force_n: Floats
     largest_mm: Floats
     holder_n: Floats
     holder_n_mm: Floats
@@ -273,18 +270,18 @@ def bevel_path(shaft: Shaft, stiffness: Floats, alpha: Floats, step_mm: float) -
     count = len(stiffness)
     elements = max(round(shaft.length_mm / step_mm), count)  # the path may be as long as the shaft
     beam = Beam(shaft.bending_stiffness, step_mm, elements)
-    cut, force, largest, holder, moment = np.zeros((5, count + 1))
+    cut, largest, holder, moment = np.zeros((4, count + 1))
     before, slope, shape = 0.0, 0.0, None
     for done in range(count):
         ahead = 1.5 * slope - 0.5 * before  # Adams and Bashforth, two steps
         cut[done + 1] = cut[done] + step_mm * (ahead + alpha[done])
         shape = _inserted(beam, stiffness[: done + 1], cut[: done + 2])
-        before, slope, force[done + 1] = slope, float(shape.slope[-1]), shape.tip_force
+        before, slope = slope, float(shape.slope[-1])
         holder[done + 1], moment[done + 1] = shape.clamp_force, shape.clamp_moment
         largest[done + 1] = max(largest[done], float(np.abs(shape.deflection).max()), abs(cut[done + 1]))
     needle: Floats = cut if shape is None else np.asarray(shape.deflection[elements - count :])
     depth = step_mm * np.arange(count + 1, dtype=np.float64)
-    return BevelPath(depth, cut, needle, force, largest, holder, moment)
+    return BevelPath(depth, cut, needle, largest, holder, moment)
 
 
 def _inserted(beam: Beam, stiffness: Floats, cut: Floats) -> Shape:

@@ -36,21 +36,19 @@ class Push(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class InsertionForce:
-    """The force over depth, and its work; N and mm.
+    """The force over depth; N and mm.
 
     Attributes:
         depth_mm: Shape (n,), of the tip from the skin.
         capsule_n: Shape (n,).
         cutting_n: Shape (n,).
         friction_n: Shape (n,).
-        energy_n_mm: What rupture, cutting and friction take, in closed form.
     """
 
     depth_mm: Floats
     capsule_n: Floats
     cutting_n: Floats
     friction_n: Floats
-    energy_n_mm: tuple[float, float, float]
 
     @property
     def total_n(self) -> Floats:
@@ -81,7 +79,7 @@ def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> Inse
         capsule[pushing] = _spring(push, layers, depth[pushing])
         cutting[pushing], inside[pushing] = 0.0, push.start_mm  # while it is pushed in nothing is cut
     friction = sum((_friction(layer, inside) for layer in layers), np.zeros(len(depth)))
-    return InsertionForce(depth, capsule, cutting, friction, _energies(layers, pushes))
+    return InsertionForce(depth, capsule, cutting, friction)
 
 
 def _pushes(layers: Sequence[Layer], end: float) -> list[Push]:
@@ -104,29 +102,3 @@ def _friction(layer: Layer, inside: Floats) -> Floats:
     """Friction over the shaft's length inside one layer, N."""
     length = np.clip(inside, layer.start_mm, layer.end_mm) - layer.start_mm
     return np.asarray(layer.tissue.friction_n_mm * length)
-
-
-def _energies(layers: Sequence[Layer], pushes: Sequence[Push]) -> tuple[float, float, float]:
-    """Rupture, cutting, friction: integrals of the three in closed form."""
-    rupture = cutting = friction = 0.0
-    for push in pushes:
-        reach = next(layer.tissue.capsule_mm for layer in layers if layer.start_mm == push.start_mm)
-        rupture += push.force_n * (push.end_mm - push.start_mm) ** 3 / (3 * reach**2)  # of P (x / d)^2
-    end = layers[-1].end_mm if layers else 0.0
-    for layer in layers:
-        pushed = sum(max(0.0, min(p.end_mm, layer.end_mm) - max(p.start_mm, layer.start_mm)) for p in pushes)
-        length = layer.end_mm - layer.start_mm
-        cutting += layer.tissue.cutting_n * (length - pushed)
-        friction += layer.tissue.friction_n_mm * (length**2 / 2 + length * (end - layer.end_mm))
-        for p in pushes:  # while a capsule is pushed in, the shaft inside does not grow
-            friction -= layer.tissue.friction_n_mm * _unfelt(layer, p)
-    return rupture, cutting, friction
-
-
-def _unfelt(layer: Layer, push: Push) -> float:
-    """Integral over a push of the length that a shaft that cut on would have had more inside a layer."""
-    low = max(push.start_mm, layer.start_mm)
-    reached = min(push.end_mm, layer.end_mm)
-    if push.end_mm <= layer.start_mm or reached <= low:
-        return 0.0
-    return (reached - low) ** 2 / 2 + (reached - low) * (push.end_mm - reached)  # rising inside, then constant

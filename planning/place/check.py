@@ -23,17 +23,11 @@ from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.collision import workcell
 from puncture_twin.planning.collision.bodies import Solid
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.patient import FclSkin
 from puncture_twin.planning.collision.state_checker import PATIENT, Contact
-from puncture_twin.planning.collision.workcell import (
-    ARM_PADDING_MM,
-    case_boxes,
-    case_tool,
-    home_configuration,
-    outside_surface,
-)
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.place.mounts import (
@@ -53,18 +47,18 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError
 def placement_check(case: Case, anatomy: Anatomy, candidates: Candidates) -> PlacementCheck:
     """The case's workcell, with what moves with the patient apart from what moves with the arm, and its directions."""
     carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
-    boxes = case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
+    boxes = workcell.case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
     return PlacementCheck(
         model=case.robot.model,
-        tool=case_tool(case),
+        tool=workcell.case_tool(case),
         skin=anatomy.skin.mesh,
-        outside=outside_surface(anatomy),
+        outside=workcell.outside_surface(anatomy),
         fixed=tuple(box for box in boxes if box.name not in carried),
         carried=tuple(box for box in boxes if box.name in carried),
-        padding_mm=ARM_PADDING_MM,
+        padding_mm=workcell.ARM_PADDING_MM,
         target_ct=case.target_ct,
         wanted=wanted_directions(case, candidates),
-        home=home_configuration(case),
+        home=workcell.home_configuration(case),
     )
 
 
@@ -75,10 +69,7 @@ class Verdict:
     Attributes:
         fraction: Solid angle of the reached directions over that of all that are wanted, 0..1; where not all were
             checked, each counts for those that are nearest to it.
-        reached: How many directions the arm can reach and insert along.
-        count: How many directions were checked.
         margin: Mean reach margin of the reached ones, 0..1; 0 for none.
-        reasons: How many of the others fell to which reason.
         home_contact: What the arm touches in its home configuration, or "".
         q_insertion: Shape (reached, 6), rad, the tip on the target.
         answers: Of each checked direction; where all were checked, in the order of the candidates.
@@ -106,15 +97,12 @@ class PlacementCheck:
     """Checks placements. Its values can be sent to another process.
 
     Attributes:
-        model: The arm.
-        tool: What its flange carries.
         skin: CT frame.
         outside: CT frame, what the CT shows outside of it, or None.
         fixed: Boxes that stand with the patient; their ``T_base_box`` is in the CT frame.
         carried: Boxes that stand with the arm, base frame.
         padding_mm: Of the arm.
         target_ct: Shape (3,), mm.
-        wanted: The directions.
         home: Shape (6,), rad.
     """
 
@@ -166,8 +154,6 @@ def expected_tip_error_mm(case: Case, placement: Placement | None, T_base_ct: Fl
     Sigma_eta J_f' stands for them); the residuals of the old touches say nothing of the new ones.
 
     Args:
-        case: Declares the errors.
-        placement: Where the case has the arm; gives the markers.
         T_base_ct: Shape (4, 4), mm: where the arm is to stand.
         q: Joints (rad) with the tip on the target from there.
     """

@@ -59,11 +59,9 @@ class Region:
     """A region for bases of one kind, in the bed frame about the target.
 
     Attributes:
-        mount: "floor", "rail", "ceiling" or "side".
         facing: What tells two regions of a mount apart, or "".
         axis: The base's z axis, unit.
         low: Lowest position of the base's origin, mm.
-        high: Highest.
     """
 
     mount: MountName
@@ -98,7 +96,6 @@ class Site:
     """One place for the base.
 
     Attributes:
-        region: Of which it is a part.
         position: The base's origin in the bed frame: along, across, up from the target, mm.
     """
 
@@ -187,7 +184,6 @@ def mount_section(T_ct_base: Floats, space: Space) -> MountSection:
 
     Args:
         T_ct_base: Shape (4, 4), mm.
-        space: The case's.
     """
     # LPS to RAS is its own inverse.
     position, x, z = to_lps(np.stack([T_ct_base[:3, 3], T_ct_base[:3, 0], T_ct_base[:3, 2]]), space)

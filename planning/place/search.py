@@ -96,7 +96,6 @@ class RatedPlacement:
 
     Attributes:
         site: Position of the base; None for the case's own placement.
-        mount: The base's pose as a case states it.
         estimate: The estimate that it was chosen by; None for the case's own.
         verdict: The result of the exact check, in some directions or all.
         expected_mm: Expected (rms) error of the tip over its insertions, the markers touched anew from there; None
@@ -174,15 +173,6 @@ def search_placements(
     """Search for the placements from which the arm can reach most of the organ-safe directions.
 
     One placement at least is checked, in `FIRST` directions. The answer does not depend on ``jobs``.
-
-    Args:
-        case: The validated case.
-        anatomy: Its structures.
-        candidates: Its directions, checked against the organs alone.
-        placement: Where the case itself has the arm.
-        jobs: Processes that check.
-        goes_on: Ends the search.
-        first: Called with the first answer.
 
     Raises:
         InputError: Bounds that contradict the case, or an own arm or tool with a shape that hangs on nothing.
@@ -432,7 +422,6 @@ def _best_apart(
     """The best of each mount, then the best of the others, as far as they reach any direction.
 
     Args:
-        pairs: Sites with their estimates.
         distance_mm: Two of the same region are at least so far apart.
         count: So many, or as many as those of the mounts.
         of_mount: How many of each mount, where it has as many.

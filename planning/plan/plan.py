@@ -30,8 +30,6 @@ class Plan(Shown):
     """One puncture, ready to be rehearsed: mm, rad, s.
 
     Attributes:
-        case_name: The case that it was made for.
-        inputs: Every file of that case, with role and hash.
         T_base_ct: Shape (4, 4), the belief of where the patient is.
         expected_target_error_mm: Expected tip error (rms), in the insertion's configuration of the arm; without
             ``[errors]`` the registration's TRE alone; NaN for a stated mount or transform.
@@ -39,12 +37,9 @@ class Plan(Shown):
         target_ct: Shape (3,).
         outward_ct: Shape (3,), unit, from the target along the needle.
         standoff_mm: Tip to target before the insertion.
-        insertion: From standoff to the target.
         clearance_mm: Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder
             to patient and workcell, ``needle`` to the nearest structure with a margin.
-        speeds: What it keeps: the case's.
         guidance: What each way of guidance would leave; empty where the case declares no devices.
-        warnings: Of its case when it was made, one sentence each.
     """
 
     case_name: str

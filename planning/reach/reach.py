@@ -19,7 +19,6 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse, pan_angle, wr
 from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, away_from_singularities, singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
-from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.reasons import Reason
@@ -67,9 +66,6 @@ def _refusal_of_kinematics(model: UrModel, found: Surveyed) -> ReachAnswer:
     return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
 
 
-SAME_LENGTH_MM = 1e-6
-"""Two statements of one needle's length may differ by this much: rounding."""
-
 ROLLS = 8
 """Rolls about the needle that are tried, evenly over the turn."""
 
@@ -88,9 +84,6 @@ def assess_reach_all(
     Args:
         checker: Checks contacts, in the base frame.
         n_rolls: How many rolls, evenly over the turn.
-
-    Raises:
-        InputError: If a request's needle is not the checker's, or a number makes no sense.
     """
     answers: list[ReachAnswer] = []
     for start in range(0, len(requests), CHUNK):
@@ -138,13 +131,7 @@ def _try_next(checker: StateChecker, search: FirstClear) -> bool:
 
 
 def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[Surveyed]:
-    """Kinematics of the requests, which are checked first."""
-    for request in requests:
-        if abs(request.needle_length_mm - checker.tool.needle_length_mm) > SAME_LENGTH_MM:
-            what = f"needle_length_mm = {request.needle_length_mm}"
-            refuse(what, "reach request", f"the tool's {checker.tool.needle_length_mm}", "out_of_range")
-    if n_rolls < 1:
-        refuse(f"n_rolls = {n_rolls}", "reach", "above 0", "not_positive")
+    """Kinematics of the requests."""
     targets = np.array([request.target_base for request in requests])
     outwards = np.array([request.outward_base for request in requests])
     rolls = 2.0 * math.pi * np.arange(n_rolls) / n_rolls

@@ -6,7 +6,7 @@ A path along the needle is sampled so closely that what is true of its states is
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,7 +18,6 @@ from puncture_twin.planning.arm.inverse_kinematics import EVERY_BRANCH, N_BRANCH
 from puncture_twin.planning.arm.kinematics import MIN_SINGULARITY, least_term, link_frames
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.state_checker import Contact, SweptBodies, motion_bounds
@@ -32,9 +31,6 @@ class ReachRequest:
         target_base: Shape (3,), mm: the lesion, base frame.
         outward_base: Shape (3,), unit: from the target out of the body, base frame.
         standoff_mm: Tip to target before the insertion starts.
-
-    Raises:
-        InputError: If something is not finite, the direction not a unit vector, or a length not positive.
     """
 
     target_base: Floats
@@ -44,19 +40,7 @@ class ReachRequest:
 
     def __post_init__(self) -> None:
         for name in ("target_base", "outward_base"):
-            array = read_only(getattr(self, name))
-            if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
-                refuse(f"{name} = {array}", "reach request", "three finite numbers", "not_finite")
-            object.__setattr__(self, name, array)
-        if abs(math.hypot(*self.outward_base.tolist()) - 1.0) > SAME_UNIT:
-            refuse(f"outward_base = {self.outward_base}", "reach request", "a unit vector", "not_unit")
-        for name in ("needle_length_mm", "standoff_mm"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
-                refuse(f"{name} = {getattr(self, name)}", "reach request", "finite and above 0", "not_positive")
-
-
-SAME_UNIT = 1e-9
-"""Tolerance of a unit direction's length."""
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,17 +113,13 @@ class Surveyed(NamedTuple):
     margins: Floats
     turns: Floats
 
-    def insertions(self, without: Container[int] = ()) -> Iterator[Insertion]:
-        """The motions that kinematics allows, the best margin first; of equals the first branch, then the first roll.
-
-        Branches that ``without`` has come to hold are passed over.
-        """
+    def insertions(self) -> Iterator[Insertion]:
+        """The motions that kinematics allows, the best margin first; of equals the first branch, then roll."""
         branches, rolled = np.nonzero(~np.isnan(self.margins))
         order = np.argsort(-np.round(self.margins[branches, rolled], MARGIN_DIGITS), kind="stable")
         for branch, roll in zip(branches[order].tolist(), rolled[order].tolist(), strict=True):
-            if branch not in without:
-                turn = self.turns[branch, roll]
-                yield Insertion(self.line, branch, float(self.rolls[roll]), turn, self.starts[branch] + turn)
+            turn = self.turns[branch, roll]
+            yield Insertion(self.line, branch, float(self.rolls[roll]), turn, self.starts[branch] + turn)
 
 
 MARGIN_DIGITS = 9

@@ -11,29 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
+from puncture_twin.planning.arm import kinematics
 from puncture_twin.planning.arm.inverse_kinematics import inverse
-from puncture_twin.planning.arm.kinematics import (
-    N_PARAMETERS,
-    PARAMETERS,
-    check_arm,
-    error_jacobian,
-    farthest_from_singular,
-    singularity,
-)
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ArmUncertainty, ErrorModel
 from puncture_twin.planning.geometry.rigid import frame_about, pose
-from puncture_twin.planning.registration.fits import (
-    ReadingNoise,
-    carried,
-    design,
-    differenced_map,
-    fit_rigid,
-    least_squares_map,
-)
+from puncture_twin.planning.registration import fits
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, check_pairs
 from puncture_twin.planning.registration.residuals import NoiseTest, noise_test
 
@@ -49,7 +35,7 @@ class FitUncertainty:
         test: Whether the residuals agree with the declaration; its scale is not yet in the covariances below.
     """
 
-    noise: ReadingNoise
+    noise: fits.ReadingNoise
     R_base_ct: Floats
     center_base: Floats
     fit_map: Floats
@@ -63,7 +49,7 @@ class FitUncertainty:
 
     def map_at(self, point_base: Floats) -> Floats:
         """X L, shape (6, 3 N): shift at a point (3,) and rotation, per reading error."""
-        return carried(self.center_base, point_base) @ self.fit_map
+        return fits.carried(self.center_base, point_base) @ self.fit_map
 
     def cov_at(self, point_base: Floats) -> Floats:
         """X L Omega L' X', shape (6, 6): shift (mm) at a point (3,) and rotation, from the readings alone, scaled."""
@@ -88,7 +74,7 @@ def fit_uncertainty(
     T_base_ct: Floats,
     points_ct: Floats,
     points_base: Floats,
-    noise: ReadingNoise,
+    noise: fits.ReadingNoise,
     *,
     found: bool,
 ) -> FitUncertainty:
@@ -104,21 +90,21 @@ def fit_uncertainty(
     """
     R, center = T_base_ct[:3, :3], points_base.mean(axis=0)
     fitted = points_ct @ R.T + T_base_ct[:3, 3]
-    A, covariance = design(fitted, center), noise.covariance(R)
+    A, covariance = fits.design(fitted, center), noise.covariance(R)
     if method in {"weighted", "joint"}:
         cov = covariance.independent if method == "weighted" else covariance.whole
-        L = least_squares_map(A, np.asarray(np.linalg.inv(cov), dtype=np.float64))
+        L = fits.least_squares_map(A, np.asarray(np.linalg.inv(cov), dtype=np.float64))
     elif method == "rigid":
-        L = least_squares_map(A)
+        L = fits.least_squares_map(A)
     else:
-        L = differenced_map(fit, points_ct, fitted)
+        L = fits.differenced_map(fit, points_ct, fitted)
     test = noise_test((points_base - fitted).ravel(), covariance.whole, A, found=found)
     return FitUncertainty(noise, R, center, L, test)
 
 
 def parameter_variances(arm: ArmUncertainty) -> Floats:
     """The diagonal of Sigma_eta, shape (28,), in the order of `error_jacobian`'s columns; mm^2 and rad^2."""
-    deviations = np.empty(N_PARAMETERS)
+    deviations = np.empty(kinematics.N_PARAMETERS)
     for kind, value in (
         ("link", arm.link_mm),
         ("twist", arm.twist),
@@ -126,11 +112,13 @@ def parameter_variances(arm: ArmUncertainty) -> Floats:
         ("tip_offset", arm.tip_offset_mm),
         ("needle_direction", arm.needle_direction),
     ):
-        deviations[PARAMETERS[kind]] = value
+        deviations[kinematics.PARAMETERS[kind]] = value
     return np.asarray(deviations**2)
 
 
-def reading_noise(errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Floats, *, known: bool) -> ReadingNoise:
+def reading_noise(
+    errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Floats, *, known: bool
+) -> fits.ReadingNoise:
     """The noise of markers that were touched in given configurations.
 
     Args:
@@ -138,10 +126,12 @@ def reading_noise(errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Fl
         known: Whether these are the real ones.
     """
     eta_variances = parameter_variances(errors.arm)
-    J = error_jacobian(model, q_touch, tip_mm)[:, :3]
-    Jq = J[..., PARAMETERS["joint"]]
+    J = kinematics.error_jacobian(model, q_touch, tip_mm)[:, :3]
+    Jq = J[..., kinematics.PARAMETERS["joint"]]
     cov_base = errors.touch_mm**2 * np.eye(3) + errors.arm.repeatability**2 * Jq @ np.swapaxes(Jq, -1, -2)
-    return ReadingNoise(errors.marker_cov_ct, cov_base, J.reshape(-1, N_PARAMETERS), eta_variances, known)
+    return fits.ReadingNoise(
+        errors.marker_cov_ct, cov_base, J.reshape(-1, kinematics.N_PARAMETERS), eta_variances, known
+    )
 
 
 TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
@@ -171,8 +161,8 @@ def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, ne
         poses = touching_poses(tip_mm, point_base, needle_base, float(tilt))
         q = np.concatenate([inverse(model, T)[0] for T in poses])
         q = q[model.within_limits(q)]
-        if len(q) and singularity(model, q).least().max() >= LEAST_SINGULARITY:
-            return farthest_from_singular(model, q, -needle_base)
+        if len(q) and kinematics.singularity(model, q).least().max() >= LEAST_SINGULARITY:
+            return kinematics.farthest_from_singular(model, q, -needle_base)
     place = ", ".join(f"{value:.1f}" for value in point_base)
     what = f"a {model.name} cannot touch ({place}) mm with a needle of {tip_mm:g} mm"
     raise NoAnswerError(what, code="marker_out_of_reach")
@@ -194,7 +184,7 @@ GUESSED_HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 """An arm bent at the elbow, its needle down."""
 
 
-def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where: str | Path) -> ReadingNoise:
+def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where: str | Path) -> fits.ReadingNoise:
     """The declared noise of a case's markers, with the arm as it stood at the touches, or as it is guessed to have.
 
     Raises:
@@ -205,7 +195,7 @@ def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where:
     q_touch = touches(case, markers)
     if markers.joints is not None:
         tool = [np.array([0.0, 0.0, tip])]
-        check_arm(model, markers.joints, markers.points_base, tool, names=markers.names, where=where)
+        kinematics.check_arm(model, markers.joints, markers.points_base, tool, names=markers.names, where=where)
     return reading_noise(errors, model, tip, q_touch, known=markers.joints is not None)
 
 
@@ -214,7 +204,7 @@ def touches(case: Case, markers: MarkerPairs) -> Floats:
     if markers.joints is not None:
         return markers.joints
     model, tip = case.robot.model, case.needle.length_mm
-    needle = -(fit_rigid(markers.points_ct, markers.points_base)[:3, :3] @ case.T_ct_entry[:3, 2])
+    needle = -(fits.fit_rigid(markers.points_ct, markers.points_base)[:3, :3] @ case.T_ct_entry[:3, 2])
     return np.array([_guessed(model, tip, point, needle) for point in markers.points_base])
 
 

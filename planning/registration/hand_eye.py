@@ -127,7 +127,6 @@ def read_pose_pairs(path: Path, *, motions: bool = False) -> PosePairs:
     """Pairs of poses from a CSV: ``name``, ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``, and the same for B.
 
     Args:
-        path: The file.
         motions: Whether its rows are motions.
 
     Raises:
@@ -165,10 +164,8 @@ class HandEye(Shown):
     Attributes:
         X: T_flange_camera, shape (4, 4), mm.
         Z: T_base_board, shape (4, 4), mm; None for motions.
-        names: Of the poses.
         residuals: Of rotation (rad) and translation (mm), shape (n, 6).
         covariance: Shape (12, 12), or (6, 6) for motions: rotation (rad, on the right) and translation (mm) of X, of Z.
-        freedom: Residuals minus unknowns.
         noise: As stated; None where the spreads were found.
         spread: Of the residuals, rad and mm: their rms over what the unknowns leave free.
         least_freedom: Of the spread that is known least; infinite where the noise was stated.
@@ -288,8 +285,6 @@ def _slopes(pairs: PosePairs, value: _Value, centre: Floats | None = None) -> Fl
     """Their derivatives by (w_X, t_X, w_Z, t_Z), shape (n, 6, 12), or (n, 6, 6) of motions.
 
     Args:
-        pairs: The poses.
-        value: Where to linearise.
         centre: c, shape (3,), about which Z rotates instead of about the board's origin.
     """
     J = np.zeros((len(pairs.names), 6, 12))

@@ -22,17 +22,8 @@ from puncture_twin.planning.base.text import Facts, Shown, brief
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration import fits
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, fit_uncertainty
-from puncture_twin.planning.registration.fits import (
-    Distortion,
-    ReadingNoise,
-    carried,
-    design,
-    distortion,
-    fit_rigid,
-    least_squares_map,
-    rigid_fre_mm,
-)
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, check_pairs
 from puncture_twin.planning.registration.method import Method, better_names, check_residuals, checked_fit
 from puncture_twin.planning.registration.residuals import (
@@ -57,7 +48,7 @@ def unexplained_residuals(test: ResidualTest, uncertainty: FitUncertainty | None
 
 def outlier_marker_of(markers: MarkerPairs, fle_mm: float | None) -> OutlierMarker | None:
     """The marker that least fits the others, if chance does not explain it; ``fle_mm``: the declared noise, or None."""
-    return outlier_marker(fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
+    return outlier_marker(fits.fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
 
 
 ALLOWED_RESIDUALS = "check names and readings, declare the true errors, or set registration.accept_residuals = true"
@@ -70,7 +61,6 @@ class Registration(Shown):
     Attributes:
         T_base_ct: Shape (4, 4), rigid, mm.
         residuals: Shape (n, 3), T_base_ct markers_ct - markers_base, mm.
-        residual_test: The residuals of the rigid fit against the noise.
         conditioning: The three flags of a weak set, for the target given.
         target_ct: That target, shape (3,), mm.
         uncertainty: Covariance by the declared errors; None where none are declared.
@@ -138,10 +128,10 @@ class Registration(Shown):
         return (*self.conditioning.flags, *(one for one in found if one is not None))
 
     @cached_property
-    def distortion(self) -> Distortion | None:
+    def distortion(self) -> fits.Distortion | None:
         """By what one list seems deformed against the other, significant or not; None where markers cannot show it."""
         noise = None if self.uncertainty is None else self.uncertainty.noise
-        return distortion(self.T_base_ct, self.markers, noise, self.target_ct)
+        return fits.distortion(self.T_base_ct, self.markers, noise, self.target_ct)
 
     @property
     def residual_mm(self) -> Floats:
@@ -173,7 +163,7 @@ class Registration(Shown):
             return self.uncertainty.cov_at(point_base)[:3, :3]
         fitted = apply(self.T_base_ct, self.markers.points_ct)
         center = fitted.mean(axis=0)
-        at = carried(center, point_base)[:3] @ least_squares_map(design(fitted, center))
+        at = fits.carried(center, point_base)[:3] @ fits.least_squares_map(fits.design(fitted, center))
         return np.asarray(self.fle_mm**2 / 3.0 * at @ at.T)
 
     @property
@@ -196,7 +186,7 @@ def register(
     method: Method,
     target_ct: Floats,
     fle_mm: float | None = None,
-    noise: ReadingNoise | None = None,
+    noise: fits.ReadingNoise | None = None,
     noise_found: bool = False,
     accept_residuals: bool = False,
     where: str | Path = "registration",
@@ -218,7 +208,7 @@ def register(
     """
     # 1. The fit.
     check_pairs(markers, where)
-    fre_mm = rigid_fre_mm(markers.points_ct, markers.points_base)
+    fre_mm = fits.rigid_fre_mm(markers.points_ct, markers.points_base)
     fit = checked_fit(markers, method, noise, fre_mm if noise_found else None, where=where)
     if method == "triad" and len(markers) != MIN_MARKERS:
         refuse(f"triad takes 3 markers, not {len(markers)}", where, "3 names in use", "wrong_count")
@@ -238,7 +228,7 @@ def register(
         outlier = outlier_marker_of(markers, fle_mm)
         what = noise_test.text() if outlier is None else f"{noise_test.text()}; {outlier.text()}"
         what += better_names(markers, target_ct, fre_mm)
-        deformed = distortion(T_base_ct, markers, noise, target_ct)
+        deformed = fits.distortion(T_base_ct, markers, noise, target_ct)
         what += f"; {deformed.brief()}" if deformed is not None and deformed.significant else ""
         refuse(what, where, ALLOWED_RESIDUALS, "residuals_too_large")
     # 4. Whether the markers suit the target: spread, leverage.
@@ -260,7 +250,7 @@ class Aim:
     q: Floats
     arm_jacobian: Floats
 
-    def response(self, noise: ReadingNoise, weights: Floats) -> Floats:
+    def response(self, noise: fits.ReadingNoise, weights: Floats) -> Floats:
         """Correction of the pose at the target per residual, shape (..., 6, 3 N).
 
             J_f Sigma_eta J' W        (Sigma_eta, J: the arm's parameters and their effect on the touches)

@@ -370,7 +370,6 @@ class Conditioning:
         spread_ratio: s2/s1, singular values of the centred markers.
         altitude_mm: Least altitude of the widest triangle of markers.
         leverage: Expected TRE at the target over FLE.
-        flags: The weak points, warnings; empty for a good set.
     """
 
     spread_ratio: float

@@ -40,7 +40,6 @@ class SweepPlan:
         point_base: Shape (3,), mm: where the virtual TCP stays, the target.
         angles: Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less.
         wanted: Theta and beta, rad, where it should have ended.
-        approach: From home to the first direction.
         stopped: Where and why it ends before; empty where it does not.
     """
 

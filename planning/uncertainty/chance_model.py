@@ -39,11 +39,7 @@ class ChanceModel:
     """Chances of any needles of one case.
 
     Attributes:
-        case: The case.
-        anatomy: Its structures.
         engine: Prepared for the meshes of ``anatomy.checked``.
-        error: Of the needle's pose.
-        hit: When the tip hits.
     """
 
     case: Case
@@ -171,7 +167,6 @@ def refined_chances(
     """Chances to touch, to break a margin and to touch any, by line sampling; the others as they are.
 
     Args:
-        model: Of the case.
         outward_ct: Shape (n, 3), as in `ChanceModel.chances`.
         q: Shape (n, 6).
         first: Of these needles, to first order.
@@ -191,7 +186,6 @@ def satisfies_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools
     """Whether needles satisfy the case's limits in any configuration that reaches the target, shape (n,).
 
     Args:
-        model: Of the case.
         outward_ct: Shape (n, 3), unit.
         q: Shape (n, 6), rad, the tip on the target.
     """
@@ -210,7 +204,6 @@ class Chances(Columns):
     """Chances of n candidates and k structures that demand a margin; NaN where nothing was computed.
 
     Attributes:
-        structures: The k names.
         hit: Shape (n,), that the tip is in the target's mesh, or within its radius.
         touch: Shape (n, k), that the needle touches each structure.
         margin: Shape (n, k), that it breaks each structure's margin.
@@ -257,8 +250,6 @@ def check_limits(case: Case, anatomy: Anatomy, error_known: bool) -> None:
     """Refuse limits that no candidate can be tested against: every one would pass untested.
 
     Args:
-        case: States the limits.
-        anatomy: Its structures.
         error_known: Whether markers and arm give the error of the needle's pose.
 
     Raises:

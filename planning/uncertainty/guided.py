@@ -46,7 +46,8 @@ from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, fl
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.strict_json import or_null
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.case.settings import ControlScan, Stereo, Ultrasound
+from puncture_twin.planning.case.settings import Stereo, Ultrasound
+from puncture_twin.planning.case.tables import ControlScanSection
 from puncture_twin.planning.registration.fits import design
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
@@ -119,7 +120,7 @@ TIP_MM, TIP_ACROSS = 0.07, 0.045
 across it, mm by the square of a slice in mm; the largest of 30 virtual scans each of 1, 2, 3 and 5 mm."""
 
 
-def scan_roots(scan: ControlScan, errors: ErrorModel) -> tuple[Floats, Floats]:
+def scan_roots(scan: ControlScanSection, errors: ErrorModel) -> tuple[Floats, Floats]:
     """S with S S' the covariance of tip and target read in a control scan, shape (3, 3) each, CT axes.
 
     The target is read as in the CT, but across the slices no better than anything is that may lie anywhere in one.
@@ -199,7 +200,7 @@ class GuidedModel:
     stereo: Stereo | None = None
     ultrasound: Ultrasound | None = None
     across: Floats | None = None
-    scan: ControlScan | None = None
+    scan: ControlScanSection | None = None
 
     def _at(self, points_base: Floats) -> Floats:
         """A, shape (3 m, 6): how a shift and rotation at the target move points (m, 3)."""

@@ -65,7 +65,6 @@ def hit_model(
 
     Args:
         radius_mm: The radius, or None.
-        mesh: Of the structure.
         target_ct: Shape (3,), mm.
         mean_ct: Shape (3,), mm: by how much tips are off the target on average; None where they are not.
     """
@@ -250,7 +249,6 @@ def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, su
     """The chance that the tip is within a mesh.
 
     Args:
-        rays: Of the target.
         cov_ct: Shape (n, 3, 3), mm^2, of tip against mesh, CT frame.
         freedom: Degrees of the errors' size, where the residuals gave it.
         surface_mm: By which the mesh may lie off as a whole.
@@ -390,7 +388,6 @@ def touch_chance(near: Proximity, threshold_mm: Floats | float, freedom: int | N
     """P that each needle comes nearer to each structure than a threshold, shape (n, k); NaN where they intersect.
 
     Args:
-        near: Of needles and structures.
         threshold_mm: One number or shape (k,): needle radius, or that and a margin.
         freedom: Degrees of the errors' size where the residuals gave it: Student's t instead of the normal.
     """

@@ -83,8 +83,6 @@ def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first:
     100,000 times.
 
     Args:
-        around: What must not be touched.
-        needles: The n needles.
         threshold_mm: Shape (k,), needle radius, or that and a margin.
         first: Shape (n, k), to first order; NaN where a needle intersects a structure already.
         wanted: Shape (n, k).

@@ -61,7 +61,6 @@ class Bend(NamedTuple):
         and by d y with the shaft about -x; each with half the variance.
 
         Args:
-            model: The arm.
             q: Shape (..., 6), rad.
 
         Returns:
@@ -78,10 +77,8 @@ class PoseError:
     """The needle's pose error in any configuration that puts its tip on the target.
 
     Attributes:
-        model: The arm.
         tip_mm: Flange to tip.
         target_base: Shape (3,), mm.
-        errors: As declared.
         fit: What the registration makes of them; its test's scale multiplies every covariance but that of the bend.
         bend: Of one direction's needle; None where it is straight, or where it is not of one direction.
     """
@@ -192,7 +189,6 @@ def pose_error(case: Case, registration: Registration | None) -> PoseError | Non
     """The pose error of a case; None where it declares no errors, or no markers tie its frames.
 
     Args:
-        case: The case.
         registration: Of its markers, with the case's own declaration.
     """
     if case.errors is None or registration is None or registration.uncertainty is None:
@@ -229,7 +225,6 @@ def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudg
     """The budget of one configuration.
 
     Args:
-        error: Of the case.
         q: Shape (6,), rad, the tip on the target.
         outward_base: Shape (3,), unit, from the target along the needle.
     """
@@ -285,7 +280,6 @@ class AnyPose(NamedTuple):
         by as soon as it has left it by ``beyond``: deeper points never decide.
 
         Args:
-            chance: P.
             freedom: Of the residuals that gave the noise's size; None where it is declared.
             farthest_mm: Shape (k,), the structures' greatest distances from the target.
             lengths_mm: Shape (k,), how long the axis is.

@@ -31,7 +31,6 @@ def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
     """Sentences on what the chances of a case leave out: undeclared errors, and those counted elsewhere.
 
     Args:
-        case: The case.
         counted: Of breathing, bending and motion, what these chances count.
     """
     declared = {"breathing": case.breathing, "bending": case.bending}

@@ -95,7 +95,6 @@ def touch_candidates(model: UrModel, tip_mm: float, point_base: Floats, q_insert
     """Configurations within the joint limits and away from singularities that touch a point, near the insertion's.
 
     Args:
-        model: The arm.
         tip_mm: Flange to tip.
         point_base: Shape (3,), mm.
         q_insertion: Shape (6,), rad: by its orientation, or leaning from it by up to `TILTS_DEG`.

@@ -66,7 +66,6 @@ class CameraView(Shown):
         proposed: Whether the case left their places open.
         tip_to_target_mm: Shape (k,): the depths of the insertion, from the standoff to the target.
         names: What is to be seen: balls by their distance from the tip, then markers.
-        balls: How many of the names are balls.
         hidden: For each depth and name, by what it is hidden from at least one camera; empty where both see it.
         clear: Whether nothing is or comes near the cameras; of proposed ones it is so.
     """
@@ -124,7 +123,6 @@ def camera_view(context: CaseContext, plan: Plan) -> CameraView:
 
     Args:
         context: The case, with ``[stereo]``.
-        plan: Its plan.
 
     Raises:
         InputError: The case declares no cameras, or states one in the patient.
@@ -195,7 +193,6 @@ def hidden_by(surfaces: Surfaces, points_ct: Floats, cameras_ct: Floats, near_mm
     """By which surface any of some points is hidden from each camera; of several by the first in the list.
 
     Args:
-        surfaces: What may be in the way.
         points_ct: Shape (k, 3), mm.
         cameras_ct: Shape (n, 3), mm.
         near_mm: What is nearer to a point than this does not hide it.

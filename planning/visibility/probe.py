@@ -166,7 +166,6 @@ def probe_view(context: CaseContext, plan: Plan) -> ProbeView:
 
     Args:
         context: The case, with ``[ultrasound]``.
-        plan: Its plan.
 
     Raises:
         InputError: The case declares no probe, or a stated base of its arm is in the patient.
@@ -192,7 +191,6 @@ class Footprints:
     """Footprints, a row each.
 
     Attributes:
-        skin: The body's surface.
         target_ct: Shape (3,), mm.
         T_ct_image: Shape (n, 4, 4), mm, see `ProbeView`; NaN without skin.
         depth: Shape (n,), mm, from the face to the target.
@@ -227,7 +225,6 @@ def footprints(skin: Skin, target_ct: Floats, outward_ct: Floats, depth_mm: floa
     """The footprints about a needle, those without skin, too deep and too tilted ruled out.
 
     Args:
-        skin: The body's surface.
         target_ct: Shape (3,), mm.
         outward_ct: Shape (3,), unit, from the target along the needle.
         depth_mm: How deep the probe sees.

@@ -58,13 +58,6 @@ def test_in_a_gantry_both_checkers_agree() -> None:
     assert {None, "gantry"} <= met
 
 
-@pytest.mark.parametrize("name", sorted(SIZES))
-def test_sizes_that_make_no_sense_are_refused(name: str) -> None:
-    """By name."""
-    with refused("not_positive", name):
-        gantry_boxes(TILT, **{**SIZES, name: np.nan})
-
-
 GANTRY = """
 [gantry]
 bore_diameter_mm = 700.0

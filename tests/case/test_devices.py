@@ -10,7 +10,7 @@ from refusals import refused
 
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.case_file import case_schema
-from puncture_twin.planning.case.settings import ControlScan
+from puncture_twin.planning.case.tables import ControlScanSection
 
 EVERY_KEY = """[stereo]
 cameras_mm = [[-250.0, -900.0, 300.0], [250.0, -900.0, 300.0]]
@@ -59,7 +59,7 @@ def test_the_defaults_are_those_of_the_reference(read):
     probe = case.ultrasound
     assert (probe.model.name, probe.target_sd_mm, probe.tip_sd_mm) == ("ur3", (0.3, 0.5), (0.08, 0.5))
     assert (probe.calibration_sd_mm, probe.depth_mm, probe.width_mm) == (0.07, 150.0, 40.0)
-    assert case.control_scan == ControlScan(slice_mm=2.0, target_seen=True, dose_msv=0.9, seconds=120.0)
+    assert case.control_scan == ControlScanSection(slice_mm=2.0, target_seen=True, dose_msv=0.9, seconds=120.0)
 
 
 def test_every_key_is_read(read):
@@ -70,7 +70,7 @@ def test_every_key_is_read(read):
     probe = case.ultrasound
     assert (probe.model.name, probe.target_sd_mm, probe.tip_sd_mm) == ("ur5", (0.6, 1.0), (0.3, 1.0))
     assert (probe.calibration_sd_mm, probe.depth_mm, probe.width_mm) == (0.1, 120.0, 60.0)
-    assert case.control_scan == ControlScan(slice_mm=3.0, target_seen=False, dose_msv=0.4, seconds=90.0)
+    assert case.control_scan == ControlScanSection(slice_mm=3.0, target_seen=False, dose_msv=0.4, seconds=90.0)
     T_ct_base = np.linalg.inv(probe.T_base_ct_mount)
     assert T_ct_base[:3, 3] == pytest.approx([-600.0, 20.0, -30.0])
     assert T_ct_base[:3, 2] == pytest.approx([0.0, -1.0, 0.0], abs=1e-12)

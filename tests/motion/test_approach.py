@@ -276,18 +276,6 @@ def test_a_shortcut_is_taken_only_where_its_own_check_allows() -> None:
         assert all(contact_of(*ends) is None for ends in pairwise(path))
 
 
-def test_angles_outside_the_limits_are_refused() -> None:
-    """Home and goals must be within the joint limits and finite."""
-    checker = CellChecker(UR3, TOOL)
-    beyond = LEFT + np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0])
-    with refused("joint_beyond_limits"):
-        plan_approach(checker, LEFT, beyond, seed=1)
-    with refused("joint_beyond_limits"):
-        plan_approach(checker, np.full(6, np.nan), RIGHT, seed=1)
-    with refused("joint_beyond_limits"):
-        plan_approach(checker, LEFT, np.empty((0, 6)), seed=1)
-
-
 @KINDS
 def test_the_least_clearance_is_that_of_every_state(kind: type[CellChecker]) -> None:
     """Skipping states by how far bodies moved, or by bounds, finds what measuring all of them finds, to its step."""
@@ -371,15 +359,6 @@ def test_a_rounded_corner_is_the_integral_of_its_speed() -> None:
     assert np.allclose(rounded(corner, u, w, 0.3, np.ones(1)), corner + 0.3 * w)
 
 
-def test_cuts_that_overlap_are_refused() -> None:
-    """Two roundings must leave each other room."""
-    corners = np.array([[0.0] * 6, [1.0] * 6, [2.0] * 3 + [0.0] * 3, [0.0] * 6])
-    with refused("wrong_count"):
-        follow(UR3, corners, np.array([2.0, 2.0]))
-    with refused("wrong_count"):
-        follow(UR3, corners, np.array([0.1]))
-
-
 @pytest.mark.parametrize("turn", [0.002, 0.1, 1.0, 7.5])
 def test_one_joint_runs_in_the_shortest_time(turn: float) -> None:
     """Seven phases by hand: T = L / v + v / a + a / j with the highest v and a that the length allows."""
@@ -457,15 +436,8 @@ def test_trajectories_that_make_no_sense_are_refused(times: list[float], q: np.n
         Trajectory(np.array(times), q)
 
 
-def test_time_laws_refuse_bad_numbers() -> None:
-    """Speeds and depths that make no sense are input errors, not infinities."""
-    two = np.stack([LEFT, RIGHT])
-    with refused("out_of_range"):
-        follow(UR3, two, speed_scale=0.0)
-    with refused("not_positive", "max_tip_speed"):
-        follow_smoothly(UR3, two, np.array([0.0, 1.0]), max_tip_speed_mm_s=np.nan)
-    with refused("not_rising"):
-        follow_smoothly(UR3, two, np.array([1.0, 0.0]), max_tip_speed_mm_s=1.0)
+def test_a_motion_without_motion_is_refused() -> None:
+    """A motion in which no joint moves is an input error, not an infinity."""
     with refused("no_motion"):
         follow_smoothly(UR3, np.stack([LEFT, LEFT]), np.array([0.0, 1.0]), max_tip_speed_mm_s=1.0)
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.case.settings import ControlScan, Stereo, Ultrasound
+from puncture_twin.planning.case.settings import Stereo, Ultrasound
+from puncture_twin.planning.case.tables import ControlScanSection
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.planning.uncertainty.guided import picture_root, scan_roots
 
@@ -92,7 +93,7 @@ class RoomScanner:
 
     @classmethod
     def placed(
-        cls, device: ControlScan, errors: ErrorModel, T_base_ct: Floats, count: int, rng: np.random.Generator
+        cls, device: ControlScanSection, errors: ErrorModel, T_base_ct: Floats, count: int, rng: np.random.Generator
     ) -> RoomScanner:
         """Scanners in so many rooms."""
         tip, target = scan_roots(device, errors)

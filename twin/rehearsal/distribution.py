@@ -29,7 +29,7 @@ from puncture_twin.planning.budget.guidance import (
 )
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.case.settings import ControlScan
+from puncture_twin.planning.case.tables import ControlScanSection
 from puncture_twin.planning.clearance.engine import normals_of
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.reach.standoff import case_axis_lengths
@@ -246,7 +246,7 @@ def rehearse_trials(
     return replace(found, stepwise=_stepwise(case.control_scan, steps, done, open_loop))
 
 
-def _stepwise(scan: ControlScan | None, steps: int, done: GuidedTrials, open_loop: Distribution) -> Stepwise:
+def _stepwise(scan: ControlScanSection | None, steps: int, done: GuidedTrials, open_loop: Distribution) -> Stepwise:
     """Of trials; one that was stopped had its last scan where the correction was refused."""
     assert scan is not None
     went = np.isfinite(done.moved_mm)

@@ -156,7 +156,6 @@ class CtImage:
         hu: Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head; of 16 bits
             where the file has such, else of single precision.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
-        shown: What a person says that it shows.
         as_stored: Shape of ``hu``, as the file has them, where that differs.
         not_measured: Shape of ``hu``, what was not, where that is known.
     """

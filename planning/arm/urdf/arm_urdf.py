@@ -116,7 +116,6 @@ class ArmUrdf:
     """A URDF that was found to be of an arm built as a UR.
 
     Attributes:
-        text: The file's bytes.
         chain: The document's six joints and seven bodies.
         lengths_mm: d1, a2, a3, d4, d5, d6.
         T_base_root: Shape (4, 4), mm: the URDF's root in the controller's base frame.
@@ -162,8 +161,6 @@ def read_arm_urdf(data: bytes, where: Path, *, flange: str, read: Read, T_base_r
     """The arm of a URDF.
 
     Args:
-        data: The file's bytes.
-        flange: Name of the link that carries the needle.
         read: Reads a mesh file by its address in the URDF.
         T_base_root: Shape (4, 4), mm: the root in the controller's base frame, where the URDF does not say it.
 

@@ -91,8 +91,6 @@ class UrdfJoint:
 
     Attributes:
         kind: One of ``JOINTS``.
-        parent: Name of the link before it.
-        child: Name of the link that it moves.
         T_parent_child: Shape (4, 4), mm, at the angle zero.
         axis: Shape (3,), unit, in the child's frame.
         limits: Those of ``LIMITS`` that are stated: rad, rad/s, N m.
@@ -120,12 +118,6 @@ class UrdfDocument:
     links: Mapping[str, UrdfLink]
     joints: tuple[UrdfJoint, ...]
     where: Path
-
-    @property
-    def addresses(self) -> tuple[str, ...]:
-        """Every mesh file that a collision shape names, once, as it is named."""
-        shapes = [shape for link in self.links.values() for shape in link.collisions]
-        return tuple(dict.fromkeys(shape.address for shape in shapes if shape.kind == "mesh"))
 
 
 def parse_urdf(data: bytes, where: Path) -> UrdfDocument:

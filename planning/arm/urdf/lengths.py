@@ -325,9 +325,6 @@ class ArmChain:
 def arm_chain(document: UrdfDocument, flange: str) -> ArmChain:
     """The chain from the URDF's root to the flange.
 
-    Args:
-        flange: Name of the link that carries the needle.
-
     Raises:
         InputError: There is no such link, the links are no tree, or other joints than six that turn.
     """

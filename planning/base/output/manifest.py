@@ -46,7 +46,6 @@ class ManifestEntry:
     """What one command wrote.
 
     Attributes:
-        inputs: Every file that decided the result, with role and hash.
         depends_on: Entries of the same folder without which this one means nothing.
         files: File name, relative to the folder with ``/``, to SHA-256.
     """
@@ -126,9 +125,6 @@ class Output(NamedTuple):
 
 def read_output(path: Path, *, max_bytes: int) -> Output:
     """Read what an earlier command wrote, and refuse it where its folder's manifest tells otherwise.
-
-    Args:
-        max_bytes: A larger file is something else.
 
     Raises:
         InputError: It cannot be read, is too large, or lies in a set that does not list these bytes: the set is

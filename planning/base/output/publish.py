@@ -32,14 +32,7 @@ from types import FrameType
 from typing import Any
 
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.base.output.manifest import (
-    MANIFEST_NAME,
-    MAX_MANIFEST_BYTES,
-    TIMINGS_NAME,
-    Manifest,
-    ManifestEntry,
-    file_digest,
-)
+from puncture_twin.planning.base.output import manifest
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.base.strict_json import read_json
 
@@ -56,33 +49,33 @@ def publish(draft: Draft, started: datetime) -> None:
     refuse_foreign(draft, files)
     kept = {name: entry for name, entry in old.entries.items() if name not in gone}
     left = files.union(old.unfinished, *(old.entries[name].files for name in gone))
-    (state / "before").write_text(Manifest(kept, tuple(sorted(left))).text(), encoding="utf-8")
-    (state / "after").write_text(Manifest({**kept, **new}).text(), encoding="utf-8")
+    (state / "before").write_text(manifest.Manifest(kept, tuple(sorted(left))).text(), encoding="utf-8")
+    (state / "after").write_text(manifest.Manifest({**kept, **new}).text(), encoding="utf-8")
     timings = with_timings(out, kept, draft.command, started, draft.seconds)
     (state / "timings").write_text(timings, encoding="utf-8")
     with uninterrupted():
-        (state / "before").replace(out / MANIFEST_NAME)
+        (state / "before").replace(out / manifest.MANIFEST_NAME)
         for name in sorted(files):
             (out / name).parent.mkdir(parents=True, exist_ok=True)
             (draft.folder / name).replace(out / name)
         _remove(out, left - files)
-        (state / "timings").replace(out / TIMINGS_NAME)
-        (state / "after").replace(out / MANIFEST_NAME)
+        (state / "timings").replace(out / manifest.TIMINGS_NAME)
+        (state / "after").replace(out / manifest.MANIFEST_NAME)
     others = gone - {draft.command, *new} - _dependents(old, {draft.command, *new})
     _report_outdated(draft, {name for entry in gone - others for name in old.entries[entry].files} - files)
     _report_removed(draft, others)
 
 
-def _entries(draft: Draft) -> dict[str, ManifestEntry]:
+def _entries(draft: Draft) -> dict[str, manifest.ManifestEntry]:
     """The new entries, from the files in the draft."""
     files: dict[str, dict[str, str]] = {draft.command: {}}
     for path in sorted(draft.folder.rglob("*")):
         if path.is_file():
             name = path.relative_to(draft.folder).as_posix()
-            files.setdefault(draft.parts.get(name, draft.command), {})[name] = file_digest(path)
+            files.setdefault(draft.parts.get(name, draft.command), {})[name] = manifest.file_digest(path)
     own = version("puncture-twin")
     return {
-        name: ManifestEntry(
+        name: manifest.ManifestEntry(
             own, tuple(draft.inputs), draft.depends_on if name == draft.command else (draft.command,), listed
         )
         for name, listed in files.items()
@@ -90,13 +83,13 @@ def _entries(draft: Draft) -> dict[str, ManifestEntry]:
     }
 
 
-def _gone(old: Manifest, new: set[str], files: set[str]) -> set[str]:
+def _gone(old: manifest.Manifest, new: set[str], files: set[str]) -> set[str]:
     """The old entries that a new one replaces, robs of a file, or leaves without what they depend on."""
     gone = {name for name, entry in old.entries.items() if name in new or files & set(entry.files)}
     return gone | _dependents(old, gone)
 
 
-def _dependents(old: Manifest, names: set[str]) -> set[str]:
+def _dependents(old: manifest.Manifest, names: set[str]) -> set[str]:
     """The entries that depend on some, directly or through others."""
     found: set[str] = set()
     while more := {name for name, entry in old.entries.items() if {*names, *found} & set(entry.depends_on)} - found:
@@ -111,9 +104,9 @@ def refuse_foreign(draft: Draft, files: Iterable[str]) -> None:
         InputError: Names the first such file.
     """
     known = {*draft.old.files, *draft.old.unfinished}
-    if (draft.out / MANIFEST_NAME).exists():
-        known.add(TIMINGS_NAME)
-    for name in sorted({*files, TIMINGS_NAME} - known):
+    if (draft.out / manifest.MANIFEST_NAME).exists():
+        known.add(manifest.TIMINGS_NAME)
+    for name in sorted({*files, manifest.TIMINGS_NAME} - known):
         foreign = _foreign_entry(draft.out, name)
         if foreign is not None:
             what = f"{name} would be written, but the existing file {foreign} is not from this program"
@@ -181,7 +174,7 @@ def with_timings(
     Args:
         kept: Commands whose entries stay, and so their timings.
     """
-    before = _read(folder / TIMINGS_NAME)
+    before = _read(folder / manifest.TIMINGS_NAME)
     timings = {name: before[name] for name in kept if name in before}
     timings[command] = {
         "started": started.isoformat(timespec="seconds"),
@@ -193,7 +186,7 @@ def with_timings(
 def _read(path: Path) -> dict[str, Any]:
     """Bytes of a file; nothing where it cannot be read: no result depends on it."""
     try:
-        document = read_json(path, max_bytes=MAX_MANIFEST_BYTES, allowed="timings")
+        document = read_json(path, max_bytes=manifest.MAX_MANIFEST_BYTES, allowed="timings")
     except InputError:
         return {}
     return document if isinstance(document, dict) else {}
@@ -212,7 +205,6 @@ class Draft:
         depends_on: Entries of the output folder that these files are made from.
         parts: Files that go to an entry of another name than the command's.
         seconds: How long each stage took, for ``timings.json``; read at the end.
-        note: Told what was removed that nobody might expect.
     """
 
     command: str
@@ -221,7 +213,7 @@ class Draft:
     inputs: Sequence[Input]
     seconds: Mapping[str, float]
     note: Callable[[str], None]
-    old: Manifest
+    old: manifest.Manifest
     depends_on: tuple[str, ...] = ()
     parts: dict[str, str] = field(default_factory=dict)
 

@@ -53,10 +53,7 @@ class CtSeries:
     """A CT series in one folder. Its headers are read once, its pixels at each call of `volume`.
 
     Attributes:
-        path: What was named: the folder, or a file in it.
         files: Every file of the series, by its key in ``content``.
-        content: Gives the bytes of each.
-        aside: What else lies in the folder, one sentence.
     """
 
     path: Path

@@ -26,9 +26,7 @@ class MaskVolume:
 
     Attributes:
         files: Every file that decides it, by its key in ``content``: also the CT's, where it lies on its grid.
-        part: Which structure of the file it is.
         grid: Where the voxels lie, LPS mm; sheared where the CT's gantry was tilted.
-        make: Makes the voxels, of the grid's shape.
     """
 
     path: Path
@@ -45,11 +43,7 @@ class MaskVolume:
 
 @dataclass(frozen=True, eq=False)
 class NamedMasks:
-    """Named structures of one file as masks.
-
-    Attributes:
-        notes: Notes for a person, one sentence each.
-    """
+    """Named structures of one file as masks."""
 
     masks: dict[str, MaskVolume]
     notes: tuple[str, ...]

@@ -37,8 +37,6 @@ class PixelLayout:
 
     Attributes:
         frames: Images in the file.
-        rows: Of each.
-        columns: Of each.
         allocated: Bits of a cell.
         stored: Of them, the bits of a value: the lowest.
         signed: Whether values are two's complements.

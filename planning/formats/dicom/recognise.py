@@ -16,26 +16,7 @@ from pydicom.uid import UID
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import is_folder, read_input
 from puncture_twin.planning.base.text import first_few
-from puncture_twin.planning.formats.dicom.dicom_file import (
-    has,
-    parse_dicom,
-    read_meta,
-    refuse_big_endian,
-    refused_if_damaged,
-    sop_class_of,
-    text,
-    texts,
-)
-from puncture_twin.planning.formats.dicom.storage import (
-    BIG_ENDIAN,
-    DEFLATED,
-    IMPLICIT,
-    META_START,
-    Kind,
-    is_dicom,
-    is_dicom_file,
-    kind_of,
-)
+from puncture_twin.planning.formats.dicom import dicom_file, storage
 from puncture_twin.planning.formats.folder import FILE, FOLDER, HIDDEN, Entry, entries, unaccounted
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 
@@ -61,9 +42,7 @@ class DicomFile:
     """A DICOM file by its header.
 
     Attributes:
-        name: The file's name in its folder.
         sop_class: What the standard calls this class.
-        series_uid: The series that it belongs to.
         series: Its number and description, as a person knows it.
         frame_of_reference: The coordinates in which it lies, or the empty string.
         is_slice: Whether it is a CT image, and no scout or page of text.
@@ -71,7 +50,7 @@ class DicomFile:
     """
 
     name: str
-    kind: Kind
+    kind: storage.Kind
     sop_class: str
     series_uid: str
     series: str
@@ -88,14 +67,14 @@ def recognise(path: Path) -> DicomFile | None:
     """
     try:
         with path.open("rb") as stream:
-            if not is_dicom(stream.read(META_START)):
+            if not storage.is_dicom(stream.read(storage.META_START)):
                 return None
-            with refused_if_damaged(path):
-                meta = read_meta(stream)
+            with dicom_file.refused_if_damaged(path):
+                meta = dicom_file.read_meta(stream)
                 syntax = meta.TransferSyntaxUID
-                if syntax == BIG_ENDIAN:
+                if syntax == storage.BIG_ENDIAN:
                     return _big_endian(meta, path)
-                header = None if syntax == DEFLATED else _header(stream, implicit=syntax == IMPLICIT)
+                header = None if syntax == storage.DEFLATED else _header(stream, implicit=syntax == storage.IMPLICIT)
                 if header is not None:
                     header.file_meta = meta
     except OSError as error:
@@ -103,7 +82,7 @@ def recognise(path: Path) -> DicomFile | None:
         raise InputError(what, where=path, allowed="a readable file", code="unreadable") from error
     if header is None:
         content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
-        return described(parse_dicom(content, path), path)
+        return described(dicom_file.parse_dicom(content, path), path)
     return described(header, path)
 
 
@@ -113,10 +92,10 @@ def _big_endian(meta: FileMetaDataset, path: Path) -> DicomFile:
     Raises:
         InputError: It may be: no value of such a file is read.
     """
-    sop_class = text(meta, "MediaStorageSOPClassUID", where=str(path))
-    if not sop_class or kind_of(sop_class) is not Kind.OTHER:
-        refuse_big_endian(path)
-    return DicomFile(path.name, Kind.OTHER, UID(sop_class).name, "", "big endian", "", is_slice=False, date="")
+    sop_class = dicom_file.text(meta, "MediaStorageSOPClassUID", where=str(path))
+    if not sop_class or storage.kind_of(sop_class) is not storage.Kind.OTHER:
+        dicom_file.refuse_big_endian(path)
+    return DicomFile(path.name, storage.Kind.OTHER, UID(sop_class).name, "", "big endian", "", is_slice=False, date="")
 
 
 def described(data: Dataset, path: Path) -> DicomFile:
@@ -126,28 +105,34 @@ def described(data: Dataset, path: Path) -> DicomFile:
         InputError: Its header is damaged.
     """
     where = str(path)
-    sop_class = sop_class_of(data, where=where)
-    kind = kind_of(sop_class)
-    with refused_if_damaged(path):
+    sop_class = dicom_file.sop_class_of(data, where=where)
+    kind = storage.kind_of(sop_class)
+    with dicom_file.refused_if_damaged(path):
         called = UID(sop_class).name if sop_class else "no SOP class"
-    number, description = (text(data, keyword, where=where) for keyword in ("SeriesNumber", "SeriesDescription"))
-    types = {part.upper() for part in texts(data, "ImageType", where=where)}
-    placed = has(data, "ImagePositionPatient") or has(data, "ImageOrientationPatient") or "SECONDARY" not in types
+    number, description = (
+        dicom_file.text(data, keyword, where=where) for keyword in ("SeriesNumber", "SeriesDescription")
+    )
+    types = {part.upper() for part in dicom_file.texts(data, "ImageType", where=where)}
+    placed = (
+        dicom_file.has(data, "ImagePositionPatient")
+        or dicom_file.has(data, "ImageOrientationPatient")
+        or "SECONDARY" not in types
+    )
     return DicomFile(
         name=path.name,
         kind=kind,
         sop_class=called,
-        series_uid=text(data, "SeriesInstanceUID", where=where),
+        series_uid=dicom_file.text(data, "SeriesInstanceUID", where=where),
         series=f"{number or '?'} {description or 'without description'}",
-        frame_of_reference=text(data, "FrameOfReferenceUID", where=where),
-        is_slice=kind is Kind.CT and placed and not types & NO_SLICES,
+        frame_of_reference=dicom_file.text(data, "FrameOfReferenceUID", where=where),
+        is_slice=kind is storage.Kind.CT and placed and not types & NO_SLICES,
         date=_date(data, where),
     )
 
 
 def _date(data: Dataset, where: str) -> str:
     """Date of the acquisition, else of its series or study: eight digits, or none."""
-    stated = (text(data, keyword, where=where) for keyword in ("AcquisitionDate", "SeriesDate", "StudyDate"))
+    stated = (dicom_file.text(data, keyword, where=where) for keyword in ("AcquisitionDate", "SeriesDate", "StudyDate"))
     plain = next((one for one in stated if len(one) == DATE_DIGITS and one.isascii() and one.isdigit()), "")
     return plain and f"{plain[:4]}-{plain[4:6]}-{plain[6:]}"
 
@@ -192,9 +177,6 @@ class SeriesFiles:
 def choose_series(path: Path) -> SeriesFiles:
     """The files of the CT series that a path means.
 
-    Args:
-        path: A folder that holds one CT series, or a file of the series.
-
     Raises:
         InputError: No CT series there, several, or a file that is no slice of one.
     """
@@ -229,7 +211,7 @@ def _may_be_slice(one: Entry, names: Sequence[str]) -> bool:
 
 def _holds_dicom(folder: Path) -> bool:
     """Whether slices may lie in a folder next to the series, by its first files."""
-    return any(is_dicom_file(folder / one.name) for one in entries(folder, most=MAX_FILES)[:LOOKED_AT])
+    return any(storage.is_dicom_file(folder / one.name) for one in entries(folder, most=MAX_FILES)[:LOOKED_AT])
 
 
 def _check_one_series(
@@ -254,7 +236,9 @@ def _check_one_series(
 
 
 def _notes(aside: Sequence[DicomFile], below: Sequence[Entry], path: Path) -> tuple[str, ...]:
-    kinds = Counter(f"{one.sop_class} '{one.series}'" if one.kind is Kind.CT else one.sop_class for one in aside)
+    kinds = Counter(
+        f"{one.sop_class} '{one.series}'" if one.kind is storage.Kind.CT else one.sop_class for one in aside
+    )
     shown = [*(f"{count} {name}" for name, count in kinds.most_common()), *(f"DICOM in {one.name}" for one in below)]
     return (f"{path.name}: other files next to the CT series were left out: {first_few(shown)}",) if shown else ()
 

@@ -12,25 +12,8 @@ from pydicom.dataset import Dataset
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.formats.dicom import dicom_file, named_masks
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
-from puncture_twin.planning.formats.dicom.dicom_file import (
-    has,
-    how_to_convert,
-    items,
-    name,
-    number,
-    parse_dicom,
-    sop_class_of,
-    text,
-    whole,
-)
-from puncture_twin.planning.formats.dicom.named_masks import (
-    Mask,
-    MaskVolume,
-    NamedMasks,
-    check_frame_of_reference,
-    unique_names,
-)
 from puncture_twin.planning.formats.dicom.pixels import check_length, sizes
 from puncture_twin.planning.formats.dicom.slices import (
     AXES_TOLERANCE,
@@ -78,49 +61,55 @@ class _Placed:
     offset: tuple[int, int, int]
 
 
-def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | None) -> NamedMasks:
+def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | None) -> named_masks.NamedMasks:
     """The segments of a DICOM SEG, each by its label.
 
     Args:
         file: The file's key in ``content``.
-        content: Gives its bytes.
         ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
 
     Raises:
         InputError: No segmentation, one that cannot be trusted, or one of another frame of reference.
     """
-    data = parse_dicom(content(file), path)
+    data = dicom_file.parse_dicom(content(file), path)
     where = path.name
-    if (sop_class := sop_class_of(data, where=where)) != SEGMENTATION:
+    if (sop_class := dicom_file.sop_class_of(data, where=where)) != SEGMENTATION:
         refuse(f"SOP class {sop_class or 'missing'}", path, "a DICOM SEG", "wrong_format")
     kind = _checked_kind(data, path)
     if ct is not None:
-        check_frame_of_reference(text(data, "FrameOfReferenceUID", where=where), ct, path)
+        named_masks.check_frame_of_reference(dicom_file.text(data, "FrameOfReferenceUID", where=where), ct, path)
     names = _names(data, where)
-    unique_names(list(names.values()), path)
+    named_masks.unique_names(list(names.values()), path)
     frames = _frames(data, names, ct, path)
     placed = _placed(frames, ct, path)
     files = (file,) if ct is None else (file, *ct.files)
     masks = {
-        called: MaskVolume(path, files, (called,), placed.grid, partial(_mask, data, frames, placed, segment, path))
+        called: named_masks.MaskVolume(
+            path, files, (called,), placed.grid, partial(_mask, data, frames, placed, segment, path)
+        )
         for segment, called in names.items()
     }
     notes = [] if ct else [f"{where}: the case's CT is not a DICOM series, so this may belong to another CT"]
     if kind == "FRACTIONAL":
         notes.append(f"{where}: fractional segments; voxels of {HALF:g} or more count")
-    return NamedMasks(masks, tuple(notes))
+    return named_masks.NamedMasks(masks, tuple(notes))
 
 
 def _checked_kind(data: Dataset, path: Path) -> str:
     where = path.name
-    kind = text(data, "SegmentationType", where=where)
+    kind = dicom_file.text(data, "SegmentationType", where=where)
     if kind not in ("BINARY", "FRACTIONAL"):
-        refuse(f"{name('SegmentationType')} is {kind or 'missing'}", path, "BINARY, FRACTIONAL", "unsupported_feature")
+        refuse(
+            f"{dicom_file.name('SegmentationType')} is {kind or 'missing'}",
+            path,
+            "BINARY, FRACTIONAL",
+            "unsupported_feature",
+        )
     if data.file_meta.TransferSyntaxUID not in PLAIN:
         syntax = data.file_meta.TransferSyntaxUID
-        refuse(f"transfer syntax {syntax.name} ({syntax})", path, how_to_convert(), "transfer_syntax")
+        refuse(f"transfer syntax {syntax.name} ({syntax})", path, dicom_file.how_to_convert(), "transfer_syntax")
     bits = 1 if kind == "BINARY" else 8
-    whole(data, "BitsAllocated", low=bits, high=bits, where=where)
+    dicom_file.whole(data, "BitsAllocated", low=bits, high=bits, where=where)
     rows, columns, count = sizes(data, where)
     check_length(data, (rows * columns * count * bits + 7) // 8, where)
     return kind
@@ -128,11 +117,11 @@ def _checked_kind(data: Dataset, path: Path) -> str:
 
 def _names(data: Dataset, where: str) -> dict[int, str]:
     found: dict[int, str] = {}
-    for item in items(data, "SegmentSequence", where=where):
-        segment = whole(item, "SegmentNumber", low=1, high=65535, where=where)
+    for item in dicom_file.items(data, "SegmentSequence", where=where):
+        segment = dicom_file.whole(item, "SegmentNumber", low=1, high=65535, where=where)
         if segment in found:
             refuse(f"two segments have the number {segment}", where, "each number once", "duplicate_number")
-        found[segment] = text(item, "SegmentLabel", where=where)
+        found[segment] = dicom_file.text(item, "SegmentLabel", where=where)
     return found
 
 
@@ -153,7 +142,7 @@ def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
     found = groups.find("SegmentIdentificationSequence", label)
     if len(found) != 1:
         refuse(f"{len(found)} items state its segment", label, "one", "wrong_count")
-    segment = whole(found[0], "ReferencedSegmentNumber", low=1, high=65535, where=label)
+    segment = dicom_file.whole(found[0], "ReferencedSegmentNumber", low=1, high=65535, where=label)
     if segment not in names:
         refuse(f"is of segment {segment}, which is not listed", label, f"{sorted(names)}"[:200], "unknown_segment")
     return segment
@@ -162,12 +151,12 @@ def _segment(groups: Groups, label: str, names: dict[int, str]) -> int:
 def _stated_step(groups: Groups, where: str, ct: CtSeries | None) -> float | None:
     """Distance of slices by header or CT, mm; not the slice thickness, which may be thinner."""
     measures = groups.holder("PixelMeasuresSequence", where)
-    if has(measures, "SpacingBetweenSlices"):
-        step = number(measures, "SpacingBetweenSlices", where=where)
+    if dicom_file.has(measures, "SpacingBetweenSlices"):
+        step = dicom_file.number(measures, "SpacingBetweenSlices", where=where)
     elif ct is not None:
         step = float(ct.stack.step_ct @ ct.stack.plane.normal_ct)
-    elif has(measures, "SliceThickness"):
-        step = number(measures, "SliceThickness", where=where)
+    elif dicom_file.has(measures, "SliceThickness"):
+        step = dicom_file.number(measures, "SliceThickness", where=where)
     else:
         return None
     return step if MIN_SPACING_MM <= step <= MAX_SPACING_MM else None
@@ -236,7 +225,7 @@ def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:
     return _Placed(VolumeGrid(check_shape((*own[:2], max(own[2], 2)), where=path), frames.T_ct_index, {}), (0, 0, 0))
 
 
-def _mask(data: Dataset, frames: _Frames, placed: _Placed, segment: int, path: Path) -> Mask:
+def _mask(data: Dataset, frames: _Frames, placed: _Placed, segment: int, path: Path) -> named_masks.Mask:
     made = np.zeros(placed.grid.shape, np.uint8, order="F")
     i, j, k = placed.offset
     for frame in np.flatnonzero(frames.segments == segment).tolist():
@@ -245,11 +234,11 @@ def _mask(data: Dataset, frames: _Frames, placed: _Placed, segment: int, path: P
     return made
 
 
-def _image(data: Dataset, frame: int, rows: int, columns: int, path: Path) -> Mask:
+def _image(data: Dataset, frame: int, rows: int, columns: int, path: Path) -> named_masks.Mask:
     """One frame, shape (rows, columns), 0 and 1; bits are packed over frames without a gap, the lowest first."""
     count = rows * columns
-    if text(data, "SegmentationType", where=path.name) == "FRACTIONAL":
-        highest = whole(data, "MaximumFractionalValue", low=1, high=255, where=path.name)
+    if dicom_file.text(data, "SegmentationType", where=path.name) == "FRACTIONAL":
+        highest = dicom_file.whole(data, "MaximumFractionalValue", low=1, high=255, where=path.name)
         cells = np.frombuffer(data.PixelData, np.uint8, count, frame * count)
         return (cells >= HALF * highest).astype(np.uint8).reshape(rows, columns)
     first, last = frame * count // 8, ((frame + 1) * count + 7) // 8

@@ -61,8 +61,6 @@ class Slice:
     Attributes:
         file: The file's key in ``content``.
         frame: Its number in the file, from 0.
-        label: How a person finds it.
-        plane: Where it lies.
         slope: What a stored value is multiplied with.
         intercept: What is added then; the sum is in Hounsfield units.
     """
@@ -79,8 +77,6 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     """The slices of a CT file; scouts among the frames of an enhanced one are left out.
 
     Args:
-        data: The file's data set.
-        file: Its name.
         frames: How many images it holds.
 
     Raises:

@@ -16,24 +16,8 @@ from skimage.morphology import convex_hull_image
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import first_few
+from puncture_twin.planning.formats.dicom import dicom_file, named_masks
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
-from puncture_twin.planning.formats.dicom.dicom_file import (
-    has,
-    items,
-    name,
-    parse_dicom,
-    refused_if_damaged,
-    sop_class_of,
-    text,
-    whole,
-)
-from puncture_twin.planning.formats.dicom.named_masks import (
-    Mask,
-    MaskVolume,
-    NamedMasks,
-    check_frame_of_reference,
-    unique_names,
-)
 from puncture_twin.planning.formats.dicom.storage import STRUCTURE_SET
 from puncture_twin.planning.formats.volumes.volume_files import Content
 from puncture_twin.planning.formats.volumes.volume_header import MAX_ORIGIN_MM, VolumeGrid, check_shape
@@ -70,7 +54,7 @@ class _Region:
     others: int
 
 
-def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -> NamedMasks:
+def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -> named_masks.NamedMasks:
     """The regions of an RTSTRUCT, each by its name, on the slices of a CT.
 
     A slice between two contoured ones is filled with what either of them encloses, where they overlap: programs leave
@@ -79,26 +63,27 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
 
     Args:
         file: The file's key in ``content``.
-        content: Gives its bytes.
 
     Raises:
         InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that
             lie off the CT's slices.
     """
-    data = parse_dicom(content(file), path)
+    data = dicom_file.parse_dicom(content(file), path)
     where = path.name
-    if (sop_class := sop_class_of(data, where=where)) != STRUCTURE_SET:
+    if (sop_class := dicom_file.sop_class_of(data, where=where)) != STRUCTURE_SET:
         refuse(f"SOP class {sop_class or 'missing'}", path, "a DICOM RTSTRUCT", "wrong_format")
     names = _names(data, ct, path)
-    unique_names(list(names.values()), path)
+    named_masks.unique_names(list(names.values()), path)
     grid = _slices_grid(ct)
     regions = _regions(data, names, grid, path)
     files = (file, *ct.files)
     masks = {
-        called: MaskVolume(path, files, (called,), grid, partial(_mask, regions[roi].contours, grid.shape))
+        called: named_masks.MaskVolume(path, files, (called,), grid, partial(_mask, regions[roi].contours, grid.shape))
         for roi, called in names.items()
     }
-    return NamedMasks(masks, tuple(_notes({names[roi]: region for roi, region in regions.items()}, grid, where)))
+    return named_masks.NamedMasks(
+        masks, tuple(_notes({names[roi]: region for roi, region in regions.items()}, grid, where))
+    )
 
 
 def _slices_grid(ct: CtSeries) -> VolumeGrid:
@@ -108,28 +93,32 @@ def _slices_grid(ct: CtSeries) -> VolumeGrid:
 
 def _names(data: Dataset, ct: CtSeries, path: Path) -> dict[int, str]:
     found: dict[int, str] = {}
-    for item in items(data, "StructureSetROISequence", where=path.name):
-        roi = whole(item, "ROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
+    for item in dicom_file.items(data, "StructureSetROISequence", where=path.name):
+        roi = dicom_file.whole(item, "ROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
         if roi in found:
             refuse(f"two regions have the number {roi}", path, "each number once", "duplicate_number")
-        check_frame_of_reference(text(item, "ReferencedFrameOfReferenceUID", where=path.name), ct, path)
-        found[roi] = text(item, "ROIName", where=path.name)
+        named_masks.check_frame_of_reference(
+            dicom_file.text(item, "ReferencedFrameOfReferenceUID", where=path.name), ct, path
+        )
+        found[roi] = dicom_file.text(item, "ROIName", where=path.name)
     return found
 
 
 def _regions(data: Dataset, names: dict[int, str], grid: VolumeGrid, path: Path) -> dict[int, _Region]:
     found: dict[int, _Region] = {}
-    if not has(data, "ROIContourSequence"):
-        refuse(f"{name('ROIContourSequence')} is missing: was the file cut?", path, "contours", "missing_tag")
+    if not dicom_file.has(data, "ROIContourSequence"):
+        refuse(
+            f"{dicom_file.name('ROIContourSequence')} is missing: was the file cut?", path, "contours", "missing_tag"
+        )
     T_index_ct = np.asarray(np.linalg.inv(grid.T_ct_index), np.float64)
-    for item in items(data, "ROIContourSequence", where=path.name):
-        roi = whole(item, "ReferencedROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
+    for item in dicom_file.items(data, "ROIContourSequence", where=path.name):
+        roi = dicom_file.whole(item, "ReferencedROINumber", low=-(2**31), high=2**31 - 1, where=path.name)
         if roi not in names or roi in found:
             what = f"contours of region {roi}, which is {'listed twice' if roi in found else 'not listed'}"
             refuse(what, path, "one list of contours for each region", "unknown_region")
         label = f"{path.name}, {names[roi]!r}"
-        listed = items(item, "ContourSequence", where=label)
-        closed = [one for one in listed if text(one, "ContourGeometricType", where=label) in CLOSED]
+        listed = dicom_file.items(item, "ContourSequence", where=label)
+        closed = [one for one in listed if dicom_file.text(one, "ContourGeometricType", where=label) in CLOSED]
         contours = tuple(_contour(one, T_index_ct, grid, label) for one in closed)
         found[roi] = _Region(contours, len(listed) - len(closed))
     return {roi: found.get(roi, _Region((), 0)) for roi in names}
@@ -154,7 +143,7 @@ def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) ->
 
 def _points(item: Dataset, label: str) -> Floats:
     """The points of a contour, shape (n, 3), LPS mm; split here, as the library takes microseconds a number."""
-    with refused_if_damaged(f"{label}: {name('ContourData')}"):
+    with dicom_file.refused_if_damaged(f"{label}: {dicom_file.name('ContourData')}"):
         raw = item.get_item("ContourData")
         stored = raw.value if isinstance(raw, RawDataElement) else None
         parts = bytes(stored or b"").rstrip(b" \0").split(b"\\")
@@ -162,13 +151,13 @@ def _points(item: Dataset, label: str) -> Floats:
     count = len(flat) // 3
     if len(flat) != 3 * count or not 3 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
         allowed = "three finite numbers for each of at least three points"
-        refuse(f"{name('ContourData')} has {len(flat)} numbers", label, allowed, "wrong_count")
-    if has(item, "NumberOfContourPoints"):
-        whole(item, "NumberOfContourPoints", low=count, high=count, where=label)
+        refuse(f"{dicom_file.name('ContourData')} has {len(flat)} numbers", label, allowed, "wrong_count")
+    if dicom_file.has(item, "NumberOfContourPoints"):
+        dicom_file.whole(item, "NumberOfContourPoints", low=count, high=count, where=label)
     return flat.reshape(-1, 3)
 
 
-def _mask(contours: tuple[Contour, ...], shape: tuple[int, int, int]) -> Mask:
+def _mask(contours: tuple[Contour, ...], shape: tuple[int, int, int]) -> named_masks.Mask:
     made = np.zeros(shape, np.uint8, order="F")
     for number in {one.slice for one in contours}:
         made[:, :, number] = _slice_mask([one for one in contours if one.slice == number], shape[:2])

@@ -109,7 +109,6 @@ class LabelRule:
     """Rule of one label that is present.
 
     Attributes:
-        kind: What the case wants of it.
         margin_mm: The clearance that an avoided or unknown structure demands; 0 for the other kinds.
     """
 
@@ -196,7 +195,6 @@ def select(
     Args:
         avoid: Pattern to margin in mm.
         unknown: Patterns of structures of which it is unknown whether a path may cross them.
-        ignore: Patterns of what does not count.
         all_named: Whether ``names`` holds every name that can occur, so that a pattern of none is a slip.
 
     Raises:

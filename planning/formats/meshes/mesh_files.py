@@ -235,7 +235,6 @@ def read_mesh(
     about x, so that z is; of a GLB it must be stated.
 
     Args:
-        path: An STL, OBJ, PLY, GLB, VTP or VTK file.
         unit: The unit of its coordinates.
         space_is_default: Whether a patient space that the file states holds instead of ``space``.
         up: Its axis that is up in the file; without it, z of all but GLB.

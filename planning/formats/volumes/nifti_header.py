@@ -14,14 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.planning.formats.volumes.volume_header import (
-    VolumeHeader,
-    VoxelLayout,
-    check_affine,
-    check_shape,
-    corner_deviation_mm,
-    first_bytes,
-)
+from puncture_twin.planning.formats.volumes import volume_header
 
 HEADER_BYTES = 348
 FIRST_VOXEL_BYTE = 352
@@ -61,7 +54,7 @@ class _Fields:
     srow: tuple[float, ...]
 
 
-def parse_nifti_header(content: bytes, path: Path) -> VolumeHeader:
+def parse_nifti_header(content: bytes, path: Path) -> volume_header.VolumeHeader:
     """What the header of a file says; of a .nii.gz no more than the header is inflated.
 
     Where sform and qform are both given they must agree, so that it does not matter which one a program takes
@@ -72,21 +65,25 @@ def parse_nifti_header(content: bytes, path: Path) -> VolumeHeader:
     """
     compressed = path.name.lower().endswith(".gz")
     start = memoryview(content)
-    head = first_bytes(start, HEADER_BYTES, where=path, allowed=PLAIN) if compressed else content[:HEADER_BYTES]
+    head = (
+        volume_header.first_bytes(start, HEADER_BYTES, where=path, allowed=PLAIN)
+        if compressed
+        else content[:HEADER_BYTES]
+    )
     fields = _parse(head, path)
     shape = _shape(fields, path)
     if BITS_OF_DATATYPE.get(fields.datatype) != fields.bitpix:
         what = f"datatype {fields.datatype} with {fields.bitpix} bits"
         refuse(what, path, f"(datatype: bits) {BITS_OF_DATATYPE}", "unknown_type")
     slope, intercept = _scaling(fields, path)
-    T_ct_index = check_affine(_affine(fields, shape, path), where=path)
+    T_ct_index = volume_header.check_affine(_affine(fields, shape, path), where=path)
     offset = fields.vox_offset
     if not (np.isfinite(offset) and offset >= FIRST_VOXEL_BYTE and offset == int(offset)):
         refuse(f"vox_offset {offset}", path, f"a whole number >= {FIRST_VOXEL_BYTE}", "out_of_range")
     dtype = np.dtype(fields.order + TYPES[fields.datatype])
     encoding = "gzip" if compressed else "raw"
-    cells = VoxelLayout(dtype, encoding, offset=int(offset), slope=slope, intercept=intercept)
-    return VolumeHeader(shape, T_ct_index, {}, cells, path)
+    cells = volume_header.VoxelLayout(dtype, encoding, offset=int(offset), slope=slope, intercept=intercept)
+    return volume_header.VolumeHeader(shape, T_ct_index, {}, cells, path)
 
 
 def _scaling(fields: _Fields, path: Path) -> tuple[float, float]:
@@ -134,7 +131,7 @@ def _shape(fields: _Fields, path: Path) -> tuple[int, int, int]:
     if not 3 <= count <= 7 or set(fields.dim[4 : count + 1]) - {1}:
         allowed = "one volume with 3 dimensions (further ones of length 1), no time series, no components"
         refuse(f"{count} dimensions, sizes {fields.dim[1 : max(count, 3) + 1]}", path, allowed, "wrong_dimension")
-    return check_shape(fields.dim[1:4], where=path)
+    return volume_header.check_shape(fields.dim[1:4], where=path)
 
 
 def _affine(fields: _Fields, shape: tuple[int, int, int], path: Path) -> NDArray[np.float64]:
@@ -154,8 +151,8 @@ def _affine(fields: _Fields, shape: tuple[int, int, int], path: Path) -> NDArray
         _check_pixdim(candidates[0], np.array(fields.pixdim[1:4]) * scale, path)
     if fields.qform_code > 0:
         candidates.append(_to_lps_mm(_qform(fields, path), scale))
-    checked = [check_affine(T, where=path) for T in candidates]
-    apart = corner_deviation_mm(checked[0], checked[-1], shape)
+    checked = [volume_header.check_affine(T, where=path) for T in candidates]
+    apart = volume_header.corner_deviation_mm(checked[0], checked[-1], shape)
     if apart > QFORM_TOLERANCE_MM:
         what = f"sform and qform place a corner of the volume {apart:.3g} mm apart"
         refuse(what, path, f"both agree within {QFORM_TOLERANCE_MM} mm, or one is unset", "geometry_contradicted")

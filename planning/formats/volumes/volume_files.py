@@ -24,20 +24,13 @@ from numpy.typing import DTypeLike, NDArray
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import absence, is_plain_file, read_input
 from puncture_twin.planning.base.text import Shown, brief
-from puncture_twin.planning.formats.volumes import nrrd_header
+from puncture_twin.planning.formats.volumes import nrrd_header, volume_header
 from puncture_twin.planning.formats.volumes.nifti_header import parse_nifti_header
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_nrrd_header
-from puncture_twin.planning.formats.volumes.volume_header import (
-    MAX_VOXELS,
-    VolumeGrid,
-    VolumeHeader,
-    VoxelLayout,
-    decoded,
-)
 
 NIFTI_ENDINGS = (".nii", ".nii.gz")
 NRRD_ENDINGS = (".nrrd", ".nhdr")
-MAX_FILE_BYTES = 8 * MAX_VOXELS + 10_000_000
+MAX_FILE_BYTES = 8 * volume_header.MAX_VOXELS + 10_000_000
 """As many voxels as are taken, of the widest type, behind the longest header."""
 SCALING_ROUNDING = float(np.finfo(np.float64).eps)
 """A slope this near to 1, and an intercept this near to 0, leave the stored values and their type as they are."""
@@ -51,7 +44,6 @@ class Volume(Shown):
         values: Shape (ni, nj, nk), read-only; Hounsfield units for a CT.
         T_ct_index: Shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm. Its determinant
             may have either sign: index axes can be left-handed, the patient's axes are not touched by that.
-        fields: The file's own key/value remarks.
     """
 
     values: NDArray[Any]
@@ -79,7 +71,7 @@ def data_file(content: bytes, path: Path) -> str | None:
     return nrrd_header.data_file(content, path) if path.name.lower().endswith(NRRD_ENDINGS) else None
 
 
-def parse_header(content: bytes, path: Path) -> VolumeHeader:
+def parse_header(content: bytes, path: Path) -> volume_header.VolumeHeader:
     """The checked header of a volume file that has been read; the voxels are not looked at.
 
     Raises:
@@ -119,7 +111,7 @@ def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volum
     header = parse_header(content, path)
     stored = content if data is None else data
     try:
-        values = _scaled(decoded(memoryview(stored), header), header.cells)
+        values = _scaled(volume_header.decoded(memoryview(stored), header), header.cells)
     except MemoryError as error:
         what = "the volume does not fit into the memory of this machine"
         raise InputError(what, where=path, allowed="a smaller one", code="out_of_memory") from error
@@ -128,7 +120,7 @@ def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volum
     return Volume(values, header.T_ct_index, path, header.fields)
 
 
-def _parser(path: Path) -> Callable[[bytes, Path], VolumeHeader]:
+def _parser(path: Path) -> Callable[[bytes, Path], volume_header.VolumeHeader]:
     name = path.name.lower()
     if name.endswith(NIFTI_ENDINGS):
         return parse_nifti_header
@@ -138,7 +130,7 @@ def _parser(path: Path) -> Callable[[bytes, Path], VolumeHeader]:
     raise InputError(what, where=path, allowed=", ".join(NIFTI_ENDINGS + NRRD_ENDINGS), code="unknown_format")
 
 
-def _scaled(stored: NDArray[Any], cells: VoxelLayout) -> NDArray[Any]:
+def _scaled(stored: NDArray[Any], cells: volume_header.VoxelLayout) -> NDArray[Any]:
     """Stored values times the slope plus the intercept; of integers that makes single precision, as SimpleITK does."""
     if abs(cells.slope - 1.0) <= SCALING_ROUNDING and abs(cells.intercept) <= SCALING_ROUNDING:
         return stored
@@ -160,7 +152,6 @@ class VolumeSource(Protocol):
     Attributes:
         files: Every file that decides a voxel or its place, as the content is wanted it.
         part: Which part of these files it is, where they hold several volumes.
-        notes: What a person should be told of how it was read, one sentence each.
         grid: Where the voxels lie, LPS mm.
     """
 
@@ -173,7 +164,7 @@ class VolumeSource(Protocol):
     @property
     def notes(self) -> tuple[str, ...]: ...  # noqa: D102
     @property
-    def grid(self) -> VolumeGrid: ...  # noqa: D102
+    def grid(self) -> volume_header.VolumeGrid: ...  # noqa: D102
 
     def volume(self) -> Volume:
         """The volume with its voxels, which are decoded at each call."""
@@ -185,7 +176,6 @@ class VolumeFile:
 
     Attributes:
         files: That file, and the one beside it.
-        content: Gives the bytes of both.
     """
 
     path: Path
@@ -194,7 +184,7 @@ class VolumeFile:
     part: tuple[str, ...] = ()
 
     @cached_property
-    def grid(self) -> VolumeHeader:
+    def grid(self) -> volume_header.VolumeHeader:
         """Where the voxels lie, LPS mm, as the checked header states it."""
         return parse_header(self.content(self.files[0]), self.path)
 

@@ -88,7 +88,6 @@ class VolumeHeader(VolumeGrid):
     Attributes:
         data_path: The file that holds them: the header's own, or one beside it.
         layers: How many values each voxel has, one for each layer of segments that overlap.
-        notes: What a person should be told of how it was read, one sentence each.
     """
 
     cells: VoxelLayout
@@ -192,7 +191,6 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
     Stops one byte after the promised length, so what a bomb would inflate to is never made.
 
     Args:
-        content: The compressed bytes.
         promised: Bytes that the header says they inflate to.
 
     Returns:

@@ -21,14 +21,8 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.tables import NO_RESIDUALS, MarkerSection, RegistrationSection, other_readings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.checks import places
 from puncture_twin.planning.registration.checks.markers import Surroundings, check_markers
-from puncture_twin.planning.registration.checks.places import (
-    OF_MARKERS,
-    OF_MOUNT,
-    base_place,
-    off_upright,
-    place_warnings,
-)
 from puncture_twin.planning.registration.placement import Placement, load_placement, registered
 from puncture_twin.planning.registration.registration import Registration
 
@@ -60,8 +54,6 @@ class Reading:
     Attributes:
         keys: Those that differ from the case's; empty as stated.
         T_base_ct: Shape (4, 4), mm.
-        impossible: Why nothing can be so, or empty.
-        unlikely: What hardly is so, or empty.
         rests_on: The obstacle of frame ``base`` that the patient lies on, or empty.
         tilt: Between the robot's z axis and up, rad.
     """
@@ -136,7 +128,7 @@ def check_transform(
 
 
 def _reading(case: Case, skin: TriangleMesh, keys: str, T_base_ct: Floats) -> Reading:
-    return Reading(keys, T_base_ct, *base_place(case, skin, T_base_ct), off_upright(case, T_base_ct))
+    return Reading(keys, T_base_ct, *places.base_place(case, skin, T_base_ct), places.off_upright(case, T_base_ct))
 
 
 def _better(others: Sequence[Reading]) -> str:
@@ -283,9 +275,9 @@ def placement_findings(
     skin = around.skin
     if placement.registration is not None:
         own = tuple(check_markers(case, around, placement.registration, cache))
-        return (*place_warnings(case, skin.mesh, placement.T_base_ct, OF_MARKERS, cache.memory), *own)
+        return (*places.place_warnings(case, skin.mesh, placement.T_base_ct, places.OF_MARKERS, cache.memory), *own)
     if case.robot.stated is None:
-        return tuple(place_warnings(case, skin.mesh, placement.T_base_ct, OF_MOUNT, cache.memory))
+        return tuple(places.place_warnings(case, skin.mesh, placement.T_base_ct, places.OF_MOUNT, cache.memory))
     registration = marker_registration(case, case.robot.stated)
     said = tuple(check_transform(case, skin.mesh, placement.T_base_ct, registration))
     if registration is None:

@@ -121,7 +121,6 @@ class MarkerList:
     """One reading of the CT markers.
 
     Attributes:
-        fit: How it lies on the skin.
         behind: Rows of markers that no needle can have touched, and what is before each, in words.
         excluded: Why the robot cannot stand where this list puts it, or empty.
         target_mm: How far this list puts the target from where the given one puts it.

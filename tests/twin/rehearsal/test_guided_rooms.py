@@ -13,7 +13,7 @@ from puncture_twin import api as pt
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.budget.guidance import Sight, corridor_mm, declared_ways, equipped, guided_error, lost_sight
-from puncture_twin.planning.case.settings import ControlScan
+from puncture_twin.planning.case.tables import ControlScanSection
 from puncture_twin.planning.uncertainty import guided
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
@@ -320,7 +320,7 @@ def scanned(tmp_path_factory):
     context, outward, q = prepared(tmp_path_factory.mktemp("scanned"), MOVED)
 
     def with_scans(**stated):
-        scan = ControlScan(**{"slice_mm": 2.0, "target_seen": True, "dose_msv": 0.9, "seconds": 120.0} | stated)
+        scan = ControlScanSection(**{"slice_mm": 2.0, "target_seen": True, "dose_msv": 0.9, "seconds": 120.0} | stated)
         return replace(context, case=replace(context.case, control_scan=scan)), outward, q
 
     return with_scans
