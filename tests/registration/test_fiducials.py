@@ -133,9 +133,9 @@ def test_several_sizes_are_not_guessed(two_sizes):
     """They are told with places and sizes; a size, or a count that one of them has, decides; a wrong one does not."""
     large, small, seen = two_sizes
     with refused("markers_unclear", "8.0 mm", "4.0 mm", by=NoAnswerError):
-        choose_fiducials(seen, Stated(), 2.5, where="test")
+        choose_fiducials(seen, Stated(), where="test")
     for stated, true in ((Stated(diameter_mm=8.0), large), (Stated(count=4), large), (Stated(diameter_mm=4.0), small)):
-        found = choose_fiducials(seen, stated, 2.5, where="test").fiducials
+        found = choose_fiducials(seen, stated, where="test").fiducials
         assert len(found) == len(true) and len(matched(true, found)[0]) == len(true)
         assert [one.name for one in found] == [f"M{n}" for n in range(1, len(true) + 1)]
     for stated, code in (
@@ -144,7 +144,7 @@ def test_several_sizes_are_not_guessed(two_sizes):
         (Stated(diameter_mm=14.0), "no_markers"),
     ):
         with refused(code, by=NoAnswerError):
-            choose_fiducials(seen, stated, 2.5, where="test")
+            choose_fiducials(seen, stated, where="test")
 
 
 @pytest.mark.parametrize(
@@ -179,9 +179,10 @@ NAMES = tuple("ABCDE")
 
 def fiducials(points, kind="ball"):
     """Balls or discs of 8 mm there, under other names."""
-    shape = Shape(kind, 8.0, 1.0, np.array([0.0, -1, 0]))
+    shape, make = Shape(kind, 8.0, 1.0, np.array([0.0, -1, 0])), (np.log([1000.0, 8.0]), np.diag([0.1, 0.02]) ** 2)
     return [
-        Fiducial(f"M{k}", Reading(p, np.eye(3) * 0.01, shape, 900.0, False, 0.1), 4.0) for k, p in enumerate(points)
+        Fiducial(f"M{k}", Reading(p, np.eye(3) * 0.01, shape, 900.0, False, 0.1, *make), 4.0)
+        for k, p in enumerate(points)
     ]
 
 
@@ -261,8 +262,8 @@ def test_discs_as_large_as_the_balls_are_told_apart():
     """As electrodes are: not one list; what a count leaves out is doubtful."""
     both = Seen((*fiducials(LAYOUT), *fiducials(LAYOUT[:3] + 200.0, "disc")), ())
     with refused("markers_unclear", by=NoAnswerError):
-        choose_fiducials(both, Stated(), 1.0, where="test")
-    chosen = choose_fiducials(both, Stated(count=5), 1.0, where="test")
+        choose_fiducials(both, Stated(), where="test")
+    chosen = choose_fiducials(both, Stated(count=5), where="test")
     assert [one.reading.shape.kind for one in chosen.fiducials] == ["ball"] * 5 and len(chosen.doubtful) == 3
 
 
