@@ -294,26 +294,22 @@ def read_marker(
         diameter_mm: As a person states it.
     """
     unresolved = middle.wide_mm < UNRESOLVED * float(spacing_mm(middle.box.volume).min())
-    every, background = list[Reading](), middle.background(normal)
+    every, background = list[tuple[float, Reading]](), middle.background(normal)
     for kind in kinds[:1] if unresolved else kinds:
-        every.append(_fitted(_Drawing.of(middle, kind, normal, diameter_mm, background)))
-        if every[-1].misfit < SURE:
+        lacks, reading = _fitted(_Drawing.of(middle, kind, normal, diameter_mm, background))
+        every.append((lacks * PLAIN[kind], reading))
+        if lacks < SURE:
             break
-    every.sort(key=_rank)
-    best = every[0]
-    near = [one for one in every if _rank(one) < AS_NEAR * _rank(best)]
-    off, made = (np.array(some) for some in zip(*((o.centre_ct - best.centre_ct, o.make - best.make) for o in near)))
-    others = kinds if unresolved else tuple(one.shape.kind for one in near[1:])
-    cov_ct, cov_make = best.cov_ct + off.T @ off / len(near), best.cov_make + made.T @ made / len(near)
+    least, best = min(every, key=lambda one: one[0])
+    near = [one for lacks, one in every if lacks < AS_NEAR * least]
+    off, make = (np.array([getattr(one, of) - getattr(best, of) for one in near]) for of in ("centre_ct", "make"))
+    others = kinds if unresolved else tuple(one.shape.kind for one in near if one is not best)
+    cov_ct, cov_make = best.cov_ct + off.T @ off / len(near), best.cov_make + make.T @ make / len(near)
     return replace(best, cov_ct=cov_ct, cov_make=cov_make, others=others)
 
 
-def _rank(reading: Reading) -> float:
-    return reading.misfit * PLAIN[reading.shape.kind]
-
-
-def _fitted(drawing: _Drawing) -> Reading:
-    """The marker of a kind whose drawing is nearest to the image."""
+def _fitted(drawing: _Drawing) -> tuple[float, Reading]:
+    """The marker of a kind whose drawing is nearest to the image, and what that lacks of it, noise too."""
     middle, start, known = drawing.middle, drawing.start, drawing.known
     noise = middle.box.noise_hu
 
@@ -332,10 +328,10 @@ def _fitted(drawing: _Drawing) -> Reading:
 
     fit = gauss_newton(start, linearised, np.add, lambda _, step: bool(np.abs(step[:3]).max() < SETTLED_MM), ROUNDS)
     p = fit.estimate
-    lacks = max(float(np.mean((drawing.seen - drawing.image(p)) ** 2)) - noise**2, 0.0)
-    shape, misfit, cov = drawing.shape(p), float(np.sqrt(lacks)) / drawing.contrast_hu, np.linalg.inv(fit.system.information)
-    edge = LACKING * misfit * float(spacing_mm(middle.box.volume).min()) / shape.diameter_mm
-    return Reading(
+    lacks, contrast = float(np.mean((drawing.seen - drawing.image(p)) ** 2)), drawing.contrast_hu
+    misfit, shape = float(np.sqrt(max(lacks - noise**2, 0.0))) / contrast, drawing.shape(p)
+    cov, edge = np.linalg.inv(fit.system.information), 2 * LACKING * misfit * min(spacing_mm(middle.box.volume))
+    return np.sqrt(lacks) / contrast, Reading(
         middle.centre_ct + p[:3],
         cov[:3, :3] + drawing.unknown(p, misfit),
         shape,
@@ -343,7 +339,7 @@ def _fitted(drawing: _Drawing) -> Reading:
         middle.clipped,
         misfit,
         p[3:5],
-        cov[3:5, 3:5] + np.diag([misfit, 2 * edge]) ** 2,
+        cov[3:5, 3:5] + np.diag([misfit, edge / shape.diameter_mm]) ** 2,
     )
 
 

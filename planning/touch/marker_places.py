@@ -22,6 +22,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.distance import pdist
 
 from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, OUTSIDE_BODY, Anatomy
+from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.case.case import Case, up_axis
@@ -68,6 +69,13 @@ FLE_MM = 1.0
 """Error of one marker where the case declares none: the answer then is per mm of it."""
 
 
+class Tape(NamedTuple):
+    """A length on the skin, from the middle of the body's upper side, and the patient's side toward which it runs."""
+
+    length_mm: float
+    toward: str
+
+
 @dataclass(frozen=True, eq=False)
 class MarkerPlace:
     """Where one marker should be put, LPS mm.
@@ -75,24 +83,25 @@ class MarkerPlace:
     Attributes:
         point_ct: Shape (3,), on the skin.
         head_mm: Toward the head from the target's level, negative toward the feet.
-        girth_mm: Along a tape round the body at that level, from its highest point, positive to the patient's left.
+        tape: Round the body at that level; None where the image cuts the body's sides.
     """
 
     name: str
     point_ct: Floats
     normal_ct: Floats
     head_mm: float
-    girth_mm: float
+    tape: Tape | None
 
     def words(self, space: Space) -> str:
         """How to find it on the skin; a space of its own has no anatomy, and is told by coordinates."""
         if space is Space.LOCAL:
             return f"at {point_text(self.point_ct, space)}"
-        level, side = "head" if self.head_mm >= 0 else "feet", "left" if self.girth_mm >= 0 else "right"
-        return (
-            f"{abs(self.head_mm):.0f} mm toward the {level} from the target's level, then {abs(self.girth_mm):.0f} mm "
-            f"along the skin to the patient's {side} from the highest point there"
-        )
+        end = "head" if self.head_mm >= 0 else "feet"
+        level = f"{abs(self.head_mm):.0f} mm toward the {end} from the target's level"
+        if self.tape is None:
+            return f"{level}, at {point_text(self.point_ct, space)}"
+        along = f"{self.tape.length_mm:.0f} mm along the skin to the patient's {self.tape.toward}"
+        return f"{level}, then {along} from halfway between the body's sides"
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +185,7 @@ def _unmet(put: _Skin, target_ct: Floats) -> Iterator[str]:
 
 
 def _places(case: Case, anatomy: Anatomy, entries: cKDTree) -> _Skin:
-    """Places of the trunk's skin where a marker could stick, drawn evenly: whatever their distances from the windows."""
+    """Places of the trunk's skin where a marker could stick, drawn evenly, however far from windows and target."""
     mesh, cut = anatomy.skin.mesh, anatomy.skin.cut_faces
     triangles = mesh.triangles
     middles = triangles.mean(axis=1)
@@ -248,9 +257,7 @@ def _is_free(checkers: ApproachCheckers, case: Case, point_base: Floats, q_inser
     return any(not why_not(checkers, tip, q) for q in np.concatenate([found.alike, found.others])[:POSES])
 
 
-def _exchanged(
-    skin: _Skin, target_ct: Floats, C: Floats, count: int, shrunk: float = 1.0
-) -> tuple[list[int], float]:
+def _exchanged(skin: _Skin, target_ct: Floats, C: Floats, count: int, shrunk: float = 1.0) -> tuple[list[int], float]:
     """Rows of the best places, by exchange from several starts, and their expected error, mm; none where none fit."""
     rng, best, least = np.random.default_rng(SEED), list[int](), np.inf
     A = design(skin.points, target_ct).reshape(-1, 3, 6)
@@ -300,29 +307,45 @@ def _told_apart(points: Floats, target_ct: Floats, slip_mm: float) -> bool:
 
 
 def _described(name: str, place: _Skin, case: Case, anatomy: Anatomy) -> MarkerPlace:
-    point, normal = place.points[0], place.normals[0]
-    girth = girth_mm(anatomy.skin.mesh.vertices, point, np.asarray(up_axis(case)))
-    return MarkerPlace(name, point, normal, float(point[2] - case.target_ct[2]), girth)
+    (point,), (normal,) = place.points, place.normals
+    tape = None if case.space is Space.LOCAL else tape_to(anatomy.skin, point, np.asarray(up_axis(case)))
+    return MarkerPlace(name, point, normal, float(point[2] - case.target_ct[2]), tape)
 
 
 LEVEL_MM = 4.0
 """Of a body's vertices, those so near to a level show its outline there."""
+SIDES = ("left", "back", "right", "front")
+"""LPS, a quarter of a rotation about the head's axis each."""
 
 
-def girth_mm(vertices: Floats, point: Floats, up: Floats) -> float:
-    """Length of a tape round the body from its highest point to a point (3,), positive to the patient's left, mm.
+def tape_to(skin: Skin, point: Floats, up: Floats) -> Tape | None:
+    """A tape round the body at a point (3,), mm, from the middle of the body's upper side.
 
-    A tape spans hollows: it is the outline's convex hull in the axial slice.
+    A tape spans hollows: it is the outline's convex hull in the axial slice. The middle is halfway between the body's
+    sides, which a person sees; of a flat belly none sees the highest point.
+
+    Args:
+        up: Shape (3,), LPS, of any length.
+
+    Returns:
+        None where the image cuts the body's sides at this level.
     """
-    level = vertices[np.abs(vertices[:, 2] - point[2]) <= LEVEL_MM][:, :2]
-    hull = level[ConvexHull(level).vertices]
-    upward = up[:2] / max(float(np.linalg.norm(up[:2])), 1e-9)
-    start = int(np.argmax(hull @ upward))
-    line = np.vstack([np.roll(hull, -start, axis=0), hull[start]])
-    edges = np.diff(line, axis=0)
-    lengths = np.linalg.norm(edges, axis=1)
-    part = np.clip(np.einsum("ij,ij->i", point[:2] - line[:-1], edges) / np.maximum(lengths**2, 1e-12), 0.0, 1.0)
-    nearest = int(np.argmin(np.linalg.norm(line[:-1] + part[:, None] * edges - point[:2], axis=1)))
-    along = float(lengths[:nearest].sum() + part[nearest] * lengths[nearest])
+    vertices, cut = skin.mesh.vertices, np.zeros(len(skin.mesh.vertices), np.bool_)
+    cut[skin.mesh.faces[skin.cut_faces]] = True
+    near = np.abs(vertices[:, 2] - point[2]) <= LEVEL_MM
+    rows = ConvexHull(vertices[near][:, :2]).vertices  # in the order left, back, right, front
+    hull, upward = vertices[near][rows, :2], up[:2] / max(float(np.hypot(*up[:2])), 1e-9)
+    across = hull @ [-upward[1], upward[0]]
+    if cut[near][rows[[across.argmin(), across.argmax()]]].any():
+        return None
+    after, edges = np.roll(across, -1), np.roll(hull, -1, axis=0) - hull
+    lengths, middle = np.linalg.norm(edges, axis=1), (across.min() + across.max()) / 2
+    upper = int(np.flatnonzero((across <= middle) & (after > middle))[0])  # across grows along the upper side alone
+    part = np.clip(np.einsum("ij,ij->i", point[:2] - hull, edges) / np.maximum(lengths**2, 1e-12), 0.0, 1.0)
+    nearest = int(np.argmin(np.linalg.norm(hull + part[:, None] * edges - point[:2], axis=1)))
+    begins = np.cumsum(lengths) - lengths
+    start = begins[upper] + (middle - across[upper]) / (after[upper] - across[upper]) * lengths[upper]
+    along = float((begins[nearest] + part[nearest] * lengths[nearest] - start) % lengths.sum())
+    quarter = int(np.rint(np.arctan2(upward[1], upward[0]) / (np.pi / 2)))
     back = float(lengths.sum()) - along
-    return along if along <= back else -back  # the hull runs from left to back, as its points are ordered in (x, y)
+    return Tape(along, SIDES[(quarter + 1) % 4]) if along <= back else Tape(back, SIDES[(quarter - 1) % 4])
