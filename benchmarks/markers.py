@@ -390,8 +390,10 @@ def main() -> None:
 
 def summary(rows: list[dict[str, Any]]) -> list[str]:
     """The table, and what lists hold that is no marker."""
-    lines = ["| markers | slices, mm | found | doubtful | lost | rms in the plane, along the bed, mm | in the 95 % region |",
-             "|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = [
+        "| markers | slices, mm | found | doubtful | lost | rms in plane, along bed, mm | in the 95 % region |",
+        "|---|---|---|---|---|---|---|",
+    ]
     for group in sorted({row["group"] for row in rows}):
         for name, least, most in (("1 to 2", 0.0, 2.0), ("2.5 to 5", 2.1, 9.0)):
             some = [m for row in rows if row["group"] == group and least <= row["spacing"] <= most

@@ -114,7 +114,7 @@ class Reading:
         cov_ct: Shape (3, 3), mm².
         contrast_hu: Its greatest value above soft tissue's; of clipped metal at least so much.
         clipped: Whether the image's range clips it.
-        misfit: Root mean square of what its drawing lacks beyond noise, over that of its contrast; 0 is a perfect marker.
+        misfit: Root mean square of what its drawing lacks beyond noise, over that of its contrast.
         make: Logarithms of density (HU) and diameter (mm), shape (2,).
         cov_make: Of these, shape (2, 2).
         others: Kinds whose drawing is about as near.

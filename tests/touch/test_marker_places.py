@@ -125,9 +125,9 @@ def test_where_windows_cover_the_skin_the_best_places_are_given_with_what_is_not
 
 @pytest.mark.parametrize("count", [3, 4])
 def test_no_set_of_a_coarse_choice_errs_less(carton, monkeypatch, count):
-    """Against all sets of 22 places, apart and told apart: the least error, to 2 %."""
+    """Against all sets of 18 places, apart and told apart: the least error, to 2 %."""
     context, candidates, _ = carton
-    monkeypatch.setattr(marker_places, "PLACES", 22)
+    monkeypatch.setattr(marker_places, "PLACES", 18)
     monkeypatch.setattr(marker_places, "BETWEEN_PLACES_MM", 20.0)
     tried = []
     thinned = marker_places._thinned
@@ -138,24 +138,25 @@ def test_no_set_of_a_coarse_choice_errs_less(carton, monkeypatch, count):
     found = propose_markers(bare, candidates, count)
     (points,) = tried
     C = case.errors.marker_cov_ct + case.errors.touch_mm**2 * np.eye(3)
-    least = np.inf
-    for rows in itertools.combinations(range(len(points)), count):
-        some = points[list(rows)]
-        if pdist(some).min() >= APART_MM:
-            A = design(some, case.target_ct)
-            information = A.T @ np.kron(np.eye(count), np.linalg.inv(C)) @ A
-            if np.linalg.cond(information) < 1e12:
-                error = np.sqrt(np.trace(np.linalg.inv(information)[:3, :3]))
-                names = MarkerPairs(tuple("ABCD"[:count]), some, some)
-                if error < least and not renamings(names, case.target_ct, SLIP_MM).found:
-                    least = error
-    assert least <= found.expected_mm * (1 + 1e-6) and found.expected_mm <= 1.02 * least
+    sets = [some for rows in itertools.combinations(range(len(points)), count)
+            if pdist(some := points[list(rows)]).min() >= APART_MM]  # fmt: skip
+    errors = []
+    for some in sets:
+        A = design(some, case.target_ct)
+        information = A.T @ np.kron(np.eye(count), np.linalg.inv(C)) @ A
+        known = np.linalg.cond(information) < 1e12
+        errors.append(np.sqrt(np.trace(np.linalg.inv(information)[:3, :3])) if known else np.inf)
+    for row in np.argsort(errors):
+        names = MarkerPairs(tuple("ABCD"[:count]), sets[row], sets[row])
+        if not renamings(names, case.target_ct, SLIP_MM).found:
+            assert errors[row] <= found.expected_mm * (1 + 1e-6) and found.expected_mm <= 1.02 * errors[row]
+            return
+    pytest.fail("no set is told apart")
 
 
 def test_a_tape_round_a_cylinder():
     """Radius times angle to either side of the middle, whichever side is up, and straight over a hollow."""
-    cylinder = trimesh.creation.cylinder(100.0, 60.0, sections=720)
-    cylinder = cylinder.slice_plane([0, 0, -4], [0, 0, 1], cap=False)
+    cylinder = trimesh.creation.cylinder(100.0, 8.0, sections=720)
     skin = Skin(
         TriangleMesh(np.asarray(cylinder.vertices), np.asarray(cylinder.faces)),
         np.zeros(len(cylinder.faces), bool),
