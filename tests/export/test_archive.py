@@ -179,6 +179,20 @@ def test_what_lies_outside_is_refused(scan):
         archive_files(scan, ArchiveContent("A path", (away,), {}, (), ()))
 
 
+@pytest.mark.parametrize(("name", "value"), [("PatientID", "another"), ("StudyInstanceUID", "1.2.3.4")])
+def test_slices_of_several_patients_are_refused(tmp_path, name, value):
+    """One slice that names another: nobody could say whose the needle is."""
+    slices, content = world.series(world.phantom(SHAPE) % 2000), {}
+    setattr(slices[5], name, value)
+    for number, one in enumerate(slices):
+        stream = io.BytesIO()
+        one.save_as(stream, enforce_file_format=True)
+        content[f"{number}.dcm"] = stream.getvalue()
+    scan = CtSeries(tmp_path, tuple(content), content.__getitem__)
+    with refused("several_patients"):
+        archive_files(scan, content_of(scan)[0])
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """A trunk as DICOM and as NIfTI, searched every 5 degrees, so that it has windows."""
