@@ -302,10 +302,9 @@ def read_marker(
             break
     least, best = min(every, key=lambda one: one[0])
     near = [one for lacks, one in every if lacks < AS_NEAR * least]
-    off, make = (np.array([getattr(one, of) - getattr(best, of) for one in near]) for of in ("centre_ct", "make"))
+    off = np.array([one.centre_ct - best.centre_ct for one in near])
     others = kinds if unresolved else tuple(one.shape.kind for one in near if one is not best)
-    cov_ct, cov_make = best.cov_ct + off.T @ off / len(near), best.cov_make + make.T @ make / len(near)
-    return replace(best, cov_ct=cov_ct, cov_make=cov_make, others=others)
+    return replace(best, cov_ct=best.cov_ct + off.T @ off / len(off), others=others)
 
 
 def _fitted(drawing: _Drawing) -> tuple[float, Reading]:

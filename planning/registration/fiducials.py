@@ -254,7 +254,7 @@ def _candidates(volume: Volume, skin: Skin, ceiling_hu: float, noise: float) -> 
         pieces = [(number, box) for number, box in enumerate(ndimage.find_objects(labels), start=1)]
         ends = np.array([[(one.start, one.stop) for one in box] for _, box in pieces])
         sides = np.ptp(ends, axis=2)
-        small = np.all((sides - 1) * spacing <= LARGEST_MM + 2.0, axis=1)
+        small = np.all((sides - 1) * spacing <= 2 * LARGEST_MM + 2.0, axis=1)
         small &= (sizes[1:] >= LEAST_VOXELS) | (level >= TISSUE_HU + LEAST_CONTRAST_SD * noise)
         rows = np.flatnonzero(small)
         middles = apply(volume.T_ct_index, (ends[rows].sum(axis=2) - 1) / 2 + first)
