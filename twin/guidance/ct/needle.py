@@ -28,7 +28,7 @@ from puncture_twin.planning.anatomy.metal import (
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import Finding, InputError, Severity, refuse
 from puncture_twin.planning.formats.volumes.volume_files import Volume
-from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rigid import apply, frame_about
 from puncture_twin.twin.guidance.ct.needle_fit import (
     UNKNOWN,
     WIDE_MM,
@@ -49,8 +49,8 @@ SLENDER = 8.0
 """Length over width: a rib is bent, and so wider."""
 LEVELS_HU = (METAL_HU, 1000.0, 600.0, 400.0)
 """From what on voxels are taken for metal: thick slices dilute it."""
-GROWTHS = 4
-"""The first line through a short piece is not yet the needle's."""
+GROWTHS, GROWN_MM = 8, 10.0
+"""The first line through a short piece is not yet the needle's; a bend is followed so far beyond it at a time."""
 SEEN_MM = 3.0
 """So far before and beyond a tip the needle's axis is clear of other metal: else the tip is not seen."""
 LARGEST_GAP_MM = 6.0
@@ -289,23 +289,25 @@ def _check_tip(volume: Volume, found: FoundNeedle, hidden: Bools, target_ct: Flo
 
 
 def _whole(volume: Volume, metal: Metal, line: Line, hidden: Bools) -> tuple[Metal, Line]:
-    """The whole needle, where thick slices dilute it and show it only in pieces at first."""
+    """The whole needle, where thick slices dilute it and show it only in pieces at first: along its line, or its bend."""
     at = np.argwhere((volume.values > LEVELS_HU[-1]) & ~hidden)
     places = apply(volume.T_ct_index, at.astype(float))
-    grown = 0
+    reach = WIDE_MM + 0.5 + WIDEST_SLICE * float(spacing_mm(volume).max())
     for _ in range(GROWTHS):
-        points = places - line.middle
-        along = points @ line.forward
-        across = np.linalg.norm(points - along[:, None] * line.forward, axis=1)
-        near = across <= WIDE_MM + 0.5 + line.width_mm + WIDEST_SLICE * float(spacing_mm(volume).max())
+        axes = frame_about(line.forward).T
+        own, local = ((points - line.middle) @ axes.T for points in (_places(volume, metal), places))
+        along, low, high = local[:, 2], own[:, 2].min(), own[:, 2].max()
+        bend = np.linalg.lstsq(np.vander(own[:, 2] / high, 4), own[:, :2], rcond=None)[0]
+        beside = local[:, :2] - np.vander(np.clip(along, low, high) / high, 4) @ bend
+        bent = (np.linalg.norm(beside, axis=1) <= reach) & (along > low - GROWN_MM) & (along < high + GROWN_MM)
+        near = bent | (np.linalg.norm(local[:, :2], axis=1) <= reach + line.width_mm)
         kept, along = at[near], along[near]
         order = np.argsort(along)
         parts = np.concatenate([[0], np.cumsum(np.diff(along[order]) > LARGEST_GAP_MM)])
-        own = parts == parts[np.argmin(np.abs(along[order]))]
-        if own.sum() == grown:
+        grown = kept[order[parts == parts[np.argmin(np.abs(along[order]))]]]
+        if len(grown) == metal.voxels.sum():
             break
-        grown = own.sum()
-        metal = _piece(volume, kept[order[own]])
+        metal = _piece(volume, grown)
         line = _axis(volume, metal)
     return metal, line
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import expit
 
@@ -26,8 +27,8 @@ from puncture_twin.planning.geometry.rigid import apply, skew
 from puncture_twin.planning.registration.fits import carried_along
 from puncture_twin.twin.guidance.ct.needle_image import LEVER_MM, NUMBERS, CurveImage
 
-AHEAD_MM, FITTED_MM = 12.0, 120.0
-"""Beyond the foremost voxel of metal, and behind the tip, so much of a needle is fitted."""
+AHEAD_MM, FITTED_MM, TAIL_MM = 12.0, 120.0, 4.0
+"""Beyond the foremost voxel of metal, and behind the tip, so much of a needle is fitted; not its other end."""
 WIDE_MM = 2.5
 """About the axis of a needle, so far."""
 WIDEST_SLICE = 0.6
@@ -47,6 +48,8 @@ STRAIGHTENED, BENT_AGAIN = 2, 2
 """Times that a straight rod is fitted, as the first line through metal may hold something beside it; and a bent one."""
 SCALES = np.array([1.0, 1.0, 1.0, 0.02, 0.02, 0.3, 0.3, 1.0, 1.0, 1.0, 1.0])
 """Of what is fitted."""
+PLACE_MM = 2.0
+"""Of a needle's length, in which what a fit leaves is counted."""
 BENT_MM = 0.3
 """A smaller sagitta is not called a bend."""
 BEND_SD = np.array([2.0, 2.0, 0.5, 0.5])
@@ -150,12 +153,14 @@ def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hid
     index = np.argwhere(np.ones(metal.voxels.shape, dtype=bool)) + [axis.start for axis in metal.box]
     places, shown = apply(volume.T_ct_index, index.astype(float)), ~hidden[tuple(index.T)]
     heavy = places[metal.voxels.ravel() & (parts > typical / 2)] - line.middle
-    start, begun = line.middle + float((heavy @ line.forward).max()) * line.forward, np.zeros(7)
+    along = heavy @ line.forward
+    start, begun = line.middle + float(along.max()) * line.forward, np.zeros(7)
+    length = min(FITTED_MM, float(np.ptp(along)) - TAIL_MM)
     for again in range(STRAIGHTENED):
         axes = np.concatenate([line.forward[None], np.linalg.svd(line.forward[None])[2][1:]])
         local = (places - start) @ axes.T
         reach = WIDE_MM + WIDEST_SLICE * float(np.linalg.norm(axes[1:] @ volume.T_ct_index[:3, 2]))
-        about, bends = _about(local, np.where(shown, parts, 0.0), reach, line.width_mm)
+        about, bends = _about(local, np.where(shown, parts, 0.0), length, reach, line.width_mm)
         local, seen = local[about & shown], parts[about & shown]
         curve = CurveImage.of(volume, axes, diameter_mm)
         image = curve.parts(np.zeros(NUMBERS), local)
@@ -172,8 +177,7 @@ def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hid
             forward = np.concatenate([[1.0], straight.x[3:5]]) @ axes
             line = line._replace(forward=forward / np.linalg.norm(forward))
             begun = straight.x * [1, 0, 0, 0, 0, 1, 1]
-    length = min(FITTED_MM, float(-local[seen > full / 4][:, 0].min(initial=-AHEAD_MM)))
-    fit, noise = _bent(curve, straight, bends, local, seen)
+    straight, fit, noise = _bent(curve, straight, bends, local, seen)
     x, cov, bent = _weighed(straight, fit, noise, len(seen))
     basis = block_diag(axes, axes[1:])
     cov[:5, :5] += basis @ modes @ basis.T
@@ -199,14 +203,14 @@ def unclear(line: Line, tip_ct: Floats) -> FoundNeedle:
     return FoundNeedle(tip_ct, toward(line, tip_ct).forward, line.width_mm, path, UNKNOWN, unclear=True)
 
 
-def _about(local: Floats, seen: Floats, reach: float, width_mm: float) -> tuple[Bools, Floats]:
+def _about(local: Floats, seen: Floats, length: float, reach: float, width_mm: float) -> tuple[Bools, Floats]:
     """Which points (n, 3) lie about a straight needle, or about the curve through what is seen (n,), and that curve.
 
     Returns:
         Shape (n,); and shape (4, 2), factors of u³ to 1 with u from the tip in `LEVER_MM`, across the needle, mm.
     """
     across = np.linalg.norm(local[:, 1:], axis=1)
-    near = (across <= reach + 2 * width_mm) & (local[:, 0] > -FITTED_MM) & (local[:, 0] < AHEAD_MM)
+    near = (across <= reach + 2 * width_mm) & (local[:, 0] > -length) & (local[:, 0] < AHEAD_MM)
     heavy, terms = seen[near, None], np.vander(np.minimum(local[near, 0], 0.0) / LEVER_MM, 4)
     bends = np.linalg.lstsq(heavy * terms, heavy * local[near, 1:], rcond=None)[0]
     about = near & (across <= reach)
@@ -234,25 +238,42 @@ def _modes(fits: Sequence[OptimizeResult], best: OptimizeResult, axes: Floats, c
     return np.asarray(gaps.T @ (odds[:, None] * gaps) / odds.sum())
 
 
-def _settled(curve: CurveImage, begun: Floats, local: Floats, seen: Floats, noise: float = 0.0) -> OptimizeResult:
+def _settled(
+    curve: CurveImage, begun: Floats, local: Floats, seen: Floats, weights: Floats | float = 1.0, noise: float = 0.0
+) -> OptimizeResult:
     """The numbers from a start (7,) or (11,) that bring the image of points (n, 3) nearest to what is seen (n,).
 
     Of 11 the bends are held to `BEND_SD`, which weighs as much as a voxel of so much noise.
     """
-    count = len(begun)
+    count, weights = len(begun), np.broadcast_to(weights, len(seen))
     held = noise * np.eye(NUMBERS)[7:count] / BEND_SD[: count - 7, None]
 
     def whole(x: Floats) -> Floats:
         return np.concatenate([x, np.zeros(NUMBERS - count)])
 
     def misfit(x: Floats) -> Floats:
-        return np.concatenate([curve.parts(whole(x), local) - seen, held @ whole(x)])
+        return np.concatenate([weights * (curve.parts(whole(x), local) - seen), held @ whole(x)])
 
     def slopes(x: Floats) -> Floats:
-        return np.concatenate([curve.slopes(whole(x), local), held])[:, :count]
+        return np.concatenate([weights[:, None] * curve.slopes(whole(x), local), held])[:, :count]
 
     return least_squares(misfit, begun, slopes, x_scale=SCALES[:count], method="lm", max_nfev=MOST_CALLS,
                          ftol=SETTLED, xtol=SETTLED)  # fmt: skip
+
+
+def _weights(curve: CurveImage, x: Floats, local: Floats, seen: Floats) -> Floats:
+    """Of voxels (n,): by what a fit leaves of those about the same place along the needle.
+
+    Skin, bone and streaks, which no image of a needle explains, are local.
+    """
+    image = curve.parts(x, local)
+    shown = image > LEAST_METAL * image.max()
+    place = ((local[:, 0] - local[:, 0].min()) / PLACE_MM).astype(int)
+    squares = np.bincount(place, shown * (image - seen) ** 2)
+    counts = np.bincount(place, shown.astype(np.float64))
+    squares, counts = (gaussian_filter1d(one, 2.0, mode="constant") for one in (squares, counts))
+    typical = squares.sum() / counts.sum()
+    return np.asarray(np.sqrt(typical / ((squares + typical) / (counts + 1.0)))[place])
 
 
 def _noise(fit: OptimizeResult, count: int) -> float:
@@ -263,15 +284,25 @@ def _noise(fit: OptimizeResult, count: int) -> float:
 
 def _bent(
     curve: CurveImage, straight: OptimizeResult, bends: Floats, local: Floats, seen: Floats
-) -> tuple[OptimizeResult, float]:
-    """The bent fit, begun from the straight one and from the bend of the brightest voxels (4, 2); and its noise."""
+) -> tuple[OptimizeResult, OptimizeResult, float]:
+    """The straight and the bent fit under the same weights, and the noise.
+
+    The bent one begins from the straight one and from the bend of the brightest voxels (4, 2).
+    """
     seen_bend = np.concatenate([[0.0], bends[3], bends[2] / LEVER_MM, straight.x[5:7], bends[1], bends[0]])
-    starts = [np.concatenate([straight.x, np.zeros(4)]), seen_bend]
-    noise = _noise(straight, len(seen))
+    starts, weights, noise = (
+        [np.concatenate([straight.x, np.zeros(4)]), seen_bend],
+        np.ones(len(seen)),
+        _noise(straight, len(seen)),
+    )
     for _ in range(BENT_AGAIN):  # a bend that is not yet fitted looks like noise
-        fit = min((_settled(curve, one, local, seen, noise) for one in starts), key=lambda one: float(one.cost))
-        starts, noise = [fit.x], _noise(fit, len(seen))
-    return fit, noise
+        fit = min(
+            (_settled(curve, one, local, seen, weights, noise) for one in starts), key=lambda one: float(one.cost)
+        )
+        starts, noise, weights = [fit.x], _noise(fit, len(seen)), _weights(curve, fit.x, local, seen)
+    straight = _settled(curve, straight.x, local, seen, weights)
+    fit = _settled(curve, fit.x, local, seen, weights, noise)
+    return straight, fit, _noise(fit, len(seen))
 
 
 def _weighed(straight: OptimizeResult, fit: OptimizeResult, noise: float, count: int) -> tuple[Floats, Floats, bool]:

@@ -4,7 +4,7 @@ A rod of radius r along a curve c(s), s <= 0 behind its tip, in axes whose first
 
     c(s) = tip + (s, g s + b u^2 + d u^3),    u = s / `LEVER_MM`
 
-At a point s along the curve and y (2,) across it, with the blur's covariance in blocks C_ss, C_ys and C_yy:
+At a point s along the curve and y (2,) beside it, with the blur's covariance there in blocks C_ss, C_ys and C_yy:
 
     image = gain pi r^2 N(y; C_yy) Phi((k.y - s) / l),    k = C_yy^-1 C_ys,    l^2 = C_ss - k.C_ys
 
@@ -73,36 +73,26 @@ class CurveImage(NamedTuple):
 
     def parts(self, x: Floats, local: Floats) -> Floats:
         """Part of metal at points (n, 3), mm, in its axes."""
-        image = np.empty(len(local))
-        _render(local, self.layers, x, self._shape(x), self.full, image, np.empty((0, NUMBERS)))
-        return image
+        return self._rendered(x, local, np.empty((0, NUMBERS)))
 
     def slopes(self, x: Floats, local: Floats) -> Floats:
-        """Derivatives of the parts by the numbers, shape (n, 11)."""
-        image, slopes = np.empty(len(local)), np.empty((len(local), NUMBERS))
-        _render(local, self.layers, x, self._shape(x), self.full, image, slopes)
+        """Derivatives of the parts by the numbers, shape (n, 11); a blur's own change by a bend is left out."""
+        slopes = np.empty((len(local), NUMBERS))
+        self._rendered(x, local, slopes)
         return slopes
 
-    def _shape(self, x: Floats) -> Floats:
-        """What a blur makes of a rod: Q = C_yy^-1 (3), k (2), l and the factor; derivatives by the blur's logarithm."""
-        plane = np.exp(2 * x[5]) * self.plane
-        C, D = plane + self.fixed, 2 * plane
-        Q = np.linalg.inv(C[1:, 1:])
-        k = Q @ C[1:, 0]
-        long = np.sqrt(C[0, 0] - k @ C[1:, 0])
-        factor = np.exp(x[6]) * self.diameter_mm**2 / 8 * np.sqrt(np.linalg.det(Q)) / len(self.layers)
-        by_k = Q @ (D[1:, 0] - D[1:, 1:] @ k)
-        by_long = (D[0, 0] - 2 * k @ D[1:, 0] + k @ D[1:, 1:] @ k) / (2 * long)
-        by_factor = -0.5 * np.trace(Q @ D[1:, 1:])
-        row = [Q[0, 0], Q[0, 1], Q[1, 1], *k, long, factor, D[1, 1], D[1, 2], D[2, 2], *by_k, by_long, by_factor]
-        return np.array(row)
+    def _rendered(self, x: Floats, local: Floats, slopes: Floats) -> Floats:
+        plane, image = np.exp(2 * x[5]) * self.plane, np.empty(len(local))
+        factor = np.exp(x[6]) * self.diameter_mm**2 / 8 / len(self.layers)
+        _render(local, self.layers, x, plane + self.fixed, 2 * plane, factor, self.full, image, slopes)
+        return image
 
 
 @nb.njit(cache=True, error_model="numpy")
-def _render(points, layers, x, shape, full, image, slopes):  # type: ignore[no-untyped-def]  # numba infers
+def _render(points, layers, x, blur, by_blur, factor, full, image, slopes):  # type: ignore[no-untyped-def]
     """Fill the image (n,), and its slopes (n, 11) where there is room for them."""
-    Q00, Q01, Q11, k0, k1, long, factor, D00, D01, D11, by_k0, by_k1, by_long, by_factor = shape
     sloped = len(slopes) > 0
+    C, D = np.empty(6), np.empty(6)
     for row in range(len(points)):
         total = 0.0
         if sloped:
@@ -113,33 +103,53 @@ def _render(points, layers, x, shape, full, image, slopes):  # type: ignore[no-u
             u = min(s, 0.0) / LEVER_MM
             y0 = points[row, 1] + layers[layer, 1] - x[1] - s * x[3] - u * u * (x[7] + u * x[9])
             y1 = points[row, 2] + layers[layer, 2] - x[2] - s * x[4] - u * u * (x[8] + u * x[10])
+            lean0 = x[3] + (2.0 * u * x[7] + 3.0 * u * u * x[9]) / LEVER_MM
+            lean1 = x[4] + (2.0 * u * x[8] + 3.0 * u * u * x[10]) / LEVER_MM
+            _leant(blur, lean0, lean1, C)
+            det = C[3] * C[5] - C[4] * C[4]
+            Q00, Q01, Q11 = C[5] / det, -C[4] / det, C[3] / det
             q0, q1 = Q00 * y0 + Q01 * y1, Q01 * y0 + Q11 * y1
             exponent = 0.5 * (q0 * y0 + q1 * y1)
             if exponent > FAR:
                 continue
-            density = factor * math.exp(-exponent)
+            k0, k1 = Q00 * C[1] + Q01 * C[2], Q01 * C[1] + Q11 * C[2]
+            long = math.sqrt(C[0] - k0 * C[1] - k1 * C[2])
+            density = factor * math.sqrt((1.0 + lean0 * lean0 + lean1 * lean1) / det) * math.exp(-exponent)
             m = (k0 * y0 + k1 * y1 - s) / long
             part = density * 0.5 * math.erfc(-m / math.sqrt(2.0))
             total += part
             if sloped:
                 end = density * math.exp(-0.5 * m * m) / (math.sqrt(2.0 * math.pi) * long)
                 a0, a1 = end * k0 - part * q0, end * k1 - part * q1  # by y
-                lean0 = x[3] + (2.0 * u * x[7] + 3.0 * u * u * x[9]) / LEVER_MM
-                lean1 = x[4] + (2.0 * u * x[8] + 3.0 * u * u * x[10]) / LEVER_MM
                 by[0] += end + a0 * lean0 + a1 * lean1
                 by[1] -= a0
                 by[2] -= a1
                 by[3] -= a0 * s
                 by[4] -= a1 * s
-                curved = 0.5 * (D00 * q0 * q0 + 2.0 * D01 * q0 * q1 + D11 * q1 * q1)
-                by[5] += part * (by_factor + curved) + end * (by_k0 * y0 + by_k1 * y1 - m * by_long)
                 by[6] += part
                 by[7] -= a0 * u * u
                 by[8] -= a1 * u * u
                 by[9] -= a0 * u * u * u
                 by[10] -= a1 * u * u * u
+                _leant(by_blur, lean0, lean1, D)
+                wider = 0.5 * (D[3] * q0 * q0 + 2.0 * D[4] * q0 * q1 + D[5] * q1 * q1)
+                wider -= 0.5 * (Q00 * D[3] + 2.0 * Q01 * D[4] + Q11 * D[5])
+                v0, v1 = D[1] - D[3] * k0 - D[4] * k1, D[2] - D[4] * k0 - D[5] * k1
+                longer = (D[0] - k0 * (D[1] + v0) - k1 * (D[2] + v1)) / (2.0 * long)
+                by[5] += part * wider + end * (q0 * v0 + q1 * v1 - m * longer)
         if total >= full:
             total = full
             if sloped:
                 by[:] = 0.0
         image[row] = total
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _leant(C, a, b, leant):  # type: ignore[no-untyped-def]
+    """A covariance of (s, y) with y counted from a line of slopes a and b: ss, sy, sy, yy, yy, yy."""
+    leant[0] = C[0, 0]
+    leant[1] = C[0, 1] - a * C[0, 0]
+    leant[2] = C[0, 2] - b * C[0, 0]
+    leant[3] = C[1, 1] - 2.0 * a * C[0, 1] + a * a * C[0, 0]
+    leant[4] = C[1, 2] - a * C[0, 2] - b * C[0, 1] + a * b * C[0, 0]
+    leant[5] = C[2, 2] - 2.0 * b * C[0, 2] + b * b * C[0, 0]
