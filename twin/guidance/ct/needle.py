@@ -55,6 +55,8 @@ SEEN_MM = 3.0
 """So far before and beyond a tip the needle's axis is clear of other metal: else the tip is not seen."""
 LARGEST_GAP_MM = 6.0
 """Along a needle, between voxels that show it."""
+SKIN_MM = 5.0
+"""A needle that ends so near below the skin comes from outside: thick slices of it show no metal in air."""
 EDGE_VOXELS = 1.5
 """A needle that ends so near to the image's border leaves the image there."""
 SAME_MM, SAME_DEG = 4.0, 10.0
@@ -254,19 +256,17 @@ def _tip_end(
     if inside is None:
         near = int(np.linalg.norm(ends - target_ct, axis=1).argmin())
         return ends[near], False
-    at = apply(np.linalg.inv(volume.T_ct_index), ends)
-    beyond_at = (at < EDGE_VOXELS) | (at > np.array(volume.values.shape) - 1 - EDGE_VOXELS)
-    border = np.asarray(beyond_at.any(axis=1))
-    within, step = inside(ends), np.array([[-1.0], [1.0]]) * line.forward
-    beyond = np.rint(apply(np.linalg.inv(volume.T_ct_index), ends + SEEN_MM * step)).astype(int)
-    beyond = np.clip(beyond, 0, np.array(hidden.shape) - 1)
-    out = border | ~within | hidden[tuple(beyond.T)]
+    step, shape = np.array([[-1.0], [1.0]]) * line.forward, np.array(volume.values.shape)
+    at, beyond = (apply(np.linalg.inv(volume.T_ct_index), ends + far * step) for far in (0.0, SEEN_MM))
+    border = np.asarray(((at < EDGE_VOXELS) | (at > shape - 1 - EDGE_VOXELS)).any(axis=1))
+    within, beyond = inside(ends), np.clip(np.rint(beyond).astype(int), 0, shape - 1)
+    out = border | ~inside(ends + SKIN_MM * step) | hidden[tuple(beyond.T)]
     deeper = (target_ct - line.middle) @ line.forward > 0
     for one, other in ((1, 0), (0, 1)) if deeper else ((0, 1), (1, 0)):
         if within[one] and not border[one] and out[other]:
             return ends[one], False
     for one, other in ((0, 1), (1, 0)):
-        if within[one] and border[one] and (border[other] or not within[other]):
+        if within[one] and border[one] and out[other]:
             return ends[one], True
     return None
 
