@@ -11,7 +11,7 @@ import argparse
 import json
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,7 @@ class Control:
         return self.tip + np.array([2.0, -1.5, 1.0]), self.forward
 
 
+@cache
 def trunk() -> tuple[TriangleMesh, tuple[TriangleMesh, ...]]:
     """Skin and bones of a piece of a trunk: an ellipsoid that is not round, a spine, and two ribs that are bent."""
     skin = trimesh.creation.icosphere(5, 1.0)
@@ -187,9 +188,8 @@ def _scanned(
             x, y = (i - i[metal].mean()) * cell[0], (j - j[metal].mean()) * cell[1]
             phase, parts = rng.uniform(0, 2 * np.pi, len(waves)), rng.normal(0, 1, len(waves)) / np.sqrt(len(waves))
             turn, fades = np.arctan2(y, x), np.exp(-np.hypot(x, y) / 25.0)
-            hu[:, :, k] += (
-                size * fades * sum(a * np.cos(w * turn + p) for w, a, p in zip(waves, parts, phase, strict=True))
-            )
+            around = np.polyval([*(parts * np.exp(1j * phase))[::-1], 0, 0], np.exp(1j * turn))  # sum a cos(w turn + p)
+            hu[:, :, k] += size * fades * around.real
     return Volume(np.clip(np.rint(hu), -1024, 3071).astype(np.int16), T, Path("scan"))
 
 
