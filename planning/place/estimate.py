@@ -352,19 +352,22 @@ class ReachEstimate(NamedTuple):
 NOTHING = ReachEstimate(0.0, 0.0, 0.0)
 
 
-def insertion_branches(model: UrModel, target_base: Floats, outward_base: Floats, distances_mm: Floats) -> Branches:
+def insertion_branches(
+    model: UrModel, target_base: Floats, outward_base: Floats, distances_mm: Floats, at_least: float = MIN_SINGULARITY
+) -> Branches:
     """Every branch of many insertions, by kinematics alone; joint limits are not tested.
 
     Args:
         target_base: Shape (3,), mm.
         outward_base: Shape (n, 3), unit.
         distances_mm: Shape (n, m): target to flange at each state.
+        at_least: Each singularity must be farther than this.
     """
     count, states = distances_mm.shape
     poses = flange_poses(target_base, np.repeat(outward_base, states, axis=0), distances_mm.reshape(-1))
     q = inverse(model, poses).reshape(count, states, N_BRANCHES, 6)
     least = singularity(model, q).least().min(axis=1)  # NaN where a state does not exist
-    return Branches(np.moveaxis(q, 2, 1), np.where(least > MIN_SINGULARITY, least, 0.0))
+    return Branches(np.moveaxis(q, 2, 1), np.where(least > at_least, least, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
