@@ -110,6 +110,16 @@ class Drawn(NamedTuple):
     inverse: Floats32
     triangle: Ints32
 
+    def part(self, where: tuple[slice, slice, slice]) -> Drawn:
+        """A copy of rows and columns of it."""
+        return Drawn(self.inverse[where].copy(), self.triangle[where].copy())
+
+    @staticmethod
+    def joined(bands: Sequence[Drawn]) -> Drawn:
+        """Bands, one below the other."""
+        inverse, triangle = [one.inverse for one in bands], [one.triangle for one in bands]
+        return Drawn(np.concatenate(inverse, axis=1), np.concatenate(triangle, axis=1))
+
     @staticmethod
     def empty(most: int, shape: tuple[int, ...]) -> Drawn:
         """Nothing is drawn yet; at most so many surfaces a sample."""
@@ -139,7 +149,8 @@ class Look(NamedTuple):
     def with_more(self, other: Look) -> Look:
         """Both; of two in one place the bodies of this one are seen."""
         faces, bodies = other.faces + np.int32(len(self.points)), other.bodies + np.int32(len(self.colours))
-        return Look(*map(np.concatenate, zip(self, other._replace(faces=faces, bodies=bodies), strict=True)))
+        parts: Any = zip(self, other._replace(faces=faces, bodies=bodies), strict=True)
+        return Look(*(np.concatenate(both) for both in parts))
 
 
 class View:
@@ -229,10 +240,8 @@ class MovingPicture:
         solid, glass = View(opaque, self._camera), View(translucents, self._camera)
         bands = _in_bands(self._camera, lambda rows: _drawn_band(solid, glass, rows))
         self._solid, self._glass = solid.look, glass.look
-        self._behind, self._shells = (
-            Drawn(*(np.concatenate(parts, axis=1) for parts in zip(*drawn, strict=True)))
-            for drawn in ([one.behind for one in bands], [one.shells for one in bands])
-        )
+        self._behind = Drawn.joined([one.behind for one in bands])
+        self._shells = Drawn.joined([one.shells for one in bands])
         self.still: Pixels = np.concatenate([one.pixels for one in bands])
         """The picture without what moves, shape (h, w, 3)."""
 
@@ -247,8 +256,9 @@ class MovingPicture:
             return self.still
         top, left = (int(one) // SAMPLES for one in spans[:, [1, 3]].min(axis=0))
         bottom, right = (int(one) // SAMPLES + 1 for one in spans[:, [2, 4]].max(axis=0))
-        part = np.s_[:, top * SAMPLES : bottom * SAMPLES, left * SAMPLES : right * SAMPLES]
-        behind, shells = Drawn(*(one[part].copy() for one in self._behind)), Drawn(*(one[part] for one in self._shells))
+        rows, columns = slice(top * SAMPLES, bottom * SAMPLES), slice(left * SAMPLES, right * SAMPLES)
+        part = slice(None), rows, columns
+        behind, shells = self._behind.part(part), self._shells.part(part)
         grid, corner = views[0].grid, (top * SAMPLES, left * SAMPLES)
         nothing = np.zeros(behind.inverse.shape[1:], dtype=np.float32)
         draw(*look[:3], spans, grid, corner, nothing, *behind)
