@@ -55,6 +55,10 @@ TYPE_2 = (
 """A slice that leaves one of these out gives it as empty: DICOM allows both to be unknown."""
 
 
+WHOSE = ("PatientID", "PatientName", "PatientBirthDate", "StudyInstanceUID")
+"""What all slices must say alike."""
+
+
 class Region(NamedTuple):
     """A region that becomes one segment: every voxel that holds one of its points.
 
@@ -97,8 +101,8 @@ def archive_files(scan: CtSeries, content: ArchiveContent) -> dict[str, bytes]:
     """The segmentation and the report, by their names.
 
     Raises:
-        InputError: A scan without a frame of reference or in several multi-frame files, a region outside of it, or
-            highdicom is not installed.
+        InputError: A scan without a frame of reference, of several patients or in several multi-frame files, a region
+            outside of it, or highdicom is not installed.
     """
     if not scan.frame_of_reference:
         what = "the scan states no frame of reference: nothing can refer to its coordinates"
@@ -120,6 +124,9 @@ def _sources(scan: CtSeries) -> list[Dataset]:
     """The scan's files in the order of the stack, complete in what every object of its study must repeat."""
     names = list(dict.fromkeys(one.file for one in scan.stack.slices))
     data = [parse_dicom(scan.content(name), Path(name)) for name in names]
+    if len({tuple(str(one.get(name, "")) for name in WHOSE) for one in data}) > 1:
+        what = "its slices name several patients or studies: the objects could belong to the wrong one"
+        refuse(what, scan.path, "slices of one patient and study", "several_patients")
     if len(data) > 1 and any(int(one.get("NumberOfFrames", 1)) > 1 for one in data):
         allowed = "one multi-frame file, or slices of one file each"
         refuse("several multi-frame files: no segmentation refers to them", scan.path, allowed, "many_multi_frame")

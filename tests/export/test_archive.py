@@ -10,6 +10,7 @@ import highdicom as hd
 import numpy as np
 import pydicom
 import pytest
+import SimpleITK
 from refusals import refused
 from search.test_dicom_case import write_scene
 
@@ -124,6 +125,32 @@ def test_regions_lie_where_they_are(scan):
     assert masks["entry window 1"][[30, 36, 33], [26, 26, 33], [9, 9, 10]].all()
 
 
+def test_another_reader_finds_the_voxels_where_they_are(scan, tmp_path):
+    """By the SEG's own orientation, spacing and positions alone: every set voxel's centre is that of the scan's voxel.
+
+    The frames are decoded by SimpleITK (GDCM), which shares no code with highdicom.
+    """
+    files = archive_files(scan, content_of(scan)[0])
+    (tmp_path / "segments.dcm").write_bytes(files[NAMES[0]])
+    frames = SimpleITK.GetArrayFromImage(SimpleITK.ReadImage(tmp_path / "segments.dcm"))
+    head = pydicom.dcmread(tmp_path / "segments.dcm", stop_before_pixels=True)
+    masks, at = read_masks(files[NAMES[0]], scan), centres(scan)
+    groups, names = head.SharedFunctionalGroupsSequence[0], [one.SegmentLabel for one in head.SegmentSequence]
+    found = {name: [] for name in names}
+    for frame, own in zip(frames, head.PerFrameFunctionalGroupsSequence, strict=True):
+        plane, measures = own.get("PlaneOrientationSequence", groups.get("PlaneOrientationSequence")), groups
+        row, column = np.reshape(np.array(plane[0].ImageOrientationPatient, float), (2, 3))
+        down, right = np.array(measures.PixelMeasuresSequence[0].PixelSpacing, float)
+        origin = np.array(own.PlanePositionSequence[0].ImagePositionPatient, float)
+        j, i = np.nonzero(frame)
+        points = origin + i[:, None] * right * row + j[:, None] * down * column
+        found[names[own.SegmentIdentificationSequence[0].ReferencedSegmentNumber - 1]].append(points)
+    for name, mask in masks.items():
+        points, true = np.concatenate(found[name]), at[mask]
+        assert len(points) == len(true) > 0
+        assert np.linalg.norm(points[:, None] - true, axis=2).min(axis=1).max() < 1e-3
+
+
 def test_the_report_has_numbers_lines_and_words(scan):
     """Numbers exactly, lines in the single precision that DICOM has, in the scan's frame of reference."""
     content, ends = content_of(scan)
@@ -150,6 +177,20 @@ def test_what_lies_outside_is_refused(scan):
     away = Region("far", "skin", np.full((1, 3), 5000.0))
     with refused("outside_image"):
         archive_files(scan, ArchiveContent("A path", (away,), {}, (), ()))
+
+
+@pytest.mark.parametrize(("name", "value"), [("PatientID", "another"), ("StudyInstanceUID", "1.2.3.4")])
+def test_slices_of_several_patients_are_refused(tmp_path, name, value):
+    """One slice that names another: nobody could say whose the needle is."""
+    slices, content = world.series(world.phantom(SHAPE) % 2000), {}
+    setattr(slices[5], name, value)
+    for number, one in enumerate(slices):
+        stream = io.BytesIO()
+        one.save_as(stream, enforce_file_format=True)
+        content[f"{number}.dcm"] = stream.getvalue()
+    scan = CtSeries(tmp_path, tuple(content), content.__getitem__)
+    with refused("several_patients"):
+        archive_files(scan, content_of(scan)[0])
 
 
 @pytest.fixture(scope="module")
