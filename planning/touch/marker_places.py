@@ -6,22 +6,28 @@ pose is off at the target by the covariance
     (sum_i A_i' C^-1 A_i)^-1,   of which the first three axes are the shift,
 
 so that places far apart and all round the target are best. Places are exchanged, one at a time, until none is better;
-those are passed over that lie in or near an entry window, that no needle can touch, or whose names could be swapped
-without a trace, also where a person puts each a few mm off.
+those are passed over that lie in or near an entry window, at an arm or under one, on an edge, that no needle can touch,
+or whose names could be swapped without a trace, also where a person puts each a few mm off. Where too few are left the
+distances that are wanted shrink, and what is not met is said.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial.distance import pdist
 
-from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, Anatomy
+from puncture_twin.planning.anatomy.anatomy import ATTACHED_LIMB, OUTSIDE_BODY, Anatomy
+from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.case.case import Case, up_axis
+from puncture_twin.planning.geometry.containment import crossings
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.registration.checks.places import untouchable
@@ -34,8 +40,8 @@ from puncture_twin.planning.touch.touch_planner import MOST_MARKERS, PLANNED_PAD
 from puncture_twin.planning.touch.tour_motions import ApproachCheckers, why_not
 from puncture_twin.planning.uncertainty.touch_choice import touch_candidates
 
-PLACES, BETWEEN_PLACES_MM = 300, 9.0
-"""Places of the skin that are tried, and the least distance between two of them."""
+DRAWN, PLACES, BETWEEN_PLACES_MM = 12_000, 300, 9.0
+"""Places of the skin that are drawn and that are tried, and the least distance between two of these."""
 FAR_MM = 150.0
 """From the target: farther away the skin moves on its own, and an arm does not reach both."""
 APART_MM = 35.0
@@ -43,12 +49,17 @@ APART_MM = 35.0
 WINDOW_MM = 25.0
 """From an entry of a safe direction: half a drape's hole, and a finger."""
 END_MM = 15.0
-"""From where the image ends."""
+"""From where the image ends, and from what lies on the skin or is no trunk: arms, the table."""
+RELAXED = ((1.0, 1.0), (0.5, 1.0), (0.2, 1.0), (0.5, 2.0), (0.2, 5.0))
+"""Times what is wanted from windows and between places, and times the farthest from the target: one pair after the
+other, until there are places."""
+FLAT = 0.97
+"""Length of the mean of the skin's normals about a place: a marker does not stick to an edge."""
 LEAST_UP = 0.1
 """Cosine between the skin's normal and up: a marker below is not seen from where an arm stands."""
 SLIP_MM = 6.0
 """A set of names swapped must not fit to so much (rms): a person puts a marker some mm off."""
-STARTS, SWEEPS, SEED = 6, 6, 37
+STARTS, SWEEPS, SEED = 16, 6, 37
 TRIES = 80
 """The best places that are looked at for one marker in a sweep."""
 POSES = 8
@@ -59,6 +70,13 @@ FLE_MM = 1.0
 """Error of one marker where the case declares none: the answer then is per mm of it."""
 
 
+class Tape(NamedTuple):
+    """A length on the skin, from the middle of the body's upper side, and the patient's side toward which it runs."""
+
+    length_mm: float
+    toward: str
+
+
 @dataclass(frozen=True, eq=False)
 class MarkerPlace:
     """Where one marker should be put, LPS mm.
@@ -66,24 +84,25 @@ class MarkerPlace:
     Attributes:
         point_ct: Shape (3,), on the skin.
         head_mm: Toward the head from the target's level, negative toward the feet.
-        girth_mm: Along a tape round the body at that level, from its highest point, positive to the patient's left.
+        tape: Round the body at that level; None where the image cuts the body's sides.
     """
 
     name: str
     point_ct: Floats
     normal_ct: Floats
     head_mm: float
-    girth_mm: float
+    tape: Tape | None
 
     def words(self, space: Space) -> str:
         """How to find it on the skin; a space of its own has no anatomy, and is told by coordinates."""
         if space is Space.LOCAL:
             return f"at {point_text(self.point_ct, space)}"
-        level, side = "head" if self.head_mm >= 0 else "feet", "left" if self.girth_mm >= 0 else "right"
-        return (
-            f"{abs(self.head_mm):.0f} mm toward the {level} from the target's level, then {abs(self.girth_mm):.0f} mm "
-            f"along the skin to the patient's {side} from the highest point there"
-        )
+        end = "head" if self.head_mm >= 0 else "feet"
+        level = f"{abs(self.head_mm):.0f} mm toward the {end} from the target's level"
+        if self.tape is None:
+            return f"{level}, at {point_text(self.point_ct, space)}"
+        along = f"{self.tape.length_mm:.0f} mm along the skin to the patient's {self.tape.toward}"
+        return f"{level}, then {along} from halfway between the body's sides"
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +114,7 @@ class Proposal:
         declared: Whether the case declares the errors, or 1 mm a marker is assumed.
         arm: Whether the arm was asked, or why not.
         near_window_mm: Of the nearest one to an entry.
+        unmet: What is wanted of places and is not so here, in words.
     """
 
     places: tuple[MarkerPlace, ...]
@@ -102,16 +122,18 @@ class Proposal:
     declared: bool
     arm: str
     near_window_mm: float
+    unmet: tuple[str, ...]
 
 
 class _Skin(NamedTuple):
-    """Places (n, 3) of the skin, mm, and normals out of it (n, 3)."""
+    """Places (n, 3) of the skin, mm, normals out of it (n, 3), and how far each is from an entry (n,)."""
 
     points: Floats
     normals: Floats
+    to_entry: Floats
 
     def of(self, rows: Ints | Bools) -> _Skin:
-        return _Skin(self.points[rows], self.normals[rows])
+        return _Skin(*(one[rows] for one in self))
 
 
 def propose_markers(context: CaseContext, candidates: Candidates, count: int) -> Proposal:
@@ -132,45 +154,84 @@ def propose_markers(context: CaseContext, candidates: Candidates, count: int) ->
     if not candidates.safe.any():
         raise NoAnswerError("no direction is safe: there is no window to put markers beside", code="no_safe_direction")
     entries = cKDTree(candidates.path.entry_ct[candidates.safe])
-    skin = _places(case, anatomy, entries)
-    skin = skin.of(_touchable(context, candidates, skin.points))
-    C = FLE_MM**2 / 3 * np.eye(3)
+    every, C = _places(case, anatomy, entries), FLE_MM**2 / 3 * np.eye(3)
     if case.errors is not None:
         C = case.errors.marker_cov_ct + case.errors.touch_mm**2 * np.eye(3)
-    chosen, error = _exchanged(skin, case.target_ct, C, count)
+    for less, farther in RELAXED:
+        skin = _wanted(every, case, anatomy, WINDOW_MM * less, FAR_MM * farther)
+        skin = skin.of(_touchable(context, candidates, skin.points))
+        chosen, error = _exchanged(skin, case.target_ct, C, count, less)
+        if chosen:
+            break
+    else:
+        what = f"no {count} places that can be told apart, of {len(skin.points)} beside the windows that can be touched"
+        raise NoAnswerError(what, code="no_place")
     order = sorted(chosen, key=lambda row: (-skin.points[row, 2], skin.points[row, 0]))
-    places = tuple(_described(f"M{n}", skin.of(np.array([row])), case, anatomy) for n, row in enumerate(order, start=1))
-    near, _ = entries.query(skin.points[order])
-    return Proposal(places, error, case.errors is not None, context.arm, float(near.min()))
+    put = skin.of(np.array(order))
+    places = tuple(_described(f"M{n}", put.of(np.array([n - 1])), case, anatomy) for n in range(1, count + 1))
+    unmet, near = tuple(_unmet(put, case.target_ct)), float(put.to_entry.min())
+    return Proposal(places, error, case.errors is not None, context.arm, near, unmet)
+
+
+def _unmet(put: _Skin, target_ct: Floats) -> Iterator[str]:
+    """What is wanted of places and is not so of these, in words."""
+    if (near := put.to_entry.min()) < WINDOW_MM:
+        yield f"a marker is {near:.0f} mm from an entry, less than {WINDOW_MM:g}: mind the drape"
+    if (far := np.linalg.norm(put.points - target_ct, axis=1).max()) > FAR_MM:
+        yield f"a marker is {far:.0f} mm from the target, more than {FAR_MM:g}: skin moves there on its own"
+    if (gap := pdist(put.points).min()) < APART_MM:
+        yield f"two markers are {gap:.0f} mm apart, less than {APART_MM:g}"
+    if not _told_apart(put.points, target_ct, SLIP_MM):
+        within = SLIP_MM * RELAXED[-1][0]
+        yield f"put each within {within:.1g} mm of its place: with names swapped they would fit to {SLIP_MM:g} mm"
 
 
 def _places(case: Case, anatomy: Anatomy, entries: cKDTree) -> _Skin:
-    """Places of the skin where a marker could be, evenly spread."""
+    """Places of the trunk's skin where a marker could stick, drawn evenly, however far from windows and target."""
     mesh, cut = anatomy.skin.mesh, anatomy.skin.cut_faces
     triangles = mesh.triangles
     middles = triangles.mean(axis=1)
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     areas = np.linalg.norm(normals, axis=1)
-    usable = ~cut & (areas > 0) & (np.linalg.norm(middles - case.target_ct, axis=1) <= FAR_MM)
-    ends = [middles[cut]] if cut.any() else []
-    limbs = [one.mesh.vertices for one in anatomy.structures if one.name == ATTACHED_LIMB]
-    for points in (*ends, *limbs):
-        usable &= cKDTree(points).query(middles, distance_upper_bound=END_MM)[0] > END_MM
-    usable &= entries.query(middles, distance_upper_bound=WINDOW_MM)[0] > WINDOW_MM
+    usable = ~cut & (areas > 0) & (np.linalg.norm(middles - case.target_ct, axis=1) <= FAR_MM * RELAXED[-1][1])
+    for points in (middles[cut], *(mesh.vertices for mesh in _others(anatomy))):
+        if len(points):
+            usable &= cKDTree(points).query(middles, distance_upper_bound=END_MM)[0] > END_MM
     rows = np.flatnonzero(usable)
     if not len(rows):
-        raise NoAnswerError("no skin is left beside the entry windows", code="no_place")
+        raise NoAnswerError("no skin of the trunk is seen but at its ends", code="no_place")
     rng = np.random.default_rng(SEED)
-    drawn = rng.choice(rows, size=min(len(rows), 20 * PLACES), replace=False, p=areas[rows] / areas[rows].sum())
-    about = cKDTree(middles)
-    smooth = np.array([normals[near].sum(axis=0) for near in about.query_ball_point(middles[drawn], BETWEEN_PLACES_MM)])
-    smooth *= np.copysign(1.0, mesh.volume) / np.maximum(np.linalg.norm(smooth, axis=1, keepdims=True), 1e-9)
+    drawn = rng.choice(rows, size=min(len(rows), DRAWN), replace=False, p=areas[rows] / areas[rows].sum())
+    near = cKDTree(middles).query_ball_point(middles[drawn], BETWEEN_PLACES_MM)
+    flat = np.array([normals[some].sum(axis=0) / areas[some].sum() for some in near]) * np.copysign(1.0, mesh.volume)
     up = np.asarray(up_axis(case)) / np.linalg.norm(up_axis(case))
-    over = np.flatnonzero(smooth @ up >= LEAST_UP)
-    skin = _Skin(middles[drawn[over]], smooth[over])
+    over = np.flatnonzero((flat @ up >= LEAST_UP) & (np.linalg.norm(flat, axis=1) >= FLAT))
+    points = middles[drawn[over]]
+    return _Skin(points, flat[over] / np.linalg.norm(flat[over], axis=1, keepdims=True), entries.query(points)[0])
+
+
+def _others(anatomy: Anatomy) -> list[TriangleMesh]:
+    """What the CT shows that is not the trunk: arms at its side or across it, the table."""
+    return [one.mesh for one in anatomy.surroundings if one.name in (ATTACHED_LIMB, OUTSIDE_BODY)]
+
+
+def _wanted(every: _Skin, case: Case, anatomy: Anatomy, off_mm: float, far_mm: float) -> _Skin:
+    """Those so far from the windows and so near to the target, evenly spread, over which nothing stands."""
+    far = np.linalg.norm(every.points - case.target_ct, axis=1)
+    skin = every.of((every.to_entry > off_mm) & (far <= far_mm))
     skin = skin.of(_thinned(skin.points))
-    blocked = {row for row, _ in untouchable(case, skin.points, skin.normals, anatomy.couch)}
-    return skin.of(np.array([row for row in range(len(skin.points)) if row not in blocked], dtype=np.int64))
+    boxed = [row for row, _ in untouchable(case, skin.points, skin.normals)]
+    skin = skin.of(np.setdiff1d(np.arange(len(skin.points)), boxed))
+    for solid in (*_others(anatomy), *([] if anatomy.couch is None else [anatomy.couch])):
+        places = zip(skin.points, skin.normals, strict=True)
+        clear = [_is_clear(solid, *one, case.needle.length_mm) for one in places]
+        skin = skin.of(np.array(clear, dtype=np.bool_))
+    return skin
+
+
+def _is_clear(solid: TriangleMesh, point: Floats, normal: Floats, reach_mm: float) -> bool:
+    """Whether nothing of a solid stands over a place (3,), straight out of the skin, as an arm over a trunk does."""
+    return not crossings(solid, point, normal[None], reach_mm).count[0]
 
 
 def _thinned(points: Floats) -> Ints:
@@ -198,8 +259,8 @@ def _is_free(checkers: ApproachCheckers, case: Case, point_base: Floats, q_inser
     return any(not why_not(checkers, tip, q) for q in np.concatenate([found.alike, found.others])[:POSES])
 
 
-def _exchanged(skin: _Skin, target_ct: Floats, C: Floats, count: int) -> tuple[list[int], float]:
-    """Rows of the best places, by exchange from several starts, and their expected error, mm."""
+def _exchanged(skin: _Skin, target_ct: Floats, C: Floats, count: int, less: float = 1.0) -> tuple[list[int], float]:
+    """Rows of the best places, by exchange from several starts, and their expected error, mm; none where none fit."""
     rng, best, least = np.random.default_rng(SEED), list[int](), np.inf
     A = design(skin.points, target_ct).reshape(-1, 3, 6)
     each = np.swapaxes(A, 1, 2) @ np.linalg.inv(C) @ A
@@ -211,16 +272,13 @@ def _exchanged(skin: _Skin, target_ct: Floats, C: Floats, count: int) -> tuple[l
             for slot in range(count):
                 others = chosen[:slot] + chosen[slot + 1 :]
                 costs = _errors_mm(each[others].sum(axis=0) + each)
-                found = _first(costs, skin, others, target_ct)
+                found = _first(costs, skin.points, others, target_ct, less)
                 chosen[slot], settled[slot] = (chosen[slot], False) if found is None else (found, True)
             if chosen == before:
                 break
         error = float(_errors_mm(each[chosen].sum(axis=0)[None])[0])
         if all(settled) and error < least:
             best, least = chosen, error
-    if not best:
-        what = f"no {count} places that can be told apart, of {len(skin.points)} beside the windows that can be touched"
-        raise NoAnswerError(what, code="no_place")
     return best, least
 
 
@@ -234,47 +292,62 @@ def _errors_mm(information: Floats) -> Floats:
     return np.where(known, np.sqrt(np.trace(shift, axis1=-2, axis2=-1)), np.inf)
 
 
-def _first(costs: Floats, skin: _Skin, others: list[int], target_ct: Floats) -> int | None:
+def _first(costs: Floats, every: Floats, others: list[int], target_ct: Floats, less: float) -> int | None:
     """The place of least cost that is apart from the others and told apart from them."""
-    points = skin.points[others]
-    gaps = np.linalg.norm(skin.points[:, None] - points, axis=2).min(axis=1)
-    rows = [row for row in np.argsort(costs, kind="stable") if gaps[row] >= APART_MM and np.isfinite(costs[row])]
-    for row in rows[:TRIES]:
-        if _told_apart(np.vstack([points, skin.points[row]]), target_ct):
-            return int(row)
-    return None
+    points = every[others]
+    gaps = np.linalg.norm(every[:, None] - points, axis=2).min(axis=1)
+    apart = (gaps >= APART_MM * less) & np.isfinite(costs)
+    rows = [row for row in np.argsort(costs, kind="stable") if apart[row]]
+    told = (one for one in rows[:TRIES] if _told_apart(np.vstack([points, every[one]]), target_ct, SLIP_MM * less))
+    return next((int(row) for row in told), None)
 
 
-def _told_apart(points: Floats, target_ct: Floats) -> bool:
+def _told_apart(points: Floats, target_ct: Floats, slip_mm: float) -> bool:
     """Whether no swap of names fits as well as a person puts markers."""
     names = tuple(map(str, range(len(points))))
-    return not renamings(MarkerPairs(names, points, points), target_ct, SLIP_MM).found
+    return not renamings(MarkerPairs(names, points, points), target_ct, slip_mm).found
 
 
 def _described(name: str, place: _Skin, case: Case, anatomy: Anatomy) -> MarkerPlace:
-    point, normal = place.points[0], place.normals[0]
-    girth = girth_mm(anatomy.skin.mesh.vertices, point, np.asarray(up_axis(case)))
-    return MarkerPlace(name, point, normal, float(point[2] - case.target_ct[2]), girth)
+    (point,), (normal,) = place.points, place.normals
+    tape = None if case.space is Space.LOCAL else tape_to(anatomy.skin, point, np.asarray(up_axis(case)))
+    return MarkerPlace(name, point, normal, float(point[2] - case.target_ct[2]), tape)
 
 
 LEVEL_MM = 4.0
 """Of a body's vertices, those so near to a level show its outline there."""
+SIDES = ("left", "back", "right", "front")
+"""LPS, a quarter of a rotation about the head's axis each."""
 
 
-def girth_mm(vertices: Floats, point: Floats, up: Floats) -> float:
-    """Length of a tape round the body from its highest point to a point (3,), positive to the patient's left, mm.
+def tape_to(skin: Skin, point: Floats, up: Floats) -> Tape | None:
+    """A tape round the body at a point (3,), mm, from the middle of the body's upper side.
 
-    A tape spans hollows: it is the outline's convex hull in the axial slice.
+    A tape spans hollows: it is the outline's convex hull in the axial slice. The middle is halfway between the body's
+    sides, which a person sees; of a flat belly none sees the highest point.
+
+    Args:
+        up: Shape (3,), LPS, of any length.
+
+    Returns:
+        None where the image cuts the body's sides at this level.
     """
-    level = vertices[np.abs(vertices[:, 2] - point[2]) <= LEVEL_MM][:, :2]
-    hull = level[ConvexHull(level).vertices]
-    upward = up[:2] / max(float(np.linalg.norm(up[:2])), 1e-9)
-    start = int(np.argmax(hull @ upward))
-    line = np.vstack([np.roll(hull, -start, axis=0), hull[start]])
-    edges = np.diff(line, axis=0)
-    lengths = np.linalg.norm(edges, axis=1)
-    part = np.clip(np.einsum("ij,ij->i", point[:2] - line[:-1], edges) / np.maximum(lengths**2, 1e-12), 0.0, 1.0)
-    nearest = int(np.argmin(np.linalg.norm(line[:-1] + part[:, None] * edges - point[:2], axis=1)))
-    along = float(lengths[:nearest].sum() + part[nearest] * lengths[nearest])
+    vertices, cut = skin.mesh.vertices, np.zeros(len(skin.mesh.vertices), np.bool_)
+    cut[skin.mesh.faces[skin.cut_faces]] = True
+    near = np.abs(vertices[:, 2] - point[2]) <= LEVEL_MM
+    rows = ConvexHull(vertices[near][:, :2]).vertices  # in the order left, back, right, front
+    hull, upward = vertices[near][rows, :2], up[:2] / max(float(np.hypot(*up[:2])), 1e-9)
+    across = hull @ [-upward[1], upward[0]]
+    if cut[near][rows[[across.argmin(), across.argmax()]]].any():
+        return None
+    after, edges = np.roll(across, -1), np.roll(hull, -1, axis=0) - hull
+    lengths, middle = np.linalg.norm(edges, axis=1), (across.min() + across.max()) / 2
+    upper = int(np.flatnonzero((across <= middle) & (after > middle))[0])  # across grows along the upper side alone
+    part = np.clip(np.einsum("ij,ij->i", point[:2] - hull, edges) / np.maximum(lengths**2, 1e-12), 0.0, 1.0)
+    nearest = int(np.argmin(np.linalg.norm(hull + part[:, None] * edges - point[:2], axis=1)))
+    begins = np.cumsum(lengths) - lengths
+    start = begins[upper] + (middle - across[upper]) / (after[upper] - across[upper]) * lengths[upper]
+    along = float((begins[nearest] + part[nearest] * lengths[nearest] - start) % lengths.sum())
+    quarter = int(np.rint(np.arctan2(upward[1], upward[0]) / (np.pi / 2)))
     back = float(lengths.sum()) - along
-    return along if along <= back else -back  # the hull runs from left to back, as its points are ordered in (x, y)
+    return Tape(along, SIDES[(quarter + 1) % 4]) if along <= back else Tape(back, SIDES[(quarter - 1) % 4])

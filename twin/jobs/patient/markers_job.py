@@ -285,6 +285,7 @@ class ProposalRun:
             "errors": "declared" if proposal.declared else "1 mm a marker",
             "arm": proposal.arm,
             "nearest_entry_mm": proposal.near_window_mm,
+            "unmet": list(proposal.unmet),
             "inputs": inputs_document(case.inputs),
             "files": [str(path) for path in self.files],
         }
@@ -294,7 +295,9 @@ class ProposalRun:
         position = to_lps(one.point_ct[None], space)[0].tolist()
         measured: dict[str, Any] = {}
         if space is not Space.LOCAL:
-            measured = {"toward_head_mm": one.head_mm, "round_to_left_mm": one.girth_mm}
+            measured = {"toward_head_mm": one.head_mm}
+            if one.tape is not None:
+                measured |= {"along_skin_mm": one.tape.length_mm, "along_skin_to": one.tape.toward}
         if self.context.anatomy.scan is not None:
             number, _ = slice_numbers(self.context.anatomy.scan.grid)
             measured["slice"] = int(np.rint(number @ [*one.point_ct, 1.0]))
@@ -316,7 +319,7 @@ class ProposalRun:
             Section(f"where to put {len(names)} markers, {self.context.case.name}",
                     [facts([(one["name"], _place_text(one)) for one in found["proposed"]]), facts(facts_)]),
             Section("straight distances, mm", [grid([Field("", "name"), *(Field(n, n, 0) for n in names)], rows)]),
-            *footer(self.files),
+            *footer(self.files, self.proposal.unmet),
         ])  # fmt: skip
 
 
