@@ -1,58 +1,12 @@
 """A body in a scanner with markers on its skin, and everything in and about it that is none."""
 
 from itertools import pairwise
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import trimesh
 
-from puncture_twin.planning.anatomy.body.body_mask import ct_image
-from puncture_twin.planning.anatomy.skin import skin_of_image
-from puncture_twin.planning.formats.volumes.volume_files import Volume
-from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
-from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import frame_about
+from benchmarks.markers import Markers, body, body_of, marker_mesh, on_skin, scanned, table
 from puncture_twin.planning.registration.fiducials import Stated, find_fiducials, look_for_fiducials
-from puncture_twin.twin.plant.scanner.image import Solid, ball, box, rod, scan_solids
-
-RADII = np.array([52.0, 42.0, 70.0])
-"""Half axes of the body, an ellipsoid, mm."""
-PIXEL = 0.8
-
-
-def on_skin(theta, z):
-    """A point of the body's skin (3,), mm, and its outward normal; theta from the left toward the back, rad."""
-    wide = np.sqrt(1 - (z / RADII[2]) ** 2)
-    point = np.array([wide * np.cos(theta), wide * np.sin(theta), z / RADII[2]]) * RADII
-    normal = point / RADII**2
-    return point, normal / np.linalg.norm(normal)
-
-
-def ring(point, normal, diameter, thick):
-    """A washer with a hole of 0.4 of its diameter, about a point (3,), mm."""
-    mesh = trimesh.creation.annulus(0.2 * diameter, diameter / 2, thick, sections=48)
-    R = frame_about(normal)
-    return TriangleMesh(np.asarray(mesh.vertices) @ R.T + point, np.asarray(mesh.faces))
-
-
-def marker_mesh(kind, point, normal, diameter, thick):
-    """One marker's surface."""
-    if kind == "ball":
-        return ball(point, diameter)
-    half = thick / 2 * normal
-    return rod(point - half, point + half, diameter) if kind == "disc" else ring(point, normal, diameter, thick)
-
-
-class Markers(NamedTuple):
-    """What stands on the skin: ``off_mm`` from a marker's back to the skin."""
-
-    kind: str = "ball"
-    diameter: float = 8.0
-    hu: float = 8000.0
-    thick: float = 2.0
-    count: int = 6
-    off_mm: float = 0.3
+from puncture_twin.twin.plant.scanner.image import Solid, ball, rod
 
 
 def places(markers, rng):
@@ -90,39 +44,14 @@ def distractors(rng):
     return solids
 
 
-def table():
-    """A shell about foam under the body, with bolts."""
-    at, size = np.array([0.0, RADII[1] + 16.0, 0.0]), np.array([120.0, 20.0, 150.0])
-    bolts = [Solid("bolt", ball(at + [x, 4.0, z], 8.0), 8000.0) for x in (-40.0, 40.0) for z in (-40.0, 0.0, 40.0)]
-    return [Solid("table", box(at, size), 60.0), Solid("foam", box(at, size - 4.0), -930.0), *bolts]
-
-
-def scanned(solids, settings, rng, half=(75.0, 72.0, 86.0)):
-    """The CT of a scene, its grid anywhere within a voxel."""
-    spacing, half = np.array([settings.pixel_mm, settings.pixel_mm, settings.spacing_mm]), np.array(half)
-    T = np.diag([*spacing, 1.0])
-    T[:3, 3] = -half + rng.uniform(0, 1, 3) * spacing
-    shape = tuple(int(n) for n in 2 * half / spacing)
-    image = scan_solids(solids, VolumeGrid(shape, T, {}), settings, rng)
-    return Volume(image.hu, T, Path("scan"))
-
-
 def scene(markers, rng, *, others=True):
     """True centres (n, 3) and the solids of a whole scene."""
-    mesh = trimesh.creation.icosphere(5, 1.0)
-    body = TriangleMesh(np.asarray(mesh.vertices) * RADII, np.asarray(mesh.faces))
     points, normals = places(markers, rng)
     on = [
         Solid("marker", marker_mesh(markers.kind, p, n, markers.diameter, markers.thick), markers.hu)
         for p, n in zip(points, normals, strict=True)
     ]
-    return points, [*(table() if others else []), Solid("body", body, 30.0), *(distractors(rng) if others else []), *on]
-
-
-def body_of(volume):
-    """The CT as the finder takes it, and its skin."""
-    image = ct_image(volume)
-    return Volume(image.hu, image.T_ct_index, volume.path), skin_of_image(image)
+    return points, [*(table() if others else []), body(), *(distractors(rng) if others else []), *on]
 
 
 def found_in(markers, settings, *, others=True, stated=None):

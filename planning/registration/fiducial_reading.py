@@ -80,6 +80,10 @@ STATED = 0.07
 THICK_MM = 2.5
 BLUR_SIGMA_MM, BLUR_KNOWN = 0.45, 0.12
 """Of reconstruction and pixel together, in the plane, mm."""
+MADE = np.diag([0.1, 0.02]) ** 2
+"""Of density and diameter: how far markers of one product differ (logarithms)."""
+ALIKE = 11.829
+"""Square of a difference over its covariance: of one product in 3 standard deviations, chi-squared of two (99.7 %)."""
 FLOOR_MM, LACKING = 0.01, 0.25
 """Standard deviation that no reading is below, and how far what a drawing lacks may move it, part of a voxel along each
 axis: it is no noise, which a mean would lessen."""
@@ -110,7 +114,9 @@ class Reading:
         cov_ct: Shape (3, 3), mm².
         contrast_hu: Its greatest value above soft tissue's; of clipped metal at least so much.
         clipped: Whether the image's range clips it.
-        misfit: Root mean square of what its drawing lacks, over that of its contrast; 0 is a perfect marker.
+        misfit: Root mean square of what its drawing lacks beyond noise, over that of its contrast.
+        make: Logarithms of density (HU) and diameter (mm), shape (2,).
+        cov_make: Of these, shape (2, 2).
         others: Kinds whose drawing is about as near.
     """
 
@@ -120,12 +126,20 @@ class Reading:
     contrast_hu: float
     clipped: bool
     misfit: float
+    make: Floats
+    cov_make: Floats
     others: tuple[Kind, ...] = ()
 
-    @property
-    def kinds(self) -> tuple[Kind, ...]:
-        """What it may be."""
-        return (self.shape.kind, *self.others)
+    def alike(self, other: Reading) -> bool:
+        """Whether both may be of one product: of one kind, and as large and dense as their readings tell."""
+        off, cov = self.make - other.make, self.cov_make + other.cov_make + 2 * MADE
+        return bool({self.shape.kind, *self.others} & {other.shape.kind, *other.others}) and bool(
+            off @ np.linalg.solve(cov, off) < ALIKE
+        )
+
+    def of_size(self, diameter_mm: float) -> bool:
+        """Whether it may be as wide as a person states."""
+        return bool((self.make[1] - np.log(diameter_mm)) ** 2 < ALIKE * (self.cov_make[1, 1] + STATED**2))
 
 
 class Box(NamedTuple):
@@ -207,10 +221,19 @@ class Middle:
         return np.asarray(slope / np.linalg.norm(slope))
 
     @property
+    def _variances(self) -> Floats:
+        """Along its axes, least first, without blur, shape (3,), mm²."""
+        return np.asarray(np.maximum(np.linalg.eigvalsh(self.spread - _blur(self.box.volume)), 0.0))
+
+    @property
     def wide_mm(self) -> float:
         """About its diameter."""
-        variances = np.linalg.eigvalsh(self.spread - _blur(self.box.volume))
-        return float(np.clip(4 * np.sqrt(max(float(variances[1:].mean()), 0.0)), LEAST_MM, 1.3 * LARGEST_MM))
+        return float(np.clip(4 * np.sqrt(self._variances[1:].mean()), LEAST_MM, 1.3 * LARGEST_MM))
+
+    @property
+    def across_mm(self) -> float:
+        """About how wide it is across its longest axis."""
+        return 4 * float(np.sqrt(self._variances[1]))
 
 
 def find_middle(box: Box) -> Middle | None:
@@ -271,25 +294,21 @@ def read_marker(
         diameter_mm: As a person states it.
     """
     unresolved = middle.wide_mm < UNRESOLVED * float(spacing_mm(middle.box.volume).min())
-    every, background = list[Reading](), middle.background(normal)
+    every, background = list[tuple[float, Reading]](), middle.background(normal)
     for kind in kinds[:1] if unresolved else kinds:
-        every.append(_fitted(_Drawing.of(middle, kind, normal, diameter_mm, background)))
-        if every[-1].misfit < SURE:
+        lacks, reading = _fitted(_Drawing.of(middle, kind, normal, diameter_mm, background))
+        every.append((lacks * PLAIN[kind], reading))
+        if lacks < SURE:
             break
-    every.sort(key=_rank)
-    best = every[0]
-    near = [one for one in every if _rank(one) < AS_NEAR * _rank(best)]
+    least, best = min(every, key=lambda one: one[0])
+    near = [one for lacks, one in every if lacks < AS_NEAR * least]
     off = np.array([one.centre_ct - best.centre_ct for one in near])
-    others = kinds if unresolved else tuple(one.shape.kind for one in near[1:])
+    others = kinds if unresolved else tuple(one.shape.kind for one in near if one is not best)
     return replace(best, cov_ct=best.cov_ct + off.T @ off / len(off), others=others)
 
 
-def _rank(reading: Reading) -> float:
-    return reading.misfit * PLAIN[reading.shape.kind]
-
-
-def _fitted(drawing: _Drawing) -> Reading:
-    """The marker of a kind whose drawing is nearest to the image."""
+def _fitted(drawing: _Drawing) -> tuple[float, Reading]:
+    """The marker of a kind whose drawing is nearest to the image, and what that lacks of it, noise too."""
     middle, start, known = drawing.middle, drawing.start, drawing.known
     noise = middle.box.noise_hu
 
@@ -308,10 +327,19 @@ def _fitted(drawing: _Drawing) -> Reading:
 
     fit = gauss_newton(start, linearised, np.add, lambda _, step: bool(np.abs(step[:3]).max() < SETTLED_MM), ROUNDS)
     p = fit.estimate
-    misfit = float(np.sqrt(np.mean((drawing.seen - drawing.image(p)) ** 2))) / drawing.contrast_hu
-    cov = np.linalg.inv(fit.system.information)[:3, :3] + drawing.unknown(p, misfit)
-    hu = middle.peak_hu - TISSUE_HU
-    return Reading(middle.centre_ct + p[:3], cov, drawing.shape(p), hu, middle.clipped, misfit)
+    lacks, contrast = float(np.mean((drawing.seen - drawing.image(p)) ** 2)), drawing.contrast_hu
+    misfit, shape = float(np.sqrt(max(lacks - noise**2, 0.0))) / contrast, drawing.shape(p)
+    cov, edge = np.linalg.inv(fit.system.information), 2 * LACKING * misfit * min(spacing_mm(middle.box.volume))
+    return np.sqrt(lacks) / contrast, Reading(
+        middle.centre_ct + p[:3],
+        cov[:3, :3] + drawing.unknown(p, misfit),
+        shape,
+        middle.peak_hu - TISSUE_HU,
+        middle.clipped,
+        misfit,
+        p[3:5],
+        cov[3:5, 3:5] + np.diag([misfit, edge / shape.diameter_mm]) ** 2,
+    )
 
 
 @dataclass(frozen=True, eq=False)

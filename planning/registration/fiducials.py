@@ -22,6 +22,7 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from puncture_twin.planning.anatomy.metal import METAL_HU, spacing_mm
@@ -61,18 +62,17 @@ LEAST_CLIPPED = 4
 """Voxels of one greatest value: dense things have noise where they are not clipped."""
 LEAST_CONTRAST_HU, LEAST_CONTRAST_SD = 150.0, 6.0
 """Of a marker above soft tissue, and over the image's noise; 200 HU less what small ones lose by blur."""
-MOST_MISFIT = 0.38
-"""Of an image from the drawing of a marker: balls, discs and rings have up to .3, an L or a bone's end more."""
+MOST_MISFIT = 0.28
+"""Of an image from the drawing of a marker: balls, discs and rings have up to .25, an L or a bone's end more."""
 LEAST_ROUND = 0.42
 """Of two axes: a piece of wire has a tenth."""
 NEARLY = 0.7
 """What has so much of what a marker has is doubtful."""
 OFF_SKIN_MM, UNDER_SKIN_MM, IN_SKIN_MM = 5.0, 4.0, 1.0
 """How far beyond its own size a marker may lie off the skin, of metal under it, and of other contrast under it."""
-SIZE_ALIKE = 0.3
-"""Diameters of one kind of marker differ by less, and half a voxel."""
-CONTRAST_ALIKE = 3.0
-"""Times: so much denser is of another kind."""
+AS_WIDE, AS_DENSE = (0.25, 1.5), 2.0
+"""Times: what is no marker, but about as wide (two that touch, a part of a ring) and as dense as the markers, is
+doubtful; a wire is thinner."""
 ABOUT_MM = 20.0
 """So far about a marker the skin's direction is taken."""
 FRONT = read_only([0.0, -1.0, 0.0])
@@ -136,11 +136,21 @@ class Passed(NamedTuple):
     Attributes:
         point_ct: Shape (3,), LPS mm.
         nearly: Whether it lacks little: a person should look at it.
+        middle: How wide and dense it is, where it is on the skin and ends.
     """
 
     point_ct: Floats
     why: str
     nearly: bool
+    middle: Middle | None = None
+
+    def resembles(self, group: Sequence[Fiducial]) -> bool:
+        """Whether markers of a group may be in it, or be it in part."""
+        if self.nearly or self.middle is None:
+            return self.nearly
+        of_one = self.middle.across_mm / np.median([one.reading.shape.diameter_mm for one in group])
+        dense = (self.middle.peak_hu - TISSUE_HU) / np.median([one.reading.contrast_hu for one in group])
+        return bool(AS_WIDE[0] <= of_one <= AS_WIDE[1] and 1 / AS_DENSE <= dense <= AS_DENSE)
 
 
 class Seen(NamedTuple):
@@ -199,14 +209,14 @@ def _looked_at(
     if not _on_skin(box, middle.peak_hu, middle.wide_mm / 2, gap):
         return Passed(point, "not on the skin", nearly=False)
     if contrast < least:
-        return Passed(point, "too faint", contrast > NEARLY * least)
+        return Passed(point, "too faint", contrast > NEARLY * least, middle)
     if middle.roundness < LEAST_ROUND:
-        return Passed(point, "long, as wires and clips are", middle.roundness > NEARLY * LEAST_ROUND)
+        return Passed(point, "long, as wires and clips are", middle.roundness > NEARLY * LEAST_ROUND, middle)
     reading = read_marker(middle, normal, kinds, diameter_mm)
     if not LEAST_MM / 1.5 <= reading.shape.diameter_mm <= LARGEST_MM * 1.15:
         return Passed(point, "too small or too large", nearly=True)
     if reading.misfit > MOST_MISFIT:
-        return Passed(point, "no ball, disc or ring", reading.misfit < MOST_MISFIT / NEARLY)
+        return Passed(point, "no ball, disc or ring", reading.misfit < MOST_MISFIT / NEARLY, middle)
     if not _on_skin(box, middle.peak_hu, reading.shape.half_mm(normal), gap):
         return Passed(point, "under the skin or off it", nearly=True)
     return Fiducial("", reading, gap)
@@ -244,7 +254,7 @@ def _candidates(volume: Volume, skin: Skin, ceiling_hu: float, noise: float) -> 
         pieces = [(number, box) for number, box in enumerate(ndimage.find_objects(labels), start=1)]
         ends = np.array([[(one.start, one.stop) for one in box] for _, box in pieces])
         sides = np.ptp(ends, axis=2)
-        small = np.all((sides - 1) * spacing <= LARGEST_MM + 2.0, axis=1)
+        small = np.all((sides - 1) * spacing <= 2 * LARGEST_MM + 2.0, axis=1)
         small &= (sizes[1:] >= LEAST_VOXELS) | (level >= TISSUE_HU + LEAST_CONTRAST_SD * noise)
         rows = np.flatnonzero(small)
         middles = apply(volume.T_ct_index, (ends[rows].sum(axis=2) - 1) / 2 + first)
@@ -332,38 +342,29 @@ def find_fiducials(
         InputError: A layout that is mirrored.
     """
     seen = look_for_fiducials(volume, skin, stated)
-    return choose_fiducials(seen, stated, float(spacing_mm(volume).max()), layout, where=where)
+    return choose_fiducials(seen, stated, layout, where=where)
 
 
-def choose_fiducials(
-    seen: Seen, stated: Stated, voxel_mm: float, layout: NamedPoints | None = None, *, where: str | Path
-) -> Seen:
-    """Of what looks like markers those that are meant, as `find_fiducials` does.
-
-    Args:
-        voxel_mm: The longest side of a voxel.
-    """
+def choose_fiducials(seen: Seen, stated: Stated, layout: NamedPoints | None = None, *, where: str | Path) -> Seen:
+    """Of what looks like markers those that are meant, as `find_fiducials` does."""
     size = stated.diameter_mm
-    alike = [one for one in seen.fiducials if size is None or _same_size(one.reading.shape.diameter_mm, size, voxel_mm)]
+    alike = [one for one in seen.fiducials if size is None or one.reading.of_size(size)]
     if layout is not None:
         chosen, why = named_by_layout(alike, layout, where), "no part of the layout"
     else:
-        chosen, why = _numbered(_one_kind(alike, stated, seen, voxel_mm)), "of another size or kind"
+        chosen, why = _numbered(_one_kind(alike, stated, seen)), "of another size or kind"
     taken = {one.reading for one in chosen}
     others = [Passed(one.position_ct, why, nearly=True) for one in seen.fiducials if one.reading not in taken]
-    return Seen(chosen, (*seen.passed, *others))
+    passed = [one._replace(nearly=one.resembles(chosen)) for one in seen.passed]
+    return Seen(chosen, (*passed, *others))
 
 
 def _numbered(fiducials: Sequence[Fiducial]) -> tuple[Fiducial, ...]:
     return tuple(replace(one, name=f"M{number}") for number, one in enumerate(fiducials, start=1))
 
 
-def _same_size(one_mm: float, other_mm: float, voxel_mm: float) -> bool:
-    return abs(one_mm - other_mm) <= SIZE_ALIKE * max(one_mm, other_mm) / 2 + voxel_mm / 2
-
-
-def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen, voxel_mm: float) -> Sequence[Fiducial]:
-    """The markers where they are of one size, and as many as stated.
+def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen) -> Sequence[Fiducial]:
+    """The markers where they are of one product, and as many as stated.
 
     Raises:
         NoAnswerError: They are not.
@@ -375,11 +376,11 @@ def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen, voxel_mm: f
         if seen.fiducials:
             what = f"no marker as stated; seen: {seen_text(seen.fiducials)}"
         raise NoAnswerError(what, code="no_markers")
-    groups = _groups(alike, voxel_mm)
+    groups = _groups(alike)
     if stated.count is not None:
-        groups = [one for one in groups if len(one) == stated.count] or groups
-    if len(groups) > 1:
-        what = f"things of {len(groups)} kinds may be markers: {seen_text(alike)}"
+        groups = [one for one in groups if _may_be(one, stated.count, seen)] or groups
+    if len(groups) > 1 or not all(one.reading.alike(other.reading) for one in groups[0] for other in groups[0]):
+        what = f"things of {max(len(groups), 2)} kinds may be markers: {seen_text(alike)}"
         raise NoAnswerError(f"{what}; --diameter, --kind, --count or --layout tells them apart", code="markers_unclear")
     (group,) = groups
     wanted = stated.count or len(group)
@@ -392,24 +393,17 @@ def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen, voxel_mm: f
     return group
 
 
-def _groups(fiducials: Sequence[Fiducial], voxel_mm: float) -> list[list[Fiducial]]:
-    """Markers of one kind, size and density each, in the order given."""
-    groups: list[list[Fiducial]] = []
-    for one in fiducials:
-        mine = (group for group in groups if all(_alike(one.reading, other.reading, voxel_mm) for other in group))
-        group = next(mine, None)
-        if group is None:
-            groups.append([one])
-        else:
-            group.append(one)
-    return groups
+def _groups(fiducials: Sequence[Fiducial]) -> list[list[Fiducial]]:
+    """Things that may be alike together, also by others between them, in the order given."""
+    alike = [[one.reading.alike(other.reading) for other in fiducials] for one in fiducials]
+    count, labels = connected_components(np.array(alike))
+    return [[one for one, label in zip(fiducials, labels, strict=True) if label == group] for group in range(count)]
 
 
-def _alike(one: Reading, other: Reading, voxel_mm: float) -> bool:
-    """Whether two may be of one kind; what is no larger than a voxel has no density of its own."""
-    sizes, (less, more) = (one.shape.diameter_mm, other.shape.diameter_mm), sorted([one.contrast_hu, other.contrast_hu])
-    as_dense = more <= CONTRAST_ALIKE * less or min(sizes) <= voxel_mm
-    return as_dense and bool({*one.kinds} & {*other.kinds}) and _same_size(*sizes, voxel_mm)
+def _may_be(group: Sequence[Fiducial], count: int, seen: Seen) -> bool:
+    """Whether a group has a count, or lacks what is doubtful: each may be two that touch."""
+    doubtful = sum(one.resembles(group) for one in seen.passed)
+    return len(group) <= count <= len(group) + 2 * doubtful
 
 
 def seen_text(fiducials: Sequence[Fiducial]) -> str:

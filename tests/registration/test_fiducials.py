@@ -6,6 +6,7 @@ from marker_world import Markers, Stated, body_of, distractors, found_in, matche
 from places import DATA, REAL_CT
 from refusals import refused
 
+from benchmarks.markers import counted, scene as benchmark_scene
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
@@ -13,6 +14,7 @@ from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.registration.fiducial_reading import Reading, Shape
 from puncture_twin.planning.registration.fiducials import (
     Fiducial,
+    Passed,
     Seen,
     choose_fiducials,
     find_fiducials,
@@ -133,9 +135,9 @@ def test_several_sizes_are_not_guessed(two_sizes):
     """They are told with places and sizes; a size, or a count that one of them has, decides; a wrong one does not."""
     large, small, seen = two_sizes
     with refused("markers_unclear", "8.0 mm", "4.0 mm", by=NoAnswerError):
-        choose_fiducials(seen, Stated(), 2.5, where="test")
+        choose_fiducials(seen, Stated(), where="test")
     for stated, true in ((Stated(diameter_mm=8.0), large), (Stated(count=4), large), (Stated(diameter_mm=4.0), small)):
-        found = choose_fiducials(seen, stated, 2.5, where="test").fiducials
+        found = choose_fiducials(seen, stated, where="test").fiducials
         assert len(found) == len(true) and len(matched(true, found)[0]) == len(true)
         assert [one.name for one in found] == [f"M{n}" for n in range(1, len(true) + 1)]
     for stated, code in (
@@ -144,7 +146,7 @@ def test_several_sizes_are_not_guessed(two_sizes):
         (Stated(diameter_mm=14.0), "no_markers"),
     ):
         with refused(code, by=NoAnswerError):
-            choose_fiducials(seen, stated, 2.5, where="test")
+            choose_fiducials(seen, stated, where="test")
 
 
 @pytest.mark.parametrize(
@@ -177,11 +179,13 @@ LAYOUT = np.array([[0.0, 0, 0], [60, 5, 0], [10, 90, 12], [75, 80, 30], [30, 40,
 NAMES = tuple("ABCDE")
 
 
-def fiducials(points, kind="ball"):
-    """Balls or discs of 8 mm there, under other names."""
-    shape = Shape(kind, 8.0, 1.0, np.array([0.0, -1, 0]))
+def fiducials(points, kind="ball", diameter=8.0):
+    """Balls or discs there, read to 1 %, under other names."""
+    shape = Shape(kind, diameter, 1.0, np.array([0.0, -1, 0]))
+    make = (np.log([1000.0, diameter]), np.diag([0.1, 0.01]) ** 2)
     return [
-        Fiducial(f"M{k}", Reading(p, np.eye(3) * 0.01, shape, 900.0, False, 0.1), 4.0) for k, p in enumerate(points)
+        Fiducial(f"M{k}", Reading(p, np.eye(3) * 0.01, shape, 900.0, False, 0.1, *make), 4.0)
+        for k, p in enumerate(points)
     ]
 
 
@@ -261,9 +265,50 @@ def test_discs_as_large_as_the_balls_are_told_apart():
     """As electrodes are: not one list; what a count leaves out is doubtful."""
     both = Seen((*fiducials(LAYOUT), *fiducials(LAYOUT[:3] + 200.0, "disc")), ())
     with refused("markers_unclear", by=NoAnswerError):
-        choose_fiducials(both, Stated(), 1.0, where="test")
-    chosen = choose_fiducials(both, Stated(count=5), 1.0, where="test")
+        choose_fiducials(both, Stated(), where="test")
+    chosen = choose_fiducials(both, Stated(count=5), where="test")
     assert [one.reading.shape.kind for one in chosen.fiducials] == ["ball"] * 5 and len(chosen.doubtful) == 3
+
+
+SCENES = {
+    "two that touch": (1, Markers("disc", 6.0, thick=2.5, count=5), ("staples", "wire"), "touching"),
+    "rings nearly as wide as snaps": (2, Markers("ring", 5.8, thick=1.5, count=5), ("electrodes", "piercing"), "none"),
+    "balls as wide as buttons": (3, Markers("ball", 9.0, count=4), ("buttons", "port"), "none"),
+    "too small for the slices": (5, Markers("ball", 1.2, 900.0, count=4), ("staples", "calcified"), "none"),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_what_is_no_marker_is_never_in_a_list(name):
+    """With a count or without; what is lost beside others is doubtful, or there is no list."""
+    seed, markers, extras, trouble = SCENES[name]
+    row = counted(benchmark_scene(np.random.default_rng(seed), markers, 2.0, extras, trouble))
+    for stated in ("alone", "counted"):
+        assert not row[stated].get("false")
+        if "listed" in row[stated]:
+            assert all(one["found"] or one["doubtful"] for one in row["markers"])
+    if trouble == "touching":
+        assert row["alone"] == {"listed": 3, "false": []} and row["counted"] == {"refused": "too_few_markers"}
+
+
+def test_what_differs_by_more_than_its_reading_is_another_product():
+    """8 mm and 8.2 mm read to 2 % are alike, 9.5 mm are not; a count takes no group beside one that may lack some."""
+    few, many = fiducials(LAYOUT[:3]), fiducials(LAYOUT + 200.0, diameter=9.5)
+    near = fiducials(LAYOUT[3:] - 100.0, diameter=8.2)
+    assert len(choose_fiducials(Seen((*few, *near), ()), Stated(), where="test").fiducials) == 5
+    with refused("markers_unclear", by=NoAnswerError):
+        choose_fiducials(Seen((*few, *many), ()), Stated(), where="test")
+    assert len(choose_fiducials(Seen((*few, *many), ()), Stated(count=5), where="test").fiducials) == 5
+    pair = Passed(LAYOUT[3], "long, as wires and clips are", nearly=True)
+    with refused("markers_unclear", by=NoAnswerError):
+        choose_fiducials(Seen((*few, *many), (pair,)), Stated(count=5), where="test")
+
+
+def test_things_alike_by_one_between_them_are_no_list():
+    """8 mm and 9 mm differ, 8.5 mm may be either."""
+    chain = [one for mm, k in ((8.0, 0), (8.5, 2), (9.0, 3)) for one in fiducials(LAYOUT[k : k + 2], diameter=mm)]
+    with refused("markers_unclear", by=NoAnswerError):
+        choose_fiducials(Seen(tuple(chain), ()), Stated(), where="test")
 
 
 def test_a_layout_of_other_distances_is_not_seen():
