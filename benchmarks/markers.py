@@ -16,7 +16,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -43,7 +43,8 @@ MATCHED_MM = 4.0
 """A thing so near to a marker's centre is that marker; or half of its size, if that is more."""
 
 
-class Markers(NamedTuple):
+@dataclass(frozen=True)
+class Markers:
     """What is on the skin: ``off_mm`` from a marker's back to the skin."""
 
     kind: str = "ball"
@@ -301,7 +302,7 @@ def _spots(markers: Markers, rng: np.random.Generator, taken: list[Solid]) -> li
             np.linalg.norm(cloud - at, axis=1).min() > markers.diameter / 2 + 9.0
         ):
             spots.append((point, normal))
-        cloud = cloud[1:] if rng.random() < 0.002 and len(cloud) > 1 else cloud
+        cloud = cloud[1:] if rng.random() < 0.002 and len(cloud) > 1 else cloud  # a crowded skin must end
     return spots
 
 

@@ -50,8 +50,9 @@ WINDOW_MM = 25.0
 """From an entry of a safe direction: half a drape's hole, and a finger."""
 END_MM = 15.0
 """From where the image ends, and from what lies on the skin or is no trunk: arms, the table."""
-SHRUNK = (1.0, 0.5, 0.2)
-"""Of the distances that are wanted, one after the other, until there are places."""
+RELAXED = ((1.0, 1.0), (0.5, 1.0), (0.2, 1.0), (0.5, 2.0), (0.2, 5.0))
+"""Times what is wanted from windows and between places, and times the farthest from the target: one pair after the
+other, until there are places."""
 FLAT = 0.97
 """Length of the mean of the skin's normals about a place: a marker does not stick to an edge."""
 LEAST_UP = 0.1
@@ -156,10 +157,10 @@ def propose_markers(context: CaseContext, candidates: Candidates, count: int) ->
     every, C = _places(case, anatomy, entries), FLE_MM**2 / 3 * np.eye(3)
     if case.errors is not None:
         C = case.errors.marker_cov_ct + case.errors.touch_mm**2 * np.eye(3)
-    for shrunk in SHRUNK:
-        skin = _wanted(every, case, anatomy, shrunk)
+    for less, farther in RELAXED:
+        skin = _wanted(every, case, anatomy, WINDOW_MM * less, FAR_MM * farther)
         skin = skin.of(_touchable(context, candidates, skin.points))
-        chosen, error = _exchanged(skin, case.target_ct, C, count, shrunk)
+        chosen, error = _exchanged(skin, case.target_ct, C, count, less)
         if chosen:
             break
     else:
@@ -181,7 +182,8 @@ def _unmet(put: _Skin, target_ct: Floats) -> Iterator[str]:
     if (gap := pdist(put.points).min()) < APART_MM:
         yield f"two markers are {gap:.0f} mm apart, less than {APART_MM:g}"
     if not _told_apart(put.points, target_ct, SLIP_MM):
-        yield f"put each within {SLIP_MM * SHRUNK[-1]:.1g} mm of its place: names swapped would fit to {SLIP_MM:g} mm"
+        within = SLIP_MM * RELAXED[-1][0]
+        yield f"put each within {within:.1g} mm of its place: with names swapped they would fit to {SLIP_MM:g} mm"
 
 
 def _places(case: Case, anatomy: Anatomy, entries: cKDTree) -> _Skin:
@@ -191,7 +193,7 @@ def _places(case: Case, anatomy: Anatomy, entries: cKDTree) -> _Skin:
     middles = triangles.mean(axis=1)
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     areas = np.linalg.norm(normals, axis=1)
-    usable = ~cut & (areas > 0) & (np.linalg.norm(middles - case.target_ct, axis=1) <= FAR_MM / SHRUNK[-1])
+    usable = ~cut & (areas > 0) & (np.linalg.norm(middles - case.target_ct, axis=1) <= FAR_MM * RELAXED[-1][1])
     for points in (middles[cut], *(mesh.vertices for mesh in _others(anatomy))):
         if len(points):
             usable &= cKDTree(points).query(middles, distance_upper_bound=END_MM)[0] > END_MM
@@ -213,10 +215,10 @@ def _others(anatomy: Anatomy) -> list[TriangleMesh]:
     return [one.mesh for one in anatomy.surroundings if one.name in (ATTACHED_LIMB, OUTSIDE_BODY)]
 
 
-def _wanted(every: _Skin, case: Case, anatomy: Anatomy, shrunk: float) -> _Skin:
-    """Those with the distances that are wanted, shrunk, evenly spread, which nothing lies before."""
+def _wanted(every: _Skin, case: Case, anatomy: Anatomy, off_mm: float, far_mm: float) -> _Skin:
+    """Those so far from the windows and so near to the target, evenly spread, over which nothing stands."""
     far = np.linalg.norm(every.points - case.target_ct, axis=1)
-    skin = every.of((every.to_entry > WINDOW_MM * shrunk) & (far <= FAR_MM / shrunk))
+    skin = every.of((every.to_entry > off_mm) & (far <= far_mm))
     skin = skin.of(_thinned(skin.points))
     boxed = [row for row, _ in untouchable(case, skin.points, skin.normals)]
     skin = skin.of(np.setdiff1d(np.arange(len(skin.points)), boxed))
@@ -257,7 +259,7 @@ def _is_free(checkers: ApproachCheckers, case: Case, point_base: Floats, q_inser
     return any(not why_not(checkers, tip, q) for q in np.concatenate([found.alike, found.others])[:POSES])
 
 
-def _exchanged(skin: _Skin, target_ct: Floats, C: Floats, count: int, shrunk: float = 1.0) -> tuple[list[int], float]:
+def _exchanged(skin: _Skin, target_ct: Floats, C: Floats, count: int, less: float = 1.0) -> tuple[list[int], float]:
     """Rows of the best places, by exchange from several starts, and their expected error, mm; none where none fit."""
     rng, best, least = np.random.default_rng(SEED), list[int](), np.inf
     A = design(skin.points, target_ct).reshape(-1, 3, 6)
@@ -270,7 +272,7 @@ def _exchanged(skin: _Skin, target_ct: Floats, C: Floats, count: int, shrunk: fl
             for slot in range(count):
                 others = chosen[:slot] + chosen[slot + 1 :]
                 costs = _errors_mm(each[others].sum(axis=0) + each)
-                found = _first(costs, skin.points, others, target_ct, shrunk)
+                found = _first(costs, skin.points, others, target_ct, less)
                 chosen[slot], settled[slot] = (chosen[slot], False) if found is None else (found, True)
             if chosen == before:
                 break
@@ -290,13 +292,13 @@ def _errors_mm(information: Floats) -> Floats:
     return np.where(known, np.sqrt(np.trace(shift, axis1=-2, axis2=-1)), np.inf)
 
 
-def _first(costs: Floats, every: Floats, others: list[int], target_ct: Floats, shrunk: float) -> int | None:
+def _first(costs: Floats, every: Floats, others: list[int], target_ct: Floats, less: float) -> int | None:
     """The place of least cost that is apart from the others and told apart from them."""
     points = every[others]
     gaps = np.linalg.norm(every[:, None] - points, axis=2).min(axis=1)
-    apart = (gaps >= APART_MM * shrunk) & np.isfinite(costs)
+    apart = (gaps >= APART_MM * less) & np.isfinite(costs)
     rows = [row for row in np.argsort(costs, kind="stable") if apart[row]]
-    told = (row for row in rows[:TRIES] if _told_apart(np.vstack([points, every[row]]), target_ct, SLIP_MM * shrunk))
+    told = (one for one in rows[:TRIES] if _told_apart(np.vstack([points, every[one]]), target_ct, SLIP_MM * less))
     return next((int(row) for row in told), None)
 
 
