@@ -844,9 +844,3 @@ def test_absurd_times_are_refused_in_bounded_work(plan, smooth, name, tmp_path):
         with refused("not_read_back" if name == "urscript" and one is not approach else "too_long"):
             export_plan(one, name, tmp_path / "out", source=SOURCE)
     assert not (tmp_path / "out").exists()
-
-
-def test_an_unknown_format_is_refused(plan, tmp_path):
-    """With the three that are known."""
-    with refused("unknown_format"):
-        export_plan(plan, "krl", tmp_path, source=SOURCE)

@@ -15,7 +15,6 @@ from refusals import refused_command
 from puncture_twin.planning.base import errors
 from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.base.output.manifest import problems, read_manifest
-from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED
 from puncture_twin.twin.jobs.options import prepared
@@ -145,8 +144,30 @@ def test_a_written_plan_is_rehearsed_again_with_the_same_result(carton, rehearse
     assert problems(copy) == ()
 
 
-def test_of_many_rooms_the_median_is_shown(carton, tmp_path, capfd):
-    """Headline, film and numbers are of the room in the middle, which the simulator confirms."""
+@pytest.fixture
+def one_core(monkeypatch):
+    """Nothing begins in a process beside."""
+    monkeypatch.setattr("puncture_twin.twin.jobs.patient.rehearsed.worker_count", lambda wanted, pieces: 1)
+
+
+@pytest.fixture
+def no_encoder(monkeypatch):
+    """A short film, and nothing that makes an MP4 of it."""
+
+    def absent(*arguments, **options):
+        raise RuntimeError("no ffmpeg")
+
+    film = "puncture_twin.twin.report.scene.film"
+    monkeypatch.setattr(f"{film}_text.imageio_ffmpeg.write_frames", absent)
+    monkeypatch.setattr(f"{film}.film_times", lambda total: FilmTimes((0.0, total), 1.0, 1))
+
+
+@pytest.mark.usefixtures("one_core", "no_encoder")
+def test_of_many_rooms_the_median_is_shown(carton, rehearsed, tmp_path, capfd):
+    """Headline, film and numbers are of the room in the middle, which the simulator confirms.
+
+    The page is drawn while the film is made; where that is a GIF, for want of an encoder, again.
+    """
     here = tmp_path / "case"
     shutil.copytree(carton.parent, here)
     text = re.sub(r"\n\[errors\].*?(?=\n\[)", "", (here / "case_m.toml").read_text(), flags=re.DOTALL).split("\n[end]")[
@@ -163,6 +184,10 @@ def test_of_many_rooms_the_median_is_shown(carton, tmp_path, capfd):
     assert rooms["physics"]["rooms"] == 1 and rooms["physics"]["largest_apart_mm"] < 0.05
     page = (tmp_path / "out/report.html").read_text()
     assert "median of 201 trials (50th percentile" in page
+    assert 'href="rehearsal.gif"' in page and "rehearsal.mp4" not in page
+    assert 'href="rehearsal.mp4"' in (rehearsed / "report.html").read_text()
+    assert {"rehearsal.gif", "report.html"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    assert problems(tmp_path / "out") == ()
     assert main(["rehearse", str(carton), "--physics", "1", "--out", str(tmp_path / "no")]) == BAD_INPUT
 
 
@@ -244,34 +269,6 @@ def test_ctrl_c_is_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_path, 
     assert capfd.readouterr().err.splitlines()[-1] == "interrupted"
     assert {path.name for path in copy.iterdir()} == {path.name for path in rehearsed.iterdir()}
     assert problems(copy) == ()
-
-
-@pytest.fixture
-def one_core(monkeypatch):
-    """Nothing begins in a process beside."""
-    monkeypatch.setattr("puncture_twin.twin.jobs.patient.rehearsed.worker_count", lambda wanted, pieces: 1)
-
-
-@pytest.mark.usefixtures("one_core")
-def test_the_page_links_the_film_that_there_is(carton, rehearsed, tmp_path, monkeypatch):
-    """The page is drawn while the film is made; where that is a GIF, for want of an encoder, again."""
-
-    def no_encoder(*arguments, **options):
-        raise RuntimeError("no ffmpeg")
-
-    monkeypatch.setattr("puncture_twin.twin.report.scene.film_text.imageio_ffmpeg.write_frames", no_encoder)
-    monkeypatch.setattr(
-        "puncture_twin.twin.report.scene.film.film_times", lambda total: FilmTimes((0.0, total), 1.0, 1)
-    )
-    run = rehearse_case(prepare(carton), tmp_path)
-    page = (tmp_path / "report.html").read_text()
-    assert 'href="rehearsal.gif"' in page and "rehearsal.mp4" not in page
-    assert 'href="rehearsal.mp4"' in (rehearsed / "report.html").read_text()
-    assert {path.name for path in run.files} == {path.name for path in tmp_path.iterdir()} - {
-        "manifest.json",
-        "timings.json",
-    }
-    assert problems(tmp_path) == ()
 
 
 def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, capfd):
