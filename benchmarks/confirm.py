@@ -11,7 +11,7 @@ import argparse
 import json
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,8 @@ from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.twin.guidance.ct.needle import FoundNeedle, read_needle
+from puncture_twin.twin.guidance.ct.needle import read_needle
+from puncture_twin.twin.guidance.ct.needle_fit import FoundNeedle
 from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, rod, scan_solids
 
 METAL_HU = 8000.0
@@ -68,6 +69,7 @@ class Control:
         return self.tip + np.array([2.0, -1.5, 1.0]), self.forward
 
 
+@cache
 def trunk() -> tuple[TriangleMesh, tuple[TriangleMesh, ...]]:
     """Skin and bones of a piece of a trunk: an ellipsoid that is not round, a spine, and two ribs that are bent."""
     skin = trimesh.creation.icosphere(5, 1.0)
@@ -187,9 +189,8 @@ def _scanned(
             x, y = (i - i[metal].mean()) * cell[0], (j - j[metal].mean()) * cell[1]
             phase, parts = rng.uniform(0, 2 * np.pi, len(waves)), rng.normal(0, 1, len(waves)) / np.sqrt(len(waves))
             turn, fades = np.arctan2(y, x), np.exp(-np.hypot(x, y) / 25.0)
-            hu[:, :, k] += (
-                size * fades * sum(a * np.cos(w * turn + p) for w, a, p in zip(waves, parts, phase, strict=True))
-            )
+            around = np.polyval([*(parts * np.exp(1j * phase))[::-1], 0, 0], np.exp(1j * turn))  # sum a cos(w turn + p)
+            hu[:, :, k] += size * fades * around.real
     return Volume(np.clip(np.rint(hu), -1024, 3071).astype(np.int16), T, Path("scan"))
 
 
@@ -233,9 +234,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="a line a scan is written to this file")
+    parser.add_argument("--rows", type=Path, nargs="*", default=(), help="files of --json that are summed up instead")
     stated = parser.parse_args()
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = [json.loads(line) for file in stated.rows for line in file.read_text().splitlines()]
+    if rows:
+        print("\n".join(summary(rows)))
+        return
     with nullcontext() if stated.json is None else stated.json.open("w", encoding="utf-8") as file:
         for seed in range(stated.first, stated.first + stated.scans):
             one = control(np.random.default_rng(seed))
