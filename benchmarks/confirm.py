@@ -29,7 +29,8 @@ from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.twin.guidance.ct.needle import FoundNeedle, read_needle
+from puncture_twin.twin.guidance.ct.needle import read_needle
+from puncture_twin.twin.guidance.ct.needle_fit import FoundNeedle
 from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, rod, scan_solids
 
 METAL_HU = 8000.0
@@ -233,9 +234,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scans", type=int, default=1000)
     parser.add_argument("--first", type=int, default=0, help="seed of the first")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="a line a scan is written to this file")
+    parser.add_argument("--rows", type=Path, nargs="*", default=(), help="files of --json that are summed up instead")
     stated = parser.parse_args()
-    rows: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = [json.loads(line) for file in stated.rows for line in file.read_text().splitlines()]
+    if rows:
+        print("\n".join(summary(rows)))
+        return
     with nullcontext() if stated.json is None else stated.json.open("w", encoding="utf-8") as file:
         for seed in range(stated.first, stated.first + stated.scans):
             one = control(np.random.default_rng(seed))

@@ -18,7 +18,7 @@ from puncture_twin.planning.base.output.manifest import problems, read_manifest
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED
 from puncture_twin.twin.jobs.options import prepared
-from puncture_twin.twin.jobs.patient.main_job import demo_case, rehearse_case
+from puncture_twin.twin.jobs.patient.main_job import demo_case
 from puncture_twin.twin.report.progress import LineDisplay, progress_display
 from puncture_twin.twin.report.scene.film import FilmTimes
 

@@ -35,6 +35,7 @@ from puncture_twin.twin.guidance.ct.needle_fit import (
     WIDEST_SLICE,
     FoundNeedle,
     Line,
+    beside,
     fit_needle,
     toward,
     unclear,
@@ -193,22 +194,39 @@ def _needles(
     widest = diameter_mm / 2 + 0.5 * float(spacing_mm(volume).max()) + BLUR_SIGMA_MM
     known: list[FoundNeedle] = []
     for level in LEVELS_HU:
-        for metal in metal_pieces(volume, level, hidden):
+        for metal in metal_pieces(volume, level, hidden | _taken(volume, known)):
             if metal.size_mm < SHORTEST_MM:
                 continue
-            places = _places(volume, metal)
-            if _width(places) >= min(widest, metal.size_mm / SLENDER) or any(_same(one, places) for one in known):
+            places, line = _places(volume, metal), _axis(volume, metal)
+            if any(_same(one, places) for one in known):
                 continue
-            whole, line = _whole(volume, metal, _axis(volume, metal), hidden)
-            ends = _tip_end(volume, whole, line, target_ct, inside, hidden)
+            thin = _width(places) < min(widest, metal.size_mm / SLENDER)
+            if thin:
+                metal, line = _whole(volume, metal, line, hidden)
+            elif level < METAL_HU:
+                continue
+            ends = _tip_end(volume, metal, line, target_ct, inside, hidden)
             if ends is None:
                 continue
-            found = fit_needle(volume, whole, toward(line, ends[0]), diameter_mm, hidden)
-            if found is None and level == METAL_HU:  # never passed over in silence
+            found = fit_needle(volume, metal, toward(line, ends[0]), diameter_mm, hidden) if thin else None
+            if found is None and level == METAL_HU:  # never passed over in silence: needles that cross are not thin
                 found = unclear(line, ends[0])
             if found is not None and not any(_same(one, found.path_ct) for one in known):
                 known.append(found._replace(leaves=ends[1]))
                 yield known[-1], hidden
+
+
+def _taken(volume: Volume, known: Sequence[FoundNeedle]) -> Bools:
+    """The voxels that needles explain: a lower level would join them to what lies beside."""
+    taken = np.zeros(volume.values.shape, np.bool_)
+    at = np.argwhere(volume.values > LEVELS_HU[-1])
+    places, reach = apply(volume.T_ct_index, at.astype(float)), WIDE_MM + WIDEST_SLICE * float(spacing_mm(volume)[2])
+    for path in (one.path_ct for one in known if not one.unclear):
+        start, steps = path[:-1, None], np.diff(path, axis=0)[:, None]
+        share = np.clip(((places - start) * steps).sum(axis=2) / (steps**2).sum(axis=2), 0.0, 1.0)[..., None]
+        near = np.linalg.norm(places - start - share * steps, axis=2).min(axis=0) <= reach
+        taken[tuple(at[near].T)] = True
+    return taken
 
 
 def _hide(volume: Volume, marker: Floats, hidden: Bools) -> None:
@@ -289,18 +307,17 @@ def _check_tip(volume: Volume, found: FoundNeedle, hidden: Bools, target_ct: Flo
 
 
 def _whole(volume: Volume, metal: Metal, line: Line, hidden: Bools) -> tuple[Metal, Line]:
-    """The whole needle, where thick slices dilute it and show it only in pieces at first: along its line, or its bend."""
+    """The whole needle along its line or bend, where thick slices dilute it and show it only in pieces at first."""
     at = np.argwhere((volume.values > LEVELS_HU[-1]) & ~hidden)
     places = apply(volume.T_ct_index, at.astype(float))
-    reach = WIDE_MM + 0.5 + WIDEST_SLICE * float(spacing_mm(volume).max())
     for _ in range(GROWTHS):
         axes = frame_about(line.forward).T
         own, local = ((points - line.middle) @ axes.T for points in (_places(volume, metal), places))
-        along, low, high = local[:, 2], own[:, 2].min(), own[:, 2].max()
+        along, low, high, thick = local[:, 2], own[:, 2].min(), own[:, 2].max(), axes[:2] @ volume.T_ct_index[:3, 2]
         bend = np.linalg.lstsq(np.vander(own[:, 2] / high, 4), own[:, :2], rcond=None)[0]
-        beside = local[:, :2] - np.vander(np.clip(along, low, high) / high, 4) @ bend
-        bent = (np.linalg.norm(beside, axis=1) <= reach) & (along > low - GROWN_MM) & (along < high + GROWN_MM)
-        near = bent | (np.linalg.norm(local[:, :2], axis=1) <= reach + line.width_mm)
+        aside = local[:, :2] - np.vander(np.clip(along, low, high) / high, 4) @ bend
+        bent = (beside(aside, thick) <= WIDE_MM) & (along > low - GROWN_MM) & (along < high + GROWN_MM)
+        near = bent | (beside(local[:, :2], thick) <= WIDE_MM)
         kept, along = at[near], along[near]
         order = np.argsort(along)
         parts = np.concatenate([[0], np.cumsum(np.diff(along[order]) > LARGEST_GAP_MM)])

@@ -56,14 +56,14 @@ BEND_SD = np.array([2.0, 2.0, 0.5, 0.5])
 """How far needles bend at the lever, mm, square and cube, each across two axes; ours: a sagitta of 2 mm over 95 mm."""
 PIECE_MM = 10.0
 """A needle's path is given in pieces no longer than this."""
-LEAST_VOXEL, LEAST_DEG = 0.06, 0.05
+LEAST_VOXEL, LEAST_DEG = 0.03, 0.02
 """Standard deviations that no fit undercuts: of the tip along each voxel axis, in voxels, and of the direction. What
 blurs a scan is no exact Gaussian."""
 FEW_SLICES = 4.0
 """A needle through fewer slices is not known to less than these across them."""
 THIN_MM = 1.2
 """Through slices up to this a needle has one optimum."""
-CORRELATED, CORRELATED_BENT = 2.0, 16.0
+CORRELATED, CORRELATED_BENT = 4.0, 16.0
 """By which factor residuals of neighbouring voxels, which streaks and kernel share, widen the fit's variances: those of
 a straight line, and those of a curve, which follows them further."""
 MISLED = 6.0
@@ -153,14 +153,16 @@ def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hid
     index = np.argwhere(np.ones(metal.voxels.shape, dtype=bool)) + [axis.start for axis in metal.box]
     places, shown = apply(volume.T_ct_index, index.astype(float)), ~hidden[tuple(index.T)]
     heavy = places[metal.voxels.ravel() & (parts > typical / 2)] - line.middle
+    if not len(heavy):
+        return None
     along = heavy @ line.forward
     start, begun = line.middle + float(along.max()) * line.forward, np.zeros(7)
     length = min(FITTED_MM, float(np.ptp(along)) - TAIL_MM)
     for again in range(STRAIGHTENED):
         axes = np.concatenate([line.forward[None], np.linalg.svd(line.forward[None])[2][1:]])
         local = (places - start) @ axes.T
-        reach = WIDE_MM + WIDEST_SLICE * float(np.linalg.norm(axes[1:] @ volume.T_ct_index[:3, 2]))
-        about, bends = _about(local, np.where(shown, parts, 0.0), length, reach, line.width_mm)
+        thick = axes[1:] @ volume.T_ct_index[:3, 2]
+        about, bends = _about(local, np.where(shown, parts, 0.0), length, thick, line.width_mm)
         local, seen = local[about & shown], parts[about & shown]
         curve = CurveImage.of(volume, axes, diameter_mm)
         image = curve.parts(np.zeros(NUMBERS), local)
@@ -186,7 +188,7 @@ def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hid
     ahead = float(local[seen > 0.5 * min(full, float(seen.max()))][:, 0].max(initial=-np.inf) - x[0])
     if (
         unlike > UNLIKE
-        or abs(ahead) > FARTHEST_MM + reach
+        or abs(ahead) > FARTHEST_MM + WIDE_MM + WIDEST_SLICE * float(np.linalg.norm(thick))
         or not (GAINS[0] < gain < GAINS[1] and BLURS[0] < blur < BLURS[1])
     ):
         return unclear(line, start) if typical > AS_BRIGHT * float(image[bright].mean()) else None
@@ -203,18 +205,24 @@ def unclear(line: Line, tip_ct: Floats) -> FoundNeedle:
     return FoundNeedle(tip_ct, toward(line, tip_ct).forward, line.width_mm, path, UNKNOWN, unclear=True)
 
 
-def _about(local: Floats, seen: Floats, length: float, reach: float, width_mm: float) -> tuple[Bools, Floats]:
+def beside(across: Floats, thick: Floats) -> Floats:
+    """Distance of points (n, 2) from what a slice's thickness (2,) makes of a needle's axis, across it, mm."""
+    share = np.clip(across @ thick / max(float(thick @ thick), 1e-9), -WIDEST_SLICE, WIDEST_SLICE)
+    return np.asarray(np.linalg.norm(across - share[:, None] * thick, axis=1))
+
+
+def _about(local: Floats, seen: Floats, length: float, thick: Floats, width_mm: float) -> tuple[Bools, Floats]:
     """Which points (n, 3) lie about a straight needle, or about the curve through what is seen (n,), and that curve.
 
     Returns:
         Shape (n,); and shape (4, 2), factors of u³ to 1 with u from the tip in `LEVER_MM`, across the needle, mm.
     """
-    across = np.linalg.norm(local[:, 1:], axis=1)
-    near = (across <= reach + 2 * width_mm) & (local[:, 0] > -length) & (local[:, 0] < AHEAD_MM)
+    across = beside(local[:, 1:], thick)
+    near = (across <= WIDE_MM + 2 * width_mm) & (local[:, 0] > -length) & (local[:, 0] < AHEAD_MM)
     heavy, terms = seen[near, None], np.vander(np.minimum(local[near, 0], 0.0) / LEVER_MM, 4)
     bends = np.linalg.lstsq(heavy * terms, heavy * local[near, 1:], rcond=None)[0]
-    about = near & (across <= reach)
-    about[near] |= np.linalg.norm(local[near, 1:] - terms @ bends, axis=1) <= reach
+    about = near & (across <= WIDE_MM)
+    about[near] |= beside(local[near, 1:] - terms @ bends, thick) <= WIDE_MM
     return about, np.asarray(bends, dtype=np.float64)
 
 

@@ -28,7 +28,8 @@ from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_markers, read_lesion
-from puncture_twin.twin.guidance.ct.needle import FoundNeedle, find_needle, needle_error
+from puncture_twin.twin.guidance.ct.needle import find_needle, needle_error
+from puncture_twin.twin.guidance.ct.needle_fit import FoundNeedle
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.plant.scanner.case_scene import (
     CaseScene,

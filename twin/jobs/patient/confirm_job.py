@@ -33,7 +33,8 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_inputs
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.taken_line import SURE, UNCERTAIN, Aim, LineCheck, check_line, next_aims
-from puncture_twin.twin.guidance.ct.needle import FoundNeedle, needle_error, read_needle
+from puncture_twin.twin.guidance.ct.needle import needle_error, read_needle
+from puncture_twin.twin.guidance.ct.needle_fit import FoundNeedle
 from puncture_twin.twin.guidance.ct.tie import Body, Tie, body_of, tie_frames
 from puncture_twin.twin.jobs.patient.main_job import read_noted_plan
 from puncture_twin.twin.jobs.terminal import write_result
