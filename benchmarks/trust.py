@@ -390,7 +390,9 @@ def scenes(directions: int, temporary: Path) -> Iterator[Scene]:
         yield scene("carton-l", folder() / "carton" / "case_l.toml", directions)
         return
     text = (temporary / "case_v2.toml").read_text("utf-8")
-    (temporary / "case.toml").write_text(text.replace("fle_mm = 1.0\n", "") + REAL_ERRORS, "utf-8")
+    for simpler in ("fle_mm = 1.0\n", "fle_ct_mm = 0.9\n", "fle_touch_mm = 0.1\n"):
+        text = text.replace(simpler, "")
+    (temporary / "case.toml").write_text(text + REAL_ERRORS, "utf-8")
     yield scene("real CT", temporary / "case.toml", directions)
 
 

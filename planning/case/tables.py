@@ -570,6 +570,8 @@ class RehearsalSection(Section):
 
     seed: Annotated[int, Strict(), Field(ge=0, lt=2**31)] = 0
     truth_base: str | None = None
+    fle_ct_mm: NotNegative = 0.5
+    fle_touch_mm: NotNegative = 0.1
     joint_offset_deg: NotNegative = 0.02
     control: Literal["impedance", "admittance", "position"] = "impedance"
     errors: ErrorsSection | None = None

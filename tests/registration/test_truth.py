@@ -15,8 +15,10 @@ from puncture_twin.planning.case.settings import Needle, RobotSettings, SearchSe
 from puncture_twin.planning.case.tables import MarkerSection, RankingSection, RehearsalSection
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
+from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.twin.plant.truth import draw_truth
+from puncture_twin.planning.registration.residuals import leverage
+from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error
 
 MESHES = ROOT / "meshes"
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147]])
@@ -92,17 +94,17 @@ def test_same_seed_same_truth_other_seed_another(tmp_path):
     one, again, other = (draw_truth(case(tmp_path, seed=seed), pose(0)) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one.T_base_ct_true, again.T_base_ct_true)
     np.testing.assert_array_equal(one.joint_offsets, again.joint_offsets)
-    assert not np.array_equal(one.joint_offsets, other.joint_offsets)
+    assert not np.array_equal(one.T_base_ct_true, other.T_base_ct_true)
     assert (one.seed, other.seed) == (5, 6)
     overridden = draw_truth(case(tmp_path, seed=6), pose(0), seed=5)
-    np.testing.assert_array_equal(overridden.joint_offsets, one.joint_offsets)
+    np.testing.assert_array_equal(overridden.T_base_ct_true, one.T_base_ct_true)
 
 
 def test_no_error_means_truth_is_belief(tmp_path):
-    """With exact joints, and no declared errors of markers, nothing differs."""
-    exact = case(tmp_path, joint_offset_deg=0.0)
+    """With exact markers and exact joints nothing differs."""
+    exact = case(tmp_path, fle_ct_mm=0.0, fle_touch_mm=0.0, joint_offset_deg=0.0)
     truth = draw_truth(exact, pose(0))
-    np.testing.assert_array_equal(truth.T_base_ct_true, pose(0))
+    np.testing.assert_allclose(truth.T_base_ct_true, pose(0), atol=1e-9)
     np.testing.assert_array_equal(truth.joint_offsets, np.zeros(6))
 
 
@@ -114,6 +116,37 @@ def test_drawn_truth_is_rigid_and_read_only(tmp_path):
     assert np.linalg.det(R) > 0
     with pytest.raises(ValueError, match="read-only"):
         truth.T_base_ct_true[0, 3] = 0.0
+
+
+@pytest.mark.parametrize(("ct_mm", "touch_mm"), [(0.5, 0.1), (0.0, 0.4)])
+def test_drawn_errors_are_those_that_fitzpatrick_expects(ct_mm, touch_mm):
+    """Root mean square distance of truth and belief at the target = FLE times the markers' leverage, within 4 %.
+
+    2000 draws leave 1.6 % (one standard deviation, three degrees of freedom at the least).
+    """
+    rng, T = np.random.default_rng(11), pose(3)
+    squares = []
+    for _ in range(2000):
+        error = registration_error(MARKERS, T, fit_rigid, MarkerNoise(ct_mm, touch_mm), rng)
+        T_true = T @ np.linalg.inv(error)
+        squares.append(np.sum((apply(T, TARGET) - apply(T_true, TARGET)) ** 2))
+    fle = np.sqrt(3 * (ct_mm**2 + touch_mm**2))
+    expected = fle * leverage(MARKERS, TARGET[None])[0]
+    assert np.sqrt(np.mean(squares)) == pytest.approx(expected, rel=0.04)
+
+
+def test_believing_the_truth_with_its_error_is_the_belief():
+    """T_believed = T_true E, by construction of the truth, for the triad as well."""
+    T = pose(4)
+    E = registration_error(MARKERS[:3], T, fit_triad, MarkerNoise(0.5, 0.1), np.random.default_rng(1))
+    np.testing.assert_allclose((T @ np.linalg.inv(E)) @ E, T, atol=1e-9)
+    assert np.linalg.norm(E - np.eye(4)) > 1e-3
+
+
+def test_triad_cases_draw_triad_errors(tmp_path):
+    """The error is that of the case's own method and markers: the same noise, another truth."""
+    rigid, triad = (draw_truth(case(tmp_path, method=method), pose(0)) for method in ("rigid", "triad"))
+    assert not np.allclose(rigid.T_base_ct_true, triad.T_base_ct_true, atol=1e-3)
 
 
 def test_file_of_true_positions_is_found_again(tmp_path):

@@ -9,6 +9,7 @@ repeatability, and the true Denavit-Hartenberg numbers carry the flange somewher
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,13 +21,27 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ArmErrors
+from puncture_twin.planning.case.tables import MarkerSection
 from puncture_twin.planning.formats.points import NamedPoints, parse_points
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
-from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs
+from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, match
 
 COLLINEAR = 0.01
 """s2/s1 of the true points below which they leave a rotation free."""
+
+
+Fit = Callable[[Floats, Floats], Floats]
+
+
+class MarkerNoise(NamedTuple):
+    """Standard deviations per axis of markers in CT and by touch, normal errors."""
+
+    ct_mm: float
+    """Where a marker is found in the CT."""
+    touch_mm: float
+    """Position of the touch that the robot reports."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +75,11 @@ class Truth:
 def draw_truth(case: Case, T_base_ct: Floats, *, seed: int | None = None) -> Truth:
     """The truth of a case.
 
-    Where the case names a file of true positions, the patient lies where that file says; else where it is believed.
+    Where the case names a file of true positions, the patient lies where that file says. Otherwise marker errors are
+    drawn such that the belief is a plausible registration of this truth. Without markers belief and truth agree.
 
     Args:
-        case: The case; its ``[rehearsal]`` table says how large the joints' errors are.
+        case: The case; its ``[rehearsal]`` table says how large the errors are.
         T_base_ct: The belief, shape (4, 4), mm.
         seed: Instead of the case's own.
 
@@ -77,9 +93,44 @@ def draw_truth(case: Case, T_base_ct: Floats, *, seed: int | None = None) -> Tru
     if settings.truth_base is not None:
         T_true = _from_file(case, settings.truth_base)
         source = f"true positions from {settings.truth_base}"
+    elif case.registration is not None:
+        T_true = _drawn(case, case.registration, T_base_ct, rng)
+        source = (
+            f"drawn with seed {seed}: marker errors of {settings.fle_ct_mm:g} mm in the CT and "
+            f"{settings.fle_touch_mm:g} mm at the touch (standard deviations per axis)"
+        )
     else:
-        T_true, source = T_base_ct, "same as the belief: the case declares no errors of its markers"
+        T_true, source = T_base_ct, "same as the belief: the case has no markers with errors"
     return Truth(T_true, offsets, seed, source)
+
+
+def registration_error(
+    points_ct: Floats, T_base_ct: Floats, fit: Fit, noise: MarkerNoise, rng: np.random.Generator
+) -> Floats:
+    """E with T_believed = T_true E: one registration of noisy markers, shape (4, 4), mm, CT frame.
+
+    Args:
+        points_ct: The markers, shape (n, 3), mm.
+        T_base_ct: Shape (4, 4): where they are touched, without error.
+        fit: The registration method.
+        noise: How far off the markers are found.
+        rng: Source of the errors.
+    """
+    read_ct = points_ct + rng.normal(0.0, noise.ct_mm, points_ct.shape)
+    touched_base = apply(T_base_ct, points_ct) + rng.normal(0.0, noise.touch_mm, points_ct.shape)
+    return np.asarray(np.linalg.inv(T_base_ct) @ fit(read_ct, touched_base))
+
+
+def _drawn(case: Case, registration: MarkerSection, T_base_ct: Floats, rng: np.random.Generator) -> Floats:
+    markers = match(
+        _read(case, registration.markers_ct, case.space),
+        _read(case, registration.markers_base, None),
+        use=registration.use,
+    )
+    fit = fit_triad if registration.method == "triad" else fit_rigid
+    noise = MarkerNoise(case.rehearsal.fle_ct_mm, case.rehearsal.fle_touch_mm)
+    error = registration_error(markers.points_ct, T_base_ct, fit, noise, rng)
+    return np.asarray(T_base_ct @ np.linalg.inv(error))
 
 
 def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "rehearsal.truth_base") -> Floats:
