@@ -21,7 +21,7 @@ import trimesh
 from scipy.stats import chi2
 
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import Finding, InputError
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
@@ -196,15 +196,19 @@ def _scanned(
 
 def read(one: Control) -> FoundNeedle | str:
     """What is read in the scan, or the code of the refusal."""
-    back = inverse(one.T_scan_ct)
-    tip, forward = one.plan
-    planned = apply(one.T_scan_ct, tip), one.T_scan_ct[:3, :3] @ forward
     try:
-        markers = apply(one.T_scan_ct, one.markers.points)
-        inside = partial(_inside, one.skin, back)
-        return read_needle(one.volume, planned[0], DIAMETER_MM, inside, planned, markers)[0]
+        return reading(one)[0]
     except InputError as error:
         return error.code
+
+
+def reading(one: Control) -> tuple[FoundNeedle, tuple[Finding, ...]]:
+    """What is read in the scan, and what is said of it."""
+    tip, forward = one.plan
+    planned = apply(one.T_scan_ct, tip), one.T_scan_ct[:3, :3] @ forward
+    markers = apply(one.T_scan_ct, one.markers.points)
+    inside = partial(_inside, one.skin, inverse(one.T_scan_ct))
+    return read_needle(one.volume, planned[0], DIAMETER_MM, inside, planned, markers)
 
 
 def _inside(skin: TriangleMesh, T_ct_scan: Floats, points: Floats) -> Bools:

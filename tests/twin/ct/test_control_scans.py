@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from benchmarks.confirm import MUST_REFUSE, control, errors, read
+from benchmarks.confirm import MUST_REFUSE, control, errors, read, reading
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, inverse, pose, rotation_angle
@@ -60,6 +60,14 @@ def test_two_lines_of_one_image_are_not_one_needle():
 def test_a_second_needle_is_not_swallowed(seed, code):
     """9 mm beside the first in slices of 5 mm, where low levels join them; and one that crosses it."""
     assert read(control(np.random.default_rng(seed))) == code
+
+
+def test_slices_in_which_a_second_needle_hides_are_warned_of():
+    """In 5 mm a needle beside the first is once in a hundred scans taken for it (seed 106); in thin ones none was."""
+    for spacing, said in ((5.0, ["thick_slices"]), (2.0, [])):
+        _, findings = reading(control(np.random.default_rng(901), extra="none", bent=False, spacing=spacing))
+        assert [one.code for one in findings] == said
+    assert [one.code for one in reading(control(np.random.default_rng(106)))[1]] == ["thick_slices"]
 
 
 @pytest.mark.parametrize("extra", ["wire", "vessel"])

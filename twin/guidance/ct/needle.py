@@ -69,6 +69,9 @@ MARKER_MM = 6.0
 UNSURE_MM = 1.5
 """A tip known worse than this is not read: streaks, other metal or thick slices hide where it ends."""
 
+THICK_MM, BESIDE_MM = 3.0, 10.0
+"""In thicker slices a needle so near beside another, and nearly along it, may show as one with it."""
+
 Inside = Callable[[Floats], Bools]
 """Which of points (n, 3), LPS mm, lie in the body."""
 
@@ -153,6 +156,12 @@ def read_needle(
         refuse(
             what, volume.path, f"a tip known to {UNSURE_MM:g} mm: thinner slices, or another gantry tilt", "tip_hidden"
         )
+    thick = float(spacing_mm(volume)[2])
+    if thick > THICK_MM:
+        said = (
+            f"slices of {thick:g} mm: a second needle within {BESIDE_MM:g} mm of this one may not be seen; look for it"
+        )
+        findings.append(Finding("thick_slices", Severity.WARNING, said, {"slice_mm": thick}))
     return needle, tuple(findings)
 
 
