@@ -109,7 +109,7 @@ def test_the_region_after_shots_holds_the_truth_as_often_as_it_says():
         exact = exact_recording(truth, draw_probe_poses(rng, truth, 26), draw_image_poses(rng, 26))
         recording = with_noise(rng, exact, SPEC_NOISE)
         recording = Recording(recording.A, recording.B, recording.P)
-        given = {"noise": SPEC_NOISE, "start": as_estimate(truth), "robust": False, "direction": False}
+        given = {"noise": SPEC_NOISE, "direction": False}
         followed = after(ShotByShot.of(calibrate(recording.subset(slice(0, 20)), **given)), recording, range(20, 26))
         refused_shots += sum(not shot.used for shot in followed.shots)
         found = followed.calibration()
@@ -167,7 +167,7 @@ def test_declared_arms_are_followed_too(with_arms):
     recording, declared = with_arms
     recording = Recording(recording.A, recording.B, recording.P, q_probe=recording.q_probe, q_needle=recording.q_needle)
     noise = SPEC_NOISE._replace(robot_mm=0.0, robot_rad=0.0, image_mm=0.1, off_plane_mm=0.1)
-    given = {"noise": noise, "arms": declared, "robust": False}
+    given = {"noise": noise, "arms": declared}
     first = calibrate(recording.subset(slice(0, 25)), **given)
     followed = after(ShotByShot.of(first), recording, range(25, len(recording))).calibration()
     batch = calibrate(recording, **given)

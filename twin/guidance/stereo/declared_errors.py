@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, Strict, model_validator
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import ARM_KINDS, ArmErrors
@@ -53,7 +53,7 @@ class ServoErrors(ArmErrors):
 
     arm: Literal["calibrated", "nominal"] = "calibrated"
     gear_deg: Degrees = 0.0
-    gear_cycles: Annotated[Number, Field(ge=1, le=1000)] = 200.0
+    gear_cycles: Annotated[int, Strict(), Field(ge=1, le=1000)] = 200
     ball_offset_mm: Millimetres = 0.3
     tip_offset_mm: Millimetres = 0.3
     needle_direction_deg: Degrees = 0.2
