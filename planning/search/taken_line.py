@@ -18,7 +18,6 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.skin import SkinPaths, skin_paths
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.strict_json import or_null
 from puncture_twin.planning.clearance.engine import Clearances, measure, normals_of
 from puncture_twin.planning.registration.fits import carried_along
@@ -260,7 +259,3 @@ def hit_chance(context: CaseContext, tip_ct: Floats, cov_ct: Floats) -> float:
     rays = hit_model(case.hit_radius_mm, target.mesh, case.target_ct, tip_ct - case.target_ct).rays
     assert rays is not None
     return float(hit_in_mesh(rays, np.asarray(cov_ct)[None], None, surface)[0])
-
-
-NOT_SAFE = {Reason.TOO_CLOSE.value: "too close to", Reason.UNKNOWN_REGION.value: "in an unknown region:"}
-"""Words of a verdict before its structure."""

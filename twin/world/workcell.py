@@ -159,7 +159,6 @@ def thinned(mesh: TriangleMesh, max_faces: int = MAX_PHYSICS_FACES) -> TriangleM
     return TriangleMesh(vertices, faces)
 
 
-FIELD_OF_VIEW_DEG = 45.0
 NEAR_M = 0.05
 FAR_M = 10.0
 
