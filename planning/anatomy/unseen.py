@@ -76,7 +76,7 @@ def beyond_images(case: Case, skin: Skin, scan: Scan | None, memory: Memory = NO
     ends = [end for end in [*ends, *([] if of_scan is None else [of_scan])] if end[0].cut.any()]
     if not ends:
         return Beyond((), ())
-    found = [assumed(case, view, skin) for view, _ in ends]
+    found = [assumed(case, view, skin, memory) for view, _ in ends]
     breath = _breath(case)
 
     def make() -> TriangleMesh:
@@ -91,7 +91,7 @@ def beyond_images(case: Case, skin: Skin, scan: Scan | None, memory: Memory = NO
     return Beyond((solid,), tuple({one.sentence: one for one in said}.values()))
 
 
-def assumed(case: Case, view: FieldOfView, skin: Skin) -> Assumed:
+def assumed(case: Case, view: FieldOfView, skin: Skin, memory: Memory = NO_MEMORY) -> Assumed:
     """Width assumed beyond a case's image: as a person states it, or the usual where no arm can be beyond.
 
     An arm that is stretched out lies farther from the trunk than anything usual: unless there is none, or the image
@@ -103,7 +103,8 @@ def assumed(case: Case, view: FieldOfView, skin: Skin) -> Assumed:
         return Assumed(ct.beyond_mm, "[ct] beyond_mm")
     if ct.arms == "none" or case.region == "phantom":
         return Assumed(USUAL_MM, "no arms" if ct.arms == "none" else "a phantom")
-    if not view.cut[0].any() and (ct.arms == "present" or _shows_arms(skin.mesh)):
+    key = (__name__, "arms", skin.mesh.digest)
+    if not view.cut[0].any() and (ct.arms == "present" or memory.get(key, lambda: _shows_arms(skin.mesh), int)):
         return Assumed(USUAL_MM, "the image shows the arms and the whole width of the body")
     return Assumed(np.inf, "the position of the arms is not known")
 

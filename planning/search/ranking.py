@@ -145,16 +145,14 @@ def _risk(min_clearance: Floats, touch_chance: Floats | None) -> Floats:
 def pareto_front(terms: Floats) -> NDArray[np.bool_]:
     """Which rows of (n, m) no other row dominates (at most as large everywhere, smaller somewhere); shape (n,).
 
-    In ascending order of the sum a row can be dominated only by earlier ones, and then by one of the front.
+    In ascending order of the sum no row is dominated by a later one: the first is of the front, and takes out its own.
     """
-    front = np.zeros(len(terms), bool)
-    front_rows: list[int] = []
-    for row in np.lexsort((*terms.T, terms.sum(axis=1))):
-        others = terms[front_rows]
-        dominated = np.all(others <= terms[row], axis=1) & np.any(others < terms[row], axis=1)
-        if not dominated.any():
-            front[row] = True
-            front_rows.append(int(row))
+    front, order = np.zeros(len(terms), bool), np.lexsort((*terms.T, terms.sum(axis=1)))
+    left = terms[order]
+    while len(left):
+        front[order[0]] = True
+        stays = (left[1:] < left[0]).any(axis=1) | (left[1:] == left[0]).all(axis=1)
+        left, order = left[1:][stays], order[1:][stays]
     return front
 
 
