@@ -553,6 +553,7 @@ class ErrorsSection(Section):
     joint_deg: Degrees | None = None
     repeatability_deg: Degrees = 0.003
     joint_drift_deg: Degrees | None = None
+    jitter_deg: Degrees = 0.0
     tip_offset_mm: Millimetres = 0.3
     needle_direction_deg: Degrees = 0.2
     surface_mm: Millimetres | None = None

@@ -4,7 +4,8 @@ Everything that errs is a source, normal with deviation 1: x. Everything of whic
 u, the patient's pose and the cameras' frame. Needle (shift and rotation at the tip), anatomy, target and each reading
 are linear in both:
 
-    needle_k = J_k (eta + drift + arrival_k)             eta 28 parameters of arm and tool, k a look or the end
+    needle_k = J_k (eta + drift + arrival_k)             eta 28 parameters of arm and tool, k a look or the end;
+                                                         an arrival with the jitter of its moment
     anatomy  = pose + motion + breath                    of the target and what surrounds it, since the scan
     target   = anatomy + reading of the target in the CT
     touch_i  = A_i pose - J_i eta - R r_i + w breath' + n       marker i: r its reading in the CT, w the skin's weight
@@ -212,7 +213,12 @@ class GuidedModel:
         J = scale * error_jacobian(self.error.model, q, self.error.tip_mm)
         Jq = J[:, PARAMETERS["joint"]]
         own = J * np.sqrt(self.error.fit.noise.eta_variances)
-        return {"arm": own, "drift": arm.drift * Jq, arrival: arm.repeatability * Jq}
+        return {
+            "arm": own,
+            "drift": arm.drift * Jq,
+            arrival: arm.repeatability * Jq,
+            f"jitter {arrival}": arm.jitter * Jq,
+        }
 
     def _bent(self, q: Floats, inserted: float) -> Rows:
         """What the bend adds to it: tissue bends the needle the more, the deeper it is."""
@@ -419,6 +425,7 @@ class GuidedModel:
 
 _SOURCE_OF = {
     "arrival": "repeatability",
+    "jitter": "jitter",
     "markers": "markers_ct",
     "breath": "motion",
     "seen": "cameras",

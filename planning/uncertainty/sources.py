@@ -74,6 +74,7 @@ SOURCES: Mapping[str, Source] = MappingProxyType(
         "joint": Source("zeros of the joints", "joint_deg", "deg"),
         "repeatability": Source("repeatability", "repeatability_deg", "deg"),
         "drift": Source("drift since the touch", "joint_drift_deg", "deg"),
+        "jitter": Source("jitter of the joints", "jitter_deg", "deg"),
         "tip_offset": Source("offset of the needle's tip", "tip_offset_mm", "mm"),
         "needle_direction": Source("direction of the needle", "needle_direction_deg", "deg"),
         "bend": Source("bending of the needle", "bevel_deg", "deg"),

@@ -97,7 +97,7 @@ def guided_trials(
     found: Readings = {("touch", -1): (truths.touched_base - apply_each(T_base_ct, truths.read_ct)).reshape(count, -1)}
     for number, look in enumerate(model.looks):
         q, there = commanded(puncture, T_base_ct, moved, look.out_mm, look.q)
-        arrival = rng.normal(size=(count, 6)) * errors.arm.repeatability
+        arrival = rng.normal(size=(count, 6)) * errors.arm.arriving
         found |= room.look(
             look, number, q, true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
         )
@@ -119,7 +119,7 @@ def guided_trials(
 
 def _drift(errors: ErrorModel, last: Floats, rng: np.random.Generator) -> Floats:
     """What drifted since the touches, given drift and last arrival together, shape (n, 6), rad."""
-    drift, anew = errors.arm.drift, errors.arm.repeatability
+    drift, anew = errors.arm.drift, errors.arm.arriving
     whole = np.hypot(drift, anew)
     if whole == 0.0:
         return np.zeros_like(last)

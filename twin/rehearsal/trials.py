@@ -148,7 +148,7 @@ def draw_truths(
     motion, breath, skin = _moved(moving, count, rng)
     eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))  # stays for all touches of a trial
     read_ct, touched = _touched(puncture, errors, eta, skin, rng)
-    arrival = rng.normal(size=(count, 6)) * np.hypot(errors.arm.repeatability, errors.arm.drift)
+    arrival = rng.normal(size=(count, 6)) * np.hypot(errors.arm.arriving, errors.arm.drift)
     target_ct = puncture.target_ct + _normal(rng, errors.target_cov_ct, (count,))
     side = np.zeros(count) if puncture.bend is None else rng.uniform(0, 2 * np.pi, count)
     return Truths(eta, read_ct, touched, arrival, target_ct, side, motion, breath)

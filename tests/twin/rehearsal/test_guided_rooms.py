@@ -10,6 +10,7 @@ from second_plant import PicturingProbe, PinholePair, Uniform, needle_by_screws
 from uncertainty_world import ball
 
 from puncture_twin import api as pt
+from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.budget.guidance import Sight, corridor_mm, declared_ways, equipped, guided_error, lost_sight
@@ -64,6 +65,22 @@ def test_every_way_errs_as_predicted(insertion, way):
     off = [abs(hit_in_ball(found.cov_ct[None], mm)[0] - (found.tip_error_mm < mm).mean()) for mm in radii]
     assert np.mean(off) <= 0.01
     assert found.summary()["guidance"] == way and found.summary()["stopped"] == 0
+
+
+@pytest.mark.parametrize("way", ["ct", "stereo", "all"])
+def test_a_needle_that_shakes_is_led_as_predicted(tmp_path, way):
+    """It shakes anew at each look, and at the end, which no look tells; touches read a mean, and are none worse."""
+    still, shaking = (
+        prepared(tmp_path, DEVICES.replace("[motion]", f"jitter_deg = {deg}\n[motion]")) for deg in (0, 0.1)
+    )
+    calm, found = (rehearse_trials(*one, ROOMS, 3, way) for one in (still, shaking))
+    assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.03)
+    Jq = error_jacobian(found.puncture.model, shaking[2], found.puncture.tip_mm)[:3, PARAMETERS["joint"]]
+    last = np.sum(np.square(np.radians(0.1) * Jq))
+    own = found.budget.fraction["jitter"] * found.predicted_rms_mm**2
+    assert own == pytest.approx(last) if way == "ct" else own > 0.999 * last
+    assert found.predicted_rms_mm**2 >= calm.predicted_rms_mm**2 + 0.999 * last and "jitter" not in calm.budget.fraction
+    np.testing.assert_array_equal(still[0].chance.error.fit.noise.cov_base, shaking[0].chance.error.fit.noise.cov_base)
 
 
 def test_the_second_arm_is_the_first_one():
