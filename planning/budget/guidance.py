@@ -14,6 +14,7 @@ does not hit.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -31,12 +32,14 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import stereo_of, ultrasound_of
 from puncture_twin.planning.case.tables import ControlScanSection, StereoSection, UltrasoundSection
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.needle.insertion_force import Pushed, pushed
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.reach.standoff import case_axis_lengths, case_paths, standoffs
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise, touches
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.registration.residuals import NoiseTest
+from puncture_twin.planning.search.bending import path_layers
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import moving_weights
@@ -222,12 +225,14 @@ def guided_model(
     if breathing is not None:
         breath, skin_weight = breathing.spread_ct, moving_weights(case, breathing, anatomy).skin
     motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
+    looks = _looks(case, anatomy, error, outward_ct, q, sight or Sight(), steps)
+    push = target_push(case, anatomy, outward_ct)
     return guided.GuidedModel(
         error=error,
         markers=registration.markers.names,
         points_base=apply(registration.T_base_ct, registration.markers.points_ct),
         q_insertion=q,
-        looks=_looks(case, anatomy, error, outward_ct, q, sight or Sight(), steps),
+        looks=looks,
         motion=R @ motion @ R.T,
         breath=R @ breath,
         skin_weight=skin_weight,
@@ -235,7 +240,26 @@ def guided_model(
         ultrasound=case.ultrasound if steps is None else None,
         scan=None if steps is None else case.control_scan,
         across=R @ _across(outward_ct, sight or Sight()),
+        push=None if push is None else np.outer(_push_mm(push, looks), -R @ outward_ct),
     )
+
+
+BEYOND_TARGET_MM = 10.0
+"""How far behind the target its tissues are followed: a correction may lead there."""
+
+
+def target_push(case: Case, anatomy: Anatomy, outward_ct: Floats) -> Pushed | None:
+    """By how much the needle of one direction (3,), unit, pushes the target; None where its tissue does not say it."""
+    if case.bending is None:
+        return None
+    length = float(case_paths(case, anatomy.skin, outward_ct[None]).path_length[0])
+    end = case.target_ct - BEYOND_TARGET_MM * outward_ct
+    return pushed(path_layers(case.bending, anatomy, end, outward_ct, length + BEYOND_TARGET_MM), length)
+
+
+def _push_mm(push: Pushed, looks: Sequence[guided.Look]) -> Floats:
+    """At each look, and at the end."""
+    return push.at(push.target_mm - np.array([*(look.out_mm for look in looks), 0.0]))
 
 
 def _looks(
@@ -335,12 +359,16 @@ def explained_ways(context: CaseContext, explained: Explanation) -> Explanation:
 
 
 def followers(case: Case, anatomy: Anatomy) -> tuple[guided.Follows, ...]:
-    """How each of ``anatomy.checked`` follows the target; what is outside of the body does not but with the breath."""
+    """How each of ``anatomy.checked`` follows the target; what is outside of the body does not but with the breath.
+
+    What the needle pushes is the target's own structure alone.
+    """
     breath = np.ones(len(anatomy.checked))
+    pushes = case.bending is not None and any(one.held_n_mm for one in case.bending.tissues.of_pattern.values())
     if case.breathing is not None:
         breath = moving_weights(case, case.breathing, anatomy).structures
     return tuple(
-        guided.Follows(0.0 if one.outside else 1.0, weight)
+        guided.Follows(0.0 if one.outside else 1.0, weight, float(not pushes or one.name == case.target_structure))
         for one, weight in zip(anatomy.checked, breath.tolist(), strict=True)
     )
 

@@ -284,6 +284,7 @@ class TissueSection(Section):
     friction_n_mm: Annotated[Number, Field(ge=0, le=1)] = 0.0
     capsule_n: Force = 0.0
     capsule_mm: Annotated[Number, Field(ge=0, le=50)] = 0.0
+    held_n_mm: Annotated[Number, Field(ge=0.01, le=1000)] | None = None
 
     @model_validator(mode="after")
     def _capsule_is_whole(self) -> Self:
