@@ -360,9 +360,22 @@ def touch(
     choice: Choice,
     out_dir: OutOfCaseOption = None,
     seed: Annotated[int, typer.Option("--seed", min=0, max=2**31 - 1, help="Seed of motions and ground truth.")] = 0,
+    host: Annotated[
+        str | None, typer.Option("--host", help="Address of a UR that is led by hand: read only, no twin.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Plan the marker touches and execute them in the twin. Writes touch.csv. Exit 1 if too few were touched."""
+    """Plan the marker touches and execute them in the twin, or read a UR's. Writes touch.csv. Exit 1 on too few."""
+    if host is not None:
+        from puncture_twin.planning.case.case import load_case
+        from puncture_twin.twin.jobs.robot import led_touches
+        from puncture_twin.twin.jobs.robot.rtde import LedArm, connect
+
+        led_touches.refuse_of_twin(choice, seed)
+        told, arm = load_case(case), LedArm(connect(host, "touch --host"))
+        read = led_touches.touch_by_hand(told, arm, _led_to, out_folder(out_dir, case, "touch"))
+        finish("touch", read, read.summary(), led_touches.led_text(read), as_json)
+        return
     require_extra("twin", "touch")
     from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
 
@@ -370,6 +383,12 @@ def touch(
     with prepared(case) as context:
         run = touch_case(context, folder, choice, seed)
     finish("touch", run, run.summary(), touch_text(run), as_json)
+
+
+def _led_to(marker: str) -> bool:
+    """Ask for the tip on a marker; whether a line came from standard input."""
+    print(f"{marker}: lead the tip onto it, let it rest, press Enter (Ctrl-D: no more)", file=sys.stderr, flush=True)
+    return sys.stdin.readline() != ""
 
 
 @app.command()

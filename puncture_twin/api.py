@@ -696,9 +696,9 @@ def confirm(context: CaseContext, scan: Path | str, *, plan: Path | str | None =
     Raises:
         InputError: A scan that cannot be read, or tied to the case; no needle, two of them, or a tip that is not seen.
     """
-    from puncture_twin.twin.jobs.patient.confirm_job import confirm_needle
+    from puncture_twin.twin.jobs.patient.confirm_job import ScanFiles, confirm_needle
 
-    return confirm_needle(context, Path(scan), None if plan is None else Path(plan))
+    return confirm_needle(context, ScanFiles(Path(scan)), None if plan is None else Path(plan))
 
 
 @checked

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
+from puncture_twin.planning.base.provenance import Input
+from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.touch.tour_motions import Touch
 
@@ -31,6 +33,9 @@ class Arm(Protocol):
 
     def move_jp(self, q: Floats) -> None:
         """Move to joints (6,), rad, and return when they are at rest."""
+
+    def measured_jp(self) -> Floats:
+        """What the encoders say at rest, joints (6,), rad."""
 
 
 class Cameras(Protocol):
@@ -81,6 +86,23 @@ class JogOperator(Protocol):
         Returns:
             Shape (6,), rad, not moved to yet; NaN out of reach.
         """
+
+
+class ControlScan(NamedTuple):
+    """A CT of the patient in the scanner's own frame, LPS mm, Hounsfield units."""
+
+    volume: Volume
+    frame: str = ""
+    """Its frame of reference by the scanner's own name, as in DICOM; empty where it states none."""
+    inputs: tuple[Input, ...] = ()
+    """Files that it was read from."""
+
+
+class Scanner(Protocol):
+    """A CT scanner."""
+
+    def measured_scan(self) -> ControlScan:
+        """A new scan, or the one that was taken."""
 
 
 class StoppedError(Exception):

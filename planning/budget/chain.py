@@ -121,6 +121,7 @@ class Chain:
         q_insertion: Shape (6,), rad, the tip on the target.
         path: Of a needle that bends; None for a straight one.
         breath: None where it is not declared.
+        motion_base: Shape (3, 3), mm^2, of the target since the scan, base axes; None where it is not declared.
         aim: The insertion that a joint registration is corrected for.
     """
 
@@ -136,6 +137,7 @@ class Chain:
     q_insertion: Floats
     path: BentPath | None = None
     breath: Breath | None = None
+    motion_base: Floats | None = None
     aim: Aim | None = None
 
     def pose_error(self) -> PoseError:
@@ -152,7 +154,12 @@ class Chain:
     def tip_mean_square(self) -> Floats:
         """Mean square of the tip about the intended point, shape (3, 3), mm^2, base axes."""
         still = self.pose_error().tip_covariance(self.q_insertion[None])[0]
-        return still if self.breath is None else still + self.breath.mean_square_base()
+        return np.asarray(sum(self.body_mean_squares().values(), still))
+
+    def body_mean_squares(self) -> dict[str, Floats]:
+        """What the body adds, by source: shape (3, 3) each, mm^2, base axes."""
+        found = {} if self.breath is None else {"breathing": self.breath.mean_square_base()}
+        return found if self.motion_base is None else {**found, "motion": self.motion_base}
 
     def expected_mm(self) -> float:
         """Expected (rms) distance of the tip from the intended point, mm."""
@@ -165,7 +172,7 @@ class Chain:
 
 
 def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: BentPath | None = None) -> Chain:
-    """The chain of a case, with its breathing.
+    """The chain of a case, with its breathing and motion.
 
     Args:
         registration: Of its markers, with the case's own declaration, to whose residuals the errors are scaled.
@@ -173,7 +180,7 @@ def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: 
         path: Of the needle there, where it bends.
     """
     assert case.errors is not None and registration.uncertainty is not None
-    scale = registration.uncertainty.test.scale
+    scale, R = registration.uncertainty.test.scale, registration.T_base_ct[:3, :3]
     return Chain(
         case.robot.model,
         case.needle.length_mm,
@@ -186,6 +193,7 @@ def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: 
         case.target_ct,
         q_insertion,
         path,
-        None if case.breathing is None else Breath(case.breathing, registration.T_base_ct[:3, :3]),
+        None if case.breathing is None else Breath(case.breathing, R),
+        None if case.motion is None else R @ case.motion.target_cov_ct @ R.T,
         registration.aim,
     )

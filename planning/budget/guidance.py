@@ -14,6 +14,7 @@ does not hit.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -23,6 +24,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.breathing.breathing import position_at
@@ -31,19 +33,22 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import stereo_of, ultrasound_of
 from puncture_twin.planning.case.tables import ControlScanSection, StereoSection, UltrasoundSection
 from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.motion.trajectory import Trajectory
+from puncture_twin.planning.needle.insertion_force import Pushed, pushed
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.reach.standoff import case_axis_lengths, case_paths, standoffs
 from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty, reading_noise, touches
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.registration.residuals import NoiseTest
+from puncture_twin.planning.search.bending import path_layers
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.planning.search.phases import moving_weights
 from puncture_twin.planning.uncertainty import guided
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.pose_error import PoseError
-from puncture_twin.planning.visibility.cameras import CameraView, camera_view
+from puncture_twin.planning.visibility.cameras import CameraView, Watched, camera_view
 from puncture_twin.planning.visibility.probe import ProbeView, probe_view
 
 LOOKS = 3
@@ -161,6 +166,13 @@ class Sight:
     probe: ProbeView | None = None
     no_cameras: str = ""
 
+    def sentences(self) -> Iterator[tuple[str, str]]:
+        """What cameras and probe see, or why they do not, of those that were asked about."""
+        if self.cameras is not None or self.no_cameras:
+            yield "cameras", self.no_cameras if self.cameras is None else self.cameras.sentence
+        if self.probe is not None:
+            yield "probe", self.probe.sentence
+
     def hidden(self, out_mm: float) -> dict[str, str]:
         """What is out of sight with the tip so far from the target, by the names of readings, and why."""
         found = {}
@@ -180,7 +192,7 @@ class Sight:
 FEW_MARKERS = f"fewer than {MIN_MARKERS} markers are seen"
 
 
-def sight_of(context: CaseContext, plan: Plan, *ways: str) -> Sight:
+def sight_of(context: CaseContext, plan: Plan | Watched, *ways: str) -> Sight:
     """What those devices of some ways that the case declares see during a plan's insertion.
 
     Raises:
@@ -222,12 +234,14 @@ def guided_model(
     if breathing is not None:
         breath, skin_weight = breathing.spread_ct, moving_weights(case, breathing, anatomy).skin
     motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
+    looks = _looks(case, anatomy, error, outward_ct, q, sight or Sight(), steps)
+    push = target_push(case, anatomy, outward_ct)
     return guided.GuidedModel(
         error=error,
         markers=registration.markers.names,
         points_base=apply(registration.T_base_ct, registration.markers.points_ct),
         q_insertion=q,
-        looks=_looks(case, anatomy, error, outward_ct, q, sight or Sight(), steps),
+        looks=looks,
         motion=R @ motion @ R.T,
         breath=R @ breath,
         skin_weight=skin_weight,
@@ -235,7 +249,26 @@ def guided_model(
         ultrasound=case.ultrasound if steps is None else None,
         scan=None if steps is None else case.control_scan,
         across=R @ _across(outward_ct, sight or Sight()),
+        push=None if push is None else np.outer(_push_mm(push, looks), -R @ outward_ct),
     )
+
+
+BEYOND_TARGET_MM = 10.0
+"""How far behind the target its tissues are followed: a correction may lead there."""
+
+
+def target_push(case: Case, anatomy: Anatomy, outward_ct: Floats) -> Pushed | None:
+    """By how much the needle of one direction (3,), unit, pushes the target; None where its tissue does not say it."""
+    if case.bending is None:
+        return None
+    length = float(case_paths(case, anatomy.skin, outward_ct[None]).path_length[0])
+    end = case.target_ct - BEYOND_TARGET_MM * outward_ct
+    return pushed(path_layers(case.bending, anatomy, end, outward_ct, length + BEYOND_TARGET_MM), length)
+
+
+def _push_mm(push: Pushed, looks: Sequence[guided.Look]) -> Floats:
+    """At each look, and at the end."""
+    return push.at(push.target_mm - np.array([*(look.out_mm for look in looks), 0.0]))
 
 
 def _looks(
@@ -246,17 +279,22 @@ def _looks(
     standoff = float(standoffs(case.needle, length, paths.skin_angle[0]))
     parts = LOOKS - 1 if steps is None else steps
     outs = [length * (1 - step / parts) for step in range(1, parts + 1)]
-    outs = [standoff, *outs] if steps is None else outs
-    T, looks = flange_pose(error.model, q), []
-    for out in outs:
-        at = T.copy()
-        at[:3, 3] -= out * T[:3, 2]
-        there = nearest_within_limits(error.model, inverse(error.model, at[None])[0], q)
-        off = np.where(np.isnan(there).any(axis=1), np.inf, np.abs(there - q).max(axis=1))
+    outs, looks = [standoff, *outs] if steps is None else outs, []
+    for out, there in zip(outs, _drawn_back(error.model, q, outs), strict=True):
         inserted = (length - out) / length
         hidden = sight.hidden(out) | ({} if inserted > 0 else {"tip": OUTSIDE})
-        looks.append(guided.Look(there[off.argmin()], out, inserted, hidden))
+        looks.append(guided.Look(there, out, inserted, hidden))
     return tuple(looks)
+
+
+def _drawn_back(model: UrModel, q: Floats, outs: Sequence[float] | Floats) -> Floats:
+    """Joints with the needle drawn back along itself by so many mm from joints q (6,), nearest to them: (n, 6), rad."""
+    T = flange_pose(model, q)
+    back = np.repeat(T[None], len(outs), axis=0)
+    back[:, :3, 3] -= np.asarray(outs)[:, None] * T[:3, 2]
+    there = nearest_within_limits(model, inverse(model, back), q)
+    off = np.where(np.isnan(there).any(axis=2), np.inf, np.abs(there - q).max(axis=2))
+    return np.asarray(there[np.arange(len(there)), off.argmin(axis=1)])
 
 
 def _across(outward_ct: Floats, sight: Sight) -> Floats:
@@ -326,21 +364,44 @@ def check_ways(context: CaseContext, plan: Plan, where: str | Path) -> None:
 
 
 def explained_ways(context: CaseContext, explained: Explanation) -> Explanation:
-    """A checked direction with what each way of guidance would leave, nothing hidden: sight needs a plan."""
-    row = explained.candidates
-    q = row.arm.q_insertion[0]
-    if np.isnan(q).any() or np.isnan(row.path.length[0]):
+    """A checked direction with what each way of guidance would leave, and what its devices see of the insertion.
+
+    The approach, of which only a plan knows, is in nobody's way here.
+    """
+    case, row = context.case, explained.candidates
+    q, placement = row.arm.q_insertion[0], context.placement
+    declared = case.stereo is not None or case.ultrasound is not None
+    if not declared or placement is None or np.isnan(q).any() or np.isnan(row.path.length[0]):
         return explained
-    return replace(explained, guidance=way_chances(context, row.outward_ct[0], q))
+    standoff = float(standoffs(case.needle, row.path.length[0], row.path.skin_angle[0]))
+    outs = np.linspace(standoff, 0.0, max(2, int(np.ceil(standoff / WATCHED_MM))))
+    joints = _drawn_back(case.robot.model, q, outs)
+    if not np.isfinite(joints).all():
+        return explained
+    insertion = Trajectory(np.arange(len(outs), dtype=np.float64), joints)
+    watched = Watched(
+        case.robot.model, placement.T_base_ct, case.target_ct, row.outward_ct[0], row.path.entry_ct[0],
+        case.needle.length_mm, Trajectory(insertion.times_s[:1], insertion.q[:1]), insertion,
+    )  # fmt: skip
+    sight = sight_of(context, watched, "all")
+    return replace(explained, guidance=way_chances(context, row.outward_ct[0], q, sight), sight=dict(sight.sentences()))
+
+
+WATCHED_MM = 1.0
+"""Between two states of an insertion that is watched without a plan."""
 
 
 def followers(case: Case, anatomy: Anatomy) -> tuple[guided.Follows, ...]:
-    """How each of ``anatomy.checked`` follows the target; what is outside of the body does not but with the breath."""
+    """How each of ``anatomy.checked`` follows the target; what is outside of the body does not but with the breath.
+
+    What the needle pushes is the target's own structure alone.
+    """
     breath = np.ones(len(anatomy.checked))
+    pushes = case.bending is not None and any(one.held_n_mm for one in case.bending.tissues.of_pattern.values())
     if case.breathing is not None:
         breath = moving_weights(case, case.breathing, anatomy).structures
     return tuple(
-        guided.Follows(0.0 if one.outside else 1.0, weight)
+        guided.Follows(0.0 if one.outside else 1.0, weight, float(not pushes or one.name == case.target_structure))
         for one, weight in zip(anatomy.checked, breath.tolist(), strict=True)
     )
 

@@ -51,7 +51,7 @@ class Change:
     """One change of the chain, and the error that it would leave.
 
     Attributes:
-        group: slices, markers, touches, arm, tip, needle or breath.
+        group: slices, markers, touches, arm, tip, needle, breath or body.
         rms_mm: The tip's expected error then, all else as it is.
         point_ct: Shape (3,), mm, where the last of further markers sits; None for other changes.
     """
@@ -67,8 +67,7 @@ def source_costs(chain: Chain) -> tuple[SourceCost, ...]:
     outward_base = -flange_pose(chain.model, chain.q_insertion)[:3, 2]
     budget = error_budget(chain.pose_error(), chain.q_insertion, outward_base)
     squares = {source: budget.rms_mm**2 * part for source, part in budget.fraction.items()}
-    if chain.breath is not None:
-        squares["breathing"] = float(np.trace(chain.breath.mean_square_base()))
+    squares |= {source: float(np.trace(square)) for source, square in chain.body_mean_squares().items()}
     whole = sum(squares.values())
     costs = [
         SourceCost(source, float(np.sqrt(square)), float(np.sqrt(max(whole - square, 0.0))))
@@ -90,6 +89,7 @@ def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tupl
         *_arms(chain),
         *_needles(chain),
         *_gates(chain),
+        *_fixation(chain),
         *_fewer_markers(chain),
         *_more_markers(chain, skin_points_ct),
     )
@@ -159,6 +159,12 @@ def _gates(chain: Chain) -> Iterator[Change]:
         part = 1.0 if gate is None else fraction_within(gate, declared.exponent)
         when = "at any phase" if gate is None else f"at s <= {gate:g} ({100 * part:.0f} % of the time)"
         yield Change("breath", f"inserted {when}", replace(chain, breath=breath).expected_mm())
+
+
+def _fixation(chain: Chain) -> Iterator[Change]:
+    if chain.motion_base is not None:
+        fixed = replace(chain, motion_base=None)
+        yield Change("body", "a body that is fixed as it was scanned", fixed.expected_mm())
 
 
 def _fewer_markers(chain: Chain) -> Iterator[Change]:

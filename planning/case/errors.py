@@ -108,6 +108,7 @@ class ArmUncertainty:
         joint: Of every joint's zero.
         repeatability: Of every joint, anew at each arrival.
         drift: Of every joint, since the markers were touched.
+        jitter: Of every joint about where it arrived, at any one moment; a touch reads its mean.
         tip_offset_mm: Of the needle's tip, per axis of the flange.
         needle_direction: Of the needle's direction, about each of the flange's x and y axes.
     """
@@ -119,6 +120,12 @@ class ArmUncertainty:
     drift: float
     tip_offset_mm: float
     needle_direction: float
+    jitter: float = 0.0
+
+    @property
+    def arriving(self) -> float:
+        """Of every joint at one moment after one arrival: repeatability and jitter, rad."""
+        return float(np.hypot(self.repeatability, self.jitter))
 
     def scaled(self, factor: float) -> ArmUncertainty:
         """Each deviation times a factor."""
@@ -234,6 +241,7 @@ def _arm(section: ErrorsSection) -> ArmUncertainty:
         drift=np.radians(_or(section.joint_drift_deg, DEFAULT_DRIFT_DEG)),
         tip_offset_mm=section.tip_offset_mm,
         needle_direction=np.radians(section.needle_direction_deg),
+        jitter=np.radians(section.jitter_deg),
     )
 
 

@@ -284,6 +284,7 @@ class TissueSection(Section):
     friction_n_mm: Annotated[Number, Field(ge=0, le=1)] = 0.0
     capsule_n: Force = 0.0
     capsule_mm: Annotated[Number, Field(ge=0, le=50)] = 0.0
+    held_n_mm: Annotated[Number, Field(ge=0.01, le=1000)] | None = None
 
     @model_validator(mode="after")
     def _capsule_is_whole(self) -> Self:
@@ -553,6 +554,7 @@ class ErrorsSection(Section):
     joint_deg: Degrees | None = None
     repeatability_deg: Degrees = 0.003
     joint_drift_deg: Degrees | None = None
+    jitter_deg: Degrees = 0.0
     tip_offset_mm: Millimetres = 0.3
     needle_direction_deg: Degrees = 0.2
     surface_mm: Millimetres | None = None

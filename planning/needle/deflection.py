@@ -373,6 +373,7 @@ class Tissue:
         friction_n_mm: Along the shaft, by length of it inside.
         capsule_n: Force at which its surface ruptures; 0 has none.
         capsule_mm: How far the surface is pushed in by then.
+        held_n_mm: Force along the needle that moves it as a whole by 1 mm against the body; None moves nothing.
     """
 
     stiffness_n_mm2: float
@@ -380,6 +381,7 @@ class Tissue:
     friction_n_mm: float = 0.0
     capsule_n: float = 0.0
     capsule_mm: float = 0.0
+    held_n_mm: float | None = None
 
 
 class Layer(NamedTuple):

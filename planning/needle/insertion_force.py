@@ -10,13 +10,13 @@ back to its place: the tip is then in by d, without further work.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.needle.deflection import Layer
+from puncture_twin.planning.needle.deflection import Layer, Tissue
 
 SAMPLE_MM = 0.1
 """Between two samples of the force."""
@@ -80,6 +80,40 @@ def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> Inse
         cutting[pushing], inside[pushing] = 0.0, push.start_mm  # while it is pushed in nothing is cut
     friction = sum((_friction(layer, inside) for layer in layers), np.zeros(len(depth)))
     return InsertionForce(depth, capsule, cutting, friction)
+
+
+class Pushed(NamedTuple):
+    """By how much the tissue about the target is pushed on along the needle."""
+
+    depth_mm: Floats
+    """Shape (n,), of the tip from the skin."""
+    shift_mm: Floats
+    """Shape (n,)."""
+    target_mm: float
+    """Depth of the target as planned."""
+
+    def at(self, depth_mm: Floats) -> Floats:
+        """The shift at depths, mm."""
+        return np.interp(depth_mm, self.depth_mm, self.shift_mm)
+
+
+def pushed(layers: Sequence[Layer], target_mm: float) -> Pushed | None:
+    """The shift of the tissue at a depth, where it says by what the body holds it: F / K.
+
+    F is what the needle does to that tissue alone, capsule, cutting and friction; those of other layers move others.
+    """
+    own = next(layer.tissue for layer in layers if target_mm <= layer.end_mm + ROUNDING_MM)
+    if own.held_n_mm is None:
+        return None
+    alone = [one if _same(one.tissue, own) else one._replace(tissue=Tissue(0.0)) for one in layers]
+    force = insertion_force(alone)
+    return Pushed(force.depth_mm, force.total_n / own.held_n_mm, target_mm)
+
+
+def _same(one: Tissue, other: Tissue) -> bool:
+    """One tissue, whether or not its surface is passed there."""
+    bare = (replace(tissue, capsule_n=0.0, capsule_mm=0.0) for tissue in (one, other))
+    return next(bare) == next(bare)
 
 
 def _pushes(layers: Sequence[Layer], end: float) -> list[Push]:

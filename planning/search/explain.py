@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -49,7 +50,8 @@ class Explanation(Shown):
         facts: The path as a person at the patient sees it.
         breakdown: How sure it is; None where the case declares no errors, or the candidate was rejected before.
         read: What was read besides the case to choose it.
-        guidance: What each way of guidance would leave, nothing hidden; empty where the case declares no devices.
+        guidance: What each way of guidance would leave; empty where the case declares no devices.
+        sight: Of the declared ones, cameras and probe, what they see of the insertion, or why not, in words.
     """
 
     case: Case
@@ -59,6 +61,7 @@ class Explanation(Shown):
     breakdown: UncertaintyBreakdown | None = None
     read: tuple[Input, ...] = ()
     guidance: tuple[WayChance, ...] = ()
+    sight: Mapping[str, str] = field(default_factory=dict)
 
     def _title(self) -> str:
         return self.head()[0]
@@ -138,6 +141,7 @@ class Explanation(Shown):
             **self._needle(),
             **self._breathing(),
             **({"guidance": [one.document() for one in self.guidance]} if self.guidance else {}),
+            **({"sight": dict(self.sight)} if self.sight else {}),
         }
 
     def _at_target(self) -> dict[str, list[float]] | None:
@@ -211,11 +215,14 @@ class Explanation(Shown):
     def _breakdown(self) -> list[str]:
         if self.breakdown is not None:
             led = (
-                f"  by {way:10s} {mm} mm rms, hits {hit}, stopped {stop}"
-                for way, mm, hit, stop, _ in map(way_cells, self.guidance)
+                f"  by {way:10s} {mm} mm rms, hits {hit}, stopped {stop}{', not all in sight' if lost else ''}"
+                for way, mm, hit, stop, lost in map(way_cells, self.guidance)
             )
-            return [*(f"  {line}" for line in self.breakdown.lines()), *led]
-        return [] if self.case.errors is None else [f"  {NO_CHANCES}"]
+            return [*(f"  {line}" for line in self.breakdown.lines()), *led, *self._sight()]
+        return [*([] if self.case.errors is None else [f"  {NO_CHANCES}"]), *self._sight()]
+
+    def _sight(self) -> list[str]:
+        return [f"  {device:14s} {said}" for device, said in self.sight.items()]
 
     def _path(self) -> list[str]:
         row, needle = self.candidates, self.case.needle

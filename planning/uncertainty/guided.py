@@ -4,8 +4,10 @@ Everything that errs is a source, normal with deviation 1: x. Everything of whic
 u, the patient's pose and the cameras' frame. Needle (shift and rotation at the tip), anatomy, target and each reading
 are linear in both:
 
-    needle_k = J_k (eta + drift + arrival_k)             eta 28 parameters of arm and tool, k a look or the end
-    anatomy  = pose + motion + breath                    of the target and what surrounds it, since the scan
+    needle_k = J_k (eta + drift + arrival_k)             eta 28 parameters of arm and tool, k a look or the end;
+                                                         an arrival with the jitter of its moment
+    anatomy  = pose + motion + breath + push_k           of the target and what surrounds it, since the scan; push:
+                                                         by the needle at its depth there, known as the breath's mean
     target   = anatomy + reading of the target in the CT
     touch_i  = A_i pose - J_i eta - R r_i + w breath' + n       marker i: r its reading in the CT, w the skin's weight
     cameras  = A_i (pose + frame) - R r_i + w breath + n        markers, A_i = [I, -[p_i - f]x],
@@ -149,10 +151,11 @@ class Look(NamedTuple):
 
 
 class Follows(NamedTuple):
-    """By how much of the target's motion since the scan, and of its breath, something moves."""
+    """By how much of the target's motion since the scan, of its breath, and of its push, something moves."""
 
     motion: float
     breath: float
+    push: float = 1.0
 
 
 WHOLLY = Follows(1.0, 1.0)
@@ -183,6 +186,7 @@ class GuidedModel:
         motion: Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan.
         breath: Shape (3, 2), mm: mean and deviation of the target's displacement by the breath; 0 without breathing.
         skin_weight: By how much of it the markers move.
+        push: Shape (looks + 1, 3), mm: by how much the needle pushes the target at each look, and at the end.
         stereo: The cameras, or None.
         ultrasound: The probe, or None.
         across: Shape (3,), unit: the normal of its picture.
@@ -201,6 +205,7 @@ class GuidedModel:
     ultrasound: Ultrasound | None = None
     across: Floats | None = None
     scan: ControlScanSection | None = None
+    push: Floats | None = None
 
     def _at(self, points_base: Floats) -> Floats:
         """A, shape (3 m, 6): how a shift and rotation at the target move points (m, 3)."""
@@ -212,23 +217,34 @@ class GuidedModel:
         J = scale * error_jacobian(self.error.model, q, self.error.tip_mm)
         Jq = J[:, PARAMETERS["joint"]]
         own = J * np.sqrt(self.error.fit.noise.eta_variances)
-        return {"arm": own, "drift": arm.drift * Jq, arrival: arm.repeatability * Jq}
+        return {
+            "arm": own,
+            "drift": arm.drift * Jq,
+            arrival: arm.repeatability * Jq,
+            f"jitter {arrival}": arm.jitter * Jq,
+        }
 
     def _bent(self, q: Floats, inserted: float) -> Rows:
         """What the bend adds to it: tissue bends the needle the more, the deeper it is."""
         bend = self.error.bend
         return {} if bend is None else {"bend": max(inserted, 0.0) ** 2 * bend.sides(self.error.model, q)}
 
-    def anatomy(self, follows: Follows = WHOLLY) -> Rows:
-        """Deviation of anatomy at the target from where the registration puts it, 6 rows."""
+    def anatomy(self, follows: Follows = WHOLLY, look: int = -1) -> Rows:
+        """Deviation of anatomy at the target from where the registration puts it at a look, or the end, 6 rows."""
         motion, breath = follows.motion * _root(self.motion), follows.breath * self.breath
+        if self.push is not None:
+            breath = breath + follows.push * np.outer(self.push[look], [1.0, 0.0])
         still = np.zeros((3, 3))
         return {"pose": np.eye(6), "motion": np.vstack([motion, still]), "breath": np.vstack([breath, still[:, :2]])}
 
     @cached_property
     def target(self) -> Rows:
-        """Deviation of the true target, 3 rows."""
-        return _sum(_times(np.eye(6)[:3], self.anatomy()), {"target": _root(self.error.target_covariance)})
+        """Deviation of the true target at the end, 3 rows."""
+        return self._target_at(-1)
+
+    def _target_at(self, look: int) -> Rows:
+        anatomy = _times(np.eye(6)[:3], self.anatomy(look=look))
+        return _sum(anatomy, {"target": _root(self.error.target_covariance)})
 
     @cached_property
     def readings(self) -> tuple[Reading, ...]:
@@ -282,7 +298,7 @@ class GuidedModel:
         if self.ultrasound is None or self.across is None:
             return []
         one, found = self.ultrasound, []
-        for name, rows, sd_mm in (("target", self.target, one.target_sd_mm), ("tip", tip, one.tip_sd_mm)):
+        for name, rows, sd_mm in (("target", self._target_at(number), one.target_sd_mm), ("tip", tip, one.tip_sd_mm)):
             own = {
                 "calibration": one.calibration_sd_mm * np.eye(3),
                 f"pictured {name}": picture_root(sd_mm, self.across),
@@ -300,7 +316,7 @@ class GuidedModel:
         own = {"pose": -self._at(there[None]), f"{SCANNED_TIP} {number}": tip_root}
         found = [Reading("scan", SCANNED_TIP, number, _sum(tip, own))]
         if self.scan.target_seen:
-            rows = _sum(self.target, {"pose": -np.eye(6)[:3], SCANNED_TARGET: target_root})
+            rows = _sum(self._target_at(number), {"pose": -np.eye(6)[:3], SCANNED_TARGET: target_root})
             found.append(Reading("scan", SCANNED_TARGET, number, rows))
         return found
 
@@ -419,6 +435,7 @@ class GuidedModel:
 
 _SOURCE_OF = {
     "arrival": "repeatability",
+    "jitter": "jitter",
     "markers": "markers_ct",
     "breath": "motion",
     "seen": "cameras",

@@ -3,7 +3,7 @@
 With J_i the arm's error Jacobian at marker i's touch and J_f at the insertion, L the registration's map, X its
 transport to the target, Omega what errs anew at each marker:
 
-    Sigma6 = G Sigma_eta G' + X L Omega L' X' + (rep^2 + drift^2) Jq_f Jq_f',   G = J_f - X L J
+    Sigma6 = G Sigma_eta G' + X L Omega L' X' + (rep^2 + jitter^2 + drift^2) Jq_f Jq_f',   G = J_f - X L J
 
 The minus sign is the cancellation: what the arm does wrong at the markers it does again at the target.
 `AnyPose` bounds the error in all configurations that put the tip on the target.
@@ -100,7 +100,7 @@ class PoseError:
         readings = self.fit.cov_at(self.target_base)
         J, arm = error_jacobian(self.model, q, self.tip_mm), self.errors.arm
         lasting = not_cancelled(self.fit, J, self.target_base) * np.sqrt(self.fit.noise.eta_variances)
-        anew = J[..., PARAMETERS["joint"]] * np.hypot(arm.drift, arm.repeatability)
+        anew = J[..., PARAMETERS["joint"]] * np.hypot(arm.drift, arm.arriving)
         root = self.fit.test.scale * np.concatenate([lasting, anew], axis=-1)  # root @ root' is the arm's part
         straight = readings + root @ np.swapaxes(root, -1, -2)
         return straight if self.bend is None else straight + _bend_covariance(self.model, q, self.bend)
@@ -171,7 +171,7 @@ class PoseError:
         Jq, arm = J[..., PARAMETERS["joint"]], self.errors.arm
         found["drift"] = _outer(Jq, np.full(6, arm.drift**2))
         found["arrival"] = _outer(Jq, np.full(6, arm.repeatability**2))
-        return found
+        return found if arm.jitter == 0.0 else {**found, "jitter": _outer(Jq, np.full(6, arm.jitter**2))}
 
 
 def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
@@ -304,7 +304,7 @@ def any_pose(error: PoseError) -> AnyPose:
     link, twist, joint, tip, direction = (variance[PARAMETERS[kind]] for kind in PARAMETERS)
     own_mm = np.sqrt(link.sum() + twist @ levers[1:] ** 2 + joint @ levers[:6] ** 2 + tip.max())
     own_rad = np.sqrt(twist.sum() + joint.sum() + direction.max())
-    anew = np.hypot(arm.drift, arm.repeatability)
+    anew = np.hypot(arm.drift, arm.arriving)
     readings = error.fit.cov_at(error.target_base)
     bounds = []
     for rows, own, arrival in (

@@ -74,11 +74,14 @@ SOURCES: Mapping[str, Source] = MappingProxyType(
         "joint": Source("zeros of the joints", "joint_deg", "deg"),
         "repeatability": Source("repeatability", "repeatability_deg", "deg"),
         "drift": Source("drift since the touch", "joint_drift_deg", "deg"),
+        "jitter": Source("jitter of the joints", "jitter_deg", "deg"),
         "tip_offset": Source("offset of the needle's tip", "tip_offset_mm", "mm"),
         "needle_direction": Source("direction of the needle", "needle_direction_deg", "deg"),
         "bend": Source("bending of the needle", "bevel_deg", "deg"),
         "breathing": Source("breathing while it is inserted", "amplitude_mm", "mm"),
-        "motion": Source("motion of the target since the scan", "motion.target_sd_mm and [breathing]", "mm"),
+        "motion": Source(
+            "motion of the target since the scan", "motion.target_sd_mm, [breathing], tissue held_n_mm", "mm"
+        ),
         "cameras": Source("points seen by the cameras", "stereo.sd_mm", "mm"),
         "pictures": Source("ultrasound pictures", "ultrasound.target_sd_mm, tip_sd_mm, calibration_sd_mm", "mm"),
         "scans": Source("readings of the control scans", "control_scan.slice_mm and [errors] target_mm", "mm"),

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import convex_hull
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, read_only
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
 from puncture_twin.planning.base.text import Facts, Shown, brief, first_few, plural
@@ -27,6 +28,7 @@ from puncture_twin.planning.collision.state_checker import PATIENT, SweptBodies
 from puncture_twin.planning.geometry.containment import contains, crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply, inverse
+from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
 
@@ -49,6 +51,20 @@ MARKER_MM = 5.0
 CAMERA_MM, BETWEEN_MM = 80.0, 20.0
 """Radius of a ball about a proposed camera, its housing and its mount, that nothing is in at some states of the motion;
 at all others nothing is nearer than that less by the second."""
+
+
+class Watched(NamedTuple):
+    """A straight insertion without a plan, as `Plan` has its own: the approach is the standoff alone; mm."""
+
+    model: UrModel
+    T_base_ct: Floats
+    target_ct: Floats
+    outward_ct: Floats
+    entry_ct: Floats
+    needle_length_mm: float
+    approach: Trajectory
+    insertion: Trajectory
+
 
 Names = NDArray[np.object_]
 """Texts, of any shape."""
@@ -114,7 +130,7 @@ class CameraView(Shown):
             yield name, f"seen at {hidden.count('')} of {len(hidden)} depths" + (f"; hidden by {by}" if by else "")
 
 
-def camera_view(context: CaseContext, plan: Plan) -> CameraView:
+def camera_view(context: CaseContext, plan: Plan | Watched) -> CameraView:
     """Where two cameras look from, and what they see during the insertion of a plan.
 
     Stated cameras are taken. Others are proposed: one meter from the target and half a meter apart, higher than the
@@ -257,7 +273,9 @@ def _hidden(looks: Sequence[_Look], static: Surfaces, markers_ct: Floats, camera
     return np.array(found, object)
 
 
-def _free_places(static: Surfaces, bodies: Sequence[Body], swept: SweptBodies, plan: Plan) -> Callable[[Floats], bool]:
+def _free_places(
+    static: Surfaces, bodies: Sequence[Body], swept: SweptBodies, plan: Plan | Watched
+) -> Callable[[Floats], bool]:
     """Whether a ball of `CAMERA_MM` about a point (3,), CT, is outside of everything while the arm moves."""
     q = np.concatenate([plan.approach.q, plan.insertion.q])
     moving = inverse(plan.T_base_ct) @ link_poses(plan.model, q[swept.rows_within(q, BETWEEN_MM)])

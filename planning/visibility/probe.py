@@ -37,6 +37,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about, inverse, pose
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.search.context import CaseContext
+from puncture_twin.planning.visibility.cameras import Watched
 
 HEAD_MM, HANDLE_MM, LENGTH_MM = (8.0, 30.0, 20.0), 40.0, 150.0
 """Of the probe: how much wider than its footprint the head is, how long, and how thick; the handle's diameter; flange
@@ -161,7 +162,7 @@ _ORDER = [str(why) for why in Ruled]
 FREE = "free"
 
 
-def probe_view(context: CaseContext, plan: Plan) -> ProbeView:
+def probe_view(context: CaseContext, plan: Plan | Watched) -> ProbeView:
     """Where the probe goes while a plan's needle is inserted.
 
     Args:
@@ -289,7 +290,7 @@ def _air_on(scan: Scan, target_ct: Floats, rays: Floats, ends: Floats) -> Bools:
     return found
 
 
-def _mounts(context: CaseContext, plan: Plan) -> Iterator[Floats]:
+def _mounts(context: CaseContext, plan: Plan | Watched) -> Iterator[Floats]:
     """T_base_ct of the assumed places of the second arm: the needle's, turned about the target; the other side first.
 
     None is in an obstacle, in the patient's table or next to the needle's base.
@@ -345,7 +346,7 @@ class _ProbeArm:
         return None if all(self.between.apart(q, one) for one in self.q_needle) else Ruled.ARMS
 
 
-def _arm(context: CaseContext, plan: Plan, probe: Ultrasound, T_base_ct: Floats) -> _ProbeArm | None:
+def _arm(context: CaseContext, plan: Plan | Watched, probe: Ultrasound, T_base_ct: Floats) -> _ProbeArm | None:
     """The probe's arm at a place; None where the case leaves the place open and its base would be in the patient.
 
     Raises:

@@ -101,6 +101,18 @@ def test_sources_with_the_body_add_up(chain):
     assert not {"needle", "breath"} & groups
 
 
+def test_a_fixed_body_takes_its_motion_away(chain):
+    """The motion is a source whose squares add up; fixed, the error is that of the chain without it; else no word."""
+    motion = np.diag([0.4, 0.4, 1.0]) ** 2
+    one = replace(chain, motion_base=motion)
+    costs = {cost.source: cost for cost in source_costs(one)}
+    assert costs["motion"].alone_mm == pytest.approx(np.sqrt(np.trace(motion)))
+    assert sum(cost.alone_mm**2 for cost in costs.values()) == pytest.approx(one.expected_mm() ** 2)
+    (fixed,) = (change for change in changes(one, np.empty((0, 3)), None) if change.group == "body")
+    assert fixed.rms_mm == pytest.approx(chain.expected_mm()) == pytest.approx(costs["motion"].without_mm)
+    assert not {"body"} & {change.group for change in changes(chain, np.empty((0, 3)), None)}
+
+
 def test_narrower_gates_cost_time_and_win_millimetres(chain):
     """Each other gate, with the part of the time that it leaves."""
     one = replace(chain, breath=Breath(breath(0.5), chain.T_base_ct[:3, :3]))
@@ -131,6 +143,8 @@ amplitude_mm = 12.0
 gate = 0.25
 [breathing.weights]
 "*" = 0.5
+[motion]
+target_sd_mm = [0.4, 0.4, 1.0]
 """
 
 
@@ -153,5 +167,6 @@ def test_register_shows_them_where_they_are_declared(tmp_path):
     costs = {one["text"]: one["alone_mm"] for one in budget["sources"]}
     assert 0.1 < costs["bending of the needle"] < 10
     assert costs["breathing while it is inserted"] == pytest.approx(12 * mean_square_within(0.25, 2, 0.0) ** 0.5)
-    assert {one["group"] for one in budget["changes"]} > {"needle", "breath"}
-    assert budget["not_modelled"] == "tissue motion, errors of the meshes (organ, rib: errors.surface_mm)"
+    assert costs["motion of the target since the scan"] == pytest.approx(np.sqrt(0.4**2 + 0.4**2 + 1.0))
+    assert {one["group"] for one in budget["changes"]} > {"needle", "breath", "body"}
+    assert budget["not_modelled"] == "errors of the meshes (organ, rib: errors.surface_mm)"

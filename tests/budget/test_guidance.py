@@ -82,11 +82,28 @@ def test_a_checked_direction_says_it_too(planned):
     explained = pt.check(context, theta_deg=plan.theta_deg, beta_deg=plan.beta_deg)
     assert [one["way"] for one in explained.summary()["guidance"]] == [one.way for one in plan.guidance]
     assert "by ct+us+tip" in explained.text()
+    sight = dict(sight_of(context, plan, "all").sentences())
+    assert explained.sight == sight and set(sight) == {"cameras", "probe"} and sight["probe"] in explained.text()
+    q = explained.candidates.arm.q_insertion[0]  # the plan may take another configuration of the arm
+    other = way_chances(context, plan.outward_ct, q, sight_of(context, plan, "all"))
+    assert [(one.way, one.lost_sight) for one in explained.guidance] == [(one.way, one.lost_sight) for one in other]
+    np.testing.assert_allclose([one[1:4] for one in explained.guidance], [one[1:4] for one in other], rtol=1e-6)
     bare = replace(context, case=replace(context.case, stereo=None, ultrasound=None))
-    assert "guidance" not in pt.check(bare, theta_deg=plan.theta_deg, beta_deg=plan.beta_deg).summary()
+    assert not {"guidance", "sight"} & set(pt.check(bare, theta_deg=plan.theta_deg, beta_deg=plan.beta_deg).summary())
     assert with_ways(bare, plan).guidance == ()
     with refused("plan_of_another"):
         check_ways(bare, plan, "plan.json")
+
+
+def test_a_checked_direction_says_why_there_is_no_window(planned):
+    """A probe that sees too shallow: ultrasound has no number, the text names what would let it; cameras go on."""
+    context, plan = planned
+    shallow = replace(context, case=replace(context.case, ultrasound=replace(context.case.ultrasound, depth_mm=5.0)))
+    explained = pt.check(shallow, theta_deg=plan.theta_deg, beta_deg=plan.beta_deg)
+    found = {one.way: one for one in explained.guidance}
+    assert np.isnan(found["us"].p_hit) and "depth_mm" in explained.sight["probe"] in found["us"].lost_sight
+    assert "depth_mm" in explained.text() and "not all in sight" in explained.text()
+    assert found["stereo"].lost_sight == "" and explained.summary()["sight"]["cameras"].startswith("both cameras see")
 
 
 def test_terminal_and_page_show_one_table(planned):

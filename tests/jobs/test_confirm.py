@@ -11,25 +11,31 @@ from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
-from puncture_twin.twin.plant.scanner.case_scene import TrueRod, case_scene, scan_grid
-from puncture_twin.twin.plant.scanner.image import ScanSettings, scan_solids
+from puncture_twin.twin.jobs.patient.confirm_job import ScanFiles, confirm_needle
+from puncture_twin.twin.plant.scanner.case_scene import TrueRod, VirtualScanner, case_scene
+from puncture_twin.twin.plant.scanner.image import ScanSettings
 from puncture_twin.twin.plant.scanner.writers import write_nifti, write_series
 
 CASE = folder() / "abdomen"
 OUTWARD = np.array([-0.89, -0.437, -0.126]) / np.linalg.norm([-0.89, -0.437, -0.126])
 
 
-def scanned(place, off, *, needle=True, series=False):
-    """A coarse scan of the patient rotated by 3 degrees, the tip ``off`` the target; the file, and T_scan_ct."""
+def scanner(off, *, needle=True):
+    """A scanner with the patient in, rotated by 3 degrees, the tip ``off`` the target: its slices are coarse."""
     context = prepare(CASE, arm=False)
     settings, rng = ScanSettings(3.0, 1.2, 15.0, turn=np.radians(3.0)), np.random.default_rng(1)
     rod = TrueRod(context.case.target_ct + np.array(off), -OUTWARD) if needle else None
-    scene = case_scene(context.case, context.anatomy, settings, rng, needle=rod)
-    image = scan_solids(scene.solids, scan_grid(scene, settings, rng), settings, rng)
+    return VirtualScanner(case_scene(context.case, context.anatomy, settings, rng, needle=rod), settings, rng)
+
+
+def scanned(place, off, *, needle=True, series=False):
+    """A scan of it; the file, and T_scan_ct."""
+    device = scanner(off, needle=needle)
+    image, T = device.image(), device.scene.T_scan_ct
     if series:
-        write_series(place / "series", image, settings, "control", "abdomen")
-        return place / "series", scene.T_scan_ct
-    return write_nifti(place / "control.nii.gz", image.hu, image.grid.T_ct_index), scene.T_scan_ct
+        write_series(place / "series", image, device.settings, "control", "abdomen")
+        return place / "series", T
+    return write_nifti(place / "control.nii.gz", image.hu, image.grid.T_ct_index), T
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +66,17 @@ def test_a_needle_is_read_in_the_cases_frame(control, capfd):
     assert {"confirm.html", "confirm.png", "confirm.json"} <= {one.name for one in (place / "out").iterdir()}
     listed = {one["role"] for one in found["inputs"]}
     assert "control ct" in listed
+
+
+def test_a_scan_is_read_off_the_scanner_as_off_its_files(control):
+    """Two devices of one protocol: the needle and what is to be done are the same; files are inputs, a scanner none."""
+    _, file, _ = control
+    context = prepare(CASE, arm=False)
+    live, kept = (confirm_needle(context, one) for one in (scanner(4.0 * OUTWARD), ScanFiles(file)))
+    np.testing.assert_allclose(live.needle.tip_ct, kept.needle.tip_ct, atol=1e-4)
+    np.testing.assert_allclose(live.needle.cov_ct, kept.needle.cov_ct, rtol=1e-3)
+    assert [one.kind for one in live.aims] == [one.kind for one in kept.aims]
+    assert not live.read and [one.role for one in kept.read] == ["control ct"]
 
 
 def test_a_mirrored_scan_and_one_without_a_needle(tmp_path, capfd, control):

@@ -4,6 +4,7 @@ import importlib.util
 import itertools
 import json
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -14,14 +15,18 @@ from puncture_twin import run_twin
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_tool
+from puncture_twin.planning.formats.points import read_points
+from puncture_twin.planning.geometry.spaces import Unit
 from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.survey import ReachRequest
+from puncture_twin.planning.registration.fit_uncertainty import touches
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.twin.jobs.robot import mirror
+from puncture_twin.twin.jobs.robot import led_touches, mirror, rtde
 
 ABDOMEN = folder() / "abdomen"
 
@@ -75,14 +80,14 @@ def test_the_tip_comes_straight_to_the_target(drive):
     """Along an insertion the target stays on the needle's line, and the distance is the standoff less the depth."""
     shown = mirror.Mirror.of(load_case(ABDOMEN))
     for q, depth in zip(drive.insertion_q, drive.insertion_depth_mm, strict=True):
-        one = shown.show(mirror.RecordedState(0.0, q))
+        one = shown.show(rtde.RecordedState(0.0, q))
         assert one.off_axis_mm < 1e-6 and one.to_target_mm == pytest.approx(120.0 - depth, abs=1e-6)
 
 
 def test_a_live_arm_is_read_until_its_time_is_over(drive):
     """By the robot's clock: four readings in 1.5 seconds."""
     arm = FakeArm([list(drive.insertion_q[0])] * 9)
-    states = list(mirror.live_states(arm, period_s=0.0, seconds=1.5))
+    states = list(rtde.live_states(arm, period_s=0.0, seconds=1.5))
     assert [state.time_s for state in states] == [100.5, 101.0, 101.5, 102.0]
 
 
@@ -90,7 +95,7 @@ def test_a_live_arm_is_read_until_its_time_is_over(drive):
 def test_joint_angles_that_are_none_are_refused(rows):
     """Five of them, or one that is no number."""
     with refused("joints"):
-        next(mirror.live_states(FakeArm(rows), period_s=0.0, seconds=None))
+        next(rtde.live_states(FakeArm(rows), period_s=0.0, seconds=None))
 
 
 class SilentArm(FakeArm):
@@ -116,8 +121,8 @@ class SilentArm(FakeArm):
 @pytest.mark.parametrize(("connected", "match"), [(False, "7.500"), (True, "7.500")])
 def test_an_old_state_is_not_shown_again(monkeypatch, connected, match):
     """The last word of a robot that is gone must not look like an arm that stands still."""
-    monkeypatch.setattr(mirror, "SILENCE_S", 0.05)
-    states = mirror.live_states(SilentArm(connected), period_s=0.001, seconds=None)
+    monkeypatch.setattr(rtde, "SILENCE_S", 0.05)
+    states = rtde.live_states(SilentArm(connected), period_s=0.001, seconds=None)
     assert next(states).time_s == 7.5
     with refused("robot_silent", match):
         next(states)
@@ -128,7 +133,7 @@ def test_before_the_first_word_nothing_is_shown():
     arm = FakeArm([[0.0] * 6, [0.1] * 6])
     times = iter([0.0, 3.0])
     arm.getTimestamp = lambda: next(times)
-    state = next(mirror.live_states(arm, period_s=0.0, seconds=None))
+    state = next(rtde.live_states(arm, period_s=0.0, seconds=None))
     assert state.time_s == 3.0 and state.q[0] == 0.1
 
 
@@ -168,7 +173,7 @@ def test_a_controller_is_mirrored_as_its_recording_is(rows, tmp_path, capfd):
 def test_a_controller_that_stops_ends_the_mirror(rows, order, match):
     """Whether it closes the line or leaves it open."""
     with rtde_server(HOST, rows) as controller:
-        states = mirror.live_states(mirror.connect(HOST), period_s=0.02, seconds=None)
+        states = rtde.live_states(rtde.connect(HOST), period_s=0.02, seconds=None)
         assert len(list(itertools.islice(states, 3))) == 3
         controller.order(order)
         with refused(match):
@@ -251,6 +256,116 @@ def test_one_arm_at_a_time(capsys):
 
 
 def test_only_the_receiving_half_is_ever_named():
-    """The library's controlling half stands nowhere in the mirror."""
-    text = (folder().parent / "twin" / "jobs" / "robot" / "mirror.py").read_text()
+    """The library's controlling half stands nowhere in what reads a robot."""
+    files = [*(folder().parent / "twin" / "jobs" / "robot").glob("*.py")]
+    text = "".join(one.read_text() for one in files)
     assert "rtde_receive" in text and not any(word in text for word in ("rtde_control", "rtde_io", "RTDEControl"))
+
+
+class PushedArm(FakeArm):
+    """Reads like an arm that moves from row to row, a hundredth of a second each, and stays at the last."""
+
+    def getActualQ(self):  # noqa: N802
+        """The next, or the last again."""
+        return self.rows.pop(0) if len(self.rows) > 1 else self.rows[0]
+
+    def getTimestamp(self):  # noqa: N802
+        """A hundredth of a second later each time."""
+        self.time += 0.01
+        return self.time
+
+
+def test_a_led_arm_is_read_at_rest():
+    """Not while it moves: the mean of half a second in which no joint turned; `move_jp` passes over other rests."""
+    moving = np.linspace(0.0, 1.0, 50)[:, None] * np.ones(6)
+    rest, noise = np.full(6, 1.2), np.random.default_rng(0).uniform(-1e-4, 1e-4, (60, 6))
+    arm = rtde.LedArm(PushedArm([*moving, *(rest + noise), rest]), period_s=0.0)
+    q = arm.measured_jp()
+    assert 0.0 < np.abs(q - rest).max() < 2e-5  # of the mean of fifty readings
+    elsewhere = np.full((80, 6), 0.3)
+    arm = rtde.LedArm(PushedArm([*elsewhere, *moving, rest]), period_s=0.0)
+    arm.move_jp(rest + np.radians(0.4))
+    np.testing.assert_allclose(arm.measured_jp(), rest, atol=1e-12)
+
+
+def test_an_arm_that_nobody_leads_is_not_waited_for_without_end(monkeypatch):
+    """It rests elsewhere, or never, until its time is over."""
+    monkeypatch.setattr(rtde, "LED_S", 3.0)
+    for rows in ([np.zeros(6)], np.linspace(0.0, 5.0, 400)[:, None] * np.ones(6)):
+        with pytest.raises(NoAnswerError) as error:
+            rtde.LedArm(PushedArm(list(rows)), period_s=0.0).move_jp(np.ones(6) * 2.0)
+        assert error.value.code == "not_led"
+
+
+@pytest.fixture(scope="module")
+def touched_q():
+    """Joints with the abdomen's needle on each of its markers, (n, 6) rad, and the case."""
+    case = load_case(ABDOMEN)
+    placement = load_placement(case)
+    markers = placement.registration.markers
+    return case, markers, touches(case, markers)
+
+
+@needs_the_extra
+def test_markers_are_read_off_a_controller(touched_q, tmp_path, capfd, monkeypatch):
+    """Through ur-rtde: `touch.csv` is what the nominal arm computes of the joints, and registers; nothing is sent."""
+    case, markers, q = touched_q
+    monkeypatch.setattr(rtde, "STILL_S", 0.2)
+    called, lines = [], iter(q)
+
+    def connected(*args, connect=rtde.connect):
+        called.append(connect(*args))
+        return called[0]
+
+    class Terminal:
+        def readline(self):
+            place = next(lines)
+            while np.abs(np.array(called[0].getActualQ()) - place).max() > 1e-9:
+                time.sleep(0.005)
+            return "\n"
+
+    monkeypatch.setattr(rtde, "connect", connected)
+    monkeypatch.setattr(sys, "stdin", Terminal())
+    with rtde_server(HOST, np.repeat(q, 250, axis=0)) as controller:
+        code = run_twin.main(["touch", str(ABDOMEN), "--host", HOST, "--out", str(tmp_path), "--json"])
+    said = json.loads(capfd.readouterr().out)
+    assert code == 0 and said["suffices"]
+    read = read_points(tmp_path / "touch.csv", default_unit=Unit.MM)
+    listed = [markers.names.index(name) for name in read.names]
+    np.testing.assert_allclose(read.joints, q[listed], atol=1e-9)
+    flange = flange_pose(case.robot.model, q[listed])
+    np.testing.assert_allclose(read.points, (flange @ [0.0, 0.0, case.needle.length_mm, 1.0])[:, :3], atol=1e-6)
+    assert said["fre_mm"] == pytest.approx(0.0, abs=3.0)
+    assert "".join(kind for kind, _ in controller.received) == "VvOS"
+
+
+class AtMarkers:
+    """An arm that is led to each marker in turn."""
+
+    def __init__(self, q):
+        self.q = list(q)
+
+    def measured_jp(self):
+        """The next."""
+        return self.q.pop(0)
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_too_few_touches_by_hand(touched_q, count, tmp_path):
+    """None is refused; two are kept, and do not register: the rest is named."""
+    case, markers, q = touched_q
+    answers = iter([True] * count + [False])
+    if not count:
+        with refused("empty"):
+            led_touches.touch_by_hand(case, AtMarkers(q), lambda _: next(answers), tmp_path)
+        assert not list(tmp_path.iterdir())
+        return
+    read = led_touches.touch_by_hand(case, AtMarkers(q), lambda _: next(answers), tmp_path)
+    assert not read.suffices and read.residuals_mm is None and len(read.left_out) == len(markers.names) - 2
+    assert read.summary()["fre_mm"] is None and f"not touched: {read.left_out[0]}" in led_touches.led_text(read)
+
+
+def test_no_tour_is_planned_for_an_arm_that_is_led(capsys):
+    """A direction or a seed beside --host is refused before anyone is called."""
+    for more in (["--seed", "1"], ["--theta", "18", "--beta", "232"]):
+        refused_command(["touch", ABDOMEN, "--host", HOST, *more], capsys, "conflicting_options")

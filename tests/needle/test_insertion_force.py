@@ -1,10 +1,12 @@
 """The force of an insertion, and where the arm's work goes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from puncture_twin.planning.needle.deflection import Layer, Tissue
-from puncture_twin.planning.needle.insertion_force import insertion_force
+from puncture_twin.planning.needle.insertion_force import insertion_force, pushed
 
 SKIN = Tissue(0.1, cutting_n=0.6, friction_n_mm=0.01, capsule_n=4.0, capsule_mm=5.0)
 FAT = Tissue(0.02, cutting_n=0.3, friction_n_mm=0.005)
@@ -89,3 +91,18 @@ def test_a_capsule_gives_way_at_its_force():
 def test_nothing_to_pass_needs_no_force():
     """A path without length."""
     assert insertion_force([]).peak_n == 0.0
+
+
+def test_a_held_tissue_is_pushed_by_its_own_forces_over_its_stiffness():
+    """K s = cutting + friction over the length inside it, as a pencil has it; what is before it does not push."""
+    skin, liver = Tissue(0.05, friction_n_mm=0.1, capsule_n=3.0, capsule_mm=4.0), Tissue(0.05, 0.5, 0.02, held_n_mm=0.8)
+    layers = [Layer(0.0, 30.0, skin), Layer(30.0, 70.0, liver), Layer(70.0, 80.0, skin)]
+    found = pushed(layers, 60.0)
+    at = np.array([0.0, 20.0, 29.9, 30.1, 45.0, 60.0])
+    by_hand = np.where(at < 30.0, 0.0, (0.5 + 0.02 * (at - 30.0)) / 0.8)
+    np.testing.assert_allclose(found.at(at), by_hand, atol=1e-9)
+    assert found.target_mm == 60.0 and found.at(90.0) == found.at(80.0)
+    assert pushed([Layer(0.0, 30.0, liver), Layer(30.0, 70.0, skin)], 60.0) is None
+    capsule = replace(liver, capsule_n=2.0, capsule_mm=5.0)
+    rising = pushed([Layer(0.0, 30.0, skin), Layer(30.0, 70.0, capsule)], 60.0)
+    assert rising.at(35.0) == pytest.approx(2.0 / 0.8) and rising.at(35.2) == pytest.approx((0.5 + 0.02 * 5.2) / 0.8)

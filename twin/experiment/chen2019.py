@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import combinations
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import minimize_scalar
 from scipy.special import chdtrc
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import design, fit_affine, fit_rigid, fit_triad
 
@@ -250,6 +251,7 @@ class Experiment:
         joint: Sums of squares per axis of the CT (mm^2), and chi-squared, over all points of both setups.
         probability: Of a chi-squared as large as the paper's, by the law with 24 degrees.
         best_strain: Fraction of draws in which some strain takes away as much as the paper's best one does.
+        several: Errors by several triads, mm, see `several_triads`: by the paper's own points, and rms of the draws.
     """
 
     declaration: Declaration
@@ -258,6 +260,7 @@ class Experiment:
     joint: tuple[DrawnRank, ...]
     probability: float
     best_strain: float
+    several: Mapping[str, tuple[float, float]]
 
     @property
     def rejected(self) -> bool:
@@ -283,6 +286,12 @@ def run_draws(declaration: Declaration, draws: int, rng: np.random.Generator) ->
         _ranks(_joint(paper, declaration), _joint(drawn, declaration)),
         float(chdtrc(FREEDOM, chi)),
         float(np.mean(_best(drawn) >= _best(paper)[0])),
+        {
+            name: (float(off[0]), rms(drawn_off))
+            for (name, off), drawn_off in zip(
+                several_triads(measured()[SETUP]).items(), several_triads(touched[SETUP]).values(), strict=True
+            )
+        },
     )
 
 
@@ -345,6 +354,42 @@ def unskewed(points: Floats, k: float) -> Floats:
     moved = points.copy()
     moved[:, 1] += k * points[:, 2]
     return moved
+
+
+TRIPLES = tuple("".join(one) for one in combinations(MARKERS, 3))
+
+
+def several_triads(touched: Floats, read: Floats = READ, lesion: str = "M") -> dict[str, Floats]:
+    """Errors of a lesion by several triads of the markers of the second setup, of n experiments, (n,) each, mm.
+
+    Args:
+        touched: Shape (n, 8, 3), rows as `NAMES`, mm.
+        read: Shape (8, 3), mm, in the CT.
+    """
+    rows, at = rows_of(MARKERS), read[rows_of(lesion)]
+    poses = np.array([_triad(touched, read, names) for names in TRIPLES])
+    points = poses[..., :3, :3] @ at[0] + poses[..., :3, 3]
+    off = np.linalg.norm(points - touched[:, rows_of(lesion)[0]], axis=2)
+    best, *_, worst = sorted(TRIPLES, key=lambda names: spread_of(read[rows_of(names)], at))
+    every = fit_rigid(np.broadcast_to(read[rows], (len(touched), len(rows), 3)), touched[:, rows])
+    return {
+        f"the best-placed triad, {'-'.join(best)}": off[TRIPLES.index(best)],
+        f"the worst-placed triad, {'-'.join(worst)}": off[TRIPLES.index(worst)],
+        f"one of all {len(TRIPLES)} triads, rms": np.sqrt(np.mean(off**2, axis=0)),
+        "mean of the points of all triads": np.linalg.norm(
+            points.mean(axis=0) - touched[:, rows_of(lesion)[0]], axis=1
+        ),
+        "rigid fit of all five markers": _misses(every, touched, read, lesion)[:, 0],
+    }
+
+
+def spread_of(markers: Floats, at: Floats) -> float:
+    """Rms error at a point (1, 3), mm, per mm of independent error of markers (k, 3) along each axis, before any touch.
+
+    With D the design of the markers and d that of the point, the trace of d (D'D)^-1 d'.
+    """
+    D, d = design(markers, markers.mean(axis=0)), design(at, markers.mean(axis=0))
+    return float(np.sqrt(np.trace(d @ np.linalg.solve(D.T @ D, d.T))))
 
 
 BED = 0

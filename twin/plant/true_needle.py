@@ -249,6 +249,6 @@ def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget
         seed: Of the truth.
     """
     rng = np.random.default_rng([seed, 2])
-    arrival = rng.normal(size=6) * np.hypot(errors.arm.repeatability, errors.arm.drift)
+    arrival = rng.normal(size=6) * np.hypot(errors.arm.arriving, errors.arm.drift)
     values, axes = np.linalg.eigh(errors.target_cov_ct)
     return AtTarget(arrival, target_ct + axes @ (rng.normal(size=3) * np.sqrt(np.maximum(values, 0.0))))

@@ -240,13 +240,18 @@ class PlantArm:
     """
 
     def __init__(self, arm: TrueArm, rng: np.random.Generator) -> None:
-        self._arm, self._rng = arm, rng
+        self._arm, self._rng, self._sent = arm, rng, np.zeros(6)
         self.rests: list[Floats] = []
         """True joints after each move, (6,), rad."""
 
     def move_jp(self, q: Floats) -> None:
         """Move to joints (6,), rad: its gears stop short, its joints miss."""
         self.rests.append(self._arm.settle(q, self.rests[-1] if self.rests else q, self._rng))
+        self._sent = q
+
+    def measured_jp(self) -> Floats:
+        """The last command, (6,), rad: encoders are on the motors' side, and see no play."""
+        return self._sent
 
 
 def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator) -> TrueArm:

@@ -26,6 +26,7 @@ from puncture_twin.planning.budget.guidance import (
     guided_model,
     lost_sight,
     stepped,
+    target_push,
 )
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
@@ -236,6 +237,8 @@ def rehearse_trials(
     check_way(guidance)
     case, assumed = equipped(context.case, led)
     context = replace(context, case=case)
+    push = target_push(case, context.anatomy, outward_ct)
+    query = query._replace(puncture=replace(query.puncture, push=push))
     way, moving = _way(context, query, led, sight, steps)
     truths = draw_truths(query.puncture, query.truth, count, rng, moving)
     done = guided_trials(query.puncture, truths, query.truth, way, np.random.default_rng([seed, 4]))
@@ -448,6 +451,7 @@ def _touches(context: CaseContext, puncture: Puncture, trials: Trials, off_mm: F
         length, radius = float(lengths[column]), np.maximum(case.needle.radius_mm + off_mm[:, column], CONTACT_MM)
         own = follows[column]
         tip_ct = trials.tip_ct + (1 - own.motion) * trials.motion_ct + (1 - own.breath) * trials.breath_ct
+        tip_ct = tip_ct + (1 - own.push) * trials.pushed_ct
         shift = np.linalg.norm(tip_ct - case.target_ct, axis=1)
         for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):  # others are surely clear
             touched[row, place] = context.engine.collides(

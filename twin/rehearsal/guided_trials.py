@@ -37,6 +37,7 @@ from puncture_twin.twin.rehearsal.trials import (
     commanded,
     ended,
     open_loop,
+    pushed_by,
     registered,
 )
 
@@ -97,7 +98,7 @@ def guided_trials(
     found: Readings = {("touch", -1): (truths.touched_base - apply_each(T_base_ct, truths.read_ct)).reshape(count, -1)}
     for number, look in enumerate(model.looks):
         q, there = commanded(puncture, T_base_ct, moved, look.out_mm, look.q)
-        arrival = rng.normal(size=(count, 6)) * errors.arm.repeatability
+        arrival = rng.normal(size=(count, 6)) * errors.arm.arriving
         found |= room.look(
             look, number, q, true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
         )
@@ -119,7 +120,7 @@ def guided_trials(
 
 def _drift(errors: ErrorModel, last: Floats, rng: np.random.Generator) -> Floats:
     """What drifted since the touches, given drift and last arrival together, shape (n, 6), rad."""
-    drift, anew = errors.arm.drift, errors.arm.repeatability
+    drift, anew = errors.arm.drift, errors.arm.arriving
     whole = np.hypot(drift, anew)
     if whole == 0.0:
         return np.zeros_like(last)
@@ -169,7 +170,10 @@ class _Room:
         if puncture.bend is not None:
             grown = max(look.inserted, 0.0) ** 2
             needle = bent(needle, puncture.bend._replace(tip_mm=grown * puncture.bend.tip_mm), self.truths.side)
-        found |= self._by_probe(needle, tip) | self._by_scanner(needle, tip)
+        truths = self.truths
+        moved = truths.motion_ct + truths.breath_ct + pushed_by(puncture, truths, needle)
+        target_ct = truths.target_ct + moved
+        found |= self._by_probe(needle, tip, target_ct) | self._by_scanner(needle, tip, target_ct)
         return {(name, number): value for name, value in found.items() if name not in look.hidden}
 
     def _by_cameras(self, look: Look, needle: TrueNeedle, tip: Floats, axis: Floats) -> dict[str, Floats]:
@@ -189,21 +193,21 @@ class _Room:
         there = apply_each(T_base_cameras, markers) - expected
         return {**{name: there[:, row] for row, name in enumerate(names)}, **seen}
 
-    def _by_probe(self, needle: TrueNeedle, tip: Floats) -> dict[str, Floats]:
+    def _by_probe(self, needle: TrueNeedle, tip: Floats, target_ct: Floats) -> dict[str, Floats]:
         if self.probe is None:
             return {}
-        puncture, truths = self.puncture, self.truths
-        target = apply(puncture.T_base_ct, truths.target_ct + truths.motion_ct + truths.breath_ct)
+        puncture = self.puncture
+        target = apply(puncture.T_base_ct, target_ct)
         expected = self.T_base_ct[:, :3, :3] @ puncture.target_ct + self.T_base_ct[:, :3, 3]
         return {"target": self.probe.target(target) - expected, "tip": self.probe.tip(needle.tip_base) - tip}
 
-    def _by_scanner(self, needle: TrueNeedle, tip: Floats) -> dict[str, Floats]:
+    def _by_scanner(self, needle: TrueNeedle, tip: Floats, target_ct: Floats) -> dict[str, Floats]:
         if self.scanner is None:
             return {}
-        R, t, truths = self.T_base_ct[:, :3, :3], self.T_base_ct[:, :3, 3], self.truths
+        R, t = self.T_base_ct[:, :3, :3], self.T_base_ct[:, :3, 3]
         there = self.scanner.tip(needle.tip_base)
         found = {SCANNED_TIP: np.einsum("nab,nb->na", R, there) + t - tip}
         if self.model.scan is not None and self.model.scan.target_seen:
-            target = self.scanner.target(truths.target_ct + truths.motion_ct + truths.breath_ct)
+            target = self.scanner.target(target_ct)
             found[SCANNED_TARGET] = np.einsum("nab,nb->na", R, target - self.puncture.target_ct)
         return found

@@ -20,6 +20,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.breathing.breathing import Breathing, position_at
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation
+from puncture_twin.planning.needle.insertion_force import Pushed
 from puncture_twin.planning.registration.fit_uncertainty import parameter_variances
 from puncture_twin.planning.registration.fits import (
     ReadingNoise,
@@ -53,6 +54,7 @@ class Puncture:
         q_insertion: Shape (6,), rad, the tip on the target.
         bend: Of the needle; None where it is straight.
         aim: Of the method ``joint``: the insertion that every trial's pose is corrected for; None where it is not.
+        push: By how much the needle pushes the target on; None where it does not.
     """
 
     model: UrModel
@@ -67,6 +69,7 @@ class Puncture:
     q_insertion: Floats
     bend: Bend | None = None
     aim: Aim | None = None
+    push: Pushed | None = None
 
 
 class Trials(NamedTuple):
@@ -84,6 +87,7 @@ class Trials(NamedTuple):
         motion_ct: Shape (n, 3), by how much the body about the target has moved since the scan: positions are
             relative to it.
         breath_ct: Shape (n, 3), and by how much the breath has moved the target.
+        pushed_ct: Shape (n, 3), and by how much the needle has.
     """
 
     tip_ct: Floats
@@ -96,6 +100,7 @@ class Trials(NamedTuple):
     bevel_side: Floats
     motion_ct: Floats
     breath_ct: Floats
+    pushed_ct: Floats
 
     def of(self, rows: Bools | Ints) -> Trials:
         """The results of some trials."""
@@ -148,7 +153,7 @@ def draw_truths(
     motion, breath, skin = _moved(moving, count, rng)
     eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))  # stays for all touches of a trial
     read_ct, touched = _touched(puncture, errors, eta, skin, rng)
-    arrival = rng.normal(size=(count, 6)) * np.hypot(errors.arm.repeatability, errors.arm.drift)
+    arrival = rng.normal(size=(count, 6)) * np.hypot(errors.arm.arriving, errors.arm.drift)
     target_ct = puncture.target_ct + _normal(rng, errors.target_cov_ct, (count,))
     side = np.zeros(count) if puncture.bend is None else rng.uniform(0, 2 * np.pi, count)
     return Truths(eta, read_ct, touched, arrival, target_ct, side, motion, breath)
@@ -205,11 +210,22 @@ def ended(puncture: Puncture, truths: Truths, T_base_ct: Floats, needle: TrueNee
     R_ct_needle = T_ct_base[:3, :3] @ needle.R_base_needle
     there = apply_each(T_base_ct, truths.read_ct)
     squares = _chi_squared(puncture, (truths.touched_base - there).reshape(len(there), -1))
-    tip_ct = apply(T_ct_base, needle.tip_base) - truths.motion_ct - truths.breath_ct
+    pushed_ct = pushed_by(puncture, truths, needle)
+    tip_ct = apply(T_ct_base, needle.tip_base) - truths.motion_ct - truths.breath_ct - pushed_ct
     return Trials(
         tip_ct, outward_ct, truths.target_ct, T_base_ct, reached, R_ct_needle, squares, truths.side, truths.motion_ct,
-        truths.breath_ct,
+        truths.breath_ct, pushed_ct,
     )  # fmt: skip
+
+
+def pushed_by(puncture: Puncture, truths: Truths, needle: TrueNeedle) -> Floats:
+    """By how much needles have pushed their targets on, shape (n, 3), CT frame: along each, by its own depth."""
+    if puncture.push is None:
+        return np.zeros_like(truths.motion_ct)
+    T_ct_base = np.linalg.inv(puncture.T_base_ct)
+    tip_ct = apply(T_ct_base, needle.tip_base) - truths.motion_ct - truths.breath_ct
+    depth_mm = puncture.push.target_mm - (tip_ct - puncture.target_ct) @ puncture.outward_ct
+    return np.asarray(puncture.push.at(depth_mm)[:, None] * (needle.R_base_needle[:, :, 2] @ T_ct_base[:3, :3].T))
 
 
 def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:

@@ -1,5 +1,7 @@
 """The experiment drawn anew: which declaration of its errors the paper's own points allow."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -11,6 +13,7 @@ from puncture_twin.run_twin import app
 from puncture_twin.twin.experiment.chen2019 import (
     AS_FOUND,
     AS_STATED,
+    NAMES,
     POINTS,
     READ,
     SETUPS,
@@ -24,6 +27,8 @@ from puncture_twin.twin.experiment.chen2019 import (
     rigid_residuals,
     rows_of,
     run_draws,
+    several_triads,
+    spread_of,
 )
 
 PRINTED = {
@@ -53,6 +58,44 @@ def test_the_stated_errors_are_rejected_and_those_found_are_not():
     assert stated.rejected
     assert not found.rejected
     assert found.agrees
+
+
+def test_several_triads_are_what_one_after_the_other_gives():
+    """A plain loop over experiments and triads; a triad by Chen's equations 1 to 9, written out."""
+    touched = READ + np.random.default_rng(0).normal(0.0, 0.5, (20, 8, 3))
+    found, lesion = several_triads(touched), NAMES.index("M")
+    for row, points in enumerate(touched):
+        images = {}
+        for names in combinations("ABCDE", 3):
+            ct, base = (axes_of(side[rows_of("".join(names))]) for side in (READ, points))
+            rows = rows_of("".join(names))
+            R = base @ ct.T
+            images["-".join(names)] = R @ READ[lesion] + np.mean(points[rows] - READ[rows] @ R.T, axis=0)
+        off = {name: np.linalg.norm(image - points[lesion]) for name, image in images.items()}
+        assert found["one of all 10 triads, rms"][row] == pytest.approx(np.sqrt(np.mean(np.square([*off.values()]))))
+        mean = np.mean([*images.values()], axis=0)
+        assert found["mean of the points of all triads"][row] == pytest.approx(np.linalg.norm(mean - points[lesion]))
+        for name in ("best", "worst"):
+            key = next(one for one in found if one.startswith(f"the {name}"))
+            assert found[key][row] == pytest.approx(off[key.split(", ")[1]])
+
+
+def axes_of(points):
+    """Chen's triad as columns."""
+    first = points[1] - points[0]
+    third = np.cross(first, points[2] - points[0])
+    e1, e3 = first / np.linalg.norm(first), third / np.linalg.norm(third)
+    return np.column_stack([e1, np.cross(e3, e1), e3])
+
+
+def test_all_markers_are_worth_more_than_any_triad():
+    """Of touches that err alike: the rigid fit as its law says, below the best triad, the mean, and one of them."""
+    touched = READ + np.random.default_rng(1).normal(0.0, 0.5, (20_000, 8, 3))
+    rms = {name.split(",")[0]: np.sqrt(np.mean(off**2)) for name, off in several_triads(touched).items()}
+    law = 0.5 * np.hypot(spread_of(READ[rows_of("ABCDE")], READ[rows_of("M")]), np.sqrt(3.0))  # and the lesion's touch
+    every = rms.pop("rigid fit of all five markers")
+    assert every == pytest.approx(law, rel=0.02)
+    assert every < min(rms.values()) and rms.pop("the worst-placed triad") > 2.0 * max(rms.values())
 
 
 @pytest.mark.parametrize("touch_mm", [0.1, 0.35, 1.0])

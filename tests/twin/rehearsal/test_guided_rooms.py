@@ -10,6 +10,7 @@ from second_plant import PicturingProbe, PinholePair, Uniform, needle_by_screws
 from uncertainty_world import ball
 
 from puncture_twin import api as pt
+from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.budget.guidance import Sight, corridor_mm, declared_ways, equipped, guided_error, lost_sight
@@ -39,12 +40,14 @@ def insertion(tmp_path_factory):
     return prepared(tmp_path_factory.mktemp("ball"), DEVICES)
 
 
-def prepared(folder, tables, touch_mm=0.2, length_mm=210.0, nearest=False):
+def prepared(folder, tables, touch_mm=0.2, length_mm=210.0, nearest=False, bevel=False):
     """The round patient with more tables in its case, one direction, and the joints there."""
     file = ball(folder, errors=f"touch_mm = {touch_mm}\n" + tables)
     needle = "length_mm = {}\nshaft_mm = {}"
     stated = needle.format(210.0, 150.0), needle.format(length_mm, min(150.0, length_mm - 10.0))
     file.write_text(changed(file.read_text(), stated))
+    if bevel:
+        file.write_text(changed(file.read_text(), ("length_mm = 210.0", "bevel_deg = 0.0\nlength_mm = 210.0")))
     context = pt.prepare(file)
     found = context.search()
     rows = np.flatnonzero(found.safe)
@@ -64,6 +67,70 @@ def test_every_way_errs_as_predicted(insertion, way):
     off = [abs(hit_in_ball(found.cov_ct[None], mm)[0] - (found.tip_error_mm < mm).mean()) for mm in radii]
     assert np.mean(off) <= 0.01
     assert found.summary()["guidance"] == way and found.summary()["stopped"] == 0
+
+
+@pytest.mark.parametrize("way", ["ct", "stereo", "all"])
+def test_a_needle_that_shakes_is_led_as_predicted(tmp_path, way):
+    """It shakes anew at each look, and at the end, which no look tells; touches read a mean, and are none worse."""
+    still, shaking = (
+        prepared(tmp_path, DEVICES.replace("[motion]", f"jitter_deg = {deg}\n[motion]")) for deg in (0, 0.1)
+    )
+    calm, found = (rehearse_trials(*one, ROOMS, 3, way) for one in (still, shaking))
+    assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.03)
+    Jq = error_jacobian(found.puncture.model, shaking[2], found.puncture.tip_mm)[:3, PARAMETERS["joint"]]
+    last = np.sum(np.square(np.radians(0.1) * Jq))
+    own = found.budget.fraction["jitter"] * found.predicted_rms_mm**2
+    assert own == pytest.approx(last) if way == "ct" else own > 0.999 * last
+    assert found.predicted_rms_mm**2 >= calm.predicted_rms_mm**2 + 0.999 * last and "jitter" not in calm.budget.fraction
+    np.testing.assert_array_equal(still[0].chance.error.fit.noise.cov_base, shaking[0].chance.error.fit.noise.cov_base)
+
+
+TISSUE = """
+[tissue."*"]
+stiffness_n_mm2 = 0.01
+friction_n_mm = 0.02
+[tissue.organ]
+stiffness_n_mm2 = 0.01
+cutting_n = 1.0
+friction_n_mm = 0.03
+"""
+
+
+def pushing(folder, held_n_mm):
+    """The round patient, whose organ is held by so much; None where the case does not say it."""
+    held = "" if held_n_mm is None else f"held_n_mm = {held_n_mm}\n"
+    return prepared(folder, DEVICES + TISSUE + held, bevel=True)
+
+
+@pytest.mark.parametrize("way", ["ct", "stereo", "us", "ct+us+tip", "all"])
+def test_a_target_is_pushed_on_by_the_needle(tmp_path, way):
+    """As predicted, in size and along the needle; who reads the target late sees it, and touches and cameras do not."""
+    insertion = pushing(tmp_path, 0.8)
+    found = rehearse_trials(*insertion, ROOMS, 3, way)
+    push = found.puncture.push
+    shift = float(push.at(push.target_mm))
+    assert shift > 1.0
+    assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.05)
+    assert found.in_region.mean() == pytest.approx(0.95, abs=0.02)
+    short = float(np.mean(found.error_ct @ insertion[1]))
+    assert short == pytest.approx(shift, rel=0.05) if way in ("ct", "stereo") else abs(short) < 0.5 * shift
+    predicted = guided_error(distribution._way(insertion[0], distribution._query(*insertion), way)[0].model, way)
+    mean_ct = predicted.about_breath()[1]
+    assert mean_ct @ insertion[1] == pytest.approx(short, abs=0.05 * shift)
+    assert found.p_hit == pytest.approx(found.hit_share, abs=0.03)
+
+
+def test_what_is_not_held_is_not_pushed(tmp_path):
+    """Nothing moves where no tissue says how it is held, or nothing guides; twice as firm, half as far."""
+    still, firm, twice = (pushing(tmp_path, held) for held in (None, 1.0, 2.0))
+    free = rehearse_trials(*still, 200, 3, "us")
+    assert free.puncture.push is None and not free.trials.pushed_ct.any()
+    shifts = [rehearse_trials(*one, 200, 3, "ct").trials.pushed_ct for one in (firm, twice)]
+    np.testing.assert_allclose(shifts[0], 2.0 * shifts[1], rtol=1e-12)
+    assert np.linalg.norm(shifts[0], axis=1).min() > 0.5
+    np.testing.assert_array_equal(
+        rehearse_trials(*firm, 200, 3).trials.tip_ct, rehearse_trials(*still, 200, 3).trials.tip_ct
+    )
 
 
 def test_the_second_arm_is_the_first_one():

@@ -34,6 +34,7 @@ ALONE = {
     "joint_deg": {"joint_deg": 0.1},
     "repeatability_deg": {"repeatability_deg": 0.15},
     "joint_drift_deg": {"joint_drift_deg": 0.15},
+    "jitter_deg": {"jitter_deg": 0.15},
     "tip_offset_mm": {"tip_offset_mm": 1.0},
     "needle_direction_deg": {"needle_direction_deg": 1.5},
     "surface_mm": {"surface_mm": 1.2},

@@ -106,3 +106,23 @@ def test_damping_is_nothing_far_from_singular_and_bounds_the_step_near():
     flat = J.copy()
     flat[2] = flat[0]
     assert np.linalg.norm(damped(flat, goal)) <= np.linalg.norm(goal) / (2 * 0.05) + 1e-9
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_five_joints_bring_ball_and_needle_to_where_six_do(seed):
+    """The paper's step, J^+ [dX; da] of 6 x 5 with the sixth joint held: da has no part about the needle."""
+    rng = np.random.default_rng(seed)
+    rod, start = rod_at(GOOD), GOOD + 0.03 * rng.normal(size=6)
+    goal, q, six = ball_base(rod, GOOD) + rng.uniform(-8, 8, 3), start, start
+    for _ in range(300):
+        z = flange_pose(MODEL, q)[:3, 2]
+        J = ball_jacobian(rod, q)[:, :5] / np.repeat([300.0, 1.0], 3)[:, None]
+        q = q + np.append(
+            np.linalg.pinv(J) @ np.append((goal - ball_base(rod, q)) / 300.0, np.cross(z, rod.R_base_flange[:, 2])), 0.0
+        )
+        six = servo_step(rod, six, goal - ball_base(rod, six), StepLimits()).q_path[-1]
+    for joints in (q, six):
+        np.testing.assert_allclose(ball_base(rod, joints), goal, atol=1e-3)
+        np.testing.assert_allclose(flange_pose(MODEL, joints)[:3, 2], rod.R_base_flange[:, 2], atol=1e-5)
+    assert q[5] == start[5] and abs(six[5] - start[5]) > 1e-3
+    np.testing.assert_allclose(q[:5], six[:5], atol=1e-5)

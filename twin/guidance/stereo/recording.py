@@ -66,7 +66,11 @@ class Recorder:
     def move_jp(self, q: Floats) -> None:
         """Move; what is looked at next is a stop, unless it is measured."""
         self.devices.move_jp(q)
-        self._joints, self._table = tuple(repr(float(degrees)) for degrees in np.degrees(q)), ""
+        self._joints, self._table = tuple(map(repr, np.degrees(self.measured_jp()).tolist())), ""
+
+    def measured_jp(self) -> Floats:
+        """Where the arm rests: what is kept of a move."""
+        return self.devices.measured_jp()
 
     def measured_cp(self) -> Floats:
         """The measuring arm's reading: a point of the calibration."""
@@ -138,8 +142,11 @@ class Replay:
         """Go on to the next row of points or, after the last, of stops."""
         self._table = POINTS if self._at[POINTS] < len(self.tables[POINTS].names) else STOPS
         self._at[self._table] += 1
-        own = self.tables[self._table].values[self._at[self._table] - 1, :6]
-        assert np.allclose(np.radians(own), q)  # whoever replays sends the recorded joints
+        assert np.allclose(self.measured_jp(), q)  # whoever replays sends the recorded joints
+
+    def measured_jp(self) -> Floats:
+        """The current row's joints, shape (6,), rad."""
+        return np.asarray(np.radians(self.tables[self._table].values[self._at[self._table] - 1, :6]))
 
     def measured_cp(self) -> Floats:
         """The measuring arm's reading at the current point, shape (3,), mm, C."""

@@ -36,7 +36,7 @@ class RobotCalibration:
     Attributes:
         cameras: The calibrated cameras.
         T_base_c: Shape (4, 4), mm: r_T_c.
-        q_command: Shape (k, 6), rad.
+        q_command: Shape (k, 6), rad: where the arm said that it rests.
         measured_c: Shape (k, 3), mm: the measuring arm's readings.
         pixels: Shape (c, k, 2).
         covariances: Shape (c, k, 2, 2), px^2.
@@ -91,17 +91,18 @@ def calibrate_by_robot(
         NoAnswerError: A ball is not found.
         InputError: The points do not determine a camera.
     """
-    rod, (q_command, branch) = calibrating_rod(case), commands
+    rod, reached = calibrating_rod(case), []
     measured, detections, radius_mm = [], [], case.file.tool.ball_diameter_mm / 2
-    for number, q in enumerate(q_command, start=1):
+    for number, q in enumerate(commands.q, start=1):
         arm.move_jp(q)
+        reached.append(arm.measured_jp())
         measured.append(touch.measured_cp())
         searches = tuple(Search(one, measured[-1], radius_mm, FIRST_SEARCH_PX) for one in planned_cameras(case))
         seen = look_at(detector, searches, case.file.servo.frames)
         if isinstance(seen, Lost):
             raise NoAnswerError(f"calibration, point {number}: {seen.reason}", code="ball_not_found")
         detections.append(seen)
-    measured_c = np.array(measured)
+    measured_c, q_command = np.array(measured), np.array(reached)
     pixels = np.stack([s.pixels for s in detections], axis=1)
     covariances = np.stack([s.covariances for s in detections], axis=1)
     cameras = _cameras(case, measured_c, pixels)
@@ -116,7 +117,7 @@ def calibrate_by_robot(
         covariances,
         tuple(found.rms_px for found in cameras),
         np.asarray(residual),
-        branch,
+        commands.branch,
     )
 
 

@@ -36,11 +36,11 @@ from puncture_twin.twin.plant.scanner.case_scene import (
     MarkerKind,
     Placer,
     TrueRod,
+    VirtualScanner,
     case_scene,
     label_layers,
-    scan_grid,
 )
-from puncture_twin.twin.plant.scanner.image import CtImage, ScanSettings, scan_solids
+from puncture_twin.twin.plant.scanner.image import CtImage, ScanSettings
 from puncture_twin.twin.plant.scanner.writers import write_nifti, write_series
 from puncture_twin.twin.report.present import Block, Field, Section, facts, grid, text
 
@@ -200,7 +200,7 @@ def _scanned(context: CaseContext, request: ScanRequest) -> ScanRun:
     needle, read = _rehearsed(request.rehearsal)
     rod = None if needle is None else needle[0]
     scene = case_scene(case, context.anatomy, settings, rng, marker=request.marker, needle=rod, outside=request.beside)
-    image = scan_solids(scene.solids, scan_grid(scene, settings, rng), settings, rng)
+    image = VirtualScanner(scene, settings, rng).image()
     volume = Volume(image.hu, image.grid.T_ct_index, case.path)
     markers = None if scene.listed is None else find_markers(volume, scene.listed)
     lesion = _lesion(context, scene, image, volume)

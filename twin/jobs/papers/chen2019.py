@@ -218,6 +218,9 @@ def experiment_facts(stated: Experiment, found: Experiment) -> dict[str, Any]:
         "lesions": [
             {"what": name, "as_read_mm": read, "square_mm": square} for name, (read, square) in skew.lesions.items()
         ],
+        "several_triads": [
+            {"what": name, "paper_mm": paper, "drawn_rms_mm": drawn} for name, (paper, drawn) in found.several.items()
+        ],
         "holds": stated.rejected and found.agrees,
     }
 
@@ -267,8 +270,13 @@ def experiment_text(facts: Mapping[str, Any]) -> str:
         Section("all points of both setups together, squares in mm^2 (x lies along the bed)",
                 [_ranks(stated["joint"], found["joint"]), *verdicts]),
         Section(skew, ["{what}: {as_read_mm:.2f} -> {square_mm:.2f} mm".format(**one) for one in facts["lesions"]]),
+        Section("lesion M of setup 2 by several triads, mm: by the paper's points, and rms of the draws as found",
+                [grid(SEVERAL, facts["several_triads"])]),
         Section(open_, []), Section(touches, []),
     ])  # fmt: skip
+
+
+SEVERAL = (Field("by", "what"), Field("paper", "paper_mm", 2), Field("drawn", "drawn_rms_mm", 2))
 
 
 def _ranks(stated: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]]) -> Table:

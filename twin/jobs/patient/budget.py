@@ -77,7 +77,8 @@ def _across_and_along(chain: Chain) -> dict[str, float]:
 
 def _counted(chain: Chain) -> list[str]:
     """What a budget counts beside the declared errors."""
-    return [name for name, one in (("breathing", chain.breath), ("bending", chain.path)) if one is not None]
+    counted = {"breathing": chain.breath, "bending": chain.path, "motion": chain.motion_base}
+    return [name for name, one in counted.items() if one is not None]
 
 
 def _insertion(case: Case, registration: Registration) -> Floats | None:

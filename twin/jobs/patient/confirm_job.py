@@ -33,6 +33,7 @@ from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_inputs
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.taken_line import SURE, UNCERTAIN, Aim, LineCheck, check_line, next_aims
+from puncture_twin.twin.devices import ControlScan, Scanner
 from puncture_twin.twin.guidance.ct.needle import needle_error, read_needle
 from puncture_twin.twin.guidance.ct.needle_fit import FoundNeedle
 from puncture_twin.twin.guidance.ct.tie import Body, Tie, body_of, tie_frames
@@ -224,11 +225,11 @@ def aim_text(aim: Aim) -> str:
     return "withdraw, and plan again: no line from this entry is safe"
 
 
-def confirm_needle(context: CaseContext, scan: Path, plan_path: Path | None = None) -> Confirmed:
+def confirm_needle(context: CaseContext, scanner: Scanner, plan_path: Path | None = None) -> Confirmed:
     """Read a control scan of a case's patient with the needle in, and check its line.
 
     Args:
-        scan: A DICOM folder or a file in it, NIfTI, or NRRD.
+        scanner: Has the patient in, such as `ScanFiles`.
         plan_path: The plan that was executed.
 
     Raises:
@@ -242,7 +243,7 @@ def confirm_needle(context: CaseContext, scan: Path, plan_path: Path | None = No
         check_inputs(plan, context.case, plan_path)
         read.append(source)
     with context.stages.time("scan"):
-        volume, frame, inputs = _scan(scan)
+        volume, frame, inputs = scanner.measured_scan()
     with context.stages.time("frames"):
         own = "" if context.anatomy.scan is None else _frame_of(context.anatomy.scan.source.surfaces.source)
         body = _body(context)
@@ -265,7 +266,7 @@ def confirm_needle(context: CaseContext, scan: Path, plan_path: Path | None = No
 
 def confirm_case(context: CaseContext, scan: Path, out: Path, plan_path: Path | None = None) -> Confirmed:
     """`confirm_needle`, with its page, picture and report as one set of files."""
-    done = confirm_needle(context, scan, plan_path)
+    done = confirm_needle(context, ScanFiles(scan), plan_path)
     made_from = {one.path: one.sha256 for one in done.read if one.role == "plan"}
     inputs, seconds = (*done.read, *context.case.inputs), context.stages.seconds
     with writing(
@@ -282,15 +283,21 @@ def _inside(skin: TriangleMesh, T_ct_scan: Floats, points: Floats) -> Bools:
     return inside_each(skin, apply(T_ct_scan, points))
 
 
-def _scan(path: Path) -> tuple[Volume, str, tuple[Input, ...]]:
-    """The control scan, its frame of reference ("" where none is stated), and its files."""
-    place = path.resolve()
-    files = InputFiles(place.parent)
-    volumes = CaseVolumes(files, place.parent / "--scan")
-    volumes.read("ct", place.name, key="--scan")
-    source = volumes.source(place.name)
-    read = tuple(Input(f"control {one.role}", one.path, one.sha256) for one in files.inputs)
-    return source.volume(), _frame_of(source), read
+@dataclass(frozen=True)
+class ScanFiles:
+    """A `Scanner` whose scan was taken already: a DICOM folder or a file in it, NIfTI, or NRRD."""
+
+    path: Path
+
+    def measured_scan(self) -> ControlScan:
+        """The scan, read from its files; an `InputError` where they cannot be."""
+        place = self.path.resolve()
+        files = InputFiles(place.parent)
+        volumes = CaseVolumes(files, place.parent / "--scan")
+        volumes.read("ct", place.name, key="--scan")
+        source = volumes.source(place.name)
+        read = tuple(Input(f"control {one.role}", one.path, one.sha256) for one in files.inputs)
+        return ControlScan(source.volume(), _frame_of(source), read)
 
 
 def _frame_of(source: object) -> str:

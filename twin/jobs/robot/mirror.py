@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import socket
-import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,55 +13,17 @@ from puncture_twin.planning.arm.kinematics import check_recording, flange_pose
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
-from puncture_twin.planning.base.errors import InputError, refuse, require_extra
+from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import read_input, unfinished_warnings
 from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.formats.points import joint_readings, parse_joint_recording
+from puncture_twin.planning.formats.points import parse_joint_recording
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE
+from puncture_twin.twin.jobs.robot.rtde import RecordedState, connect, live_states
 
 MAX_RECORDING_BYTES = 200_000_000
 """An hour at 125 states a second is 60 MB."""
-
-RTDE_PORT = 30004
-"""On which a controller tells its state; the only port that is used."""
-
-VARIABLES = ("timestamp", "actual_q")
-"""What the controller is queried to tell."""
-
-MAX_HOST = 253
-"""Characters of a name on a network (RFC 1035)."""
-
-ANSWER_S = 5.0
-"""A controller that does not take the call within this time is not there."""
-
-SILENCE_S = 1.0
-"""A controller that tells nothing new for so long has stopped: it tells its state at least every 8 ms."""
-
-
-class Receiver(Protocol):
-    """The part of ``rtde_receive.RTDEReceiveInterface`` that is used: it only reads."""
-
-    def getActualQ(self) -> list[float]:  # noqa: N802  # the library's name
-        """The joint angles, rad."""
-        ...
-
-    def getTimestamp(self) -> float:  # noqa: N802  # the library's name
-        """Seconds since the controller started; 0 before its first word."""
-        ...
-
-    def isConnected(self) -> bool:  # noqa: N802  # the library's name
-        """Whether the line stands."""
-        ...
-
-
-class RecordedState(NamedTuple):
-    """The joints at one time."""
-
-    time_s: float
-    q: Floats
-    """Shape (6,), rad."""
 
 
 class Mirrored(NamedTuple):
@@ -123,57 +83,6 @@ class Mirror:
     def follow(self, states: Iterable[RecordedState]) -> Iterator[Mirrored]:
         """One after the other."""
         return map(self.show, states)
-
-
-def connect(host: str) -> Receiver:
-    """The receiving half of RTDE; the controlling half is never opened.
-
-    Raises:
-        InputError: The extra is not installed, or no robot answers there.
-    """
-    require_extra("mirror", "mirror")
-    from rtde_receive import RTDEReceiveInterface
-
-    _check_host(host)
-    try:  # first by ourselves: the library waits for minutes, and cannot be interrupted
-        socket.create_connection((host, RTDE_PORT), timeout=ANSWER_S).close()
-        receiver: Receiver = RTDEReceiveInterface(host, variables=list(VARIABLES))
-    except (OSError, RuntimeError, ValueError) as error:  # ValueError: a name that no address can have
-        where = f"mirror {host}, port {RTDE_PORT}"
-        what = f"the robot does not answer: {error}"
-        raise InputError(what, where=where, allowed="a UR that is switched on", code="no_robot_answers") from error
-    return receiver
-
-
-def _check_host(host: str) -> None:
-    if not 0 < len(host) <= MAX_HOST or not host.isprintable() or any(c.isspace() for c in host):
-        what = f"host name of {len(host)} characters, or with spaces"
-        refuse(what, f"mirror {host}", f"a name or address of 1 to {MAX_HOST} characters", "bad_host")
-
-
-def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[RecordedState]:
-    """What a receiver reads, every so often; nothing twice. Time and angles may be one package (8 ms) apart.
-
-    Args:
-        seconds: How long, by the robot's clock; None for ever.
-
-    Raises:
-        InputError: The robot hangs up or falls silent, or tells something that is no joint angles.
-    """
-    start, last, heard = None, 0.0, time.monotonic()
-    while True:
-        state = told(receiver.getTimestamp(), receiver.getActualQ())
-        if state.time_s != last:
-            start = state.time_s if start is None else start
-            last, heard = state.time_s, time.monotonic()
-            if seconds is not None and state.time_s - start > seconds:
-                return
-            yield state
-        elif not receiver.isConnected() or time.monotonic() - heard > SILENCE_S:
-            # the library goes on to give the last state it has heard
-            said = "closed the connection" if not receiver.isConnected() else "sends nothing new"
-            refuse(f"the robot {said}, {last:.3f} s by its clock", "mirror", "a UR that is switched on", "robot_silent")
-        time.sleep(period_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,13 +151,6 @@ def readings_of(
         refuse("two sources of joints, or none", "mirror", "HOST, or --from joints.csv", "conflicting_options")
     read = RecordedJoints.read(recording)
     return Readings(read.states(case), (read.input, *case.inputs), read.warnings())
-
-
-def told(time_s: float, q: list[float]) -> RecordedState:
-    """A controller's word, if it is a time and six angles that an arm can have; else an `InputError`."""
-    if not np.isfinite(time_s):
-        refuse(f"a time of {time_s} s", "the robot's answer", "a finite time", "not_finite")
-    return RecordedState(float(time_s), joint_readings([q], "rad", where="the robot's answer")[0])
 
 
 def mirror_text(shown: Mirrored) -> str:

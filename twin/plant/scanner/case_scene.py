@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
@@ -20,12 +21,23 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case, bed_frame
 from puncture_twin.planning.formats.points import NamedPoints, parse_points
+from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.checks.markers import skin_fit
-from puncture_twin.twin.plant.scanner.image import ScanSettings, Solid, ball, box, check_closed, rod
+from puncture_twin.twin.devices import ControlScan
+from puncture_twin.twin.plant.scanner.image import (
+    CtImage,
+    ScanSettings,
+    Solid,
+    ball,
+    box,
+    check_closed,
+    rod,
+    scan_solids,
+)
 
 METAL_HU = 8000.0
 """Steel and titanium lie beyond what 12 bits hold; how far is declared as ours."""
@@ -332,6 +344,27 @@ AIR_MM = 15.0
 """Air around the body, and about arms and lines: a needle's entry is not at the image's edge."""
 TABLE_MM = 100.0
 """Next to and behind the body, so much of a table is shown: where the image cuts it, what is beyond is not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualScanner:
+    """A `Scanner` with a scene in it; each scan draws anew where its grid falls, and its noise."""
+
+    scene: CaseScene
+    settings: ScanSettings
+    rng: np.random.Generator
+
+    def image(self) -> CtImage:
+        """A new scan, with its ground truth."""
+        grid = scan_grid(self.scene, self.settings, self.rng)
+        return scan_solids(self.scene.solids, grid, self.settings, self.rng)
+
+    def measured_scan(self) -> ControlScan:
+        """A new scan, as guidance sees it."""
+        image = self.image()
+        return ControlScan(Volume(image.hu, image.grid.T_ct_index, Path("scan")))
+
+
 MOST_VOXELS = 200_000_000
 """A whole trunk at 0.8 x 0.8 x 0.6 mm; each voxel takes some ten bytes while it is made."""
 DECIMALS = 4

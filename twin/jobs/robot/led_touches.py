@@ -1,0 +1,140 @@
+"""`touch CASE --host HOST`: markers that somebody touches with a real UR's needle, read off its joints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import refuse
+from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.case.case import Case
+from puncture_twin.planning.formats.points import NamedPoints, parse_points, write_points
+from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.registration.fits import fit_rigid
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
+from puncture_twin.planning.search.choice import Choice
+from puncture_twin.twin.devices import Arm
+from puncture_twin.twin.jobs.terminal import write_result
+from puncture_twin.twin.report.present import Field, Section, footer, grid, text
+
+TOUCH, SUMMARY = "touch.csv", "touch.json"
+
+
+@dataclass(frozen=True, eq=False)
+class LedTouches:
+    """Markers as a case's CT shows those k of its n that were touched, and where the arm read them.
+
+    Attributes:
+        ct: LPS mm.
+        base: Base frame, mm, with the joints.
+        left_out: Names of those that were not touched.
+    """
+
+    case: Case
+    ct: NamedPoints
+    base: NamedPoints
+    left_out: tuple[str, ...]
+    files: tuple[Path, ...] = ()
+
+    @property
+    def suffices(self) -> bool:
+        """Whether the readings register."""
+        return len(self.base.names) >= MIN_MARKERS
+
+    @property
+    def residuals_mm(self) -> Floats | None:
+        """What the rigid fit leaves of each, shape (k,), mm; None of fewer than three."""
+        if not self.suffices:
+            return None
+        T_base_ct = fit_rigid(self.ct.points, self.base.points)
+        return np.asarray(np.linalg.norm(apply(T_base_ct, self.ct.points) - self.base.points, axis=1))
+
+    def summary(self) -> dict[str, Any]:
+        """Plain values for JSON: mm and degrees."""
+        assert self.base.joints is not None
+        left = self.residuals_mm
+        rows = zip(self.base.names, self.base.points, np.degrees(self.base.joints), strict=True)
+        return {
+            "case": self.case.name,
+            "touches": [
+                {"marker": name, "point_mm": point.tolist(), "joints_deg": q.tolist(),
+                 "residual_mm": None if left is None else float(left[row])}
+                for row, (name, point, q) in enumerate(rows)
+            ],
+            "left_out": list(self.left_out),
+            "suffices": self.suffices,
+            "fre_mm": None if left is None else float(np.sqrt(np.mean(left**2))),
+            "inputs": inputs_document(self.case.inputs),
+            "files": [str(path) for path in self.files],
+        }  # fmt: skip
+
+
+def led_touches(case: Case, arm: Arm, ready: Callable[[str], bool]) -> LedTouches:
+    """Read the arm at each of a case's markers, in the order of their list, by its nominal kinematics.
+
+    Args:
+        case: With a list of markers in its CT.
+        arm: Whose needle somebody leads to them.
+        ready: Asks for a marker, and returns when the tip is on it; False where nobody touches any more.
+
+    Raises:
+        InputError: The case has no markers, or the robot hangs up.
+        NoAnswerError: The arm does not come to rest, or not one marker is touched.
+    """
+    if case.registration is None:
+        refuse("no list of markers", case.path, "[registration] markers_ct", "no_markers")
+    name = case.registration.markers_ct
+    listed = parse_points(case.files.content(name), case.folder / name, default_space=case.space)
+    joints = []
+    for marker in listed.names:
+        if not ready(marker):
+            break
+        joints.append(arm.measured_jp())
+    count, q = len(joints), np.array(joints).reshape(-1, 6)
+    if not count:
+        refuse("no marker was touched", "touch --host", "a line (Enter) for each, the tip on it", "empty")
+    T = flange_pose(case.robot.model, q)
+    tips = T[:, :3, 3] + case.needle.length_mm * T[:, :3, 2]
+    names, left = listed.names[:count], listed.names[count:]
+    return LedTouches(case, NamedPoints(names, listed.points[:count], listed.space),
+                      NamedPoints(names, tips, None, joints=q), left)  # fmt: skip
+
+
+def refuse_of_twin(choice: Choice, seed: int) -> None:
+    """Refuse what is of the twin alone beside ``--host``."""
+    if choice != Choice() or seed:
+        refuse("a direction, or a seed, beside --host", "touch", "--host HOST alone: no tour is planned",
+               "conflicting_options")  # fmt: skip
+
+
+def touch_by_hand(case: Case, arm: Arm, ready: Callable[[str], bool], out: Path) -> LedTouches:
+    """`led_touches`, written as `[registration] markers_base` reads them."""
+    read = led_touches(case, arm, ready)
+    with writing(out, "touch", inputs=case.inputs, names=(TOUCH, SUMMARY)) as draft:
+        read = replace(read, files=draft.final(tuple(draft.folder / name for name in (TOUCH, SUMMARY))))
+        write_points(draft.folder / TOUCH, read.base)
+        write_result(read.summary(), draft.folder / SUMMARY, out)
+    return read
+
+
+ROWS = (
+    Field("marker", "marker"),
+    Field("base frame, mm", lambda row: "  ".join(f"{mm:8.2f}" for mm in row["point_mm"])),
+    Field("the rigid fit leaves", "residual_mm", 2, "mm"),
+)
+
+
+def led_text(read: LedTouches) -> str:
+    """For the terminal."""
+    said = read.summary()
+    left = [f"not touched: {', '.join(said['left_out'])}"] if said["left_out"] else []
+    few = [] if read.suffices else [f"no registration: {MIN_MARKERS} markers are needed"]
+    head = f"{len(said['touches'])} markers read off the joints of the nominal {read.case.robot.model.name}"
+    return text([Section(head, [grid(ROWS, said["touches"]), *left, *few]), *footer(read.files)])
