@@ -526,7 +526,7 @@ def export(
     folder = out_folder(out_dir, source, f"export-{format_name}")
     with progress_display() as progress:
         done = export_source(source, case, format_name, folder, choice, progress, scan)
-    finish("export", done.found, done.summary, done.text, as_json)
+    finish("export", done, done.summary(), done.text(), as_json)
 
 
 @app.command()

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from puncture_twin.planning.case.case import Case
     from puncture_twin.planning.certify.certificate import Certificate
     from puncture_twin.planning.certify.checker import Verification
-    from puncture_twin.planning.export.exporter import Exported
     from puncture_twin.planning.formats.points import NamedPoints
     from puncture_twin.planning.formats.volumes.volume_files import Volume
     from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -44,9 +43,8 @@ if TYPE_CHECKING:
     from puncture_twin.twin.jobs.choosing.compare_job import Comparison
     from puncture_twin.twin.jobs.experiment.touch_job import TouchRun
     from puncture_twin.twin.jobs.patient.confirm_job import Confirmed
-    from puncture_twin.twin.jobs.patient.export_jobs import ExportedTable
     from puncture_twin.twin.jobs.patient.markers_job import MarkersRun
-    from puncture_twin.twin.jobs.patient.path_exports import PathExport
+    from puncture_twin.twin.jobs.patient.path_exports import Written
     from puncture_twin.twin.rehearsal.result import Rehearsal
 
     Points = NamedPoints | Mapping[str, ArrayLike]
@@ -757,7 +755,7 @@ def compare(
 @checked
 def export(
     source: Plan | Candidates | Explanation, format_name: str, folder: Path | str, *, context: CaseContext | None = None
-) -> Exported | ExportedTable | PathExport:
+) -> Written:
     """Write a plan for a robot, the table of candidates, or a direction for 3D Slicer or an archive; read back.
 
     Args:

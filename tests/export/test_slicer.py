@@ -95,7 +95,7 @@ def test_the_line_goes_from_the_entry_to_the_target(exported, context):
     read = read_points(out / "path.mrk.json", default_space=Space.RAS)
     assert read.names == ("entry", "target")
     assert np.array_equal(read.points, np.stack([found.path.entry_ct[row], context.case.target_ct]))
-    assert f"theta {np.degrees(found.theta[row]):g}" in done.path
+    assert f"theta {np.degrees(found.theta[row]):g}" in done.facts["path"]
 
 
 def test_markers_read_back_as_a_case_reads_them(exported, context):
@@ -112,7 +112,7 @@ def test_the_transform_takes_the_robots_points_to_the_ct_as_itk_reads_it(exporte
     read = SimpleITK.ReadTransform(str(out / "ct_to_robot.tfm"))
     for ct, base in zip(MARKERS * [-1, -1, 1], apply(T_BASE_CT, MARKERS * [-1, -1, 1]), strict=True):
         assert read.TransformPoint(base.tolist()) == pytest.approx(ct, abs=1e-6)
-    assert any("ct_to_robot.tfm: from base to CT in LPS" in note for note in done.notes)
+    assert any("ct_to_robot.tfm: from base to CT in LPS" in note for note in done.facts["notes"])
     keys = '[registration]\ntransform = "ct_to_robot.tfm"\ntransform_maps = "base_to_ct"\nbase_axes = "LPS"\n'
     write_case(tmp_path, *CHANGES, text=changed(CASE, (registration_section(), keys)))
     (tmp_path / "ct_to_robot.tfm").write_bytes((out / "ct_to_robot.tfm").read_bytes())

@@ -9,26 +9,24 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.base.files import atomic, check_writable
+from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Silent, Watcher
-from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
+from puncture_twin.planning.base.provenance import Input, read_inputs
 from puncture_twin.planning.base.strict_json import parse_json
-from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.budget.guidance import check_ways
 from puncture_twin.planning.export.archive import DICOM
-from puncture_twin.planning.export.exporter import Exported, format_names
+from puncture_twin.planning.export.exporter import export_name, export_plan, format_names
 from puncture_twin.planning.export.moveit import MOVEIT, moveit_files, moveit_names
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
@@ -37,10 +35,9 @@ from puncture_twin.planning.search.candidates import ANGLE_DIGITS, Candidates
 from puncture_twin.planning.search.choice import BEST, Choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation
-from puncture_twin.twin.jobs.patient.main_job import case_of, export, is_plan, plan_case, read_noted_plan, search_case
-from puncture_twin.twin.jobs.patient.path_exports import PATH_FORMATS, PathExport, export_confirmation, export_path
-from puncture_twin.twin.jobs.patient.summaries import export_summary
-from puncture_twin.twin.report.present import Section, text
+from puncture_twin.twin.jobs.patient.main_job import case_of, is_plan, plan_case, read_noted_plan, search_case
+from puncture_twin.twin.jobs.patient.path_exports import PATH_FORMATS, Written, export_confirmation, export_path, put
+from puncture_twin.twin.report.present import Section
 
 TABLE = "candidates.parquet"
 ALLOWED = "a case, or the candidates.parquet of a search, or its folder"
@@ -49,25 +46,6 @@ MAX_TABLE_BYTES = 4_000_000_000
 
 ROUNDED = ("theta_deg", "beta_deg")
 """Tables of older versions have 59.99999999999999 for 60."""
-
-
-@dataclass(frozen=True, repr=False)
-class ExportedTable(Shown):
-    """What was written."""
-
-    format_name: str
-    path: Path
-    rows: int
-    inputs: tuple[Input, ...]
-
-    def summary(self) -> dict[str, Any]:
-        """As plain values."""
-        inputs = inputs_document(self.inputs)
-        return {"format": self.format_name, "rows": self.rows, "inputs": inputs, "files": [str(self.path)]}
-
-    def text(self) -> str:
-        """As a line."""
-        return f"{self.format_name}: {self.rows} rows in {self.path}"
 
 
 def table_of(source: Path, choice: Choice) -> Path | None:
@@ -84,7 +62,7 @@ def table_of(source: Path, choice: Choice) -> Path | None:
     return table if table.is_file() and not (source / "case.toml").is_file() else None
 
 
-def export_candidates(table_path: Path, format_name: str, out: Path, note: Callable[[str], None]) -> ExportedTable:
+def export_candidates(table_path: Path, format_name: str, out: Path, note: Callable[[str], None]) -> Written:
     """Write a table of candidates as text, beside its own set or elsewhere.
 
     Args:
@@ -107,9 +85,9 @@ def export_candidates(table_path: Path, format_name: str, out: Path, note: Calla
         raise ArithmeticError(f"{name} does not read back as the table")
     made_from = {source.path: source.sha256}
     with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
-        path = draft.folder / name
-        path.write_text(text, encoding="utf-8", newline="")
-    return ExportedTable(format_name, draft.final((path,))[0], len(rows), inputs)
+        files = put(draft, {name: text})
+    said = [Section(f"{format_name}: {len(rows)} rows in {files[0]}", [])]
+    return Written(format_name, files, {"rows": len(rows)}, said, inputs)
 
 
 def _table(data: bytes, path: Path) -> pa.Table:
@@ -186,7 +164,7 @@ CANDIDATE_FORMATS = tuple(_WRITERS)
 """Of ``export --format``."""
 
 
-NOTES = (
+MOVEIT_NOTES = (
     "files: scene, goals, arm with needle, and a sender; read the sender before you run it; it asks before each phase",
     "send 'insertion' only when the operator says so; no ROS controller stops at tissue",
     "never run on a controller or in MoveIt; the messages were only compared with their definitions",
@@ -194,8 +172,18 @@ NOTES = (
 )
 
 
-def export_to_moveit(context: CaseContext, plan_path: Path, out: Path, *, seed: int | None = None) -> Exported:
-    """Check a plan against its case again; write the four files.
+def export_robot(
+    plan_path: Path,
+    format_name: str,
+    out: Path,
+    context: CaseContext | None,
+    note: Callable[[str], None],
+    *,
+    seed: int | None = None,
+) -> Written:
+    """Write a plan for a robot; with its case, after it has been checked again, and with rounded corners where free.
+
+    For MoveIt and ROS 2, which need the case: the scene, the goals, the arm with its needle and a sender, as one set.
 
     Args:
         seed: That the plan must state; the case's by default.
@@ -203,25 +191,49 @@ def export_to_moveit(context: CaseContext, plan_path: Path, out: Path, *, seed: 
     Raises:
         InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
-    note = context.watcher.note
     source, plan = read_noted_plan(plan_path, note)
-    check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed if seed is None else seed)
-    check_ways(context, plan, plan_path)
-    plan = with_case_arm(plan, context.case)
-    names, inputs = moveit_names(plan_path.stem), (source, *plan.inputs)
-    texts = moveit_files(plan, context.case, context.anatomy, source=plan_path)
-    made_from = {source.path: source.sha256}
+    if context is not None:
+        check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed if seed is None else seed)
+        check_ways(context, plan, plan_path)
+    if moves := format_name == MOVEIT and context is not None:
+        assert context is not None
+        names = moveit_names(plan_path.stem)
+        plan = with_case_arm(plan, context.case)
+        made = moveit_files(plan, context.case, context.anatomy, source=plan_path)
+    else:
+        names = (export_name(plan_path, format_name),)
+    inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
     with writing(out, f"export {names[0]}", inputs=inputs, names=names, made_from=made_from, note=note) as draft:
-        for name, text in texts.items():
-            with atomic(draft.folder / name) as temporary:
-                temporary.write_text(text, encoding="ascii")
-    path = draft.final(tuple(draft.folder / name for name in names))[0]
-    return Exported(path, MOVEIT, NOTES, inputs, plan)
+        if moves:
+            notes, files = MOVEIT_NOTES, put(draft, made)
+        else:
+            checker = None if context is None or context.reach is None else context.reach.checker
+            done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
+            notes, files = done.notes, draft.final((done.path,))
+    return _of_robot(format_name, files[0], plan, notes, inputs, case_checked=context is not None)
+
+
+def _of_robot(
+    format_name: str, path: Path, plan: Plan, notes: Sequence[str], inputs: tuple[Input, ...], *, case_checked: bool
+) -> Written:
+    """What was written, and what whoever runs it should know."""
+    theta, beta = float(np.degrees(plan.theta)), float(np.degrees(plan.beta))
+    facts = {
+        "theta_deg": theta,
+        "beta_deg": beta,
+        "notes": list(notes),
+        "warnings": list(plan.warnings),
+        "case_checked": case_checked,
+    }
+    unchecked = [] if case_checked else ["the plan was not checked against its case again; --case CASE does so"]
+    head = Section(f"{format_name}: {path}", [f"direction: theta {theta:g} deg, beta {beta:g} deg", *notes, *unchecked])
+    said = [head, *(Section(f"warning: {one}", []) for one in plan.warnings)]
+    return Written(format_name, (path,), facts, said, inputs)
 
 
 def export_value(
     source: Plan | Candidates | Explanation, format_name: str, folder: Path | str, context: CaseContext | None
-) -> Exported | ExportedTable | PathExport:
+) -> Written:
     """Write what is in memory: a plan for a robot, a table, or a checked direction for 3D Slicer or an archive.
 
     Raises:
@@ -245,18 +257,7 @@ def export_value(
         return export_path(context, format_name, out, Choice(angles=(float(one.theta[0]), float(one.beta[0]))))
     with writing(out, "plan", inputs=source.inputs, names=("plan.json",)) as draft:
         write_plan(source, draft.folder / "plan.json")
-    if format_name == MOVEIT:
-        assert context is not None
-        return export_to_moveit(context, out / "plan.json", out, seed=source.seed)
-    return export(out / "plan.json", format_name, out, context, note, seed=source.seed)
-
-
-class Export(NamedTuple):
-    """What was written: as it is found, for ``--json`` and for a person."""
-
-    found: Any
-    summary: dict[str, Any]
-    text: str
+    return export_robot(out / "plan.json", format_name, out, context, note, seed=source.seed)
 
 
 def refuse_format(name: str) -> None:
@@ -274,7 +275,7 @@ def export_source(
     choice: Choice,
     watcher: Watcher,
     scan: Path | None = None,
-) -> Export:
+) -> Written:
     """Write a case's plan, or a plan that is there, or what else of a case a format holds.
 
     Args:
@@ -290,36 +291,19 @@ def export_source(
         if table is None:
             search_case(prepare(source, watcher=watcher), out, pictures=False)
             table = out / TABLE
-        written = export_candidates(table, format_name, out, watcher.note)
-        return Export(written, written.summary(), written.text())
+        return export_candidates(table, format_name, out, watcher.note)
     if scan is not None:
         if format_name != DICOM or choice != BEST or case is not None or not is_plan(source):
             allowed = f"--format {DICOM} alone, with a confirm.json"
             refuse("a control scan belongs to a confirmation", "--scan", allowed, "conflicting_options")
-        confirmed = export_confirmation(source, scan, out, watcher.note)
-        return Export(confirmed, confirmed.summary(), confirmed.text())
+        return export_confirmation(source, scan, out, watcher.note)
     planned_case = case_of(source, case, choice)
     if format_name in (MOVEIT, *PATH_FORMATS) and planned_case is None:
         refuse(f"{format_name} shows the case", source, "export plan.json --case CASE", "missing_option")
-    if format_name in PATH_FORMATS and planned_case is not None:
-        shown = export_path(prepare(planned_case, watcher=watcher), format_name, out, choice, source)
-        return Export(shown, shown.summary(), shown.text())
     context = None if planned_case is None else prepare(planned_case, watcher=watcher)
-    plan_path = source
+    if context is not None and format_name in PATH_FORMATS:
+        return export_path(context, format_name, out, choice, source)
     if context is not None and not is_plan(source):
         plan_case(context, out, choice)
-        plan_path = out / "plan.json"
-    if format_name == MOVEIT and context is not None:
-        done = export_to_moveit(context, plan_path, out)
-    else:
-        done = export(plan_path, format_name, out, context, watcher.note)
-    return Export(done, export_summary(done, context is not None), export_text(done, context is not None))
-
-
-def export_text(done: Exported, case_checked: bool) -> str:
-    """What was written, and what whoever runs it should know."""
-    unchecked = [] if case_checked else ["the plan was not checked against its case again; --case CASE does so"]
-    direction = f"direction: theta {np.degrees(done.plan.theta):g} deg, beta {np.degrees(done.plan.beta):g} deg"
-    warned = (Section(f"warning: {one}", []) for one in done.plan.warnings)
-    said = Section(f"{done.format_name}: {done.path}", [direction, *done.notes, *unchecked])
-    return text([said, *warned])
+        source = out / "plan.json"
+    return export_robot(source, format_name, out, context, watcher.note)

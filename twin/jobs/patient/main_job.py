@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,10 +30,6 @@ from puncture_twin.planning.search.choice import BEST, Choice, choose_stated, wi
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
-
-if TYPE_CHECKING:
-    from puncture_twin.planning.export.exporter import Exported
-
 
 CERTIFICATE = "certificate.json"
 
@@ -263,37 +259,6 @@ def read_noted_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Pla
     if found.note:
         note(f"warning: {found.note}")
     return found.input("plan"), plan
-
-
-def export(
-    plan_path: Path,
-    format_name: str,
-    out: Path,
-    context: CaseContext | None,
-    note: Callable[[str], None],
-    *,
-    seed: int | None = None,
-) -> Exported:
-    """Write a plan for a robot; with its case, after it has been checked again, and with rounded corners where free.
-
-    The plan must state this seed; None takes the case's.
-
-    Raises:
-        InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
-    """
-    from puncture_twin.planning.export.exporter import export_name, export_plan
-    from puncture_twin.planning.plan.plan_check import check_plan
-
-    source, plan = read_noted_plan(plan_path, note)
-    if context is not None:
-        check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed if seed is None else seed)
-        check_ways(context, plan, plan_path)
-    checker = None if context is None or context.reach is None else context.reach.checker
-    name = export_name(plan_path, format_name)
-    inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
-    with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
-        done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
-    return replace(done, path=draft.final((done.path,))[0], inputs=inputs)
 
 
 def report_case(run: Run, out: Path) -> Run:

@@ -5,7 +5,7 @@ The arm is not needed; without it Slicer gets no transform.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from puncture_twin.planning.base.errors import refuse, require_extra
-from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
+from puncture_twin.planning.base.output.publish import Draft
 from puncture_twin.planning.base.provenance import Input, InputFiles, inputs_document, read_inputs
 from puncture_twin.planning.base.strict_json import array, fitting, number, parse_json
 from puncture_twin.planning.base.text import Shown
@@ -60,43 +60,60 @@ AIMED = ("by_mm", "turn_deg", "p_hit", "lateral_mm")
 
 
 @dataclass(frozen=True, repr=False)
-class PathExport(Shown):
-    """What was written.
+class Written(Shown):
+    """The files of one export.
 
     Attributes:
-        path: The direction that is shown.
-        notes: What whoever opens them should know, one sentence each.
+        facts: What they hold, as plain values.
+        said: For a person: the same, and what whoever opens them should know.
     """
 
     format_name: str
     files: tuple[Path, ...]
-    path: str
-    notes: tuple[str, ...]
-    warnings: tuple[str, ...]
+    facts: Mapping[str, Any]
+    said: Sequence[Section]
     inputs: tuple[Input, ...]
+
+    @property
+    def path(self) -> Path:
+        """The first of them."""
+        return self.files[0]
 
     def summary(self) -> dict[str, Any]:
         """As plain values."""
-        return {
-            "format": self.format_name,
-            "path": self.path,
-            "notes": list(self.notes),
-            "warnings": list(self.warnings),
-            "inputs": inputs_document(self.inputs),
-            "files": [str(file) for file in self.files],
-        }
+        inputs, files = inputs_document(self.inputs), [str(file) for file in self.files]
+        return {"format": self.format_name, **self.facts, "inputs": inputs, "files": files}
 
     def text(self) -> str:
         """As lines."""
-        warned = (f"warning: {one}" for one in self.warnings)
-        return text(
-            [Section(f"{self.format_name}: {self.path}", [Warn(tuple(map(str, self.files))), *self.notes, *warned])]
-        )
+        return text(self.said)
+
+    @classmethod
+    def of_path(
+        cls,
+        name: str,
+        files: tuple[Path, ...],
+        path: str,
+        notes: Sequence[str],
+        warnings: Sequence[str],
+        inputs: tuple[Input, ...],
+    ) -> Written:
+        """Of one path."""  # fmt: skip
+        facts = {"path": path, "notes": list(notes), "warnings": list(warnings)}
+        lines = [Warn(tuple(map(str, files))), *notes, *(f"warning: {one}" for one in warnings)]
+        return cls(name, files, facts, [Section(f"{name}: {path}", lines)], inputs)
+
+
+def put(draft: Draft, made: Mapping[str, str | bytes]) -> tuple[Path, ...]:
+    """Write files into a draft; returns where they will lie."""
+    for name, content in made.items():
+        (draft.folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+    return draft.final(draft.folder / name for name in made)
 
 
 def export_path(
     context: CaseContext, format_name: str, out: Path, choice: Choice, source: Path | None = None
-) -> PathExport:
+) -> Written:
     """Search, and write the chosen path and the safe entry area as one set.
 
     Args:
@@ -132,15 +149,12 @@ def export_path(
             made, notes = files.texts, files.notes
         else:
             made, notes = archive_files(scan, _archived(context, scan, found, pick)), (NO_DEVICE,)
-        for file, content in made.items():
-            with atomic(draft.folder / file) as temporary:
-                temporary.write_bytes(content.encode() if isinstance(content, str) else content)
-    written = draft.final(tuple(draft.folder / file for file in made))
+        written = put(draft, made)
     said = (NO_APPROACH if plan is None else PLANNED, f"arm: {found.arm_note}", *notes)
-    return PathExport(format_name, written, name, said, tuple(context.anatomy.warnings), inputs)
+    return Written.of_path(format_name, written, name, said, context.anatomy.warnings, inputs)
 
 
-def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str], None]) -> PathExport:
+def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str], None]) -> Written:
     """Write the needle that `confirm` read, on the slices of its control scan.
 
     Args:
@@ -178,11 +192,8 @@ def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str
     made = archive_files(series, ArchiveContent("Needle confirmed", (rod,), {"needle": path}, quantities, said))
     inputs = (read.input("confirmation"), *files.inputs)
     with writing(out, f"export {DICOM}", inputs=inputs, names=archive.NAMES, note=note) as draft:
-        for file, content in made.items():
-            with atomic(draft.folder / file) as temporary:
-                temporary.write_bytes(content)
-    written = draft.final(tuple(draft.folder / file for file in made))
-    return PathExport(DICOM, written, f"needle, {words['verdict']}", (NO_DEVICE,), (), inputs)
+        written = put(draft, made)
+    return Written.of_path(DICOM, written, f"needle, {words['verdict']}", (NO_DEVICE,), (), inputs)
 
 
 def _series(case: Case) -> CtSeries:

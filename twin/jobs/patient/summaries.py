@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.plan.plan import Plan
@@ -19,8 +18,7 @@ from puncture_twin.planning.search.explain import finite
 from puncture_twin.planning.search.windows import Window
 from puncture_twin.planning.uncertainty.chance_model import touch_limit
 
-if TYPE_CHECKING:  # they bring export and simulator with them
-    from puncture_twin.planning.export.exporter import Exported
+if TYPE_CHECKING:  # they bring the simulator with them
     from puncture_twin.twin.rehearsal.distribution import Distribution
     from puncture_twin.twin.rehearsal.result import Rehearsal
 
@@ -156,20 +154,6 @@ def trial_failures(case: Case, found: Distribution) -> Iterator[str]:
     for name, share in zip(found.structures, touched.tolist(), strict=True):
         if share > (most := touch_limit(case, name)):
             yield f"{100 * share:.2f} % of the trials touched {name}; the case allows {100 * most:.2f} %"
-
-
-def export_summary(done: Exported, case_checked: bool) -> dict[str, Any]:
-    """A plan that was written for a robot, as plain values; and whether its case was checked again."""
-    return {
-        "format": done.format_name,
-        "theta_deg": float(np.degrees(done.plan.theta)),
-        "beta_deg": float(np.degrees(done.plan.beta)),
-        "notes": list(done.notes),
-        "warnings": list(done.plan.warnings),
-        "case_checked": case_checked,
-        "inputs": inputs_document(done.inputs),
-        "files": [str(done.path)],
-    }
 
 
 def _needle_end(rehearsal: Rehearsal) -> dict[str, list[float]]:
