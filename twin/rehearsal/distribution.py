@@ -194,7 +194,9 @@ class Distribution:
     def _guided(self) -> dict[str, Any]:
         said = {"lost_sight": list(self.hidden), "assumed": list(self.assumed), "looks": dict(self.looks)}
         steps = {} if self.stepwise is None else self.stepwise.document()
-        return {"guidance": self.guidance, "stopped": self.stopped, "p_stop": self.p_stop, **said, **steps}
+        push = self.puncture.push
+        pushed = {} if push is None else {"pushed_mm": float(push.at(np.array(push.target_mm)))}
+        return {"guidance": self.guidance, "stopped": self.stopped, "p_stop": self.p_stop, **pushed, **said, **steps}
 
 
 def _fraction(trials: Bools) -> float | None:
