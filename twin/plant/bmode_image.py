@@ -37,7 +37,6 @@ def blurred_speckle(
         rows: Of the image; row r lies at depth r * pixel_mm.
         columns: Of the image.
         pixel_mm: Edge of a pixel.
-        spread: The point spread.
         reflectivity: Amplitude of the scatterers, shape (rows, columns); edges continue beyond the image.
         rng: Draws the scatterers: complex Gaussian, independent from pixel to pixel.
 

@@ -117,10 +117,8 @@ class TouchingPlant:
     """The simulated arm at the true markers, as a `TouchingArm`.
 
     Args:
-        workcell: The simulated workcell.
         rigid: The arm's masses as its controller knows them.
         tour: For arm and needle.
-        truth: The ground truth.
         patient: Checker of the needle against the patient at their true pose.
     """
 

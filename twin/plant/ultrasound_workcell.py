@@ -59,7 +59,6 @@ def jog_into_slice(
     ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
 
     Args:
-        truth: The ground truth.
         q_probe: Where the probe's joints rest, shape (6,), rad.
         q_needle: Where the needle's arm begins, shape (6,), rad.
         wanted: The needle in the image, after the jog.
@@ -94,7 +93,6 @@ class UltrasoundPlant:
 
     Args:
         case: What it was drawn from.
-        truth: The ground truth.
         rng: Draws the arms' repeatability, what the jog leaves, and the images.
     """
 

@@ -78,7 +78,6 @@ def guided_trials(
     """Rehearse the puncture in each trial, by one way of guidance.
 
     Args:
-        puncture: Common part of all trials.
         truths: Of the n trials, as every way has them.
         errors: What they were drawn from.
         way: Of guidance.

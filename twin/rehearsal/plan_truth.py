@@ -60,8 +60,6 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
     """The truth of one rehearsal: a trial of the declared errors, unless the case states true positions or none.
 
     Args:
-        context: The plan's case.
-        plan: What is executed.
         seed: Instead of the case's own.
 
     Raises:
@@ -82,7 +80,6 @@ def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
 
     Args:
         context: The plan's case; where it declares no tissue, nothing bends.
-        plan: What is executed.
         truth: Of a straight needle; the side is drawn by its seed.
     """
     bend = bend_along(context, plan.outward_ct)
@@ -148,7 +145,6 @@ def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_tar
     """Execute the puncture of touches in their ground truth. The same arguments give the same numbers.
 
     Args:
-        context: The case.
         plan: By the registration of the touches.
         truth: Of the touches.
         at_target: What is true on arrival.
@@ -174,10 +170,7 @@ def physics_trials(
     """Run some of the trials, spread evenly over the order of their tip errors, in the simulator.
 
     Args:
-        context: The plan's case.
-        plan: What is executed.
         found: The trials; the arm reached the pose in one at least.
-        count: How many.
         progress: Called with trials done and all of them.
 
     Returns:

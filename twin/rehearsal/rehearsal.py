@@ -47,7 +47,6 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
     Args:
         plan: What was planned on the belief.
         case: The case of the plan.
-        anatomy: Its structures.
         truth: The patient's pose and the joints' offsets, already drawn.
 
     Raises:

@@ -184,11 +184,9 @@ class Session:
     """Result of a session.
 
     Attributes:
-        workcell: The truth.
         calibration: Result of the robot's points.
         mapping: What the markers gave.
         reached: One for each target.
-        trial: The session as plain values.
     """
 
     workcell: StereoWorkcell
@@ -220,7 +218,6 @@ def run_session(
     """Run a whole session in a workcell drawn from a seed.
 
     Args:
-        case: The case.
         seed: Of all that is drawn.
         targets: Only these; all when None.
         detector_of: Makes the detector in place of images; for studies of what is behind them.
@@ -339,7 +336,6 @@ def run_trials(case: ServoCase, seeds: Sequence[int], done: Count = uncounted) -
     """The trials of every seed, in the order given; they share the checker of the empty workcell.
 
     Args:
-        case: The case.
         seeds: Which.
         done: Told how many of how many are done.
     """

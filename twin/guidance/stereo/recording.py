@@ -116,7 +116,6 @@ class Replay:
     """A recording as devices: it answers what was recorded, in the order in which it was.
 
     Attributes:
-        folder: The recording.
         tables: By name.
         size_px: Width and height of every picture.
     """
@@ -205,7 +204,6 @@ def read_recording(folder: Path, size_px: tuple[int, int]) -> Replay:
     """The tables of a recording; its pictures are read when they are looked at.
 
     Args:
-        folder: The recording.
         size_px: Width and height of every picture.
 
     Raises:

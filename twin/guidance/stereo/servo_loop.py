@@ -87,7 +87,6 @@ class Servoed:
     """Result of a servo.
 
     Attributes:
-        stop: Why it ended.
         visits: Every stop at which the ball was seen, in order.
         q_command: Shape (6,), rad: the last command.
         detail: What was touched or missing, for people.
@@ -120,7 +119,6 @@ def servo(task: Task, q_command: Floats, look: Look, arm: Arm) -> Servoed:
     """Move the ball onto the target: look, measure the error, move a step; until it converges or must stop.
 
     Args:
-        task: Target, limits and devices.
         q_command: Shape (6,), rad: where the arm was sent.
         look: Takes images and measures.
         arm: Moves the ball.

@@ -118,7 +118,6 @@ def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generat
     """Draw geometries, solve for both arms, check contacts.
 
     Args:
-        case: The self-calibration case.
         workcell: Its collision checker.
         rng: For the draws.
 

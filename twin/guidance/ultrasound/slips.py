@@ -63,7 +63,6 @@ def checked_calibration(
     Args:
         recording: As its file gives it.
         case: As `calibrate_case` takes it.
-        where: Its file.
         hold: Whether the needle's length is held where the case says so.
 
     Raises:

@@ -105,7 +105,6 @@ def run_selfcal(
         recording: A recording's CSV or folder; None to simulate.
         seeds: Rooms that are drawn, from the case's seed on.
         out: Where files go.
-        watcher: Shows progress.
         record: A folder that is not there yet, for the first seed's pictures and joints; None for none.
         shots: A recording of what was seen after ``recording``; None for none.
 

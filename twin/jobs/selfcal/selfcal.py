@@ -44,7 +44,6 @@ class SelfcalRun:
         case: The case, in the twin.
         candidates: Poses that were to choose from, in the twin.
         choice: The poses chosen of them, in the twin.
-        stages: Seconds.
         files: What was written.
         warnings: What the recording leaves open, one sentence each.
         shots: What came of each shot after the recording.

@@ -79,7 +79,6 @@ def scan_solids(solids: Sequence[Solid], grid: VolumeGrid, settings: ScanSetting
     Args:
         solids: The scene in the scanner's frame, LPS mm; later ones fill the place of earlier ones.
         grid: The voxels; axis k runs across the slices.
-        settings: Blur and noise.
         rng: Draws the noise.
     """
     T_index_ct = np.linalg.inv(grid.T_ct_index)
@@ -194,7 +193,6 @@ class Solid(NamedTuple):
     """One body in the scanner; a later one fills the place of an earlier one.
 
     Attributes:
-        name: What it is.
         mesh: Closed, mm.
         hu: What it is made of, Hounsfield units.
         label: Its number in its label map; 0 for what no segmentation names.

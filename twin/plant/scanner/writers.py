@@ -30,7 +30,6 @@ def write_series(folder: Path, image: CtImage, settings: ScanSettings, identity:
     Args:
         folder: It is made.
         image: The scan.
-        settings: How it was made.
         identity: What the scan was made from: the same gives the same identifiers, anything else gives others.
         name: Of the patient.
 

@@ -109,7 +109,6 @@ def visible_fraction(
 
     Args:
         grey: The image.
-        camera: The camera.
         spokes: Around the measured ball.
         on_circle: Shape (n,): the spokes whose edge lies on the circle.
         contrast: Between ball and surroundings, grey levels.

@@ -98,7 +98,6 @@ def needle_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.
 
     Args:
         estimate: R_X, R_Y and t_Q.
-        recording: The poses.
         kept: Shape (n,): poses whose tip is trusted.
     """
     if recording.v is not None:
@@ -262,7 +261,6 @@ def linearised_direction(estimate: Estimate, recording: Recording, v_image: Floa
 
     Args:
         estimate: Where to linearise.
-        recording: The poses.
         v_image: The measured directions, unit, shape (n, 3).
     """
     M = needle_in_image(estimate, recording)
