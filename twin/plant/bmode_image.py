@@ -107,7 +107,6 @@ def render(
     """One B-mode image.
 
     Args:
-        imager: Probe and machine.
         needle: The needle, or None for none.
         rng: Draws speckle, the shaft's roughness and electronic noise.
         echo: What the needle sends back; None for the usual one.

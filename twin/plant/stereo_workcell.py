@@ -73,7 +73,6 @@ class StereoWorkcell:
     """The ground truth of one workcell.
 
     Attributes:
-        case: What it was drawn from.
         T_c_base: Shape (4, 4), mm: the true arm's base in C.
         cameras: The true cameras.
         T_c_m: Shape (4, 4), mm: true pose of the head when its markers are seen.

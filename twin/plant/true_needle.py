@@ -95,7 +95,6 @@ class TrueTissue:
 
     Args:
         insertion: What the needle passes, from the skin on.
-        path: Where.
         side: Whereto the bevel points about the needle's z, rad.
         shaft_mm: From the holder to the tip.
     """

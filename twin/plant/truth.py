@@ -112,7 +112,6 @@ def registration_error(
     Args:
         points_ct: The markers, shape (n, 3), mm.
         T_base_ct: Shape (4, 4): where they are touched, without error.
-        fit: The registration method.
         noise: How far off the markers are found.
     """
     read_ct = points_ct + rng.normal(0.0, noise.ct_mm, points_ct.shape)
@@ -228,11 +227,7 @@ class TrueArm(NamedTuple):
 
 
 class PlantArm:
-    """An arm as it moves, with the play of its last arrival.
-
-    Args:
-        rng: Draws its repeatability.
-    """
+    """An arm as it moves, with the play of its last arrival."""
 
     def __init__(self, arm: TrueArm, rng: np.random.Generator) -> None:
         self._arm, self._rng, self._sent = arm, rng, np.zeros(6)

@@ -92,7 +92,6 @@ class UltrasoundPlant:
     """A workcell in time: both arms, the probe, and the operator who jogs.
 
     Args:
-        case: What it was drawn from.
         rng: Draws the arms' repeatability, what the jog leaves, and the images.
     """
 

@@ -42,9 +42,6 @@ def drawn_truth(puncture: Puncture, trials: Trials, row: int, seed: int, source:
     """The truth whose execution ends as one of the trials did.
 
     Args:
-        puncture: Common part of the trials.
-        trials: As drawn.
-        row: Which.
         seed: Of their draws.
         source: In words for the report.
     """
@@ -146,7 +143,6 @@ def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_tar
 
     Args:
         plan: By the registration of the touches.
-        truth: Of the touches.
         at_target: What is true on arrival.
     """
     hit = bent_truth(context, plan, puncture_truth(plan, truth, at_target))
@@ -171,7 +167,6 @@ def physics_trials(
 
     Args:
         found: The trials; the arm reached the pose in one at least.
-        progress: Called with trials done and all of them.
 
     Returns:
         Plain values: how far each tip ended from that of the kinematics, and in how many the arm touched something.

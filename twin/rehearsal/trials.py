@@ -43,7 +43,6 @@ class Puncture:
 
     Attributes:
         tip_mm: Flange to tip.
-        method: Of the registration.
         noise: Of the markers, as believed: the weights of ``weighted``.
         points_ct: Shape (N, 3), mm, the markers.
         q_touch: Shape (N, 6), rad, how the arm touches them.
@@ -143,7 +142,6 @@ def draw_truths(
     """Draw the truth of trials from declared errors; what moves has a generator of its own.
 
     Args:
-        errors: What their truth is drawn from.
         moving: None moves nothing.
     """
     motion, breath, skin = _moved(moving, count, rng)
@@ -170,11 +168,7 @@ def _moved(moving: Moving | None, count: int, rng: np.random.Generator) -> tuple
 
 
 def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Trials:
-    """Draw trials from declared errors and rehearse the puncture in each, by its registration.
-
-    Args:
-        errors: What their truth is drawn from.
-    """
+    """Draw trials from declared errors and rehearse the puncture in each, by its registration."""
     return open_loop(puncture, draw_truths(puncture, errors, count, rng))
 
 
@@ -190,7 +184,6 @@ def ended(puncture: Puncture, truths: Truths, T_base_ct: Floats, needle: TrueNee
     """Trials whose straight needles ended so.
 
     Args:
-        truths: Of the n trials.
         T_base_ct: Shape (n, 4, 4), as registered.
         needle: Of each trial; it bends if the puncture's does.
         reached: Shape (n,), whether the arm could reach what was commanded.

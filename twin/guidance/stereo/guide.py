@@ -23,7 +23,6 @@ class Guide:
     """The paper's chain: calibrated cameras triangulate the ball; the mapping gives the target.
 
     Args:
-        calibration: Of cameras and robot.
         markers: Their pixels.
         markers_m: Shape (n, 3), mm: the markers as the image has them.
     """

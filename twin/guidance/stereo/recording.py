@@ -50,7 +50,6 @@ class Recorder:
     """Devices that are used through it, and all that they said.
 
     Attributes:
-        devices: What answers.
         folder: Empty; pictures are written at once, tables by `finish`.
         target: To which the arm is sent.
     """
@@ -116,7 +115,6 @@ class Replay:
     """A recording as devices: it answers what was recorded, in the order in which it was.
 
     Attributes:
-        tables: By name.
         size_px: Width and height of every picture.
     """
 

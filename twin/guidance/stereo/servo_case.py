@@ -159,7 +159,6 @@ class ServoCase:
     """A servo case, read and checked.
 
     Attributes:
-        file: Its content.
         skin: The head's surface, image frame, mm.
         markers: The markers' centres, image frame, in truth.
         targets: The targets, image frame, in truth.

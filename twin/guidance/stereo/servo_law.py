@@ -257,7 +257,6 @@ def map_head(
 
     Args:
         names: The markers, n at least 3.
-        seen: What the cameras have.
         markers_m: Shape (n, 3), mm: what the image has.
         image_mm: Standard deviation per axis of ``markers_m``.
         targets_m: Shape (k, 3), mm: where the error matters.

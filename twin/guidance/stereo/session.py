@@ -135,7 +135,6 @@ def aims_of(
     """Where the arm is sent for the case's targets, or for those that are wanted.
 
     Args:
-        calibration: Of cameras and robot.
         targets_m: Shape (k, 3), mm, as they are read in the image.
         wanted: Names; None for all.
 

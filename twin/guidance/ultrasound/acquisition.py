@@ -104,7 +104,6 @@ def acquire(
         candidates: Poses that can be taken.
         devices: Both arms, the probe, and who jogs.
         rng: For the choice, if it is random.
-        count: Called after every image.
 
     Raises:
         NoAnswerError: The candidates are used up before enough images show the needle.

@@ -61,7 +61,6 @@ def checked_calibration(
     """Calibration of a recording from outside; one that was read otherwise than meant is refused.
 
     Args:
-        recording: As its file gives it.
         case: As `calibrate_case` takes it.
         hold: Whether the needle's length is held where the case says so.
 

@@ -46,7 +46,6 @@ def hold_sessions(case: ServoCase, seeds: int, done: Count = uncounted, record: 
     """Hold the sessions of a case, from its own seed on.
 
     Args:
-        done: Told how many of how many are done.
         record: An empty folder for all that the devices of the first session say.
     """
     seed = case.file.seed
@@ -69,7 +68,6 @@ def run_servo(
 
     Args:
         seeds: How many, from the case's own on.
-        done: Told how many of how many are done.
         note: Told what was removed that nobody might expect.
         record: A folder that is not there yet, for all that the devices of the first session say.
 

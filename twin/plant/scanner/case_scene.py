@@ -143,7 +143,6 @@ class CaseScene:
         T_scan_ct: Shape (4, 4): the case's frame to the scanner's; a rotation, never a mirror.
         cut: Shape (3, 2): at which ends the body goes on beyond its surface.
         tables: Shape (2, 3): the box about what the patient lies on; infinite without any.
-        outside_objects: The objects outside of the patient.
         markers: True positions, or None.
         listed: The case's own readings of them.
         target: Shape (3,).
@@ -373,7 +372,6 @@ def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator
 
     Args:
         scene: What lies in the scanner; where the body goes on beyond its surface, the scan ends within it.
-        settings: Spacing, pixel and field of view.
         rng: Draws where the grid falls.
 
     Raises:

@@ -79,7 +79,6 @@ def scan_solids(solids: Sequence[Solid], grid: VolumeGrid, settings: ScanSetting
     Args:
         solids: The scene in the scanner's frame, LPS mm; later ones fill the place of earlier ones.
         grid: The voxels; axis k runs across the slices.
-        rng: Draws the noise.
     """
     T_index_ct = np.linalg.inv(grid.T_ct_index)
     each = [apply(T_index_ct, solid.mesh.vertices)[solid.mesh.faces] for solid in solids]
@@ -157,7 +156,6 @@ def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bool
 
     Args:
         labels: Shape (nx, ny, nz), what is labelled at each centre.
-        label: The structure's.
         corners: Its triangles, shape (n, 3, 3), in voxels.
         later: Shape (largest label + 1,), which labels fill the place of this one: their voxels are not missed.
     """

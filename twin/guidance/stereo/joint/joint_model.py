@@ -41,8 +41,6 @@ class Observed:
     """Measurements; n markers, s stays of the arm of which the first k were also read by the measuring arm.
 
     Attributes:
-        planned: The cameras as they were planned.
-        rod: The nominal arm.
         q_command: Shape (s, 6), rad.
         pixels: Shape (c, s, 2): the ball in each camera.
         pixel_covariance: Shape (c, s, 2, 2), px^2.
@@ -312,11 +310,9 @@ class Adjusted:
     """The joint estimate.
 
     Attributes:
-        model: The problem.
         covariance: Shape (N, N): of the unknowns, by Fisher's information.
         chi2: Sum of the squared residuals.
         freedom: Their number, less that of the unknowns: what chi2 is on average if the declaration holds.
-        iterations: Steps taken.
     """
 
     model: JointModel

@@ -183,7 +183,6 @@ def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection
     Args:
         names: Of the poses.
         aside: Shape (n,): the tip was used and the direction was not.
-        seen: The needle's direction.
     """
     found = []
     for code, rows, problem, most in (

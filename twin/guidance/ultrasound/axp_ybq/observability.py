@@ -98,7 +98,6 @@ def observe(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
 
     Args:
         estimate: Where the Jacobian is taken; any solution will do, also one of many.
-        recording: The poses that were used.
     """
     active = active[active < 17]
     J = scaled_jacobian(estimate, recording, active)
@@ -272,7 +271,6 @@ def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
 
     Args:
         estimate: A solution, unique or not.
-        recording: The poses that were used.
     """
     active = active[active < 17]
     reference = _central(recording)
