@@ -59,6 +59,7 @@ class ScanRequest(NamedTuple):
 
     Attributes:
         marker: What stands at the markers' places.
+        rehearsal: Its needle is shown in a control CT.
         beside: Places what lies outside of the patient; nothing where None.
     """
 

@@ -104,6 +104,8 @@ def run_selfcal(
         case_path: The case, or its folder; None only beside a recording.
         recording: A recording's CSV or folder; None to simulate.
         seeds: Rooms that are drawn, from the case's seed on.
+        out: Where files go.
+        watcher: Shows progress.
         record: A folder that is not there yet, for the first seed's pictures and joints; None for none.
         shots: A recording of what was seen after ``recording``; None for none.
 
@@ -204,6 +206,7 @@ def write_page(run: SelfcalRun, sheet: Path | None, workcell: Path | None, path:
     """Write the page.
 
     Args:
+        run: What was done.
         sheet: The B-mode pictures; None for a recording.
         workcell: The picture of the workcell; None for a recording.
         path: The HTML to write; it appears whole or not at all.

@@ -44,6 +44,9 @@ class SelfcalRun:
         case: The case, in the twin.
         candidates: Poses that were to choose from, in the twin.
         choice: The poses chosen of them, in the twin.
+        stages: Seconds.
+        files: What was written.
+        warnings: What the recording leaves open, one sentence each.
         shots: What came of each shot after the recording.
     """
 
@@ -106,6 +109,7 @@ def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None =
     """Calibrate from a recording's CSV, or a folder with ``recording.csv``; a case says noise and needle length.
 
     Args:
+        path: The recording.
         case: What it was recorded with.
         shots: A recording of what was seen afterwards: each of its poses updates the calibration; None for none.
 
