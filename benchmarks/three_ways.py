@@ -169,7 +169,7 @@ def main() -> None:
         for lost in found.hidden:
             print(f"{'':10s} {lost}")
     drawn = [(one.found, one.rating, COLOURS[one.rating]) for one in rated(list(shown.values()))]
-    draw_clouds(drawn, plan.outward_ct, options.picture, HIT_MM)
+    draw_clouds(drawn, plan.outward_ct, options.picture, HIT_MM, columns=4)
 
 
 if __name__ == "__main__":

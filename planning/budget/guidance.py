@@ -262,6 +262,8 @@ def target_push(case: Case, anatomy: Anatomy, outward_ct: Floats) -> Pushed | No
     if case.bending is None:
         return None
     length = float(case_paths(case, anatomy.skin, outward_ct[None]).path_length[0])
+    if not np.isfinite(length):
+        return None
     end = case.target_ct - BEYOND_TARGET_MM * outward_ct
     return pushed(path_layers(case.bending, anatomy, end, outward_ct, length + BEYOND_TARGET_MM), length)
 

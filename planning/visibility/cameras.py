@@ -238,7 +238,7 @@ class _Look(NamedTuple):
 
 
 def _looks(
-    plan: Plan, bodies: Sequence[Body], balls_mm: Sequence[float], shaft_mm: float, holder_mm: float
+    plan: Plan | Watched, bodies: Sequence[Body], balls_mm: Sequence[float], shaft_mm: float, holder_mm: float
 ) -> Iterator[_Look]:
     """Arm and balls at each depth. The needle hides no ball: it runs through it. Nor does the holder one around it."""
     poses = inverse(plan.T_base_ct) @ link_poses(plan.model, plan.insertion.q)

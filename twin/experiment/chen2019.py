@@ -404,7 +404,6 @@ class Declaration:
     """Declared errors of one experiment.
 
     Attributes:
-        name: What it is called in a table.
         slice_mm: Slice spacing: a uniform error of half of it each way along the bed.
         pixel_mm: The same across the bed.
         reading_mm: Standard deviation of a reading in the CT, per axis, besides.

@@ -96,7 +96,6 @@ def render(
 
     Args:
         camera: The true camera.
-        scene: What there is.
         rng: Draws the noise and the pattern of the background.
         noise: Standard deviation of the sensor's noise, grey levels.
         blur_px: Standard deviation of the lens's blur.

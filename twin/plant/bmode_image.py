@@ -37,7 +37,6 @@ def blurred_speckle(
         rows: Of the image; row r lies at depth r * pixel_mm.
         columns: Of the image.
         pixel_mm: Edge of a pixel.
-        spread: The point spread.
         reflectivity: Amplitude of the scatterers, shape (rows, columns); edges continue beyond the image.
         rng: Draws the scatterers: complex Gaussian, independent from pixel to pixel.
 
@@ -108,7 +107,6 @@ def render(
     """One B-mode image.
 
     Args:
-        imager: Probe and machine.
         needle: The needle, or None for none.
         rng: Draws speckle, the shaft's roughness and electronic noise.
         echo: What the needle sends back; None for the usual one.

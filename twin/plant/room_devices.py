@@ -22,9 +22,7 @@ class RoomCameras:
     """Two cameras, calibrated to each other, anywhere in each of n rooms.
 
     Attributes:
-        device: As declared.
         T_cameras_base: Shape (n, 4, 4), mm.
-        rng: Of the readings.
     """
 
     device: Stereo
@@ -83,7 +81,6 @@ class RoomScanner:
         T_ct_base: Shape (4, 4), mm: where the couch really is.
         tip_root: Shape (3, 3), mm, CT axes: S with S S' the covariance of a tip's reading.
         target_off: Shape (n, 3), mm: what target readings are off by.
-        rng: Of the tips' readings.
     """
 
     T_ct_base: Floats

@@ -104,9 +104,7 @@ def exact_recording(truth: SimulatedTruth, A: Floats, seen: ImagePose) -> Record
     """The recording without noise: B such that the needle shows in the image as wished.
 
     Args:
-        truth: The calibration.
         A: Shape (n, 4, 4).
-        seen: The needle in the image.
     """
     n = len(A)
     shown = np.column_stack([np.cos(seen.insertion), np.sin(seen.insertion)])

@@ -73,13 +73,10 @@ class StereoWorkcell:
     """The ground truth of one workcell.
 
     Attributes:
-        case: What it was drawn from.
-        arm: The true arm.
         T_c_base: Shape (4, 4), mm: the true arm's base in C.
         cameras: The true cameras.
         T_c_m: Shape (4, 4), mm: true pose of the head when its markers are seen.
         T_c_m_after: Shape (4, 4), mm: where it is from then on.
-        tool: The true tool.
     """
 
     case: ServoCase
@@ -155,7 +152,6 @@ class StereoPlant(PlantArm):
     """A workcell in time: where the arm is, whether the head is there; it answers as arm, cameras and touch do.
 
     Args:
-        workcell: The ground truth.
         pictures: Draws what differs from image to image.
         arm: Draws the arm's repeatability, and the measuring arm's readings.
         operator: Draws where the operator points.

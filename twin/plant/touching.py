@@ -95,10 +95,8 @@ def execute_touches(
     Args:
         tour: Where, in which order, by which motions.
         case: For tool, boxes and gravity.
-        anatomy: For the skin.
         checkers: Of the workcell as it is believed.
         truth: All randomness but the force sensor's is in it, and that comes from its seed.
-        progress: Called with touches done and all of them.
     """
     tool, T = case_tool(case), truth.T_base_ct
     down_ct = -bed_frame(case)[:3, 2]
@@ -117,10 +115,8 @@ class TouchingPlant:
     """The simulated arm at the true markers, as a `TouchingArm`.
 
     Args:
-        workcell: The simulated workcell.
         rigid: The arm's masses as its controller knows them.
         tour: For arm and needle.
-        truth: The ground truth.
         patient: Checker of the needle against the patient at their true pose.
     """
 

@@ -34,7 +34,6 @@ def true_needle(model: UrModel, q_true: Floats, eta: Floats, tip_mm: float) -> T
     """The needle of arms whose 28 parameters err.
 
     Args:
-        model: The nominal arm.
         q_true: Shape (..., 6), rad: true joints, but for the error of their zeros.
         eta: Shape (..., 28), the errors in the order of `error_jacobian`'s columns, mm and rad.
         tip_mm: Flange to tip by the controller's number.
@@ -58,7 +57,6 @@ def joints_at_points(model: UrModel, points_base: Floats, q_start: Floats, eta: 
     """True joints that put each true tip on its point, shape (..., 6), rad, nearest to where they start.
 
     Args:
-        model: The nominal arm.
         points_base: Shape (..., 3), mm.
         q_start: Shape (..., 6), rad: such as what would do for the nominal arm.
         eta: Shape (..., 28).
@@ -97,7 +95,6 @@ class TrueTissue:
 
     Args:
         insertion: What the needle passes, from the skin on.
-        path: Where.
         side: Whereto the bevel points about the needle's z, rad.
         shaft_mm: From the holder to the tip.
     """
@@ -172,7 +169,6 @@ class TouchTruth:
     """Ground truth of touches, one draw of the declared errors: patient, markers, and the arm's errors.
 
     Attributes:
-        seed: Of it.
         T_base_ct: Shape (4, 4), mm: true pose of the patient.
         eta: Shape (28,): what is wrong with the arm's parameters, mm and rad.
         aim_ct: Marker to shape (3,), mm: where the tip comes to on the marker, its touch noise included.
@@ -201,8 +197,6 @@ def draw_touch_truth(
         T_base_ct: Shape (4, 4), mm: where the patient lies.
         names: The N markers.
         points_ct: Shape (N, 3), mm, as read.
-        errors: As declared.
-        seed: Of all draws.
     """
     rng = np.random.default_rng(seed)
     eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
@@ -222,8 +216,6 @@ def draw_pivot_truth(
         T_base_ct: Shape (4, 4), mm.
         names: Of the touches.
         place_base: Shape (3,), mm.
-        errors: As declared.
-        seed: Of all draws.
     """
     rng = np.random.default_rng(seed)
     eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
@@ -245,7 +237,6 @@ def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget
 
     Args:
         target_ct: Shape (3,), mm, as read.
-        errors: As declared.
         seed: Of the truth.
     """
     rng = np.random.default_rng([seed, 2])

@@ -112,9 +112,7 @@ def registration_error(
     Args:
         points_ct: The markers, shape (n, 3), mm.
         T_base_ct: Shape (4, 4): where they are touched, without error.
-        fit: The registration method.
         noise: How far off the markers are found.
-        rng: Source of the errors.
     """
     read_ct = points_ct + rng.normal(0.0, noise.ct_mm, points_ct.shape)
     touched_base = apply(T_base_ct, points_ct) + rng.normal(0.0, noise.touch_mm, points_ct.shape)
@@ -141,8 +139,6 @@ def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "
 
     Args:
         points: Markers and target by name, in the CT and at their true positions in the base frame.
-        target_name: The name of the target.
-        where: What errors name.
 
     Returns:
         T_base_ct, shape (4, 4), mm.
@@ -224,7 +220,6 @@ class TrueArm(NamedTuple):
         Args:
             q_command: Shape (6,), what the encoders say on arrival.
             q_before: Shape (6,), what this function gave for the arrival before, or the first command.
-            rng: For the repeatability.
         """
         half = 0.5 * self.backlash
         settled = np.clip(q_before, q_command - half, q_command + half)  # the play operator
@@ -232,12 +227,7 @@ class TrueArm(NamedTuple):
 
 
 class PlantArm:
-    """An arm as it moves, with the play of its last arrival.
-
-    Args:
-        arm: The true arm.
-        rng: Draws its repeatability.
-    """
+    """An arm as it moves, with the play of its last arrival."""
 
     def __init__(self, arm: TrueArm, rng: np.random.Generator) -> None:
         self._arm, self._rng, self._sent = arm, rng, np.zeros(6)

@@ -59,7 +59,6 @@ def jog_into_slice(
     ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
 
     Args:
-        truth: The ground truth.
         q_probe: Where the probe's joints rest, shape (6,), rad.
         q_needle: Where the needle's arm begins, shape (6,), rad.
         wanted: The needle in the image, after the jog.
@@ -93,8 +92,6 @@ class UltrasoundPlant:
     """A workcell in time: both arms, the probe, and the operator who jogs.
 
     Args:
-        case: What it was drawn from.
-        truth: The ground truth.
         rng: Draws the arms' repeatability, what the jog leaves, and the images.
     """
 

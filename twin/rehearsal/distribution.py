@@ -86,10 +86,7 @@ class Distribution:
     """n trials of one puncture in which the arm reached the pose; mm.
 
     Attributes:
-        seed: Of all draws.
         unreached: Further trials, whose registration put the pose out of the arm's reach.
-        puncture: Common part of all trials.
-        trials: The n trials.
         cov_ct: Shape (3, 3), predicted of it, mm^2.
         in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid, about the mean where one is known.
         hit: Shape (n,).
@@ -194,7 +191,9 @@ class Distribution:
     def _guided(self) -> dict[str, Any]:
         said = {"lost_sight": list(self.hidden), "assumed": list(self.assumed), "looks": dict(self.looks)}
         steps = {} if self.stepwise is None else self.stepwise.document()
-        return {"guidance": self.guidance, "stopped": self.stopped, "p_stop": self.p_stop, **said, **steps}
+        push = self.puncture.push
+        pushed = {} if push is None else {"pushed_mm": float(push.at(np.array(push.target_mm)))}
+        return {"guidance": self.guidance, "stopped": self.stopped, "p_stop": self.p_stop, **pushed, **said, **steps}
 
 
 def _fraction(trials: Bools) -> float | None:
@@ -218,7 +217,6 @@ def rehearse_trials(
         outward_ct: Shape (3,), unit, from the target along the needle.
         q_insertion: Shape (6,), rad, the tip on the target.
         count: Trials, at least 1.
-        seed: Of all draws.
         guidance: One of `WAYS`, in bodies that move as the case declares: every way has the same patients by a seed.
             None is by registration, in bodies at rest. Devices that the case does not declare are assumed.
         sight: What its devices see of the insertion; None hides nothing.
@@ -318,7 +316,6 @@ def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
     """Deflection along one direction, if the bevel never rotates; None for a straight needle.
 
     Args:
-        context: Of a case.
         outward_ct: Shape (3,), unit, from the target along the needle.
     """
     path = bent_path(context.case, context.anatomy, outward_ct)

@@ -51,7 +51,6 @@ class Way:
 
     Attributes:
         name: As in `WAYS`.
-        model: What is believed.
         corridor_mm: How far from its plan a correction may take the needle, by what is believed.
     """
 
@@ -78,9 +77,7 @@ def guided_trials(
     """Rehearse the puncture in each trial, by one way of guidance.
 
     Args:
-        puncture: Common part of all trials.
         truths: Of the n trials, as every way has them.
-        errors: What they were drawn from.
         way: Of guidance.
         rng: Of the devices, and of the arrivals before the last.
     """

@@ -42,9 +42,6 @@ def drawn_truth(puncture: Puncture, trials: Trials, row: int, seed: int, source:
     """The truth whose execution ends as one of the trials did.
 
     Args:
-        puncture: Common part of the trials.
-        trials: As drawn.
-        row: Which.
         seed: Of their draws.
         source: In words for the report.
     """
@@ -60,8 +57,6 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
     """The truth of one rehearsal: a trial of the declared errors, unless the case states true positions or none.
 
     Args:
-        context: The plan's case.
-        plan: What is executed.
         seed: Instead of the case's own.
 
     Raises:
@@ -82,7 +77,6 @@ def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
 
     Args:
         context: The plan's case; where it declares no tissue, nothing bends.
-        plan: What is executed.
         truth: Of a straight needle; the side is drawn by its seed.
     """
     bend = bend_along(context, plan.outward_ct)
@@ -148,9 +142,7 @@ def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_tar
     """Execute the puncture of touches in their ground truth. The same arguments give the same numbers.
 
     Args:
-        context: The case.
         plan: By the registration of the touches.
-        truth: Of the touches.
         at_target: What is true on arrival.
     """
     hit = bent_truth(context, plan, puncture_truth(plan, truth, at_target))
@@ -174,11 +166,7 @@ def physics_trials(
     """Run some of the trials, spread evenly over the order of their tip errors, in the simulator.
 
     Args:
-        context: The plan's case.
-        plan: What is executed.
         found: The trials; the arm reached the pose in one at least.
-        count: How many.
-        progress: Called with trials done and all of them.
 
     Returns:
         Plain values: how far each tip ended from that of the kinematics, and in how many the arm touched something.

@@ -47,7 +47,6 @@ def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsa
     Args:
         plan: What was planned on the belief.
         case: The case of the plan.
-        anatomy: Its structures.
         truth: The patient's pose and the joints' offsets, already drawn.
 
     Raises:
@@ -163,7 +162,6 @@ class Executed:
     """Measurements of the simulator.
 
     Attributes:
-        execution: Its records.
         phase: Shape (m,), of each record: "approach", "settle", "insertion" or "hold".
         off_path_mm: Largest distance of the tip from its commanded path, by the encoders, from the insertion on.
         tissue_force: The greatest forces of the tissue; None where none is declared.
@@ -242,7 +240,6 @@ def execute_sweep(plan: SweepPlan, case: Case, anatomy: Anatomy, T_base_ct: Floa
     Args:
         plan: The motion.
         case: For tool, boxes, gravity and control.
-        anatomy: For the skin.
         T_base_ct: Shape (4, 4), mm: where the patient lies.
     """
     tool, down_ct, still = case_tool(case), -bed_frame(case)[:3, 2], np.zeros(6)

@@ -96,7 +96,6 @@ class Rehearsal(Shown):
 
     Attributes:
         seed: What the truth was drawn from.
-        truth_source: How the truth was found.
         T_base_ct_true: Shape (4, 4), true pose of the patient.
         times_s: Shape (m,), from the start of the approach.
         q: Shape (m, 6), encoder angles.

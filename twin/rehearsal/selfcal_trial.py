@@ -85,12 +85,8 @@ def punctures(
     """Send the needle to the middle of the image's tip, one held-out candidate after the other.
 
     Args:
-        case: The self-calibration case.
         workcell: Its collision checker; a target at which something would touch is passed over.
-        candidates: Where probe and needle can stand.
         rows: The candidates to use: none of them was recorded.
-        truth: The ground truth.
-        calibration: What was found.
         rng: The reading of the target and the arms' repeatability.
     """
     models, click_mm, reached = case.models, case.content.truth.click_mm, []
@@ -150,11 +146,8 @@ class SelfcalTrial:
     """One seed in the twin: workcell, recording, calibration, and the errors at targets.
 
     Attributes:
-        seed: Of this trial.
-        truth: The ground truth.
         acquisition: What was recorded.
         shown: What was true at each of its images.
-        calibration: What was found.
         unseen_mm: Predicted minus true tip at poses that were not recorded, shape (k,).
         punctures: One per target.
     """

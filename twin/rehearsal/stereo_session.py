@@ -81,7 +81,6 @@ def needle_outcome(believed: NeedleError, true: TrueNeedle, radius_mm: float | N
 
     Args:
         believed: As predicted.
-        true: As it came.
         radius_mm: Within which of the target the tip hits, where a case states one.
     """
     realised = float(np.linalg.norm(true.error_m))
@@ -184,11 +183,8 @@ class Session:
     """Result of a session.
 
     Attributes:
-        workcell: The truth.
         calibration: Result of the robot's points.
-        mapping: What the markers gave.
         reached: One for each target.
-        trial: The session as plain values.
     """
 
     workcell: StereoWorkcell
@@ -220,7 +216,6 @@ def run_session(
     """Run a whole session in a workcell drawn from a seed.
 
     Args:
-        case: The case.
         seed: Of all that is drawn.
         targets: Only these; all when None.
         detector_of: Makes the detector in place of images; for studies of what is behind them.
@@ -336,13 +331,7 @@ def run_trial(case: ServoCase, seed: int, empty: StateChecker | None = None) -> 
 
 
 def run_trials(case: ServoCase, seeds: Sequence[int], done: Count = uncounted) -> list[ServoTrial]:
-    """The trials of every seed, in the order given; they share the checker of the empty workcell.
-
-    Args:
-        case: The case.
-        seeds: Which.
-        done: Told how many of how many are done.
-    """
+    """The trials of every seed, in the order given; they share the checker of the empty workcell."""
     empty, found = workcell_checker(case, None), []
     for seed in seeds:
         found.append(run_trial(case, seed, empty))

@@ -42,9 +42,7 @@ class Puncture:
     """Common part of all trials: the belief, and the commands that follow from it.
 
     Attributes:
-        model: The arm.
         tip_mm: Flange to tip.
-        method: Of the registration.
         noise: Of the markers, as believed: the weights of ``weighted``.
         points_ct: Shape (N, 3), mm, the markers.
         q_touch: Shape (N, 6), rad, how the arm touches them.
@@ -144,10 +142,6 @@ def draw_truths(
     """Draw the truth of trials from declared errors; what moves has a generator of its own.
 
     Args:
-        puncture: Common part of all trials.
-        errors: What their truth is drawn from.
-        count: Trials.
-        rng: The source of all draws.
         moving: None moves nothing.
     """
     motion, breath, skin = _moved(moving, count, rng)
@@ -174,14 +168,7 @@ def _moved(moving: Moving | None, count: int, rng: np.random.Generator) -> tuple
 
 
 def draw_trials(puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator) -> Trials:
-    """Draw trials from declared errors and rehearse the puncture in each, by its registration.
-
-    Args:
-        puncture: Common part of all trials.
-        errors: What their truth is drawn from.
-        count: Trials.
-        rng: The source of all draws.
-    """
+    """Draw trials from declared errors and rehearse the puncture in each, by its registration."""
     return open_loop(puncture, draw_truths(puncture, errors, count, rng))
 
 
@@ -197,8 +184,6 @@ def ended(puncture: Puncture, truths: Truths, T_base_ct: Floats, needle: TrueNee
     """Trials whose straight needles ended so.
 
     Args:
-        puncture: Common part of all trials.
-        truths: Of the n trials.
         T_base_ct: Shape (n, 4, 4), as registered.
         needle: Of each trial; it bends if the puncture's does.
         reached: Shape (n,), whether the arm could reach what was commanded.
@@ -293,7 +278,6 @@ def commanded(
     """The joints (n, 6) that the nominal arm takes to the target, in the planned branch and roll, and whether.
 
     Args:
-        puncture: Common part of all trials.
         T_base_ct: Shape (n, 4, 4), as registered.
         moved_base: Shape (n, 3), mm: by how much the needle is corrected.
         out_mm: How far before the target.

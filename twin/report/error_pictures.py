@@ -185,7 +185,7 @@ PANEL_INCHES = (3.0, 3.5)
 
 
 def draw_clouds(
-    ways: Sequence[tuple[Any, str, str]], outward_ct: Floats, path: Path, hit_mm: float | None = None
+    ways: Sequence[tuple[Any, str, str]], outward_ct: Floats, path: Path, hit_mm: float | None = None, columns: int = 2
 ) -> None:
     """Error clouds of ways of guidance, all to one scale, in the plane of the needle where they are widest.
 
@@ -194,11 +194,11 @@ def draw_clouds(
         outward_ct: Shape (3,), unit, from the target along the needle.
         path: The PNG to write; it appears whole or not at all.
         hit_mm: Radius of a hit, drawn as a ring.
+        columns: Clouds beside each other; two can still be read on a telephone.
     """
     R, reach = needle_frame(outward_ct), 0.0
     widest = np.sum([R[:2] @ found.cov_ct @ R[:2].T for found, _, _ in ways], axis=0)
     R[:2] = np.linalg.eigh(widest)[1].T[::-1] @ R[:2]
-    columns = 2 if len(ways) <= 4 else 4  # two can still be read on a telephone
     rows = -(-len(ways) // columns)
     size = (PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows)
     figure = Figure(figsize=size, dpi=DPI, facecolor="white", layout="compressed")

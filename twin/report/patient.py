@@ -285,6 +285,8 @@ def _sources(found: Mapping[str, Any]) -> list[Block]:
     said = [f"Sources of the predicted variance: {', '.join(named)}."] if named else []
     if found.get("deflection_mm") is not None:
         said.append(f"The needle bends by {found['deflection_mm']:.2f} mm, to a side drawn in each trial.")
+    if "pushed_mm" in found:
+        said.append(f"The needle pushes the target on by {found['pushed_mm']:.2f} mm.")
     if found.get("physics") is not None:
         said.append(
             "{rooms} of them in the simulator: tips at most {largest_apart_mm:.4f} mm from the kinematic result; "

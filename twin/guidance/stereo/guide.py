@@ -23,12 +23,8 @@ class Guide:
     """The paper's chain: calibrated cameras triangulate the ball; the mapping gives the target.
 
     Args:
-        case: The case.
-        calibration: Of cameras and robot.
-        mapping: Of the head.
         markers: Their pixels.
         markers_m: Shape (n, 3), mm: the markers as the image has them.
-        detector: Finds the ball in new images.
     """
 
     def __init__(

@@ -55,7 +55,6 @@ def workcell_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
     """The planner's collision checker of the workcell.
 
     Args:
-        case: The case.
         T_base_m: Where the head is believed to stand, shape (4, 4), mm; None for a workcell without it.
     """
     boxes = []

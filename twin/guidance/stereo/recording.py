@@ -50,7 +50,6 @@ class Recorder:
     """Devices that are used through it, and all that they said.
 
     Attributes:
-        devices: What answers.
         folder: Empty; pictures are written at once, tables by `finish`.
         target: To which the arm is sent.
     """
@@ -116,8 +115,6 @@ class Replay:
     """A recording as devices: it answers what was recorded, in the order in which it was.
 
     Attributes:
-        folder: The recording.
-        tables: By name.
         size_px: Width and height of every picture.
     """
 
@@ -205,7 +202,6 @@ def read_recording(folder: Path, size_px: tuple[int, int]) -> Replay:
     """The tables of a recording; its pictures are read when they are looked at.
 
     Args:
-        folder: The recording.
         size_px: Width and height of every picture.
 
     Raises:

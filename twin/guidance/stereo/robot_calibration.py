@@ -60,7 +60,6 @@ def calibration_commands(case: ServoCase, checker: StateChecker) -> Posture:
     """Joints that put the ball on the calibration's points, along a path that touches nothing.
 
     Args:
-        case: The case.
         checker: Checks contacts; the head is not there yet.
 
     Raises:
@@ -81,11 +80,8 @@ def calibrate_by_robot(
     """Move to the points, detect, measure, and fit.
 
     Args:
-        case: The case.
         commands: Joints that put the ball on the points.
         arm: Carries it there.
-        touch: Measures each.
-        detector: Takes the images.
 
     Raises:
         NoAnswerError: A ball is not found.

@@ -159,9 +159,6 @@ class ServoCase:
     """A servo case, read and checked.
 
     Attributes:
-        path: The case file.
-        file: Its content.
-        model: The arm.
         skin: The head's surface, image frame, mm.
         markers: The markers' centres, image frame, in truth.
         targets: The targets, image frame, in truth.

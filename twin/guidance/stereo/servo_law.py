@@ -129,7 +129,6 @@ def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits
     """The joint path that moves the ball by a vector and keeps the needle's orientation.
 
     Args:
-        rod: The arm and its rod.
         q: Shape (6,), rad: the arm's commanded configuration.
         move_base: Shape (3,), mm.
         limits: A longer move is cut short; the next look sees what is left.
@@ -258,11 +257,9 @@ def map_head(
 
     Args:
         names: The markers, n at least 3.
-        seen: What the cameras have.
         markers_m: Shape (n, 3), mm: what the image has.
         image_mm: Standard deviation per axis of ``markers_m``.
         targets_m: Shape (k, 3), mm: where the error matters.
-        where: What errors name.
 
     Raises:
         InputError: Fewer than three markers, collinear, mirrored, a unit slip, or a marker far off.
@@ -336,7 +333,6 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
     Args:
         rod: The arm, its rod and its orientation.
         points_base: Shape (n, 3), mm.
-        checker: Checks contacts.
         first: Try this branch before the others.
 
     Raises:

@@ -58,9 +58,7 @@ class Task:
         rod: The arm, its rod and the orientation to keep.
         T_base_c: Shape (4, 4), mm: from the calibration frame c to the base, as calibrated (Liu's r_T_c).
         tolerance_mm: The servo has converged when a look sees no larger error.
-        max_steps: Moves at most.
         looks: Looks at most before a ball counts as lost.
-        limits: What one step may do.
         checker: Checks contacts, with the head where it is believed to be.
     """
 
@@ -87,7 +85,6 @@ class Servoed:
     """Result of a servo.
 
     Attributes:
-        stop: Why it ended.
         visits: Every stop at which the ball was seen, in order.
         q_command: Shape (6,), rad: the last command.
         detail: What was touched or missing, for people.
@@ -120,9 +117,7 @@ def servo(task: Task, q_command: Floats, look: Look, arm: Arm) -> Servoed:
     """Move the ball onto the target: look, measure the error, move a step; until it converges or must stop.
 
     Args:
-        task: Target, limits and devices.
         q_command: Shape (6,), rad: where the arm was sent.
-        look: Takes images and measures.
         arm: Moves the ball.
     """
     visits: list[Visit] = []

@@ -135,9 +135,6 @@ def aims_of(
     """Where the arm is sent for the case's targets, or for those that are wanted.
 
     Args:
-        case: The case.
-        calibration: Of cameras and robot.
-        mapping: Of the head.
         targets_m: Shape (k, 3), mm, as they are read in the image.
         wanted: Names; None for all.
 
@@ -162,8 +159,6 @@ def follow(
     """What a session's looks at the ball say, stop by stop, as plain values: mm and degrees; None of a lost ball.
 
     Args:
-        case: The case.
-        guide: Of its calibration and mapping.
         T_base_c: Shape (4, 4), mm, as calibrated.
         targets_m: Shape (k, 3), mm, in the image.
         stops: Name of the target, and joints (6,), rad.

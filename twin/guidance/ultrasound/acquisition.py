@@ -100,12 +100,10 @@ def acquire(
     """Record as many poses as the case asks for, choosing others for those in which the needle is not found.
 
     Args:
-        case: The self-calibration case.
         workcell: Its collision checker: the jog is checked too.
         candidates: Poses that can be taken.
         devices: Both arms, the probe, and who jogs.
         rng: For the choice, if it is random.
-        count: Called after every image.
 
     Raises:
         NoAnswerError: The candidates are used up before enough images show the needle.
@@ -141,9 +139,7 @@ def keep_pictures(taken: Acquisition, pixel_mm: float, folder: Path) -> None:
     """Write a recording with its pictures, found or not, into an empty folder: the tips are to be read from them.
 
     Args:
-        taken: What was recorded.
         pixel_mm: Edge of a pixel.
-        folder: The folder.
     """
     shots = sorted((*taken.shots, *taken.missed_shots), key=lambda shot: shot.number)
     play = taken.recording.turn_probe is not None

@@ -117,11 +117,6 @@ def _lowest_corner(case: SelfcalCase, T_base1_image: Floats) -> Floats:
 def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generator) -> CandidatePoses:
     """Draw geometries, solve for both arms, check contacts.
 
-    Args:
-        case: The self-calibration case.
-        workcell: Its collision checker.
-        rng: For the draws.
-
     Raises:
         NoAnswerError: No draw can be taken; it holds the counts.
     """
@@ -270,7 +265,6 @@ def choose_poses(
     Args:
         candidates: Poses that could be recorded, with the tip where it would show.
         n: How many to choose.
-        noise: Of both arms and the image.
         prior: A rough calibration, such as the drawing's: 10 deg and 20 mm off will do.
         recorded: Poses that are recorded already and count.
 

@@ -22,10 +22,8 @@ def aim(
     """Commanded joints of the needle's arm by its nominal kinematics and the calibration: (6,), rad; NaN out of reach.
 
     Args:
-        candidates: Where probe and needle can stand.
         row: The candidate whose probe pose, insertion and roll are used.
         target_mm: In the image, shape (2,).
-        calibration: What was found.
         models: The probe's and the needle's arm, as they are drawn.
     """
     poses = candidates.poses

@@ -212,7 +212,6 @@ class SelfcalCase:
     """A validated case.
 
     Attributes:
-        path: The case file.
         content: What it says.
         inputs: The case file, with role and hash.
         models: The probe's arm and the needle's.

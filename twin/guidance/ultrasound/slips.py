@@ -61,9 +61,7 @@ def checked_calibration(
     """Calibration of a recording from outside; one that was read otherwise than meant is refused.
 
     Args:
-        recording: As its file gives it.
         case: As `calibrate_case` takes it.
-        where: Its file.
         hold: Whether the needle's length is held where the case says so.
 
     Raises:

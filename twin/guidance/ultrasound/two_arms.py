@@ -53,11 +53,7 @@ def between_arms(case: SelfcalCase, T_end1_image: Floats, T_base1_base2: Floats,
 
 
 class TwoArms:
-    """FCL's verdict on both arms. Not for several threads at once: FCL's objects are moved for each question.
-
-    Args:
-        case: The self-calibration case.
-    """
+    """FCL's verdict on both arms. Not for several threads at once: FCL's objects are moved for each question."""
 
     def __init__(self, case: SelfcalCase) -> None:
         content = case.content

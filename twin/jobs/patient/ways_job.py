@@ -126,6 +126,7 @@ class Compared:
         lost += [f"{way}: {why}" for way, why in self.unknown.items()]
         said = [f"Not modelled: {first['not_modelled']}."]
         said += dict.fromkeys(one for row in rows for one in row["assumed"])
+        said += [f"The needle pushes the target on by {first['pushed_mm']:.2f} mm."] if "pushed_mm" in first else []
         said += ["The trials were drawn from [rehearsal.errors]: the belief is wrong."] * first["wrong_belief"]
         said += ["How the arm touched the markers is not known: a posture was assumed."] * first["guessed_touches"]
         title = f"the same {patients} by each way of guidance, seed {first['seed']}; best first"

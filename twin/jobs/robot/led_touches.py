@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -76,37 +77,6 @@ class LedTouches:
         }  # fmt: skip
 
 
-def led_touches(case: Case, arm: Arm, ready: Callable[[str], bool]) -> LedTouches:
-    """Read the arm at each of a case's markers, in the order of their list, by its nominal kinematics.
-
-    Args:
-        case: With a list of markers in its CT.
-        arm: Whose needle somebody leads to them.
-        ready: Asks for a marker, and returns when the tip is on it; False where nobody touches any more.
-
-    Raises:
-        InputError: The case has no markers, or the robot hangs up.
-        NoAnswerError: The arm does not come to rest, or not one marker is touched.
-    """
-    if case.registration is None:
-        refuse("no list of markers", case.path, "[registration] markers_ct", "no_markers")
-    name = case.registration.markers_ct
-    listed = parse_points(case.files.content(name), case.folder / name, default_space=case.space)
-    joints = []
-    for marker in listed.names:
-        if not ready(marker):
-            break
-        joints.append(arm.measured_jp())
-    count, q = len(joints), np.array(joints).reshape(-1, 6)
-    if not count:
-        refuse("no marker was touched", "touch --host", "a line (Enter) for each, the tip on it", "empty")
-    T = flange_pose(case.robot.model, q)
-    tips = T[:, :3, 3] + case.needle.length_mm * T[:, :3, 2]
-    names, left = listed.names[:count], listed.names[count:]
-    return LedTouches(case, NamedPoints(names, listed.points[:count], listed.space),
-                      NamedPoints(names, tips, None, joints=q), left)  # fmt: skip
-
-
 def refuse_of_twin(choice: Choice, seed: int) -> None:
     """Refuse what is of the twin alone beside ``--host``."""
     if choice != Choice() or seed:
@@ -115,8 +85,27 @@ def refuse_of_twin(choice: Choice, seed: int) -> None:
 
 
 def touch_by_hand(case: Case, arm: Arm, ready: Callable[[str], bool], out: Path) -> LedTouches:
-    """`led_touches`, written as `[registration] markers_base` reads them."""
-    read = led_touches(case, arm, ready)
+    """Read the arm at each of a case's markers, by its nominal kinematics; written as `markers_base` is read.
+
+    Args:
+        arm: Whose needle somebody leads to the markers, in the order of their list.
+        ready: Asks for a marker, and returns when the tip is on it; False where nobody touches any more.
+
+    Raises:
+        InputError: The case has no markers, none is touched, or the robot hangs up.
+        NoAnswerError: The arm does not come to rest.
+    """
+    if case.registration is None:
+        refuse("no list of markers", case.path, "[registration] markers_ct", "no_markers")
+    name = case.registration.markers_ct
+    listed = parse_points(case.files.content(name), case.folder / name, default_space=case.space)
+    q = np.array([arm.measured_jp() for _ in takewhile(ready, listed.names)]).reshape(-1, 6)
+    if not (count := len(q)):
+        refuse("no marker was touched", "touch --host", "a line (Enter) for each, the tip on it", "empty")
+    T = flange_pose(case.robot.model, q)
+    tips = T[:, :3, 3] + case.needle.length_mm * T[:, :3, 2]
+    ct = NamedPoints(listed.names[:count], listed.points[:count], listed.space)
+    read = LedTouches(case, ct, NamedPoints(ct.names, tips, None, joints=q), listed.names[count:])
     with writing(out, "touch", inputs=case.inputs, names=(TOUCH, SUMMARY)) as draft:
         read = replace(read, files=draft.final(tuple(draft.folder / name for name in (TOUCH, SUMMARY))))
         write_points(draft.folder / TOUCH, read.base)

@@ -118,7 +118,6 @@ class Part(NamedTuple):
     """One body outside of a patient; a later one fills the place of an earlier one.
 
     Attributes:
-        name: What it is.
         mesh: Closed, mm.
         hu: What it is made of, Hounsfield units.
         place: ``beneath`` the patient, as the bed; ``upon`` them, as arms and lines, which the body displaces;
@@ -142,10 +141,8 @@ class CaseScene:
     Attributes:
         solids: In the order in which they fill each other's place.
         T_scan_ct: Shape (4, 4): the case's frame to the scanner's; a rotation, never a mirror.
-        skin: The body's surface.
         cut: Shape (3, 2): at which ends the body goes on beyond its surface.
         tables: Shape (2, 3): the box about what the patient lies on; infinite without any.
-        outside_objects: The objects outside of the patient.
         markers: True positions, or None.
         listed: The case's own readings of them.
         target: Shape (3,).
@@ -175,8 +172,6 @@ def case_scene(
     """Place a case in the scanner.
 
     Args:
-        case: The case.
-        anatomy: Its structures.
         settings: By how much the patient is rotated; the cells of readings where the case declares none.
         rng: Draws each true marker in its cell.
         marker: What stands at each marker's place.
@@ -221,7 +216,6 @@ def scan_frame(case: Case, turn: float) -> Floats:
     determinant is 1, where swapping two axes would be a mirror that no distance shows.
 
     Args:
-        case: The case.
         turn: About the bed's direction through the target, rad.
     """
     R = np.eye(3)
@@ -378,7 +372,6 @@ def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator
 
     Args:
         scene: What lies in the scanner; where the body goes on beyond its surface, the scan ends within it.
-        settings: Spacing, pixel and field of view.
         rng: Draws where the grid falls.
 
     Raises:

@@ -79,8 +79,6 @@ def scan_solids(solids: Sequence[Solid], grid: VolumeGrid, settings: ScanSetting
     Args:
         solids: The scene in the scanner's frame, LPS mm; later ones fill the place of earlier ones.
         grid: The voxels; axis k runs across the slices.
-        settings: Blur and noise.
-        rng: Draws the noise.
     """
     T_index_ct = np.linalg.inv(grid.T_ct_index)
     each = [apply(T_index_ct, solid.mesh.vertices)[solid.mesh.faces] for solid in solids]
@@ -158,7 +156,6 @@ def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bool
 
     Args:
         labels: Shape (nx, ny, nz), what is labelled at each centre.
-        label: The structure's.
         corners: Its triangles, shape (n, 3, 3), in voxels.
         later: Shape (largest label + 1,), which labels fill the place of this one: their voxels are not missed.
     """
@@ -194,7 +191,6 @@ class Solid(NamedTuple):
     """One body in the scanner; a later one fills the place of an earlier one.
 
     Attributes:
-        name: What it is.
         mesh: Closed, mm.
         hu: What it is made of, Hounsfield units.
         label: Its number in its label map; 0 for what no segmentation names.

@@ -29,8 +29,6 @@ def write_series(folder: Path, image: CtImage, settings: ScanSettings, identity:
 
     Args:
         folder: It is made.
-        image: The scan.
-        settings: How it was made.
         identity: What the scan was made from: the same gives the same identifiers, anything else gives others.
         name: Of the patient.
 
@@ -123,7 +121,6 @@ def write_nifti(path: Path, values: NDArray[Any], T_ct_index: Floats) -> Path:
     """Write a ``.nii.gz``.
 
     Args:
-        path: The file.
         values: Shape (ni, nj, nk), whole numbers or floats.
         T_ct_index: Shape (4, 4), voxel index to LPS mm; kept in single precision, as the format does.
     """

@@ -108,8 +108,6 @@ def visible_fraction(
     """Fraction of the disc that looks like the ball: as bright as next to its edges, within a part of its contrast.
 
     Args:
-        grey: The image.
-        camera: The camera.
         spokes: Around the measured ball.
         on_circle: Shape (n,): the spokes whose edge lies on the circle.
         contrast: Between ball and surroundings, grey levels.

@@ -81,7 +81,6 @@ def calibrate(
         size: Width and height of the image, px.
         names: What errors call the points; None numbers them from 1.
         distortion: False holds the lens perfect, as the paper does.
-        where: What errors name.
 
     Raises:
         InputError: Too few points, a ball not found, points in a plane or twice, a point behind the camera or that

@@ -41,9 +41,6 @@ class Observed:
     """Measurements; n markers, s stays of the arm of which the first k were also read by the measuring arm.
 
     Attributes:
-        planned: The cameras as they were planned.
-        rod: The nominal arm.
-        errors: As declared.
         q_command: Shape (s, 6), rad.
         pixels: Shape (c, s, 2): the ball in each camera.
         pixel_covariance: Shape (c, s, 2, 2), px^2.
@@ -135,7 +132,6 @@ class JointModel:
     """The problem, to be linearised anywhere.
 
     Attributes:
-        observed: What was measured.
         guess: Where poses are counted from.
     """
 
@@ -314,12 +310,9 @@ class Adjusted:
     """The joint estimate.
 
     Attributes:
-        model: The problem.
-        unknowns: Their values.
         covariance: Shape (N, N): of the unknowns, by Fisher's information.
         chi2: Sum of the squared residuals.
         freedom: Their number, less that of the unknowns: what chi2 is on average if the declaration holds.
-        iterations: Steps taken.
     """
 
     model: JointModel
@@ -354,7 +347,6 @@ def adjust(observed: Observed, guess: Guess, start: Unknowns | None = None) -> A
     """The joint estimate of everything, by Gauss-Newton.
 
     Args:
-        observed: What was measured.
         guess: Where poses are counted from; within a few degrees and centimetres.
         start: Unknowns to start from; all errors 0 when None.
 

@@ -90,7 +90,6 @@ def servoed_error(found: Adjusted, stay: int, target_m: Floats) -> NeedleError:
     """The needle's error after an image of the ball.
 
     Args:
-        found: The joint estimate.
         stay: Which of the stays; -1 is the last.
         target_m: Shape (3,), mm, as the image has it.
     """

@@ -250,9 +250,6 @@ def calibration_of(
     """The calibration at a fit, under the estimated or declared noise; its arrays are read-only.
 
     Args:
-        problem: As it was solved.
-        fit: Its solution.
-        observability: How well the poses show it.
         seen: The needle's direction before it took part.
         cannot_show: What the poses cannot show, one sentence each.
         arms: As declared.

@@ -98,7 +98,6 @@ def needle_direction(estimate: Estimate, recording: Recording, kept: NDArray[np.
 
     Args:
         estimate: R_X, R_Y and t_Q.
-        recording: The poses.
         kept: Shape (n,): poses whose tip is trusted.
     """
     if recording.v is not None:
@@ -184,7 +183,6 @@ def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection
     Args:
         names: Of the poses.
         aside: Shape (n,): the tip was used and the direction was not.
-        seen: The needle's direction.
     """
     found = []
     for code, rows, problem, most in (
@@ -262,7 +260,6 @@ def linearised_direction(estimate: Estimate, recording: Recording, v_image: Floa
 
     Args:
         estimate: Where to linearise.
-        recording: The poses.
         v_image: The measured directions, unit, shape (n, 3).
     """
     M = needle_in_image(estimate, recording)

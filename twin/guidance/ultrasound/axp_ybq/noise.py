@@ -64,7 +64,6 @@ def found_spreads(problem: Problem, fit: RobustFit) -> ResidualSpreads:
 
     Args:
         problem: With the directions where they take part, and with the spreads found so far.
-        fit: Its fit.
     """
     if problem.arms is not None:
         return by_likelihood(problem, fit)

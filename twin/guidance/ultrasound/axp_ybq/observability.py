@@ -79,8 +79,6 @@ def scaled_jacobian(
 
     Args:
         estimate: Where the Jacobian is taken.
-        recording: The poses.
-        active: The free parameters.
         centre_base2: c, shape (3,), mm; None for the middle of the recording's tips.
     """
     centre = tips_centre(estimate, recording) if centre_base2 is None else centre_base2
@@ -100,8 +98,6 @@ def observe(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
 
     Args:
         estimate: Where the Jacobian is taken; any solution will do, also one of many.
-        recording: The poses that were used.
-        active: The free parameters.
     """
     active = active[active < 17]
     J = scaled_jacobian(estimate, recording, active)
@@ -248,7 +244,6 @@ class Degenerate(InputError):  # noqa: N818 - the field's word for such poses
 
     Attributes:
         motions: What can move without any residual showing it, in words and with its cause.
-        suggestion: Poses that would mend it.
     """
 
     def __init__(self, observability: Observability, suggestion: SuggestedPoses) -> None:
@@ -276,8 +271,6 @@ def propose(estimate: Estimate, recording: Recording, active: NDArray[np.int_]) 
 
     Args:
         estimate: A solution, unique or not.
-        recording: The poses that were used.
-        active: The free parameters.
     """
     active = active[active < 17]
     reference = _central(recording)

@@ -59,7 +59,6 @@ def settled(problem: Problem, fit: RobustFit) -> RobustFit:
 
     Args:
         problem: It may have grown since the fit (directions, another spread).
-        fit: Where to begin.
 
     Raises:
         InputError: More than half of the poses disagree.
@@ -128,8 +127,6 @@ def agreeing(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[
     """Tips and directions that agree with the fit, given how far each one pulled it.
 
     Args:
-        problem: What was fitted.
-        fit: The fit.
         alarm: Only ask whether a closer look is due, after a fit of all poses, whose outliers widen the spread.
     """
     at_fit = weighed(problem, fit)

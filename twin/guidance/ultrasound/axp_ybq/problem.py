@@ -115,7 +115,6 @@ def covariances(
 
     Args:
         estimate: Where the residuals are linearised.
-        recording: The poses.
         noise: Propagated to first order through both arms and the image, or taken as it is.
         v_image: The measured directions, unit, shape (n, 3), where they are used.
         lean_rad: How far the needle leans out of the measured direction's plane across the image.
@@ -162,7 +161,6 @@ def flange_slopes(estimate: Estimate, recording: Recording, v_image: Floats | No
 
     Args:
         estimate: Where to linearise.
-        recording: The poses.
         v_image: The measured directions, unit, shape (n, 3), where they are used.
     """
     n, size = len(recording), 3 if v_image is None else 5

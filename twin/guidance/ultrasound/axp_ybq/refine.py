@@ -159,7 +159,6 @@ def refine(
     """The estimate of least weighted squares near a start; the pose covariances follow the estimate.
 
     Args:
-        problem: What is estimated.
         start: Such as the closed form's.
         tip_weights: One per pose for its tip, shape (n,); a flag counts as 1 or 0.
         direction_weights: One per pose for its direction, shape (n,).

@@ -54,7 +54,6 @@ class Imager:
         range_db: Dynamic range of the display: this many dB from black to white.
         speckle_db: Grey of mean speckle power, dB below white.
         noise_db: Electronic noise, dB below mean speckle.
-        spread: The point spread in the plane.
     """
 
     columns: int = 250
