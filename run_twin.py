@@ -443,7 +443,7 @@ def mirror(
     """Show a running arm's needle in the CT. Prints tip and distance to the target; only reads the robot."""
     from puncture_twin.planning.base.provenance import inputs_document
     from puncture_twin.planning.case.case import load_case
-    from puncture_twin.twin.jobs.robot.mirror import Mirror, mirror_text, readings_of
+    from puncture_twin.twin.jobs.live.mirror import Mirror, mirror_text, readings_of
     from puncture_twin.twin.jobs.terminal import ended_by_ctrl_c
 
     followed = load_case(case)
@@ -586,7 +586,7 @@ def _hand_eye(
 ) -> None:
     """Find where a camera is on the flange, from pairs of poses: AX = ZB or AX = XB. It only reports."""
     from puncture_twin.planning.registration.hand_eye import calibrate_hand_eye, read_pose_pairs
-    from puncture_twin.twin.jobs.robot.calibrate_job import hand_eye_summary, hand_eye_text, parse_noise
+    from puncture_twin.twin.jobs.patient.answers import hand_eye_summary, hand_eye_text, parse_noise
 
     pairs = read_pose_pairs(recording, motions=motions)
     found = calibrate_hand_eye(pairs, parse_noise(noise))

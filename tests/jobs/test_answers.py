@@ -11,8 +11,7 @@ import typer
 
 from puncture_twin.run_twin import app
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, OK, PROGRAM_FAILED, RULES, finish
-from puncture_twin.twin.jobs.patient.run import Run
-from puncture_twin.twin.jobs.patient.summaries import rehearsal_failures, trial_failures
+from puncture_twin.twin.jobs.patient.run import Run, rehearsal_failures, trial_failures
 
 ROOT = Path(__file__).parents[2]
 

@@ -21,7 +21,7 @@ from puncture_twin.planning.collision.workcell import case_tool
 from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.twin.jobs.robot import mirror
+from puncture_twin.twin.jobs.live import mirror
 
 ABDOMEN = folder() / "abdomen"
 
@@ -252,5 +252,5 @@ def test_one_arm_at_a_time(capsys):
 
 def test_only_the_receiving_half_is_ever_named():
     """The library's controlling half stands nowhere in the mirror."""
-    text = (folder().parent / "twin" / "jobs" / "robot" / "mirror.py").read_text()
+    text = (folder().parent / "twin" / "jobs" / "live" / "mirror.py").read_text()
     assert "rtde_receive" in text and not any(word in text for word in ("rtde_control", "rtde_io", "RTDEControl"))

@@ -39,7 +39,6 @@ class ReasonCount:
 
     Attributes:
         code: The reason's code, "safe" for safe.
-        fraction: Of the grid's directions, 0..1.
         solid_angle: Of the searched solid angle, 0..1; the grid is denser near θ = 0, this is not.
     """
 
@@ -47,7 +46,6 @@ class ReasonCount:
     code: str
     colour: Rgb
     count: int
-    fraction: float
     solid_angle: float
 
 
@@ -63,12 +61,12 @@ def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
         lines.append((text, reason.value or "safe", REASON_COLOURS.get(reason, SAFE), here))
     lines.append((UNSEEN_AIR_TEXT, Reason.UNKNOWN_REGION.value, UNSEEN_AIR, air))
     counts = [
-        ReasonCount(text, code, colour, int(here.sum()), float(here.mean()), float(weights[here].sum() / weights.sum()))
+        ReasonCount(text, code, colour, int(here.sum()), float(weights[here].sum() / weights.sum()))
         for text, code, colour, here in lines
         if here.any()
     ]
     if not candidates.safe.any():
-        counts.append(ReasonCount(candidates.safe_text, "safe", SAFE, 0, 0.0, 0.0))
+        counts.append(ReasonCount(candidates.safe_text, "safe", SAFE, 0, 0.0))
     return tuple(sorted(counts, key=lambda line: (line.code != "safe", -line.count)))
 
 

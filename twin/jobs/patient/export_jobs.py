@@ -65,9 +65,6 @@ def table_of(source: Path, choice: Choice) -> Path | None:
 def export_candidates(table_path: Path, format_name: str, out: Path, note: Callable[[str], None]) -> Written:
     """Write a table of candidates as text, beside its own set or elsewhere.
 
-    Args:
-        note: Told in a sentence what whoever reads it should know.
-
     Raises:
         InputError: No table of candidates, or not the one that its folder's manifest lists.
     """

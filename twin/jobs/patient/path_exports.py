@@ -117,7 +117,6 @@ def export_path(
     """Search, and write the chosen path and the safe entry area as one set.
 
     Args:
-        format_name: One of `PATH_FORMATS`.
         source: A plan of the case, whose direction is chosen after it was checked again; anything else is passed over.
 
     Raises:

@@ -55,9 +55,6 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
     candidate -1 outside the grid. A pick that the search has no row of is one row more.
 
     Args:
-        case: The case.
-        candidates: The search's rows.
-        pick: What is shown as chosen.
         raster: The map's pixels where somebody has them already.
     """
     view, windows = map_view(case, candidates), candidates.windows

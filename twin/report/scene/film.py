@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
-from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
@@ -89,12 +88,8 @@ def film_times(total_s: float) -> FilmTimes:
     return FilmTimes(tuple(float(m) for m in moments), float(speed), round(STILL_S * FRAMES_PER_SECOND))
 
 
-def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path, progress: Count = uncounted) -> Path:
+def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path) -> Path:
     """Write the film; a GIF beside it when no H.264 encoder can be started.
-
-    Args:
-        anatomy: Structures and skin, CT frame.
-        path: The ``.mp4`` to write; it appears whole or not at all.
 
     Returns:
         The file that was written.
@@ -102,10 +97,10 @@ def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path, pr
     times = film_times(float(rehearsal.times_s[-1]))
     film, path = _Film.of(rehearsal, plan, case, anatomy, times.speed), Path(path)
     try:
-        write_mp4(film.frames(times, progress), film.words.size, path, FRAMES_PER_SECOND)
+        write_mp4(film.frames(times), film.words.size, path, FRAMES_PER_SECOND)
     except (OSError, RuntimeError):  # no encoder on this machine, or one without H.264
         path = path.with_suffix(".gif")
-        write_gif(film.frames(times, progress), path, FRAMES_PER_SECOND)
+        write_gif(film.frames(times), path, FRAMES_PER_SECOND)
     return path
 
 
@@ -139,7 +134,7 @@ class _Film(NamedTuple):
             poses,
         )
 
-    def frames(self, times: FilmTimes, progress: Count) -> Iterator[Pixels]:
+    def frames(self, times: FilmTimes) -> Iterator[Pixels]:
         """The frames that move, drawn by as many threads as there are cores while others are encoded; then the last."""
         threads = min(len(os.sched_getaffinity(0)), MOST_THREADS)
         with ThreadPoolExecutor(threads) as pool:
@@ -149,7 +144,6 @@ class _Film(NamedTuple):
                 while len(waiting) > threads or (waiting and number == len(times.moments) - 1):
                     frame = waiting.popleft().result()
                     yield frame
-                progress(number + 1, len(times.moments))
         yield from repeat(frame, times.still_frames)
 
     def _frame(self, moment: float) -> Pixels:

@@ -168,7 +168,6 @@ class SceneBody:
     Attributes:
         group: "organ", "skin", "safe", "needle", "arm", "room" or "target".
         mesh: CT frame, mm.
-        alpha: 1 for opaque; less for see-through.
         frame: Of an arm's link: with which of ``link_poses`` it moves.
     """
 

@@ -56,7 +56,6 @@ def overview(
     Args:
         content_ct: Shape (n, 3), what must be in the picture.
         focus_ct: Shape (k, 3), what should not be hidden.
-        size: Width and height in pixels.
         outward_ct: Shape (3,), unit, from the target out of the body along the needle; None looks from any side.
     """
     up = up_ct(case)
@@ -79,7 +78,6 @@ def close_up(case: Any, path_ct: Floats, radius: float, blockers: Layer, size: t
     Args:
         path_ct: Shape (2, 3), target and entry.
         radius: mm about the path's ends that must be in the picture.
-        size: Width and height in pixels.
     """
     along = (path_ct[1] - path_ct[0]) / np.linalg.norm(path_ct[1] - path_ct[0])
     side = _across(along)
