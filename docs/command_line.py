@@ -34,8 +34,8 @@ NO = {
     "check": "the candidate, or a row of the list, is rejected",
     "compare": "one of the two paths is rejected",
     "plan": "nothing is safe, the named direction is rejected, or no approach to it was found",
-    "rehearse": "there is no plan; the tip misses the target or the true needle or the arm touches what it must not, in "
-    f"the trial that is executed; with `--seeds`, also if fewer hit or more touch than {LIMITS}",
+    "rehearse": "there is no plan; the tip misses the target or the true needle or the arm touches what it must not, "
+    f"in the trial that is executed; with `--seeds`, also if fewer hit or more touch than {LIMITS}",
     "rehearse --sweep": "the sweep stops before its end",
     "rehearse --guidance A,B": f"by none of the ways the trials keep to what {LIMITS}",
     "markers": "no markers are found, too few, too many, or of several kinds; with `--propose` no places",

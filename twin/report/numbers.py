@@ -24,7 +24,6 @@ from puncture_twin.planning.base.reasons import (
 from puncture_twin.planning.place.mounts import Region, ring_weights
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import body_directions, step_of
-from puncture_twin.twin.report.palette import reason_of
 from puncture_twin.twin.report.present import number
 
 TRUTH_IS_BELIEF = (
@@ -56,7 +55,7 @@ def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
     air = candidates.unseen_air
     for value in np.unique(candidates.verdict.reason):
         here = (candidates.verdict.reason == value) & ~air
-        reason = reason_of(str(value))
+        reason = Reason(str(value))
         text = REASON_TEXT[reason] if reason else candidates.safe_text
         lines.append((text, reason.value or "safe", REASON_COLOURS.get(reason, SAFE), here))
     lines.append((UNSEEN_AIR_TEXT, Reason.UNKNOWN_REGION.value, UNSEEN_AIR, air))

@@ -42,8 +42,7 @@ from puncture_twin.twin.report.scene.film_text import model_note
 from puncture_twin.twin.report.scene.scene_parts import (
     LIFT_MM,
     SceneBody,
-    corridor_mouth,
-    corridor_walls,
+    corridor,
     needle_bodies,
     patient,
 )
@@ -293,7 +292,7 @@ def test_camera_round_trip(rng):
 
 def test_the_corridor_is_where_the_safe_directions_are(case, candidates):
     """Its mouth lies on the skin, has the solid angle of the safe cells, and its walls have a closed rim."""
-    mouth, walls = corridor_mouth(candidates, case), corridor_walls(candidates, case)
+    mouth, walls = corridor(candidates, case)
     radius = np.linalg.norm(mouth.vertices - world.TARGET, axis=1)
     assert np.allclose(radius, world.SKIN_RADIUS + LIFT_MM)
     a, b, c = np.moveaxis(mouth.triangles, 1, 0)
@@ -308,16 +307,16 @@ def test_the_corridor_is_where_the_safe_directions_are(case, candidates):
     _, uses = np.unique(walls.faces[walls.faces != apex], return_counts=True)
     assert (uses % 2 == 0).all()
     nothing = world.make_candidates(case, safe=False)
-    assert corridor_mouth(nothing, case) is None and corridor_walls(nothing, case) is None
+    assert corridor(nothing, case) == []
 
 
 def test_needle_and_holder_end_where_they_should(case):
     """The needle spans tip to shaft, the holder shaft to flange, along the outward direction."""
     outward = np.array([0.0, 0.6, -0.8])
     bodies = needle_bodies(case.needle, world.TARGET, outward)
-    spans = [np.sort((b.mesh.vertices - world.TARGET) @ outward)[[0, -1]] for b in bodies.all]
+    spans = [np.sort((b.mesh.vertices - world.TARGET) @ outward)[[0, -1]] for b in bodies]
     assert np.allclose(spans, [[0, 150], [150, 210]])
-    across = bodies.holder.mesh.vertices - world.TARGET
+    across = bodies[1].mesh.vertices - world.TARGET
     across = across - np.outer(across @ outward, outward)
     assert np.linalg.norm(across, axis=1).max() == pytest.approx(15)
 

@@ -154,13 +154,13 @@ def _bodies(
     bodies = [*patient(anatomy, case), *room(case, T_base_ct), *safe_region(candidates, case)]
     direction = chosen_direction(pick, plan)
     if direction is not None:
-        bodies += needle_bodies(case.needle, case.target_ct, direction).all
+        bodies += needle_bodies(case.needle, case.target_ct, direction)
     bodies += arm_bodies(case, plan, pick, T_base_ct)
     if plan is None or direction is None:
         return bodies, []
     arm = ArmPicture(plan.model, plan.T_base_ct, case.tool)
     tip = case.target_ct + plan.standoff_mm * direction
-    waiting = [*arm.bodies(plan.insertion.q[0]), *needle_bodies(case.needle, tip, direction).all]
+    waiting = [*arm.bodies(plan.insertion.q[0]), *needle_bodies(case.needle, tip, direction)]
     return bodies, [SceneBody(f"{b.name}, standoff", f"{b.group}-standoff", b.mesh, b.colour) for b in waiting]
 
 

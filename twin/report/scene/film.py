@@ -24,7 +24,14 @@ from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface
 from puncture_twin.twin.report.scene.film_text import BELOW, FilmFrames, write_gif, write_mp4
-from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, bar, needle_bodies, patient, room
+from puncture_twin.twin.report.scene.scene_parts import (
+    ArmPicture,
+    SceneBody,
+    bar,
+    needle_bodies,
+    patient,
+    room,
+)
 from puncture_twin.twin.report.scene.views import close_up, overview
 
 MOST_THREADS = 4
@@ -159,7 +166,7 @@ def _moving_picture(bodies: list[SceneBody], camera: ViewCamera, layers: Sequenc
 
 def _planned_path(plan: Any) -> SceneBody:
     """The line that the tip should follow, from standoff to target."""
-    direction = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
+    direction = plan.outward_ct
     line = bar(plan.target_ct, plan.target_ct + plan.standoff_mm * direction, PLANNED_RADIUS_MM)
     return SceneBody("planned path", "safe", line, PLANNED)
 
@@ -168,14 +175,14 @@ def _tool_layer(case: Any, camera: ViewCamera) -> Layer:
     """All that the flange carries, flange frame: the needle points along +z, at least `NEEDLE_PIXELS` wide."""
     tip = np.array([0.0, 0.0, case.needle.length_mm])
     mm_per_pixel = float(camera.project(case.target_ct[None])[0, 2]) / camera.scale
-    bodies = needle_bodies(case.needle, tip, np.array([0.0, 0.0, -1.0]), NEEDLE_PIXELS / 2 * mm_per_pixel).all
+    bodies = needle_bodies(case.needle, tip, np.array([0.0, 0.0, -1.0]), NEEDLE_PIXELS / 2 * mm_per_pixel)
     own = [] if case.tool is None else [Surface(case.tool.mesh, palette.HOLDER)]
     return Layer([*(Surface(b.mesh, b.colour) for b in bodies), *own])
 
 
 def _wide_camera(case: Any, still: list[SceneBody], arm: ArmPicture, rehearsal: Any, plan: Any) -> ViewCamera:
     """The patient fills the picture, seen from the entry's side, with the needle at its standoff."""
-    direction = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
+    direction = plan.outward_ct
     focus = plan.target_ct + np.linspace(0, plan.standoff_mm + case.needle.length_mm, 24)[:, None] * direction
     shown = focus[np.linalg.norm(focus - plan.target_ct, axis=1) < plan.standoff_mm + ABOVE_MM]
     skin = [b.mesh.vertices for b in still if b.group == "skin"]

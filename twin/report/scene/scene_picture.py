@@ -76,7 +76,7 @@ def draw_scene(
     bodies = [*patient(anatomy, case), *safe_region(candidates, case), *room(case, T_base_ct)]
     direction = chosen_direction(pick, plan)
     if direction is not None:
-        bodies.extend(needle_bodies(case.needle, case.target_ct, direction).all)
+        bodies.extend(needle_bodies(case.needle, case.target_ct, direction))
     arm = [] if failed else arm_bodies(case, plan, pick, T_base_ct)
     image = Image.new("RGB", (WIDTH, HEIGHT), annotate.WHITE)
     draw = ImageDraw.Draw(image)
