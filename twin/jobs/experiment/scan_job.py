@@ -25,7 +25,7 @@ from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.strict_json import array, fitting, parse_json
 from puncture_twin.planning.formats.points import write_points
 from puncture_twin.planning.formats.volumes.volume_files import Volume
-from puncture_twin.planning.geometry.rigid import apply, inverse
+from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_markers, read_lesion
 from puncture_twin.twin.guidance.ct.needle import find_needle, needle_error
@@ -273,7 +273,8 @@ def _draw(run: ScanRun, path: Path) -> Path:
     if run.markers is not None:
         fine = run.markers.fine
         marks += [Mark(name, point, "as it was read") for name, point in zip(fine.names, fine.points, strict=True)]
-    T, hu = inverse(run.image.grid.T_ct_index), run.image.hu.astype(np.float32)
+    T = np.asarray(np.linalg.inv(run.image.grid.T_ct_index), dtype=np.float64)
+    hu = run.image.hu.astype(np.float32)
     skin = run.context.anatomy.skin.mesh.transformed(run.scene.T_scan_ct)
     return write_points_sheet(
         path, f"{run.context.case.name}, simulated", marks, partial(nearest, hu, T), skin, HALF_MM
