@@ -368,8 +368,8 @@ def touch(
     """Plan the marker touches and execute them in the twin, or read a UR's. Writes touch.csv. Exit 1 on too few."""
     if host is not None:
         from puncture_twin.planning.case.case import load_case
-        from puncture_twin.twin.jobs.robot import led_touches
-        from puncture_twin.twin.jobs.robot.rtde import LedArm, connect
+        from puncture_twin.twin.jobs.live import led_touches
+        from puncture_twin.twin.jobs.live.rtde import LedArm, connect
 
         led_touches.refuse_of_twin(choice, seed)
         told, arm = load_case(case), LedArm(connect(host, "touch --host"))
@@ -462,7 +462,7 @@ def mirror(
     """Show a running arm's needle in the CT. Prints tip and distance to the target; only reads the robot."""
     from puncture_twin.planning.base.provenance import inputs_document
     from puncture_twin.planning.case.case import load_case
-    from puncture_twin.twin.jobs.robot.mirror import Mirror, mirror_text, readings_of
+    from puncture_twin.twin.jobs.live.mirror import Mirror, mirror_text, readings_of
     from puncture_twin.twin.jobs.terminal import ended_by_ctrl_c
 
     followed = load_case(case)
@@ -605,7 +605,7 @@ def _hand_eye(
 ) -> None:
     """Find where a camera is on the flange, from pairs of poses: AX = ZB or AX = XB. It only reports."""
     from puncture_twin.planning.registration.hand_eye import calibrate_hand_eye, read_pose_pairs
-    from puncture_twin.twin.jobs.robot.calibrate_job import hand_eye_summary, hand_eye_text, parse_noise
+    from puncture_twin.twin.jobs.patient.answers import hand_eye_summary, hand_eye_text, parse_noise
 
     pairs = read_pose_pairs(recording, motions=motions)
     found = calibrate_hand_eye(pairs, parse_noise(noise))

@@ -5,7 +5,6 @@ from pathlib import Path
 import typer
 
 from puncture_twin.run_twin import app
-from puncture_twin.twin.jobs.exit_codes import RULES
 
 HEAD = """# Command line
 
@@ -24,6 +23,43 @@ options from its next start on (1 from any other); `--show-completion` prints th
 
 *Written by `python docs/command_line.py` from the help of each command (`run-twin COMMAND --help`).*
 """
+
+LIMITS = "`search.min_hit`, `max_touch`, `max_touch_of` allow"
+NO = {
+    "demo": "as `rehearse`",
+    "schema": "never: it only reports",
+    "init": "never: a case is written, or refused",
+    "search": "no direction is safe",
+    "verify": "never: a cell without proof, or a damaged certificate, is refused",
+    "check": "the candidate, or a row of the list, is rejected",
+    "compare": "one of the two paths is rejected",
+    "plan": "nothing is safe, the named direction is rejected, or no approach to it was found",
+    "rehearse": "there is no plan; the tip misses the target or the true needle or the arm touches what it must not, "
+    f"in the trial that is executed; with `--seeds`, also if fewer hit or more touch than {LIMITS}",
+    "rehearse --sweep": "the sweep stops before its end",
+    "rehearse --guidance A,B": f"by none of the ways the trials keep to what {LIMITS}",
+    "markers": "no markers are found, too few, too many, or of several kinds; with `--propose` no places",
+    "touch": "too few markers were touched for a registration",
+    "pivot": "the touches contradict each other",
+    "place": "no direction is safe for the organs, or no placement reaches one",
+    "mirror": "never: it only reports",
+    "live": "never: it answers until Ctrl-C (130)",
+    "export": "there is no plan to write, or the case now rejects it",
+    "register": "never: markers that contradict each other are refused",
+    "selfcal": "never: a recording that does not determine the calibration is refused",
+    "calibrate hand-eye": "never: poses that do not determine the calibration, or contradict it, are refused",
+    "servo": "a servo did not converge",
+    "scan": "never: it only reports",
+    "confirm": "the line is not safe, or the needle had better be moved",
+    "confirm --learn": "never: it only reports",
+    "reproduce": "one of the paper's numbers is outside its limits",
+    "batch plan": "never: it only reports",
+    "batch run": "a case of the part has no verdict (3 if the program failed on one)",
+    "batch status": "never: it only reports",
+    "batch merge": "a case has no row, or differs from `--expect`",
+    "batch compare": "never: it only reports",
+}
+"""Where a command that is done has the answer no (`twin.jobs.exit_codes.RULES`), or finds nothing to answer with."""
 
 
 def option_row(parameter):
@@ -49,7 +85,7 @@ def commands(group, before=""):
 def main() -> None:
     """Write the page."""
     lines = [HEAD, "| command | exit code 1, the answer is no, where |", "|---|---|"]
-    lines += [*(f"| `{name}` | {rule.no} |" for name, rule in RULES.items()), ""]
+    lines += [*(f"| `{name}` | {no} |" for name, no in NO.items()), ""]
     for name, command in commands(typer.main.get_command(app)):
         lines += [f"## `{name}`", command.help, "", "| | | default |", "|---|---|---|"]
         lines += [*(option_row(one) for one in command.params), ""]

@@ -27,7 +27,7 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
-from puncture_twin.twin.jobs.robot.mirror import RecordedJoints
+from puncture_twin.twin.jobs.live.mirror import RecordedJoints
 from puncture_twin.twin.pictures import read_frames
 
 

@@ -26,7 +26,7 @@ from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.registration.fit_uncertainty import touches
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.twin.jobs.robot import led_touches, mirror, rtde
+from puncture_twin.twin.jobs.live import led_touches, mirror, rtde
 
 ABDOMEN = folder() / "abdomen"
 
@@ -257,7 +257,7 @@ def test_one_arm_at_a_time(capsys):
 
 def test_only_the_receiving_half_is_ever_named():
     """The library's controlling half stands nowhere in what reads a robot."""
-    files = [*(folder().parent / "twin" / "jobs" / "robot").glob("*.py")]
+    files = [*(folder().parent / "twin" / "jobs" / "live").glob("*.py")]
     text = "".join(one.read_text() for one in files)
     assert "rtde_receive" in text and not any(word in text for word in ("rtde_control", "rtde_io", "RTDEControl"))
 

@@ -26,7 +26,7 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import BAD_INPUT
-from puncture_twin.twin.jobs.robot.mirror import Mirror
+from puncture_twin.twin.jobs.live.mirror import Mirror
 
 TABLE = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 150.0, 0.0]\nsize_mm = [600.0, 40.0, 1200.0]\n'
 LOPSIDED = np.array([15.0, 30.0, 40.0])

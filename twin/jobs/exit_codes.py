@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from enum import Enum
 from types import MappingProxyType
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import typer
 
@@ -38,72 +38,26 @@ OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 1
 """The last two as the shell gives them for a program that Ctrl-C, or a closed pipe, has ended."""
 
 
-class Rule(NamedTuple):
-    """When a command that is done has the answer no.
-
-    Attributes:
-        no: Where, in words; also where it finds nothing to answer with (`NoAnswerError`).
-        code: The exit code of what it found.
-    """
-
-    no: str
-    code: Callable[[Any], int] = lambda _: OK
-
-
-def _unless(yes: Callable[[Any], bool]) -> Callable[[Any], int]:
-    return lambda found: OK if yes(found) else ANSWER_IS_NO
-
-
-def _code_of_batch(counts: Any) -> int:
-    failed = counts.ended[PROGRAM_FAILED] > 0
-    return OK if counts.whole else PROGRAM_FAILED if failed else ANSWER_IS_NO
-
-
-NEVER = "never: it only reports"
-REHEARSED = (
-    "the tip misses the target or the true needle or the arm touches what it must not, in the trial that is executed; "
-    "with `--seeds`, also if fewer hit or more touch than `search.min_hit`, `max_touch`, `max_touch_of` allow"
-)
-
-RULES: Mapping[str, Rule] = MappingProxyType(
+RULES: Mapping[str, Callable[[Any], bool]] = MappingProxyType(
     {
-        "demo": Rule("as `rehearse`", _unless(lambda run: not run.failures)),
-        "schema": Rule(NEVER),
-        "init": Rule("never: a case is written, or refused"),
-        "search": Rule("no direction is safe", _unless(lambda run: run.candidates.safe.any())),
-        "verify": Rule("never: a cell without proof, or a damaged certificate, is refused"),
-        "check": Rule("the candidate, or a row of the list, is rejected", _unless(lambda found: found.safe)),
-        "compare": Rule("one of the two paths is rejected", _unless(lambda found: found.safe)),
-        "plan": Rule("nothing is safe, the named direction is rejected, or no approach to it was found"),
-        "rehearse": Rule(f"there is no plan; {REHEARSED}", _unless(lambda run: not run.failures)),
-        "rehearse --sweep": Rule("the sweep stops before its end", _unless(lambda run: run.whole)),
-        "rehearse --guidance A,B": Rule(
-            "by none of the ways the trials keep to what `search.min_hit`, `max_touch`, `max_touch_of` allow",
-            _unless(lambda found: found.passed),
-        ),
-        "markers": Rule("no markers are found, too few, too many, or of several kinds; with `--propose` no places"),
-        "touch": Rule("too few markers were touched for a registration", _unless(lambda run: run.suffices)),
-        "pivot": Rule("the touches contradict each other", _unless(lambda found: not found.pivot.large)),
-        "place": Rule("no direction is safe for the organs, or no placement reaches one"),
-        "mirror": Rule(NEVER),
-        "live": Rule("never: it answers until Ctrl-C (130)"),
-        "export": Rule("there is no plan to write, or the case now rejects it"),
-        "register": Rule("never: markers that contradict each other are refused"),
-        "selfcal": Rule("never: a recording that does not determine the calibration is refused"),
-        "calibrate hand-eye": Rule("never: poses that do not determine the calibration, or contradict it, are refused"),
-        "servo": Rule("a servo did not converge", _unless(lambda job: job.passed)),
-        "scan": Rule(NEVER),
-        "confirm": Rule("the line is not safe, or the needle had better be moved", _unless(lambda done: done.yes)),
-        "confirm --learn": Rule(NEVER),
-        "reproduce": Rule("one of the paper's numbers is outside its limits", _unless(lambda result: result.passed)),
-        "batch plan": Rule(NEVER),
-        "batch run": Rule("a case of the part has no verdict (3 if the program failed on one)", _code_of_batch),
-        "batch status": Rule(NEVER),
-        "batch merge": Rule("a case has no row, or differs from `--expect`", _unless(lambda found: found.as_expected)),
-        "batch compare": Rule(NEVER),
+        "demo": lambda run: not run.failures,
+        "search": lambda run: bool(run.candidates.safe.any()),
+        "check": lambda found: found.safe,
+        "compare": lambda found: found.safe,
+        "rehearse": lambda run: not run.failures,
+        "rehearse --sweep": lambda run: run.whole,
+        "rehearse --guidance A,B": lambda found: found.passed,
+        "touch": lambda run: run.suffices,
+        "pivot": lambda found: not found.pivot.large,
+        "servo": lambda job: job.passed,
+        "confirm": lambda done: done.yes,
+        "reproduce": lambda result: result.passed,
+        "batch run": lambda counts: counts.whole,
+        "batch merge": lambda found: found.as_expected,
     }
 )
-"""One for each command, by its name; a test holds them beside the command line."""
+"""Whether what a command found is the answer yes, by its name; the others have no other. In words, where it is no:
+``docs/reference/command-line.md``."""
 
 
 def finish(command: str, found: Any, summary: dict[str, Any], text: str, as_json: bool) -> None:
@@ -113,8 +67,9 @@ def finish(command: str, found: Any, summary: dict[str, Any], text: str, as_json
         typer.Exit: The code is not 0.
     """
     print_answer(summary, text, as_json)
-    if code := RULES[command].code(found):
-        raise typer.Exit(code)
+    if command in RULES and not RULES[command](found):
+        failed = command == "batch run" and found.ended[PROGRAM_FAILED] > 0
+        raise typer.Exit(PROGRAM_FAILED if failed else ANSWER_IS_NO)
 
 
 PrintLine = Callable[[str], None]

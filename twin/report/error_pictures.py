@@ -40,7 +40,6 @@ def draw_budget(facts: Mapping[str, Any], path: Path) -> None:
 
     Args:
         facts: As ``register --json`` has them under ``budget``.
-        path: The PNG to write; it appears whole or not at all.
     """
     write_png(_budget(facts), path)
 
@@ -131,11 +130,7 @@ def needle_frame(outward_ct: Floats) -> Floats:
 
 
 def draw_rooms_picture(found: Any, path: Path) -> None:
-    """Write the picture.
-
-    Args:
-        path: The PNG to write; it appears whole or not at all.
-    """
+    """Write the picture."""
     R = needle_frame(found.puncture.outward_ct)
     error, cov = found.error_ct @ R.T, R @ found.cov_ct @ R.T
     figure = Figure(figsize=FIGURE_INCHES, dpi=DISTRIBUTION_DPI, facecolor="white")
@@ -192,7 +187,6 @@ def draw_clouds(
     Args:
         ways: The trials of each, a word beside its name, and its colour.
         outward_ct: Shape (3,), unit, from the target along the needle.
-        path: The PNG to write; it appears whole or not at all.
         hit_mm: Radius of a hit, drawn as a ring.
         columns: Clouds beside each other; two can still be read on a telephone.
     """

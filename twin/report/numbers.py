@@ -24,7 +24,6 @@ from puncture_twin.planning.base.reasons import (
 from puncture_twin.planning.place.mounts import Region, ring_weights
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import body_directions, step_of
-from puncture_twin.twin.report.palette import reason_of
 from puncture_twin.twin.report.present import number
 
 TRUTH_IS_BELIEF = (
@@ -39,7 +38,6 @@ class ReasonCount:
 
     Attributes:
         code: The reason's code, "safe" for safe.
-        fraction: Of the grid's directions, 0..1.
         solid_angle: Of the searched solid angle, 0..1; the grid is denser near θ = 0, this is not.
     """
 
@@ -47,7 +45,6 @@ class ReasonCount:
     code: str
     colour: Rgb
     count: int
-    fraction: float
     solid_angle: float
 
 
@@ -58,17 +55,17 @@ def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
     air = candidates.unseen_air
     for value in np.unique(candidates.verdict.reason):
         here = (candidates.verdict.reason == value) & ~air
-        reason = reason_of(str(value))
+        reason = Reason(str(value))
         text = REASON_TEXT[reason] if reason else candidates.safe_text
         lines.append((text, reason.value or "safe", REASON_COLOURS.get(reason, SAFE), here))
     lines.append((UNSEEN_AIR_TEXT, Reason.UNKNOWN_REGION.value, UNSEEN_AIR, air))
     counts = [
-        ReasonCount(text, code, colour, int(here.sum()), float(here.mean()), float(weights[here].sum() / weights.sum()))
+        ReasonCount(text, code, colour, int(here.sum()), float(weights[here].sum() / weights.sum()))
         for text, code, colour, here in lines
         if here.any()
     ]
     if not candidates.safe.any():
-        counts.append(ReasonCount(candidates.safe_text, "safe", SAFE, 0, 0.0, 0.0))
+        counts.append(ReasonCount(candidates.safe_text, "safe", SAFE, 0, 0.0))
     return tuple(sorted(counts, key=lambda line: (line.code != "safe", -line.count)))
 
 

@@ -7,7 +7,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.reasons import Reason, Rgb
+from puncture_twin.planning.base.reasons import Rgb
 
 PNG_LEVEL = 3
 """How hard pictures are packed: a tenth larger than at Pillow's own 6, in half the time."""
@@ -44,72 +44,39 @@ LESION, ARTERY, VEIN, PORTAL = (255, 215, 6), (178, 54, 10), (0, 140, 226), (125
 NERVE, BILE, URINE, BONE, MUSCLE = (255, 255, 160), (157, 154, 103), (230, 190, 230), (244, 229, 192), (131, 105, 100)
 CARTILAGE, HEART = (188, 206, 186), (185, 39, 82)
 
-CUSTOM_COLOURS: tuple[tuple[str, Rgb], ...] = (
-    ("lesion", LESION),
-    ("tumor", LESION),
-    ("tumour", LESION),
-    ("metasta", LESION),
-    ("cyst", (205, 205, 100)),
-    ("pulmonary_vein", ARTERY),
-    ("pulmonary_artery", VEIN),
-    ("portal", PORTAL),
-    ("aorta", ARTERY),
-    ("arter", ARTERY),
-    ("carotid", ARTERY),
-    ("brachiocephalic_trunk", ARTERY),
-    ("vena", VEIN),
-    ("vein", VEIN),
-    ("cava", VEIN),
-    ("jugular", VEIN),
-    ("hepatic_v", VEIN),
-    ("vessel", PORTAL),
-    ("muscle", MUSCLE),
-    ("gluteus", MUSCLE),
-    ("autochthon", MUSCLE),
-    ("iliopsoas", MUSCLE),
-    ("psoas", MUSCLE),
-    ("trapezius", MUSCLE),
-    ("quadriceps", MUSCLE),
-    ("ureter", URINE),
-    ("cartilage", CARTILAGE),
-    ("costal", CARTILAGE),
-    ("spinal_cord", NERVE),
-    ("nerve", NERVE),
-    ("vertebra", BONE),
-    ("spine", BONE),
-    ("sacrum", BONE),
-    ("rib", BONE),
-    ("sternum", BONE),
-    ("skull", BONE),
-    ("hip", BONE),
-    ("femur", BONE),
-    ("humerus", BONE),
-    ("scapula", BONE),
-    ("clavicula", BONE),
-    ("clavicle", BONE),
-    ("bone", BONE),
-    ("brain", (251, 222, 212)),
-    ("bile", BILE),
-    ("gallbladder", BILE),
-    ("liver", (224, 124, 72)),
-    ("adrenal", (255, 118, 114)),
-    ("kidney", (177, 110, 102)),
-    ("spleen", (150, 91, 122)),
-    ("esophagus", (179, 142, 161)),
-    ("oesophagus", (179, 142, 161)),
-    ("stomach", (240, 147, 165)),
-    ("duodenum", (251, 222, 212)),
-    ("colon", (152, 122, 68)),
-    ("bowel", (179, 159, 135)),
-    ("pancreas", (243, 168, 87)),
-    ("bladder", URINE),
-    ("prostate", (225, 95, 150)),
-    ("trachea", (222, 240, 255)),
-    ("lung", (187, 194, 215)),
-    ("heart", HEART),
-    ("atri", HEART),
+CUSTOM_COLOURS: tuple[tuple[Rgb, str], ...] = (
+    (LESION, "lesion tumor tumour metasta"),
+    ((205, 205, 100), "cyst"),
+    (ARTERY, "pulmonary_vein"),
+    (VEIN, "pulmonary_artery"),
+    (PORTAL, "portal"),
+    (ARTERY, "aorta arter carotid brachiocephalic_trunk"),
+    (VEIN, "vena vein cava jugular hepatic_v"),
+    (PORTAL, "vessel"),
+    (MUSCLE, "muscle gluteus autochthon iliopsoas psoas trapezius quadriceps"),
+    (URINE, "ureter"),
+    (CARTILAGE, "cartilage costal"),
+    (NERVE, "spinal_cord nerve"),
+    (BONE, "vertebra spine sacrum rib sternum skull hip femur humerus scapula clavicula clavicle bone"),
+    ((251, 222, 212), "brain"),
+    (BILE, "bile gallbladder"),
+    ((224, 124, 72), "liver"),
+    ((255, 118, 114), "adrenal"),
+    ((177, 110, 102), "kidney"),
+    ((150, 91, 122), "spleen"),
+    ((179, 142, 161), "esophagus oesophagus"),
+    ((240, 147, 165), "stomach"),
+    ((251, 222, 212), "duodenum"),
+    ((152, 122, 68), "colon"),
+    ((179, 159, 135), "bowel"),
+    ((243, 168, 87), "pancreas"),
+    (URINE, "bladder"),
+    ((225, 95, 150), "prostate"),
+    ((222, 240, 255), "trachea"),
+    ((187, 194, 215), "lung"),
+    (HEART, "heart atri"),
 )
-"""Part of a structure's name, colour; the first match counts.
+"""Colour, parts of structures' names; the first match counts.
 
 Near the field's habits (arteries red, veins blue, bone ivory, bile olive), but as far apart as so many can be: the
 colours that atlases give to organs are a dozen browns, in which a vessel is lost in the liver. Found by annealing over
@@ -122,18 +89,13 @@ SIDES = re.compile(r"(^|[_ ])(right|left|r|l)(?=[_ ]|$)")
 """Of a structure's name: both sides look alike."""
 
 
-def reason_of(value: str) -> Reason:
-    """The reason behind a value of ``Candidates.verdict.reason``."""
-    return Reason(value)
-
-
 def organ_colours(names: tuple[str, ...]) -> dict[str, Rgb]:
     """One colour for each structure name; by custom where there is one, else by turn."""
     colours: dict[str, Rgb] = {}
     spare: dict[str, Rgb] = {}
     for name in names:
         plain = name.lower().replace(" ", "_")
-        custom = next((colour for part, colour in CUSTOM_COLOURS if part in plain), None)
+        custom = next((colour for colour, parts in CUSTOM_COLOURS if any(one in plain for one in parts.split())), None)
         if custom is None:
             custom = spare.setdefault(SIDES.sub("", plain), ORGAN_COLOURS[len(spare) % len(ORGAN_COLOURS)])
         colours[name] = custom

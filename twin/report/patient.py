@@ -145,11 +145,9 @@ def plan(
     """The plan's numbers, or why there is none, and how its path, or that of the best direction, is found.
 
     Args:
-        plan: The plan, or None.
         at_patient: Names and values for whoever stands at the patient.
         refusal: Why there is no plan although one was requested; "" where none was.
         declared: Whether the case declares the arm's errors, which a plan's expected error then counts.
-        notes: What else must be known of it, one sentence each.
     """
     if plan is None:
         best = facts(at_patient)

@@ -101,7 +101,7 @@ def test_no_other_reason_looks_safe(reason):
 
 def test_no_structure_is_green_as_safe_is():
     """To every reader: what is green in the scene is where a needle may go."""
-    for colour in (*ORGAN_COLOURS, *(colour for _, colour in CUSTOM_COLOURS)):
+    for colour in (*ORGAN_COLOURS, *(colour for colour, _ in CUSTOM_COLOURS)):
         for shade in (SAFE, SAFE_HIGH):
             lab = (rgb2lab(np.array(one) / 255) for one in (colour, shade))
             assert float(deltaE_ciede2000(*lab)) > 15, colour

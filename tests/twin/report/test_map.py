@@ -22,7 +22,7 @@ from puncture_twin.twin.report.map.map_raster import (
     shown_front,
 )
 from puncture_twin.twin.report.map_view import map_view
-from puncture_twin.twin.report.numbers import ReasonCount, reason_counts
+from puncture_twin.twin.report.numbers import reason_counts
 from puncture_twin.twin.report.page.page_map import map_data
 
 
@@ -157,24 +157,6 @@ def test_a_needle_through_a_structure_crosses_it(case, candidates):
     assert reason_text(replace(through, verdict=amounts[0.0]), row).endswith(
         " with 0.00 mm clearance where 1 mm is demanded"
     )
-
-
-def test_a_legends_text_ends_before_its_number(monkeypatch, case, candidates):
-    """A long name ran into 27,164: whatever the words and the count, there is white between them."""
-    monkeypatch.setattr("puncture_twin.twin.report.map.map_picture.reason_counts", lambda _: LONG_LEGEND)
-    drawn = map_figure(candidates, case).findobj(Text)
-    for entry in LONG_LEGEND:
-        number = next(text for text in drawn if text.get_text() == f"{entry.count:,}")
-        words = next(text for text in drawn if text.get_text().replace("\n", " ") == entry.text)
-        assert words.get_position()[1] == number.get_position()[1]
-        assert words.get_window_extent().x1 + 5 < number.get_window_extent().x0
-
-
-LONG_LEGEND = (
-    ReasonCount("safe for the organs", "safe", (0, 158, 115), 27_164, 0.8, 0.8),
-    ReasonCount("may bend into a structure's margin", "needle_bends", (170, 68, 153), 1_234_567, 0.1, 0.1),
-    ReasonCount("unknown region (image ends, or not named)", "unknown_region", (110, 110, 110), 8, 0.1, 0.1),
-)
 
 
 def test_the_greys_of_what_is_not_known_are_told_apart(case, candidates):

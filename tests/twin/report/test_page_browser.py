@@ -11,8 +11,7 @@ from page_browser import PATIENCE_MS, chromium, opened, row_of
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.slices.panel import TONES
 
-SCENE = "#scene[role=group]"
-"""Within it plotly has a part of the same name."""
+SCENE = "#scene3d"
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +52,7 @@ def page(browser, path):
 @pytest.fixture
 def scene(page):
     """The page, whose scene is drawn."""
-    if page.evaluate("document.getElementById('scene').hidden"):
+    if page.evaluate("document.getElementById('scene3d').hidden"):
         pytest.skip("this browser has no WebGL")
     page.locator(SCENE).scroll_into_view_if_needed()  # what nobody sees is not drawn
     page.wait_for_selector(f"{SCENE} canvas >> nth=0")
@@ -139,18 +138,18 @@ def test_the_focus_is_visible(page):
 
 def test_the_scene_is_drawn_and_answers_the_map(scene, case, candidates):
     """The scene holds its meshes; a click on the map draws that direction; the buttons change the arm's pose."""
-    names = scene.evaluate("document.getElementById('scene').data.map(t => t.name)")
+    names = scene.evaluate("document.getElementById('scene3d').data.map(t => t.name)")
     assert {"liver", "aorta", "skin", "target", "safe region", "needle", "arm"} <= set(names)
     end = world.TARGET + 210 * candidates.outward_ct[row_of(candidates, 30, 200)]
     point_at(scene, case, candidates, 30, 200, click=True)
     scene.locator(SCENE).scroll_into_view_if_needed()
-    last = "document.getElementById('scene').data.at(-1)"
+    last = "document.getElementById('scene3d').data.at(-1)"
     scene.wait_for_function(f"{last}.x.length === 2 && Math.abs({last}.x[1] - {end[0]}) < 0.01")  # not the line before
     line = np.array(scene.evaluate(f"[{last}.x, {last}.y, {last}.z]")).T
     assert np.allclose(line[0], world.TARGET)
     assert np.allclose(line[1], end, atol=0.01)
     visible = (
-        "document.getElementById('scene').data.filter(t => t.meta && t.meta.pose === '{}' && (!{} || t.meta.arm))"
+        "document.getElementById('scene3d').data.filter(t => t.meta && t.meta.pose === '{}' && (!{} || t.meta.arm))"
         ".every(t => t.visible === {})"
     )
     scene.wait_for_function(visible.format("target", "true", "false"))  # the arm is hidden at first
@@ -163,7 +162,7 @@ def test_the_scene_is_true_to_scale(scene):
     """A millimetre is as long along every axis, whatever is hidden; of itself plotly scales by what is shown."""
     for pose in ("none", "target"):
         scene.locator(f"#pose-{pose}").click()
-        layout = "document.getElementById('scene')._fullLayout.scene"
+        layout = "document.getElementById('scene3d')._fullLayout.scene"
         ratio, *ranges = scene.evaluate(
             f"(() => {{ const at = {layout}; const {{ x, y, z }} = at.aspectratio;"
             " return [[x, y, z], at.xaxis.range, at.yaxis.range, at.zaxis.range].map(one => [...one]); })()"
@@ -178,7 +177,7 @@ def test_views_look_where_they_say(scene, case, candidates):
     along = candidates.outward_ct[row_of(candidates, 30, 200)]
     for view, expected in (("along", along), ("axial", [0, 0, -1]), ("coronal", [0, -1, 0])):
         scene.locator(f"[data-view={view}]").click()
-        camera = scene.evaluate("document.getElementById('scene').layout.scene.camera")
+        camera = scene.evaluate("document.getElementById('scene3d').layout.scene.camera")
         eye, centre = (np.array([camera[key][axis] for axis in "xyz"]) for key in ("eye", "center"))
         assert np.allclose((eye - centre) / np.linalg.norm(eye - centre), expected, atol=1e-3), view
 

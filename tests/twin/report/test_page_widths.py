@@ -126,7 +126,7 @@ COLOURS = """() => {
         return (colour[3] ?? 1) === 1 ? colour : groundOf(one.parentElement);
     };
     for (const one of document.querySelectorAll("body *")) {
-        if (one.closest("svg, #scene, .slice, script, [hidden]") || !one.getClientRects().length) continue;
+        if (one.closest("svg, #scene3d, .slice, script, [hidden]") || !one.getClientRects().length) continue;
         const style = getComputedStyle(one), name = `${one.tagName} ${one.textContent.slice(0, 30)}`;
         if ([...one.childNodes].some((node) => node.nodeType === 3 && node.data.trim()))
             shown.push([name, 4.5, channels(style.color), groundOf(one)]);
@@ -378,7 +378,7 @@ def test_the_arm_follows_what_is_chosen(browser, tmp_path):
     before = [unpacked(one) for one in drawn_first if one.get("meta", {}).get("frame")]
     with opened(browser, path.as_uri(), 1000) as page:
         drawn(page)
-        if page.evaluate("document.getElementById('scene').hidden"):
+        if page.evaluate("document.getElementById('scene3d').hidden"):
             pytest.skip("this browser has no WebGL")
         follow_rows(page, found, before, case.robot.model, (q, first.row, T_base_ct))
 
@@ -386,8 +386,8 @@ def test_the_arm_follows_what_is_chosen(browser, tmp_path):
 def follow_rows(page, found, before, model, arm):
     """Choose rows by the slider and compare every link."""
     q, first, T_base_ct = arm
-    page.evaluate("document.getElementById('scene').scrollIntoView()")
-    links = "document.getElementById('scene').data.filter(t => t.meta && t.meta.frame)"
+    page.evaluate("document.getElementById('scene3d').scrollIntoView()")
+    links = "document.getElementById('scene3d').data.filter(t => t.meta && t.meta.frame)"
     places = f"JSON.stringify({links}.map(t => ['x', 'y', 'z'].map(a => [...t[a]].filter((_, k) => k % 50 === 0))))"
     frames = page.evaluate(f"{links}.map(t => t.meta.frame)")
     assert {1, 2, 3, 4, 5, 6} <= set(frames)
@@ -396,7 +396,7 @@ def follow_rows(page, found, before, model, arm):
         page.evaluate(choose + "document.getElementById('theta').dispatchEvent(new Event('input'))")
         row = row_of(found, theta, beta)
         end = world.TARGET + 210 * found.outward_ct[row]
-        last = "document.getElementById('scene').data.at(-1)"
+        last = "document.getElementById('scene3d').data.at(-1)"
         page.wait_for_function(f"{last}.x.length === 2 && Math.abs({last}.x[1] - {end[0]}) < 0.01")
         moves = [np.linalg.inv(T_base_ct) @ link_poses(model, one) for one in (q[first], q[row])]
         for mine, frame, points in zip(json.loads(page.evaluate(places)), frames, before, strict=True):

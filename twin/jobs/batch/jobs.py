@@ -130,7 +130,6 @@ class Where:
     Attributes:
         part: As it was typed, or None.
         scheduler: Address of a Dask scheduler, or None for processes of this machine.
-        pages: Whether each case gets its page.
     """
 
     part: str | None
@@ -255,7 +254,6 @@ def merge_cohort(out: Path, expect: Path | None, tolerance_mm: float, watcher: W
     """Write ``cases.parquet``, the dataset of candidates and the page.
 
     Args:
-        expect: An earlier ``cases.parquet``, or the folder of one, against which the verdicts are held.
         tolerance_mm: By so much a best clearance may differ from it.
 
     Raises:

@@ -167,11 +167,7 @@ CASE = (
 
 
 def write_cohort_page(name: str, rows: Sequence[Row], inputs: Sequence[Input], path: Path) -> None:
-    """Write the page: failures first, then distributions, then a sortable table.
-
-    Args:
-        path: The HTML to write; it appears whole or not at all.
-    """
+    """Write the page: failures first, then distributions, then a sortable table."""
     charts = tuple(histogram(found, said) for column, said in DISTRIBUTIONS if (found := _values(rows, column)))
     shown = [
         Section("failures", [REFUSED, _failures(rows)]),
@@ -228,11 +224,7 @@ WIDTH, HEIGHT, SHARP = 460, 220, 2
 
 
 def histogram(values: Sequence[float], text: str) -> Markup:
-    """A picture of the count of cases over a number.
-
-    Args:
-        text: What it is, with its unit.
-    """
+    """A picture of the count of cases over a number."""
     from matplotlib.ticker import MaxNLocator  # here: a cohort is searched without it
 
     from puncture_twin.twin.report.figures import PIXEL_DPI, figure_of, png

@@ -26,7 +26,7 @@ from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
 from puncture_twin.planning.search.windows import Window, nearest_row
 from puncture_twin.twin.jobs.patient.main_job import is_plan, read_noted_plan
-from puncture_twin.twin.jobs.patient.summaries import plan_summary
+from puncture_twin.twin.jobs.patient.run import plan_summary
 from puncture_twin.twin.report.present import NOTHING, Block, Field, Section, Table, facts, number, text
 
 SAME_DIRECTION = 1e-9
@@ -220,11 +220,9 @@ class Side:
     """One of two paths.
 
     Attributes:
-        outward_ct: Shape (3,), unit.
         entry_ct: Shape (3,), mm; NaN without a skin entry.
         explained: Checked against its case; None of a plan alone.
         grid: What the search of its case says; None without one.
-        plan: The plan, where it is one.
     """
 
     title: str

@@ -6,9 +6,10 @@ A list of entries, or of targets, checked row by row: one row out for each row i
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,8 +89,11 @@ CSV, PARQUET = "checked.csv", "checked.parquet"
 REFUSED = "refused"
 """The verdict of a row that could not be checked: neither safe nor rejected."""
 
-TEXTS = frozenset({"name", "verdict", "reason", "reason_structure", "detail", "on_the_skin", "nearest"})
-WHOLE = frozenset({"row", "safe_directions", "windows"})
+TYPES: Mapping[str, str] = MappingProxyType(
+    {"row": "int64", "reachable": "bool", "safe_directions": "int64", "windows": "int64"}
+    | dict.fromkeys(("name", "verdict", "reason", "reason_structure", "detail", "on_the_skin", "nearest"), "string")
+)
+"""Of the columns that are no numbers with a fraction."""
 COLUMNS = (
     *("row", "name", "x_mm", "y_mm", "z_mm", "verdict", "reason", "reason_structure", "detail"),
     *("theta_deg", "beta_deg", "entry_x_mm", "entry_y_mm", "entry_z_mm", "on_the_skin"),
@@ -104,8 +108,6 @@ class Outcome(NamedTuple):
 
     Attributes:
         explained: None of a row that was refused, or for whose target nothing is safe.
-        verdict: ``safe``, ``rejected``, or `REFUSED`.
-        detail: Why it has no explanation.
         safe_directions: Of a target's search; None of an entry.
     """
 
@@ -205,9 +207,10 @@ def write_checked(checked: CheckedList, context: CaseContext, out: Path) -> Chec
         rows = [[row[name] for name in COLUMNS] for row in checked.rows]
         paths[0].write_text(csv_text(COLUMNS, rows), encoding="utf-8", newline="")
         run = {**context.provenance(), "inputs": inputs_document(checked.inputs)}
-        table = pa.table({name: pa.array([row[name] for row in checked.rows], _kind(name)) for name in COLUMNS})
+        schema = pa.schema([(name, TYPES.get(name, "float64")) for name in COLUMNS])
+        table = pa.Table.from_pylist(list(checked.rows), schema)
         pq.write_table(table.replace_schema_metadata({"run": json.dumps(run, sort_keys=True)}), paths[1])
-    return CheckedList(**{**vars(checked), "files": draft.final(paths)})
+    return replace(checked, files=draft.final(paths))
 
 
 def _checked(context: CaseContext, listed: ReadList, outcome: Callable[[Listed], Outcome]) -> CheckedList:
@@ -225,8 +228,7 @@ def _checked(context: CaseContext, listed: ReadList, outcome: Callable[[Listed],
 
 
 def _document(context: CaseContext, row: Listed, found: Outcome) -> dict[str, Any]:
-    blank: dict[str, Any] = dict.fromkeys(COLUMNS)
-    blank |= dict.fromkeys(TEXTS, "")
+    blank: dict[str, Any] = {name: "" if TYPES.get(name) == "string" else None for name in COLUMNS}
     point = {} if row.point_mm is None else dict(zip(("x_mm", "y_mm", "z_mm"), row.point_mm, strict=True))
     stated = {"row": row.number, "name": row.name, "verdict": found.verdict, "detail": found.detail}
     counts = {"safe_directions": found.safe_directions, "windows": found.windows}
@@ -253,14 +255,6 @@ def _explained(explained: Explanation) -> dict[str, Any]:
         "p_hit": None if breakdown is None else breakdown.p_hit,
         "p_touch_any": None if breakdown is None else breakdown.p_touch_any,
     }
-
-
-def _kind(name: str) -> str:
-    if name in TEXTS:
-        return "string"
-    if name == "reachable":
-        return "bool"
-    return "int64" if name in WHOLE else "float64"
 
 
 FIELDS = (

@@ -203,7 +203,6 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
 
     Args:
         context: Of a case with declared errors and an arm.
-        poses: How many, 4 to 12.
         place_base: Shape (3,), mm, where; None for a place that is found.
 
     Raises:

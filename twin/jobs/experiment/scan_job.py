@@ -1,8 +1,6 @@
 """The job ``scan``: a case scanned, its markers, its lesion and a needle found again, and how far off each was.
 
 What ``scan`` prints: how it scanned, both readings of each marker beside the truth, and the next command.
-
-One axial slice of a scan: through the target, or as near to it as the field of view comes.
 """
 
 from __future__ import annotations
@@ -10,20 +8,22 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.metal import METAL_HU
+from puncture_twin.planning.anatomy.scan import nearest
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.strict_json import array, fitting, parse_json
-from puncture_twin.planning.formats.points import NamedPoints, write_points
+from puncture_twin.planning.formats.points import write_points
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext
@@ -50,6 +50,8 @@ CT, LABELS, CROSSED, FOUND, REPORT, PICTURE = (
     *("markers_ct.csv", "scan.json", "scan.png"),
 )
 MAX_REHEARSAL_BYTES = 50_000_000
+HALF_MM = 50.0
+"""Of a slice's side in the picture."""
 SUB_VOXEL_SD = 0.03
 """Of a drawn marker along the bed, over the spacing: what the detector is held to where metal is clipped."""
 
@@ -58,8 +60,6 @@ class ScanRequest(NamedTuple):
     """What the user asks for.
 
     Attributes:
-        marker: What stands at the markers' places.
-        rehearsal: Its needle is shown in a control CT.
         beside: Places what lies outside of the patient; nothing where None.
     """
 
@@ -260,9 +260,25 @@ def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
     if run.markers is not None:
         write_points(folder / FOUND, run.markers.fine)
         yield folder / FOUND
-    found = None if run.markers is None else run.markers.fine
-    needle = None if run.control is None else run.control.found
-    yield draw_scan(image, Shown(run.scene.target, found, needle, case.needle.shaft_mm), folder / PICTURE)
+    yield _draw(run, folder / PICTURE)
+
+
+def _draw(run: ScanRun, path: Path) -> Path:
+    """Slices through the target, and through each marker and the needle's tip where they were read."""
+    from puncture_twin.twin.report.slices.points import Mark, write_points_sheet  # with matplotlib
+
+    marks, control = [Mark("target", run.scene.target, "true place")], run.control
+    if control is not None and control.found is not None:
+        marks.append(Mark("needle", control.found.tip_ct, "tip as it was read"))
+    if run.markers is not None:
+        fine = run.markers.fine
+        marks += [Mark(name, point, "as it was read") for name, point in zip(fine.names, fine.points, strict=True)]
+    T = np.asarray(np.linalg.inv(run.image.grid.T_ct_index), dtype=np.float64)
+    hu = run.image.hu.astype(np.float32)
+    skin = run.context.anatomy.skin.mesh.transformed(run.scene.T_scan_ct)
+    return write_points_sheet(
+        path, f"{run.context.case.name}, simulated", marks, partial(nearest, hu, T), skin, HALF_MM
+    )
 
 
 def _write_labels(folder: Path, file: str, names: Sequence[str], run: ScanRun, labels: NDArray[Any]) -> Iterator[Path]:
@@ -340,74 +356,3 @@ def _needle_rows(needle: dict[str, Any] | None) -> list[tuple[str, str]]:
 
 def _vector(numbers: list[float]) -> str:
     return " ".join(f"{one:+6.2f}" for one in numbers)
-
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-WINDOW_HU = (-160.0, 240.0)
-"""What abdomens are read in: 400 wide about 40."""
-NEAR_MM = 6.0
-"""A marker so near to the slice is named in it."""
-INCHES, DPI = 9.0, 100
-GREEN, YELLOW = "#38d39f", "#ffd34d"
-
-
-class Shown(NamedTuple):
-    """What is drawn over a slice, LPS mm.
-
-    Attributes:
-        target: Shape (3,).
-        markers: As they were found, or None.
-        needle: As it was found, or None.
-    """
-
-    target: Floats
-    markers: NamedPoints | None
-    needle: FoundNeedle | None
-    length_mm: float
-
-
-def draw_scan(image: CtImage, shown: Shown, path: Path) -> Path:
-    """Draw it; the patient's right is on the left, as radiologists look at it."""
-    T, (nx, ny, nz), (dx, dy, _) = image.grid.T_ct_index, image.grid.shape, image.grid.spacing_mm
-    index = apply(np.linalg.inv(T), shown.target)
-    k = int(np.clip(round(float(index[2])), 0, nz - 1))
-    x0, y0, z = apply(T, np.array([-0.5, -0.5, k]))
-    from matplotlib.figure import Figure
-
-    from puncture_twin.twin.report.figures import halo, write_png
-
-    rim = halo(3, "black")  # on bone the marks are seen by it
-    figure = Figure(figsize=(INCHES, INCHES * ny * dy / (nx * dx) + 0.6), dpi=DPI)
-    ax = figure.add_axes((0.09, 0.1, 0.89, 0.82))
-    extent = (x0, x0 + nx * dx, y0 + ny * dy, y0)
-    low, high = WINDOW_HU
-    ax.imshow(image.hu[:, :, k].T, cmap="gray", vmin=low, vmax=high, extent=extent, interpolation="nearest")
-    ax.plot(*shown.target[:2], "+", color=GREEN, markersize=12, label="target", path_effects=rim)
-    if shown.needle is not None:
-        _draw_needle(ax, shown.needle, shown.length_mm)
-    if shown.markers is not None:
-        _draw_markers(ax, shown.markers, z, rim)
-    ax.legend(loc="upper left", fontsize=8)
-    ax.set(xlabel="x, mm (patient's left to the right)", ylabel="y, mm (front above)")
-    ax.set_title(f"slice {k + 1} of {nz}, z {z:.1f} mm; simulated", fontsize=10)
-    ax.set_xlim(extent[:2])
-    ax.set_ylim(extent[2:])
-    write_png(figure, path)
-    return path
-
-
-def _draw_markers(ax: Axes, markers: NamedPoints, z: float, rim: list[Any]) -> None:
-    """The names of those that the slice shows."""
-    for name, point in zip(markers.names, markers.points, strict=True):
-        if abs(point[2] - z) <= NEAR_MM:
-            text = ax.annotate(name, point[:2], (0, 8), textcoords="offset points", color=YELLOW, ha="center")
-            text.set_path_effects(rim)
-
-
-def _draw_needle(ax: Axes, needle: FoundNeedle, length_mm: float) -> None:
-    """Its axis as found, of which the slice shows a cut."""
-    ends = np.stack([needle.tip_ct, needle.tip_ct - length_mm * needle.forward_ct])
-    ax.plot(ends[:, 0], ends[:, 1], "--", color=YELLOW, linewidth=0.8, label="detected needle, projected")
-    ax.plot(*needle.tip_ct[:2], "x", color=YELLOW, label="detected tip")

@@ -1,1 +1,1 @@
-"""The headless planner as a server: OpenIGTLink's messages, the sockets, and what is answered."""
+"""What follows an arm or a tracked needle: the planner as an OpenIGTLink server, and the mirror, which only reads."""

@@ -80,7 +80,6 @@ def reproduce(out_dir: Path, seeds: int | None) -> Answer:
     """Hold the paper's sessions in the twin, print its tables beside ours, and write pictures, plot and page.
 
     Args:
-        out_dir: Folder for the files.
         seeds: How many; the first is the case's own, the others follow it.
     """
     with writing(out_dir, "reproduce", names=NAMES) as draft:

@@ -65,9 +65,6 @@ def table_of(source: Path, choice: Choice) -> Path | None:
 def export_candidates(table_path: Path, format_name: str, out: Path, note: Callable[[str], None]) -> Written:
     """Write a table of candidates as text, beside its own set or elsewhere.
 
-    Args:
-        note: Told in a sentence what whoever reads it should know.
-
     Raises:
         InputError: No table of candidates, or not the one that its folder's manifest lists.
     """
@@ -164,7 +161,7 @@ CANDIDATE_FORMATS = tuple(_WRITERS)
 """Of ``export --format``."""
 
 
-MOVEIT_NOTES = (
+MOVEIT_NOTES: tuple[str, ...] = (
     "files: scene, goals, arm with needle, and a sender; read the sender before you run it; it asks before each phase",
     "send 'insertion' only when the operator says so; no ROS controller stops at tissue",
     "never run on a controller or in MoveIt; the messages were only compared with their definitions",
@@ -195,21 +192,19 @@ def export_robot(
     if context is not None:
         check_plan(plan, context, plan_path, seed=context.case.rehearsal.seed if seed is None else seed)
         check_ways(context, plan, plan_path)
-    if moves := format_name == MOVEIT and context is not None:
-        assert context is not None
-        names = moveit_names(plan_path.stem)
+    moves: Mapping[str, str] = {}
+    if context is not None and format_name == MOVEIT:
         plan = with_case_arm(plan, context.case)
-        made = moveit_files(plan, context.case, context.anatomy, source=plan_path)
-    else:
-        names = (export_name(plan_path, format_name),)
+        moves = moveit_files(plan, context.case, context.anatomy, source=plan_path)
+    names = moveit_names(plan_path.stem) if moves else (export_name(plan_path, format_name),)
     inputs, made_from = (source, *plan.inputs), {source.path: source.sha256}
     with writing(out, f"export {names[0]}", inputs=inputs, names=names, made_from=made_from, note=note) as draft:
         if moves:
-            notes, files = MOVEIT_NOTES, put(draft, made)
+            files, notes = put(draft, moves), MOVEIT_NOTES
         else:
             checker = None if context is None or context.reach is None else context.reach.checker
             done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
-            notes, files = done.notes, draft.final((done.path,))
+            files, notes = draft.final((done.path,)), done.notes
     return _of_robot(format_name, files[0], plan, notes, inputs, case_checked=context is not None)
 
 

@@ -77,9 +77,6 @@ class InitRun:
 def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
     """Make the case, read it as `search` does, and write it; what is wrong leaves nothing behind.
 
-    Args:
-        force: Whether a case that is there may be replaced.
-
     Raises:
         InputError: Everything that keeps the case from being searched, in one line.
     """

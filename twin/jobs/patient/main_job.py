@@ -320,9 +320,6 @@ def is_plan(source: Path) -> bool:
 def case_of(source: Path, case: Path | None, choice: Choice) -> Path | None:
     """The case of a command: its source, or what is named beside a plan; None of a plan without its case.
 
-    Args:
-        case: The option ``--case``.
-
     Raises:
         InputError: A plan with a choice, since it has its direction, or two cases.
     """

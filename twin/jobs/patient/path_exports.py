@@ -41,7 +41,7 @@ from puncture_twin.planning.search.choice import Choice, choose, choose_stated, 
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import to_table
 from puncture_twin.twin.jobs.patient.main_job import is_plan, read_noted_plan
-from puncture_twin.twin.report.present import Section, Warn, text
+from puncture_twin.twin.report.present import Block, Section, Warn, text
 
 PATH_FORMATS = (SLICER, DICOM)
 NO_APPROACH = "directions checked; no approach planned"
@@ -100,7 +100,7 @@ class Written(Shown):
     ) -> Written:
         """Of one path."""  # fmt: skip
         facts = {"path": path, "notes": list(notes), "warnings": list(warnings)}
-        lines = [Warn(tuple(map(str, files))), *notes, *(f"warning: {one}" for one in warnings)]
+        lines: list[Block] = [Warn(tuple(map(str, files))), *notes, *(f"warning: {one}" for one in warnings)]
         return cls(name, files, facts, [Section(f"{name}: {path}", lines)], inputs)
 
 
@@ -117,7 +117,6 @@ def export_path(
     """Search, and write the chosen path and the safe entry area as one set.
 
     Args:
-        format_name: One of `PATH_FORMATS`.
         source: A plan of the case, whose direction is chosen after it was checked again; anything else is passed over.
 
     Raises:

@@ -18,8 +18,7 @@ from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.twin.jobs.patient.budget import budget_facts
-from puncture_twin.twin.jobs.patient.run import FILM, PAGE, ROOMS, SLICES, Run
-from puncture_twin.twin.jobs.patient.summaries import registration_summary
+from puncture_twin.twin.jobs.patient.run import FILM, PAGE, ROOMS, SLICES, Run, registration_summary
 from puncture_twin.twin.report.error_pictures import draw_budget
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster

@@ -96,8 +96,6 @@ def place_case(
     """Search; write ``placements.csv``, ``place.json`` and, if wanted, the two pictures.
 
     Args:
-        context: The case, whose own arm need not be checked.
-        pictures: Whether to draw.
         quick_s: End after about so many seconds, with what is known then; None searches to the end.
         began: `time.perf_counter` from which they count; now, if None.
 
@@ -148,7 +146,6 @@ def find_places(context: CaseContext, jobs: int, until: float = np.inf) -> Place
     """Search for the best position of the arm's base.
 
     Args:
-        context: The case, whose own arm need not be checked.
         until: `time.perf_counter` at which it ends with what is known then; infinite for a search to its end.
 
     Raises:

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 from puncture_twin.planning.base.processes import process_pool, worker_count
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.budget.guidance import equipped, sight_of
-from puncture_twin.twin.jobs.patient.run import FILM, ROOMS, RoomCount, Run
-from puncture_twin.twin.jobs.patient.summaries import rehearsal_summary
+from puncture_twin.twin.jobs.patient.run import FILM, ROOMS, RoomCount, Run, rehearsal_summary
 from puncture_twin.twin.jobs.terminal import write_json
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
 from puncture_twin.twin.rehearsal.plan_truth import error_rank, median_truth, plan_truth

@@ -29,7 +29,7 @@ from puncture_twin.planning.search.uncertainty_breakdown import LEAST_FRACTION
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.jobs.patient.main_job import checked_plan, is_plan, plan_case
-from puncture_twin.twin.jobs.patient.summaries import plan_summary, trial_failures
+from puncture_twin.twin.jobs.patient.run import plan_summary, trial_failures
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
 from puncture_twin.twin.report import present

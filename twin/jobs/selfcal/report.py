@@ -101,13 +101,7 @@ def run_selfcal(
     """Simulate a case, or calibrate a recording, and write everything into a folder.
 
     Args:
-        case_path: The case, or its folder; None only beside a recording.
-        recording: A recording's CSV or folder; None to simulate.
-        seeds: Rooms that are drawn, from the case's seed on.
-        out: Where files go.
-        watcher: Shows progress.
         record: A folder that is not there yet, for the first seed's pictures and joints; None for none.
-        shots: A recording of what was seen after ``recording``; None for none.
 
     Raises:
         InputError: Something that cannot be used, or poses that cannot show every unknown.
@@ -203,14 +197,7 @@ def selfcal_text(found: Facts) -> str:
 
 
 def write_page(run: SelfcalRun, sheet: Path | None, workcell: Path | None, path: Path) -> Path:
-    """Write the page.
-
-    Args:
-        run: What was done.
-        sheet: The B-mode pictures; None for a recording.
-        workcell: The picture of the workcell; None for a recording.
-        path: The HTML to write; it appears whole or not at all.
-    """
+    """Write the page."""
     found, seed = selfcal_facts(run), run.trials[0].seed if run.trials else None
     residuals = picture(residual_picture(run.calibration, run.recording), "Residual of each pose, and v over u")
     shown = [*sections(found)]

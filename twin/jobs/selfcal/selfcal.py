@@ -36,16 +36,7 @@ class SelfcalRun:
     """What the command did.
 
     Attributes:
-        name: The case's, or the recording file's.
-        calibration: The first trial's, or the recording's.
-        recording: What it was made from.
-        inputs: Recording and case file, with role and hash.
         trials: In the twin, one per seed; empty for a recording.
-        case: The case, in the twin.
-        candidates: Poses that were to choose from, in the twin.
-        choice: The poses chosen of them, in the twin.
-        stages: Seconds.
-        files: What was written.
         warnings: What the recording leaves open, one sentence each.
         shots: What came of each shot after the recording.
     """
@@ -109,8 +100,6 @@ def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None =
     """Calibrate from a recording's CSV, or a folder with ``recording.csv``; a case says noise and needle length.
 
     Args:
-        path: The recording.
-        case: What it was recorded with.
         shots: A recording of what was seen afterwards: each of its poses updates the calibration; None for none.
 
     Raises:

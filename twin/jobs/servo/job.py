@@ -46,9 +46,6 @@ def hold_sessions(case: ServoCase, seeds: int, done: Count = uncounted, record: 
     """Hold the sessions of a case, from its own seed on.
 
     Args:
-        case: The case.
-        seeds: How many.
-        done: Told how many of how many are done.
         record: An empty folder for all that the devices of the first session say.
     """
     seed = case.file.seed
@@ -70,11 +67,6 @@ def run_servo(
     """Hold the sessions of a case and write pictures, plot and page.
 
     Args:
-        path: The case.
-        out_dir: Folder for the files.
-        seeds: How many, from the case's own on.
-        done: Told how many of how many are done.
-        note: Told what was removed that nobody might expect.
         record: A folder that is not there yet, for all that the devices of the first session say.
 
     Raises:
@@ -106,7 +98,6 @@ def follow_recording(path: Path, recording: Path) -> Answer:
     """Calibrate and map from a recorded session, and say what each of its looks at the ball says.
 
     Args:
-        path: The case.
         recording: Its folder; see `twin.guidance.stereo.recording`.
 
     Raises:

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
-from matplotlib.text import Text
+from matplotlib.legend import Legend
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
 
 from puncture_twin.planning.base.reasons import NOT_SEARCHED_TEXT, UNSEEN_AIR, Reason, Rgb, css
 from puncture_twin.planning.base.text import plural
@@ -81,9 +83,6 @@ def draw_map(
     """Write the map of a search.
 
     Args:
-        case: The case: ``name``, ``space``, ``T_ct_entry``, ``needle``, ``target_name``.
-        path: The PNG to write; it appears whole or not at all.
-        pick: The planned candidate, or the one to be shown; None shows the best.
         raster: The map's pixels where somebody has them already.
         scan: The CT, whose voxels say how many digits a length has; None for meshes alone.
     """
@@ -118,11 +117,11 @@ def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None
     """What the colours and marks mean, the chosen direction, and how to read the map; y 0..1 runs downwards."""
     axes.set_axis_off()
     axes.set(xlim=(0, 1), ylim=(1, 0), autoscale_on=False)
-    y = _legend(axes, reason_counts(candidates))
-    y = _scale(axes, candidates, y + 0.01)
-    y = _chance_legend(axes, candidates, y)
-    y = _mark_legend(axes, candidates, view, y + 0.05)
-    _chosen(axes, candidates, pick, y + 0.04, scan)
+    y = _reasons(axes, reason_counts(candidates))
+    y = _scale(axes, candidates, y + GAP)
+    y = _chance_key(axes, candidates, y)
+    y = _mark_key(axes, candidates, view, y)
+    _chosen(axes, candidates, pick, y, scan)
     whole = candidates.grid is None or (candidates.grid.full_circle and candidates.theta.min() < step_of(candidates))
     outside = "" if whole else f"White with lines: {NOT_SEARCHED_TEXT}.\n"
     toward = f"Centre (+), θ = 0: {view.centre}.\n" if view.centre else ""
@@ -138,70 +137,36 @@ def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None
     axes.text(0.0, 1.0, text, fontsize=SMALL, va="bottom", linespacing=1.4, color="0.25")
 
 
-MOST_LEGEND, LINE, GAP = 0.45, 0.0215, 0.6
-"""Heights: of the legend's entries together, of the column's; of a line; between two entries, of a line."""
+GAP = 0.025
+"""Between the parts of the column, of its height."""
 
-PATCH = 0.06
-"""Width of a patch of colour, of the column's."""
-
-TEXT_AT, COUNT_ENDS, GRID_ENDS, ENTRY, MOST_LETTERS = 0.085, 0.62, 0.79, 10.5, 19
-"""Of the legend's entries: where text begins and the numbers end; letters in points at most, and as many in a line."""
-
-PADDING = 0.018
-"""Between a text and its number at least, of the column's width."""
+LETTERS, MOST_LINES = 46, 19
+"""Of the key of reasons: letters in a line, and lines at its full size; with more of them it is smaller."""
 
 
-def _legend(axes: Axes, counts: Sequence[ReasonCount]) -> float:
-    """A patch, a text and numbers for each reason; an entry of more lines is higher."""
-    for x, text in ((COUNT_ENDS, "directions"), (GRID_ENDS, "of grid"), (1.0, "of solid\nangle")):
-        axes.text(x, 0.012, text, fontsize=9, color="0.35", ha="right", va="bottom")
-    texts = [_words(axes, one) for one in counts]
-    heights = np.array([text.get_text().count("\n") + 1 + GAP for text in texts])
-    unit = min(LINE, MOST_LEGEND / float(heights.sum()))
-    ends = 0.022 + unit * np.cumsum(heights)
-    size = min(ENTRY, unit * SIDE_HIGH / 1.08 * 72 / DPI)
-    for one, words, y in zip(counts, texts, (ends - unit * heights / 2).tolist(), strict=True):
-        words.set(y=y, fontsize=size)
-        _patch(axes, y, 0.032 * min(1.0, unit / 0.015), one)
-        numbers = (f"{one.count:,}", percent(one.fraction), percent(one.solid_angle))
-        for x, value in zip((COUNT_ENDS, GRID_ENDS, 1.0), numbers, strict=True):
-            axes.text(x, y, value, fontsize=size, weight=words.get_fontweight(), ha="right", va="center")
-    return float(ends[-1])
+def _key(axes: Axes, y: float, handles: Sequence[Artist], title: str = "", **look: Any) -> float:
+    """A key below a height of the column, each handle with its label; returns where the next part may begin."""
+    labels = [str(one.get_label()) for one in handles]
+    where = {"loc": "upper left", "bbox_to_anchor": (0.0, 1.0 - y), "alignment": "left", "frameon": False}
+    close = {"borderpad": 0.0, "borderaxespad": 0.0, "handletextpad": 0.5, "columnspacing": 0.7, "handlelength": 1.7}
+    size = {"title_fontsize": SMALL, "fontsize": SMALL, "handleheight": 1.1}
+    key = Legend(axes, handles, labels, title=title, **{**where, **close, **size, **look})
+    axes.add_artist(key)
+    return 1.0 - (key.get_window_extent().y0 - axes.bbox.y0) / axes.bbox.height + GAP
 
 
-def _words(axes: Axes, one: ReasonCount) -> Text:
-    """An entry's text, folded so that it ends before its number."""
-    look: dict[str, Any] = {"fontsize": ENTRY, "weight": "bold" if one.code == "safe" else "normal"}
-    count = axes.text(0.0, 0.0, f"{one.count:,}", **look)
-    room = COUNT_ENDS - TEXT_AT - PADDING - _width(count)
-    count.remove()
-    text = axes.text(TEXT_AT, 0.0, one.text, va="center", linespacing=1.15, **look)
-    for letters in range(MOST_LETTERS, 0, -1):
-        text.set_text(textwrap.fill(one.text, letters, break_long_words=False, break_on_hyphens=False))
-        if _width(text) <= room:
-            break
-    return text
-
-
-def _width(text: Text) -> float:
-    return float(text.get_window_extent().width) / SIDE_WIDE
-
-
-def _patch(axes: Axes, y: float, high: float, one: ReasonCount) -> None:
-    """A reason's colour, with the lines that the map has over it."""
-    hatch, ink = "", (0, 0, 0)
-    if one.code == Reason.UNKNOWN_REGION.value:
-        hatch, ink = ("\\\\", HATCH_AIR) if one.colour == UNSEEN_AIR else ("//", HATCH)
-    _box(axes, y - high / 2, high, one.colour, hatch=hatch, ink=css(ink))
-
-
-def _box(
-    axes: Axes, y: float, high: float, ground: Rgb, x: float = 0.0, *, hatch: str = "", ink: Any = "black"
-) -> None:
-    """A patch of a colour below a height, hatched with an ink, in a black edge."""
-    lines = Rectangle((x, y), PATCH, high, facecolor=css(ground), edgecolor=ink, lw=0, hatch=hatch)
-    axes.add_patch(lines)
-    axes.add_patch(Rectangle((x, y), PATCH, high, fill=False, lw=0.8, clip_on=False))
+def _reasons(axes: Axes, counts: Sequence[ReasonCount]) -> float:
+    """A patch, a text and numbers for each reason, with the lines that the map has over its colour."""
+    handles = []
+    for one in counts:
+        hatch, ink = "", "black"
+        if one.code == Reason.UNKNOWN_REGION.value:
+            hatch, ink = ("\\\\", css(HATCH_AIR)) if one.colour == UNSEEN_AIR else ("//", css(HATCH))
+        text = textwrap.fill(f"{one.text}: {one.count:,} ({percent(one.solid_angle)})", LETTERS)
+        handles.append(Patch(facecolor=css(one.colour), edgecolor=ink, hatch=hatch, label=text))
+    lines = sum(str(one.get_label()).count("\n") + 1 for one in handles)
+    size = 10.5 * min(1.0, MOST_LINES / lines)
+    return _key(axes, 0.0, handles, "directions (part of the solid angle)", fontsize=size, labelspacing=0.6)
 
 
 def _scale(axes: Axes, candidates: Candidates, y: float) -> float:
@@ -211,24 +176,19 @@ def _scale(axes: Axes, candidates: Candidates, y: float) -> float:
     scale = clearance_scale(candidates)
     safe = "" if candidates.breathing is not None else f"{candidates.safe_text}, "  # too long for one line
     if scale.even:
-        _box(axes, y + 0.02, 0.032, _even_shade(scale))
-        axes.text(TEXT_AT, y + 0.036, f"{safe}{_even_text(scale)}", fontsize=SMALL, va="center")
-        return y + 0.06
-    shades, box = safe_shades(np.linspace(0, 1, 256))[None], (0.0, 1.0, y + 0.045, y + 0.02)
+        red, green, blue = scale.shades(np.zeros(1))[0].tolist()
+        shade = css((red, green, blue))
+        return _key(axes, y, [Patch(facecolor=shade, edgecolor="black", label=f"{safe}{_even_text(scale)}")])
+    shades, box = safe_shades(np.linspace(0, 1, 256))[None], (0.0, 1.0, y + 0.025, y)
     axes.imshow(shades, extent=box, aspect="auto", interpolation="bilinear")
-    axes.add_patch(Rectangle((0.0, y + 0.02), 1.0, 0.025, fill=False, lw=0.8, clip_on=False))
+    axes.add_patch(Rectangle((0.0, y), 1.0, 0.025, fill=False, lw=0.8, clip_on=False))
     for x, text, ha in (
         (0.0, number(scale.low, SCALE_DIGITS, "mm"), "left"),
         (0.5, f"{safe}by least clearance", "center"),
         (1.0, number(scale.high, SCALE_DIGITS, "mm"), "right"),
     ):
-        axes.text(x, y + 0.05, text, fontsize=SMALL, ha=ha, va="top")
-    return y + 0.06
-
-
-def _even_shade(scale: ClearanceScale) -> Rgb:
-    red, green, blue = scale.shades(np.zeros(1))[0].tolist()
-    return red, green, blue
+        axes.text(x, y + 0.03, text, fontsize=SMALL, ha=ha, va="top")
+    return y + 0.045 + GAP
 
 
 def _even_text(scale: ClearanceScale) -> str:
@@ -242,32 +202,30 @@ PALE: Rgb = (205, 235, 220)
 """Below the legend's hatching."""
 
 
-def _chance_legend(axes: Axes, candidates: Candidates, y: float) -> float:
-    """What lines and hatching mean; nothing without chances. Returns where the next line may stand."""
+def _chance_key(axes: Axes, candidates: Candidates, y: float) -> float:
+    """What hatching and lines mean; nothing without chances."""
     if touch_nothing(candidates) is None:
         return y
-    axes.text(0.0, y + 0.034, "chance to touch no structure to avoid", fontsize=SMALL, va="center")
     text = (f"< {LEVELS[0]:g}", *(f"{low:g}–{high:g}" for low, high in pairwise(LEVELS)), f"> {LEVELS[-1]:g}")
-    for place, (name, hatch) in enumerate(zip(text, HATCHES, strict=True)):
-        x = 0.25 * place
-        _box(axes, y + 0.05, 0.028, PALE, x, hatch=hatch, ink=HATCH_INK)
-        axes.text(x + 0.07, y + 0.064, name, fontsize=8.5, va="center")
-        if place < len(LEVELS):
-            axes.plot((x + 0.232, x + 0.232), (y + 0.05, y + 0.078), color="black", lw=1.5, ls=STYLES[place])
-    return y + 0.065
+    hatched = [
+        Patch(facecolor=css(PALE), edgecolor=HATCH_INK, hatch=hatch, label=name)
+        for name, hatch in zip(text, HATCHES, strict=True)
+    ]
+    lines = [
+        Line2D([], [], color="black", ls=style, label=f"at {level:g}")
+        for level, style in zip(LEVELS, STYLES, strict=True)
+    ]
+    by_column = [one for pair in zip_longest(hatched, lines) for one in pair if one is not None]
+    return _key(axes, y, by_column, "chance to touch no structure to avoid: hatched, and lines", ncols=len(hatched))
 
 
-def _mark_legend(axes: Axes, candidates: Candidates, view: MapView, y: float) -> float:
+def _mark_key(axes: Axes, candidates: Candidates, view: MapView, y: float) -> float:
     if not candidates.safe.any():
         return y
-    marks = [(0.03, CHOSEN, 0.07, "chosen"), (0.225, BEST, 0.25, "best of a window")]
-    front = shown_front(candidates, view)
-    if front.of:
-        marks.append((0.575, FRONT, 0.595, front.text))
-    for x, mark, beside, text in marks:
-        axes.plot([x], [y], **mark)
-        axes.text(beside, y, text, fontsize=SMALL, va="center")
-    return y
+    marks, front = [(CHOSEN, "chosen"), (BEST, "best of a window")], shown_front(candidates, view)
+    marks += [(FRONT, front.text)] if front.of else []
+    handles = [Line2D([], [], ls="none", label=text, **mark) for mark, text in marks]
+    return _key(axes, y, handles, ncols=3, handlelength=1.2)
 
 
 def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float, scan: Any | None) -> None:

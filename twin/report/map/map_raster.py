@@ -17,7 +17,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.reasons import REASON_COLOURS, UNSEEN_AIR, Reason, Rgb
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import MapCells, MapView
-from puncture_twin.twin.report.palette import reason_of, safe_shades
+from puncture_twin.twin.report.palette import safe_shades
 
 PIXELS = 1120
 """Side of the raster that picture and page share: twice as fine as the page shows it, finer than the picture does."""
@@ -83,7 +83,7 @@ def row_colours(candidates: Candidates) -> NDArray[np.uint8]:
     """The colour of every direction, shape (n, 3)."""
     colours = np.zeros((len(candidates), 3), dtype=np.uint8)
     for value in np.unique(candidates.verdict.reason):
-        reason = reason_of(str(value))
+        reason = Reason(str(value))
         if reason in REASON_COLOURS:
             colours[candidates.verdict.reason == value] = REASON_COLOURS[reason]
     safe = candidates.safe

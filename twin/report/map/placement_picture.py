@@ -51,12 +51,7 @@ SAME_AXIS = 0.94
 
 
 def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Path) -> None:
-    """Write the map of fractions over position.
-
-    Args:
-        skin: The patient, CT frame.
-        path: The PNG to write; it appears whole or not at all.
-    """
+    """Write the map of fractions over position."""
     panels = _panels(found)
     columns = min(MOST_COLUMNS, len(panels) + 1)
     rows = -(-(len(panels) + 1) // columns)

@@ -14,7 +14,6 @@ import numpy as np
 from markupsafe import Markup
 
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.errors import Severity
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.formats.dicom.storage import is_dicom_file
@@ -66,7 +65,6 @@ class Uncertainty(NamedTuple):
     Attributes:
         breakdown: Of the chosen direction, or None where it has no chances.
         rooms: A `Distribution` as plain values, or None.
-        picture: ``rooms.png``, or None.
         budget: Of the chosen direction, as ``register --json`` has it, or None.
     """
 
@@ -81,12 +79,6 @@ class Shown:
     """What a page shows.
 
     Attributes:
-        case: The case.
-        anatomy: Structures, skin, warnings.
-        candidates: The search's rows.
-        plan: The plan, or None.
-        rehearsal: What was measured, or None.
-        registration: The registration as plain values, or None.
         film: Name of the rehearsal's film, which lies beside the page and is linked; None without one.
         uncertainty: What there is to say of chances and rooms; None where the case declares no errors.
         pick: The planned candidate, or the one to be shown; None shows the best.
@@ -164,7 +156,7 @@ def _drawn(shown: Shown) -> dict[str, Any]:
     slices, ct, surfaces = slices_data(subject, found, picked_row(found, pick), shown.regions_ct)
     data = {
         "map": map_data(case, found, pick, shown.raster),
-        "scene": scene_figure(case, shown.anatomy, found, shown.plan, user_cache(), pick, shown.T_base_ct),
+        "scene": scene_figure(case, shown.anatomy, found, shown.plan, pick, shown.T_base_ct),
         "arm": arm_data(case, found, shown.plan, pick, shown.T_base_ct),
         "slices": slices,
         "target": [float(v) for v in case.target_ct],

@@ -18,7 +18,7 @@ from puncture_twin.planning.search.windows import MOST_WINDOWS
 from puncture_twin.twin.report.map.map_raster import PIXELS as FINE, MapRaster, map_raster, shown_front
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.template import image_address
-from puncture_twin.twin.report.palette import PNG_LEVEL, reason_of
+from puncture_twin.twin.report.palette import PNG_LEVEL
 from puncture_twin.twin.report.slices.panel import MOST_NEAR, NEAR_MM
 
 PIXELS = FINE // 2
@@ -55,9 +55,6 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
     candidate -1 outside the grid. A pick that the search has no row of is one row more.
 
     Args:
-        case: The case.
-        candidates: The search's rows.
-        pick: What is shown as chosen.
         raster: The map's pixels where somebody has them already.
     """
     view, windows = map_view(case, candidates), candidates.windows
@@ -105,9 +102,9 @@ def _directions(parts: Sequence[tuple[Candidates, Ints, Ints]]) -> dict[str, Any
     columns = [_columns(*part, structures, reasons, sentences) for part in parts]
     return {
         "structures": structures,
-        "reasons": [REASON_TEXT[reason_of(r)] for r in reasons],
+        "reasons": [REASON_TEXT[Reason(r)] for r in reasons],
         "codes": [r or "safe" for r in reasons],
-        "details": [DETAIL_UNITS.get(reason_of(r), ("", "")) for r in reasons],
+        "details": [DETAIL_UNITS.get(Reason(r), ("", "")) for r in reasons],
         "sentences": sentences,
         **{name: [value for one in columns for value in one[name]] for name in columns[0]},
     }

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from dataclasses import replace
-from hashlib import sha256
 from typing import Any
 
 import fast_simplification
@@ -17,8 +16,6 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
@@ -82,23 +79,18 @@ def scene_figure(
     anatomy: Any,
     candidates: Candidates,
     plan: Any | None,
-    cache: Cache = NO_CACHE,
     pick: Pick | None = None,
     T_base_ct: Floats | None = None,
 ) -> dict[str, Any]:
     """A plotly figure as plain values, meshes in base64.
 
     Args:
-        case: The case.
-        anatomy: Structures and skin.
-        candidates: The search's rows.
         plan: The plan, or None: then the arm is that of the search, if it reaches the pick.
-        cache: Where lightened meshes are kept.
         pick: Whose needle is shown where there is no plan; None shows none.
         T_base_ct: Shape (4, 4), mm, of a search whose arm was checked.
     """
     bodies, standoff = _bodies(case, anatomy, candidates, plan, pick, T_base_ct if plan is None else plan.T_base_ct)
-    light = lightened([*bodies, *standoff], TRIANGLES, cache)
+    light = lightened([*bodies, *standoff], TRIANGLES)
     hidden = set(range(len(bodies), len(light)))
     first = {_legend_name(body): i for i, body in reversed(list(enumerate(light))) if i not in hidden}
     traces = [
@@ -147,12 +139,12 @@ def box_of(points_ct: Floats) -> Floats:
     return np.stack([low, high]) + BORDER * (high - low) * np.array([[-1.0], [1.0]])
 
 
-def lightened(bodies: Sequence[SceneBody], triangles: int, cache: Cache = NO_CACHE) -> list[SceneBody]:
+def lightened(bodies: Sequence[SceneBody], triangles: int) -> list[SceneBody]:
     """The bodies with about so many triangles altogether, each cut by the same share."""
     fraction = min(1.0, triangles / max(1, sum(len(b.mesh.faces) for b in bodies)))
     least = [LEAST_OF_ARM if body.group.startswith("arm") else LEAST_TRIANGLES for body in bodies]
     wanted = [max(few, int(fraction * len(body.mesh.faces))) for few, body in zip(least, bodies, strict=True)]
-    return [replace(body, mesh=lighter_mesh(body.mesh, most, cache)) for body, most in zip(bodies, wanted, strict=True)]
+    return [replace(body, mesh=lighter_mesh(body.mesh, most)) for body, most in zip(bodies, wanted, strict=True)]
 
 
 def _bodies(
@@ -162,13 +154,13 @@ def _bodies(
     bodies = [*patient(anatomy, case), *room(case, T_base_ct), *safe_region(candidates, case)]
     direction = chosen_direction(pick, plan)
     if direction is not None:
-        bodies += needle_bodies(case.needle, case.target_ct, direction).all
+        bodies += needle_bodies(case.needle, case.target_ct, direction)
     bodies += arm_bodies(case, plan, pick, T_base_ct)
     if plan is None or direction is None:
         return bodies, []
     arm = ArmPicture(plan.model, plan.T_base_ct, case.tool)
     tip = case.target_ct + plan.standoff_mm * direction
-    waiting = [*arm.bodies(plan.insertion.q[0]), *needle_bodies(case.needle, tip, direction).all]
+    waiting = [*arm.bodies(plan.insertion.q[0]), *needle_bodies(case.needle, tip, direction)]
     return bodies, [SceneBody(f"{b.name}, standoff", f"{b.group}-standoff", b.mesh, b.colour) for b in waiting]
 
 
@@ -283,40 +275,13 @@ WELDED = 0.75
 """Corners per triangle; a closed surface that shares its corners has half a corner per triangle."""
 
 
-def lighter_mesh(mesh: TriangleMesh, triangles: int, cache: Cache) -> TriangleMesh:
-    """The mesh with about so many triangles; itself where it has no more, or where nothing would be left.
-
-    Args:
-        mesh: Any surface, mm.
-        triangles: How many are wanted.
-        cache: Where lightened meshes are kept.
-    """
+def lighter_mesh(mesh: TriangleMesh, triangles: int) -> TriangleMesh:
+    """The mesh with about so many triangles; itself where it has no more, or where nothing would be left."""
     if triangles >= len(mesh.faces):
         return mesh
-    made_from = {
-        "what": "lighter mesh",
-        "vertices": sha256(mesh.vertices.tobytes()).hexdigest(),
-        "faces": sha256(mesh.faces.tobytes()).hexdigest(),
-        "triangles": triangles,
-    }
-    found = cache.arrays(made_from, lambda: _simplified(mesh, triangles), by=__name__, check=_check)
-    if len(found["faces"]) == 0:  # nothing may vanish from a picture
-        return mesh
-    return TriangleMesh(found["vertices"], found["faces"])
-
-
-def _check(stored: Arrays) -> None:
-    vertices, faces = stored["vertices"], stored["faces"]
-    if vertices.ndim != 2 or faces.ndim != 2 or {vertices.shape[1], faces.shape[1]} != {3}:
-        raise ValueError("no mesh")
-    if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise ValueError("an index out of range")
-
-
-def _simplified(mesh: TriangleMesh, wanted: int) -> Arrays:
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
     if len(vertices) > WELDED * len(faces):  # a robot's STL shares no corners
         vertices, welded = np.unique(vertices, axis=0, return_inverse=True)
         faces = np.ascontiguousarray(welded.reshape(-1)[faces], dtype=np.int32)
-    vertices, faces = fast_simplification.simplify(vertices, faces, target_count=wanted)
-    return {"vertices": np.asarray(vertices, dtype=np.float64), "faces": np.asarray(faces, dtype=np.int32)}
+    vertices, faces = fast_simplification.simplify(vertices, faces, target_count=triangles)
+    return TriangleMesh(vertices.astype(np.float64), faces.astype(np.int32)) if len(faces) else mesh

@@ -58,7 +58,6 @@ def slices_data(
     """What the page's slices are made of: facts, and the bytes of CT and surfaces.
 
     Args:
-        subject: The direction that is shown first.
         candidates: Of the search; their entries say how far the block reaches.
         picked: The row of that direction on the page.
         regions_ct: Shape (n, 3, 3), mm^2, of the tip, NaN where it is not known; None without declared errors.
@@ -134,7 +133,6 @@ def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = M
         hu: Shape (nx, ny, nz), Hounsfield units.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
         box_ct: Shape (2, 3), mm.
-        most: Bytes.
     """
     corners = np.array(list(itertools.product(*box_ct.T)))
     index = apply(np.linalg.inv(T_ct_index), corners)

@@ -42,8 +42,6 @@ def write_html(template: str, path: Path, **parts: object) -> None:
     """Fill a template and write the page, whole or not at all.
 
     Args:
-        template: Its file name.
-        path: The HTML to write.
         parts: What the template names: plain text, or `Markup`.
 
     Raises:

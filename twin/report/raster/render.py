@@ -70,11 +70,7 @@ class Surface:
 
 
 class Layer:
-    """Surfaces that move together, in their own frame. Of two in one place the first is seen.
-
-    Args:
-        surfaces: The surfaces, in one frame.
-    """
+    """Surfaces that move together, in their own frame. Of two in one place the first is seen."""
 
     def __init__(self, surfaces: Sequence[Surface]) -> None:
         self.surfaces = tuple(surfaces)

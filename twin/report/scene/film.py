@@ -18,14 +18,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
-from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface
 from puncture_twin.twin.report.scene.film_text import BELOW, FilmFrames, write_gif, write_mp4
-from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, bar, needle_bodies, patient, room
+from puncture_twin.twin.report.scene.scene_parts import (
+    ArmPicture,
+    SceneBody,
+    bar,
+    needle_bodies,
+    patient,
+    room,
+)
 from puncture_twin.twin.report.scene.views import close_up, overview
 
 MOST_THREADS = 4
@@ -89,12 +95,8 @@ def film_times(total_s: float) -> FilmTimes:
     return FilmTimes(tuple(float(m) for m in moments), float(speed), round(STILL_S * FRAMES_PER_SECOND))
 
 
-def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path, progress: Count = uncounted) -> Path:
+def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path) -> Path:
     """Write the film; a GIF beside it when no H.264 encoder can be started.
-
-    Args:
-        anatomy: Structures and skin, CT frame.
-        path: The ``.mp4`` to write; it appears whole or not at all.
 
     Returns:
         The file that was written.
@@ -102,10 +104,10 @@ def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path, pr
     times = film_times(float(rehearsal.times_s[-1]))
     film, path = _Film.of(rehearsal, plan, case, anatomy, times.speed), Path(path)
     try:
-        write_mp4(film.frames(times, progress), film.words.size, path, FRAMES_PER_SECOND)
+        write_mp4(film.frames(times), film.words.size, path, FRAMES_PER_SECOND)
     except (OSError, RuntimeError):  # no encoder on this machine, or one without H.264
         path = path.with_suffix(".gif")
-        write_gif(film.frames(times, progress), path, FRAMES_PER_SECOND)
+        write_gif(film.frames(times), path, FRAMES_PER_SECOND)
     return path
 
 
@@ -139,7 +141,7 @@ class _Film(NamedTuple):
             poses,
         )
 
-    def frames(self, times: FilmTimes, progress: Count) -> Iterator[Pixels]:
+    def frames(self, times: FilmTimes) -> Iterator[Pixels]:
         """The frames that move, drawn by as many threads as there are cores while others are encoded; then the last."""
         threads = min(len(os.sched_getaffinity(0)), MOST_THREADS)
         with ThreadPoolExecutor(threads) as pool:
@@ -149,7 +151,6 @@ class _Film(NamedTuple):
                 while len(waiting) > threads or (waiting and number == len(times.moments) - 1):
                     frame = waiting.popleft().result()
                     yield frame
-                progress(number + 1, len(times.moments))
         yield from repeat(frame, times.still_frames)
 
     def _frame(self, moment: float) -> Pixels:
@@ -165,7 +166,7 @@ def _moving_picture(bodies: list[SceneBody], camera: ViewCamera, layers: Sequenc
 
 def _planned_path(plan: Any) -> SceneBody:
     """The line that the tip should follow, from standoff to target."""
-    direction = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
+    direction = plan.outward_ct
     line = bar(plan.target_ct, plan.target_ct + plan.standoff_mm * direction, PLANNED_RADIUS_MM)
     return SceneBody("planned path", "safe", line, PLANNED)
 
@@ -174,14 +175,14 @@ def _tool_layer(case: Any, camera: ViewCamera) -> Layer:
     """All that the flange carries, flange frame: the needle points along +z, at least `NEEDLE_PIXELS` wide."""
     tip = np.array([0.0, 0.0, case.needle.length_mm])
     mm_per_pixel = float(camera.project(case.target_ct[None])[0, 2]) / camera.scale
-    bodies = needle_bodies(case.needle, tip, np.array([0.0, 0.0, -1.0]), NEEDLE_PIXELS / 2 * mm_per_pixel).all
+    bodies = needle_bodies(case.needle, tip, np.array([0.0, 0.0, -1.0]), NEEDLE_PIXELS / 2 * mm_per_pixel)
     own = [] if case.tool is None else [Surface(case.tool.mesh, palette.HOLDER)]
     return Layer([*(Surface(b.mesh, b.colour) for b in bodies), *own])
 
 
 def _wide_camera(case: Any, still: list[SceneBody], arm: ArmPicture, rehearsal: Any, plan: Any) -> ViewCamera:
     """The patient fills the picture, seen from the entry's side, with the needle at its standoff."""
-    direction = (plan.entry_ct - plan.target_ct) / np.linalg.norm(plan.entry_ct - plan.target_ct)
+    direction = plan.outward_ct
     focus = plan.target_ct + np.linspace(0, plan.standoff_mm + case.needle.length_mm, 24)[:, None] * direction
     shown = focus[np.linalg.norm(focus - plan.target_ct, axis=1) < plan.standoff_mm + ABOVE_MM]
     skin = [b.mesh.vertices for b in still if b.group == "skin"]

@@ -31,7 +31,6 @@ def write_mp4(frames: Iterable[Pixels], size: tuple[int, int], path: Path, fps: 
     Args:
         frames: Each of shape (h, w, 3).
         size: Width and height; multiples of 16, as H.264 likes them.
-        path: The ``.mp4`` to write.
 
     Raises:
         OSError: No encoder can be started.
@@ -99,10 +98,7 @@ class FilmFrames:
     """Whole frames: the overview is upper left, the close-up beside it, numbers below.
 
     Args:
-        rehearsal: What was measured.
         cameras: Of the overview and of the close-up.
-        speed: Of the playback.
-        keep_away: The structures that the needle must keep away from.
     """
 
     def __init__(

@@ -59,37 +59,28 @@ def ring(T_ct_ring: Floats, inner: float, outer: float, thickness: float) -> Tri
     return revolved(outline, 2 * SECTIONS).transformed(np.asarray(T_ct_ring))
 
 
-def corridor_mouth(candidates: Candidates, case: Any) -> TriangleMesh | None:
-    """Patches of the skin where a needle may enter, one for every safe cell of the grid; None when nothing is safe."""
-    cells = _cells(candidates, case)
-    if cells is None:
-        return None
-    points, corners = cells
-    return TriangleMesh(points, np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]))
+def corridor(candidates: Candidates, case: Any) -> list[TriangleMesh]:
+    """Where a needle may enter: a patch of the skin for every safe cell of the grid, and the walls from there.
 
-
-def corridor_walls(candidates: Candidates, case: Any) -> TriangleMesh | None:
-    """The border of the safe directions: triangles from the target to the rim of the mouth."""
-    cells = _cells(candidates, case)
-    if cells is None:
-        return None
-    points, corners = cells
+    These are triangles from the target to the rim of the patches. Nothing where nothing is safe; no walls where all is.
+    """
+    rows = np.flatnonzero(candidates.safe & np.isfinite(candidates.path.length))
+    if len(rows) == 0:
+        return []
+    points, corners = _cells(candidates, case, rows)
+    mouth = TriangleMesh(points, np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]]))
     edges = np.sort(np.concatenate([corners[:, [i, (i + 1) % 4]] for i in range(4)]), axis=1)
     edges, uses = np.unique(edges, axis=0, return_counts=True)
     rim = edges[uses == 1]
-    long = np.linalg.norm(points[rim[:, 0]] - points[rim[:, 1]], axis=1) > KEY
-    rim = rim[long]
+    rim = rim[np.linalg.norm(points[rim[:, 0]] - points[rim[:, 1]], axis=1) > KEY]
     if len(rim) == 0:
-        return None
+        return [mouth]
     apex = np.full((len(rim), 1), len(points))
-    return TriangleMesh(np.vstack([points, case.target_ct]), np.hstack([apex, rim]))
+    return [mouth, TriangleMesh(np.vstack([points, case.target_ct]), np.hstack([apex, rim]))]
 
 
-def _cells(candidates: Candidates, case: Any) -> tuple[Floats, NDArray[np.int64]] | None:
-    """Corner points (n, 3), shared between cells, and the four corners (m, 4) of every safe cell."""
-    rows = np.flatnonzero(candidates.safe & np.isfinite(candidates.path.length))
-    if len(rows) == 0:
-        return None
+def _cells(candidates: Candidates, case: Any, rows: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
+    """Corner points (n, 3), shared between cells, and the four corners (m, 4) of the cells of some rows."""
     half = step_of(candidates) / 2
     signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     theta = np.clip(candidates.theta[rows, None] + half * signs[:, 0], 0.0, np.pi)
@@ -168,7 +159,6 @@ class SceneBody:
     Attributes:
         group: "organ", "skin", "safe", "needle", "arm", "room" or "target".
         mesh: CT frame, mm.
-        alpha: 1 for opaque; less for see-through.
         frame: Of an arm's link: with which of ``link_poses`` it moves.
     """
 
@@ -184,19 +174,6 @@ class SceneBody:
         """For the ray caster; the corridor is flat colour, without the rim that makes a skin look like glass."""
         rim = 0.0 if self.group == "safe" else Surface.rim
         return Surface(self.mesh, self.colour, self.alpha, rim)
-
-
-@dataclass(frozen=True, eq=False)
-class NeedleBodies:
-    """Needle and holder at one place."""
-
-    needle: SceneBody
-    holder: SceneBody | None
-
-    @property
-    def all(self) -> tuple[SceneBody, ...]:
-        """Both, or the needle alone where the shaft reaches the flange."""
-        return (self.needle,) if self.holder is None else (self.needle, self.holder)
 
 
 def patient(anatomy: Any, case: Any) -> tuple[SceneBody, ...]:
@@ -232,17 +209,15 @@ def _opacity(structure: Any, case: Any) -> float:
 
 def safe_region(candidates: Candidates, case: Any) -> tuple[SceneBody, ...]:
     """The safe directions: where they pierce the skin, and the walls of the corridor; empty when nothing is safe."""
-    mouth, walls = corridor_mouth(candidates, case), corridor_walls(candidates, case)
-    bodies = []
-    if mouth is not None:
-        bodies.append(SceneBody("safe entry", "safe", mouth, SAFE, MOUTH_OPACITY))
-    if walls is not None:
-        bodies.append(SceneBody("safe corridor", "safe", walls, SAFE, WALL_OPACITY))
-    return tuple(bodies)
+    looks = (("safe entry", MOUTH_OPACITY), ("safe corridor", WALL_OPACITY))
+    meshes = corridor(candidates, case)
+    return tuple(SceneBody(name, "safe", mesh, SAFE, alpha) for mesh, (name, alpha) in zip(meshes, looks, strict=False))
 
 
-def needle_bodies(needle: Any, tip_ct: Floats, outward_ct: Floats, least_mm: float = LEAST_NEEDLE_MM) -> NeedleBodies:
-    """Needle and holder with the tip at a point.
+def needle_bodies(
+    needle: Any, tip_ct: Floats, outward_ct: Floats, least_mm: float = LEAST_NEEDLE_MM
+) -> tuple[SceneBody, ...]:
+    """Needle and holder with the tip at a point; the needle alone where the shaft reaches the flange.
 
     Args:
         needle: With ``length_mm``, ``shaft_mm``, ``radius_mm``, ``holder_diameter_mm``.
@@ -253,9 +228,9 @@ def needle_bodies(needle: Any, tip_ct: Floats, outward_ct: Floats, least_mm: flo
     shaft, top = tip_ct + needle.shaft_mm * outward_ct, tip_ct + needle.length_mm * outward_ct
     body = SceneBody("needle", "needle", bar(tip_ct, shaft, radius), palette.NEEDLE)
     if needle.length_mm - needle.shaft_mm < 1e-6:
-        return NeedleBodies(body, None)
+        return (body,)
     holder = bar(shaft, top, needle.holder_diameter_mm / 2)
-    return NeedleBodies(body, SceneBody("needle holder", "needle", holder, palette.HOLDER))
+    return body, SceneBody("needle holder", "needle", holder, palette.HOLDER)
 
 
 def chosen_direction(pick: Pick | None, plan: Any | None) -> Floats | None:

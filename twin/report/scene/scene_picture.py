@@ -65,10 +65,8 @@ def draw_scene(
     """Write the picture of the scene.
 
     Args:
-        anatomy: Structures and skin, CT frame.
         candidates: The search's rows; the safe ones make the corridor.
         plan: The plan, or None: then the needle is that of the best candidate, and the arm that of the search.
-        path: The PNG to write; it appears whole or not at all.
         pick: The planned candidate, or the one to be shown; None shows the best.
         T_base_ct: Shape (4, 4), mm, of a search whose arm was checked.
         failed: Whether a plan was requested, and there is none.
@@ -78,7 +76,7 @@ def draw_scene(
     bodies = [*patient(anatomy, case), *safe_region(candidates, case), *room(case, T_base_ct)]
     direction = chosen_direction(pick, plan)
     if direction is not None:
-        bodies.extend(needle_bodies(case.needle, case.target_ct, direction).all)
+        bodies.extend(needle_bodies(case.needle, case.target_ct, direction))
     arm = [] if failed else arm_bodies(case, plan, pick, T_base_ct)
     image = Image.new("RGB", (WIDTH, HEIGHT), annotate.WHITE)
     draw = ImageDraw.Draw(image)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -56,16 +57,10 @@ def overview(
     Args:
         content_ct: Shape (n, 3), what must be in the picture.
         focus_ct: Shape (k, 3), what should not be hidden.
-        size: Width and height in pixels.
         outward_ct: Shape (3,), unit, from the target out of the body along the needle; None looks from any side.
     """
     up = up_ct(case)
-    side = _across(up)
-    options = []
-    for elevation in ELEVATIONS:
-        for turn in (np.arange(AZIMUTHS) + 0.5) * 2 * np.pi / AZIMUTHS:
-            level = np.cos(turn) * side + np.sin(turn) * np.cross(up, side)
-            options.append(-np.cos(elevation) * level - np.sin(elevation) * up)
+    options = [-one for one in _around(up, ELEVATIONS)]
     if str(case.space) != "local":
         options = [o for o in options if abs(o @ np.array(ANATOMICAL_LPS["head"])) < ALONG_BODY]
     if outward_ct is not None:
@@ -79,23 +74,24 @@ def close_up(case: Any, path_ct: Floats, radius: float, blockers: Layer, size: t
     Args:
         path_ct: Shape (2, 3), target and entry.
         radius: mm about the path's ends that must be in the picture.
-        size: Width and height in pixels.
     """
     along = (path_ct[1] - path_ct[0]) / np.linalg.norm(path_ct[1] - path_ct[0])
-    side = _across(along)
-    options = []
-    for tilt in TILTS:
-        for turn in (np.arange(AZIMUTHS) + 0.5) * 2 * np.pi / AZIMUTHS:
-            level = np.cos(turn) * side + np.sin(turn) * np.cross(along, side)
-            options.append(np.cos(tilt) * level + np.sin(tilt) * along)
     up = up_ct(case)
-    options = [o for o in options if o @ up < 0.35]  # not from below the table
+    options = [o for o in _around(along, TILTS) if o @ up < 0.35]  # not from below the table
     steps = np.linspace(0, 1, PATH_SAMPLES)[:, None]
     focus = path_ct[0] * (1 - steps) + path_ct[1] * steps
     focus = np.concatenate([focus, np.repeat(path_ct[:1], TARGET_WEIGHT, axis=0)])
     cube = radius * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3)
     content = np.concatenate([path_ct[0] + cube, path_ct[1] + cube])
     return _best(options, up, content, focus, blockers, size)
+
+
+def _around(axis: Floats, tilts: Sequence[float]) -> list[Floats]:
+    """Unit vectors about a unit axis (3,), at so many azimuths, so far toward it from across, rad."""
+    side = _across(axis)
+    turns = (np.arange(AZIMUTHS) + 0.5) * 2 * np.pi / AZIMUTHS
+    levels = [np.cos(turn) * side + np.sin(turn) * np.cross(axis, side) for turn in turns]
+    return [np.cos(tilt) * level + np.sin(tilt) * axis for tilt in tilts for level in levels]
 
 
 def _across(direction: Floats) -> Floats:

@@ -62,7 +62,6 @@ class Subject:
     """One direction, as the slices show it.
 
     Attributes:
-        anatomy: Structures, skin, and the CT where there is one.
         pick: The candidate; None for the image alone, in which nobody has proposed a needle yet.
         region_ct: Shape (3, 3), mm^2: the tip is expected within x' inv(region) x <= 1 in 95 of 100; None without
             declared errors.

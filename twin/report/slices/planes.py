@@ -200,7 +200,6 @@ def capsule(outward_ct: Floats, length_mm: float, radius_mm: float, plane: Plane
     Args:
         outward_ct: From the target along the needle, unit, shape (3,).
         length_mm: The piece's length; it begins at the target.
-        radius_mm: Greater than 0.
         points: On each of the line's two sides.
 
     Returns:

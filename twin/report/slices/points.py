@@ -45,7 +45,6 @@ def write_points_sheet(
 
     Args:
         hu_at: Hounsfield units at points (n, 3), NaN outside of the image; None without a CT.
-        half_mm: Half of a slice's side.
     """
     rows = -(-len(points) // ACROSS)
     width, height = 2 * TILE + GAP, TILE + CAPTION + GAP

@@ -318,7 +318,7 @@
   readout("");
 
   // ---- the scene -----------------------------------------------------------------------------------------------
-  const scene = byId("scene");
+  const scene = byId("scene3d");
   let probing = null, probed = null, inSight = false;
   const probeTrace = data.scene.data.length - 1;
   function hasWebgl() {

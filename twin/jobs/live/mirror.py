@@ -20,7 +20,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points import parse_joint_recording
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE
-from puncture_twin.twin.jobs.robot.rtde import RecordedState, connect, live_states
+from puncture_twin.twin.jobs.live.rtde import RecordedState, connect, live_states
 
 MAX_RECORDING_BYTES = 200_000_000
 """An hour at 125 states a second is 60 MB."""

@@ -1,1 +1,0 @@
-"""The commands about a real robot: mirror, which only reads."""
