@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from puncture_twin.planning.formats.labels.naming import BUILT_IN, LabelRule, Ru
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.volumes.volume_files import NRRD_ENDINGS
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, refuse_lost_grid
+from puncture_twin.planning.geometry.containment import contains
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, Unit, Up, parse_space, parse_unit
 
@@ -151,7 +153,12 @@ class StructureSources:
             volume = self._volume(name) if label is None else self._labels(name)
             organs, ct = [(one.mesh, one.voxel_mm) for one in structures], self._case.ct
             shown = Shown(self._case.region == "phantom", ct.arms, ct.table)
-            self._imaged[name, label] = volume.imaged(label, organs, shown=shown, stated=stated)
+            imaged, target_ct = partial(volume.imaged, label, organs, stated=stated), self._case.target_ct
+            seen = imaged(shown=shown)
+            of_skin = label is None and name == self._case.skin_section.ct
+            if shown.phantom and of_skin and not contains(seen.skin().mesh, target_ct):
+                seen = imaged(shown=replace(shown, about=tuple(target_ct.tolist())))  # of several phantoms another
+            self._imaged[name, label] = seen
         return self._imaged[name, label]
 
     def scan(self, skin_section: StructureSection, skin: Skin, structures: Sequence[Structure] = ()) -> Scan | None:

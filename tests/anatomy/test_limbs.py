@@ -95,18 +95,17 @@ def test_a_bone_that_a_structure_names_is_no_evidence(line):
         assert limbs_of(hu, body, structures=[Named(name, bone)]).any(), name
 
 
-@pytest.mark.parametrize("name", ["femur_right", "rib_right_7"])
-def test_a_thigh_pressed_against_the_one_that_holds_the_target_is_found_though_its_bone_is_named(name):
-    """Two thighs of 75 mm side by side; beyond a neck a leg's bone is a limb's, a rib is not."""
+def test_a_thigh_pressed_against_the_one_that_holds_the_target_is_found_though_its_bone_is_named():
+    """Two thighs of 75 mm side by side: beyond a neck no bone is asked for."""
     x = POINTS[..., 0] - 160.0, POINTS[..., 1] - 140.0
     left, right = (np.hypot(x[0] - side * 73.0, x[1]) < 75.0 for side in (1, -1))
     line = (160.0 - 73.0, 140.0, 0.0), (160.0 - 73.0, 140.0, 180.0)
     hu, body = image(trunk=left | right)
     hu[body & (hu > 200.0)], hu[about(*line) < 14.0] = 30.0, 600.0
     vertices = ball(np.zeros(3), 1.0).vertices * [14.0, 14.0, 120.0] + line[0] + [0.0, 0.0, 90.0]
-    femur = Named(name, type(ball(np.zeros(3), 1.0))(vertices, ball(np.zeros(3), 1.0).faces))
+    femur = Named("femur_right", type(ball(np.zeros(3), 1.0))(vertices, ball(np.zeros(3), 1.0).faces))
     found = limbs_of(hu, body, np.array([200.0, 140.0, 90.0]), [femur])
-    assert found[right & ~left].mean() == pytest.approx(1.0 if name == "femur_right" else 0.0, abs=0.02)
+    assert found[right & ~left].mean() > 0.98
 
 
 def test_an_arm_that_holds_the_target_is_not_forbidden():

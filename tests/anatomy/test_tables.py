@@ -5,7 +5,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 from places import REAL_CT
 
-from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, body_mask
+from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, CtImage, body_mask
 from puncture_twin.planning.anatomy.body.outside_body import OutsideImage, outside_mask
 from puncture_twin.planning.anatomy.body.tables import (
     Shown,
@@ -24,9 +24,9 @@ X, Y, Z = np.indices(SHAPE) * SPACING.reshape(3, 1, 1, 1)
 """mm from the first voxel."""
 
 
-def trunk(wave_mm=8.0):
+def trunk(wave_mm=8.0, lean=0.0):
     """A trunk of 280 x 180 mm whose section changes along the bed by waves, Hounsfield units above the threshold."""
-    radius = np.hypot((X - 198.0) / 140.0, (Y - 150.0) / 90.0)
+    radius = np.hypot((X - 198.0) / 140.0, (Y - lean * (Z - 80.0) - 150.0) / 90.0)
     return 500.0 * np.clip((1.0 - radius) * 90.0 + wave_mm * np.sin(Z / 14.0), -4.0, 4.0) / 4.0
 
 
@@ -53,10 +53,13 @@ def test_a_body_in_air_has_no_drawn_side():
     assert drawn(above, trunk() > 0.0) == ()
 
 
-@pytest.mark.parametrize("slope", [(0.0, 0.0), (0.03, 0.0), (0.0, 0.06), (-0.02, 0.05)])
-def test_a_cradle_that_holds_together_with_the_body_is_drawn(slope):
-    """Its far side is found to a part of a voxel, at any angle between bed and slices."""
-    scene = np.maximum(trunk(), cradle(slope=slope))
+@pytest.mark.parametrize(
+    ("slope", "lean"),
+    [((0.0, 0.0), 0.0), ((0.03, 0.0), 0.0), ((0.0, 0.06), 0.0), ((-0.02, 0.05), 0.0), ((0.0, 0.36), 0.36)],
+)
+def test_a_cradle_that_holds_together_with_the_body_is_drawn(slope, lean):
+    """Its far side is found to a part of a voxel, at any angle between bed and slices, as after a tilted gantry."""
+    scene = np.maximum(trunk(lean=lean), cradle(slope=slope))
     (back,) = drawn(noisy(scene), scene > 0.0)
     across_mm = np.arange(100.0)[:, None] * 4.0 - 198.0 - slope[0] * (np.arange(32) * 5.0 - 80.0)
     truth = 232.0 - 250.0 + np.sqrt(274.0**2 - across_mm**2) + slope[1] * (np.arange(32) * 5.0 - 80.0)
@@ -198,6 +201,36 @@ def test_a_body_with_one_section_at_all_four_sides_is_no_table(kind):
     assert "phantom" in found.warnings[0]
     stated = touching_tables(scene, scene > 0.0, SPACING, Shown(table="present"))
     assert (1, -1) in {side.face for side in stated.sides}
+
+
+def test_a_prism_on_a_table_beside_which_it_ends_is_no_table():
+    """Seen from the front the table's top beside it is no end of its own; its front is drawn as its flanks are."""
+    phantom = np.where(SHORT, block("cylinder"), -500.0)
+    table_mm = np.minimum(12.0 - np.abs(Y - 242.0), 190.0 - np.abs(X - 198.0))
+    scene = noisy(np.maximum(phantom, 500.0 * np.clip(table_mm, -4.0, 4.0) / 4.0))
+    found = touching_tables(scene, scene > 0.0, SPACING, Shown(arms="none"))
+    assert found.cut_off[table_mm > 4.0].mean() > 0.8
+    assert found.sides == ()
+
+
+def test_arms_that_are_said_to_be_in_the_image_leave_the_faces_beside_them_free():
+    """Not those that cut the body."""
+    inside = (trunk() > 0.0)[5:95]
+    table = (Y[5:95] > 250.0) & (Y[5:95] < 275.0)
+    assert find_support(table & ~inside, inside, SPACING).open_faces == ((0, 0), (0, -1))
+    assert find_support(table & ~inside, inside, SPACING, shown=Shown(arms="present")).open_faces == ()
+    nothing = np.zeros_like(inside)
+    cut = find_support(nothing[20:], inside[20:], SPACING, shown=Shown(arms="present", table="present"))
+    assert (0, 0) in cut.open_faces and (0, -1) not in cut.open_faces
+
+
+def test_of_two_phantoms_the_one_about_the_target_is_the_body():
+    """Though it is the smaller one; where none holds it, the larger is."""
+    small, large = (np.hypot(X - x, Y - 150.0) < radius for x, radius in ((80.0, 50.0), (270.0, 90.0)))
+    hu = noisy(np.where((small | large) & SHORT, 40.0, -1000.0)).astype(np.float32)
+    for about, body in (((80.0, 150.0, 80.0), small), ((350.0, 20.0, 80.0), large), (None, large)):
+        image = CtImage(hu, np.diag([*SPACING, 1.0]), CT, Shown(phantom=True, whole=True, about=about))
+        assert (image.found.body != (body & SHORT)).mean() < 0.001
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.0, 0.06)])

@@ -5,9 +5,8 @@ beyond the circle of reconstruction, beyond the slab of a tilted gantry that was
 slices that fill a volume up. Some write -3024, some the value of air, some 0. Air that was measured has noise, and
 never one value over a whole corner of an image.
 
-A limb that does not touch the trunk is of soft tissue and holds bone, or changes its section along the bed. A table
-does neither: it is one section, drawn along the bed. What is taken for neither stays outside of the body, where
-nothing dense counts as air (`puncture_twin.planning.anatomy.body.outside_body`).
+A limb that does not touch the trunk is of soft tissue and holds bone, which no table or cushion does. What is taken for
+none stays outside of the body, where nothing dense counts as air (`puncture_twin.planning.anatomy.body.outside_body`).
 """
 
 from __future__ import annotations
@@ -25,10 +24,11 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.cut_ends import Box, Content, content_of, shifted, spacing_of
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown, TableSide, touching_tables
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, grown, widened
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32, grown, widened
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.volumes.volume_files import Volume, canonical, in_order
 from puncture_twin.planning.geometry.parts import largest_part, middle_of, parts_of
+from puncture_twin.planning.geometry.rigid import apply
 
 UNSCANNED_HU = -1500.0
 """Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
@@ -123,9 +123,6 @@ BONE_HU = 200.0
 """Above soft tissue with contrast in its vessels; cortical bone has 500 and more."""
 MIN_BONE_ML = 1.0
 """Some 10 mm of an adult's radius."""
-ALIKE = 0.9
-"""Overlap (intersection over union) of sections with the median one, from which on a part is one section drawn along
-the bed."""
 UNSCANNED = (
     "the edge of the scanned region (the scanner's field of view, or a constant fill value) cuts the body; the skin "
     "is not known there, nor is a body for the arm to avoid; the space near it is unknown_region (outside_body)"
@@ -180,7 +177,9 @@ class CtImage:
     @cached_property
     def found(self) -> BodyMask:
         """The body."""
-        return body_mask(self.hu, self.spacing_mm, where=self.where, shown=self.shown, unscanned=self.unscanned)
+        about = self.shown.about
+        at = None if about is None else np.rint(apply(np.linalg.inv(self.T_ct_index), np.array(about))).astype(int)
+        return body_mask(self.hu, self.spacing_mm, where=self.where, shown=self.shown, unscanned=self.unscanned, at=at)
 
     @cached_property
     def unscanned(self) -> Bools:
@@ -210,7 +209,13 @@ def ct_image(volume: Volume) -> CtImage:
 
 
 def body_mask(
-    hu: NDArray[Any], spacing_mm: Floats, *, where: str | Path, shown: Shown = PATIENT, unscanned: Bools | None = None
+    hu: NDArray[Any],
+    spacing_mm: Floats,
+    *,
+    where: str | Path,
+    shown: Shown = PATIENT,
+    unscanned: Bools | None = None,
+    at: Ints | None = None,
 ) -> BodyMask:
     """Finds the patient, or the phantom, in a CT.
 
@@ -221,6 +226,7 @@ def body_mask(
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
         spacing_mm: Shape (3,).
         unscanned: What was not measured, where that is known.
+        at: Shape (3,), a voxel of the part that is meant, where that need not be the largest.
 
     Raises:
         InputError: No body, an implausibly small one, or no air around it.
@@ -228,7 +234,10 @@ def body_mask(
     voxel_ml = float(np.prod(spacing_mm)) / 1000.0
     dense = hu > BODY_HU
     trunk, parts = np.zeros(hu.shape, bool), thick_parts(dense, spacing_mm)
-    for first in itertools.islice(parts, 1):
+    first = next(parts, None)
+    if at is not None:
+        first = next((part for part in parts if part.holds(at)), first)
+    if first is not None:
         trunk[first.box] = largest_part(first.mask)
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
         what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU are connected"
@@ -276,11 +285,8 @@ def _fill_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warni
     Filling too much is the safe side: it turns "air" at the border into "unknown".
     """
     air = parts_of(~body)
-    denser = air.counts(hu > OUTSIDE_AIR_HU)
-    inside = (air.sizes * voxel_ml < MIN_OUTSIDE_ML) | (2 * denser > air.sizes)
-    numbers = np.arange(len(inside))
-    for number in np.flatnonzero(~inside & (2 * denser == air.sizes)):  # the median lies between two values
-        inside[number] = np.median(hu[air.painted(numbers == number)]) > OUTSIDE_AIR_HU
+    denser, solid = air.counts(hu > OUTSIDE_AIR_HU), air.counts(hu > BODY_HU)  # a table lies in the room's air
+    inside = (air.sizes * voxel_ml < MIN_OUTSIDE_ML) | (2 * (denser - solid) >= air.sizes - solid)
     if inside.any():
         body |= air.painted(inside)
         total = (air.sizes * voxel_ml)[inside].sum()
@@ -297,6 +303,11 @@ class Piece(NamedTuple):
 
     box: tuple[slice, ...]
     mask: Bools
+
+    def holds(self, at: Ints) -> bool:
+        """Whether a voxel (3,) of the image belongs to it."""
+        index = at - [one.start for one in self.box]
+        return bool(np.all((index >= 0) & (index < self.mask.shape)) and self.mask[tuple(index)])
 
 
 def thick_parts(mask: Bools, spacing_mm: Floats) -> Iterator[Piece]:
@@ -351,7 +362,7 @@ def detached_limbs(hu: NDArray[np.float32], parts: Iterable[Piece], spacing_mm: 
         if len(values) * np.prod(spacing_mm) < 1000.0 * MIN_LIMB_ML:
             continue
         soft = SOFT_TISSUE_HU[0] <= float(np.median(values)) <= SOFT_TISSUE_HU[1]
-        if soft and (not _one_section(part.mask, hu.shape[2]) or _holds_bone(part.mask, hu[part.box], spacing_mm)):
+        if soft and _holds_bone(part.mask, hu[part.box], spacing_mm):
             limbs.append(part)
     return tuple(limbs)
 
@@ -377,11 +388,3 @@ def _side(limb: Piece, middle: Floats) -> str:
     if abs(away[0]) >= abs(away[1]):
         return "left of it" if away[0] > 0 else "right of it"
     return "behind it" if away[1] > 0 else "in front of it"
-
-
-def _one_section(part: Bools, slices: int) -> bool:
-    """Whether the part is the same in nearly every slice of the image, as a table is."""
-    section = part[:, :, part.any(axis=(0, 1))].mean(axis=2) > 0.5
-    both = (part & section[:, :, None]).sum(axis=(0, 1))
-    either = (part | section[:, :, None]).sum(axis=(0, 1))
-    return bool(np.sum(both / np.maximum(either, 1)) > ALIKE * slices)

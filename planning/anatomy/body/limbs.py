@@ -5,9 +5,9 @@ neck (a ball that fits into either does not fit through where they touch), and a
 below skin that is nearly flat: of a sphere about it, 1.6 times as wide as it is deep, .19 is air, however it runs.
 About a forearm's bones it is a third and more.
 
-Labels explain bones: what has a known name is no evidence, unless that is an arm's, or of bones altogether; beyond a
-neck a leg's bone is evidence too. No part that is larger than a limb can be is one, nor the part that holds the target,
-nor its organ. All of it is decided on a grid of 4 mm.
+Labels explain bones: what has a known name is no evidence, unless that is an arm's, or of bones altogether. Beyond a
+neck no bone is asked for. No part that is larger than a limb can be is one, nor the part that holds the target.
+All of it is decided on a grid of 4 mm.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ NAMED_DENSE = 0.4
 are."""
 LIMBS = "limbs and girdles"
 """Their line in the table of names; the names of arms, and of bones altogether, are among its others."""
-GIRDLE, LEG = re.compile(r"scapula|clavic"), re.compile(r"femur|tibia|fibula|patella|tarsal")
+NO_ARM = re.compile(r"scapula|clavic|femur|tibia|fibula|patella|tarsal")
+"""Others of that line."""
 DEEPEST_MM, DEEPEST_FRACTION = 60.0, 0.45
 """From a limb's bone to the air, and as a fraction of what the trunk's middle has: a spine lies deeper."""
 GAP_MM = 16.0
@@ -84,14 +85,12 @@ class BodyPart:
         body: Shape (nx, ny, nz); a block counts where any of its voxels does.
         solid: Same shape, the whole body, and what was not scanned: neither is air.
         bone: Same shape, bone that is evidence of a limb; a block counts where an eighth of it is, which noise is not.
-        limb_bone: Same shape, a leg's named bone too: such is a limb's beyond a neck, and the trunk's in a hip.
         spacing_mm: Shape (3,).
     """
 
     body: Bools
     solid: Bools
     bone: Bools
-    limb_bone: Bools
     spacing_mm: Floats
 
     def volume_ml(self, mask: Bools) -> float:
@@ -106,12 +105,10 @@ class BodyPart:
 
     @cached_property
     def pieces(self) -> tuple[Piece, ...]:
-        """Parts beyond a narrow neck that hold bone, and what lies about exposed bones; the same for every target."""
-        if self.volume_ml(self.limb_bone) < MIN_BONE_ML:
-            return ()
-        parts = (self._core == number for number in range(1, int(self._core.max(initial=0)) + 1))
-        bony = (part for part in parts if self.volume_ml(part & self.limb_bone) >= MIN_BONE_ML)
-        return (*(Piece(part, part, self.volume_ml(part)) for part in bony), *map(self._about, self._exposed()))
+        """Parts beyond a narrow neck, and what lies about exposed bones; the same for every target."""
+        parts = [self._core == number for number in range(1, int(self._core.max(initial=0)) + 1)]
+        necks = (Piece(part, part, self.volume_ml(part)) for part in parts if len(parts) > 1)
+        return (*necks, *map(self._about, self._exposed()))
 
     def chosen(self, at: tuple[int, ...]) -> Iterator[int]:
         """Of each piece: no limb (0), near (1) or whole (2), where a block holds the target."""
@@ -211,29 +208,27 @@ def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> Lim
     parts, _ = scipy.ndimage.label(coarse)
     solid = coarse | (2 * in_blocks(image.unscanned, stride) >= np.prod(stride))
     every_bone = 8 * in_blocks(body & (image.hu > BONE_HU), stride) >= np.prod(stride)
-    legs, others = _explained(every_bone, T, structures)
+    bone = every_bone & ~_explained(every_bone, T, structures)
     spacing_mm = image.spacing_mm * stride
 
     @cache
     def part(number: int) -> BodyPart:
         own = parts == number
-        return BodyPart(own, solid, every_bone & own & ~(legs | others), every_bone & own & ~others, spacing_mm)
+        return BodyPart(own, solid, bone & own, spacing_mm)
 
     return LimbSearch(parts, T, part)
 
 
-def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[Named]) -> tuple[Bools, Bools]:
-    """Blocks within, or beside, a structure that is a leg's bone, and one that is another of a known name, no arm's."""
-    legs, others = np.zeros(bone.shape, bool), np.zeros(bone.shape, bool)
+def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[Named]) -> Bools:
+    """Blocks within, or beside, a structure that is a bone of a known name, no arm's."""
+    explained = np.zeros(bone.shape, bool)
     for name, mesh in structures:
-        line, plain = default_role(name, "other"), plain_name(name)
-        leg = line is not None and LEG.search(plain) is not None
-        if line is not None and (line.group != LIMBS or leg or GIRDLE.search(plain)):
+        line = default_role(name, "other")
+        if line is not None and (line.group != LIMBS or NO_ARM.search(plain_name(name))):
             inside = voxels_inside(mesh, T_ct_index, bone.shape)
             if np.count_nonzero(inside & bone) >= NAMED_DENSE * np.count_nonzero(inside):
-                explained = legs if leg else others
                 explained |= inside
-    return scipy.ndimage.binary_dilation(legs, FULL), scipy.ndimage.binary_dilation(others, FULL)
+    return np.asarray(scipy.ndimage.binary_dilation(explained, FULL))
 
 
 def _axis(points: Floats) -> tuple[Floats, Floats]:

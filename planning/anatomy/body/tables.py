@@ -40,10 +40,6 @@ LEAST_LENGTH_MM, LEAST_SLICES = 50.0, 12
 """A shorter image, or fewer slices of a part of one, may show any body as one section: tables are not told."""
 TILTS_FROM_MM = 100.0
 """From this length of the image on, a bed at an angle to the slices' axis is looked for too."""
-TILTS = np.tan(np.radians(np.linspace(-4.0, 4.0, 17)))
-"""Of the bed against the slices' axis, across the lines of sight; along them any angle is found."""
-NEARLY = 0.95
-"""A tilted bed explains more than a straight one only if more than this is drawn."""
 EDGE_MM = 30.0
 """The edge of a table or cradle is no thicker."""
 NEAR_MM = 60.0
@@ -83,12 +79,14 @@ class Shown:
         phantom: It shows a phantom: no limb, and what holds together is the phantom.
         arms, table: ``none`` or ``present``; None where nobody said so.
         whole: The image shows all of it, in air.
+        about: Of several phantoms the one that holds this point is meant, LPS mm; the largest where none does.
     """
 
     phantom: bool = False
     arms: str | None = None
     table: str | None = None
     whole: bool = False
+    about: tuple[float, ...] | None = None
 
     @property
     def limbs(self) -> bool:
@@ -283,14 +281,13 @@ class _View(NamedTuple):
         ends_mm = np.where(self.counts, _smooth(self.ends * along_mm, float(self.spacing_mm[2])), np.nan)
         slope, outward = self._slope(ends_mm), 1.0 if end else -1.0
         at, drawn, off_mm = self._drawn(ends_mm, slope)
-        edge_mm = EDGE_MM if self.touching else -np.inf
-        if self.touching and drawn.sum() * across_mm < DRAWN_WIDTH_MM:
-            return max(filter(None, self._parts(middle)), key=lambda side: side.width_mm, default=None)
-        firm = not self.touching or self._one_piece(off_mm[drawn])
-        edge_mm = edge_mm if firm else 0.0
-        sink = slope[:, None] * np.arange(ends_mm.shape[1]) * self.spacing_mm[2]
         drawn &= outward * (at + slope * middle[2] * self.spacing_mm[2]) > outward * middle[axis] * along_mm
         width_mm = drawn.sum() * across_mm
+        if self.touching and width_mm < DRAWN_WIDTH_MM:
+            return max(filter(None, self._parts(middle)), key=lambda side: side.width_mm, default=None)
+        firm = not self.touching or self._one_piece(off_mm[drawn])
+        edge_mm = (EDGE_MM if firm else 0.0) if self.touching else -np.inf
+        sink = slope[:, None] * np.arange(ends_mm.shape[1]) * self.spacing_mm[2]
         closed = scipy.ndimage.binary_closing(drawn, np.ones(3))
         runs = scipy.ndimage.binary_opening(closed, np.ones(max(1, int(RUN_MM / across_mm))))
         if width_mm < DRAWN_WIDTH_MM or not runs.any():
@@ -308,26 +305,14 @@ class _View(NamedTuple):
         return TableSide(self.face, (line[:, None] + steady) / along_mm, lines, of_bed, float(width_mm), firm)
 
     def _slope(self, ends_mm: Floats) -> Floats:
-        """How the ends of each line of sight move along the bed, shape (n,), mm per mm: that of a bed at an angle.
-
-        A bed moves along the lines of sight, and across them, where its section moves the ends as it is inclined. Of
-        all angles that under which most is drawn; of those under which nearly most is, the least.
-        """
-        n, count = ends_mm.shape
-        step_mm, across_mm = float(self.spacing_mm[2]), float(self.spacing_mm[1 - self.face[0]])
+        """How the ends of each line of sight move along the bed, shape (n,), mm per mm; steep after a tilted gantry."""
+        count, step_mm = ends_mm.shape[1], float(self.spacing_mm[2])
         if count * step_mm < TILTS_FROM_MM:
-            return np.zeros(n)
-        lag, some = count // 2, slice(None, None, max(1, int(4.0 / across_mm)))
-        section = _medians(ends_mm)
-        incline = np.where(np.isfinite(section), np.gradient(section, across_mm), 0.0)
-        moves = (ends_mm[some, lag:] - ends_mm[some, :-lag]) / (lag * step_mm)
-        slopes = [np.zeros(n)]
-        for across in TILTS:
-            along = _commonest(moves + across * incline[some, None], 2.0 * DRAWN_MM / (lag * step_mm))
-            slopes.append(along - across * incline)
-        widths = [int(self._drawn(ends_mm[some], slope[some])[1].sum()) for slope in slopes]
-        enough = [slope for slope, width in zip(slopes, widths, strict=True) if width >= NEARLY * max(widths)]
-        return min(enough, key=lambda slope: float(np.abs(slope).max()))
+            return np.zeros(len(ends_mm))
+        lag = count // 2
+        slope = _medians(ends_mm[:, lag:] - ends_mm[:, :-lag]) / (lag * step_mm)
+        slope = np.where(np.isfinite(slope), slope, 0.0)
+        return scipy.ndimage.median_filter(slope, 2 * round(RUN_MM / float(self.spacing_mm[1 - self.face[0]])) + 1)
 
     def _drawn(self, ends_mm: Floats, slope: Floats) -> tuple[Floats, Bools, Floats]:
         """Where most ends of each line of sight are in slice 0, shape (n,), mm; which are drawn; how far off each."""
@@ -361,15 +346,6 @@ def _medians(values: Floats) -> Floats:
     """Of each row (n, k) the median of those that are known, shape (n,), the lower one of two; NaN without any."""
     ordered, count = np.sort(values, axis=1), np.isfinite(values).sum(axis=1)  # NaN comes last
     return np.asarray(ordered[np.arange(len(values)), np.maximum(count - 1, 0) // 2])
-
-
-def _commonest(values: Floats, window: float) -> float:
-    """The middle of the window that holds most values; 0 for none."""
-    values = np.sort(values[np.isfinite(values)])
-    if len(values) == 0:
-        return 0.0
-    first = int(np.argmax(np.searchsorted(values, values + window, side="right") - np.arange(len(values))))
-    return float(np.median(values[first : np.searchsorted(values, values[first] + window, side="right")]))
 
 
 def _smooth(ends_mm: Floats, step_mm: float) -> Floats:
@@ -419,7 +395,8 @@ def find_support(
     supports = {side.face[0] for side in (*drawn, *touching)}
     near = [face for face in FACES if _gap_mm(body, face, spacing_mm) <= NEAR_MM]
     arms = shown.limbs and bool(body[:, :, [0, -1]].any())  # of a body that ends in the image its arms are there too
-    near = [face for face in near if face[0] == 1 or arms]  # at its sides only an arm may lie unseen
+    arms_apart = arms and shown.arms != "present"  # else they lie in the image, but for what a face cuts
+    near = [face for face in near if face[0] == 1 or arms_apart or (arms and _gap_mm(body, face, spacing_mm) == 0.0)]
     if supports:  # arms may lie on what a face cuts beside the body
         beside = [face for face in near if any(face[0] != axis for axis in supports)]
         cut = [face for face in beside if outside.take(face[1], axis=face[0]).any(axis=0).mean() >= CUT_FRACTION]
