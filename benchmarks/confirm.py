@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache, partial
@@ -20,6 +21,7 @@ import numpy as np
 import trimesh
 from scipy.stats import chi2
 
+from puncture_twin.planning.anatomy.metal import spacing_mm
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import Finding, InputError
 from puncture_twin.planning.formats.points import NamedPoints
@@ -37,6 +39,7 @@ METAL_HU = 8000.0
 DIAMETER_MM = 1.2
 EXTRAS = ("none", "none", "none", "wire", "vessel", "second", "far second", "no needle", "cut", "bolt")
 """What lies in the image besides; drawn evenly."""
+SLICES_MM = (1.0, 1.5, 2.0, 2.5, 3.0, 5.0)
 MUST_REFUSE = frozenset({"second", "no needle", "cut", "bolt"})
 """What leaves no single needle whose tip is seen."""
 
@@ -107,7 +110,7 @@ def control(rng: np.random.Generator, *, extra: str | None = None, bent: bool | 
     """
     extra = str(rng.choice(EXTRAS)) if extra is None else extra
     bent = bool(rng.random() < 0.3) if bent is None else bent
-    spacing = float(rng.choice([1.0, 1.5, 2.0, 2.5, 3.0, 5.0])) if spacing is None else spacing
+    spacing = float(rng.choice(SLICES_MM)) if spacing is None else spacing
     skin, bones = trunk()
     theta, beta = rng.uniform(0, np.radians(55)), rng.uniform(0, 2 * np.pi)
     forward = np.array([np.sin(theta) * np.cos(beta), np.cos(theta), np.sin(theta) * np.sin(beta)])
@@ -219,9 +222,11 @@ def errors(one: Control, found: FoundNeedle) -> dict[str, float]:
     """Errors of a reading: mm, degrees, and squares over the stated covariance."""
     tip, forward = apply(one.T_scan_ct, one.tip), one.T_scan_ct[:3, :3] @ one.forward
     off = found.tip_ct - tip
-    turned = np.cross(forward, found.forward_ct)
+    turned, across = np.cross(forward, found.forward_ct), one.volume.T_ct_index[:3, :3] / spacing_mm(one.volume)
     return {
         "tip_mm": float(np.linalg.norm(off)),
+        "plane_mm": float(np.linalg.norm(off @ across[:, :2]) / np.sqrt(2.0)),
+        "across_mm": float(abs(off @ across[:, 2])),
         "depth_mm": float(off @ forward),
         "depth_sd_mm": float(np.sqrt(forward @ found.cov_ct[:3, :3] @ forward)),
         "tip_voxels": float(np.linalg.norm(np.linalg.solve(one.volume.T_ct_index[:3, :3], off))),
@@ -249,8 +254,12 @@ def main() -> None:
         for seed in range(stated.first, stated.first + stated.scans):
             one = control(np.random.default_rng(seed))
             found = read(one)
-            spacing_mm = float(np.linalg.norm(one.volume.T_ct_index[:3, 2]))
-            row = {"seed": seed, "extra": one.extra, "true_sagitta_mm": one.sagitta_mm, "spacing_mm": spacing_mm}
+            row = {
+                "seed": seed,
+                "extra": one.extra,
+                "true_sagitta_mm": one.sagitta_mm,
+                "spacing_mm": float(spacing_mm(one.volume)[2]),
+            }
             rows.append({**row, **({"refused": found} if isinstance(found, str) else errors(one, found))})
             if file is not None:
                 print(json.dumps(rows[-1]), file=file, flush=True)
@@ -258,26 +267,62 @@ def main() -> None:
 
 
 def summary(rows: list[dict[str, Any]]) -> list[str]:
-    """Lines on what was read and refused."""
+    """Lines on what was read and refused, and a table of the how-to's kind."""
     seen = [row for row in rows if "tip_mm" in row]
     good = [row for row in rows if row["extra"] not in MUST_REFUSE]
-    wrong = [row["seed"] for row in seen if row["extra"] in {"no needle", "cut", "bolt"} or row["tip_mm"] > 5.0]
+    wrong = [row["seed"] for row in seen if is_wrong(row)]
     refused = [(row["seed"], row["extra"], row["refused"]) for row in good if "refused" in row]
-    lines = [f"{len(rows)} scans, {len(seen)} read; read wrong: {wrong}; refused of {len(good)}: {refused}"]
-    for name, some in (("straight", [r for r in seen if r["true_sagitta_mm"] == 0]),
-                       ("bent", [r for r in seen if r["true_sagitta_mm"] > 0])):  # fmt: skip
+    right = [row for row in seen if not is_wrong(row)]
+    return [
+        f"{len(rows)} scans, {len(seen)} read; read wrong: {wrong}; refused of {len(good)}: {refused}",
+        "",
+        f"| {len(rows)} scans | read | tip, voxels (rms) | along an axis of the plane, across it, mm | axis, ° "
+        "| tip in its 95 % region | axis in its region | called bent |",
+        "|---|---|---|---|---|---|---|---|",
+        *(
+            _line(
+                name,
+                [
+                    row
+                    for row in right
+                    if bent == (row["true_sagitta_mm"] > 0) and low - 0.1 < row["spacing_mm"] < high + 0.1
+                ],
+            )
+            for name, bent, low, high in _kinds()
+        ),
+    ]
 
-        def rms(key: str, some: list[dict[str, Any]] = some) -> float:
-            return float(np.sqrt(np.mean([row[key] ** 2 for row in some])))
 
-        within = [np.mean([row[key] <= chi2.ppf(0.95, n) for row in some])
-                  for key, n in (("tip_square", 3), ("axis_square", 2))]  # fmt: skip
-        lines.append(
-            f"{name}, {len(some)}: tip {rms('tip_mm'):.3f} mm, {rms('tip_voxels'):.3f} voxels; axis "
-            f"{rms('axis_deg'):.3f} degrees (rms); in the 95 % region: tip {within[0]:.1%}, axis {within[1]:.1%}; "
-            f"called bent {np.mean([row['sagitta_mm'] > 0 for row in some]):.1%}"
-        )
-    return lines
+def is_wrong(row: dict[str, Any]) -> bool:
+    """Whether something else than the needle was read."""
+    return bool(row["extra"] in {"no needle", "cut", "bolt"} or row["tip_mm"] > WRONG_MM)
+
+
+WRONG_MM = 5.0
+
+
+def _kinds() -> Iterator[tuple[str, bool, float, float]]:
+    """What the table tells apart: a name, whether bent, and slices from and up to mm."""
+    for name, bent in (("straight", False), ("bent, sagitta .8 to 4 mm", True)):
+        yield name, bent, 0.0, np.inf
+        yield f"{name}, slices up to 2 mm", bent, 0.0, 2.0
+        for mm in SLICES_MM[2:]:
+            yield f"{name}, slices of {mm:g} mm", bent, mm, mm
+
+
+def _line(name: str, rows: list[dict[str, Any]]) -> str:
+    def rms(key: str) -> str:
+        return f"{np.sqrt(np.mean([row[key] ** 2 for row in rows])):.3f}".removeprefix("0")
+
+    def within(key: str, freedoms: int) -> str:
+        return f"{np.mean([row[key] <= chi2.ppf(0.95, freedoms) for row in rows]):.1%}".replace("%", " %")
+
+    if not rows:
+        return f"| {name} | 0 | | | | | | |"
+    bent = f"{np.mean([row['sagitta_mm'] > 0 for row in rows]):.0%}".replace("%", " %")
+    plane = f"{rms('plane_mm')}, {rms('across_mm')}"
+    each = (rms("tip_voxels"), plane, rms("axis_deg"), within("tip_square", 3), within("axis_square", 2), bent)
+    return f"| {name} | {len(rows)} | {' | '.join(each)} |"
 
 
 if __name__ == "__main__":

@@ -136,6 +136,16 @@ class _Skin(NamedTuple):
         return _Skin(*(one[rows] for one in self))
 
 
+def check_count(count: int) -> None:
+    """Refuse a number of markers that none can be proposed for, before a case is searched.
+
+    Raises:
+        InputError: Out of range.
+    """
+    if not MIN_MARKERS <= count <= MOST_MARKERS:
+        refuse(f"{count} markers", "--propose", f"{MIN_MARKERS} to {MOST_MARKERS}", "out_of_range")
+
+
 def propose_markers(context: CaseContext, candidates: Candidates, count: int) -> Proposal:
     """Places for some markers.
 
@@ -149,8 +159,7 @@ def propose_markers(context: CaseContext, candidates: Candidates, count: int) ->
         NoAnswerError: No direction is safe, or too few places are left.
     """
     case, anatomy = context.case, context.anatomy
-    if not MIN_MARKERS <= count <= MOST_MARKERS:
-        refuse(f"{count} markers", "--propose", f"{MIN_MARKERS} to {MOST_MARKERS}", "out_of_range")
+    check_count(count)
     if not candidates.safe.any():
         raise NoAnswerError("no direction is safe: there is no window to put markers beside", code="no_safe_direction")
     entries = cKDTree(candidates.path.entry_ct[candidates.safe])

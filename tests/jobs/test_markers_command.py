@@ -80,6 +80,7 @@ def test_no_is_one_line_and_nothing_is_written(patient, tmp_path, capfd, options
         (("--diameter", "20"), "out_of_range"),
         (("--count", "1"), "out_of_range"),
         (("--propose", "4", "--count", "4"), "conflicting_options"),
+        (("--propose", "2"), "out_of_range"),
         (("--layout", "nothing.csv"), "no_such_file"),
     ],
 )

@@ -11,6 +11,7 @@ from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, inverse, pose, rotation_angle
 from puncture_twin.twin.guidance.ct.tie import body_of, tie_frames
+from puncture_twin.twin.plant.scanner.image import Solid, rod
 
 CODES = {
     "second": {"two_needles"},
@@ -53,21 +54,41 @@ def test_two_lines_of_one_image_are_not_one_needle():
     one = control(np.random.default_rng(5008), extra="none", bent=False)
     seen = errors(one, read(one))
     assert seen["axis_sd_deg"] > 1.0
-    assert seen["tip_mm"] < 0.5 and seen["tip_square"] < 16.3 and seen["axis_square"] < 13.8
+    assert seen["tip_voxels"] < 0.5 and seen["tip_square"] < 16.3 and seen["axis_square"] < 13.8
 
 
-@pytest.mark.parametrize(("seed", "code"), [(50084, "two_needles"), (50106, "needle_unclear")])
-def test_a_second_needle_is_not_swallowed(seed, code):
+def test_a_second_needle_is_not_swallowed():
     """9 mm beside the first in slices of 5 mm, where low levels join them; and one that crosses it."""
-    assert read(control(np.random.default_rng(seed))) == code
+    assert read(control(np.random.default_rng(50084))) == "two_needles"
+    one = control(np.random.default_rng(50106))
+    found, findings = reading(one)
+    assert errors(one, found)["tip_mm"] < 0.5 and [said.code for said in findings] == ["two_needles"]
+
+
+@pytest.mark.parametrize("seed", [24, 89])
+def test_what_hides_no_tip_is_no_reason_to_refuse(seed):
+    """A wire on the skin that touches the needle, one piece of metal with it; a tip within a voxel of the border."""
+    one = control(np.random.default_rng(seed))
+    seen = errors(one, read(one))
+    assert seen["tip_voxels"] < 0.5 and seen["tip_square"] < 16.3 and seen["axis_square"] < 13.8
+
+
+def test_a_second_needle_close_beside_is_seen_in_thin_slices(monkeypatch):
+    """4 mm beside, its tip 10 mm behind: not one needle."""
+
+    def second(_, tip, way, aside, __):
+        return [Solid("second", rod(tip + 4 * aside - 95 * way, tip + 4 * aside - 10 * way, 1.2), 8000.0)]
+
+    monkeypatch.setattr("benchmarks.confirm._extras", second)
+    assert read(control(np.random.default_rng(60000), extra="none", bent=False, spacing=1.0)) == "two_needles"
 
 
 def test_slices_in_which_a_second_needle_hides_are_warned_of():
-    """In 5 mm a needle beside the first is once in a hundred scans taken for it (seed 106); in thin ones none was."""
+    """In 5 mm a needle beside the first may be taken for it; seed 106, where it was, is refused."""
     for spacing, said in ((5.0, ["thick_slices"]), (2.0, [])):
         _, findings = reading(control(np.random.default_rng(901), extra="none", bent=False, spacing=spacing))
         assert [one.code for one in findings] == said
-    assert [one.code for one in reading(control(np.random.default_rng(106)))[1]] == ["thick_slices"]
+    assert read(control(np.random.default_rng(106))) == "tip_hidden"
 
 
 @pytest.mark.parametrize("extra", ["wire", "vessel"])

@@ -10,11 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from scipy.optimize import minimize_scalar
 from scipy.special import ndtr
 
 from puncture_twin.planning.anatomy.metal import (
     AROUND_MM,
+    BLUR_MM,
     METAL_HU,
     Metal,
     centroid,
@@ -60,8 +62,8 @@ SKIN_MM = 5.0
 """A needle that ends so near below the skin comes from outside: thick slices of it show no metal in air."""
 EDGE_VOXELS = 1.5
 """A needle that ends so near to the image's border leaves the image there."""
-SAME_MM, SAME_DEG = 4.0, 10.0
-"""Two pieces of one needle: so near to its axis, and so parallel."""
+SAME_MM = 4.0
+"""Two pieces of one needle: so near to its axis; in thin slices nearer, as far as its own image reaches."""
 OF_PLAN_MM, OF_PLAN_DEG = 15.0, 15.0
 """Of two needles the plan's is the only one whose axis is so near to the planned tip, and so parallel to its line."""
 MARKER_MM = 6.0
@@ -69,6 +71,8 @@ MARKER_MM = 6.0
 UNSURE_MM = 1.5
 """A tip known worse than this is not read: streaks, other metal or thick slices hide where it ends."""
 
+MOST_PARTS, LINES = 4, 300
+"""Straight pieces of metal that touch; and lines that are tried for each."""
 THICK_MM, BESIDE_MM = 3.0, 10.0
 """In thicker slices a needle so near beside another, and nearly along it, may show as one with it."""
 
@@ -139,16 +143,16 @@ def read_needle(
     if planned is not None and len(found) == 1 and not _of_plan(needle, *planned):
         said = f"the needle lies more than {OF_PLAN_MM:g} mm or {OF_PLAN_DEG:g} degrees off the planned line"
         findings = [Finding("far_from_plan", Severity.WARNING, said)]
+    if needle.leaves:
+        refuse(
+            "the needle leaves the image; its tip is outside", volume.path, "a scan with its tip", "tip_outside_image"
+        )
     if needle.unclear:
         at = "({:.0f}, {:.0f}, {:.0f}) mm".format(*needle.tip_ct)
         what = (
             f"long metal ends in the body at {at} in the scan, but has not the image of a needle of {diameter_mm:g} mm"
         )
         refuse(what, volume.path, "one needle of the case's diameter, apart from other metal", "needle_unclear")
-    if needle.leaves:
-        refuse(
-            "the needle leaves the image; its tip is outside", volume.path, "a scan with its tip", "tip_outside_image"
-        )
     _check_tip(volume, needle, hidden, target_ct)
     if needle.tip_sd_mm > UNSURE_MM:
         sd = f"{needle.tip_sd_mm:.1f} mm (standard deviation)"
@@ -200,29 +204,116 @@ def _needles(
     hidden = wide_metal(volume, diameter_mm)
     for marker in np.zeros((0, 3)) if markers is None else markers:
         _hide(volume, marker, hidden)
-    widest = diameter_mm / 2 + 0.5 * float(spacing_mm(volume).max()) + BLUR_SIGMA_MM
     known: list[FoundNeedle] = []
     for level in LEVELS_HU:
         for metal in metal_pieces(volume, level, hidden | _taken(volume, known)):
-            if metal.size_mm < SHORTEST_MM:
+            if metal.size_mm < SHORTEST_MM or any(_same(volume, one, _places(volume, metal)) for one in known):
                 continue
-            places, line = _places(volume, metal), _axis(volume, metal)
-            if any(_same(one, places) for one in known):
-                continue
-            thin = _width(places) < min(widest, metal.size_mm / SLENDER)
-            if thin:
-                metal, line = _whole(volume, metal, line, hidden)
-            elif level < METAL_HU:
-                continue
-            ends = _tip_end(volume, metal, line, target_ct, inside, hidden)
-            if ends is None:
-                continue
-            found = fit_needle(volume, metal, toward(line, ends[0]), diameter_mm, hidden) if thin else None
-            if found is None and level == METAL_HU:  # never passed over in silence: needles that cross are not thin
-                found = unclear(line, ends[0])
-            if found is not None and not any(_same(one, found.path_ct) for one in known):
-                known.append(found._replace(leaves=ends[1]))
-                yield known[-1], hidden
+            for part, beside_it in _parts(volume, metal, level, hidden, diameter_mm):
+                found = _needle(volume, part, level, target_ct, inside, beside_it, diameter_mm)
+                if found is not None and not any(_same(volume, one, found.path_ct) for one in known):
+                    known.append(found)
+                    yield found, beside_it
+
+
+def _needle(
+    volume: Volume, part: Metal, level: float, target_ct: Floats, inside: Inside | None, hidden: Bools,
+    diameter_mm: float,
+) -> FoundNeedle | None:  # fmt: skip
+    """What a long piece of metal is: a needle, one that is unclear, or nothing that enters the body."""
+    line, thin = _axis(volume, part), _thin(volume, part, diameter_mm)
+    if thin:
+        part, line = _whole(volume, part, line, hidden)
+    ends = _tip_end(volume, part, line, target_ct, inside, hidden)
+    if ends is None:
+        return None
+    found = fit_needle(volume, part, toward(line, ends[0]), diameter_mm, hidden) if thin else None
+    if found is None and level == METAL_HU:  # never passed over in silence
+        found = unclear(line, ends[0])
+    return None if found is None else found._replace(leaves=ends[1] and not _ends_in(volume, found))
+
+
+def _ends_in(volume: Volume, needle: FoundNeedle) -> bool:
+    """Whether a needle at the image's border ends between its voxels, however the reading errs along it."""
+    sd = float(np.sqrt(needle.forward_ct @ needle.cov_ct[:3, :3] @ needle.forward_ct))
+    at = apply(np.linalg.inv(volume.T_ct_index), needle.tip_ct + 3.0 * sd * needle.forward_ct)
+    return bool(((at >= 0) & (at <= np.array(volume.values.shape) - 1)).all())
+
+
+def _thin(volume: Volume, metal: Metal, diameter_mm: float) -> bool:
+    widest = diameter_mm / 2 + 0.5 * float(spacing_mm(volume).max()) + BLUR_SIGMA_MM
+    return _width(_places(volume, metal)) < min(widest, metal.size_mm / SLENDER)
+
+
+def _parts(
+    volume: Volume, metal: Metal, level: float, hidden: Bools, diameter_mm: float
+) -> Iterator[tuple[Metal, Bools]]:
+    """A thin piece, or the straight ones that touch in a wide one, each with the voxels that others hide from it.
+
+    A needle at a wire or at another needle is one piece with it. A wide piece at lower levels is bone.
+    """
+    if _thin(volume, metal, diameter_mm):
+        yield metal, hidden
+    elif level == METAL_HU:
+        straight = list(_straight(volume, metal))
+        at = np.argwhere(metal.voxels) + [axis.start for axis in metal.box]
+        for part in straight:
+            others = hidden.copy()
+            others[tuple(at.T)] = True
+            own = np.argwhere(part.voxels) + [axis.start for axis in part.box]
+            others[tuple(own.T)] = False
+            yield part, hidden | _reached(volume, others & ~hidden, metal)
+        if not straight:
+            yield metal, hidden
+
+
+def _reached(volume: Volume, others: Bools, metal: Metal) -> Bools:
+    """The voxels of metal and those that it blurs into, shape of the image; all in a piece's box."""
+    reached = np.zeros_like(others)
+    away = distance_transform_edt(~others[metal.box], spacing_mm(volume))
+    reached[metal.box] = away <= BLUR_MM if others.any() else False
+    return reached
+
+
+def _straight(volume: Volume, metal: Metal) -> Iterator[Metal]:
+    """The straight parts of a wide piece: of lines through two of its voxels the one with most on it, then the next.
+
+    What lies around a line counts against it: lines through a block of metal have more around than on them.
+    """
+    rng = np.random.default_rng(0)
+    at = np.argwhere(metal.voxels) + [axis.start for axis in metal.box]
+    places, left = apply(volume.T_ct_index, at.astype(float)), np.ones(len(at), np.bool_)
+    for _ in range(MOST_PARTS):
+        best = max(_lines(volume, places, left, rng), key=lambda one: one[0], default=None)
+        if best is None or best[0] <= 0:
+            return
+        _, on, along = best
+        order = np.flatnonzero(on)[np.argsort(along[on])]  # with what other parts have of it: they cross it
+        runs = np.split(order, np.flatnonzero(np.diff(along[order]) > LARGEST_GAP_MM) + 1)
+        run = max(runs, key=lambda one: float(np.ptp(along[one])))
+        if np.ptp(along[run]) < SHORTEST_MM:
+            return
+        yield _piece(volume, at[run])
+        left &= ~on
+
+
+def _lines(
+    volume: Volume, places: Floats, left: Bools, rng: np.random.Generator
+) -> Iterator[tuple[int, Bools, Floats]]:
+    """Lines through two of those left of places (n, 3): each line's score, which of all places are on it, and where.
+
+    The score counts those left that are on it, less those around it.
+    """
+    some = places[left]
+    for a, b in some[rng.integers(len(some), size=(LINES, 2))] if len(some) else ():
+        length = float(np.linalg.norm(b - a))
+        if length < SHORTEST_MM / 2:
+            continue
+        axes = frame_about((b - a) / length).T
+        local = (places - a) @ axes.T
+        aside = beside(local[:, :2], axes[:2] @ volume.T_ct_index[:3, 2])
+        on = aside <= WIDE_MM
+        yield int(2 * on[left].sum() - (aside[left] <= 2 * WIDE_MM).sum()), on, local[:, 2]
 
 
 def _taken(volume: Volume, known: Sequence[FoundNeedle]) -> Bools:
@@ -247,11 +338,12 @@ def _hide(volume: Volume, marker: Floats, hidden: Bools) -> None:
     hidden[box] |= np.linalg.norm((index - at) * spacing_mm(volume), axis=-1) <= MARKER_MM
 
 
-def _same(needle: FoundNeedle, places: Floats) -> bool:
+def _same(volume: Volume, needle: FoundNeedle, places: Floats) -> bool:
     """Whether places (n, 3) lie along a needle that is known."""
     away = places - needle.tip_ct
     aside = np.linalg.norm(away - np.outer(away @ needle.forward_ct, needle.forward_ct), axis=1)
-    return bool(np.median(aside) < SAME_MM + needle.sagitta_mm)
+    near = min(SAME_MM, WIDE_MM + WIDEST_SLICE * float(spacing_mm(volume)[2]))
+    return bool(np.median(aside) < near + needle.sagitta_mm)
 
 
 def _places(volume: Volume, metal: Metal) -> Floats:

@@ -10,18 +10,15 @@ neither shows nor excludes is in it.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import expit
 
-from puncture_twin.planning.anatomy.metal import BLUR_MM, Metal, full_part, metal_parts, spacing_mm
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.anatomy.metal import BLUR_MM, SOLID_HU, Metal, full_part, metal_parts, spacing_mm
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply, skew
 from puncture_twin.planning.registration.fits import carried_along
@@ -56,18 +53,21 @@ BEND_SD = np.array([2.0, 2.0, 0.5, 0.5])
 """How far needles bend at the lever, mm, square and cube, each across two axes; ours: a sagitta of 2 mm over 95 mm."""
 PIECE_MM = 10.0
 """A needle's path is given in pieces no longer than this."""
-LEAST_VOXEL, LEAST_DEG = 0.03, 0.02
-"""Standard deviations that no fit undercuts: of the tip along each voxel axis, in voxels, and of the direction. What
-blurs a scan is no exact Gaussian."""
+EDGE_PIXELS = 0.06
+"""Standard deviation of where a needle ends, in pixels along it: no blur is an exact Gaussian, and its tails move an
+edge, which has one side, though not an axis, which has two. Tips err by so much without noise and streaks."""
+SHARED_MM = 6.0
+"""Along a needle, in which the voxels of a slice err together: streaks begin at its metal."""
+UNKNOWN_PART = 1e-7
+"""Of what an image says of the number that it knows best: what it says less of than that, it says nothing of."""
+ROUNDED = 1.0 / SOLID_HU / np.sqrt(12.0)
+"""No image has less noise than its whole Hounsfield units."""
+LEAST_OWN = 0.01
+"""What a piece of a slice leaves to others of a number that it alone decides."""
 FEW_SLICES = 4.0
-"""A needle through fewer slices is not known to less than these across them."""
-THIN_MM = 1.2
-"""Through slices up to this a needle has one optimum."""
-CORRELATED, CORRELATED_BENT = 4.0, 16.0
-"""By which factor residuals of neighbouring voxels, which streaks and kernel share, widen the fit's variances: those of
-a straight line, and those of a curve, which follows them further."""
-MISLED = 6.0
-"""By which factor the evidence of a bend counts less: stairs of slices look like one, as no Gaussian blurs them."""
+"""A needle through fewer slices may lie in several ways across them."""
+SPREAD, STEPS = 0.75, 9
+"""Of a slice's thickness: so far each end of such a needle is moved to either side; and in how many steps."""
 AS_BRIGHT = 0.5
 """Of a needle's brightness: long, thin metal below it that is not a needle's image is bone."""
 FARTHEST_MM = 3.0
@@ -141,62 +141,128 @@ def toward(line: Line, point_ct: Floats) -> Line:
     return line if (point_ct - line.middle) @ line.forward > 0 else line._replace(forward=-line.forward)
 
 
+class _Seen(NamedTuple):
+    """The voxels about a straight needle that are compared with its image.
+
+    Attributes:
+        axes: Shape (3, 3), rows: the needle's direction, and two across it.
+        local: Shape (n, 3), mm, in these axes from where the needle begins.
+        parts: Shape (n,), of metal.
+        slices: Shape (n,), in which slice each lies.
+        thick: Shape (3,), from one slice to the next, in these axes.
+        bends: Shape (4, 2), the curve through what is seen, as `_about` has it.
+        length: Of the needle, mm.
+    """
+
+    curve: CurveImage
+    axes: Floats
+    local: Floats
+    parts: Floats
+    slices: Ints
+    thick: Floats
+    bends: Floats
+    length: float
+
+    @property
+    def bright(self) -> Bools:
+        """Which of them a needle would make bright, shape (n,): bone is far below."""
+        image = self.curve.parts(np.zeros(NUMBERS), self.local)
+        return np.asarray(image > LEAST_METAL * image.max(initial=0.0))
+
+    @property
+    def few(self) -> bool:
+        """Whether the needle runs through few slices."""
+        return bool(self.length * abs(self.thick[0]) < FEW_SLICES * (self.thick @ self.thick))
+
+    def left(self, x: Floats) -> Floats:
+        """What the image of a curve's numbers leaves of them, shape (n,)."""
+        return self.curve.parts(x, self.local) - self.parts
+
+    @property
+    def pieces(self) -> Ints:
+        """Which piece of a slice each belongs to, shape (n,): what a slice errs is shared along `SHARED_MM`."""
+        along = np.floor(self.local[:, 0] / SHARED_MM).astype(np.int64)
+        return np.unique(np.stack([self.slices, along]), axis=1, return_inverse=True)[1].ravel()
+
+
+class _Around(NamedTuple):
+    """What surrounds a piece of metal: places (n, 3), slices (n,), parts of metal (n,), and which no other hides."""
+
+    places: Floats
+    slices: Ints
+    parts: Floats
+    shown: Bools
+    typical: float
+
+    @classmethod
+    def of(cls, volume: Volume, metal: Metal, hidden: Bools) -> _Around:
+        reach_mm = np.maximum(BLUR_MM, [0.0, 0.0, spacing_mm(volume)[2]])  # a slice shares metal with its neighbours
+        parts = np.minimum(metal_parts(volume, metal, reach_mm=reach_mm), full_part(volume)).ravel()
+        index = np.argwhere(np.ones(metal.voxels.shape, dtype=bool)) + [axis.start for axis in metal.box]
+        places, typical = apply(volume.T_ct_index, index.astype(float)), float(parts[metal.voxels.ravel()].mean())
+        return cls(places, index[:, 2], parts, ~hidden[tuple(index.T)], typical)
+
+    def about(self, volume: Volume, line: Line, start: Floats, length: float, diameter_mm: float) -> _Seen:
+        """Those about a line (3,), (3,)."""
+        axes = np.concatenate([line.forward[None], np.linalg.svd(line.forward[None])[2][1:]])
+        local, thick = (self.places - start) @ axes.T, axes @ volume.T_ct_index[:3, 2]
+        about, bends = _about(local, np.where(self.shown, self.parts, 0.0), length, thick[1:], line.width_mm)
+        some, curve = about & self.shown, CurveImage.of(volume, axes, diameter_mm)
+        return _Seen(curve, axes, local[some], self.parts[some], self.slices[some], thick, bends, length)
+
+
 def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hidden: Bools) -> FoundNeedle | None:
     """The thin rod whose blurred and clipped image is nearest to the voxels about it.
 
     None where they are too dark for a needle; one that is unclear where they are not its image.
     """
-    full = full_part(volume)
-    reach_mm = np.maximum(BLUR_MM, [0.0, 0.0, spacing_mm(volume)[2]])  # a slice shares metal with its neighbours
-    parts = np.minimum(metal_parts(volume, metal, reach_mm=reach_mm), full).ravel()
-    typical = float(parts[metal.voxels.ravel()].mean())
-    index = np.argwhere(np.ones(metal.voxels.shape, dtype=bool)) + [axis.start for axis in metal.box]
-    places, shown = apply(volume.T_ct_index, index.astype(float)), ~hidden[tuple(index.T)]
-    heavy = places[metal.voxels.ravel() & (parts > typical / 2)] - line.middle
+    around = _Around.of(volume, metal, hidden)
+    heavy = (around.places - line.middle)[metal.voxels.ravel() & (around.parts > around.typical / 2)]
     if not len(heavy):
         return None
     along = heavy @ line.forward
     start, begun = line.middle + float(along.max()) * line.forward, np.zeros(7)
     length = min(FITTED_MM, float(np.ptp(along)) - TAIL_MM)
     for again in range(STRAIGHTENED):
-        axes = np.concatenate([line.forward[None], np.linalg.svd(line.forward[None])[2][1:]])
-        local = (places - start) @ axes.T
-        thick = axes[1:] @ volume.T_ct_index[:3, 2]
-        about, bends = _about(local, np.where(shown, parts, 0.0), length, thick, line.width_mm)
-        local, seen = local[about & shown], parts[about & shown]
-        curve = CurveImage.of(volume, axes, diameter_mm)
-        image = curve.parts(np.zeros(NUMBERS), local)
-        bright = image > LEAST_METAL * image.max(initial=0.0)  # what a needle would show here: bone is far below
-        if not bright.any() or typical < GAINS[0] / 2 * float(image[bright].mean()):
+        seen = around.about(volume, line, start, length, diameter_mm)
+        if not seen.bright.any():
             return None
-        starts = [begun, *(begun + more for more in _across(volume, axes, local[bright]) if not again)]
-        fits = [_settled(curve, one, local, seen) for one in starts]
-        straight = min(fits, key=lambda fit: float(fit.cost))
-        if not again:
-            modes = _modes(fits, straight, axes, len(seen))
+        usual = float(seen.curve.parts(np.zeros(NUMBERS), seen.local)[seen.bright].mean())
+        if around.typical < GAINS[0] / 2 * usual:
+            return None
+        straight = _straight(seen, begun)
         if again + 1 < STRAIGHTENED:  # once more about the line that was found
-            start = start + straight.x[1:3] @ axes[1:]  # not along it, where a bent needle leaves a straight rod
-            forward = np.concatenate([[1.0], straight.x[3:5]]) @ axes
+            start = start + straight.x[1:3] @ seen.axes[1:]  # not along it, where a bent needle leaves a straight rod
+            forward = np.concatenate([[1.0], straight.x[3:5]]) @ seen.axes
             line = line._replace(forward=forward / np.linalg.norm(forward))
             begun = straight.x * [1, 0, 0, 0, 0, 1, 1]
-    straight, fit, noise = _bent(curve, straight, bends, local, seen)
-    x, cov, bent = _weighed(straight, fit, noise, len(seen))
-    basis = block_diag(axes, axes[1:])
-    cov[:5, :5] += basis @ modes @ basis.T
-    left = curve.parts(x, local) - seen
-    unlike, (blur, gain) = float(left @ left) / max(float(seen @ seen), 1e-9), np.exp(x[5:7])
-    ahead = float(local[seen > 0.5 * min(full, float(seen.max()))][:, 0].max(initial=-np.inf) - x[0])
-    if (
-        unlike > UNLIKE
-        or abs(ahead) > FARTHEST_MM + WIDE_MM + WIDEST_SLICE * float(np.linalg.norm(thick))
-        or not (GAINS[0] < gain < GAINS[1] and BLURS[0] < blur < BLURS[1])
-    ):
-        return unclear(line, start) if typical > AS_BRIGHT * float(image[bright].mean()) else None
-    s = -np.linspace(0.0, length, 1 + int(np.ceil(length / PIECE_MM)))
-    path = start + (np.column_stack([s, curve.off(x, s)]) + x[:3]) @ axes
-    covs, forward = _covariances(volume, x, cov, axes, s)
-    sagitta = float(np.linalg.norm(np.cross(path - path[0], (path[-1] - path[0]) / length), axis=1).max())
-    return FoundNeedle(path[0], forward, line.width_mm, path, covs, sagitta if bent and sagitta > BENT_MM else 0.0)
+    weighed = _weighed(seen, straight) if straight.jac.any() else None  # no slope: its image has left the metal
+    if weighed is None or not _alike(seen, weighed[0], full_part(volume)):
+        return unclear(line, start) if around.typical > AS_BRIGHT * usual else None
+    return _found(volume, seen, *weighed, start, line.width_mm)
+
+
+def _alike(seen: _Seen, x: Floats, full: float) -> bool:
+    """Whether what is seen is the image of a needle, as dense, as blurred, and as long as that of numbers (11,)."""
+    left, (blur, gain) = seen.left(x), np.exp(x[5:7])
+    unlike = float(left @ left) / max(float(seen.parts @ seen.parts), 1e-9)
+    metal = seen.parts > 0.5 * min(full, float(seen.parts.max()))
+    ahead = float(seen.local[metal, 0].max(initial=-np.inf) - x[0])
+    farthest = FARTHEST_MM + WIDE_MM + WIDEST_SLICE * float(np.linalg.norm(seen.thick[1:]))
+    dense, blurred = GAINS[0] < gain < GAINS[1], BLURS[0] < blur < BLURS[1]
+    return bool(unlike <= UNLIKE and abs(ahead) <= farthest and dense and blurred)
+
+
+def _found(
+    volume: Volume, seen: _Seen, x: Floats, cov: Floats, bent: bool, start: Floats, width_mm: float
+) -> FoundNeedle:
+    """The needle of numbers (11,), with their covariance; its end's place along it is known to the edge's."""
+    s = -np.linspace(0.0, seen.length, 1 + int(np.ceil(seen.length / PIECE_MM)))
+    path = start + (np.column_stack([s, seen.curve.off(x, s)]) + x[:3]) @ seen.axes
+    cov[0, 0] += float(np.sum((EDGE_PIXELS * seen.axes[0] @ volume.T_ct_index[:3, :2]) ** 2))
+    covs, forward = _covariances(x, cov, seen.axes, s)
+    sagitta = float(np.linalg.norm(np.cross(path - path[0], (path[-1] - path[0]) / seen.length), axis=1).max())
+    return FoundNeedle(path[0], forward, width_mm, path, covs, sagitta if bent and sagitta > BENT_MM else 0.0)
 
 
 def unclear(line: Line, tip_ct: Floats) -> FoundNeedle:
@@ -226,116 +292,142 @@ def _about(local: Floats, seen: Floats, length: float, thick: Floats, width_mm: 
     return about, np.asarray(bends, dtype=np.float64)
 
 
-def _across(volume: Volume, axes: Floats, bright: Floats) -> Iterator[Floats]:
-    """Changes (7,) of a start for a needle that lies in few slices: its place across them has several optima."""
-    spacing, length = float(spacing_mm(volume)[2]), float(-bright[:, 0].min(initial=-AHEAD_MM))
-    aside = axes @ volume.T_ct_index[:3, 2]
-    if length * abs(float(aside[0])) < FEW_SLICES * spacing**2 and spacing > THIN_MM:
-        for place, lean in itertools.product((-0.35, 0.0, 0.35), repeat=2):
-            if place or lean:
-                yield np.concatenate([[0.0], place * aside[1:], 2 * lean * aside[1:] / length, [0.0, 0.0]])
+def _straight(seen: _Seen, begun: Floats) -> OptimizeResult:
+    """The straight rod nearest to what is seen; of one in few slices that with the best place across them."""
+    fit = _settled(seen, begun)
+    if not seen.few:
+        return fit
+    moves = _moves(seen)
+    best = moves[int(np.argmin(_costs(seen, np.concatenate([fit.x, np.zeros(4)]), moves)))]
+    return min(fit, _settled(seen, fit.x + best[:7]), key=lambda one: float(one.cost))
 
 
-def _modes(fits: Sequence[OptimizeResult], best: OptimizeResult, axes: Floats, count: int) -> Floats:
-    """What other lines that explain an image as well differ by: covariance of shift and slope, (6, 6), LPS.
+def _moves(seen: _Seen) -> Floats:
+    """Changes (m, 11) of a needle's numbers that move its ends across the slices."""
+    steps = np.linspace(-SPREAD, SPREAD, STEPS)
+    tip, tail = (one.ravel()[:, None] * seen.thick[1:] for one in np.meshgrid(steps, steps))
+    return np.concatenate([np.zeros((len(tip), 1)), tip, (tip - tail) / seen.length, np.zeros((len(tip), 6))], axis=1)
 
-    A needle in two slices may lean to either side of the plane between them: both lines have one image.
+
+def _costs(seen: _Seen, x: Floats, moves: Floats) -> Floats:
+    """Half the squares that numbers (11,) leave after each change (m, 11), shape (m,)."""
+    return np.array([left @ left / 2 for left in (seen.left(x + move) for move in moves)])
+
+
+def _unsettled(seen: _Seen, x: Floats, noise: float) -> Floats:
+    """Mean square (11, 11) by which a needle in few slices may lie otherwise across them than numbers (11,) have it.
+
+    What lies wholly in a slice has one image wherever it lies in it: no slope at the best fit tells how far.
     """
-    odds = np.exp([(float(best.cost) - float(fit.cost)) / _noise(best, count) ** 2 for fit in fits])
-    gaps = np.array([fit.x[:5] - best.x[:5] for fit in fits]) @ block_diag(axes, axes[1:])
-    return np.asarray(gaps.T @ (odds[:, None] * gaps) / odds.sum())
+    moves = _moves(seen)
+    costs = _costs(seen, x, moves)
+    odds = np.exp((costs.min() - costs) / noise**2)
+    return np.asarray(moves.T @ (odds[:, None] * moves) / odds.sum())
 
 
-def _settled(
-    curve: CurveImage, begun: Floats, local: Floats, seen: Floats, weights: Floats | float = 1.0, noise: float = 0.0
-) -> OptimizeResult:
-    """The numbers from a start (7,) or (11,) that bring the image of points (n, 3) nearest to what is seen (n,).
+def _settled(seen: _Seen, begun: Floats, weights: Floats | float = 1.0, noise: float = 0.0) -> OptimizeResult:
+    """The numbers from a start (7,) or (11,) that bring the image nearest to what is seen.
 
     Of 11 the bends are held to `BEND_SD`, which weighs as much as a voxel of so much noise.
     """
-    count, weights = len(begun), np.broadcast_to(weights, len(seen))
+    count, weights = len(begun), np.broadcast_to(weights, len(seen.parts))
     held = noise * np.eye(NUMBERS)[7:count] / BEND_SD[: count - 7, None]
 
     def whole(x: Floats) -> Floats:
         return np.concatenate([x, np.zeros(NUMBERS - count)])
 
     def misfit(x: Floats) -> Floats:
-        return np.concatenate([weights * (curve.parts(whole(x), local) - seen), held @ whole(x)])
+        return np.concatenate([weights * seen.left(whole(x)), held @ whole(x)])
 
     def slopes(x: Floats) -> Floats:
-        return np.concatenate([weights[:, None] * curve.slopes(whole(x), local), held])[:, :count]
+        return np.concatenate([weights[:, None] * seen.curve.slopes(whole(x), seen.local), held])[:, :count]
 
     return least_squares(misfit, begun, slopes, x_scale=SCALES[:count], method="lm", max_nfev=MOST_CALLS,
                          ftol=SETTLED, xtol=SETTLED)  # fmt: skip
 
 
-def _weights(curve: CurveImage, x: Floats, local: Floats, seen: Floats) -> Floats:
+def _weights(seen: _Seen, x: Floats) -> Floats:
     """Of voxels (n,): by what a fit leaves of those about the same place along the needle.
 
     Skin, bone and streaks, which no image of a needle explains, are local.
     """
-    image = curve.parts(x, local)
+    image = seen.curve.parts(x, seen.local)
     shown = image > LEAST_METAL * image.max()
-    place = ((local[:, 0] - local[:, 0].min()) / PLACE_MM).astype(int)
-    squares = np.bincount(place, shown * (image - seen) ** 2)
+    place = ((seen.local[:, 0] - seen.local[:, 0].min()) / PLACE_MM).astype(int)
+    squares = np.bincount(place, shown * (image - seen.parts) ** 2)
     counts = np.bincount(place, shown.astype(np.float64))
     squares, counts = (gaussian_filter1d(one, 2.0, mode="constant") for one in (squares, counts))
-    typical = squares.sum() / counts.sum()
+    typical = squares.sum() / max(counts.sum(), 1.0) + ROUNDED**2
     return np.asarray(np.sqrt(typical / ((squares + typical) / (counts + 1.0)))[place])
 
 
-def _noise(fit: OptimizeResult, count: int) -> float:
-    """Standard deviation of so many voxels' residuals, widened by what neighbours share."""
-    left, factor = fit.fun[:count], CORRELATED if len(fit.x) == 7 else CORRELATED_BENT
-    return float(np.sqrt(factor * (left @ left) / max(count - len(fit.x), 1)))
+def _scatter(seen: _Seen, fit: OptimizeResult, noise: float = 0.0) -> tuple[Floats, float]:
+    """Covariance of a fit's numbers by how far they move when each piece of a slice is left out, and the noise.
 
+        cov = A (sum_k t_k t_k') A,   t_k = (1 - J_k' J_k A)^-1 J_k' r_k,   A = (J'J)^-1
 
-def _bent(
-    curve: CurveImage, straight: OptimizeResult, bends: Floats, local: Floats, seen: Floats
-) -> tuple[OptimizeResult, OptimizeResult, float]:
-    """The straight and the bent fit under the same weights, and the noise.
-
-    The bent one begins from the straight one and from the bend of the brightest voxels (4, 2).
+    the jackknife (Bell and McCaffrey 2002, their equation 3): no assumption on how voxels of a piece err together.
+    What holds the bends counts as one more observation each. The noise is the standard deviation of voxels that err on
+    their own and scatter the numbers as much; in few slices that of slices, each of which errs as one.
     """
+    pieces = seen.pieces
+    count = len(pieces)
+    scales = SCALES[: fit.jac.shape[1]]
+    known, axes = np.linalg.eigh((fit.jac * scales).T @ (fit.jac * scales))
+    root = scales[:, None] * axes / np.sqrt(np.maximum(known, max(UNKNOWN_PART * known[-1], 1e-9)))
+    order = np.argsort(pieces, kind="stable")
+    first = np.flatnonzero(np.diff(pieces[order], prepend=-1))
+    rows = (fit.jac[:count] @ root)[order]
+    pulls = np.add.reduceat(rows * fit.fun[:count][order, None], first)
+    own, turns = np.linalg.eigh(np.eye(len(root)) - np.add.reduceat(rows[:, :, None] * rows[:, None, :], first))
+    turned = np.einsum("kji,kj->ki", turns, pulls) / np.maximum(own, LEAST_OWN)
+    moved, held = np.einsum("kij,kj->ki", turns, turned), noise * fit.jac[count:] @ root
+    whole = moved.T @ moved + held.T @ held
+    left, shown = fit.fun[:count], len(np.unique(seen.slices[seen.bright]))
+    square = left @ left / shown if seen.few else np.trace(whole) / len(root)
+    return root @ whole @ root.T, float(np.sqrt(max(square, ROUNDED**2)))
+
+
+def _bent(seen: _Seen, straight: OptimizeResult) -> tuple[OptimizeResult, OptimizeResult, float]:
+    """The straight and the bent fit under the same weights, and the noise by which the bends were held.
+
+    The bent one begins from the straight one and from the bend of the brightest voxels.
+    """
+    bends = seen.bends
     seen_bend = np.concatenate([[0.0], bends[3], bends[2] / LEVER_MM, straight.x[5:7], bends[1], bends[0]])
-    starts, weights, noise = (
-        [np.concatenate([straight.x, np.zeros(4)]), seen_bend],
-        np.ones(len(seen)),
-        _noise(straight, len(seen)),
-    )
+    starts, weights = [np.concatenate([straight.x, np.zeros(4)]), seen_bend], np.ones(len(seen.parts))
+    noise = _scatter(seen, straight)[1]
     for _ in range(BENT_AGAIN):  # a bend that is not yet fitted looks like noise
-        fit = min(
-            (_settled(curve, one, local, seen, weights, noise) for one in starts), key=lambda one: float(one.cost)
-        )
-        starts, noise, weights = [fit.x], _noise(fit, len(seen)), _weights(curve, fit.x, local, seen)
-    straight = _settled(curve, straight.x, local, seen, weights)
-    fit = _settled(curve, fit.x, local, seen, weights, noise)
-    return straight, fit, _noise(fit, len(seen))
+        fits = (_settled(seen, one, weights, noise) for one in starts)
+        fit = min(fits, key=lambda one: float(one.cost))
+        starts, weights = [fit.x], _weights(seen, fit.x)
+        noise = _scatter(seen, fit, noise)[1]
+    return _settled(seen, straight.x, weights), _settled(seen, fit.x, weights, noise), noise
 
 
-def _weighed(straight: OptimizeResult, fit: OptimizeResult, noise: float, count: int) -> tuple[Floats, Floats, bool]:
+def _weighed(seen: _Seen, first: OptimizeResult) -> tuple[Floats, Floats, bool]:
     """The likelier of a straight and a bent fit (11,), the covariance of both (11, 11), and whether it is the bent one.
 
     Evidence of a fit by Laplace: exp(-chi^2 / 2), of the bent one times the root of det S / det S_0 of its bends.
     """
-    plain, cov = np.concatenate([straight.x, np.zeros(4)]), np.zeros((11, 11))
-    cov[:7, :7] = _noise(straight, count) ** 2 * np.linalg.pinv(straight.jac.T @ straight.jac)
-    cov_bent = noise**2 * np.linalg.pinv(fit.jac.T @ fit.jac)
-    kept = np.linalg.slogdet(cov_bent[7:, 7:] / np.outer(BEND_SD, BEND_SD))[1]
-    odds = (float(straight.cost) - float(fit.cost)) / noise**2 / MISLED + kept / 2  # logarithm
-    bent = bool(odds > 0)
-    gap = fit.x - plain
-    chance = float(expit(odds))
+    straight, fit, noise = _bent(seen, first)
+    plain, cov = np.concatenate([straight.x, np.zeros(4)]), np.zeros((NUMBERS, NUMBERS))
+    cov[:7, :7], noise_straight = _scatter(seen, straight)
+    cov_bent, noise_bent = _scatter(seen, fit, noise)
+    bends = noise_bent**2 * np.linalg.pinv(fit.jac.T @ fit.jac)[7:, 7:] / np.outer(BEND_SD, BEND_SD)
+    odds = (float(straight.cost) - float(fit.cost)) / noise_bent**2 + np.linalg.slogdet(bends)[1] / 2  # logarithm
+    bent, chance, gap = bool(odds > 0), float(expit(odds)), fit.x - plain
+    x, noise = (fit.x, noise_bent) if bent else (plain, noise_straight)
     both = (1 - chance) * cov + chance * cov_bent
     both += np.outer(gap, gap) * (1 - chance if bent else chance)
-    return fit.x if bent else plain, both, bent
+    return x, both + (_unsettled(seen, x, noise) if seen.few else 0.0), bent
 
 
-def _covariances(volume: Volume, x: Floats, cov: Floats, axes: Floats, s: Floats) -> tuple[Floats, Floats]:
+def _covariances(x: Floats, cov: Floats, axes: Floats, s: Floats) -> tuple[Floats, Floats]:
     """Sigma6 of places s (m,) of the curve and of its direction there, (m, 6, 6), LPS; and the tip's direction (3,)."""
     moves = [0, 1, 2, 3, 4, 7, 8, 9, 10]
     cov, two = cov[np.ix_(moves, moves)], np.eye(2)
-    covs, forward, length = np.empty((len(s), 6, 6)), axes[0], float(-s[-1])
+    covs, forward = np.empty((len(s), 6, 6)), axes[0]
     for row in range(len(s) - 1, -1, -1):
         u = s[row] / LEVER_MM
         slopes = np.kron([1.0, 2 * u / LEVER_MM, 3 * u**2 / LEVER_MM], two)
@@ -344,24 +436,5 @@ def _covariances(volume: Volume, x: Floats, cov: Floats, axes: Floats, s: Floats
         to_6 = np.zeros((6, 9))
         to_6[:3, :3], to_6[:3, 3:] = axes.T, axes[1:].T @ np.kron([s[row], u**2, u**3], two)
         to_6[3:, 3:] = skew(forward) @ axes[1:].T @ slopes  # a slope turns about what is across both
-        covs[row] = to_6 @ cov @ to_6.T + _least(volume, forward, length)
+        covs[row] = to_6 @ cov @ to_6.T
     return covs, forward
-
-
-def _least(volume: Volume, forward: Floats, length: float) -> Floats:
-    """What no fit undercuts, shape (6, 6).
-
-    A needle that lies in few slices may lie anywhere across them: what a slice shows says not at which depth.
-    """
-    edges = LEAST_VOXEL * volume.T_ct_index[:3, :3]
-    across = np.eye(3) - np.outer(forward, forward)
-    least = np.zeros((6, 6))
-    least[:3, :3], least[3:, 3:] = edges @ edges.T, np.radians(LEAST_DEG) ** 2 * across
-    spacing = float(spacing_mm(volume)[2])
-    normal = volume.T_ct_index[:3, 2] / spacing
-    flat = np.clip(1.0 - length * abs(float(forward @ normal)) / (FEW_SLICES * spacing), 0.0, 1.0)
-    aside = across @ normal * flat * spacing / np.sqrt(12.0)
-    least[:3, :3] += np.outer(aside, aside)
-    lean = np.cross(forward, aside) * 2.0 / length
-    least[3:, 3:] += np.outer(lean, lean)
-    return least

@@ -32,7 +32,7 @@ from puncture_twin.planning.init.segmentation import Place
 from puncture_twin.planning.registration.fiducials import Fiducial, Seen, Stated, find_fiducials
 from puncture_twin.planning.search.bedside import slice_numbers
 from puncture_twin.planning.search.context import CaseContext
-from puncture_twin.planning.touch.marker_places import MarkerPlace, Proposal, propose_markers
+from puncture_twin.planning.touch.marker_places import MarkerPlace, Proposal, check_count, propose_markers
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.report.present import Field, Section, facts, footer, grid, number, text, vector
 
@@ -52,11 +52,13 @@ def stated_of(
     """What a person says of the markers.
 
     Raises:
-        InputError: A kind, size or count that none has, or any of it beside a proposal.
+        InputError: A kind, size or count that none has, any of it beside a proposal, or too few or many to propose.
     """
     if propose is not None and any(one is not None for one in (kind, diameter_mm, count, layout)):
         allowed = "--propose alone, or options of the markers that are there"
         refuse("markers are to be found and proposed", "--propose", allowed, "conflicting_options")
+    if propose is not None:
+        check_count(propose)
     return Stated(kind, diameter_mm, count)
 
 
