@@ -80,7 +80,7 @@ SOURCES: Mapping[str, Source] = MappingProxyType(
         "bend": Source("bending of the needle", "bevel_deg", "deg"),
         "breathing": Source("breathing while it is inserted", "amplitude_mm", "mm"),
         "motion": Source(
-            "motion of the target since the scan", "motion.target_sd_mm, [breathing], tissue held_n_mm", "mm"
+            "target's motion, breath and push", "motion.target_sd_mm, [breathing], tissue held_n_mm", "mm"
         ),
         "cameras": Source("points seen by the cameras", "stereo.sd_mm", "mm"),
         "pictures": Source("ultrasound pictures", "ultrasound.target_sd_mm, tip_sd_mm, calibration_sd_mm", "mm"),

@@ -167,6 +167,6 @@ def test_register_shows_them_where_they_are_declared(tmp_path):
     costs = {one["text"]: one["alone_mm"] for one in budget["sources"]}
     assert 0.1 < costs["bending of the needle"] < 10
     assert costs["breathing while it is inserted"] == pytest.approx(12 * mean_square_within(0.25, 2, 0.0) ** 0.5)
-    assert costs["motion of the target since the scan"] == pytest.approx(np.sqrt(0.4**2 + 0.4**2 + 1.0))
+    assert costs["target's motion, breath and push"] == pytest.approx(np.sqrt(0.4**2 + 0.4**2 + 1.0))
     assert {one["group"] for one in budget["changes"]} > {"needle", "breath", "body"}
     assert budget["not_modelled"] == "errors of the meshes (organ, rib: errors.surface_mm)"
