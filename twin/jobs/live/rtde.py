@@ -20,8 +20,8 @@ RTDE_PORT = 30004
 VARIABLES = ("timestamp", "actual_q")
 """What the controller is queried to tell."""
 
-MAX_HOST = 253
-"""Characters of a name on a network (RFC 1035)."""
+MAX_HOST, MAX_LABEL = 253, 63
+"""Characters of a name on a network, and between two of its dots (RFC 1035)."""
 
 ANSWER_S = 5.0
 """A controller that does not take the call within this time is not there."""
@@ -70,10 +70,10 @@ def connect(host: str, command: str = "mirror") -> Receiver:
     Raises:
         InputError: The extra is not installed, or no robot answers there.
     """
+    _check_host(host, command)
     require_extra("mirror", command)
     from rtde_receive import RTDEReceiveInterface
 
-    _check_host(host, command)
     try:  # first by ourselves: the library waits for minutes, and cannot be interrupted
         socket.create_connection((host, RTDE_PORT), timeout=ANSWER_S).close()
         receiver: Receiver = RTDEReceiveInterface(host, variables=list(VARIABLES))
@@ -85,9 +85,11 @@ def connect(host: str, command: str = "mirror") -> Receiver:
 
 
 def _check_host(host: str, command: str) -> None:
-    if not 0 < len(host) <= MAX_HOST or not host.isprintable() or any(c.isspace() for c in host):
-        what = f"host name of {len(host)} characters, or with spaces"
-        refuse(what, f"{command} {host}", f"a name or address of 1 to {MAX_HOST} characters", "bad_host")
+    longest = max(len(label) for label in host.split("."))
+    if not 0 < len(host) <= MAX_HOST or longest > MAX_LABEL or not host.isprintable() or any(map(str.isspace, host)):
+        what = f"host name of {len(host)} characters, {longest} between dots, or with spaces"
+        allowed = f"a name or address of 1 to {MAX_HOST} characters, {MAX_LABEL} between dots"
+        refuse(what, f"{command} {host}", allowed, "bad_host")
 
 
 def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[RecordedState]:
