@@ -22,12 +22,15 @@ from puncture_twin.planning.base.text import check_name, first_few
 from puncture_twin.planning.formats.dicom.named_masks import Mask, MaskVolume, NamedMasks, unique_names
 from puncture_twin.planning.formats.folder import FILE, Entry, entries, unaccounted
 from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL, LabelMap
+from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_layered_header
 from puncture_twin.planning.formats.volumes.volume_files import Content
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, VolumeHeader, corner_deviation_mm, decoded
 
 MASK_ENDINGS = (".nii.gz", ".nii", ".seg.nrrd", ".nrrd")
 """Endings of files that are masks."""
+READ = ", ".join((*MASK_ENDINGS, *MESH_SUFFIXES, "DICOM"))
+"""What structures may be read from."""
 MAX_MASKS, MAX_ENTRIES = 1000, 60_000
 """TotalSegmentator has 117 classes; the slices of a CT may lie next to them."""
 SAME_PLACE_MM = 0.1
@@ -92,7 +95,7 @@ def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError
     return InputError(
         f"the folder also has files that cannot be read and may be organs: {first_few([one.line for one in left])}",
         where=where,
-        allowed=f"{among} in supported formats, and nothing else: convert, download or move the other files",
+        allowed=f"{among} ({READ}), and nothing else: convert, download or move the other files",
         code="entries_not_read",
     )
 
