@@ -68,11 +68,7 @@ def write_dataset(rows: Sequence[dict[str, Any]], out: Path, folder: Path, progr
 
 
 def union_schema(schemas: Sequence[pa.Schema], where: Path) -> pa.Schema:
-    """Every column of any, in the order of their first tables.
-
-    Raises:
-        InputError: A column of two types.
-    """
+    """Every column of any, in the order of their first tables."""
     fields: dict[str, pa.Field] = {}
     for schema in schemas:
         for one in schema:

@@ -365,11 +365,7 @@ def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> 
 
 
 def arm_of(section: tables.RobotSection, files: InputFiles, path: Path) -> UrModel:
-    """The arm's model; each file that decides it becomes an input of the case.
-
-    Raises:
-        InputError: An unknown name, a URDF or a mesh that cannot be used, or limits that are wider than the arm's own.
-    """
+    """The arm's model; each file that decides it becomes an input of the case."""
     stated = stated_limits(section.limits)
     if section.urdf is None:
         model = ur_model(section.model)

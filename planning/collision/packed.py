@@ -304,11 +304,7 @@ class TriangleTree:
 
     @classmethod
     def _of_leaves(cls, mesh: TriangleMesh, leaves: Arrays) -> TriangleTree:
-        """The tree from its leaves' boxes and rows.
-
-        Raises:
-            KeyError, TypeError, ValueError: They are not of this mesh.
-        """
+        """The tree from its leaves' boxes and rows."""
         rows = leaves["rows"]
         _check_leaves(mesh, leaves)
         lows, highs = [leaves["lows"]], [leaves["highs"]]

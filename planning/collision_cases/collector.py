@@ -243,11 +243,7 @@ class CollisionItem(pytest.Item):
 
 
 def arm_properties(session: Session, table: Table) -> list[tuple[str, object]]:
-    """Properties of a test's report about the arm.
-
-    Raises:
-        InputError: The case cannot be read, or has no arm to be checked.
-    """
+    """Properties of a test's report about the arm."""
     context = session.context(table.case, arm=bool(getattr(table.expected, "arm", False)))
     return [("case", str(table.case)), (ARM_PROPERTY, context.arm)]
 

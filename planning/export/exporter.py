@@ -138,11 +138,7 @@ def csv_text(plan: Plan, *, case_checked: bool) -> str:
 
 
 def read_csv(text: str, *, where: Path) -> SampledMotion:
-    """Read such a CSV back.
-
-    Raises:
-        InputError: Another header, another phase, or rows that are no motion.
-    """
+    """Read such a CSV back."""
     rows = list(csv.reader(io.StringIO("\n".join(line for line in text.splitlines() if not line.startswith("#")))))
     if not rows or tuple(rows[0]) != COLUMNS:
         refuse("the table has another header", where, ",".join(COLUMNS), "wrong_columns")
@@ -273,11 +269,7 @@ def format_names() -> tuple[str, ...]:
 
 
 def format_of(name: str) -> tuple[str, Drafting]:
-    """The ending of a format's files, and who writes them.
-
-    Raises:
-        InputError: There is no such format, or its package has no `Exporter` under that name.
-    """
+    """The ending of a format's files, and who writes them."""
     if name in FORMATS:
         return FORMATS[name]
     if name not in format_names():

@@ -242,11 +242,7 @@ TIP_FRAME = "needle_tip"
 
 
 def urdf_with_needle(model: UrModel, tool: Tool) -> str:
-    """The URDF's text; its meshes are named by absolute addresses of this installation.
-
-    Raises:
-        InputError: Nobody has the shapes of such a model.
-    """
+    """The URDF's text; its meshes are named by absolute addresses of this installation."""
     urdf = model_urdf(model)
     robot, flange = ElementTree.fromstring(urdf.text), urdf.chain.flange
     for mesh in robot.iter("mesh"):

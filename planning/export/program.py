@@ -138,11 +138,7 @@ def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
 
 
 def straight_move(model: UrModel, program: Program) -> Trajectory:
-    """The insertion as the controller runs it: the tip straight, a trapezoid in time, on the standoff's branch.
-
-    Raises:
-        InputError: No branch leads from the standoff to the target.
-    """
+    """The insertion as the controller runs it: the tip straight, a trapezoid in time, on the standoff's branch."""
     start, end = program.T_base_standoff[:3, 3], program.T_base_target[:3, 3]
     length = float(np.linalg.norm(end - start))
     times, travelled = _trapezoid(length, program.insertion_mm_s, program.insertion_mm_s2)
@@ -269,9 +265,6 @@ def check_positions(model: UrModel, q: Floats, *, what: str, where: Path) -> Non
 
     Args:
         q: Shape (m, 6), rad.
-
-    Raises:
-        InputError: Names the joint and the angle. NaN is outside.
     """
     inside = (q >= model.joint_limits[:, 0] - POSITION_SLACK_RAD) & (q <= model.joint_limits[:, 1] + POSITION_SLACK_RAD)
     if not inside.all():

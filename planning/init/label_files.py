@@ -195,14 +195,7 @@ def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool
 def _one_table(
     place: Place, source: str, present: Sequence[int], tables: Iterable[str]
 ) -> tuple[tuple[str, dict[int, str]] | None, list[str]]:
-    """The table beside a map that names all of its labels: the one named like the map, else the only one.
-
-    Returns:
-        The table, and why others are none, a sentence each.
-
-    Raises:
-        InputError: Several tables name them in other ways.
-    """
+    """The table beside a map that names all of its labels: the one named like the map, else the only one."""
     found, others = [], []
     for table in tables:
         try:

@@ -168,11 +168,7 @@ class Body(NamedTuple):
 
 
 def _checked(found: Found, point: Floats | None, request: Request) -> Body:
-    """The one CT, and what is the skin.
-
-    Raises:
-        InputError: Everything that is missing, doubled or could not be read.
-    """
+    """The one CT, and what is the skin."""
     problems = list(found.problems)
     cts, stated = _holding(found.cts, point), request.wanted.overrides.skin
     if len(cts) > 1:

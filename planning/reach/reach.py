@@ -98,9 +98,6 @@ def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswe
 
     Args:
         checker: Checks contacts, in the base frame.
-
-    Returns:
-        Empty where there is none.
     """
     found = _surveyed(checker, [request], ROLLS)[0]
     tried = tried_all(checker, [(found, insertion) for insertion in found.insertions()])
@@ -244,9 +241,6 @@ def tried_all(checker: StateChecker, motions: Sequence[tuple[Surveyed, Insertion
 
     Args:
         checker: Checks contacts, in the base frame.
-
-    Returns:
-        For each motion: that the arm reaches the direction by it, or where it ends.
     """
     standoffs = np.array([insertion.standoff for _, insertion in motions]).reshape(-1, 6)
     found: list[ReachAnswer | Blocked] = []

@@ -362,11 +362,7 @@ def _least_squares(pairs: PosePairs, start: _Value, sigma: Floats) -> _Value:
 
 
 def _require_observable(pairs: PosePairs, value: _Value) -> float:
-    """The conditioning of the poses, least over largest singular value.
-
-    Raises:
-        InputError: It is too small; the motion that slides is named.
-    """
+    """The conditioning of the poses, least over largest singular value."""
     J = _slopes(pairs, value, pairs.B[:, :3, 3].mean(axis=0))
     units = np.tile(np.repeat([1.0, LENGTH_MM], 3), J.shape[2] // 6)
     rows = np.repeat([1.0, LENGTH_MM], 3)

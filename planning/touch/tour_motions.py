@@ -146,12 +146,6 @@ def shortest_tour(cost: ArrayLike) -> tuple[int, ...]:
 
     Args:
         cost: Shape (n + 1, n + 1), symmetric or not: from row to column; the last row and column are home.
-
-    Returns:
-        The places 0 to n - 1 in order.
-
-    >>> shortest_tour([[0, 9, 1, 9], [9, 0, 9, 1], [9, 1, 0, 9], [1, 9, 9, 0]])
-    (0, 2, 1)
     """
     of = np.rint(np.asarray(cost, dtype=np.float64) / RESOLUTION).astype(np.int64).tolist()
     n = len(of) - 1

@@ -292,9 +292,6 @@ def refuse_unstable(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> No
         J: Jacobian of the tip, shape (6, 6).
         M: Mass matrix of the joints, shape (6, 6).
         dt: Time step, s.
-
-    Raises:
-        InputError: sqrt(K / m) dt is `MOST_RATIO` or more.
     """
     ratio = stability_ratio(stiffness, J, M, dt)
     if not ratio < MOST_RATIO:

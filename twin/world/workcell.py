@@ -91,9 +91,6 @@ def load_surface(
         T_world_mesh: Its pose, shape (4, 4), mm.
         solid: Whether bodies collide with it, or it is only seen.
         max_faces: How many triangles physics and images bear.
-
-    Returns:
-        Body id.
     """
     position, quaternion = pose_to_m(T_world_mesh)
     with tempfile.TemporaryDirectory() as folder:

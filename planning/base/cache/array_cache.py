@@ -356,11 +356,7 @@ def _generation(by: str) -> str:
 
 
 def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value] | None:
-    """The arrays of an entry; None where there is no entry, or, with a note, a damaged one.
-
-    Raises:
-        InputError: Another user owns it, or may write it.
-    """
+    """The arrays of an entry; None where there is no entry, or, with a note, a damaged one."""
     check_own(path)
     try:
         arrays = unpacked(read_plain_file(path), key)

@@ -219,10 +219,6 @@ def whole_length(data: memoryview, *, implicit: bool, where: Path) -> int:
     Args:
         data: The data set, behind its file's meta information, little endian.
         implicit: Whether value representations are left out.
-
-    Raises:
-        InputError: An element that ends outside of its parent, a sequence without an end, elements out of order, or
-            more of them than any image has.
     """
     return _Walk(data, where).data_set(0, len(data), implicit=implicit, depth=0, closed=False)
 

@@ -87,11 +87,7 @@ def recognise(path: Path) -> DicomFile | None:
 
 
 def _big_endian(meta: FileMetaDataset, path: Path) -> DicomFile:
-    """Description of a big-endian file, which this project does not read, by its meta information.
-
-    Raises:
-        InputError: It may be: no value of such a file is read.
-    """
+    """Description of a big-endian file, which this project does not read, by its meta information."""
     sop_class = dicom_file.text(meta, "MediaStorageSOPClassUID", where=str(path))
     if not sop_class or storage.kind_of(sop_class) is not storage.Kind.OTHER:
         dicom_file.refuse_big_endian(path)

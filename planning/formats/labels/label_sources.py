@@ -174,9 +174,6 @@ def listed_segments(remarks: Mapping[str, str], layers: int, path: Path) -> dict
     Args:
         remarks: The header's ``key:=value`` lines.
         layers: How many the file holds; the layer of a segment may be left out where it is one.
-
-    Raises:
-        InputError: No segment, or some that share a name or a voxel value of one layer, or lie in no layer.
     """
     numbers = sorted({int(at[1]) for key in remarks if (at := re.match(r"Segment(\d{1,6})_", key))})
     names = [check_name(remarks.get(f"Segment{n}_Name", ""), f"segment {n}", where=path) for n in numbers]

@@ -51,11 +51,7 @@ class _Content:
 
 
 def read_obj(data: bytes, where: str) -> RawMesh:
-    """The faces of an OBJ file, of all its objects and groups; polygons are cut into fans.
-
-    Raises:
-        InputError: If a line is not understood, an index is out of range, or the file shows that it was cut.
-    """
+    """The faces of an OBJ file, of all its objects and groups; polygons are cut into fans."""
     text = decode_text(data, where)
     if not text.endswith("\n"):
         refuse(
@@ -130,11 +126,7 @@ _COORDINATE_TOKENS = [8, 9, 10, 12, 13, 14, 16, 17, 18]
 
 
 def read_stl(data: bytes, where: str) -> RawMesh:
-    """The triangles of an STL file, three vertices of their own each.
-
-    Raises:
-        InputError: If it is cut, has a false count, or is not STL.
-    """
+    """The triangles of an STL file, three vertices of their own each."""
     looks_ascii = data[:512].lstrip().lower().startswith(b"solid") and b"facet" in data[:2048].lower()
     if looks_ascii and not _binary_size_fits(data):
         return _read_ascii(data, where)

@@ -65,11 +65,7 @@ class NrrdText:
 
 
 def split_header(content: bytes, path: Path) -> NrrdText:
-    """The header at the beginning of a file.
-
-    Raises:
-        InputError: No header, one without an end, an unknown field, or data elsewhere than in the file or beside it.
-    """
+    """The header at the beginning of a file."""
     head = content[:MAX_HEADER_BYTES]
     if re.match(rb"NRRD000[1-5]\r?\n", head) is None:
         refuse("not a NRRD header (magic NRRD0001 to NRRD0005)", path, "a .nrrd or .nhdr file", "wrong_format")
@@ -109,22 +105,14 @@ def _lines(lines: list[str], path: Path) -> tuple[dict[str, str], dict[str, str]
 
 
 def stated_field(fields: dict[str, str], key: str, path: Path) -> str:
-    """A field that a header must have.
-
-    Raises:
-        InputError: It has not.
-    """
+    """A field that a header must have."""
     if not fields.get(key):
         refuse(f"the header has no field {key!r}", path, "a complete NRRD header", "missing_key")
     return fields[key]
 
 
 def whole_number(text: str, path: Path) -> int:
-    """A count.
-
-    Raises:
-        InputError: Anything but digits.
-    """
+    """A count."""
     if not (text.isascii() and text.isdigit() and len(text) < 19):
         refuse(f"size {text[:30]!r}", path, "positive whole numbers", "not_whole")
     return int(text)

@@ -72,11 +72,7 @@ def data_file(content: bytes, path: Path) -> str | None:
 
 
 def parse_header(content: bytes, path: Path) -> volume_header.VolumeHeader:
-    """The checked header of a volume file that has been read; the voxels are not looked at.
-
-    Raises:
-        InputError: If its ending is unknown, or the header is wrong.
-    """
+    """The checked header of a volume file that has been read; the voxels are not looked at."""
     return _parser(path)(content, path)
 
 
@@ -104,9 +100,6 @@ def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volum
 
     Args:
         data: The file that `data_file` names, where it names one.
-
-    Raises:
-        InputError: As `read_volume`, but for reading.
     """
     header = parse_header(content, path)
     stored = content if data is None else data

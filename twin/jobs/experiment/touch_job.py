@@ -241,11 +241,7 @@ def _points(touched: Touched) -> NamedPoints:
 def _tip_error(
     context: CaseContext, plan: TouchPlan, truth: TouchTruth, fitted: Registration, q_insertion: Floats
 ) -> float:
-    """Tip to true target of the erring arm, sent to where the new registration puts the target, mm.
-
-    Raises:
-        NoAnswerError: The arm does not reach there.
-    """
+    """Tip to true target of the erring arm, sent to where the new registration puts the target, mm."""
     assert context.placement is not None
     target_ct, beliefs = context.case.target_ct, (context.placement.T_base_ct, fitted.T_base_ct)
     q = registered_joints(plan.model, plan.tip_mm, q_insertion, target_ct, beliefs)

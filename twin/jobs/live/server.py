@@ -372,11 +372,7 @@ class Client:
                 self._exchange.give(self._number, answer)
 
     def _exactly(self, size: int, until: float) -> bytes:
-        """So many bytes.
-
-        Raises:
-            OSError: They have not come until then, or never will.
-        """
+        """So many bytes."""
         data = bytearray()
         while len(data) < size:
             left = until - time.monotonic()

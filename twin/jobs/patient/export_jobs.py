@@ -49,11 +49,7 @@ ROUNDED = ("theta_deg", "beta_deg")
 
 
 def table_of(source: Path, choice: Choice) -> Path | None:
-    """The table that a source is or holds; None of a case, whose folder has a ``case.toml``.
-
-    Raises:
-        InputError: One candidate is chosen, or a plan is the source.
-    """
+    """The table that a source is or holds; None of a case, whose folder has a ``case.toml``."""
     if choice != BEST or is_plan(source):
         refuse("a table holds all candidates", source, f"{ALLOWED}; no choice", "conflicting_options")
     if source.suffix.lower() == ".parquet":
@@ -63,11 +59,7 @@ def table_of(source: Path, choice: Choice) -> Path | None:
 
 
 def export_candidates(table_path: Path, format_name: str, out: Path, note: Callable[[str], None]) -> Written:
-    """Write a table of candidates as text, beside its own set or elsewhere.
-
-    Raises:
-        InputError: No table of candidates, or not the one that its folder's manifest lists.
-    """
+    """Write a table of candidates as text, beside its own set or elsewhere."""
     found = read_output(table_path, max_bytes=MAX_TABLE_BYTES)
     if found.note:
         note(f"warning: {found.note}")
@@ -184,9 +176,6 @@ def export_robot(
 
     Args:
         seed: That the plan must state; the case's by default.
-
-    Raises:
-        InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
     source, plan = read_noted_plan(plan_path, note)
     if context is not None:

@@ -196,11 +196,7 @@ def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str
 
 
 def _series(case: Case) -> CtSeries:
-    """The DICOM series that is the case's CT.
-
-    Raises:
-        InputError: It has none, or highdicom is not installed.
-    """
+    """The DICOM series that is the case's CT."""
     require_extra("dicom", f"--format {DICOM}")
     name = case.skin_section.ct or case.ct.file
     series = case.volumes.series(name)

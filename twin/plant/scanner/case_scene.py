@@ -373,9 +373,6 @@ def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator
     Args:
         scene: What lies in the scanner; where the body goes on beyond its surface, the scan ends within it.
         rng: Draws where the grid falls.
-
-    Raises:
-        InputError: No slice, or more voxels than a machine holds.
     """
     low, high = _shown(scene, settings)
     spacing = np.array([settings.pixel_mm, settings.pixel_mm, settings.spacing_mm])

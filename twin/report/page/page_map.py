@@ -89,11 +89,7 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
 
 
 def _directions(parts: Sequence[tuple[Candidates, Ints, Ints]]) -> dict[str, Any]:
-    """What is said of each direction, a list a column; structures, reasons and sentences by their places.
-
-    Args:
-        parts: Candidates, which rows of them, and the window of each of all their rows.
-    """
+    """What is said of each direction, a list a column; structures, reasons and sentences by their places."""
     verdicts = [found.verdict.of(rows) for found, rows, _ in parts]
     named = {str(name) for one in verdicts for name in one.named}
     structures = sorted(named.union(*(found.clearance.structures for found, *_ in parts)))
