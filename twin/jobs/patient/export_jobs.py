@@ -170,7 +170,7 @@ def export_robot(
     *,
     seed: int | None = None,
 ) -> Written:
-    """Write a plan for a robot; with its case, after it has been checked again, and with rounded corners where free.
+    """Write a plan for a robot; with its case, after it has been checked again.
 
     For MoveIt and ROS 2, which need the case: the scene, the goals, the arm with its needle and a sender, as one set.
 
@@ -191,8 +191,8 @@ def export_robot(
         if moves:
             files, notes = put(draft, moves), MOVEIT_NOTES
         else:
-            checker = None if context is None or context.reach is None else context.reach.checker
-            done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
+            checked = context is not None
+            done = export_plan(plan, format_name, draft.folder, source=plan_path, case_checked=checked)
             files, notes = draft.final((done.path,)), done.notes
     return _of_robot(format_name, files[0], plan, notes, inputs, case_checked=context is not None)
 
