@@ -21,35 +21,20 @@ MAX_HEADER_BYTES = 4_000_000
 """A .seg.nrrd with a thousand segments stays below 1 MB."""
 KNOWN_FIELDS = frozenset(
     (
-        "type",
-        "dimension",
-        "space",
-        "spacedimension",
-        "sizes",
-        "spacedirections",
-        "spaceorigin",
-        "spaceunits",
-        "kinds",
-        "endian",
-        "encoding",
-        "datafile",
-        "centers",
-        "centerings",
-        "content",
-        "measurementframe",
-        "byteskip",
-        "lineskip",
-        "thicknesses",
-        "units",
-        "labels",
-        "min",
-        "max",
-        "oldmin",
-        "oldmax",
-        "number",
-        "axismins",
-        "axismaxs",
-        "sampleunits",
+        *("type", "dimension", "space", "spacedimension", "sizes", "spacedirections", "spaceorigin", "spaceunits"),
+        *(
+            "kinds",
+            "endian",
+            "encoding",
+            "datafile",
+            "centers",
+            "centerings",
+            "content",
+            "measurementframe",
+            "byteskip",
+        ),
+        *("lineskip", "thicknesses", "units", "labels", "min", "max", "oldmin", "oldmax", "number", "axismins"),
+        *("axismaxs", "sampleunits"),
     )
 )
 
@@ -154,7 +139,6 @@ TYPES = {
     "double": "f8",
 }
 GZIP = frozenset(("gzip", "gz"))
-ASCII = frozenset(("ascii", "text", "txt"))
 AXIS_KINDS = frozenset(("domain", "space", "time", "none", "???"))
 """What an axis may be that runs through space; others (vector, list, color) hold several values per voxel."""
 VECTOR = re.compile(r"\(([^()]*)\)")
@@ -332,18 +316,18 @@ def _cells(raw: NrrdText, path: Path) -> VoxelLayout:
         if raw.fields.get(key, "0") != "0":
             refuse(f"{key} {raw.fields[key]!r}", path, "0", "unsupported_feature")
     stated = stated_field(raw.fields, "encoding", path).lower()
-    encoding = "gzip" if stated in GZIP else "ascii" if stated in ASCII else stated
-    if encoding not in {"raw", "gzip", "ascii"}:
-        refuse(f"encoding {stated!r}", path, "raw, gzip, ascii", "unsupported_feature")
-    return VoxelLayout(_dtype(raw.fields, encoding, path), encoding, start=raw.data_offset)
+    encoding = "gzip" if stated in GZIP else stated
+    if encoding not in {"raw", "gzip"}:
+        refuse(f"encoding {stated!r}", path, "raw, gzip", "unsupported_feature")
+    return VoxelLayout(_dtype(raw.fields, path), encoding, start=raw.data_offset)
 
 
-def _dtype(fields: dict[str, str], encoding: str, path: Path) -> np.dtype[Any]:
+def _dtype(fields: dict[str, str], path: Path) -> np.dtype[Any]:
     name = TYPES.get(stated_field(fields, "type", path).lower())
     if name is None:
         refuse(f"type {fields['type']!r}", path, "an integer type, float or double", "unknown_type")
     dtype = np.dtype(name)
-    if encoding == "ascii" or dtype.itemsize == 1:
+    if dtype.itemsize == 1:
         return dtype
     order = {"little": "<", "big": ">"}.get(fields.get("endian", "").lower())
     if order is None:
