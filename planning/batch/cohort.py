@@ -35,13 +35,7 @@ MAX_FILE_BYTES = 200_000_000
 
 @dataclass(frozen=True)
 class CohortCase:
-    """One case with its options.
-
-    Attributes:
-        path: The case file, or the folder that holds ``case.toml``.
-        name: What people call it; "" leaves it to the case.
-        options: What is stated in place of what the case states.
-    """
+    """One case with its options."""
 
     stated: str
     path: Path

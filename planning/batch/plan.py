@@ -87,11 +87,7 @@ SCHEMA = pa.schema(
 
 @dataclass(frozen=True)
 class Plan:
-    """A cohort's plan.
-
-    Attributes:
-        version: Of this package, when it was made.
-    """
+    """A cohort's plan."""
 
     cases: tuple[PlannedCase, ...]
     sha256: str
@@ -99,11 +95,7 @@ class Plan:
 
 
 def case_id(options: str, arm: bool | None, inputs: Sequence[Input], refusal: str) -> str:
-    """The id of a case: the same bytes, options and version give the same id, wherever the files lie.
-
-    Args:
-        refusal: Why it cannot be read, or "".
-    """
+    """The id of a case: the same bytes, options and version give the same id, wherever the files lie."""
     stated = [(one.role, "" if one.role == CASE_ROLE else one.path, one.sha256) for one in inputs]
     decides = {"version": version("puncture-twin"), "options": options, "arm": arm, "refusal": refusal}
     text = json.dumps({**decides, "inputs": sorted(stated)}, sort_keys=True)

@@ -114,12 +114,7 @@ ALLOWED_AT_ONCE = "one run at a time, parallel parts (--part i/n), or another fo
 
 @dataclass(frozen=True)
 class Request:
-    """Cases to be run, and how.
-
-    Attributes:
-        jobs: Processes of this machine, at most one a core.
-        write_page: Writes a page for each case that is searched, or None.
-    """
+    """Cases to be run, and how."""
 
     part: Part = WHOLE
     jobs: int = 1
@@ -355,9 +350,6 @@ class _WorkerCache:
 
 def on_scheduler(address: str) -> RunTasks:
     """Make a function that runs cases on a scheduler's workers.
-
-    Args:
-        address: Such as ``tcp://10.0.0.1:8786``.
 
     Raises:
         InputError: The extra ``dask`` is not installed.

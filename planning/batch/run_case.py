@@ -51,13 +51,7 @@ BAD_INPUT = 2
 
 @dataclass(frozen=True)
 class CaseTask:
-    """One case to be run, with all that a worker needs.
-
-    Attributes:
-        work: For what is being written, on the same file system.
-        write_page: Writes the case's page too, or None.
-        attempt: 1, or 2 after a worker has died of it.
-    """
+    """One case to be run, with all that a worker needs."""
 
     planned: PlannedCase
     out: Path
@@ -85,11 +79,7 @@ STALE = "its files differ from those of the plan"
 
 
 def run_case(task: CaseTask, memory: Memory = NO_MEMORY) -> CaseEnd:
-    """Search a case and commit its result; nothing is done where there is a final one.
-
-    Args:
-        memory: What this process keeps from one case to the next.
-    """
+    """Search a case and commit its result; nothing is done where there is a final one."""
     known = ended(task)
     if known is not None and known.exit_code != PROGRAM_FAILED:
         return known

@@ -156,13 +156,7 @@ class CollisionMismatchError(AssertionError):
 
 @dataclass(frozen=True)
 class Table:
-    """One table of expectations, as a test needs it.
-
-    Attributes:
-        kind: ``check``, ``window`` or ``plan``.
-        at: Its number among those, from 0 on.
-        line: Where it begins, from 1 on; None where nothing tells.
-    """
+    """One table of expectations, as a test needs it."""
 
     kind: str
     at: int

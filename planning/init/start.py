@@ -142,12 +142,7 @@ def _target(request: Request, point: Floats | None, outlines: segmentation.Outli
 
 
 class Body(NamedTuple):
-    """Where the skin comes from.
-
-    Attributes:
-        ct: The CT, where there is one.
-        structure: The structure that is the skin, where the CT is not asked.
-    """
+    """Where the skin comes from."""
 
     ct: Ct | None
     structure: segmentation.SkinOf | None

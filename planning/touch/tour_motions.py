@@ -58,12 +58,7 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class TouchTour:
-    """Touches one after another.
-
-    Attributes:
-        touches: In the order in which they are touched.
-        leave: From the last standoff home.
-    """
+    """Touches one after another."""
 
     model: UrModel
     tip_mm: float
@@ -108,9 +103,6 @@ class Stops(NamedTuple):
 
 def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Count) -> TouchTour:
     """Plan the motions of a tour through stops.
-
-    Args:
-        stops: Each with a straight line to it that the arm can follow.
 
     Raises:
         NoMotionError: None to a stop.

@@ -317,11 +317,7 @@ def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:
 
 
 def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
-    """Warnings about a structure's mesh, one sentence each.
-
-    Args:
-        mesh: The structure's surface, mm.
-    """
+    """Warnings about a structure's mesh, one sentence each."""
     warnings = []
     flat = np.count_nonzero(mesh.areas == 0.0)
     if flat:

@@ -62,11 +62,7 @@ PLAN_ENTRY = "batch plan"
 
 @dataclass(frozen=True)
 class PlanRun:
-    """A cohort's plan, and where it was written, if it was.
-
-    Attributes:
-        known: Cases that have a row there already.
-    """
+    """A cohort's plan, and where it was written, if it was."""
 
     cases: tuple[PlannedCase, ...]
     out: Path
@@ -232,9 +228,6 @@ def change_summary(change: CaseChange) -> dict[str, Any]:
 
 def merge_cohort(out: Path, expect: Path | None, tolerance_mm: float, watcher: Watcher) -> Merged:
     """Write ``cases.parquet``, the dataset of candidates and the page.
-
-    Args:
-        tolerance_mm: By so much a best clearance may differ from it.
 
     Raises:
         InputError: No plan, nothing that can be expected, or a folder that cannot be written to.

@@ -244,11 +244,7 @@ class Side:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Shown):
-    """Two paths.
-
-    Attributes:
-        case_name: The case, or those that two plans name.
-    """
+    """Two paths."""
 
     case_name: str
     inputs: tuple[Input, ...]

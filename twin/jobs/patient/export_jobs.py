@@ -148,9 +148,6 @@ def export_robot(
     """Write a plan for a robot; with its case, after it has been checked again.
 
     For MoveIt and ROS 2, which need the case: the scene, the goals, the arm with its needle and a sender, as one set.
-
-    Args:
-        seed: That the plan must state; the case's by default.
     """
     source, plan = read_noted_plan(plan_path, note)
     if context is not None:
