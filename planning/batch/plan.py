@@ -14,7 +14,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -71,18 +71,7 @@ class PlannedCase:
     refusal: str
 
 
-SCHEMA = pa.schema(
-    [
-        ("case", pa.string()),
-        ("id", pa.string()),
-        ("name", pa.string()),
-        ("path", pa.string()),
-        ("options", pa.string()),
-        ("arm", pa.bool_()),
-        ("inputs", pa.string()),
-        ("refusal", pa.string()),
-    ]
-)
+SCHEMA = pa.schema((one.name, pa.bool_() if one.name == "arm" else pa.string()) for one in fields(PlannedCase))
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,7 @@ from puncture_twin.planning.base.files import atomic
 
 SUFFIX = ".arrays"
 ENTRY = re.compile(r"(?P<maker>[\w.]+)\.(?P<generation>[0-9a-f]{16})\.[0-9a-f]{64}\.arrays")
-OF_LAYOUT_1 = re.compile(r"[0-9a-f]{64}\.npz")
-TEMPORARY = re.compile(r"\..+\.arrays|\.[0-9a-f]{64}-\w+\.npz")
+TEMPORARY = re.compile(r"\..+\.arrays")
 DEAD_AFTER_S = 24 * 3600.0
 """A temporary file of this age belongs to a process that was killed."""
 
@@ -116,9 +115,7 @@ def _outlived(one: _Kept, entry: StoredFile) -> bool:
     if TEMPORARY.fullmatch(name):
         return time.time() - one.used_ns / 1e9 > DEAD_AFTER_S
     found = ENTRY.fullmatch(name)
-    if found is None:
-        return OF_LAYOUT_1.fullmatch(name) is not None
-    return found["maker"] == entry.maker and found["generation"] != entry.generation
+    return found is not None and found["maker"] == entry.maker and found["generation"] != entry.generation
 
 
 def _files(folder: Path) -> Iterator[_Kept]:
