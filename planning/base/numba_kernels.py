@@ -96,12 +96,7 @@ def _place() -> Path:
 
 
 def _own_folder(folder: Path) -> Path:
-    """The folder, made if need be, the user's own, without what was cut.
-
-    Raises:
-        InputError: It is a link, or another user owns it or may write it, with the code ``cache_not_own``.
-        OSError: It cannot be made or written to.
-    """
+    """The folder, made if need be, the user's own, without what was cut."""
     if not folder.is_dir():
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         check_own_folder(folder)

@@ -68,11 +68,7 @@ def write_dataset(rows: Sequence[dict[str, Any]], out: Path, folder: Path, progr
 
 
 def union_schema(schemas: Sequence[pa.Schema], where: Path) -> pa.Schema:
-    """Every column of any, in the order of their first tables.
-
-    Raises:
-        InputError: A column of two types.
-    """
+    """Every column of any, in the order of their first tables."""
     fields: dict[str, pa.Field] = {}
     for schema in schemas:
         for one in schema:
@@ -179,12 +175,7 @@ CaseKey = tuple[str, str, int]
 
 
 class CaseChange(NamedTuple):
-    """One case in two cohorts.
-
-    Attributes:
-        before: The case's row in the first; None where it is not there.
-        after: The second cohort's row of the case.
-    """
+    """One case in two cohorts."""
 
     case: str
     options: str
@@ -216,11 +207,7 @@ class CaseChange(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two cohorts compared, case by case.
-
-    Attributes:
-        changes: In the order of the second, then what only the first has.
-    """
+    """Two cohorts compared, case by case."""
 
     changes: tuple[CaseChange, ...]
 
@@ -248,9 +235,6 @@ def compare(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, An
 
 def read_cases(place: Path) -> list[dict[str, Any]]:
     """The rows of a merged cohort.
-
-    Args:
-        place: Its folder, or its ``cases.parquet``.
 
     Raises:
         InputError: There is none, or it is something else.

@@ -254,11 +254,7 @@ def case_of(
 
 
 def _target_of(content: CaseFile, path: Path, space: Space, files: InputFiles) -> Floats:
-    """The point to reach, shape (3,), LPS (or the case's local frame) mm, read-only.
-
-    Raises:
-        InputError: A list of points that cannot be read, or that lacks the target's name.
-    """
+    """The point to reach, shape (3,), LPS (or the case's local frame) mm, read-only."""
     target = content.target
     if target.position_mm is not None:
         return read_only(to_lps(np.asarray([target.position_mm]), space)[0])

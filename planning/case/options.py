@@ -92,11 +92,7 @@ class CaseOptions:
 
 
 def _plain(value: object) -> Any:
-    """An array of NumPy as lists.
-
-    Raises:
-        TypeError: Anything else.
-    """
+    """An array of NumPy as lists."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} is no value of a case file")
@@ -108,9 +104,6 @@ NO_OPTIONS = CaseOptions()
 
 def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
     """Options from plain values.
-
-    Args:
-        sections: Kind of option to a table of keys and values.
 
     Raises:
         InputError: An unknown kind, something that is no table, or a value that is no number, text or list of them.
@@ -144,11 +137,7 @@ def _overlay(table: dict[str, Any], values: Mapping[str, Any]) -> None:
 
 
 def _set_margins(data: dict[str, Any], values: Mapping[str, Any], where: Path | str) -> None:
-    """Set the margins of structures by name or pattern, then add to all.
-
-    Raises:
-        InputError: A pattern that fits nothing with a margin, or a margin that is no number.
-    """
+    """Set the margins of structures by name or pattern, then add to all."""
     stated = list(_margins(data))
     for pattern, margin in values.items():
         if not isinstance(margin, int | float) or isinstance(margin, bool):

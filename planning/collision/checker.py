@@ -280,9 +280,6 @@ def joined_pieces(model: UrModel) -> Mapping[tuple[str, str], Bools]:
 
     Returns:
         For the names of each link and the next, shape (pieces of the one, pieces of the other).
-
-    Raises:
-        InputError: Two neighbouring links do not touch at some angle, or a piece hangs on none of the others.
     """
     links = collision_links(model)
     solids = [[fcl.CollisionObject(convex(piece)) for piece in link.pieces] for link in links]

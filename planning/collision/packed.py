@@ -304,11 +304,7 @@ class TriangleTree:
 
     @classmethod
     def _of_leaves(cls, mesh: TriangleMesh, leaves: Arrays) -> TriangleTree:
-        """The tree from its leaves' boxes and rows.
-
-        Raises:
-            KeyError, TypeError, ValueError: They are not of this mesh.
-        """
+        """The tree from its leaves' boxes and rows."""
         rows = leaves["rows"]
         _check_leaves(mesh, leaves)
         lows, highs = [leaves["lows"]], [leaves["highs"]]
@@ -362,11 +358,7 @@ MOST_CELLS = 4_000_000
 
 
 def packed_skin(patient: TriangleMesh | None, skin_triangles: int, cache: Cache) -> SkinTree:
-    """The skin's tree and its field, of which nothing is known yet; or some that no check wants.
-
-    Args:
-        patient: The skin, and behind it what the CT shows besides.
-    """
+    """The skin's tree and its field, of which nothing is known yet; or some that no check wants."""
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))
         return SkinTree(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3), np.zeros((1, 1), np.bool_))

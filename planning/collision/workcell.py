@@ -146,9 +146,6 @@ def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
     lies wholly inside of it, and where the skin is open only its surface counts.
 
     The checkers' boxes leave a bore up to 0.9 % narrower: a patient who fits the round one is not refused for that.
-
-    Returns:
-        mm, along the bore's radius.
     """
     at = apply(np.linalg.inv(gantry.T_ct_gantry), skin.vertices)
     bore, half = gantry.bore_diameter_mm / 2, gantry.thickness_mm / 2

@@ -166,9 +166,6 @@ def line_of(text: str, place: Sequence[str | int]) -> int | None:
 
     Args:
         place: The array's name, the number of the table from 0 on, and keys; or keys of the file.
-
-    Returns:
-        None where the table does not begin with a line ``[[name]]`` of its own.
     """
     heads = [match for match in TOKENS.finditer(text) if match["kind"]]
     if len(place) < 2:

@@ -156,13 +156,7 @@ class CollisionMismatchError(AssertionError):
 
 @dataclass(frozen=True)
 class Table:
-    """One table of expectations, as a test needs it.
-
-    Attributes:
-        kind: ``check``, ``window`` or ``plan``.
-        at: Its number among those, from 0 on.
-        line: Where it begins, from 1 on; None where nothing tells.
-    """
+    """One table of expectations, as a test needs it."""
 
     kind: str
     at: int
@@ -243,11 +237,7 @@ class CollisionItem(pytest.Item):
 
 
 def arm_properties(session: Session, table: Table) -> list[tuple[str, object]]:
-    """Properties of a test's report about the arm.
-
-    Raises:
-        InputError: The case cannot be read, or has no arm to be checked.
-    """
+    """Properties of a test's report about the arm."""
     context = session.context(table.case, arm=bool(getattr(table.expected, "arm", False)))
     return [("case", str(table.case)), (ARM_PROPERTY, context.arm)]
 

@@ -128,13 +128,7 @@ def updating(config: pytest.Config) -> bool:
 
 @dataclass(frozen=True)
 class Change:
-    """A number of one table to be rewritten.
-
-    Attributes:
-        kind: The array of the table, such as ``check``.
-        at: Its number in the array, from 0 on.
-        number: What is to be written.
-    """
+    """A number of one table to be rewritten."""
 
     kind: str
     at: int

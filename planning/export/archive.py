@@ -142,11 +142,7 @@ def _sources(scan: CtSeries) -> list[Dataset]:
 
 
 def _mask(scan: CtSeries, region: Region) -> Bools:
-    """Voxels of the scan's own slices that hold a point of a region, shape (columns, rows, slices).
-
-    Raises:
-        InputError: None does.
-    """
+    """Voxels of the scan's own slices that hold a point of a region, shape (columns, rows, slices)."""
     stack, shape = scan.stack, (*scan.slice_shape, len(scan.stack.slices))
     at = np.rint(apply(inverse_of(stack), region.points_ct)).astype(int)
     at = at[((at >= 0) & (at < shape)).all(axis=1)]

@@ -153,9 +153,6 @@ def moveit_names(stem: str) -> tuple[str, ...]:
 def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> Mapping[str, str]:
     """Name to text of the MoveIt files.
 
-    Args:
-        source: The plan's file, for the names and for errors.
-
     Raises:
         InputError: A plan that contradicts itself, or a number beyond the arm's limits.
     """
@@ -242,11 +239,7 @@ TIP_FRAME = "needle_tip"
 
 
 def urdf_with_needle(model: UrModel, tool: Tool) -> str:
-    """The URDF's text; its meshes are named by absolute addresses of this installation.
-
-    Raises:
-        InputError: Nobody has the shapes of such a model.
-    """
+    """The URDF's text; its meshes are named by absolute addresses of this installation."""
     urdf = model_urdf(model)
     robot, flange = ElementTree.fromstring(urdf.text), urdf.chain.flange
     for mesh in robot.iter("mesh"):

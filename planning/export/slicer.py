@@ -51,11 +51,7 @@ _SHOWN = {
 
 @dataclass(frozen=True)
 class SceneNode:
-    """One node of a scene.
-
-    Attributes:
-        file: Where it is stored, next to the scene.
-    """
+    """One node of a scene."""
 
     kind: Kind
     name: str

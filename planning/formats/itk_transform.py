@@ -138,11 +138,7 @@ class StatedTransform(NamedTuple):
 
 
 def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
-    """The motion of points by the transforms of one file, shape (4, 4), mm; whether it is rigid is not checked.
-
-    Raises:
-        InputError: None, several that are no composite, or one of another kind or with other parameters.
-    """
+    """The motion of points by the transforms of one file, shape (4, 4), mm; whether it is rigid is not checked."""
     if len(stated) > MAX_PARTS + 1:
         refuse(f"{len(stated)} transforms", where, f"at most {MAX_PARTS} parts of a CompositeTransform", "too_many")
     parts = stated[1:] if stated and _COMPOSITE.fullmatch(stated[0].kind) else stated
@@ -239,9 +235,6 @@ def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
     group 0 without parameters, its parts the groups after it. What is read are the bytes that were hashed: nothing
     that points elsewhere is followed. The texts are found by `heap_text`: HDF5's own library never ends on some damaged
     heaps. Needs the extra ``hdf5`` (h5py), which is imported only here.
-
-    Raises:
-        InputError: Without h5py; or no whole HDF5 file of ITK's transforms.
     """
     require_extra("hdf5", where, else_allowed=_AS_TEXT)
     import h5py
@@ -322,8 +315,6 @@ def heap_text(content: bytes, offset: int | None) -> str:
     Args:
         offset: Where the element stands: length (4 bytes), the collection's address (8), the object's number (4).
 
-    Raises:
-        ValueError: It is not there.
     Source: HDF5 file format, version 3, III.E "Disk format: global heap", IV.B "variable-length datatypes".
     """
     if offset is None:

@@ -207,11 +207,7 @@ class CsvLine(NamedTuple):
 
 
 def read_csv_points(data: bytes, where: str) -> RawPoints:
-    """The points of a CSV file, in the order of its lines; empty lines are passed over.
-
-    Raises:
-        InputError: If the header or a line is not understood; the error names the line.
-    """
+    """The points of a CSV file, in the order of its lines; empty lines are passed over."""
     rows = list(csv_lines(data, where, _ALLOWED))
     if not rows:
         refuse("no line", where, _ALLOWED, "empty")
@@ -297,9 +293,6 @@ def read_markups_points(data: bytes, where: str) -> RawPoints:
     """The control points of a Slicer markups file: a list of fiducials, or a line, each by its label.
 
     Which end of a line is the target no file says: the case names it by its label.
-
-    Raises:
-        InputError: If it is no such file, states no known space, or a point has no label or defined position.
     """
     tree = parse_json(data, where=where, allowed=_MARKUPS_ALLOWED)
     markups = tree.get("markups") if isinstance(tree, dict) else None
@@ -328,11 +321,7 @@ def _control_points(markup: dict[str, Any], where: str) -> list[Any]:
 
 
 def read_fcsv_points(data: bytes, where: str) -> RawPoints:
-    """The points of an older Slicer fiducial list, which is in mm by its definition.
-
-    Raises:
-        InputError: If it states no known space or columns, or a line is not understood.
-    """
+    """The points of an older Slicer fiducial list, which is in mm by its definition."""
     lines = decode_text(data, where).splitlines()
     system, header = _fcsv_value(lines, _FCSV_SYSTEM), _fcsv_value(lines, _FCSV_COLUMNS)
     columns = [] if header is None else [name.strip() for name in header.split(",")]
@@ -494,9 +483,6 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     """The joints of a CSV: a header, then a row a pose; other columns and lines with # do not count.
 
     Separated by commas, or by spaces as RTDE's own client writes it.
-
-    Args:
-        timed: Whether it must hold times.
 
     Raises:
         InputError: A column is missing, something is no number, or the angles or times are of no arm.

@@ -117,9 +117,6 @@ def mask_of(file: str, labels: LabelMap) -> Mask | None:
 def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str | None) -> Segmentation:
     """A label map with the names of its labels: stated, inside the file, in a table beside it, or TotalSegmentator's.
 
-    Args:
-        naming: As the user states it, or None.
-
     Raises:
         InputError: No names are found, or they do not name every label.
     """
@@ -195,14 +192,7 @@ def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool
 def _one_table(
     place: Place, source: str, present: Sequence[int], tables: Iterable[str]
 ) -> tuple[tuple[str, dict[int, str]] | None, list[str]]:
-    """The table beside a map that names all of its labels: the one named like the map, else the only one.
-
-    Returns:
-        The table, and why others are none, a sentence each.
-
-    Raises:
-        InputError: Several tables name them in other ways.
-    """
+    """The table beside a map that names all of its labels: the one named like the map, else the only one."""
     found, others = [], []
     for table in tables:
         try:
@@ -248,10 +238,6 @@ def _table(path: Path) -> bytes:
 
 def file_masks(place: Place, source: str, key: str, ct: str | None) -> Segmentation:
     """The structures of a file: of DICOM on the slices of the CT, or segments of Slicer, of which some overlap.
-
-    Args:
-        key: Of the case: ``seg`` or ``rtstruct``.
-        ct: The CT of the case, read before, or None.
 
     Raises:
         InputError: Structures that cannot be trusted, or were drawn on another CT.
@@ -312,11 +298,7 @@ BESIDE_SPINE = (
 
 
 class Plausibility(NamedTuple):
-    """Agreement of a naming with the places of organs in a label map.
-
-    Attributes:
-        nameless: Labels present that the naming does not know.
-    """
+    """Agreement of a naming with the places of organs in a label map."""
 
     rules: int
     broken: int

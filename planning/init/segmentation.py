@@ -28,7 +28,7 @@ from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.named_files import CaseVolumes
-from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, UP_NOT_STATED, mesh_extent, read_mesh
+from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, mesh_extent, read_mesh
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
@@ -195,18 +195,11 @@ def mesh_folder(
 ) -> Segmentation:
     """The meshes of a folder, in the unit that their extent tells.
 
-    Args:
-        stated: Unit of the coordinates where the user says it, or None.
-        up: Their axis that is up where the user says it; of GLB it must.
-
     Raises:
         InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.
     """
     if len({mesh_name(one) for one in names}) < len(names):
         refuse("two meshes have the same name", place.folder / source, "one mesh per structure", "duplicate_name")
-    if up is None and any(name.lower().endswith(".glb") for name in names):
-        what = f"GLB: {UP_NOT_STATED} (--up y rotates them to z up, --up z keeps them)"
-        refuse(what, place.folder / source, "--up y or --up z", "up_not_stated")
     extents = [mesh_extent(place.folder / name) for name in names]
     boxes = np.stack([one.box for one in extents])
     diagonal = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))
@@ -404,11 +397,7 @@ round holds it: the target was carved out of it, and no path comes to it otherwi
 
 
 def bordering(target: str | None, segmentations: Sequence[Segmentation]) -> dict[str, float]:
-    """Of the target's surface the fraction that each structure borders on whose box may go round it.
-
-    Args:
-        target: The structure that the case names, or None.
-    """
+    """Of the target's surface the fraction that each structure borders on whose box may go round it."""
     every = [SkinOf(one, label) for one in segmentations for label in one.names]
     found = {}
     for own in (one for one in every if one.name == target):
@@ -422,11 +411,7 @@ def bordering(target: str | None, segmentations: Sequence[Segmentation]) -> dict
 
 
 def carved_notes(rows: Sequence[Assigned], target: str | None, border: Mapping[str, float]) -> Iterator[str]:
-    """That an avoided structure goes round the target's, one sentence each.
-
-    Args:
-        target: The structure that the case names, or None.
-    """
+    """That an avoided structure goes round the target's, one sentence each."""
     for row in rows:
         if row.kind == "avoid" and border.get(row.name, 0.0) >= MOST_OF_BORDER:
             yield (

@@ -142,12 +142,7 @@ def _target(request: Request, point: Floats | None, outlines: segmentation.Outli
 
 
 class Body(NamedTuple):
-    """Where the skin comes from.
-
-    Attributes:
-        ct: The CT, where there is one.
-        structure: The structure that is the skin, where the CT is not asked.
-    """
+    """Where the skin comes from."""
 
     ct: Ct | None
     structure: segmentation.SkinOf | None
@@ -168,11 +163,7 @@ class Body(NamedTuple):
 
 
 def _checked(found: Found, point: Floats | None, request: Request) -> Body:
-    """The one CT, and what is the skin.
-
-    Raises:
-        InputError: Everything that is missing, doubled or could not be read.
-    """
+    """The one CT, and what is the skin."""
     problems = list(found.problems)
     cts, stated = _holding(found.cts, point), request.wanted.overrides.skin
     if len(cts) > 1:

@@ -336,9 +336,6 @@ def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: f
     Args:
         length: Above 0.
         end_speed: Speed at the end, reachable (:func:`reachable_speed`).
-
-    Raises:
-        InputError: If ruckig finds no such motion.
     """
     task = InputParameter(1)
     task.current_position, task.current_velocity, task.current_acceleration = [0.0], [start_speed], [0.0]

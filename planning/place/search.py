@@ -147,11 +147,7 @@ class PlaceSearch(Shown):
 
 
 def _startable(check: PlacementCheck, anatomy: Anatomy, target_ct: Floats) -> WantedDirections:
-    """The directions, of `SECOND` evenly spread, in which the needle itself is clear at its standoff.
-
-    Raises:
-        NoAnswerError: There is none.
-    """
+    """The directions, of `SECOND` evenly spread, in which the needle itself is clear at its standoff."""
     spread = check.wanted.spread(SECOND)
     found = spread.only(needle_can_start(check.tool, patient_surface(anatomy), target_ct, spread, ARM_PADDING_MM))
     if not len(found):
@@ -419,13 +415,7 @@ def _order(estimate: ReachEstimate | Verdict) -> tuple[float, float]:
 def _best_apart(
     pairs: Sequence[tuple[Site, Scored]], distance_mm: float, count: int, of_mount: int
 ) -> list[tuple[Site, Scored]]:
-    """The best of each mount, then the best of the others, as far as they reach any direction.
-
-    Args:
-        distance_mm: Two of the same region are at least so far apart.
-        count: So many, or as many as those of the mounts.
-        of_mount: How many of each mount, where it has as many.
-    """
+    """The best of each mount, then the best of the others, as far as they reach any direction."""
     firsts: list[tuple[Site, Scored]] = []
     others: list[tuple[Site, Scored]] = []
     mounts: Counter[str] = Counter()

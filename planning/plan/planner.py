@@ -78,11 +78,7 @@ def _without_approach(context: CaseContext, candidates: Candidates, row: int, wh
 
 
 def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> Plan:
-    """Plan to one candidate, and check the plan.
-
-    Raises:
-        NoAnswerError: No approach, or the timed motion touches something after all.
-    """
+    """Plan to one candidate, and check the plan."""
     assert context.reach is not None and context.placement is not None  # the caller has refused this
     case, checker = context.case, context.reach.checker
     # 0. The direction, checked anew: candidates may be of another engine, or changed; here they are an order alone.
@@ -136,11 +132,7 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
 def _within_limits(
     context: CaseContext, candidates: Candidates, row: int, goals: list[ReachAnswer]
 ) -> list[ReachAnswer]:
-    """The configurations of a candidate that keep the case's limits of chances; the search has checked one alone.
-
-    Raises:
-        NoAnswerError: No configuration keeps them.
-    """
+    """The configurations of a candidate that keep the case's limits of chances; the search has checked one alone."""
     if context.chance is None or not goals:
         return goals
     q = np.array([goal.insertion_q[-1] for goal in goals])

@@ -364,11 +364,7 @@ def _numbered(fiducials: Sequence[Fiducial]) -> tuple[Fiducial, ...]:
 
 
 def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen) -> Sequence[Fiducial]:
-    """The markers where they are of one product, and as many as stated.
-
-    Raises:
-        NoAnswerError: They are not.
-    """
+    """The markers where they are of one product, and as many as stated."""
     if not alike:
         counted = Counter(one.why for one in seen.passed)
         others = ", ".join(f"{count} {why}" for why, count in counted.most_common(3))
@@ -414,12 +410,7 @@ def seen_text(fiducials: Sequence[Fiducial]) -> str:
 
 
 def named_by_layout(alike: Sequence[Fiducial], layout: NamedPoints, where: str | Path) -> tuple[Fiducial, ...]:
-    """The markers by the names of a layout, in its order.
-
-    Raises:
-        NoAnswerError: The layout is not seen, or in several ways.
-        InputError: It is seen mirrored alone.
-    """
+    """The markers by the names of a layout, in its order."""
     names, points = layout.names, layout.points
     if len(names) < MIN_MARKERS:
         refuse(plural(len(names), "marker"), where, f"a layout of {MIN_MARKERS} or more", "too_few_markers")

@@ -126,9 +126,6 @@ class PosePairs(Shown):
 def read_pose_pairs(path: Path, *, motions: bool = False) -> PosePairs:
     """Pairs of poses from a CSV: ``name``, ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``, and the same for B.
 
-    Args:
-        motions: Whether its rows are motions.
-
     Raises:
         InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
     """
@@ -362,11 +359,7 @@ def _least_squares(pairs: PosePairs, start: _Value, sigma: Floats) -> _Value:
 
 
 def _require_observable(pairs: PosePairs, value: _Value) -> float:
-    """The conditioning of the poses, least over largest singular value.
-
-    Raises:
-        InputError: It is too small; the motion that slides is named.
-    """
+    """The conditioning of the poses, least over largest singular value."""
     J = _slopes(pairs, value, pairs.B[:, :3, 3].mean(axis=0))
     units = np.tile(np.repeat([1.0, LENGTH_MM], 3), J.shape[2] // 6)
     rows = np.repeat([1.0, LENGTH_MM], 3)

@@ -349,11 +349,7 @@ def stated_choice(
 
 
 def _own_pick(context: CaseContext, candidate: Pick, where: str) -> Pick:
-    """A candidate of this case: the angles of another's are another path here.
-
-    Raises:
-        InputError: It is of another case, or no row of a search.
-    """
+    """A candidate of this case: the angles of another's are another path here."""
     found, row = candidate
     if not is_kind("Candidates", found):
         what = f"a candidate of a value {shown_value(found)}"

@@ -169,11 +169,7 @@ def _widest(case: Case, context: CaseContext, directions: Directions) -> float:
 
 
 def points_inside(structure: Structure, count: int) -> Floats:
-    """About so many points of a grid inside a closed structure, shape (m, 3), mm; none where it is that thin.
-
-    Raises:
-        InputError: The surface is open.
-    """
+    """About so many points of a grid inside a closed structure, shape (m, 3), mm; none where it is that thin."""
     mesh = structure.mesh
     if not mesh.closed:
         refuse(f"structure '{structure.name}' is open", "best_target", "points, or a closed mesh", "open_mesh")

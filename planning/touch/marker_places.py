@@ -337,9 +337,6 @@ def tape_to(skin: Skin, point: Floats, up: Floats) -> Tape | None:
 
     Args:
         up: Shape (3,), LPS, of any length.
-
-    Returns:
-        None where the image cuts the body's sides at this level.
     """
     vertices, cut = skin.mesh.vertices, np.zeros(len(skin.mesh.vertices), np.bool_)
     cut[skin.mesh.faces[skin.cut_faces]] = True

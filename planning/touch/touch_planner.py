@@ -162,11 +162,7 @@ class _Touchable(NamedTuple):
 
 
 def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
-    """The pose error after touches in the insertion's orientation.
-
-    Raises:
-        NoAnswerError: The markers that are left do not suffice.
-    """
+    """The pose error after touches in the insertion's orientation."""
     why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
     count = f"{len(task.markers)} of {len(every.markers)} markers can be touched"
     if len(task.markers) < MIN_MARKERS:

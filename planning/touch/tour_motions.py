@@ -58,12 +58,7 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class TouchTour:
-    """Touches one after another.
-
-    Attributes:
-        touches: In the order in which they are touched.
-        leave: From the last standoff home.
-    """
+    """Touches one after another."""
 
     model: UrModel
     tip_mm: float
@@ -109,9 +104,6 @@ class Stops(NamedTuple):
 def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Count) -> TouchTour:
     """Plan the motions of a tour through stops.
 
-    Args:
-        stops: Each with a straight line to it that the arm can follow.
-
     Raises:
         NoMotionError: None to a stop.
         NoAnswerError: None home.
@@ -146,12 +138,6 @@ def shortest_tour(cost: ArrayLike) -> tuple[int, ...]:
 
     Args:
         cost: Shape (n + 1, n + 1), symmetric or not: from row to column; the last row and column are home.
-
-    Returns:
-        The places 0 to n - 1 in order.
-
-    >>> shortest_tour([[0, 9, 1, 9], [9, 0, 9, 1], [9, 1, 0, 9], [1, 9, 9, 0]])
-    (0, 2, 1)
     """
     of = np.rint(np.asarray(cost, dtype=np.float64) / RESOLUTION).astype(np.int64).tolist()
     n = len(of) - 1

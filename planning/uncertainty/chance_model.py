@@ -36,11 +36,7 @@ TAKEN = frozenset({"any", "joint"})
 
 @dataclass(frozen=True, eq=False)
 class ChanceModel:
-    """Chances of any needles of one case.
-
-    Attributes:
-        engine: Prepared for the meshes of ``anatomy.checked``.
-    """
+    """Chances of any needles of one case."""
 
     case: Case
     anatomy: Anatomy

@@ -165,9 +165,6 @@ FREE = "free"
 def probe_view(context: CaseContext, plan: Plan | Watched) -> ProbeView:
     """Where the probe goes while a plan's needle is inserted.
 
-    Args:
-        context: The case, with ``[ultrasound]``.
-
     Raises:
         InputError: The case declares no probe, or a stated base of its arm is in the patient.
     """
@@ -347,11 +344,7 @@ class _ProbeArm:
 
 
 def _arm(context: CaseContext, plan: Plan | Watched, probe: Ultrasound, T_base_ct: Floats) -> _ProbeArm | None:
-    """The probe's arm at a place; None where the case leaves the place open and its base would be in the patient.
-
-    Raises:
-        InputError: The base of a stated place is in the patient.
-    """
+    """The probe's arm at a place; None where the case leaves the place open and its base would be in the patient."""
     anatomy, needle = context.anatomy, context.require_arm().checker
     tool = handle_tool(LENGTH_MM - HEAD_MM[1], HANDLE_MM)
     T_base_needle = T_base_ct @ inverse(plan.T_base_ct)

@@ -223,8 +223,8 @@ def test_names_come_out_of_a_slicer_segmentation(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("remarks", "match"),
     [
-        ("Segment0_Name:=liver\n", "out_of_range"),
-        ("Segment0_Name:=liver\nSegment0_LabelValue:=-1\n", "out_of_range -1"),
+        ("Segment0_Name:=liver\n", "bad_value"),
+        ("Segment0_Name:=liver\nSegment0_LabelValue:=-1\n", "bad_value -1"),
         ("Segment0_Name:=a\nSegment0_LabelValue:=1\nSegment1_Name:=b\nSegment1_LabelValue:=1\n", "duplicate_label"),
     ],
 )

@@ -73,8 +73,6 @@ OPTIONS = {
     "--certify": None,
     "--part": "word",
     "--expect": "path",
-    "--memory-mb": "number",
-    "--timeout-s": "number",
     "--nonsense": "word",
     "-": None,
     "--": None,

@@ -47,11 +47,7 @@ class Answer(NamedTuple):
 
 
 def default_out(source: Path, command: str) -> Path:
-    """The folder for a command's files where none is named, such as ``out/abdomen-search``.
-
-    Args:
-        source: What the command reads: a case, its folder, or a plan.
-    """
+    """The folder for a command's files where none is named, such as ``out/abdomen-search``."""
     place = source.absolute()
     if place.suffix.lower() not in {".toml", ".json"}:
         name = place.name

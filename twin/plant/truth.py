@@ -142,9 +142,6 @@ def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "
 
     Returns:
         T_base_ct, shape (4, 4), mm.
-
-    Raises:
-        InputError: Fewer than three points, or all on a line.
     """
     allowed = "3 or more points, named as the markers and the target, not on a line"
     named = ", ".join(points.names) or "none"

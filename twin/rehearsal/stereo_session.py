@@ -180,12 +180,7 @@ class Reached(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Result of a session.
-
-    Attributes:
-        calibration: Result of the robot's points.
-        reached: One for each target.
-    """
+    """Result of a session."""
 
     workcell: StereoWorkcell
     calibration: RobotCalibration

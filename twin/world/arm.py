@@ -47,12 +47,6 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
     """Write the arm with holder and needle as a URDF that PyBullet can load, and its collision pieces next to it.
 
     The collision bodies are the planner's own: convex pieces that contain each link.
-
-    Returns:
-        The URDF's path.
-
-    Raises:
-        InputError: There is no URDF of that model, or it does not say what a moving link weighs.
     """
     urdf = model_urdf(model)
     robot, flange = ET.fromstring(urdf.text), urdf.chain.flange

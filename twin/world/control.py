@@ -135,9 +135,6 @@ class VirtualMass:
 class Admittance:
     """The controller: it keeps the virtual mass's place and speed, shape (3,) each, m and m/s, base frame.
 
-    Args:
-        dt: Its step, s.
-
     Raises:
         InputError: The virtual mass would diverge with this step.
     """
@@ -292,9 +289,6 @@ def refuse_unstable(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> No
         J: Jacobian of the tip, shape (6, 6).
         M: Mass matrix of the joints, shape (6, 6).
         dt: Time step, s.
-
-    Raises:
-        InputError: sqrt(K / m) dt is `MOST_RATIO` or more.
     """
     ratio = stability_ratio(stiffness, J, M, dt)
     if not ratio < MOST_RATIO:
@@ -330,11 +324,7 @@ class Reference:
 
 
 def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float, hold_s: float = 0.0) -> Reference:
-    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then constant.
-
-    Args:
-        dt: The controller's step, s.
-    """
+    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then constant."""
     moving = int(np.ceil(trajectory.duration_s / dt)) + 1
     times = np.minimum(dt * np.arange(moving + round(hold_s / dt)), trajectory.duration_s)
     if len(trajectory.q) == 1:
@@ -473,14 +463,7 @@ class Surroundings:
 def run(
     arm: Arm, controller: Controller, reference: Reference, tip_of: Callable[[Floats], Tip], around: Surroundings
 ) -> Run:
-    """Follow a reference from where the arm is.
-
-    Args:
-        arm: Of an open workcell whose world is the base frame.
-        controller: Its step becomes that of the physics.
-        reference: The motion to follow, a row a step.
-        around: What else acts.
-    """
+    """Follow a reference from where the arm is."""
     set_time_step(arm.client, controller.dt)
     arm.release()  # motors that hold on would work against torques; goals switch them on again
     q, places, forces = [], [], []

@@ -27,12 +27,7 @@ from puncture_twin.twin.world.client import physics_client, pose_to_m, pybullet,
 
 @dataclass(frozen=True)
 class SimulatedWorkcell:
-    """An open simulated workcell.
-
-    Attributes:
-        arm: The arm; its base frame is the world frame.
-        bodies: Body id to name, the arm not among them.
-    """
+    """An open simulated workcell."""
 
     client: int
     arm: Arm
@@ -91,9 +86,6 @@ def load_surface(
         T_world_mesh: Its pose, shape (4, 4), mm.
         solid: Whether bodies collide with it, or it is only seen.
         max_faces: How many triangles physics and images bear.
-
-    Returns:
-        Body id.
     """
     position, quaternion = pose_to_m(T_world_mesh)
     with tempfile.TemporaryDirectory() as folder:

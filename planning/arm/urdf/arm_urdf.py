@@ -38,12 +38,7 @@ class BodyShape(NamedTuple):
 
 
 def body_shapes(chain: ArmChain, document: UrdfDocument, read: Read) -> tuple[tuple[BodyShape, ...], ...]:
-    """The collision shapes of each of the arm's seven bodies.
-
-    Raises:
-        InputError: A link is drawn without a shape for contacts, a body has none at all, something is fixed beyond the
-            flange, or a mesh cannot be used.
-    """
+    """The collision shapes of each of the arm's seven bodies."""
     found = []
     for number, members in enumerate(chain.bodies):
         shapes: list[BodyShape] = []

@@ -107,12 +107,7 @@ class UrdfJoint:
 
 @dataclass(frozen=True, eq=False)
 class UrdfDocument:
-    """A whole URDF.
-
-    Attributes:
-        links: By name, in the file's order.
-        joints: In the file's order.
-    """
+    """A whole URDF."""
 
     name: str
     links: Mapping[str, UrdfLink]

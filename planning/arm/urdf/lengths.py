@@ -104,11 +104,7 @@ def _axes(chain: ArmChain) -> _Axes:
 
 
 def _base(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> Floats:
-    """T_base_root: the frame whose z is axis 1 and whose -y is axis 2 at the angle zero, if the URDF says so.
-
-    Raises:
-        InputError: Axis 2 is not square to axis 1, or the link 'base' (or the root) is another frame.
-    """
+    """T_base_root: the frame whose z is axis 1 and whose -y is axis 2 at the angle zero, if the URDF says so."""
     first, second = axes.directions[:2]
     if abs(first @ second) > SQUARE_RAD:
         raise _other(chain, 1, "is not at a right angle to the axis before it", document)

@@ -41,8 +41,7 @@ from puncture_twin.planning.base.files import atomic
 
 SUFFIX = ".arrays"
 ENTRY = re.compile(r"(?P<maker>[\w.]+)\.(?P<generation>[0-9a-f]{16})\.[0-9a-f]{64}\.arrays")
-OF_LAYOUT_1 = re.compile(r"[0-9a-f]{64}\.npz")
-TEMPORARY = re.compile(r"\..+\.arrays|\.[0-9a-f]{64}-\w+\.npz")
+TEMPORARY = re.compile(r"\..+\.arrays")
 DEAD_AFTER_S = 24 * 3600.0
 """A temporary file of this age belongs to a process that was killed."""
 
@@ -116,9 +115,7 @@ def _outlived(one: _Kept, entry: StoredFile) -> bool:
     if TEMPORARY.fullmatch(name):
         return time.time() - one.used_ns / 1e9 > DEAD_AFTER_S
     found = ENTRY.fullmatch(name)
-    if found is None:
-        return OF_LAYOUT_1.fullmatch(name) is not None
-    return found["maker"] == entry.maker and found["generation"] != entry.generation
+    return found is not None and found["maker"] == entry.maker and found["generation"] != entry.generation
 
 
 def _files(folder: Path) -> Iterator[_Kept]:
@@ -172,11 +169,7 @@ class Memory:
         return self._held
 
     def get(self, key: tuple[Hashable, ...], make: Callable[[], Value], size: Callable[[Value], int]) -> Value:
-        """The value of a key, made where it is not there.
-
-        Args:
-            size: About how many bytes it holds.
-        """
+        """The value of a key, made where it is not there."""
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
@@ -356,11 +349,7 @@ def _generation(by: str) -> str:
 
 
 def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value] | None:
-    """The arrays of an entry; None where there is no entry, or, with a note, a damaged one.
-
-    Raises:
-        InputError: Another user owns it, or may write it.
-    """
+    """The arrays of an entry; None where there is no entry, or, with a note, a damaged one."""
     check_own(path)
     try:
         arrays = unpacked(read_plain_file(path), key)

@@ -22,12 +22,10 @@ PROJECT = str(PACKAGE)
 PARTS = ("planning", "twin")
 
 IMPORTED = re.compile(
-    rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n#]*)|import[ \t]+([^\n#]*))", re.M
+    rb"^[ \t]*(?:from|import)[ \t]+puncture_twin((?:\.\w+)*)(?:[ \t]+import[ \t]+(\([^)]*\)|[^\n#]*))?", re.M
 )
-"""An import: the module and the names taken from it, or a list of modules. One in a docstring counts too: it costs
-nothing but a result made anew."""
-
-NAME = re.compile(rb"([\w.]+|\*)(?:[ \t]+as[ \t]+\w+)?")
+"""An import: a module, and the names taken from it. One in a docstring counts too: it costs nothing but a result made
+anew."""
 
 
 def source_stamp(module: str) -> str:
@@ -129,53 +127,13 @@ def _source_digest(file: str) -> bytes:
 
 @cache
 def _imported(file: str) -> tuple[str, ...]:
-    """The project's files that a file imports, and those whose names a package hands on without an import."""
-    found = list(_handed_on(file))
-    for module, names, modules in _imports(_source(file)):
-        if module:
-            place = _absolute(module.decode(), file)
-            found += [one for name in NAME.findall(names) for one in _files_of_name(place, name.decode())]
-        else:
-            found += [one for name in NAME.findall(modules) for one in _files_of(name.decode())]
+    """The project's files that a file imports; a room hands on no name of its own."""
+    found: list[str] = []
+    for place, names in IMPORTED.findall(_source(file)):
+        module = f"puncture_twin{place.decode()}"
+        found += _files_of(module)
+        found += [one for name in re.findall(rb"\w+", names) for one in _files_of(f"{module}.{name.decode()}")]
     return tuple(found)
-
-
-def _handed_on(file: str) -> tuple[str, ...]:
-    """The stub beside a package's own file, which says where each of its names is made, and the package's modules.
-
-    They are loaded when a name is asked for, as an attribute too: no import need name it.
-    """
-    folder, _, name = file.rpartition("/")
-    if name != "__init__.py":
-        return ()
-    stub = f"{file}i"
-    stubs = (stub,) if os.path.isfile(stub) else ()  # noqa: PTH113  # a path of each costs 0.01 s
-    return (*stubs, *sorted(map(str, Path(folder).glob("*.py"))))
-
-
-def _absolute(module: str, file: str) -> str:
-    """The name of a module that a file may name from its own place, by leading dots."""
-    name = module.lstrip(".")
-    dots = len(module) - len(name)
-    if not dots:
-        return module
-    place = file.removeprefix(f"{PROJECT}/").split("/")[:-dots]
-    return ".".join(part for part in ("puncture_twin", *place, name) if part)
-
-
-def _imports(source: bytes) -> Iterator[tuple[bytes, bytes, bytes]]:
-    """The imports in a source by `IMPORTED`, which is tried where the word occurs, not at every line."""
-    at = source.find(b"import")
-    while at >= 0:
-        found = IMPORTED.match(source, source.rfind(b"\n", 0, at) + 1)
-        if found:
-            yield found.group(1) or b"", found.group(2) or b"", found.group(3) or b""
-        at = source.find(b"import", at + 1 if found is None else max(at + 1, found.end()))
-
-
-def _files_of_name(module: str, name: str) -> tuple[str, ...]:
-    """The files behind ``from module import name``: a module, or a name of a module."""
-    return _files_of(f"{module}.{name}") or _files_of(module)
 
 
 @cache

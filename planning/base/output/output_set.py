@@ -129,11 +129,7 @@ def _folder(out: Path) -> Iterator[None]:
 
 
 def _sources(draft: Draft, made_from: Mapping[str, str]) -> tuple[str, ...]:
-    """The entries that own the sources.
-
-    Raises:
-        InputError: The folder's set has another file of that name: what is made now would stand beside it.
-    """
+    """The entries that own the sources."""
     owners = []
     for name, digest in made_from.items():
         owner = draft.old.owner(name)

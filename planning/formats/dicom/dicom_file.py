@@ -12,7 +12,6 @@ import io
 import math
 import struct
 import warnings
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -26,10 +25,8 @@ from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.text import plural
-from puncture_twin.planning.formats.dicom.storage import BIG_ENDIAN, DEFLATED, IMPLICIT, META_START, is_dicom
+from puncture_twin.planning.formats.dicom.storage import IMPLICIT, META_START, NOT_READ, is_dicom
 
-MAX_INFLATED_BYTES = 1 << 26
-"""Bytes of one inflated file at most: two slices of the largest size, or 128 of the usual one; a bomb ends here."""
 ALLOWED = "a complete DICOM file"
 
 
@@ -57,7 +54,7 @@ def parse_dicom(content: bytes, path: Path) -> Dataset:
     """The data set of a file that has been read, with its ``file_meta``.
 
     Raises:
-        InputError: No DICOM, damaged, cut short, inflating to too much, or big endian.
+        InputError: No DICOM, damaged, cut short, deflated or big endian.
     """
     if not is_dicom(content[:META_START]):
         refuse("not a DICOM file: no DICM at byte 128", path, ALLOWED, "wrong_format")
@@ -65,7 +62,11 @@ def parse_dicom(content: bytes, path: Path) -> Dataset:
         stream = io.BytesIO(content)
         meta = read_meta(stream)
         syntax = UID(meta.TransferSyntaxUID)
-        body = _body(memoryview(content)[stream.tell() :], syntax, path)
+        if not syntax:
+            refuse("its meta information names no transfer syntax", path, ALLOWED, "missing_tag")
+        if syntax in NOT_READ:
+            refuse_syntax(syntax, path)
+        body = memoryview(content)[stream.tell() :]
         implicit = syntax == IMPLICIT
         length = whole_length(body, implicit=implicit, where=path)
         found = read_dataset(io.BytesIO(body[:length]), implicit, True)
@@ -81,28 +82,9 @@ def read_meta(stream: BinaryIO) -> FileMetaDataset:
     return meta
 
 
-def _body(data: memoryview, syntax: UID, path: Path) -> memoryview:
-    """The data set's own bytes, inflated where they are deflated."""
-    if not syntax:
-        refuse("its meta information names no transfer syntax", path, ALLOWED, "missing_tag")
-    if syntax == BIG_ENDIAN:
-        refuse_big_endian(path)
-    if syntax != DEFLATED:
-        return data
-    inflater = zlib.decompressobj(-zlib.MAX_WBITS)
-    inflated = inflater.decompress(data, MAX_INFLATED_BYTES)
-    if not inflater.eof:
-        more = len(inflated) >= MAX_INFLATED_BYTES
-        what = (
-            f"inflates to more than {MAX_INFLATED_BYTES} bytes" if more else "cut short: its deflated data have no end"
-        )
-        refuse(what, path, ALLOWED, "file_damaged")
-    return memoryview(inflated)
-
-
-def refuse_big_endian(path: Path) -> NoReturn:
-    """Raise the error of a file whose numbers are stored the other way round."""
-    refuse(f"transfer syntax {UID(BIG_ENDIAN).name} ({BIG_ENDIAN})", path, how_to_convert(), "transfer_syntax")
+def refuse_syntax(syntax: UID, path: Path) -> NoReturn:
+    """Raise the error of a file in a transfer syntax that is not read."""
+    refuse(f"transfer syntax {syntax.name} ({syntax})", path, how_to_convert(), "transfer_syntax")
 
 
 def how_to_convert() -> str:
@@ -219,10 +201,6 @@ def whole_length(data: memoryview, *, implicit: bool, where: Path) -> int:
     Args:
         data: The data set, behind its file's meta information, little endian.
         implicit: Whether value representations are left out.
-
-    Raises:
-        InputError: An element that ends outside of its parent, a sequence without an end, elements out of order, or
-            more of them than any image has.
     """
     return _Walk(data, where).data_set(0, len(data), implicit=implicit, depth=0, closed=False)
 

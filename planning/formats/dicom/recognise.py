@@ -14,11 +14,10 @@ from pydicom.filereader import read_dataset
 from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError, refuse
-from puncture_twin.planning.base.files import is_folder, read_input
+from puncture_twin.planning.base.files import is_folder
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.formats.dicom import dicom_file, storage
 from puncture_twin.planning.formats.folder import FILE, FOLDER, HIDDEN, Entry, entries, unaccounted
-from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 
 MAX_FILES = 50_000
 """In one folder; the longest series have some 5,000 slices."""
@@ -71,31 +70,22 @@ def recognise(path: Path) -> DicomFile | None:
                 return None
             with dicom_file.refused_if_damaged(path):
                 meta = dicom_file.read_meta(stream)
-                syntax = meta.TransferSyntaxUID
-                if syntax == storage.BIG_ENDIAN:
-                    return _big_endian(meta, path)
-                header = None if syntax == storage.DEFLATED else _header(stream, implicit=syntax == storage.IMPLICIT)
-                if header is not None:
-                    header.file_meta = meta
+                if meta.TransferSyntaxUID in storage.NOT_READ:
+                    return _not_read(meta, path)
+                header = _header(stream, implicit=meta.TransferSyntaxUID == storage.IMPLICIT)
+                header.file_meta = meta
     except OSError as error:
         what = f"cannot be read ({error.strerror})"
         raise InputError(what, where=path, allowed="a readable file", code="unreadable") from error
-    if header is None:
-        content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
-        return described(dicom_file.parse_dicom(content, path), path)
     return described(header, path)
 
 
-def _big_endian(meta: FileMetaDataset, path: Path) -> DicomFile:
-    """Description of a big-endian file, which this project does not read, by its meta information.
-
-    Raises:
-        InputError: It may be: no value of such a file is read.
-    """
-    sop_class = dicom_file.text(meta, "MediaStorageSOPClassUID", where=str(path))
+def _not_read(meta: FileMetaDataset, path: Path) -> DicomFile:
+    """Description, by its meta information, of a file whose transfer syntax is not read; refused if it is of use."""
+    sop_class, syntax = dicom_file.text(meta, "MediaStorageSOPClassUID", where=str(path)), UID(meta.TransferSyntaxUID)
     if not sop_class or storage.kind_of(sop_class) is not storage.Kind.OTHER:
-        dicom_file.refuse_big_endian(path)
-    return DicomFile(path.name, storage.Kind.OTHER, UID(sop_class).name, "", "big endian", "", is_slice=False, date="")
+        dicom_file.refuse_syntax(syntax, path)
+    return DicomFile(path.name, storage.Kind.OTHER, UID(sop_class).name, "", syntax.name, "", is_slice=False, date="")
 
 
 def described(data: Dataset, path: Path) -> DicomFile:

@@ -41,8 +41,10 @@ IMPLICIT = "1.2.840.10008.1.2"
 EXPLICIT = "1.2.840.10008.1.2.1"
 DEFLATED = "1.2.840.10008.1.2.1.99"
 BIG_ENDIAN = "1.2.840.10008.1.2.2"
-PLAIN = (IMPLICIT, EXPLICIT, DEFLATED)
+PLAIN = (IMPLICIT, EXPLICIT)
 """Transfer syntaxes whose pixels are stored as they are."""
+NOT_READ = (BIG_ENDIAN, DEFLATED)
+"""Transfer syntaxes of which not even a header is read."""
 
 
 def kind_of(sop_class: str) -> Kind:

@@ -8,26 +8,27 @@ file has several layers, ``SegmentN_Layer``, counted from 0.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import is_folder
-from puncture_twin.planning.base.text import check_name, first_few
-from puncture_twin.planning.formats.dicom.named_masks import Mask, MaskVolume, NamedMasks, unique_names
+from puncture_twin.planning.base.text import first_few
+from puncture_twin.planning.formats.dicom.named_masks import Mask, MaskVolume, NamedMasks
 from puncture_twin.planning.formats.folder import FILE, Entry, entries, unaccounted
-from puncture_twin.planning.formats.labels.labelmaps import MAX_LABEL, LabelMap
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, Segment, listed_segments
+from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES
 from puncture_twin.planning.formats.volumes.nrrd_header import parse_layered_header
 from puncture_twin.planning.formats.volumes.volume_files import Content
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid, VolumeHeader, corner_deviation_mm, decoded
 
 MASK_ENDINGS = (".nii.gz", ".nii", ".seg.nrrd", ".nrrd")
 """Endings of files that are masks."""
+READ = ", ".join((*MASK_ENDINGS, *MESH_SUFFIXES, "DICOM"))
+"""What structures may be read from."""
 MAX_MASKS, MAX_ENTRIES = 1000, 60_000
 """TotalSegmentator has 117 classes; the slices of a CT may lie next to them."""
 SAME_PLACE_MM = 0.1
@@ -47,10 +48,6 @@ def structure_name(file: str) -> str:
 
 def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path) -> tuple[str, ...]:
     """The names of the masks in a folder, sorted; nothing else may lie in it that could be an organ.
-
-    Args:
-        known: Whether a path in it is something else that the case names.
-        where: The file and key that name the folder, for errors.
 
     Raises:
         InputError: No folder, no mask in it, too many, two of one structure, or entries that would be passed over.
@@ -92,7 +89,7 @@ def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError
     return InputError(
         f"the folder also has files that cannot be read and may be organs: {first_few([one.line for one in left])}",
         where=where,
-        allowed=f"{among} in supported formats, and nothing else: convert, download or move the other files",
+        allowed=f"{among} ({READ}), and nothing else: convert, download or move the other files",
         code="entries_not_read",
     )
 
@@ -131,18 +128,6 @@ def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> N
 
 SEGMENT_ENDING = ".nrrd"
 """Ending of segmentations that Slicer saves, in lower case: their header and voxels are one file."""
-ALLOWED = "a .seg.nrrd as Slicer saves it, with names, label values and layers of its segments"
-
-
-class Segment(NamedTuple):
-    """Layer and label of a segment.
-
-    Attributes:
-        layer: From 0.
-    """
-
-    layer: int
-    label: int
 
 
 def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
@@ -163,43 +148,6 @@ def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
         for name, segment in found.items()
     }
     return NamedMasks(masks, header.notes)
-
-
-def listed_segments(remarks: Mapping[str, str], layers: int, path: Path) -> dict[str, Segment]:
-    """Name to layer and label, of every segment that the header lists.
-
-    Args:
-        remarks: The header's ``key:=value`` lines.
-        layers: How many the file holds; the layer of a segment may be left out where it is one.
-
-    Raises:
-        InputError: No segment, or some that share a name or a voxel value of one layer, or lie in no layer.
-    """
-    numbers = sorted({int(at[1]) for key in remarks if (at := re.match(r"Segment(\d{1,6})_", key))})
-    names = [check_name(remarks.get(f"Segment{n}_Name", ""), f"segment {n}", where=path) for n in numbers]
-    unique_names(names, path)
-    segments = [_segment(remarks, number, layers, path) for number in numbers]
-    for name, segment in zip(names, segments, strict=True):
-        if segments.count(segment) > 1:
-            what = f"segment {name!r} shares label {segment.label} of layer {segment.layer}"
-            refuse(what, path, "a label of its own in its layer for each segment", "duplicate_label")
-    return dict(zip(names, segments, strict=True))
-
-
-def _segment(remarks: Mapping[str, str], number: int, layers: int, path: Path) -> Segment:
-    label = _number(remarks, f"Segment{number}_LabelValue", None, path)
-    layer = _number(remarks, f"Segment{number}_Layer", "0" if layers == 1 else None, path)
-    if not (1 <= label <= MAX_LABEL and layer < layers):
-        allowed = f"labels from 1 to {MAX_LABEL}, layers from 0 to {layers - 1}"
-        refuse(f"segment {number} has label {label} in layer {layer}", path, allowed, "out_of_range")
-    return Segment(layer, label)
-
-
-def _number(remarks: Mapping[str, str], key: str, default: str | None, path: Path) -> int:
-    text = remarks.get(key, default)
-    if text is None or not (text.isascii() and text.isdigit() and len(text) < 10):
-        refuse(f"{key} is {'missing' if text is None else repr(text[:20])}", path, ALLOWED, "bad_value")
-    return int(text)
 
 
 def _mask(content: Content, file: str, header: VolumeHeader, segment: Segment, listed: frozenset[Segment]) -> Mask:

@@ -37,6 +37,8 @@ from puncture_twin.planning.base.arrays import Bools
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.base.strict_json import parse_json
+from puncture_twin.planning.base.text import check_name
+from puncture_twin.planning.formats.dicom.named_masks import unique_names
 from puncture_twin.planning.formats.guard import guard_mesh
 from puncture_twin.planning.formats.volumes.volume_files import Volume, canonical
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -131,25 +133,59 @@ def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer],
     return rounded.astype(np.uint16), float(off.max())
 
 
-def segment_names(fields: dict[str, str], path: Path) -> dict[int, str] | None:
-    """Label to name from the remarks ``SegmentN_Name`` and ``SegmentN_LabelValue`` of a Slicer segmentation.
+ALLOWED_SEGMENTS = "a .seg.nrrd as Slicer saves it, with names, label values and layers of its segments"
 
-    Raises:
-        InputError: Names that contradict each other.
+
+class Segment(NamedTuple):
+    """Layer and label of a segment.
+
+    Attributes:
+        layer: From 0.
     """
-    names: dict[int, str] = {}
-    for key, name in fields.items():
-        number = re.fullmatch(r"Segment(\d+)_Name", key)
-        if number is None:
-            continue
-        value = fields.get(f"Segment{number[1]}_LabelValue", "")
-        if not (value.isascii() and value.isdigit() and 0 < int(value) <= MAX_LABEL):
-            refuse(f"segment {name!r} has label value {value!r}", path, f"1 to {MAX_LABEL}", "out_of_range")
-        if int(value) in names:
-            what = f"segments {names[int(value)]!r} and {name!r} share label {value}"
-            refuse(what, path, "one label per segment", "duplicate_label")
-        names[int(value)] = name
-    return names or None
+
+    layer: int
+    label: int
+
+
+def segment_names(fields: Mapping[str, str], path: Path) -> dict[int, str] | None:
+    """Label to name, as the remarks of a Slicer segmentation state them; None where they name no segment."""
+    if not any(re.fullmatch(r"Segment\d+_Name", key) for key in fields):
+        return None
+    return {segment.label: name for name, segment in listed_segments(fields, 1, path).items()}
+
+
+def listed_segments(remarks: Mapping[str, str], layers: int, path: Path) -> dict[str, Segment]:
+    """Name to layer and label, of every segment that the header lists.
+
+    Args:
+        remarks: The header's ``key:=value`` lines.
+        layers: How many the file holds; the layer of a segment may be left out where it is one.
+    """
+    numbers = sorted({int(at[1]) for key in remarks if (at := re.match(r"Segment(\d{1,6})_", key))})
+    names = [check_name(remarks.get(f"Segment{n}_Name", ""), f"segment {n}", where=path) for n in numbers]
+    unique_names(names, path)
+    segments = [_segment(remarks, number, layers, path) for number in numbers]
+    for name, segment in zip(names, segments, strict=True):
+        if segments.count(segment) > 1:
+            what = f"segment {name!r} shares label {segment.label} of layer {segment.layer}"
+            refuse(what, path, "a label of its own in its layer for each segment", "duplicate_label")
+    return dict(zip(names, segments, strict=True))
+
+
+def _segment(remarks: Mapping[str, str], number: int, layers: int, path: Path) -> Segment:
+    label = _number(remarks, f"Segment{number}_LabelValue", None, path)
+    layer = _number(remarks, f"Segment{number}_Layer", "0" if layers == 1 else None, path)
+    if not (1 <= label <= MAX_LABEL and layer < layers):
+        allowed = f"labels from 1 to {MAX_LABEL}, layers from 0 to {layers - 1}"
+        refuse(f"segment {number} has label {label} in layer {layer}", path, allowed, "out_of_range")
+    return Segment(layer, label)
+
+
+def _number(remarks: Mapping[str, str], key: str, default: str | None, path: Path) -> int:
+    text = remarks.get(key, default)
+    if text is None or not (text.isascii() and text.isdigit() and len(text) < 10):
+        refuse(f"{key} is {'missing' if text is None else repr(text[:20])}", path, ALLOWED_SEGMENTS, "bad_value")
+    return int(text)
 
 
 def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> TriangleMesh:

@@ -183,9 +183,6 @@ def array_values(element: ElementTree.Element, count: int, encoding: Encoding, w
 
     Returns:
         Shape (count,), of the array's own type.
-
-    Raises:
-        InputError: If there are more or fewer, or they cannot be decoded.
     """
     kind = element.get("type", "")
     if kind not in _TYPES:

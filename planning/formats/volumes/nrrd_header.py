@@ -21,35 +21,20 @@ MAX_HEADER_BYTES = 4_000_000
 """A .seg.nrrd with a thousand segments stays below 1 MB."""
 KNOWN_FIELDS = frozenset(
     (
-        "type",
-        "dimension",
-        "space",
-        "spacedimension",
-        "sizes",
-        "spacedirections",
-        "spaceorigin",
-        "spaceunits",
-        "kinds",
-        "endian",
-        "encoding",
-        "datafile",
-        "centers",
-        "centerings",
-        "content",
-        "measurementframe",
-        "byteskip",
-        "lineskip",
-        "thicknesses",
-        "units",
-        "labels",
-        "min",
-        "max",
-        "oldmin",
-        "oldmax",
-        "number",
-        "axismins",
-        "axismaxs",
-        "sampleunits",
+        *("type", "dimension", "space", "spacedimension", "sizes", "spacedirections", "spaceorigin", "spaceunits"),
+        *(
+            "kinds",
+            "endian",
+            "encoding",
+            "datafile",
+            "centers",
+            "centerings",
+            "content",
+            "measurementframe",
+            "byteskip",
+        ),
+        *("lineskip", "thicknesses", "units", "labels", "min", "max", "oldmin", "oldmax", "number", "axismins"),
+        *("axismaxs", "sampleunits"),
     )
 )
 
@@ -65,11 +50,7 @@ class NrrdText:
 
 
 def split_header(content: bytes, path: Path) -> NrrdText:
-    """The header at the beginning of a file.
-
-    Raises:
-        InputError: No header, one without an end, an unknown field, or data elsewhere than in the file or beside it.
-    """
+    """The header at the beginning of a file."""
     head = content[:MAX_HEADER_BYTES]
     if re.match(rb"NRRD000[1-5]\r?\n", head) is None:
         refuse("not a NRRD header (magic NRRD0001 to NRRD0005)", path, "a .nrrd or .nhdr file", "wrong_format")
@@ -109,22 +90,14 @@ def _lines(lines: list[str], path: Path) -> tuple[dict[str, str], dict[str, str]
 
 
 def stated_field(fields: dict[str, str], key: str, path: Path) -> str:
-    """A field that a header must have.
-
-    Raises:
-        InputError: It has not.
-    """
+    """A field that a header must have."""
     if not fields.get(key):
         refuse(f"the header has no field {key!r}", path, "a complete NRRD header", "missing_key")
     return fields[key]
 
 
 def whole_number(text: str, path: Path) -> int:
-    """A count.
-
-    Raises:
-        InputError: Anything but digits.
-    """
+    """A count."""
     if not (text.isascii() and text.isdigit() and len(text) < 19):
         refuse(f"size {text[:30]!r}", path, "positive whole numbers", "not_whole")
     return int(text)
@@ -166,7 +139,6 @@ TYPES = {
     "double": "f8",
 }
 GZIP = frozenset(("gzip", "gz"))
-ASCII = frozenset(("ascii", "text", "txt"))
 AXIS_KINDS = frozenset(("domain", "space", "time", "none", "???"))
 """What an axis may be that runs through space; others (vector, list, color) hold several values per voxel."""
 VECTOR = re.compile(r"\(([^()]*)\)")
@@ -344,18 +316,18 @@ def _cells(raw: NrrdText, path: Path) -> VoxelLayout:
         if raw.fields.get(key, "0") != "0":
             refuse(f"{key} {raw.fields[key]!r}", path, "0", "unsupported_feature")
     stated = stated_field(raw.fields, "encoding", path).lower()
-    encoding = "gzip" if stated in GZIP else "ascii" if stated in ASCII else stated
-    if encoding not in {"raw", "gzip", "ascii"}:
-        refuse(f"encoding {stated!r}", path, "raw, gzip, ascii", "unsupported_feature")
-    return VoxelLayout(_dtype(raw.fields, encoding, path), encoding, start=raw.data_offset)
+    encoding = "gzip" if stated in GZIP else stated
+    if encoding not in {"raw", "gzip"}:
+        refuse(f"encoding {stated!r}", path, "raw, gzip", "unsupported_feature")
+    return VoxelLayout(_dtype(raw.fields, path), encoding, start=raw.data_offset)
 
 
-def _dtype(fields: dict[str, str], encoding: str, path: Path) -> np.dtype[Any]:
+def _dtype(fields: dict[str, str], path: Path) -> np.dtype[Any]:
     name = TYPES.get(stated_field(fields, "type", path).lower())
     if name is None:
         refuse(f"type {fields['type']!r}", path, "an integer type, float or double", "unknown_type")
     dtype = np.dtype(name)
-    if encoding == "ascii" or dtype.itemsize == 1:
+    if dtype.itemsize == 1:
         return dtype
     order = {"little": "<", "big": ">"}.get(fields.get("endian", "").lower())
     if order is None:

@@ -72,11 +72,7 @@ def data_file(content: bytes, path: Path) -> str | None:
 
 
 def parse_header(content: bytes, path: Path) -> volume_header.VolumeHeader:
-    """The checked header of a volume file that has been read; the voxels are not looked at.
-
-    Raises:
-        InputError: If its ending is unknown, or the header is wrong.
-    """
+    """The checked header of a volume file that has been read; the voxels are not looked at."""
     return _parser(path)(content, path)
 
 
@@ -100,14 +96,7 @@ def read_volume(path: Path) -> Volume:
 
 
 def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volume:
-    """Parse a volume file that has been read; it is not opened again.
-
-    Args:
-        data: The file that `data_file` names, where it names one.
-
-    Raises:
-        InputError: As `read_volume`, but for reading.
-    """
+    """Parse a volume file that has been read; it is not opened again."""
     header = parse_header(content, path)
     stored = content if data is None else data
     try:
@@ -172,11 +161,7 @@ class VolumeSource(Protocol):
 
 @dataclass(frozen=True)
 class VolumeFile:
-    """A volume in one file, or in a header and a file of voxels beside it.
-
-    Attributes:
-        files: That file, and the one beside it.
-    """
+    """A volume in one file, or in a header and a file of voxels beside it."""
 
     path: Path
     files: tuple[str, ...]

@@ -1,12 +1,11 @@
 """The checked header of a volume: its shape, its cells' type and size, and where its voxels lie.
 
-The stored voxels, from the bytes of its file: raw, gzipped or as text.
+The stored voxels, from the bytes of its file, raw or gzipped.
 """
 
 from __future__ import annotations
 
 import itertools
-import re
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -37,7 +36,7 @@ class VoxelLayout:
 
     Attributes:
         dtype: Of one voxel, with the file's byte order.
-        encoding: ``raw``, ``gzip`` or ``ascii``: of all that the file holds from byte ``start`` on.
+        encoding: ``raw`` or ``gzip``: of all that the file holds from byte ``start`` on.
         start: Bytes of the file before the encoded data.
         offset: Bytes of the decoded data before the first voxel.
         slope: What a stored value is multiplied with; 1 and an intercept of 0 leave it as it is.
@@ -190,9 +189,6 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
 
     Stops one byte after the promised length, so what a bomb would inflate to is never made.
 
-    Args:
-        promised: Bytes that the header says they inflate to.
-
     Returns:
         Shape (promised,).
 
@@ -249,14 +245,6 @@ def _parts(content: memoryview, most: int) -> Iterator[bytes]:
             yield part
 
 
-INTEGER_TEXT = re.compile(rb"[0-9+\-\s]*")
-FLOAT_TEXT = re.compile(rb"[0-9+\-.eE\s]*")
-LONGEST_NUMBER = 64
-"""Characters; a double with all of its digits and exponent has 24."""
-TEXT_BYTES = LONGEST_NUMBER + 1
-"""Of one number and the space after it, at most."""
-
-
 def decoded(content: memoryview, header: VolumeHeader) -> NDArray[Any]:
     """The voxels as stored, in this machine's byte order.
 
@@ -268,29 +256,10 @@ def decoded(content: memoryview, header: VolumeHeader) -> NDArray[Any]:
     """
     cells, where = header.cells, header.data_path
     data, count = content[cells.start :], header.count * header.layers
-    if cells.encoding == "ascii":
-        flat = _numbers(bytes(data), count, cells.dtype, where)
-    else:
-        promised = cells.offset + count * cells.dtype.itemsize
-        if cells.encoding == "raw":
-            check_exact_size(len(data), promised, where=where)
-        whole = data if cells.encoding == "raw" else inflated(data, promised, where=where)
-        flat = np.frombuffer(whole, cells.dtype, count, cells.offset)
+    promised = cells.offset + count * cells.dtype.itemsize
+    if cells.encoding == "raw":
+        check_exact_size(len(data), promised, where=where)
+    whole = data if cells.encoding == "raw" else inflated(data, promised, where=where)
+    flat = np.frombuffer(whole, cells.dtype, count, cells.offset)
     shape = header.shape if header.layers == 1 else (header.layers, *header.shape)
     return flat.astype(cells.dtype.newbyteorder("="), copy=False).reshape(shape, order="F")
-
-
-def _numbers(text: bytes, count: int, dtype: np.dtype[Any], where: Path) -> NDArray[Any]:
-    allowed = f"plain numbers of type {dtype}"
-    pattern = FLOAT_TEXT if dtype.kind == "f" else INTEGER_TEXT
-    if len(text) > count * TEXT_BYTES or pattern.fullmatch(text) is None:
-        refuse("the data have values other than numbers", where, allowed, "not_a_number")
-    words = text.split()
-    check_exact_size(len(words), count, where=where)
-    try:
-        numbers = [float(word) for word in words] if dtype.kind == "f" else [int(word) for word in words]
-        with np.errstate(over="ignore"):  # what becomes infinite is refused
-            return np.array(numbers, dtype=dtype)
-    except (ValueError, OverflowError) as error:
-        what = f"the data have no number of their type ({error})"
-        raise InputError(what, where=where, allowed=allowed, code="not_a_number") from error

@@ -108,9 +108,6 @@ def check_transform(
 
     Yields:
         Warnings; how far markers that agree are from it is a note.
-
-    Raises:
-        InputError: Base or a box of the robot's frame would be in the patient; or markers are elsewhere.
     """
     stated = case.robot.stated
     if stated is None:
@@ -186,11 +183,7 @@ def _rivals(given: Reading, others: Sequence[Reading]) -> list[Reading]:
 
 
 def _held_against_markers(case: Case, registration: Registration, given: Reading, others: Sequence[Reading]) -> Finding:
-    """How far the transform is from what the markers say: a warning where their errors do not explain it, else a note.
-
-    Raises:
-        InputError: Too far for both to be of one patient and robot.
-    """
+    """How far the transform is from what the markers say: a warning where their errors do not explain it."""
     found = _apart(case, registration, given.T_base_ct)
     said = (
         f"the markers put {found.where} {found.apart_mm:.1f} mm from its position by the stated transform; expected "

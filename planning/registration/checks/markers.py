@@ -235,9 +235,6 @@ def check_axes(
 
     Yields:
         Warnings.
-
-    Raises:
-        InputError: The list lies on the skin, or where it can be touched, only after a half turn.
     """
     slips = {name: marker_list(case, around, registration, signs, cache) for name, signs in HALF_TURNS.items()}
     likely = {name: slip for name, slip in slips.items() if _explains(slip, given)}
@@ -279,11 +276,7 @@ def _excluded(slip: MarkerList, given: MarkerList) -> bool:
 
 
 def _worse(fit: SkinFit, other: SkinFit, *, level: float) -> bool:
-    """Whether the same markers scatter more in one list than in another beyond chance, by an F-test.
-
-    Args:
-        level: How often two lists of one scatter would seem so different.
-    """
+    """Whether the same markers scatter more in one list than in another beyond chance, by an F-test."""
     freedom = len(fit.gaps_mm) - 1
     limit = float(np.sqrt(fdtri(freedom, freedom, 1 - level)))
     return fit.scatter_mm > limit * max(other.scatter_mm, SCATTER_MM)

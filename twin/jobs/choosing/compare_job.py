@@ -48,11 +48,7 @@ def parse_two(
     window: Sequence[int],
     entry: Sequence[str],
 ) -> tuple[Choice, Choice]:
-    """Two choices from options that may be repeated, in their order in the help; of one the best stands beside it.
-
-    Raises:
-        InputError: None or more than two, or one angle alone.
-    """
+    """Two choices from options that may be repeated, in their order in the help; of one the best stands beside it."""
     if len(theta_deg) != len(beta_deg):
         refuse("one angle alone gives no direction", "--theta, --beta", "as many of each", "one_angle")
     choices = [parse_choice(*pair, None, None, None) for pair in zip(theta_deg, beta_deg, strict=True)]
@@ -70,11 +66,7 @@ def parse_two(
 
 
 def two_plans(source: Path, other: Path | None, case: Path | None, chosen: bool) -> tuple[Path, Path] | None:
-    """The two plans that are to be compared; None where it is two choices of a case.
-
-    Raises:
-        InputError: One plan alone, a plan beside a case, or a plan beside a choice.
-    """
+    """The two plans that are to be compared; None where it is two choices of a case."""
     allowed = "PLAN_A PLAN_B [--case CASE], or CASE with one choice or two"
     if not is_plan(source):
         if other is not None or case is not None:
@@ -101,12 +93,7 @@ def compare_source(
 
 
 def compare_choices(context: CaseContext, choices: tuple[Choice, Choice]) -> Comparison:
-    """Two directions of a case, each checked, beside what the search says of them.
-
-    Raises:
-        InputError: A rank or window that there is not, or a point that is no skin entry.
-        NoAnswerError: Nothing is safe, so that there are no ranks.
-    """
+    """Two directions of a case, each checked, beside what the search says of them."""
     found, space = context.search(), context.case.space
     a, b = ((choice.text(space), explain_choice(context, choice, found)) for choice in choices)
     return compare_paths(context, found, a, b)
@@ -133,11 +120,7 @@ def compare_paths(context: CaseContext, found: Candidates, *paths: Titled) -> Co
 
 
 def compare_plans(paths: tuple[Path, Path], context: CaseContext | None, note: Callable[[str], None]) -> Comparison:
-    """Two plans; with their case each is checked again.
-
-    Raises:
-        InputError: A plan that cannot be used, or does not hold any more.
-    """
+    """Two plans; with their case each is checked again."""
     read = [read_noted_plan(path, note) for path in paths]
     inputs = tuple(source for source, _ in read)
     plans = [plan for _, plan in read]
@@ -261,11 +244,7 @@ class Side:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Shown):
-    """Two paths.
-
-    Attributes:
-        case_name: The case, or those that two plans name.
-    """
+    """Two paths."""
 
     case_name: str
     inputs: tuple[Input, ...]

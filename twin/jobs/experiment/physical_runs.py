@@ -38,9 +38,6 @@ DRAWS = 400
 def physical_runs(context: CaseContext, runs: int) -> dict[str, Any]:
     """Run the experiment of a case's best candidate, each run with a truth of its own.
 
-    Args:
-        context: Of a case with declared errors, markers and an arm.
-
     Returns:
         Plain values: the tip's rms error that the declaration predicts for these touches and that of the runs that
         ended, each of these, why others were refused, and the errors of truths without physics, the same and many.
@@ -73,12 +70,7 @@ def physical_runs(context: CaseContext, runs: int) -> dict[str, Any]:
 
 
 def physical_run(context: CaseContext, tour: Tour, seed: int) -> dict[str, Any]:
-    """One run.
-
-    Raises:
-        NoAnswerError: A marker was not touched (the prediction is of all of them), the puncture has no plan, or the arm
-            touched something.
-    """
+    """One run."""
     touched, use = touch_once(context, tour, seed)
     if touched.failed or isinstance(use, str):
         why = "; ".join(f"marker {name}: {reason}" for name, reason in touched.failed.items())
@@ -95,11 +87,7 @@ def physical_run(context: CaseContext, tour: Tour, seed: int) -> dict[str, Any]:
 
 
 def _inserted(context: CaseContext, tour: Tour, seed: int, registration: Registration) -> Rehearsal:
-    """The puncture planned by what was touched, and executed where everything truly is.
-
-    Raises:
-        NoAnswerError: There is no such plan, or the arm touched something.
-    """
+    """The puncture planned by what was touched, and executed where everything truly is."""
     with context.stages.time("puncture"):
         plan = plan_puncture(context, tour.outward_ct, tour.q_insertion, registration)
         truth, at_target = true_touches(context, tour, seed), true_at_target(context, seed)

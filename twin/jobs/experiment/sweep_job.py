@@ -105,11 +105,7 @@ def sweep_end(source: Path, to: str | None, *, sweep: bool, alone: bool) -> Angl
 
 
 def parse_angles(text: str | None) -> Angles | None:
-    """Theta and beta (rad) of "THETA,BETA" in degrees.
-
-    Raises:
-        InputError: Not two numbers, or out of range.
-    """
+    """Theta and beta (rad) of "THETA,BETA" in degrees."""
     if text is None:
         return None
     numbers = [parse_coordinate(part.strip(), "--to") for part in text.split(",")]

@@ -129,9 +129,6 @@ class TouchRun(Shown):
 def touch_case(context: CaseContext, out: Path, choice: Choice, seed: int) -> TouchRun:
     """Plan the touches of a case's markers for a chosen puncture, execute them in the twin, write what they read.
 
-    Args:
-        context: Of a case with declared errors, markers and an arm.
-
     Raises:
         InputError: The case declares no errors, or has no markers.
         NoAnswerError: Nothing is safe, or too few markers can be touched, with the reasons.
@@ -241,11 +238,7 @@ def _points(touched: Touched) -> NamedPoints:
 def _tip_error(
     context: CaseContext, plan: TouchPlan, truth: TouchTruth, fitted: Registration, q_insertion: Floats
 ) -> float:
-    """Tip to true target of the erring arm, sent to where the new registration puts the target, mm.
-
-    Raises:
-        NoAnswerError: The arm does not reach there.
-    """
+    """Tip to true target of the erring arm, sent to where the new registration puts the target, mm."""
     assert context.placement is not None
     target_ct, beliefs = context.case.target_ct, (context.placement.T_base_ct, fitted.T_base_ct)
     q = registered_joints(plan.model, plan.tip_mm, q_insertion, target_ct, beliefs)

@@ -202,12 +202,7 @@ def bound(host: str, port: int) -> socket.socket:
 
 
 def serve(listener: socket.socket, planner: Planner, pose_s: float = POSE_S) -> None:
-    """Answer clients until it is interrupted; the port is free then.
-
-    Args:
-        listener: From `bound`; closed at the end.
-        pose_s: How long a needle's pose counts.
-    """
+    """Answer clients until it is interrupted; the port is free then."""
     exchange, log, clients = Exchange(pose_s), Log(), dict[int, Client]()
     computing = threading.Thread(target=_compute, args=(exchange, planner), daemon=True)
     computing.start()
@@ -372,11 +367,7 @@ class Client:
                 self._exchange.give(self._number, answer)
 
     def _exactly(self, size: int, until: float) -> bytes:
-        """So many bytes.
-
-        Raises:
-            OSError: They have not come until then, or never will.
-        """
+        """So many bytes."""
         data = bytearray()
         while len(data) < size:
             left = until - time.monotonic()

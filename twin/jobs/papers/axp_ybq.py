@@ -62,12 +62,7 @@ SCALE_LIMIT_MM = 0.25
 
 
 def _row(what: str, known: float | None, ours: float, limit: float | None, unit: str) -> dict[str, Any]:
-    """One number beside the specified one.
-
-    Args:
-        known: What the specification has; None where it has none.
-        limit: The most that is allowed, with what chance adds in few runs; None where nothing is demanded.
-    """
+    """One number beside the specified one."""
     holds = limit is None or ours <= limit
     return {"what": what, "known": known, "ours": ours, "limit": limit, "unit": unit, "holds": holds}
 

@@ -57,11 +57,7 @@ def register_report(
 
 
 def registration_report(path: Path) -> dict[str, Any]:
-    """Everything known about a case's registration, as plain values.
-
-    Raises:
-        InputError: The case has no markers, or they cannot be used.
-    """
+    """Everything known about a case's registration, as plain values."""
     case = load_case(path)
     checked = checked_placement(case, user_cache())
     if checked is None or checked.placement.registration is None:
@@ -92,11 +88,7 @@ def registration_report(path: Path) -> dict[str, Any]:
 def lists_report(
     markers_ct: Path, markers_base: Path, target: str, space: Space, fle_mm: float | None
 ) -> dict[str, Any]:
-    """The registration of two lists of markers alone, as plain values.
-
-    Raises:
-        InputError: Lists that cannot be read, matched or trusted, or a target that is no point.
-    """
+    """The registration of two lists of markers alone, as plain values."""
     numbers = parse_triple(target, "--target")
     content = [read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)) for path in (markers_ct, markers_base)]
     read = [parse_points(content[0], markers_ct, default_space=space), parse_points(content[1], markers_base)]

@@ -108,9 +108,6 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
 def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = None, choice: Choice = BEST) -> Run:
     """Plan, rehearse the plan, in many rooms too where a number is given, and write everything.
 
-    Args:
-        rooms: How many, beside the one that is filmed.
-
     Raises:
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.
@@ -161,12 +158,7 @@ def demo_case(context: CaseContext, out: Path) -> Run:
 
 
 def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
-    """The choice with its file read, its direction checked before the search of all others is made for nothing.
-
-    Raises:
-        InputError: An entry where the path does not enter.
-        NoAnswerError: It is rejected; an older plan in the folder goes, as it does where a search finds none.
-    """
+    """The choice with its file read, its direction checked before the search of all others is made for nothing."""
     if choice.of_grid:
         return choice
     choice = with_file_read(context.case, choice)
@@ -205,11 +197,7 @@ def _final(run: Run, draft: Draft) -> Run:
 
 
 def _answered(run: Run, out: Path) -> Run:
-    """The run, if it has a plan.
-
-    Raises:
-        NoAnswerError: It has none.
-    """
+    """The run, if it has a plan."""
     if run.plan is None:
         what = f"{NO_PLAN}{run.refusal}; see {out / 'report.html'}"
         raise NoAnswerError(what, counts=run.candidates.counts(), code="no_plan")

@@ -80,11 +80,7 @@ class SourceCt:
 
 
 def read_source(source: Path, watcher: Watcher) -> SourceCt:
-    """The CT of a folder, a file, or a case, with its skin.
-
-    Raises:
-        InputError: There is none, or several, or it cannot be read.
-    """
+    """The CT of a folder, a file, or a case, with its skin."""
     path = source / CASE if is_plain_file(source / CASE) else source
     if path.suffix.lower() == ".toml":
         case = load_case(path)
@@ -199,9 +195,6 @@ def look_for_markers(
     source: Path, stated: Stated, layout: NamedPoints | None, where: str | Path, watcher: Watcher
 ) -> MarkersRun:
     """Find the markers of a CT.
-
-    Args:
-        where: Of the layout, for a refusal.
 
     Raises:
         InputError: Nothing that can be read, or a mirrored layout.

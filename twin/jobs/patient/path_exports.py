@@ -156,10 +156,6 @@ def export_path(
 def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str], None]) -> Written:
     """Write the needle that `confirm` read, on the slices of its control scan.
 
-    Args:
-        source: Its ``confirm.json``.
-        scan: The scan, whose bytes must be those that were confirmed.
-
     Raises:
         InputError: No confirmation, another scan than its own, or one that is no DICOM series.
     """
@@ -196,11 +192,7 @@ def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str
 
 
 def _series(case: Case) -> CtSeries:
-    """The DICOM series that is the case's CT.
-
-    Raises:
-        InputError: It has none, or highdicom is not installed.
-    """
+    """The DICOM series that is the case's CT."""
     require_extra("dicom", f"--format {DICOM}")
     name = case.skin_section.ct or case.ct.file
     series = case.volumes.series(name)

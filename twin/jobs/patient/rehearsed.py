@@ -133,11 +133,7 @@ def begin_rehearsal(run: Run, rooms: RoomCount | None, begin: Begin) -> PendingR
 
 
 def in_rooms(context: CaseContext, plan: Plan, count: RoomCount, seed: int | None = None) -> Distribution:
-    """A plan's tip errors over many rooms, each with a truth of its own; the case's seed by default.
-
-    Raises:
-        InputError: The case declares no errors, or has no markers.
-    """
+    """A plan's tip errors over many rooms, each with a truth of its own; the case's seed by default."""
     seed = context.case.rehearsal.seed if seed is None else seed
     with context.stages.time("rooms"):
         q = plan.insertion.q[-1]

@@ -85,12 +85,7 @@ OF_NAME = MappingProxyType({"bolt": METAL_HU, "unnamed_dense": 700.0, "unnamed_g
 
 
 def default_hu(name: str, region: str) -> float:
-    """Hounsfield units of a structure by its name.
-
-    Args:
-        name: In any spelling.
-        region: As the case states it.
-    """
+    """Hounsfield units of a structure by its name."""
     for start, hu in OF_NAME.items():
         if name.lower().startswith(start):
             return hu
@@ -373,9 +368,6 @@ def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator
     Args:
         scene: What lies in the scanner; where the body goes on beyond its surface, the scan ends within it.
         rng: Draws where the grid falls.
-
-    Raises:
-        InputError: No slice, or more voxels than a machine holds.
     """
     low, high = _shown(scene, settings)
     spacing = np.array([settings.pixel_mm, settings.pixel_mm, settings.spacing_mm])

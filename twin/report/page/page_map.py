@@ -53,9 +53,6 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
 
     The pixel-to-row table is stored run by run, row after row of the picture: ``runs`` is [candidate, length, ...],
     candidate -1 outside the grid. A pick that the search has no row of is one row more.
-
-    Args:
-        raster: The map's pixels where somebody has them already.
     """
     view, windows = map_view(case, candidates), candidates.windows
     raster = map_raster(candidates, view) if raster is None else raster
@@ -89,11 +86,7 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
 
 
 def _directions(parts: Sequence[tuple[Candidates, Ints, Ints]]) -> dict[str, Any]:
-    """What is said of each direction, a list a column; structures, reasons and sentences by their places.
-
-    Args:
-        parts: Candidates, which rows of them, and the window of each of all their rows.
-    """
+    """What is said of each direction, a list a column; structures, reasons and sentences by their places."""
     verdicts = [found.verdict.of(rows) for found, rows, _ in parts]
     named = {str(name) for one in verdicts for name in one.named}
     structures = sorted(named.union(*(found.clearance.structures for found, *_ in parts)))

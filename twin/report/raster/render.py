@@ -303,11 +303,7 @@ def finish(solid, glass, light, grid, corner, behind, shells, background, held, 
 
 @allocation_free(nogil=True, error_model="numpy", forceinline=True)
 def _shade(held, layer, look, light, grid, corner, triangle, k, place):
-    """Colour and opacity of what a pixel shows of a layer.
-
-    Returns:
-        0 where it shows nothing, 1 where all samples show one smooth surface, and else 2.
-    """
+    """Colour and opacity of what a pixel shows of a layer."""
     top, left = place
     scale, height, width = grid
     if all_alike(triangle[k], top, top + SAMPLES, left, left + SAMPLES, look[2], look[4]):

@@ -103,9 +103,6 @@ def revolved(outline: Floats, sections: int) -> TriangleMesh:
     Args:
         outline: Shape (k, 2), mm: radius, at least 0, and height of its corners, around the body to the left.
         sections: How many flat sides stand for the circle.
-
-    Returns:
-        A mesh whose triangles face outwards, in the frame of the axis.
     """
     angle = 2.0 * np.pi * np.arange(sections) / sections
     radius, height = outline[:, 0, None], outline[:, 1, None]
