@@ -50,7 +50,7 @@ Box = tuple[tuple[int, int], ...]
 
 FILLED = (
     "behind the body's {names} side the image has only air, up to {voxels} voxels: the body counts as cut there and "
-    'the image as padded (override with cut in the skin\'s table: cut = [] if it ends there; or region = "phantom")'
+    "the image as padded (override in the skin's table: cut = [] if it ends there{or_phantom})"
 )
 ENDS_FLAT = (
     "the phantom ends flat at its {names} side, and no structure is cut there except those that run through it: it "
@@ -214,7 +214,10 @@ def end_warnings(content: Content, cut: Bools, whole: bool) -> tuple[str, ...]:
     flat = np.array([[False], [False], [whole]]) & content.thick & content.wide & (content.beyond > 0) & ~cut
     said = []
     if filled.any():
-        said.append(FILLED.format(names=_names(filled), voxels=int(content.beyond[filled].max())))
+        or_phantom = "" if whole else '; or region = "phantom"'
+        said.append(
+            FILLED.format(names=_names(filled), voxels=int(content.beyond[filled].max()), or_phantom=or_phantom)
+        )
     if flat.any():
         said.append(ENDS_FLAT.format(names=_names(flat)))
     return tuple(said)

@@ -23,8 +23,11 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.parts import in_blocks, parts_of
 from puncture_twin.planning.geometry.rigid import apply, pose
 
-SMOOTH_MM = 3.0
-"""Means over a cube of this edge are compared with air: noise of a finer image falls below that of 3 mm voxels."""
+SMOOTH_MM = (3.0, 6.0, 9.0, 12.0)
+"""Means over a cube of such an edge are compared with air, the first in which air is quiet enough, else the first."""
+QUIET, SAMPLES = 4.5, 48
+"""Air is quiet whose median is below the limit by so many times what its lower quarter is below it: three deviations,
+and what is denser makes no bulky piece. Foam does not move that quarter. Asked of so many cubes along each axis."""
 LEAST_HU = -1024
 """What is below counts as this in a mean: some scanners write less than air has."""
 DENSE_HU = -700.0
@@ -47,7 +50,7 @@ CUT_AT_MM = (30.0, 120.0, 480.0)
 every needle, and the search would measure most axes from most of them."""
 BLOCK_MM = 2.0
 """The surface is drawn about blocks of voxels of at most this edge that hold any of it, or are less than half a block
-beside it: what is found by means over ``SMOOTH_MM`` has no finer shape, and a table of .8 mm voxels has a million
+beside it: what is found by means over 3 mm has no finer shape, and a table of .8 mm voxels has a million
 triangles."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
@@ -86,7 +89,7 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
         air_hu: Voxels whose surroundings are denser than this are not air.
     """
     hu, body, unscanned = image.hu, image.body, image.unscanned
-    size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(int)
+    size = _smooth_size(image, air_hu)
     dense = hu > max(DENSE_HU, air_hu)
     _mark_means(np.require(hu, requirements=["C", "W"]), size, float(air_hu), dense)
     dense &= ~widened(body, size // 2 + 1)
@@ -101,6 +104,24 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
         dense |= padded
     dense &= ~body
     return dense
+
+
+def _smooth_size(image: OutsideImage, air_hu: float) -> NDArray[np.int_]:
+    """Voxels along each edge of the cube whose means tell what is denser than air in the noise of this image."""
+    known = ~(image.body | image.unscanned)
+    sizes = [np.maximum(1, np.round(edge_mm / image.spacing_mm)).astype(int) for edge_mm in SMOOTH_MM]
+    for size in sizes:
+        ends = [max(1, n - k + 1) for n, k in zip(known.shape, size, strict=True)]
+        first = np.ix_(*(np.arange(0, end, max(1, end // SAMPLES)) for end in ends))
+        total = np.zeros(np.broadcast_shapes(*(one.shape for one in first)))
+        for step in np.ndindex(*np.minimum(size, known.shape)):
+            at = tuple(one + k for one, k in zip(first, step, strict=True))
+            total += np.where(known[at], np.maximum(image.hu[at], LEAST_HU), np.nan)
+        means = total / np.minimum(size, known.shape).prod()
+        air = means[means < DENSE_HU]
+        if air.size and (1.0 + QUIET) * np.median(air) - QUIET * np.percentile(air, 25) <= air_hu:
+            return size
+    return sizes[0]
 
 
 @nb.njit(cache=True)

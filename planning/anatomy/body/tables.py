@@ -56,8 +56,9 @@ CUT_OFF = (
 )
 TOUCHES = (
     "the body ends in one section along the bed at its {name} side, over {width:.0f} mm, like a table or board: the "
-    'space beyond it does not count as free ([ct] table = "none" if there is none)'
+    "space beyond it does not count as free ([ct] table = {overrule})"
 )
+NO_TABLE, NO_OTHER = '"none" if there is none', '"present" if what was removed is all that the body lies on'
 PRISM = (
     "the body has a constant section along the bed at all four sides, like a phantom: no side counts as a table "
     '([ct] table = "present" if one is; region = "phantom" if it is a whole phantom)'
@@ -174,7 +175,10 @@ def touching_tables(
         left = []
     if any(side.firm for side in drawn):  # what a body lies on is seen: its straight flanks are no tables
         left = [side for side in left if side.firm]
-    said += [TOUCHES.format(name=NAMES[side.face], width=side.width_mm) for side in left]
+    if cut_off.any() and shown.table == "present":
+        left = []
+    overrule = NO_OTHER if cut_off.any() else NO_TABLE
+    said += [TOUCHES.format(name=NAMES[side.face], width=side.width_mm, overrule=overrule) for side in left]
     if (length_mm := trunk.shape[2] * float(spacing_mm[2])) < LEAST_LENGTH_MM:
         said.append(TOO_SHORT.format(length=length_mm))
     return Touching(cut_off, tuple(left), tuple(said))
@@ -201,7 +205,8 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
     seen = side.lines & (alike.mean(axis=1) >= DRAWN_FRACTION) & (middle > 0.0) & (middle <= THICKEST_MM)
     run, lines = max(2, int(RUN_MM / spacing_mm[1 - axis])), np.flatnonzero(side.lines)
     ends = [some[seen[some]] for some in (lines[:run], lines[-run:])]
-    if seen[lines].all() or any(len(one) < DRAWN_FRACTION * run or np.ptp(middle[one]) > 2 * ALIKE_MM for one in ends):
+    lies_on = (~seen[lines]).any() or (thick_mm[lines] > THICKEST_MM).any()  # a head, an arm: in some slices
+    if not lies_on or any(len(one) < DRAWN_FRACTION * run or np.ptp(middle[one]) > 2 * ALIKE_MM for one in ends):
         return table
     most_mm = max(float(np.median(middle[one])) for one in ends) + ALIKE_MM
     table_mm = np.interp(np.arange(len(seen)), np.flatnonzero(seen), middle[seen], left=0.0, right=0.0)
@@ -411,13 +416,14 @@ def support_warnings(seen: bool, open_faces: Sequence[Face]) -> Iterator[str]:
         seen: Whether it shows what the body lies on.
         open_faces: The faces beyond which nothing is known.
     """
-    bed = f"the CT does not show {'all of ' if seen else ''}the support of the body"
-    for axis, said, key in ((1, bed, "[ct] table"), (0, "the CT may not show all of the arms", "[ct] arms")):
-        names = " and ".join(NAMES[face] for face in open_faces if face[0] == axis)
+    bed, arms = "the CT does not show the support of the body", "the CT may not show all of the arms"
+    asked = ((1, bed.replace("the support", "all of the support"), "table"), (0, arms, "arms"))
+    for axis, said, key in asked if seen else ((None, bed, "table"),):
+        names = " and ".join(NAMES[face] for face in open_faces if axis in {face[0], None})
         if names:
             yield (
                 f"{said}: the space beyond its {names} face, within {NEAR_MM:g} mm of the body, is unknown_region "
-                f'(outside_body; {key} = "none" if nothing is there)'
+                f'(outside_body; [ct] {key} = "none" if nothing is there)'
             )
     if not seen and not open_faces:
         yield "the CT shows no support below the body; the space beyond its faces counts as air"
