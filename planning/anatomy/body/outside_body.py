@@ -1,7 +1,6 @@
 """What a CT shows outside of the body that is not air: table, mattress, clothes, lines, limbs that nobody recognised.
 
-None of it is free space for a needle, its holder or the arm. It becomes one closed surface of role ``unknown``,
-checked by the same engine as every organ, along the whole needle while it waits at its standoff.
+It becomes one closed surface of role ``unknown``, for a needle, its holder and the arm.
 """
 
 from __future__ import annotations
@@ -33,25 +32,22 @@ LEAST_HU = -1024
 DENSE_HU = -700.0
 """A single voxel above this is no noise (ten times that of a low-dose image)."""
 MIN_PIECE_MM3, MIN_SOFT_MM3, SOLID_HU = 100.0, 500.0, -250.0
-"""Pieces that hold less above ``BODY_HU`` are noise, or cloth; where nothing in them is solid, less than the second: a
-full line of 4 mm diameter has the first in 8 mm of its length, between voxels of 3 mm the second in 30. A gown on the
-skin of a real chest has -850, and -260 in its folds; it stops no needle. So has a line with a bore (4 and 2.6 mm) in
-voxels of 2 mm and more, and one of 2 mm in any: it is not seen."""
+"""Pieces that hold less above ``BODY_HU`` are noise, or cloth; where nothing in them is solid, less than the second. A
+line of 4 mm has the first in 8 mm of its length, between voxels of 3 mm the second in 30. A gown on the skin of a real
+chest has -850, and -260 in its folds; so has a line of 2 mm, or with a bore: it is not seen."""
 BULKY_ML = 50.0
-"""Pieces of this volume that the border of the image cuts (a table, a mattress) go on beyond it, also between the
-places where they are cut: of a table that sags below the image both ends are seen."""
+"""Pieces of this volume that the border cuts go on beyond it, also between the places where they are cut: of a table
+that sags below the image both ends are seen."""
 BEYOND_MM = (100.0, 100.0, 2000.0)
-"""How far what the border cuts is taken to go on to the sides, to front and back, and along the bed. A CT table is at
-most 550 mm wide and an image at least 350; along the bed table and mattress go on farther than a needle reaches."""
+"""So far what the border cuts goes on to the sides, to front and back, and along the bed: a CT table is at most 550 mm
+wide and an image at least 350; along the bed it goes on farther than a needle reaches."""
 BEYOND_LONG_MM = (*BEYOND_MM[:2], 1000.0)
 """`BEYOND_MM` where an image is so long that the surface would be larger than any that is plausible."""
 CUT_AT_MM = (30.0, 120.0, 480.0)
-"""What goes on along the bed is cut across so far beyond the image: a triangle as long as all of it would lie near
-every needle, and the search would measure most axes from most of them."""
+"""Along the bed it is cut across there: a triangle as long as all of it would lie near every needle."""
 BLOCK_MM = 2.0
-"""The surface is drawn about blocks of voxels of at most this edge that hold any of it, or are less than half a block
-beside it: what is found by means over 3 mm has no finer shape, and a table of .8 mm voxels has a million
-triangles."""
+"""The surface is drawn about blocks of at most this edge that hold any of it, or lie less than half a block beside it:
+means have no finer shape, and a table of .8 mm voxels has a million triangles."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
@@ -62,10 +58,8 @@ class OutsideImage:
 
     Attributes:
         hu: Shape (nx, ny, nz), Hounsfield units.
-        body: Same shape, the body.
-        unscanned: Same shape, what was not measured.
+        body, unscanned: Same shape, the body, and what was not measured.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
-        spacing_mm: Shape (3,).
         slopes: How what lies there moves along axes 0 and 1 beyond the image's ends, mm per mm along the bed.
         beyond_mm: How far what the border cuts is taken to go on.
     """
@@ -80,13 +74,9 @@ class OutsideImage:
 
 
 def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
-    """Voxels outside of the body that are not air.
+    """Voxels outside of the body whose surroundings are denser than a limit.
 
-    Beside the body's surface a voxel, or the mean about it, is partly skin, partly air; there only what is denser than
-    half of both counts.
-
-    Args:
-        air_hu: Voxels whose surroundings are denser than this are not air.
+    Beside the body's surface they are partly skin, partly air; there only what is denser than half of both counts.
     """
     hu, body, unscanned = image.hu, image.body, image.unscanned
     size = _smooth_size(image, air_hu)
@@ -172,19 +162,15 @@ def outside_surface(
 
 
 def _layers_mm(image: OutsideImage) -> tuple[tuple[float, ...], ...]:
-    """How far beyond its border voxels' centres an image is continued by layers of blocks, along each axis.
-
-    The last layer is where what is drawn out ends: up to there it keeps its width.
-    """
+    """How far beyond its border voxels' centres layers of blocks continue an image, along each axis, to the end."""
     to_side, to_back, along = image.beyond_mm
     return (float(image.spacing_mm[0]), to_side), (float(image.spacing_mm[1]), to_back), (*CUT_AT_MM, along)
 
 
 def _drawn_out(surface: TriangleMesh, edge: NDArray[np.int_], image: OutsideImage) -> TriangleMesh:
-    """A surface that counts blocks of ``edge`` voxels, in LPS mm; the layers beyond the image's border moved outward.
+    """A surface that counts blocks of ``edge`` voxels, in LPS mm; layers beyond the border moved outward with the bed.
 
-    Of blocks within, every vertex lies on a face between two of them. The caps lie half a voxel after the last layer's
-    centre. Beyond the ends of the bed it runs on as the bed does.
+    Every vertex lies on a face between two blocks; caps half a voxel after the last layer's centre.
     """
     index = surface.vertices.copy()
     for axis, layers_mm in enumerate(_layers_mm(image)):
@@ -192,10 +178,7 @@ def _drawn_out(surface: TriangleMesh, edge: NDArray[np.int_], image: OutsideImag
         at = np.arange(0, size, edge[axis])  # first voxels of blocks
         beyond = np.array([*range(1, len(layers_mm) + 1), len(layers_mm) + 0.5])
         moved = np.array([*layers_mm, layers_mm[-1] + 0.5 * image.spacing_mm[axis]]) / image.spacing_mm[axis]
-        last, ends = (
-            len(at) - 1.0,
-            [(min(edge[axis], size) - 1) / 2.0, (at[-1] + size - 1) / 2.0],
-        )  # centres at the border
+        last, ends = len(at) - 1.0, [(min(edge[axis], size) - 1) / 2.0, (at[-1] + size - 1) / 2.0]  # border centres
         index[:, axis] = np.interp(
             index[:, axis],
             np.concatenate([-beyond[::-1], [0.0], np.arange(last) + 0.5, [last], last + beyond]),
