@@ -225,7 +225,7 @@ def body_mask(
         filled[box] |= filled_slices(limb)
     _fill_cut_lungs(filled, hu, voxel_ml, warnings)
     if filled.all():
-        refuse("no air around the body", where, "a CT that shows some skin", "no_air")
+        refuse("no air around the body", where, f"a CT that shows skin, in air below {OUTSIDE_AIR_HU:g} HU", "no_air")
     unscanned = find_unscanned(hu) if unscanned is None else unscanned
     if unscanned.any() and (grown(filled) & unscanned & ~filled).any():
         warnings.append(UNSCANNED)

@@ -98,20 +98,23 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
 
 def _smooth_size(image: OutsideImage, air_hu: float) -> NDArray[np.int_]:
     """Voxels along each edge of the cube whose means tell what is denser than air in the noise of this image."""
+    edge_mm = next((edge for edge in SMOOTH_MM if _quiet_from(image, edge) <= air_hu), SMOOTH_MM[0])
+    return np.maximum(1, np.round(edge_mm / image.spacing_mm)).astype(int)
+
+
+def _quiet_from(image: OutsideImage, edge_mm: float) -> float:
+    """The least limit above which no noise of this image's air lies, in means over a cube; NaN where it shows none."""
     known = ~(image.body | image.unscanned)
-    sizes = [np.maximum(1, np.round(edge_mm / image.spacing_mm)).astype(int) for edge_mm in SMOOTH_MM]
-    for size in sizes:
-        ends = [max(1, n - k + 1) for n, k in zip(known.shape, size, strict=True)]
-        first = np.ix_(*(np.arange(0, end, max(1, end // SAMPLES)) for end in ends))
-        total = np.zeros(np.broadcast_shapes(*(one.shape for one in first)))
-        for step in np.ndindex(*np.minimum(size, known.shape)):
-            at = tuple(one + k for one, k in zip(first, step, strict=True))
-            total += np.where(known[at], np.maximum(image.hu[at], LEAST_HU), np.nan)
-        means = total / np.minimum(size, known.shape).prod()
-        air = means[means < DENSE_HU]
-        if air.size and (1.0 + QUIET) * np.median(air) - QUIET * np.percentile(air, 25) <= air_hu:
-            return size
-    return sizes[0]
+    size = np.minimum(np.maximum(1, np.round(edge_mm / image.spacing_mm)).astype(int), known.shape)
+    ends = np.array(known.shape) - size + 1
+    first = np.ix_(*(np.arange(0, end, max(1, end // SAMPLES)) for end in ends))
+    total = np.zeros(np.broadcast_shapes(*(one.shape for one in first)))
+    for step in np.ndindex(*size):
+        at = tuple(one + k for one, k in zip(first, step, strict=True))
+        total += np.where(known[at], np.maximum(image.hu[at], LEAST_HU), np.nan)
+    means = total / size.prod()
+    air = means[means < DENSE_HU]
+    return float((1.0 + QUIET) * np.median(air) - QUIET * np.percentile(air, 25)) if air.size else np.nan
 
 
 @nb.njit(cache=True)
