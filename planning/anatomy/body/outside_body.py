@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.anatomy.body.tables import FACES, Face
 from puncture_twin.planning.base.arrays import Bools, Floats, widened
-from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.formats.labels.labelmaps import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.parts import in_blocks, parts_of
@@ -24,7 +24,7 @@ from puncture_twin.planning.geometry.rigid import apply, pose
 
 SMOOTH_MM = (3.0, 6.0, 9.0, 12.0)
 """Means over a cube of such an edge are compared with air, the first in which air is quiet enough, else the first."""
-QUIET, SAMPLES = 4.5, 48
+QUIET, SAMPLES = 4.5, 24
 """Air is quiet whose median is below the limit by so many times what its lower quarter is below it: three deviations,
 and what is denser makes no bulky piece. Foam does not move that quarter. Asked of so many cubes along each axis."""
 LEAST_HU = -1024
@@ -80,8 +80,8 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     """
     hu, body, unscanned = image.hu, image.body, image.unscanned
     size = _smooth_size(image, air_hu)
-    dense = hu > max(DENSE_HU, air_hu)
-    _mark_means(np.require(hu, requirements=["C", "W"]), size, float(air_hu), dense)
+    dense = scipy.ndimage.uniform_filter(np.maximum(hu, LEAST_HU), size, np.float32, mode="nearest") > air_hu
+    dense |= hu > max(DENSE_HU, air_hu)
     dense &= ~widened(body, size // 2 + 1)
     dense |= (hu > BODY_HU) & ~body
     if not unscanned.any():
@@ -115,27 +115,6 @@ def _quiet_from(image: OutsideImage, edge_mm: float) -> float:
     means = total / size.prod()
     air = means[means < DENSE_HU]
     return float((1.0 + QUIET) * np.median(air) - QUIET * np.percentile(air, 25)) if air.size else np.nan
-
-
-@nb.njit(cache=True)
-def _mark_means(hu: Any, size: Any, above: Any, found: Any) -> None:
-    """Set where the mean over a cube of ``size`` voxels is above a value; beyond the border the image goes on."""
-    ni, nj, nk = hu.shape
-    before, after = size // 2, (size - 1) // 2
-    least, most, sums = np.float32(LEAST_HU), np.float32(above * size.prod()), np.empty(nk, np.float32)
-    for i in range(ni):
-        for j in range(nj):
-            sums[:] = 0.0
-            for x in range(i - before[0], i + after[0] + 1):
-                for y in range(j - before[1], j + after[1] + 1):
-                    line = hu[min(max(x, 0), ni - 1), min(max(y, 0), nj - 1)]
-                    for k in range(nk):  # along memory, so that the compiler adds many at once
-                        sums[k] += max(np.float32(line[k]), least)
-            for k in range(nk):
-                total = np.float32(0.0)
-                for z in range(k - before[2], k + after[2] + 1):
-                    total += sums[min(max(z, 0), nk - 1)]
-                found[i, j, k] |= total > most
 
 
 def outside_surface(
