@@ -46,8 +46,8 @@ SEEN = "markers_ct.csv"
 """Where markers are listed that the CT shows."""
 OUTSIDE_WAYS = "a point in the body, mm, in the space given by --space; or --skin NAME for another skin"
 PHANTOM = (
-    'region = "phantom": no limbs are searched for, and the connected object is the phantom; it has no support unless '
-    "[ct] table says so or a separate object is below it"
+    'region = "phantom": no limbs are searched for, and of several connected objects the one with the target is the '
+    "phantom; it has no support unless [ct] table says so or a separate object is below it"
 )
 
 

@@ -63,6 +63,20 @@ def test_a_line_between_voxels_is_seen_by_its_length():
     assert not outside_mask(image, -900.0).any()
 
 
+@pytest.mark.parametrize("air_hu", [-1000.0, -950.0])
+def test_noise_of_air_is_air_and_foam_in_it_is_not(air_hu):
+    """Of 60 HU in voxels of 3 mm a fifth is denser than -900; a foam of -800 HU is told by wider means."""
+    rng, shape = np.random.default_rng(4), (48, 40, 30)
+    hu, nothing = rng.normal(air_hu, 60.0, shape), np.zeros(shape, bool)
+    image = OutsideImage(hu, nothing, nothing, np.diag([3.0, 3.0, 3.0, 1.0]), np.full(3, 3.0))
+    assert not outside_mask(image, -900.0).any()
+    hu[:, 20:28] += -800.0 - air_hu
+    mask = outside_mask(image, -900.0)
+    assert mask[:, 21:27].all()
+    assert not mask[:, :17].any()
+    assert not mask[:, 31:].any()
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("end", [0, -1])
 @pytest.mark.parametrize("beyond_mm", [1.0, 50.0, 99.0])

@@ -5,7 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from case_world import coarse_carton, write_case
+import SimpleITK as sitk  # noqa: N813
+from case_world import case_text, coarse_carton, structure, write_case
 from refusals import refused
 
 import puncture_twin as pt
@@ -35,6 +36,26 @@ def test_another_target_is_what_the_case_with_that_target_is(tmp_path):
                 np.testing.assert_array_equal(column, getattr(getattr(other, table), name), err_msg=f"{table}.{name}")
         with refused("input_changed"):
             context.own(one)
+
+
+def test_of_two_phantoms_another_target_chooses_the_one_that_holds_it(tmp_path):
+    """The smaller block at x = -70, the larger at 70, and back; between them there is no body."""
+    x, y, z = (np.arange(-160.0, 161.0, 5.0)[at] for at in np.ix_(*[range(65)] * 3))
+    dense = [np.maximum(abs(x - at), np.maximum(abs(y), abs(z))) < half for at, half in ((-70.0, 42.0), (70.0, 52.0))]
+    air = np.random.default_rng(1).normal(-1000.0, 10.0, dense[0].shape)
+    image = sitk.GetImageFromArray(np.where(np.logical_or(*dense), 40.0, air).astype(np.int16).T)
+    image.SetSpacing((5.0, 5.0, 5.0))
+    image.SetOrigin((-160.0, -160.0, -160.0))
+    sitk.WriteImage(image, str(tmp_path / "ct.nii.gz"))
+    skin, target = structure("skin", "skin", {"ct": "ct.nii.gz"}), "position_mm = [-70, 0, 0]\nhit_radius_mm = 5.0"
+    (tmp_path / "case.toml").write_text(case_text(skin, region="phantom", target=target))
+    context = prepare(tmp_path / "case.toml", arm=False)
+    for middle, half in ((-70.0, 42.0), (70.0, 52.0), (-70.0, 42.0)):
+        context = context.at([middle, 0.0, 0.0])
+        low, high = context.anatomy.skin.mesh.bounds[:, 0]
+        assert middle - half - 5.0 < low < middle < high < middle + half + 5.0
+    with refused("target_misplaced"):
+        context.at([0.0, 0.0, 0.0])
 
 
 def test_a_target_that_the_case_could_not_have_is_refused(case):
@@ -93,8 +114,8 @@ def test_threads_share_a_context(case):
     context, targets = prepare(case, arm=False), [[0.5 * k, 0.2 * k, -0.3 * k] for k in range(8)]
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda target: pt.safe_map(context, target).structure, targets))
-    for target, structure in zip(targets, found, strict=True):
-        assert np.array_equal(structure, pt.safe_map(context, target).structure)
+    for target, blocked_by in zip(targets, found, strict=True):
+        assert np.array_equal(blocked_by, pt.safe_map(context, target).structure)
 
 
 def test_no_two_threads_share_a_checker(tmp_path):

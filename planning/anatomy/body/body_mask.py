@@ -1,12 +1,7 @@
 """Which voxels of a CT are the patient: trunk and limbs without table and sheets, solid, lungs and gas included.
 
-What the scanner did not measure is neither body nor air. Scanners and programs write one value where they did not look:
-beyond the circle of reconstruction, beyond the slab of a tilted gantry that was resampled to a straight image, in
-slices that fill a volume up. Some write -3024, some the value of air, some 0. Air that was measured has noise, and
-never one value over a whole corner of an image.
-
-A limb that does not touch the trunk is of soft tissue and holds bone, which no table or cushion does. What is taken for
-none stays outside of the body, where nothing dense counts as air (`puncture_twin.planning.anatomy.body.outside_body`).
+What the scanner did not measure is neither body nor air. One value stands there (-3024, that of air, or 0): beyond the
+circle of reconstruction, beside the slab of a tilted gantry, in slices that fill a volume up. Measured air has noise.
 """
 
 from __future__ import annotations
@@ -30,43 +25,48 @@ from puncture_twin.planning.formats.volumes.volume_files import Volume, canonica
 from puncture_twin.planning.geometry.parts import largest_part, middle_of, parts_of
 from puncture_twin.planning.geometry.rigid import apply
 
-UNSCANNED_HU = -1500.0
-"""Nothing real is less dense than air at -1000; scanners write -2000 or -3024 where they did not look."""
-BLANK_HU = -2000.0
-"""Written in the place of paddings that are denser than air, such as 0."""
+UNSCANNED_HU, BLANK_HU = -1500.0, -2000.0
+"""Nothing real is less dense than air; and what is written in the place of paddings that are denser, such as 0."""
 NEARLY_AIR_HU = -900.0
 """Below this a voxel is air, with its noise."""
 BLOCK_VOXELS = 3
 """A cube of so many voxels along each edge that have one value is no noise, also where a scanner clips at -1024."""
 MEASURED_AIR = 0.02
-"""Of what is padded or nearly air, so much at least is measured air, or the image has no noise to tell by: of a
-background that a program has blanked only the seam of the skin is left."""
+"""So much of what may be air is measured, or nothing tells: of a blanked background only the skin's seam is left."""
 ALIKE_PAIRS = 0.5
 """Of the neighbours in measured air that have one value: noise of 2 HU leaves less than a fifth."""
+BODY_HU = -500.0
+"""Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
+OUTSIDE_AIR_HU, MIN_OUTSIDE_ML = -940.0, 50.0
+"""Air at the border is the room's if its median is below this (lung has -920), and no less than bowel holds."""
+MIN_BODY_ML = 100.0
+"""Less than a tenth of a newborn's head: something else was found."""
+OPENING_MM, SAMPLING_MM = 6.0, 3.0
+"""Parts thinner than twice this are no trunk, head or limb; asked on a grid of half of it."""
+CORNER = 3.0**0.5
+"""So many times as far from where the ball fits a box's corner lies: it belongs to the box."""
+MIN_LIMB_ML, MIN_BONE_ML = 20.0, 1.0
+"""A newborn's forearm has 25 ml; 10 mm of an adult's radius have 1."""
+SOFT_TISSUE_HU, BONE_HU = (-150.0, 150.0), 200.0
+"""The median of a limb lies between (not foam's, wood's or metal's); bone is denser than vessels with contrast."""
+UNSCANNED = (
+    "the edge of the scanned region (the scanner's field of view, or a constant fill value) cuts the body; the skin "
+    "is not known there, nor is a body for the arm to avoid; the space near it is unknown_region (outside_body)"
+)
 
 
 def measured_hu(hu: NDArray[Any]) -> tuple[NDArray[Any], Bools]:
-    """The image with ``BLANK_HU`` where a padding is denser than air, so that no padding counts as body.
-
-    Args:
-        hu: Shape (nx, ny, nz), Hounsfield units.
-
-    Returns:
-        The image itself where there is none; and what of it was not measured.
-    """
+    """An image (nx, ny, nz), HU, in which no padding counts as body: itself if none is dense; what was not measured."""
     found = find_unscanned(hu)
     dense = found & (hu >= NEARLY_AIR_HU)
     return (np.where(dense, hu.dtype.type(BLANK_HU), hu) if dense.any() else hu), found
 
 
 def find_unscanned(hu: NDArray[Any]) -> Bools:
-    """Find what the scanner did not measure, shape of the image.
+    """What the scanner did not measure, shape of the image (nx, ny, nz), HU, axis 2 along the patient.
 
     It is far below air; or a slice of one value; or what holds together with a corner of the image by cubes of one
     value. In an image without noise nothing tells such a value from that of air: then it is air.
-
-    Args:
-        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient.
     """
     found = np.asarray(hu < UNSCANNED_HU)
     corners = tuple(slice(None, None, max(1, n - 1)) for n in hu.shape)
@@ -98,35 +98,6 @@ def _measured_air_has_noise(hu: NDArray[Any], value: Any) -> bool:
         return False
     pairs = air[1:] & air[:-1]
     return bool(np.mean((hu[1:] == hu[:-1])[pairs]) < ALIKE_PAIRS) if pairs.any() else False
-
-
-BODY_HU = -500.0
-"""Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
-OUTSIDE_AIR_HU = -940.0
-"""Ambient air has -1000, inflated lung rarely less than -920: an air region that the border cuts is the room only
-if its median is below this."""
-MIN_OUTSIDE_ML = 50.0
-"""A smaller air region at the border may be bowel gas that the field of view cuts."""
-MIN_BODY_ML = 100.0
-"""Less than a tenth of a newborn's head: something else was found."""
-OPENING_MM = 6.0
-"""Parts thinner than twice this are no trunk, head or limb: table tops, sheets, tubes."""
-CORNER = 3.0**0.5
-"""So many times as far from where the ball fits a box's corner lies: it belongs to the box."""
-SAMPLING_MM = 3.0
-"""Spacing at which the opening is done: half its radius."""
-MIN_LIMB_ML = 20.0
-"""Smaller than a newborn's forearm (some 25 ml): hands of adults, cushions and lines are left to the outside."""
-SOFT_TISSUE_HU = (-150.0, 150.0)
-"""Fat at -100, muscle at 50, both with noise: the median of a limb lies between. Foam, wood and metal do not."""
-BONE_HU = 200.0
-"""Above soft tissue with contrast in its vessels; cortical bone has 500 and more."""
-MIN_BONE_ML = 1.0
-"""Some 10 mm of an adult's radius."""
-UNSCANNED = (
-    "the edge of the scanned region (the scanner's field of view, or a constant fill value) cuts the body; the skin "
-    "is not known there, nor is a body for the arm to avoid; the space near it is unknown_region (outside_body)"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,8 +167,7 @@ class CtImage:
         part = tuple(slice(*ends) for ends in box)
         if self.hu[part].shape == self.hu.shape:
             return replace(self, shown=shown)
-        T_ct_index = shifted(self.T_ct_index, box)
-        return CtImage(self.hu[part], T_ct_index, self.where, shown, self.stored[part])
+        return CtImage(self.hu[part], shifted(self.T_ct_index, box), self.where, shown, self.stored[part])
 
 
 def ct_image(volume: Volume) -> CtImage:
@@ -217,7 +187,7 @@ def body_mask(
     unscanned: Bools | None = None,
     at: Ints | None = None,
 ) -> BodyMask:
-    """Finds the patient, or the phantom, in a CT.
+    """The patient, or the phantom, in a CT.
 
     Threshold, opening, largest part without the table that touches it, and all others that look like a limb; then air
     that each encloses in an axial slice is filled, and air at the image's border that does not look like the room's.
@@ -231,8 +201,7 @@ def body_mask(
     Raises:
         InputError: No body, an implausibly small one, or no air around it.
     """
-    voxel_ml = float(np.prod(spacing_mm)) / 1000.0
-    dense = hu > BODY_HU
+    voxel_ml, dense = float(np.prod(spacing_mm)) / 1000.0, hu > BODY_HU
     trunk, parts = np.zeros(hu.shape, bool), thick_parts(dense, spacing_mm)
     first = next(parts, None)
     if at is not None:
@@ -256,7 +225,7 @@ def body_mask(
         filled[box] |= filled_slices(limb)
     _fill_cut_lungs(filled, hu, voxel_ml, warnings)
     if filled.all():
-        refuse("no air around the body", where, "a CT that shows some skin", "no_air")
+        refuse("no air around the body", where, f"a CT that shows skin, in air below {OUTSIDE_AIR_HU:g} HU", "no_air")
     unscanned = find_unscanned(hu) if unscanned is None else unscanned
     if unscanned.any() and (grown(filled) & unscanned & ~filled).any():
         warnings.append(UNSCANNED)
@@ -279,11 +248,8 @@ def filled_slices(mask: Bools) -> Bools:
     return ~np.unpackbits(outside, axis=2, count=mask.shape[2]).view(bool)
 
 
-def _fill_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warnings: list[str]) -> None:
-    """Fills air regions that are not the room: small ones, and those with the density of lung.
-
-    Filling too much is the safe side: it turns "air" at the border into "unknown".
-    """
+def _fill_cut_lungs(body: Bools, hu: NDArray[Any], voxel_ml: float, warnings: list[str]) -> None:
+    """Fill air that is not the room's: small, or as dense as lung. Too much is safe: it makes "air" "unknown"."""
     air = parts_of(~body)
     denser, solid = air.counts(hu > OUTSIDE_AIR_HU), air.counts(hu > BODY_HU)  # a table lies in the room's air
     inside = (air.sizes * voxel_ml < MIN_OUTSIDE_ML) | (2 * (denser - solid) >= air.sizes - solid)
@@ -294,12 +260,7 @@ def _fill_cut_lungs(body: Bools, hu: NDArray[np.float32], voxel_ml: float, warni
 
 
 class Piece(NamedTuple):
-    """A part of what a CT shows.
-
-    Attributes:
-        box: Of the image, in which it lies.
-        mask: Shape of the box.
-    """
+    """A part of what a CT shows: the box of the image in which it lies, and its mask there."""
 
     box: tuple[slice, ...]
     mask: Bools
@@ -311,63 +272,56 @@ class Piece(NamedTuple):
 
 
 def thick_parts(mask: Bools, spacing_mm: Floats) -> Iterator[Piece]:
-    """The parts of a mask into which a ball of ``OPENING_MM`` fits, with what lies near each, the largest first.
+    """The parts of a mask (nx, ny, nz) into which a ball of ``OPENING_MM`` fits, with what lies near, largest first.
 
-    The border counts as mask. Fine images are sampled: where a table ends and an arm begins is a coarse question. Of
-    others than the first only those that may be as large as a limb.
-
-    Args:
-        mask: Shape (nx, ny, nz).
-        spacing_mm: Shape (3,).
+    The border counts as mask. Of others than the first only those that may be as large as a limb.
     """
     stride = np.maximum(1, (SAMPLING_MM / spacing_mm).astype(int))
-    parts = _coarse_parts(mask[:: stride[0], :: stride[1], :: stride[2]], spacing_mm * stride)
-    most_ml = np.bincount(parts.ravel()) * float(np.prod(stride * spacing_mm)) / 1000.0
+    coarse_mm = spacing_mm * stride
+    near_mm = CORNER * OPENING_MM + coarse_mm.max()
+    parts = nearest_parts(mask[:: stride[0], :: stride[1], :: stride[2]], OPENING_MM, coarse_mm, near_mm)
+    most_ml = np.bincount(parts.ravel()) * float(np.prod(coarse_mm)) / 1000.0
     for number, coarse in enumerate(scipy.ndimage.find_objects(parts), start=1):
-        if number > 1 and most_ml[number] < MIN_LIMB_ML:
-            continue
-        ends = zip(coarse, stride, mask.shape, strict=True)
-        box = tuple(slice(one.start * step, min(one.stop * step, size)) for one, step, size in ends)
-        whole = parts[coarse] == number
-        for axis in (2, 1, 0):
-            whole = whole.repeat(stride[axis], axis=axis)
-        inside = mask[box]
-        yield Piece(box, inside & whole[tuple(map(slice, inside.shape))])
+        if number == 1 or most_ml[number] >= MIN_LIMB_ML:
+            ends = zip(coarse, stride, mask.shape, strict=True)
+            box = tuple(slice(one.start * step, min(one.stop * step, size)) for one, step, size in ends)
+            whole = parts[coarse] == number
+            for axis in (2, 1, 0):
+                whole = whole.repeat(stride[axis], axis=axis)
+            yield Piece(box, mask[box] & whole[tuple(map(slice, mask[box].shape))])
 
 
-def _coarse_parts(mask: Bools, spacing_mm: Floats) -> Ints32:
-    """Number the parts into which the ball fits, 1 the largest, and what lies near each; 0 elsewhere."""
-    reach = np.ceil(OPENING_MM / spacing_mm).astype(int)
+def nearest_parts(mask: Bools, radius_mm: float, spacing_mm: Floats, most_mm: float = np.inf) -> Ints32:
+    """Number the parts of a mask into which a ball fits, 1 the largest, and what lies nearest to each; 0 elsewhere.
+
+    Args:
+        mask: Shape (nx, ny, nz); beyond its border it goes on.
+        most_mm: So far from where the ball's middle may lie.
+    """
+    reach = np.ceil(radius_mm / spacing_mm).astype(int)
     padded = np.pad(mask, [(r, r) for r in reach], mode="edge")
-    cores = parts_of(scipy.ndimage.distance_transform_edt(padded, sampling=spacing_mm) > OPENING_MM)
-    rank = np.argsort(np.argsort(-cores.sizes, kind="stable"), kind="stable").astype(np.int32)
-    numbers = cores.painted(rank + 1)
-    if not len(rank):
+    cores = parts_of(scipy.ndimage.distance_transform_edt(padded, sampling=spacing_mm) > radius_mm)
+    if not len(cores.sizes):
         return np.zeros(mask.shape, np.int32)
+    numbers = cores.painted(np.argsort(np.argsort(-cores.sizes, kind="stable"), kind="stable").astype(np.int32) + 1)
     gap_mm, nearest = scipy.ndimage.distance_transform_edt(numbers == 0, sampling=spacing_mm, return_indices=True)
-    parts = np.where(gap_mm <= CORNER * OPENING_MM + spacing_mm.max(), numbers[tuple(nearest)], 0)
+    parts = np.where(gap_mm <= most_mm, numbers[tuple(nearest)], 0)
     return np.asarray(parts[tuple(slice(r, -r) for r in reach)])
 
 
-def detached_limbs(hu: NDArray[np.float32], parts: Iterable[Piece], spacing_mm: Floats) -> tuple[Piece, ...]:
-    """Those of some parts beside the trunk that are of the patient.
-
-    Args:
-        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the bed.
-        spacing_mm: Shape (3,).
-    """
+def detached_limbs(hu: NDArray[Any], parts: Iterable[Piece], spacing_mm: Floats) -> tuple[Piece, ...]:
+    """Those parts of an image (nx, ny, nz) beside the trunk that are the patient's: of soft tissue, with bone in it."""
     limbs = []
     for part in parts:
         values = hu[part.box][part.mask]
-        if len(values) * np.prod(spacing_mm) < 1000.0 * MIN_LIMB_ML:
-            continue
-        soft = SOFT_TISSUE_HU[0] <= float(np.median(values)) <= SOFT_TISSUE_HU[1]
-        if soft and _holds_bone(part.mask, hu[part.box], spacing_mm):
-            limbs.append(part)
+        if len(values) * np.prod(spacing_mm) >= 1000.0 * MIN_LIMB_ML:
+            soft = SOFT_TISSUE_HU[0] <= float(np.median(values)) <= SOFT_TISSUE_HU[1]
+            if soft and _holds_bone(part.mask, hu[part.box], spacing_mm):
+                limbs.append(part)
     return tuple(limbs)
 
 
-def _holds_bone(part: Bools, hu: NDArray[np.float32], spacing_mm: Floats) -> bool:
+def _holds_bone(part: Bools, hu: NDArray[Any], spacing_mm: Floats) -> bool:
     """Whether a bone lies within a part: it holds together, which noise does not, and is no table's hard cover."""
     cover = widened(np.pad(~part, 1, constant_values=True), np.ceil(OPENING_MM / spacing_mm).astype(int))
     bone = parts_of(~cover[1:-1, 1:-1, 1:-1] & (hu > BONE_HU))

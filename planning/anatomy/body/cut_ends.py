@@ -1,14 +1,9 @@
 """Images cut through the body and filled up with air: the faces at which they were cut.
 
-Resampling, padding to a common size and some exports lay air around an image, with the noise of a scanner or without.
-Then no face of the file cuts the body, and the face at which it was cut looks like skin. But no body ends by itself as
-wide as it is a few millimetres before, across the bed; and no organ ends where all else does. Such a face is a cut,
-whatever lies behind it, and what lies behind it is left out: the image ends there, as it once did.
-
-What cannot be told: where the case says that it shows a phantom, one that ends flat is taken to be whole, unless a
-structure ends there that does not run through it from end to end; and a face at one of the bed's sides that cuts no
-organ may as well be pressed on something (`puncture_twin.planning.anatomy.body.tables`). The key ``cut`` of the skin
-says what is right.
+Resampling, padding and some exports lay air around an image, and the face at which it was cut looks like skin. But no
+body ends by itself as wide as it is a few millimetres before, across the bed; and no organ ends where all else does.
+Such a face is a cut: the image ends there, as it once did. Of a phantom a flat end is its own, unless a structure ends
+there that does not run through it; the key ``cut`` of the skin says what is right where that is not.
 """
 
 from __future__ import annotations
@@ -30,27 +25,22 @@ SIDES: Mapping[str, tuple[int, int]] = MappingProxyType(
 )
 """The patient's sides: LPS axis, and whether its low (0) or high (1) end."""
 
-SPECK_MM2 = 100.0
-"""What is dense in a slice and smaller is noise, a line or a sheet."""
-THICK_MM = 12.0
-"""A ball of this radius fits into a body where it was cut, and into no board, sheet or cushion's skin."""
-WIDE = 0.75
-"""A ball's outermost slice is at most half as large as the next one, and a lying cylinder's at most 0.71 of it."""
-ROUND_MM = 150.0
-"""No head, foot or stump is flatter than a ball of this radius: its outermost slice is no larger than such a cap."""
-CAP_MM2 = 100.0
-"""An organ that was cut has a flat end of this area at least."""
-WALL = 0.5
-"""What ends there over so much of the face is the body itself, or a phantom's wall, and no organ that was cut."""
+SPECK_MM2, THICK_MM = 100.0, 12.0
+"""What is dense in a slice and smaller is noise, a line or a sheet; into a body that was cut such a ball fits."""
+WIDE, ROUND_MM = 0.75, 150.0
+"""A ball's outermost slice is at most half as large as the next one, a lying cylinder's .71 of it; and no head, foot or
+stump is flatter than a ball of this radius."""
+CAP_MM2, WALL = 100.0, 0.5
+"""Area of the flat end of an organ that was cut; what is so much of the face is the body, or a phantom's wall."""
 AT_PLANE = 0.75
 """Of a voxel: so near to the face ends what was cut there."""
 
 Box = tuple[tuple[int, int], ...]
-"""First voxel and the one after the last, along each axis."""
+"""Along each axis the first voxel and the one after the last."""
 
 FILLED = (
     "behind the body's {names} side the image has only air, up to {voxels} voxels: the body counts as cut there and "
-    'the image as padded (override with cut in the skin\'s table: cut = [] if it ends there; or region = "phantom")'
+    "the image as padded (override in the skin's table: cut = [] if it ends there{or_phantom})"
 )
 ENDS_FLAT = (
     "the phantom ends flat at its {names} side, and no structure is cut there except those that run through it: it "
@@ -119,12 +109,7 @@ class Content:
 
 
 def content_of(dense: Bools, T_ct_index: Floats) -> Content:
-    """Measure where, and how, what is denser than air ends in an image.
-
-    Args:
-        dense: Shape (nx, ny, nz), axes running to the left, back and head.
-        T_ct_index: Shape (4, 4), voxel index to LPS mm.
-    """
+    """Where, and how, what is denser than air ends in an image (nx, ny, nz), axes to the left, back and head."""
     spacing_mm = spacing_of(T_ct_index)
     last, area = np.zeros((3, 2), np.int64), np.zeros((3, 2))
     thick, wide = np.zeros((3, 2), bool), np.zeros((3, 2), bool)
@@ -153,8 +138,7 @@ def _is_thick(section: Bools, spacing_mm: Floats) -> bool:
 def cut_ends(content: Content, organs: Iterable[tuple[TriangleMesh, float]], *, whole: bool) -> Bools:
     """The sides at which an image was cut and then filled up, shape (3, 2).
 
-    A side without anything to tell by, behind which lie as many slices as behind one that was cut, counts as cut too;
-    but not of a whole phantom, in the middle of its image.
+    A side behind which lie as many slices as behind one that was cut counts as cut too, but not of a phantom.
 
     Args:
         organs: Structures inside the body, LPS mm, and the longest side of the voxels that they were made of.
@@ -214,7 +198,10 @@ def end_warnings(content: Content, cut: Bools, whole: bool) -> tuple[str, ...]:
     flat = np.array([[False], [False], [whole]]) & content.thick & content.wide & (content.beyond > 0) & ~cut
     said = []
     if filled.any():
-        said.append(FILLED.format(names=_names(filled), voxels=int(content.beyond[filled].max())))
+        or_phantom = "" if whole else '; or region = "phantom"'
+        said.append(
+            FILLED.format(names=_names(filled), voxels=int(content.beyond[filled].max()), or_phantom=or_phantom)
+        )
     if flat.any():
         said.append(ENDS_FLAT.format(names=_names(flat)))
     return tuple(said)

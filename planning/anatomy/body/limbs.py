@@ -1,13 +1,11 @@
 """Limbs that are pressed against the trunk: one body in the CT, but no way for a needle to go from one into the other.
 
-Between an arm and the trunk that it touches there is skin, which a CT does not show. Two things tell them apart: the
-neck (a ball that fits into either does not fit through where they touch), and a bone with air on many sides. A rib lies
-below skin that is nearly flat: of a sphere about it, 1.6 times as wide as it is deep, .19 is air, however it runs.
-About a forearm's bones it is a third and more.
+The skin between an arm and the trunk that it touches is not seen. Two things tell them apart: the neck (a ball that
+fits into either does not fit through where they touch), and a bone with air on many sides. A rib lies below skin that
+is nearly flat: of a sphere about it, 1.6 times as wide as it is deep, .19 is air; about a forearm's bones a third.
 
-Labels explain bones: what has a known name is no evidence, unless that is an arm's, or of bones altogether. Beyond a
-neck no bone is asked for. No part that is larger than a limb can be is one, nor the part that holds the target.
-All of it is decided on a grid of 4 mm.
+Labels explain bones: what has a known name is no evidence, unless that is an arm's, or of bones altogether. No part
+that is larger than a limb can be is one, nor the part that holds the target. All of it on a grid of 4 mm.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, CtImage
+from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, CtImage, nearest_parts
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
 from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
@@ -33,15 +31,11 @@ SAMPLING_MM = 4.0
 MOST_ML = 9000.0
 """An adult's leg has 8 to 10 l, an arm 3 to 4 l: of two parts the smaller one is no larger, or neither is a limb."""
 NECK_MM = 30.0
-"""Radius of a ball that fits into an adult's upper arm (35 to 50 mm) and thigh, and not through the place where an arm
-is pressed against the trunk, some 50 mm wide."""
+"""Radius of a ball that fits into an upper arm (35 to 50 mm) not through where it touches the trunk (50 mm wide)."""
 NAMED_DENSE = 0.4
-"""Of a structure's voxels so many are dense, or it is no bone: of a label "tissue" or "body" that holds bones too few
-are."""
-LIMBS = "limbs and girdles"
-"""Their line in the table of names; the names of arms, and of bones altogether, are among its others."""
-NO_ARM = re.compile(r"scapula|clavic|femur|tibia|fibula|patella|tarsal")
-"""Others of that line."""
+"""Of a structure's voxels so many are dense, or it is no bone, as a label "tissue" that holds bones."""
+LIMBS, NO_ARM = "limbs and girdles", re.compile(r"scapula|clavic|femur|tibia|fibula|patella|tarsal")
+"""In the table of names: the line that has those of arms and of bones altogether, and its others."""
 DEEPEST_MM, DEEPEST_FRACTION = 60.0, 0.45
 """From a limb's bone to the air, and as a fraction of what the trunk's middle has: a spine lies deeper."""
 GAP_MM = 16.0
@@ -49,17 +43,14 @@ GAP_MM = 16.0
 SPHERE, DIRECTIONS = 1.6, 200
 """Radius of the sphere about a bone, as a multiple of its depth, and how many points of it are asked."""
 PARTLY, EXPOSED = 0.26, 0.32
-"""Share of air about every voxel of a limb's bones, and its median. Of shoulder blades and ribs of a real chest the
-median is .30 at most, of forearms across drawn trunks .33 and more."""
-LEAST_MM = 60.0
-"""Length of a limb's bones. A nose's, a collar bone's visible end and a spinous process's are shorter."""
-LINE_MM = 12.0
-"""What continues a limb's bone keeps so near to its line."""
-FLAT, SLACK_MM = 1.25, 5.0
-"""From its bone a limb that is pressed flat reaches so many times as far as the air is away, and so much farther: that
-holds .994 and more of the arms of drawn patients, beside two thirds as much of the trunk at most."""
-BEYOND_ENDS_MM = 30.0
-"""So far beyond the end of its bone a limb goes on, to a joint and the next bone."""
+"""Air about every voxel of a limb's bones, and its median. Of a real chest's shoulder blades and ribs the median is
+.30 at most, of forearms across drawn trunks .33 and more."""
+LEAST_MM, LINE_MM = 60.0, 12.0
+"""A limb's bones are so long (a nose's and a spinous process's are not), and what continues them so near to their line.
+"""
+FLAT, SLACK_MM, BEYOND_ENDS_MM = 1.25, 5.0, 30.0
+"""From its bone a limb pressed flat reaches so many times as far as the air is away, and so much farther, and beyond
+the bone's ends: that holds .994 and more of the arms of drawn patients."""
 
 FULL = np.ones((3, 3, 3), bool)
 
@@ -119,7 +110,8 @@ class BodyPart:
 
     @cached_property
     def _core(self) -> Ints32:
-        return _nearest_core(self.body, self.spacing_mm)
+        parts = nearest_parts(self.body, NECK_MM, self.spacing_mm)
+        return np.where(self.body, parts, 0).astype(np.int32) if parts.any() else self.body.astype(np.int32)
 
     def _exposed(self) -> Iterator[Bools]:
         """Bones about which air is on more sides than about a bone of the trunk, of one limb each."""
@@ -199,7 +191,7 @@ class LimbSearch(NamedTuple):
 
 
 def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> LimbSearch:
-    """Sample a CT and its body."""
+    """The limbs of a CT and its body, sampled; bones that structures name are no evidence."""
     stride = np.maximum(1, (SAMPLING_MM / image.spacing_mm).astype(int))
     T = image.T_ct_index.copy()
     T[:3, 3] += T[:3, :3] @ ((stride - 1) / 2.0)
@@ -235,17 +227,3 @@ def _axis(points: Floats) -> tuple[Floats, Floats]:
     """Middle (3,) of points (n, 3), and the direction in which they reach farthest."""
     middle = points.mean(axis=0)
     return middle, np.linalg.svd(points - middle, full_matrices=False)[2][0]
-
-
-def _nearest_core(body: Bools, spacing_mm: Floats) -> Ints32:
-    """For every voxel of a body, the number of the nearest place into which the ball fits; 0 outside."""
-    reach = np.ceil(NECK_MM / spacing_mm).astype(int)
-    padded = np.pad(body, [(r, r) for r in reach], mode="edge")
-    cores, count = scipy.ndimage.label(scipy.ndimage.distance_transform_edt(padded, sampling=spacing_mm) > NECK_MM)
-    if count < 2:
-        return body.astype(np.int32)
-    nearest = scipy.ndimage.distance_transform_edt(
-        cores == 0, sampling=spacing_mm, return_distances=False, return_indices=True
-    )
-    owner = cores[tuple(nearest)][tuple(slice(r, -r) for r in reach)]
-    return np.asarray(np.where(body, owner, 0), dtype=np.int32)

@@ -1,7 +1,6 @@
 """What a CT shows outside of the body that is not air: table, mattress, clothes, lines, limbs that nobody recognised.
 
-None of it is free space for a needle, its holder or the arm. It becomes one closed surface of role ``unknown``,
-checked by the same engine as every organ, along the whole needle while it waits at its standoff.
+It becomes one closed surface of role ``unknown``, for a needle, its holder and the arm.
 """
 
 from __future__ import annotations
@@ -12,43 +11,43 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
 from puncture_twin.planning.anatomy.body.tables import FACES, Face
 from puncture_twin.planning.base.arrays import Bools, Floats, widened
-from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.formats.labels.labelmaps import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.parts import in_blocks, parts_of
 from puncture_twin.planning.geometry.rigid import apply, pose
 
-SMOOTH_MM = 3.0
-"""Means over a cube of this edge are compared with air: noise of a finer image falls below that of 3 mm voxels."""
+SMOOTH_MM = (3.0, 6.0, 9.0, 12.0)
+"""Means over a cube of such an edge are compared with air, the first in which air is quiet enough, else the first."""
+QUIET, SAMPLES = 4.5, 24
+"""Air is quiet whose median is below the limit by so many times what its lower quarter is below it: three deviations,
+and what is denser makes no bulky piece. Foam does not move that quarter. Asked of so many cubes along each axis."""
 LEAST_HU = -1024
 """What is below counts as this in a mean: some scanners write less than air has."""
 DENSE_HU = -700.0
 """A single voxel above this is no noise (ten times that of a low-dose image)."""
 MIN_PIECE_MM3, MIN_SOFT_MM3, SOLID_HU = 100.0, 500.0, -250.0
-"""Pieces that hold less above ``BODY_HU`` are noise, or cloth; where nothing in them is solid, less than the second: a
-full line of 4 mm diameter has the first in 8 mm of its length, between voxels of 3 mm the second in 30. A gown on the
-skin of a real chest has -850, and -260 in its folds; it stops no needle. So has a line with a bore (4 and 2.6 mm) in
-voxels of 2 mm and more, and one of 2 mm in any: it is not seen."""
+"""Pieces that hold less above ``BODY_HU`` are noise, or cloth; where nothing in them is solid, less than the second. A
+line of 4 mm has the first in 8 mm of its length, between voxels of 3 mm the second in 30. A gown on the skin of a real
+chest has -850, and -260 in its folds; so has a line of 2 mm, or with a bore: it is not seen."""
 BULKY_ML = 50.0
-"""Pieces of this volume that the border of the image cuts (a table, a mattress) go on beyond it, also between the
-places where they are cut: of a table that sags below the image both ends are seen."""
+"""Pieces of this volume that the border cuts go on beyond it, also between the places where they are cut: of a table
+that sags below the image both ends are seen."""
 BEYOND_MM = (100.0, 100.0, 2000.0)
-"""How far what the border cuts is taken to go on to the sides, to front and back, and along the bed. A CT table is at
-most 550 mm wide and an image at least 350; along the bed table and mattress go on farther than a needle reaches."""
+"""So far what the border cuts goes on to the sides, to front and back, and along the bed: a CT table is at most 550 mm
+wide and an image at least 350; along the bed it goes on farther than a needle reaches."""
 BEYOND_LONG_MM = (*BEYOND_MM[:2], 1000.0)
 """`BEYOND_MM` where an image is so long that the surface would be larger than any that is plausible."""
 CUT_AT_MM = (30.0, 120.0, 480.0)
-"""What goes on along the bed is cut across so far beyond the image: a triangle as long as all of it would lie near
-every needle, and the search would measure most axes from most of them."""
+"""Along the bed it is cut across there: a triangle as long as all of it would lie near every needle."""
 BLOCK_MM = 2.0
-"""The surface is drawn about blocks of voxels of at most this edge that hold any of it, or are less than half a block
-beside it: what is found by means over ``SMOOTH_MM`` has no finer shape, and a table of .8 mm voxels has a million
-triangles."""
+"""The surface is drawn about blocks of at most this edge that hold any of it, or lie less than half a block beside it:
+means have no finer shape, and a table of .8 mm voxels has a million triangles."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
@@ -59,10 +58,8 @@ class OutsideImage:
 
     Attributes:
         hu: Shape (nx, ny, nz), Hounsfield units.
-        body: Same shape, the body.
-        unscanned: Same shape, what was not measured.
+        body, unscanned: Same shape, the body, and what was not measured.
         T_ct_index: Shape (4, 4), voxel index to LPS mm.
-        spacing_mm: Shape (3,).
         slopes: How what lies there moves along axes 0 and 1 beyond the image's ends, mm per mm along the bed.
         beyond_mm: How far what the border cuts is taken to go on.
     """
@@ -77,18 +74,14 @@ class OutsideImage:
 
 
 def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
-    """Voxels outside of the body that are not air.
+    """Voxels outside of the body whose surroundings are denser than a limit.
 
-    Beside the body's surface a voxel, or the mean about it, is partly skin, partly air; there only what is denser than
-    half of both counts.
-
-    Args:
-        air_hu: Voxels whose surroundings are denser than this are not air.
+    Beside the body's surface they are partly skin, partly air; there only what is denser than half of both counts.
     """
     hu, body, unscanned = image.hu, image.body, image.unscanned
-    size = np.maximum(1, np.round(SMOOTH_MM / image.spacing_mm)).astype(int)
-    dense = hu > max(DENSE_HU, air_hu)
-    _mark_means(np.require(hu, requirements=["C", "W"]), size, float(air_hu), dense)
+    size = _smooth_size(image, air_hu)
+    dense = scipy.ndimage.uniform_filter(np.maximum(hu, LEAST_HU), size, np.float32, mode="nearest") > air_hu
+    dense |= hu > max(DENSE_HU, air_hu)
     dense &= ~widened(body, size // 2 + 1)
     dense |= (hu > BODY_HU) & ~body
     if not unscanned.any():
@@ -103,25 +96,25 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     return dense
 
 
-@nb.njit(cache=True)
-def _mark_means(hu: Any, size: Any, above: Any, found: Any) -> None:
-    """Set where the mean over a cube of ``size`` voxels is above a value; beyond the border the image goes on."""
-    ni, nj, nk = hu.shape
-    before, after = size // 2, (size - 1) // 2
-    least, most, sums = np.float32(LEAST_HU), np.float32(above * size.prod()), np.empty(nk, np.float32)
-    for i in range(ni):
-        for j in range(nj):
-            sums[:] = 0.0
-            for x in range(i - before[0], i + after[0] + 1):
-                for y in range(j - before[1], j + after[1] + 1):
-                    line = hu[min(max(x, 0), ni - 1), min(max(y, 0), nj - 1)]
-                    for k in range(nk):  # along memory, so that the compiler adds many at once
-                        sums[k] += max(np.float32(line[k]), least)
-            for k in range(nk):
-                total = np.float32(0.0)
-                for z in range(k - before[2], k + after[2] + 1):
-                    total += sums[min(max(z, 0), nk - 1)]
-                found[i, j, k] |= total > most
+def _smooth_size(image: OutsideImage, air_hu: float) -> NDArray[np.int_]:
+    """Voxels along each edge of the cube whose means tell what is denser than air in the noise of this image."""
+    edge_mm = next((edge for edge in SMOOTH_MM if _quiet_from(image, edge) <= air_hu), SMOOTH_MM[0])
+    return np.maximum(1, np.round(edge_mm / image.spacing_mm)).astype(int)
+
+
+def _quiet_from(image: OutsideImage, edge_mm: float) -> float:
+    """The least limit above which no noise of this image's air lies, in means over a cube; NaN where it shows none."""
+    known = ~(image.body | image.unscanned)
+    size = np.minimum(np.maximum(1, np.round(edge_mm / image.spacing_mm)).astype(int), known.shape)
+    ends = np.array(known.shape) - size + 1
+    first = np.ix_(*(np.arange(0, end, max(1, end // SAMPLES)) for end in ends))
+    total = np.zeros(np.broadcast_shapes(*(one.shape for one in first)))
+    for step in np.ndindex(*size):
+        at = tuple(one + k for one, k in zip(first, step, strict=True))
+        total += np.where(known[at], np.maximum(image.hu[at], LEAST_HU), np.nan)
+    means = total / size.prod()
+    air = means[means < DENSE_HU]
+    return float((1.0 + QUIET) * np.median(air) - QUIET * np.percentile(air, 25)) if air.size else np.nan
 
 
 def outside_surface(
@@ -151,19 +144,15 @@ def outside_surface(
 
 
 def _layers_mm(image: OutsideImage) -> tuple[tuple[float, ...], ...]:
-    """How far beyond its border voxels' centres an image is continued by layers of blocks, along each axis.
-
-    The last layer is where what is drawn out ends: up to there it keeps its width.
-    """
+    """How far beyond its border voxels' centres layers of blocks continue an image, along each axis, to the end."""
     to_side, to_back, along = image.beyond_mm
     return (float(image.spacing_mm[0]), to_side), (float(image.spacing_mm[1]), to_back), (*CUT_AT_MM, along)
 
 
 def _drawn_out(surface: TriangleMesh, edge: NDArray[np.int_], image: OutsideImage) -> TriangleMesh:
-    """A surface that counts blocks of ``edge`` voxels, in LPS mm; the layers beyond the image's border moved outward.
+    """A surface that counts blocks of ``edge`` voxels, in LPS mm; layers beyond the border moved outward with the bed.
 
-    Of blocks within, every vertex lies on a face between two of them. The caps lie half a voxel after the last layer's
-    centre. Beyond the ends of the bed it runs on as the bed does.
+    Every vertex lies on a face between two blocks; caps half a voxel after the last layer's centre.
     """
     index = surface.vertices.copy()
     for axis, layers_mm in enumerate(_layers_mm(image)):
@@ -171,10 +160,7 @@ def _drawn_out(surface: TriangleMesh, edge: NDArray[np.int_], image: OutsideImag
         at = np.arange(0, size, edge[axis])  # first voxels of blocks
         beyond = np.array([*range(1, len(layers_mm) + 1), len(layers_mm) + 0.5])
         moved = np.array([*layers_mm, layers_mm[-1] + 0.5 * image.spacing_mm[axis]]) / image.spacing_mm[axis]
-        last, ends = (
-            len(at) - 1.0,
-            [(min(edge[axis], size) - 1) / 2.0, (at[-1] + size - 1) / 2.0],
-        )  # centres at the border
+        last, ends = len(at) - 1.0, [(min(edge[axis], size) - 1) / 2.0, (at[-1] + size - 1) / 2.0]  # border centres
         index[:, axis] = np.interp(
             index[:, axis],
             np.concatenate([-beyond[::-1], [0.0], np.arange(last) + 0.5, [last], last + beyond]),

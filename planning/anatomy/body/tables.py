@@ -1,11 +1,9 @@
 """What a body lies on: tables, cradles, boards and pads, touching it or not, and what of them the image does not show.
 
 A table has one section, drawn along the bed; a patient has not. Seen from its far side it ends at one line in most
-slices, or along a hand's breadth, at the same angle to the slices' axis everywhere. Nothing comes from beyond that
-line. Where the table touches a body as dense as itself and is wider, its thickness is seen beside the body, and it is
-cut off there: what is left is the body.
-
-A body that has one section at all four sides is no table, whatever it lies on: it is a phantom, or a part of one.
+slices, or along a hand's breadth, and nothing comes from beyond. Where it touches a body as dense as itself and is
+wider, its thickness is seen beside the body, and it is cut off there. A body that has one section at all four sides is
+no table, but a phantom.
 """
 
 from __future__ import annotations
@@ -22,13 +20,10 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.parts import ends_of, middle_of, parts_of
 
-DRAWN_MM = 0.75
-"""A line of sight is drawn where the surface keeps within this of one line; noise moves it by some 0.3 mm."""
-DRAWN_FRACTION = 0.8
-"""Of the slices at least."""
+DRAWN_MM, DRAWN_FRACTION = 0.75, 0.8
+"""A line of sight is drawn where the surface keeps so near to one line (noise: .3 mm), in so many of the slices."""
 DRAWN_WIDTH_MM, RUN_MM = 100.0, 20.0
-"""Over so much of its width together, of runs of so much: single lines of sight may be drawn by chance. Of a real
-abdomen in air no side keeps to a line over more than 63 mm."""
+"""Over so much of its width together, of runs of so much. Of a real abdomen in air no side is drawn over 63 mm."""
 ONE_PIECE_MM, ONE_PIECE = 0.25, 0.945
 """Ends of a table keep so near to one another from slice to slice, or thrice their noise, .955 of them and more in
 drawn CTs. Of a trunk's straight back it is .80, of flanks .93: a back has no edge, flanks are none beside a table."""
@@ -36,15 +31,12 @@ SMOOTH_ALONG_MM = 12.0
 """Ends are averaged so far along the bed: a table is constant there, noise is not."""
 THICKEST_MM, ALIKE_MM = 80.0, 5.0
 """No table is thicker, and beside the body it is as thick to so much all over."""
-LEAST_LENGTH_MM, LEAST_SLICES = 50.0, 12
-"""A shorter image, or fewer slices of a part of one, may show any body as one section: tables are not told."""
-TILTS_FROM_MM = 100.0
-"""From this length of the image on, a bed at an angle to the slices' axis is looked for too."""
+LEAST_LENGTH_MM, LEAST_SLICES, TILTS_FROM_MM = 50.0, 12, 100.0
+"""A shorter image, or fewer slices of a part of one, may show any body as one section; a bed at an angle needs more."""
 EDGE_MM = 30.0
 """The edge of a table or cradle is no thicker."""
 NEAR_MM = 60.0
-"""A face is near the body up to this distance. Mattresses are at most some 50 mm thick; of their foam a CT shows
-nothing that is denser than air."""
+"""A face is near the body up to this distance. Mattresses are at most 50 mm thick, and their foam is hardly seen."""
 CUT_FRACTION = 0.5
 """A face cuts what the body lies on where something outside of the body ends at it in so many of the slices."""
 TOO_SHORT = (
@@ -56,19 +48,18 @@ CUT_OFF = (
 )
 TOUCHES = (
     "the body ends in one section along the bed at its {name} side, over {width:.0f} mm, like a table or board: the "
-    'space beyond it does not count as free ([ct] table = "none" if there is none)'
+    "space beyond it does not count as free ([ct] table = {overrule})"
 )
+NO_TABLE, NO_OTHER = '"none" if there is none', '"present" if what was removed is all that the body lies on'
 PRISM = (
     "the body has a constant section along the bed at all four sides, like a phantom: no side counts as a table "
     '([ct] table = "present" if one is; region = "phantom" if it is a whole phantom)'
 )
 
 Face = tuple[int, int]
-"""Array axis and end of a face."""
 FACES: tuple[Face, ...] = tuple(itertools.product((0, 1), (0, -1)))
-"""The faces of an image beside the bed's two ends."""
 NAMES = dict(zip(FACES, ("right", "left", "front", "back"), strict=True))
-"""Axes run to the left, back and head."""
+"""Array axis and end of a face of the image beside the bed's two ends; axes run to the left, back and head."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +68,7 @@ class Shown:
 
     Attributes:
         phantom: It shows a phantom: no limb, and what holds together is the phantom.
-        arms, table: ``none`` or ``present``; None where nobody said so.
+        arms, table: ``none`` or ``present`` (one table, which may be cut off); None where nobody said so.
         whole: The image shows all of it, in air.
         about: Of several phantoms the one that holds this point is meant, LPS mm; the largest where none does.
     """
@@ -107,12 +98,11 @@ class TableSide(NamedTuple):
 
     Attributes:
         face: The side of the image toward which it ends.
-        line: Shape (n, nz), by line of sight and slice, where it ends, voxels along the face's axis; beyond its edges
-            where they may end.
+        line: Shape (n, nz), by line of sight and slice, where it ends or may end, voxels along the face's axis.
         lines: Shape (n,), which lines of sight are those of the table.
         slope: How it moves along the face's axis, mm per mm along the bed.
         width_mm: How much of them is drawn.
-        firm: Whether the ends keep to one another, as those of a table do and those of a straight flank do less.
+        firm: Whether the ends keep to one another, as those of a straight flank do less.
     """
 
     face: Face
@@ -130,12 +120,7 @@ class TableSide(NamedTuple):
 
 
 class Touching(NamedTuple):
-    """What touches the body.
-
-    Attributes:
-        cut_off: Shape of the body, what of it is a table whose thickness is seen beside the body.
-        sides: At which the body ends as a table does, which could not be cut off.
-    """
+    """What touches the body: tables, shape of the body, that are cut off it; sides at which it ends as others do."""
 
     cut_off: Bools
     sides: tuple[TableSide, ...]
@@ -151,8 +136,7 @@ def touching_tables(
         hu: Shape (nx, ny, nz), axis 2 along the bed.
         trunk: Same shape; what is as dense and connected with it counts too, however thin.
         spacing_mm: Shape (3,).
-        shown: What a person says: a phantom may end in one section, and only what can be cut off it is a table, unless
-            there is said to be one.
+        shown: Of a phantom only what can be cut off is a table, unless there is said to be one.
         level: Where the body's surface is, of the values.
     """
     dense = hu > level
@@ -174,20 +158,19 @@ def touching_tables(
         left = []
     if any(side.firm for side in drawn):  # what a body lies on is seen: its straight flanks are no tables
         left = [side for side in left if side.firm]
-    said += [TOUCHES.format(name=NAMES[side.face], width=side.width_mm) for side in left]
+    if cut_off.any() and shown.table == "present":
+        left = []
+    overrule = NO_OTHER if cut_off.any() else NO_TABLE
+    said += [TOUCHES.format(name=NAMES[side.face], width=side.width_mm, overrule=overrule) for side in left]
     if (length_mm := trunk.shape[2] * float(spacing_mm[2])) < LEAST_LENGTH_MM:
         said.append(TOO_SHORT.format(length=length_mm))
     return Touching(cut_off, tuple(left), tuple(said))
 
 
 def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
-    """The table on which a body lies, as thick as it is seen beside the body; nothing where it is not seen there.
+    """The table on which a body lies, shape of ``dense``; nothing where it is not seen beside the body.
 
     Below the body its thickness is that between the two places beside the body where it is seen.
-
-    Args:
-        dense: Shape (nx, ny, nz).
-        spacing_mm: Shape (3,).
     """
     axis, end = side.face
     table, along_mm = np.zeros(dense.shape, bool), float(spacing_mm[axis])
@@ -201,7 +184,8 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
     seen = side.lines & (alike.mean(axis=1) >= DRAWN_FRACTION) & (middle > 0.0) & (middle <= THICKEST_MM)
     run, lines = max(2, int(RUN_MM / spacing_mm[1 - axis])), np.flatnonzero(side.lines)
     ends = [some[seen[some]] for some in (lines[:run], lines[-run:])]
-    if seen[lines].all() or any(len(one) < DRAWN_FRACTION * run or np.ptp(middle[one]) > 2 * ALIKE_MM for one in ends):
+    lies_on = (~seen[lines]).any() or (thick_mm[lines] > THICKEST_MM).any()  # a head, an arm: in some slices
+    if not lies_on or any(len(one) < DRAWN_FRACTION * run or np.ptp(middle[one]) > 2 * ALIKE_MM for one in ends):
         return table
     most_mm = max(float(np.median(middle[one])) for one in ends) + ALIKE_MM
     table_mm = np.interp(np.arange(len(seen)), np.flatnonzero(seen), middle[seen], left=0.0, right=0.0)
@@ -211,12 +195,7 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
 
 
 def surface_ends(hu: NDArray[Any], body: Bools, level: float = 0.0) -> dict[Face, Floats]:
-    """Where a body's surface is along each line of an axis, seen from each end of it.
-
-    Args:
-        hu: Shape (nx, ny, nz), axis 2 along the bed.
-        body: Same shape.
-        level: Where the surface is, of the values.
+    """Where a body's surface is, at a level of the values (nx, ny, nz), along each line of an axis, from each end.
 
     Returns:
         By face, voxels along its axis, shape (n, nz); NaN where there is no body, and where the image cuts it.
@@ -241,7 +220,6 @@ def drawn_sides(
     Args:
         surfaces: By face, as `surface_ends` gives them.
         body: Shape (nx, ny, nz).
-        spacing_mm: Shape (3,).
         own: Which ends count, by face, where not all do: these are known to a voxel.
     """
     if body.shape[2] * spacing_mm[2] < LEAST_LENGTH_MM:
@@ -262,7 +240,6 @@ class _View(NamedTuple):
     Attributes:
         ends: Shape (n, nz), voxels along its axis, NaN where they end at nothing.
         counts: Shape (n, nz), which of them count.
-        spacing_mm: Shape (3,).
         near_mm: How near to a line ends are drawn.
         touching: Whether the body itself ends there: then beyond both edges nothing is free either.
     """
@@ -363,8 +340,7 @@ class Support(NamedTuple):
     Attributes:
         drawn: Its far side, where it does not hold together with the body; one or none.
         seen: Whether the image shows any, there or as one with the body.
-        open_faces: Faces beyond which nothing is known, apart from those that are known to cut a body which lies on
-            something that is seen.
+        open_faces: Faces beyond which nothing is known.
     """
 
     drawn: tuple[TableSide, ...]
@@ -380,9 +356,8 @@ def find_support(
     Args:
         outside: Shape (nx, ny, nz), what was scanned, lies outside of the body and is not air; axis 2 along the bed.
         body: Same shape.
-        spacing_mm: Shape (3,).
         touching: Tables that hold together with the body, so that they are not outside of it.
-        shown: What a person says: a phantom lies on nothing where nothing is seen.
+        shown: A phantom lies on nothing where nothing is seen.
     """
     if shown.table == "none":
         return Support((), False, ())
@@ -405,19 +380,15 @@ def find_support(
 
 
 def support_warnings(seen: bool, open_faces: Sequence[Face]) -> Iterator[str]:
-    """What the image does not show of what lies beside the body, and what says so where nothing lies there.
-
-    Args:
-        seen: Whether it shows what the body lies on.
-        open_faces: The faces beyond which nothing is known.
-    """
-    bed = f"the CT does not show {'all of ' if seen else ''}the support of the body"
-    for axis, said, key in ((1, bed, "[ct] table"), (0, "the CT may not show all of the arms", "[ct] arms")):
-        names = " and ".join(NAMES[face] for face in open_faces if face[0] == axis)
+    """What the image does not show of what lies beside the body, and the key that says that nothing lies there."""
+    bed, arms = "the CT does not show the support of the body", "the CT may not show all of the arms"
+    asked = ((1, bed.replace("the support", "all of the support"), "table"), (0, arms, "arms"))
+    for axis, said, key in asked if seen else ((None, bed, "table"),):
+        names = " and ".join(NAMES[face] for face in open_faces if axis in {face[0], None})
         if names:
             yield (
                 f"{said}: the space beyond its {names} face, within {NEAR_MM:g} mm of the body, is unknown_region "
-                f'(outside_body; {key} = "none" if nothing is there)'
+                f'(outside_body; [ct] {key} = "none" if nothing is there)'
             )
     if not seen and not open_faces:
         yield "the CT shows no support below the body; the space beyond its faces counts as air"
