@@ -205,13 +205,13 @@ def read(one: Control) -> FoundNeedle | str:
         return error.code
 
 
-def reading(one: Control) -> tuple[FoundNeedle, tuple[Finding, ...]]:
-    """What is read in the scan, and what is said of it."""
+def reading(one: Control, *, planned: bool = True) -> tuple[FoundNeedle, tuple[Finding, ...]]:
+    """What is read in the scan, with a plan or without, and what is said of it."""
     tip, forward = one.plan
-    planned = apply(one.T_scan_ct, tip), one.T_scan_ct[:3, :3] @ forward
+    plan = apply(one.T_scan_ct, tip), one.T_scan_ct[:3, :3] @ forward
     markers = apply(one.T_scan_ct, one.markers.points)
     inside = partial(_inside, one.skin, inverse(one.T_scan_ct))
-    return read_needle(one.volume, planned[0], DIAMETER_MM, inside, planned, markers)
+    return read_needle(one.volume, plan[0], DIAMETER_MM, inside, plan if planned else None, markers)
 
 
 def _inside(skin: TriangleMesh, T_ct_scan: Floats, points: Floats) -> Bools:

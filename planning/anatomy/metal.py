@@ -91,6 +91,7 @@ def metal_parts(
     level_hu: float = METAL_HU,
     solid_hu: float = SOLID_HU,
     reach_mm: Floats | float = BLUR_MM,
+    least: float = LEAST_PART,
 ) -> Floats:
     """Part of each voxel of a piece's box that is metal, 0 to 1, as far as a clipped range allows.
 
@@ -101,6 +102,7 @@ def metal_parts(
         level_hu: From where on other voxels of the box are metal too.
         solid_hu: Of a voxel that is wholly metal.
         reach_mm: So far from its voxels metal blurs into others, or fills them in part; one number, or one an axis.
+        least: A smaller part is taken for none.
     """
     values = volume.values[metal.box].astype(np.float64)
     every, outside = _sides(values, volume, metal, level_hu, reach_mm)
@@ -113,7 +115,7 @@ def metal_parts(
     others = every & ~metal.voxels
     mine = ndimage.distance_transform_edt(~metal.voxels, spacing)
     strange = others.any() and mine >= ndimage.distance_transform_edt(~others, spacing)  # nearer to another piece
-    return np.where(outside | strange | (parts < LEAST_PART), 0.0, parts)
+    return np.where(outside | strange | (parts < least), 0.0, parts)
 
 
 def clear_of_metal(volume: Volume, metal: Metal, level_hu: float, reach_mm: Floats | float) -> Bools:

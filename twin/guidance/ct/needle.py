@@ -32,6 +32,7 @@ from puncture_twin.planning.base.errors import Finding, InputError, Severity, re
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply, frame_about
 from puncture_twin.twin.guidance.ct.needle_fit import (
+    FITTED_MM,
     UNKNOWN,
     WIDE_MM,
     WIDEST_SLICE,
@@ -140,9 +141,13 @@ def read_needle(
     if len(found) > 1:
         chosen, findings = _chosen(volume, found, planned)
     needle, hidden = chosen
-    if planned is not None and len(found) == 1 and not _of_plan(needle, *planned):
+    if len(found) == 1 and not _of_plan(needle, *(planned or (target_ct, needle.forward_ct))):
         said = f"the needle lies more than {OF_PLAN_MM:g} mm or {OF_PLAN_DEG:g} degrees off the planned line"
-        findings = [Finding("far_from_plan", Severity.WARNING, said)]
+        said = f"the needle's line passes the target by more than {OF_PLAN_MM:g} mm" if planned is None else said
+        findings = [Finding("far_from_plan", Severity.WARNING, f"{said}: is it the needle?")]
+    if not needle.unclear and not _enters(volume, needle, inside):
+        said = "the needle is in the body as far as it is seen: that it comes through the skin is not; is it a lead?"
+        findings.append(Finding("entry_not_seen", Severity.WARNING, said))
     if needle.leaves:
         refuse(
             "the needle leaves the image; its tip is outside", volume.path, "a scan with its tip", "tip_outside_image"
@@ -161,7 +166,7 @@ def read_needle(
             what, volume.path, f"a tip known to {UNSURE_MM:g} mm: thinner slices, or another gantry tilt", "tip_hidden"
         )
     thick = float(spacing_mm(volume)[2])
-    if thick > THICK_MM:
+    if thick > THICK_MM + 0.01:
         said = (
             f"slices of {thick:g} mm: a second needle within {BESIDE_MM:g} mm of this one may not be seen; look for it"
         )
@@ -207,13 +212,31 @@ def _needles(
     known: list[FoundNeedle] = []
     for level in LEVELS_HU:
         for metal in metal_pieces(volume, level, hidden | _taken(volume, known)):
-            if metal.size_mm < SHORTEST_MM or any(_same(volume, one, _places(volume, metal)) for one in known):
+            if any(_same(volume, one, _places(volume, metal)) for one in known):
+                continue
+            if _length(volume, metal, level, hidden, diameter_mm) < SHORTEST_MM:
                 continue
             for part, beside_it in _parts(volume, metal, level, hidden, diameter_mm):
                 found = _needle(volume, part, level, target_ct, inside, beside_it, diameter_mm)
                 if found is not None and not any(_same(volume, one, found.path_ct) for one in known):
                     known.append(found)
                     yield found, beside_it
+
+
+def _length(volume: Volume, metal: Metal, level: float, hidden: Bools, diameter_mm: float) -> float:
+    """Of a piece, mm; of a thin one with what lies beyond a gap, where another needle or a slice's border cuts it."""
+    part = LEVELS_HU[-1] < level and SHORTEST_MM / 2 <= metal.size_mm < SHORTEST_MM
+    if not (part and _thin(volume, metal, diameter_mm)):
+        return metal.size_mm
+    return _whole(volume, metal, _axis(volume, metal), hidden)[0].size_mm
+
+
+def _enters(volume: Volume, needle: FoundNeedle, inside: Inside) -> bool:
+    """Whether a needle's line, from where it is seen last, comes out of the body within the image."""
+    end, steps = needle.path_ct[-1], np.arange(0.0, FITTED_MM, 1.0)[:, None]
+    line = end - steps * (needle.tip_ct - end) / np.linalg.norm(needle.tip_ct - end)
+    at = apply(np.linalg.inv(volume.T_ct_index), line)
+    return not inside(line[((at >= 0) & (at <= np.array(volume.values.shape) - 1)).all(axis=1)]).all()
 
 
 def _needle(

@@ -13,7 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, minimum_filter
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import expit
 
@@ -32,6 +32,10 @@ WIDEST_SLICE = 0.6
 """Fraction of a slice's thickness: one slice at least is so near to the axis."""
 UNLIKE = 0.35
 """Of the squares of a needle's voxels, what its image may leave: vessels, ribs and wires leave more."""
+TIP_PLACES = 3
+"""So many places behind a tip, and all beyond it, are those about the tip: metal ahead of a needle is not its tip."""
+WIDER = 1.4
+"""More than so much of what a needle's end has for its image is of something wider."""
 GAINS, BLURS = (0.4, 4.0), (0.5, 1.8)
 """Density of the metal over the assumed one, titanium to tungsten, where contrast in a vessel is far below; and blur
 over the assumed one, where a rib is far above."""
@@ -56,7 +60,9 @@ PIECE_MM = 10.0
 EDGE_PIXELS = 0.06
 """Standard deviation of where a needle ends, in pixels along it: no blur is an exact Gaussian, and its tails move an
 edge, which has one side, though not an axis, which has two. Tips err by so much without noise and streaks."""
-SHARED_MM = 6.0
+ASLANT = np.sqrt(2.0)
+"""A tip that ends in the next slice shows as far beside its metal as metal blurs, and one slice away."""
+SHARED_MM = 15.0
 """Along a needle, in which the voxels of a slice err together: streaks begin at its metal."""
 UNKNOWN_PART = 1e-7
 """Of what an image says of the number that it knows best: what it says less of than that, it says nothing of."""
@@ -196,8 +202,8 @@ class _Around(NamedTuple):
 
     @classmethod
     def of(cls, volume: Volume, metal: Metal, hidden: Bools) -> _Around:
-        reach_mm = np.maximum(BLUR_MM, [0.0, 0.0, spacing_mm(volume)[2]])  # a slice shares metal with its neighbours
-        parts = np.minimum(metal_parts(volume, metal, reach_mm=reach_mm), full_part(volume)).ravel()
+        reach_mm = ASLANT * np.maximum(BLUR_MM, [0.0, 0.0, spacing_mm(volume)[2]])  # neighbours share a slice's metal
+        parts = np.minimum(metal_parts(volume, metal, reach_mm=reach_mm, least=-np.inf), full_part(volume)).ravel()
         index = np.argwhere(np.ones(metal.voxels.shape, dtype=bool)) + [axis.start for axis in metal.box]
         places, typical = apply(volume.T_ct_index, index.astype(float)), float(parts[metal.voxels.ravel()].mean())
         return cls(places, index[:, 2], parts, ~hidden[tuple(index.T)], typical)
@@ -236,6 +242,7 @@ def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hid
             forward = np.concatenate([[1.0], straight.x[3:5]]) @ seen.axes
             line = line._replace(forward=forward / np.linalg.norm(forward))
             begun = straight.x * [1, 0, 0, 0, 0, 1, 1]
+            length = min(length, _slim(seen, np.concatenate([straight.x, np.zeros(4)])))
     weighed = _weighed(seen, straight) if straight.jac.any() else None  # no slope: its image has left the metal
     if weighed is None or not _alike(seen, weighed[0], full_part(volume)):
         return unclear(line, start) if around.typical > AS_BRIGHT * usual else None
@@ -244,13 +251,35 @@ def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hid
 
 def _alike(seen: _Seen, x: Floats, full: float) -> bool:
     """Whether what is seen is the image of a needle, as dense, as blurred, and as long as that of numbers (11,)."""
-    left, (blur, gain) = seen.left(x), np.exp(x[5:7])
-    unlike = float(left @ left) / max(float(seen.parts @ seen.parts), 1e-9)
+    blur, gain = np.exp(x[5:7])
     metal = seen.parts > 0.5 * min(full, float(seen.parts.max()))
     ahead = float(seen.local[metal, 0].max(initial=-np.inf) - x[0])
     farthest = FARTHEST_MM + WIDE_MM + WIDEST_SLICE * float(np.linalg.norm(seen.thick[1:]))
     dense, blurred = GAINS[0] < gain < GAINS[1], BLURS[0] < blur < BLURS[1]
-    return bool(unlike <= UNLIKE and abs(ahead) <= farthest and dense and blurred)
+    return bool(_unlike(seen, x) <= UNLIKE and abs(ahead) <= farthest and dense and blurred)
+
+
+def _unlike(seen: _Seen, x: Floats) -> float:
+    """What numbers (11,) leave of the squares: of all voxels, or about the tip, of a place behind it; the larger."""
+    place = np.floor((seen.local[:, 0] - x[0]) / PLACE_MM).astype(int)
+    tip = max(-place.min() - TIP_PLACES, 1)
+    squares = ((one**2).astype(np.float64) for one in (seen.left(x), seen.curve.parts(x, seen.local)))
+    left, image = (np.bincount(place - place.min(), one, tip + 1) for one in squares)
+    usual, whole = float(np.median(image[:tip])), float(seen.parts @ seen.parts)
+    return float(max(left.sum() / max(whole, 1e-9), left[tip:].max() / max(usual, 1e-9)))
+
+
+def _slim(seen: _Seen, x: Floats) -> float:
+    """So far behind its tip, mm, a needle of numbers (11,) is as wide as there: a guide about it is wider.
+
+    By its metal in all voxels about it, wherever a bend leads it; a last piece alone is bone or a hub.
+    """
+    place = np.floor((x[0] - seen.local[:, 0]) / PIECE_MM).astype(int)
+    behind = place >= 0
+    metal, image = (np.bincount(place[behind], one[behind], 2) for one in (seen.parts, seen.curve.parts(x, seen.local)))
+    slim = np.flatnonzero(metal <= WIDER * metal[:2].sum() / max(float(image[:2].sum()), 1e-9) * image)
+    count = max(int(slim.max(initial=0)) + 1, 2)
+    return PIECE_MM * count if count + 2 <= len(metal) else np.inf
 
 
 def _found(
@@ -293,13 +322,14 @@ def _about(local: Floats, seen: Floats, length: float, thick: Floats, width_mm: 
 
 
 def _straight(seen: _Seen, begun: Floats) -> OptimizeResult:
-    """The straight rod nearest to what is seen; of one in few slices that with the best place across them."""
+    """The straight rod nearest to what is seen; of one in few slices the best of those that begin elsewhere in them."""
     fit = _settled(seen, begun)
     if not seen.few:
         return fit
     moves = _moves(seen)
-    best = moves[int(np.argmin(_costs(seen, np.concatenate([fit.x, np.zeros(4)]), moves)))]
-    return min(fit, _settled(seen, fit.x + best[:7]), key=lambda one: float(one.cost))
+    costs = _costs(seen, np.concatenate([fit.x, np.zeros(4)]), moves).reshape(STEPS, STEPS)
+    valleys = moves[(costs <= minimum_filter(costs, 3, mode="nearest")).ravel()]
+    return min([fit, *(_settled(seen, fit.x + move[:7]) for move in valleys)], key=lambda one: float(one.cost))
 
 
 def _moves(seen: _Seen) -> Floats:
@@ -314,15 +344,17 @@ def _costs(seen: _Seen, x: Floats, moves: Floats) -> Floats:
     return np.array([left @ left / 2 for left in (seen.left(x + move) for move in moves)])
 
 
-def _unsettled(seen: _Seen, x: Floats, noise: float) -> Floats:
-    """Mean square (11, 11) by which a needle in few slices may lie otherwise across them than numbers (11,) have it.
+def _unsettled(seen: _Seen, x: Floats, noise: float) -> tuple[Floats, Floats]:
+    """By how much (11,) and mean square (11, 11) a needle in few slices lies otherwise in them than numbers (11,) say.
 
     What lies wholly in a slice has one image wherever it lies in it: no slope at the best fit tells how far.
     """
     moves = _moves(seen)
     costs = _costs(seen, x, moves)
     odds = np.exp((costs.min() - costs) / noise**2)
-    return np.asarray(moves.T @ (odds[:, None] * moves) / odds.sum())
+    odds /= odds.sum()
+    mean = odds @ moves
+    return mean, np.asarray((moves - mean).T @ (odds[:, None] * (moves - mean)))
 
 
 def _settled(seen: _Seen, begun: Floats, weights: Floats | float = 1.0, noise: float = 0.0) -> OptimizeResult:
@@ -368,7 +400,7 @@ def _scatter(seen: _Seen, fit: OptimizeResult, noise: float = 0.0) -> tuple[Floa
 
     the jackknife (Bell and McCaffrey 2002, their equation 3): no assumption on how voxels of a piece err together.
     What holds the bends counts as one more observation each. The noise is the standard deviation of voxels that err on
-    their own and scatter the numbers as much; in few slices that of slices, each of which errs as one.
+    their own and scatter the numbers as much.
     """
     pieces = seen.pieces
     count = len(pieces)
@@ -383,9 +415,7 @@ def _scatter(seen: _Seen, fit: OptimizeResult, noise: float = 0.0) -> tuple[Floa
     turned = np.einsum("kji,kj->ki", turns, pulls) / np.maximum(own, LEAST_OWN)
     moved, held = np.einsum("kij,kj->ki", turns, turned), noise * fit.jac[count:] @ root
     whole = moved.T @ moved + held.T @ held
-    left, shown = fit.fun[:count], len(np.unique(seen.slices[seen.bright]))
-    square = left @ left / shown if seen.few else np.trace(whole) / len(root)
-    return root @ whole @ root.T, float(np.sqrt(max(square, ROUNDED**2)))
+    return root @ whole @ root.T, float(np.sqrt(max(np.trace(whole) / len(root), ROUNDED**2)))
 
 
 def _bent(seen: _Seen, straight: OptimizeResult) -> tuple[OptimizeResult, OptimizeResult, float]:
@@ -420,7 +450,10 @@ def _weighed(seen: _Seen, first: OptimizeResult) -> tuple[Floats, Floats, bool]:
     x, noise = (fit.x, noise_bent) if bent else (plain, noise_straight)
     both = (1 - chance) * cov + chance * cov_bent
     both += np.outer(gap, gap) * (1 - chance if bent else chance)
-    return x, both + (_unsettled(seen, x, noise) if seen.few else 0.0), bent
+    if seen.few:
+        moved, spread = _unsettled(seen, x, noise)
+        x, both = x + moved, both + spread
+    return x, both, bent
 
 
 def _covariances(x: Floats, cov: Floats, axes: Floats, s: Floats) -> tuple[Floats, Floats]:

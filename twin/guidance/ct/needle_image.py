@@ -25,8 +25,9 @@ from puncture_twin.planning.formats.volumes.volume_files import Volume
 
 BLUR_SIGMA_MM = 0.5
 """Assumed of reconstruction and pixel together, in the plane, before it is fitted."""
-LAYER_MM = 0.6
-"""A slice is taken apart into layers no thicker: their Gaussians add up to its even profile, a needle's width given."""
+LAYER_MM, SOFT = 0.6, 1.5
+"""A slice is taken apart into layers no thicker, nor than so many deviations of what a needle's own image smooths
+across it: their Gaussians add up to its even profile, whose edges tell where a needle lies that runs within it."""
 LEVER_MM = 50.0
 """At which a bend is counted."""
 NUMBERS = 11
@@ -59,10 +60,11 @@ class CurveImage(NamedTuple):
         spacing = spacing_mm(volume)
         directions = axes @ (volume.T_ct_index[:3, :3] / spacing)
         in_plane, normal = directions[:, :2], directions[:, 2:]
-        count = math.ceil(spacing[2] / LAYER_MM)
-        steps = ((np.arange(count) + 0.5) / count - 0.5) * spacing[2]
-        half = _half(diameter_mm, normal[:, 0])
+        half, along = _half(diameter_mm, normal[:, 0]), normal[0, 0] ** 2
         width = diameter_mm**2 / 16 * np.diag([0.0, 1.0, 1.0]) - np.outer(half, half)  # of a disc, along each axis
+        soft = np.sqrt(normal[:, 0] @ width @ normal[:, 0] + BLUR_SIGMA_MM**2 * along / max(1.0 - along, 1e-9))
+        count = math.ceil(spacing[2] / min(LAYER_MM, SOFT * soft))
+        steps = ((np.arange(count) + 0.5) / count - 0.5) * spacing[2]
         fixed = (spacing[2] / count) ** 2 / 12 * (normal @ normal.T) + width
         plane, layers = BLUR_SIGMA_MM**2 * (in_plane @ in_plane.T), steps[:, None] * normal.T
         both = np.concatenate([layers - half, layers + half])

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -42,6 +42,11 @@ from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.report import present
 from puncture_twin.twin.report.page.template import Card
 from puncture_twin.twin.report.present import Field, Section, facts, grid, number, percent, vector
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from puncture_twin.twin.report.slices.planes import Plane
 
 PAGE, PICTURE, REPORT = FILES = ("confirm.html", "confirm.png", "confirm.json")
 MAX_REPORT_BYTES = 5_000_000
@@ -346,51 +351,72 @@ WINDOW_HU = (-160.0, 240.0)
 
 def draw_confirmed(done: Confirmed, path: Path) -> Path:
     """Draw the control scan in the axial plane of the tip, along the real needle twice, and across it at its tip."""
-    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    from puncture_twin.planning.base.reasons import css
-    from puncture_twin.twin.report.figures import halo, write_png
-    from puncture_twin.twin.report.palette import SKIN, organ_colours
-    from puncture_twin.twin.report.slices.planes import letters, needle_planes, outline
+    from puncture_twin.twin.report.figures import write_png
+    from puncture_twin.twin.report.slices.planes import needle_planes
 
-    anatomy, needle = done.context.anatomy, done.needle
-    colours = organ_colours(tuple(one.name for one in anatomy.structures))
-    T_index_ct = np.linalg.inv(done.volume.T_ct_index) @ done.tie.T_scan_ct
     figure = Figure(figsize=(INCHES, INCHES), dpi=DPI)
-    rim = halo(3, "black")
-    planes = needle_planes(needle.tip_ct, -needle.forward_ct, done.line.inserted_mm)
+    planes = needle_planes(done.needle.tip_ct, -done.needle.forward_ct, done.line.inserted_mm)
     for axes, plane in zip(figure.subplots(2, 2).ravel(), planes, strict=True):
-        index = apply(T_index_ct, plane.points_ct(PIXELS)).T
-        shown = ndimage.map_coordinates(done.volume.values, index, np.float64, order=1, cval=-1024.0)
-        (x, y), half, (low, high) = plane.centre, plane.half_mm, WINDOW_HU
-        extent = (x - half, x + half, y - half, y + half)
-        axes.imshow(shown.reshape(PIXELS, PIXELS), cmap="gray", vmin=low, vmax=high, extent=extent)
-        for one in anatomy.structures:
-            lines = list(outline(one.mesh, plane))
-            axes.add_collection(LineCollection(lines, colors=css(colours[one.name]), linewidths=0.8))
-        axes.add_collection(LineCollection(list(outline(anatomy.skin.mesh, plane)), colors=css(SKIN), linewidths=0.8))
-        axes.plot(*plane.place(needle.path_ct).T, color="cyan", linewidth=0.8, label="needle as read")
-        axes.plot(*plane.place(needle.tip_ct), "x", color="cyan", path_effects=rim, label="its tip")
-        if done.plan is not None:
-            ends = np.stack([done.plan.target_ct, done.plan.entry_ct])
-            axes.plot(*plane.place(ends).T, "--", color="magenta", linewidth=0.8, label="planned line")
-        target = plane.place(done.context.case.target_ct)
-        axes.plot(*target, "+", color="#38d39f", markersize=12, path_effects=rim, label="target")
-        axes.set(xlim=extent[:2], ylim=extent[2:])
-        axes.set_title(plane.name.replace("target", "tip"), fontsize=9)
-        axes.set_xlabel("mm", fontsize=7, labelpad=1)
-        axes.tick_params(labelsize=7)
-        for at, toward in EDGES.items():
-            letter = letters(done.context.case.space, toward[0] * plane.right + toward[1] * plane.up)
-            look = {"color": "white", "ha": "center", "va": "center", "weight": "bold", "path_effects": rim}
-            axes.text(*at, letter, transform=axes.transAxes, **look)
+        _draw_scan(axes, done, plane)
+        _draw_lines(axes, done, plane)
+        _draw_frame(axes, done, plane)
     figure.tight_layout(rect=(0, 0.03, 1, 1))
     handles, named = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, named, loc="lower left", ncols=4, fontsize=8, facecolor="0.35", labelcolor="white")
     figure.text(0.99, 0.012, "research software, not a medical device", fontsize=8, color="0.4", ha="right")
     write_png(figure, path)
     return path
+
+
+def _draw_scan(axes: Axes, done: Confirmed, plane: Plane) -> None:
+    """The scan in a plane, with the outlines of the planning CT's structures carried to it."""
+    from matplotlib.collections import LineCollection
+
+    from puncture_twin.planning.base.reasons import css
+    from puncture_twin.twin.report.palette import SKIN, organ_colours
+    from puncture_twin.twin.report.slices.planes import outline
+
+    index = apply(np.linalg.inv(done.volume.T_ct_index) @ done.tie.T_scan_ct, plane.points_ct(PIXELS)).T
+    shown = ndimage.map_coordinates(done.volume.values, index, np.float64, order=1, cval=-1024.0)
+    (x, y), half, (low, high) = plane.centre, plane.half_mm, WINDOW_HU
+    extent = (x - half, x + half, y - half, y + half)
+    axes.imshow(shown.reshape(PIXELS, PIXELS), cmap="gray", vmin=low, vmax=high, extent=extent)
+    anatomy = done.context.anatomy
+    colours = organ_colours(tuple(one.name for one in anatomy.structures))
+    meshes = [*((one.mesh, colours[one.name]) for one in anatomy.structures), (anatomy.skin.mesh, SKIN)]
+    for mesh, colour in meshes:
+        axes.add_collection(LineCollection(list(outline(mesh, plane)), colors=css(colour), linewidths=0.8))
+    axes.set(xlim=extent[:2], ylim=extent[2:])
+
+
+def _draw_lines(axes: Axes, done: Confirmed, plane: Plane) -> None:
+    """The needle, the planned line and the target in a plane."""
+    from puncture_twin.twin.report.figures import halo
+
+    rim, needle = halo(3, "black"), done.needle
+    axes.plot(*plane.place(needle.path_ct).T, color="cyan", linewidth=0.8, label="needle as read")
+    axes.plot(*plane.place(needle.tip_ct), "x", color="cyan", path_effects=rim, label="its tip")
+    if done.plan is not None:
+        ends = np.stack([done.plan.target_ct, done.plan.entry_ct])
+        axes.plot(*plane.place(ends).T, "--", color="magenta", linewidth=0.8, label="planned line")
+    target = plane.place(done.context.case.target_ct)
+    axes.plot(*target, "+", color="#38d39f", markersize=12, path_effects=rim, label="target")
+
+
+def _draw_frame(axes: Axes, done: Confirmed, plane: Plane) -> None:
+    """A plane's name, its millimetres and the patient's directions at its edges."""
+    from puncture_twin.twin.report.figures import halo
+    from puncture_twin.twin.report.slices.planes import letters
+
+    axes.set_title(plane.name.replace("target", "tip"), fontsize=9)
+    axes.set_xlabel("mm", fontsize=7, labelpad=1)
+    axes.tick_params(labelsize=7)
+    for at, toward in EDGES.items():
+        letter = letters(done.context.case.space, toward[0] * plane.right + toward[1] * plane.up)
+        look = {"color": "white", "ha": "center", "va": "center", "weight": "bold", "path_effects": halo(3, "black")}
+        axes.text(*at, letter, transform=axes.transAxes, **look)
 
 
 class Learned(NamedTuple):
