@@ -66,7 +66,6 @@ class Position:
     dt = 1 / 240
 
     def act(self, measured, reference, row):
-        """Goals of the next step."""
         del measured
         return Goals(reference.q[row], reference.speed[row])
 
@@ -104,7 +103,6 @@ def bench(down=DOWN, factors=None, T_world_base=None):
 
 
 def true_tip(q):
-    """The tip of true joints."""
     return tips(UR3, TIP_M, q[None])
 
 
@@ -122,7 +120,6 @@ def follow(bench, controller, trajectory, *, settle_s=0.0, hold_s=0.5, resistanc
 
 
 def impedance(bench, K=2e4, K_i=5.0, dt=5e-4, keep=False):
-    """A spring at the tip."""
     return Impedance(bench.model, Stiffness(K, integral_per_s=K_i), dt, keep_compliance=keep)
 
 

@@ -30,13 +30,11 @@ def hand_eye_problem(rng, n, noise=None, *, motions=False, turns=None):
 
 
 def shaken(rng, T, mm, rad):
-    """Poses with normal errors."""
     n = len(T)
     return pose(T[:, :3, :3] @ exp_rotation(rng.normal(0, rad, (n, 3))), T[:, :3, 3] + rng.normal(0, mm, (n, 3)))
 
 
 def write_pairs(path, pairs):
-    """As a CSV."""
     values = np.column_stack([pose_values(pairs.A), pose_values(pairs.B)]).tolist()
     rows = [(name, *row) for name, row in zip(pairs.names, values, strict=True)]
     path.write_text(table_text(("name", *pose_columns("A"), *pose_columns("B")), rows))

@@ -47,7 +47,6 @@ def found(request):
 
 @pytest.mark.parametrize("name", BEDS)
 def test_an_insertion_puts_the_tip_on_the_target(name):
-    """By forward kinematics."""
     one = chain(name)
     flange = flange_pose(one.model, one.q_insertion)
     tip = flange[:3, 3] + one.tip_mm * flange[:3, 2]
@@ -56,7 +55,6 @@ def test_an_insertion_puts_the_tip_on_the_target(name):
 
 @pytest.mark.parametrize("name", BEDS)
 def test_squares_of_the_sources_add_up(name):
-    """Alone they make up the whole; without one, the rest."""
     one = chain(name)
     costs = source_costs(one)
     assert sum(cost.alone_mm**2 for cost in costs) == pytest.approx(one.expected_mm() ** 2)
@@ -115,7 +113,6 @@ def test_slices_as_they_are_change_nothing():
 
 
 def test_markers_are_counted_from_three_to_ten(found):
-    """All numbers but today's."""
     one, all_changes = found
     counts = [int(c.what.removeprefix("only ").split()[0]) for c in all_changes if c.group == "markers"]
     assert counts == [n for n in range(3, MOST_MARKERS + 1) if n != len(one.points_ct)]

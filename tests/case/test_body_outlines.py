@@ -101,7 +101,6 @@ def test_of_meshes_the_one_that_holds_the_others_is_the_skin(tmp_path, capfd):
 
 
 def test_of_two_skins_one_is_the_skin_and_the_other_left_out(tmp_path, capfd):
-    """Both cover the body."""
     meshes(tmp_path, External=(89.0, (0, 0, 0)), skin=(90.0, (0, 0, 0)), liver=(20.0, TARGET), aorta=(8.0, (36, 36, 0)))
     assert init(capfd, tmp_path)[0] == 0
     assert set(roles(tmp_path)) == {"liver", "aorta"}

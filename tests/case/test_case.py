@@ -54,7 +54,6 @@ def test_a_good_case_is_read(write):
 
 
 def test_a_folder_stands_for_its_case_file(write):
-    """A folder is read through its case.toml."""
     assert load_case(write().parent).name == "one"
 
 
@@ -66,7 +65,6 @@ def test_patient_space_defaults_to_the_bed_frame(write):
 
 
 def test_a_ras_case_is_turned_to_lps(write):
-    """Target and mount of a RAS case change the sign of x and y."""
     mount = "\n[robot.mount]\nposition_mm = [10, 20, 30]\nx_axis = [1, 0, 0]\nz_axis = [0, 0, 1]\n"
     case = load_case(write(('"LPS"', '"RAS"'), text=GOOD + mount))
     np.testing.assert_array_equal(case.target_ct, [-1, -2, 3])
@@ -77,7 +75,6 @@ def test_a_ras_case_is_turned_to_lps(write):
 
 
 def test_a_target_may_come_from_a_file_of_points(write, tmp_path):
-    """A name in a CSV of points, in the case's space."""
     (tmp_path / "targets.csv").write_text("name,x_mm,y_mm,z_mm\nA,4,5,6\n")
     path = write(("position_mm = [1.0, 2.0, 3.0]", 'points = "targets.csv"\nname = "A"'))
     np.testing.assert_array_equal(load_case(path).target_ct, [4, 5, 6])
@@ -128,7 +125,6 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_broken_case_is_refused_in_one_line(name, write):
-    """Each defect is named with its place and what is allowed."""
     change, message = BAD[name]
     text = GOOD.replace("theta_deg = [0, 60]", 'theta_deg = [0, 60]\nframe = "bed"') if "local" in name else GOOD
     with refused(*message.split(), "case.toml"):
@@ -162,7 +158,6 @@ def test_contradictions_with_the_robot_are_refused(added, message, write):
     ],
 )
 def test_what_is_no_case_file_is_refused(content, message, tmp_path):
-    """Garbage, half a file, nothing at all, far too much."""
     path = tmp_path / "case.toml"
     path.write_bytes(content)
     with refused(message):
@@ -176,7 +171,6 @@ def test_a_patient_of_any_alphabet_has_a_case(name, write):
 
 
 def test_a_missing_case_is_refused(tmp_path):
-    """The folder without a case.toml is named."""
     with refused("no_such_file", "case.toml"):
         load_case(tmp_path)
 

@@ -91,13 +91,11 @@ def vessel(place: tuple[int, int, int]) -> np.ndarray:
 
 
 def without_header(path: Path) -> None:
-    """Empty the header of a binary STL."""
     path.write_bytes(bytes(80) + path.read_bytes()[80:])
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A case with every kind of source."""
     here = tmp_path / "case"
     (here / "vessels").mkdir(parents=True)
     (here / "case.toml").write_text(CASE)
@@ -120,7 +118,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 def places(context: CaseContext) -> list[tuple[str, str]]:
-    """Role and path of each input."""
     return [(one.role, one.path) for one in context.case.inputs]
 
 

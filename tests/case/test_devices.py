@@ -46,13 +46,11 @@ def read(tmp_path):
 
 
 def test_a_case_without_them_declares_none(read):
-    """Neither a device nor a motion is assumed."""
     case = read("")
     assert case.stereo is case.ultrasound is case.control_scan is case.motion is None
 
 
 def test_the_defaults_are_those_of_the_reference(read):
-    """Cameras and mount are to be proposed."""
     case = read("[stereo]\n[ultrasound]\n[control_scan]")
     assert case.stereo.cameras_ct is None and case.ultrasound.T_base_ct_mount is None
     assert (case.stereo.balls_mm, case.stereo.sd_mm) == ((80.0, 160.0), 0.03)
@@ -63,7 +61,6 @@ def test_the_defaults_are_those_of_the_reference(read):
 
 
 def test_every_key_is_read(read):
-    """The mount as the robot's is."""
     case = read(EVERY_KEY)
     assert case.stereo.cameras_ct.tolist() == [[-250.0, -900.0, 300.0], [250.0, -900.0, 300.0]]
     assert (case.stereo.balls_mm, case.stereo.sd_mm) == ((60.0, 120.0, 180.0), 0.05)
@@ -78,7 +75,6 @@ def test_every_key_is_read(read):
 
 
 def test_places_of_a_ras_case_are_turned_to_lps(read):
-    """Cameras and mount turn; a variance per axis has no sign."""
     case = read(EVERY_KEY, ('space = "LPS"', 'space = "RAS"'))
     assert case.stereo.cameras_ct.tolist() == [[250.0, 900.0, 300.0], [-250.0, 900.0, 300.0]]
     assert np.linalg.inv(case.ultrasound.T_base_ct_mount)[:3, 3] == pytest.approx([600.0, -20.0, -30.0])
@@ -112,7 +108,6 @@ def test_places_of_a_ras_case_are_turned_to_lps(read):
     ],
 )
 def test_what_cannot_be_is_refused(read, old, new, code, named):
-    """In one line that names the key."""
     with refused(code, named):
         read(changed(EVERY_KEY, (old, new)))
 

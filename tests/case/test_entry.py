@@ -53,7 +53,6 @@ def test_ct_frame_of_a_ras_case_has_ras_axes():
 
 
 def test_explicit_axes_are_made_orthonormal():
-    """Explicit vectors keep z; x is turned to a right angle."""
     R = entry_frame(EntryAxes(z=(0, 0, 2), x=(1, 0, 1)), Space.LPS)
     np.testing.assert_allclose(R, np.eye(3), atol=1e-15)
 
@@ -85,7 +84,6 @@ def test_parallel_axes_are_refused(x):
 
 @pytest.mark.parametrize("length", [0.01, 1.0, 70.0])
 def test_axes_three_degrees_apart_span_a_frame(length):
-    """Badly chosen, but a frame."""
     z = (0.0, 0.0, length)
     R = entry_frame(EntryAxes(z=z, x=(-np.sin(np.radians(3)), 0, np.cos(np.radians(3)))), Space.LPS)
     np.testing.assert_allclose(R.T, [[-1, 0, 0], [0, -1, 0], [0, 0, 1]], atol=1e-12)
@@ -179,7 +177,6 @@ def test_grid_counts_every_cell_once():
 
 
 def test_grid_of_a_partial_range_keeps_both_ends():
-    """A range that is no full circle keeps its last azimuth."""
     found = grid((0.1, 0.1), (0, np.radians(90)), np.radians(30), np.eye(3))
     np.testing.assert_allclose(np.degrees(found.beta), [0, 30, 60, 90], atol=1e-9)
 

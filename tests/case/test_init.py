@@ -38,7 +38,6 @@ def labels():
 
 
 def write_masks(folder):
-    """A mask an organ, and an empty one."""
     folder.mkdir(exist_ok=True)
     for name, (middle, radius) in ORGANS.items():
         write_mask(folder / f"{name}.nii.gz", inside(middle, radius))
@@ -280,7 +279,6 @@ def test_no_path_through_what_nobody_knows_is_safe(tmp_path, capfd, name):
 
 
 def test_the_case_says_how_to_change_it(tmp_path, capfd):
-    """The line beside the name, followed, opens the paths."""
     around_the_lesion(tmp_path, "AAA")
     assert init(capfd, tmp_path, "--target", TARGET)[0] == 0
     path = tmp_path / "case.toml"
@@ -294,7 +292,6 @@ def test_the_case_says_how_to_change_it(tmp_path, capfd):
 
 
 def test_in_a_folder_of_masks_it_is_a_table_of_its_own(tmp_path, capfd):
-    """``[structures.unknown]``, with the same line."""
     around_the_lesion(tmp_path, "AAA")
     (tmp_path / "seg").mkdir()
     for one in ("AAA", "aorta", "lung tumor", "odd thing", "spleen"):
@@ -350,7 +347,6 @@ SPOILED = {
 
 @pytest.mark.parametrize("kind", sorted(SPOILED))
 def test_a_mask_that_is_none_is_no_structure_left_out(tmp_path, capfd, kind):
-    """It was left out with a note, and its vessel was free."""
     write_ct(tmp_path / "scan.nii.gz")
     write_masks(tmp_path / "seg")
     write_image(tmp_path / "seg" / "vein.nii.gz", SPOILED[kind]())
@@ -375,7 +371,6 @@ def test_a_mask_in_another_format_is_not_passed_over(tmp_path, capfd, ending):
 
 
 def test_tables_that_contradict_each_other_are_not_guessed(tmp_path, capfd):
-    """The first by name was taken: its aorta was fat."""
     write_ct(tmp_path / "scan.nii.gz")
     write_image(tmp_path / "map.nii.gz", labels())
     (tmp_path / "a.csv").write_text("id,name\n1,muscle\n2,torso_fat\n3,rib_left_7\n")
@@ -423,7 +418,6 @@ def test_a_target_in_no_structure_is_a_ball_of_its_own(tmp_path, capfd):
 
 
 def test_a_case_that_is_there_is_kept(tmp_path, capfd):
-    """Unless --force; and a start that fails leaves what is there."""
     write_ct(tmp_path / "scan.nii.gz")
     write_masks(tmp_path / "seg")
     (tmp_path / "case.toml").write_text("mine")
@@ -449,7 +443,6 @@ def test_a_case_that_is_there_is_kept(tmp_path, capfd):
     ],
 )
 def test_what_cannot_be_a_target_is_refused_in_one_line(tmp_path, capfd, words, match):
-    """With what is allowed, and nothing written."""
     write_ct(tmp_path / "scan.nii.gz")
     write_masks(tmp_path / "seg")
     code, out, said = init(capfd, tmp_path, *words)
@@ -478,7 +471,6 @@ def test_all_that_is_wrong_is_said_at_once(tmp_path, capfd):
 
 @pytest.mark.parametrize(("write", "missing"), [(write_ct, "no segmentation"), (write_seg_nrrd, "no CT in Hounsfield")])
 def test_a_folder_without_a_half_is_refused(tmp_path, capfd, write, missing):
-    """A CT alone, a segmentation alone, no folder at all."""
     write(tmp_path / "one.seg.nrrd")
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert (code, len(said)) == (2, 1) and missing in said[0], said

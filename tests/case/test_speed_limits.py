@@ -30,7 +30,6 @@ def test_the_default_is_reduced_speed(carton):
 
 
 def test_the_keys_are_read(carton):
-    """All four."""
     lines = ["tip_speed_mm_s = 100", "insertion_speed_mm_s = 5", "joint_speed_fraction = 0.2"]
     assert carton(*lines, "joint_acceleration_fraction = 0.3").robot.speeds == SpeedLimits(100.0, 5.0, 0.2, 0.3)
 
@@ -47,6 +46,5 @@ def test_the_keys_are_read(carton):
     ],
 )
 def test_what_is_no_limit_is_refused(carton, lines):
-    """The key is named."""
     with refused("out_of_range" if len(lines) > 1 else "bad_value", lines[0].split()[0]):
         carton(*lines)

@@ -33,7 +33,6 @@ def run(capsys, *arguments):
 
 
 def write(path, *lines):
-    """A file of lines."""
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -132,7 +131,6 @@ def test_a_line_that_is_none_is_named_and_nothing_is_written(context, tmp_path, 
     ],
 )
 def test_what_does_not_go_together_is_refused(context, arguments, capsys):
-    """Before anything is read."""
     refused_command(["check", context.case.path, *arguments], capsys, "conflicting_options")
 
 

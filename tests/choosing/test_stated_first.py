@@ -43,7 +43,6 @@ def unsearched(monkeypatch):
 
 @pytest.mark.parametrize("job", [main_job.plan_case, main_job.rehearse_case], ids=["plan", "rehearse"])
 def test_a_rejected_direction_is_told_at_once_and_an_older_plan_goes(job, context, rejected, unsearched, tmp_path):
-    """Nobody takes the plan of another direction for the answer."""
     with writing(tmp_path, "plan") as draft:
         (draft.folder / "plan.json").write_text("{}")
     with refused("direction_rejected", by=NoAnswerError):
@@ -53,7 +52,6 @@ def test_a_rejected_direction_is_told_at_once_and_an_older_plan_goes(job, contex
 
 
 def test_an_entry_off_the_skin_is_told_at_once_and_the_old_set_stays(context, unsearched, tmp_path):
-    """Bad input changes nothing."""
     with writing(tmp_path, "plan") as draft:
         (draft.folder / "plan.json").write_text("{}")
     with refused("entry_elsewhere"):

@@ -17,7 +17,6 @@ from tests.oracles import point_triangle_distance
 
 
 def of(mesh, skin, tolerance=0.01):
-    """The one structure's answer."""
     return inside_skin([mesh], skin, np.array([tolerance]))[0]
 
 
@@ -33,7 +32,6 @@ def with_structure(context, structure):
 
 
 def joined(one, other):
-    """Two surfaces as one."""
     vertices = np.concatenate([one.vertices, other.vertices])
     return TriangleMesh(vertices, np.concatenate([one.faces, other.faces + len(one.vertices)]))
 
@@ -99,7 +97,6 @@ def test_nearness_is_exact(ball, box, rng):
 
 @pytest.mark.parametrize("name", ["abdomen", "carton/case_m.toml", "carton/case_h.toml"])
 def test_the_embedded_cases_lie_inside_their_skin(name):
-    """No structure of an embedded case is warned about."""
     context = prepare(folder() / name, arm=False)
     assert not [w for w in findings(context.case, context.anatomy, None) if "outside the skin" in w.sentence]
 
@@ -131,7 +128,6 @@ def test_a_tenth_outside_is_refused(carton, ball):
 
 
 def test_an_open_skin_has_no_inside(carton):
-    """How much lies inside is not known then, and that is said once."""
     mesh = carton.anatomy.skin.mesh
     skin = skin_from_mesh(TriangleMesh(mesh.vertices, mesh.faces[:-3]))
     found = findings(carton.case, replace(carton.anatomy, skin=skin), None)

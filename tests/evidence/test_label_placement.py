@@ -132,7 +132,6 @@ def test_what_edges_cannot_tell_is_said():
 
 
 def test_surfaces_beside_the_image_are_not_said_to_fit():
-    """Nothing of them is seen, so nothing is excluded."""
     patient = PHANTOMS["trunk"]
     far = {n: mesh.transformed(moved(2000.0)) for n, mesh in meshes_of(patient).items()}
     found = assess(edge_image(patient.hu, patient.T), source_of(patient, far))

@@ -27,7 +27,6 @@ def mirrored(context, axis):
 
 
 def test_organs_in_order_say_nothing(trunk):
-    """Liver on the right, kidneys by their names, the spine behind."""
     assert list(order_of_organs(trunk.case, trunk.anatomy)) == []
 
 

@@ -8,7 +8,6 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, smooth_normals, s
 
 
 def both_ways(faces, rng):
-    """Every triangle twice."""
     return np.concatenate([faces, faces[:, ::-1]])
 
 

@@ -22,12 +22,10 @@ FULL = grid((0, np.pi), (0, 2 * np.pi), np.radians(7.3), np.eye(3)).outward_ct
 
 
 def by_ray(found, count):
-    """Depths as one list per ray."""
     return [found.depth[found.ray == row].tolist() for row in range(count)]
 
 
 def soup(rng, count, spread, size):
-    """Unconnected random triangles."""
     centers = rng.normal(0, spread, (count, 1, 3))
     return TriangleMesh(
         (centers + rng.normal(0, size, (count, 3, 3))).reshape(-1, 3), np.arange(3 * count).reshape(-1, 3)
@@ -64,7 +62,6 @@ def test_a_ray_crosses_the_same_among_few_and_among_many(rng, spread, size):
 
 
 def test_no_ray_has_no_crossings(ball):
-    """An empty answer, not an error."""
     found = crossings(ball(10.0), np.zeros(3), np.zeros((0, 3)))
     assert [len(one) for one in (found.ray, found.depth, found.face, found.count, found.first)] == [0] * 5
 
@@ -106,7 +103,6 @@ def test_a_length_leaves_out_what_lies_beyond_and_nothing_else(rng, spread, size
 
 
 def test_first_crossing_is_the_nearest(ball):
-    """Of two nested spheres the inner one is first."""
     both = TriangleMesh(
         np.concatenate([ball(50).vertices, ball(20).vertices]),
         np.concatenate([ball(50).faces, ball(20).faces + len(ball(50).vertices)]),
@@ -116,7 +112,6 @@ def test_first_crossing_is_the_nearest(ball):
 
 @pytest.mark.parametrize("flip", [False, True])
 def test_inside_and_outside(ball, flip):
-    """The winding number tells the side for both orientations."""
     mesh = ball(50)
     mesh = TriangleMesh(mesh.vertices, mesh.faces[:, ::-1]) if flip else mesh
     assert side_of(mesh, np.array([49.0, 0, 0])) is Side.INSIDE

@@ -30,18 +30,15 @@ HEAVY = ("numba", "pybullet", "matplotlib", "trimesh", "scipy", "ompl", "fcl", "
 
 @pytest.fixture(scope="module")
 def context():
-    """The carton, organs alone."""
     return pt.prepare(folder() / "carton" / "case_m.toml", arm=False)
 
 
 @pytest.fixture(scope="module")
 def candidates(context):
-    """All of its directions."""
     return pt.search(context)
 
 
 def test_every_name_is_there_with_a_docstring():
-    """And the list is short enough to be read."""
     assert 24 <= len(pt.__all__) <= 40
     for name in pt.__all__:
         assert getattr(pt, name).__doc__, name
@@ -76,7 +73,6 @@ def test_what_it_returns_prints_as_one_line(context, candidates):
 
 
 def test_a_value_that_is_half_made_still_prints():
-    """A debugger must not fail over it."""
     half = object.__new__(TriangleMesh)
     assert "TriangleMesh object at" in repr(half)
 
@@ -92,7 +88,6 @@ def test_rerank_orders_the_safe_ones_alone(candidates):
 
 @pytest.mark.parametrize("cost", [np.zeros(3), "nan", "complex"], ids=["another shape", "not a number", "complex"])
 def test_rerank_refuses_a_cost_that_orders_nothing(candidates, cost):
-    """One line that says what is allowed."""
     if isinstance(cost, str):
         cost = np.full(len(candidates), np.nan if cost == "nan" else 1.0 + 2.0j)
     with refused("wrong_type" if cost.dtype.kind == "c" else "wrong_shape"):
@@ -112,7 +107,6 @@ def test_register_takes_two_lists_and_no_case():
 
 
 def test_register_refuses_a_method_that_is_none():
-    """It is not taken for another one."""
     good = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
     with refused("unknown_method", "magic"):
         pt.register(good, good, target_ct=(0, 0, 0), method="magic")
@@ -153,7 +147,6 @@ def test_check_refuses_an_angle_outside_of_its_range(context, angles):
     ("target", "code"), [((0, 0), "wrong_shape"), ((0, 0, float("nan")), "not_finite"), ("abc", "wrong_type")]
 )
 def test_register_refuses_a_target_that_is_no_point(target, code):
-    """One line that names the target, not NumPy's complaint."""
     markers = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
     with refused(code, "target"):
         pt.register(markers, markers, target_ct=target, fle_mm=0.5)
@@ -212,14 +205,12 @@ def test_a_case_with_other_values_is_what_a_file_with_them_is(case_text, tmp_pat
     ],
 )
 def test_a_value_that_no_case_file_could_have_is_refused(options, code):
-    """By the rules of the file itself."""
     case = pt.load_case(folder() / "carton" / "case_m.toml")
     with refused(code):
         case.replace(**options)
 
 
 def test_a_case_is_prepared_as_often_as_one_likes(tmp_path):
-    """What it let go of is read again: a CT and its labels too."""
     case = pt.load_case(write_case(tmp_path))
     one, other = (pt.search(pt.prepare(case, arm=False)) for _ in range(2))
     assert same_candidates(one, other)
@@ -227,7 +218,6 @@ def test_a_case_is_prepared_as_often_as_one_likes(tmp_path):
 
 
 def test_a_case_whose_files_have_changed_is_not_made_into_another(tmp_path):
-    """It would be one half of each."""
     shutil.copytree(folder() / "carton", tmp_path / "carton")
     case = pt.load_case(tmp_path / "carton" / "case_m.toml")
     case.files.release()
@@ -323,7 +313,6 @@ def test_two_choices_or_an_arm_that_is_switched_off_are_refused(arm_context, rea
 
 
 def test_a_context_goes_to_other_processes_and_is_used_by_threads(arm_context, reached):
-    """Each gives what this process gives, the arm's answer too."""
     parts = np.array_split(np.random.default_rng(1).permutation(len(reached))[:16], 4)
     angles = [(reached.theta_deg[rows], reached.beta_deg[rows]) for rows in parts]
     expected = [pt.check_many(arm_context, *one) for one in angles]
@@ -359,7 +348,6 @@ def test_windows_and_the_best_are_the_searchs(candidates):
 
 
 def test_the_map_is_a_picture(candidates, tmp_path):
-    """For a notebook, and as a file."""
     shown = candidates.plot_map()
     assert "<img" in shown._repr_html_()
     with Image.open(shown.write(tmp_path / "map.png")) as picture:
@@ -453,7 +441,6 @@ def test_what_is_planned_is_checked_anew(arm_context, reached):
 
 
 def test_a_plan_of_another_case_is_neither_rehearsed_nor_shown(arm_context, reached, tmp_path):
-    """And one of another seed is: it is what `plan` was asked for."""
     case = arm_context.case
     plan = pt.plan(arm_context, reached, seed=3)
     other = pt.prepare(case.replace(target_ct=case.target_ct + (0.4, 0.0, 0.0)))
@@ -497,7 +484,6 @@ def test_masked_values_are_no_numbers(context):
 
 
 def test_an_option_without_keys_is_refused():
-    """It changed nothing, and said nothing."""
     case = pt.load_case(folder() / "abdomen")
     for options in ({"mount": {}}, {"needle": {"diameter_mm": 1.0}, "search": {}}):
         with refused("empty"):

@@ -45,7 +45,6 @@ def test_a_wrong_number_does_not_hold(monkeypatch):
     ],
 )
 def test_our_tables_are_the_papers(file, table):
-    """The constants equal the independently transcribed CSV."""
     with (DATA / file).open() as stream:
         rows = {row["name"]: tuple(float(row[f"{axis}_mm"]) for axis in "xyz") for row in csv.DictReader(stream)}
     assert rows == dict(table)

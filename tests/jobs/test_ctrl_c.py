@@ -91,7 +91,6 @@ def interrupted(seconds, arguments, out):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_one_line_130_and_nothing_half_written(command, typed, tmp_path):
-    """No traceback, no file, and no folder that was not there."""
     out = tmp_path / "out"
     where = ["--out", str(out)] if command in WRITING else []
     done = interrupted(0.3 if command in QUICK else 1.0, [command, *typed[command], *where], out)

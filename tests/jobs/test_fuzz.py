@@ -52,7 +52,6 @@ def test_a_case_that_lost_a_structure_is_noticed(fuzzer):
 
 
 def test_a_run_is_decided_by_its_number(fuzzer):
-    """A run that failed can be repeated."""
     fuzzer.run(7)
     first = fuzzer.last
     fuzzer.run(8)

@@ -125,7 +125,6 @@ def kills(command, entry, arguments, tells, out):
 
 @pytest.mark.parametrize("command", ["search", pytest.param("plan", marks=needs_time)])
 def test_a_command_killed_at_random(command, world, tmp_path):
-    """The whole command, as it is typed."""
     cases = world[1]
     options = ["--no-arm"] if command == "search" else []
     kills(command, command, [[command, case, *options] for case in cases], [sha256(c) for c in cases], tmp_path / "out")
@@ -141,7 +140,6 @@ def test_search_killed_between_a_large_set_and_a_small_one(world, tmp_path):
 
 @needs_time
 def test_rehearse_killed_at_random(world, plans, tmp_path):
-    """Of a plan from another folder."""
     cases = world[1]
     runs = [["rehearse", plan, "--case", case] for plan, case in zip(plans, cases, strict=True)]
     kills("rehearse", "rehearse", runs, [sha256(plan) for plan in plans], tmp_path / "out")
@@ -149,7 +147,6 @@ def test_rehearse_killed_at_random(world, plans, tmp_path):
 
 @needs_time
 def test_export_killed_at_random(plans, tmp_path):
-    """The same."""
     runs = [["export", plan, "--format", "csv"] for plan in plans]
     kills("export", "export plan.csv", runs, [sha256(plan) for plan in plans], tmp_path / "out")
 
@@ -166,14 +163,12 @@ def test_export_killed_at_random(plans, tmp_path):
     ],
 )
 def test_the_experiment_killed_at_random(command, words, world, tmp_path):
-    """Each of its commands on both cases in turn, into one folder."""
     runs = [[words[0], case, *words[1:]] for case in world[1]]
     kills(command, command, runs, [sha256(case) for case in world[1]], tmp_path / "out")
 
 
 @needs_time
 def test_place_killed_at_random(tmp_path):
-    """The abdomen with few places to stand."""
     cases = []
     for name, step in (("a", "15.0"), ("b", "18.0")):
         shutil.copytree(folder() / "abdomen", tmp_path / name)
@@ -191,7 +186,6 @@ def test_place_killed_at_random(tmp_path):
 
 @needs_time
 def test_servo_killed_at_random(tmp_path):
-    """The embedded head, with two seeds."""
     cases = []
     for name in ("a", "b"):
         shutil.copytree(folder() / "head", tmp_path / name)
@@ -235,7 +229,6 @@ def test_reproduce_killed_at_random(tmp_path):
 
 @needs_time
 def test_selfcal_killed_at_random(tmp_path):
-    """Simulated, small; the seed tells the runs apart."""
     cases = []
     for seed in (3, 4):
         case = tmp_path / str(seed) / "selfcal.toml"

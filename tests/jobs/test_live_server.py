@@ -33,7 +33,6 @@ class Slow:
         """Nothing is kept."""
 
     def subject(self, header):
-        """By name."""
         return {"Query": "status", "Target": "target", "Needle": "needle"}.get(header.name)
 
     def begin(self):
@@ -43,7 +42,6 @@ class Slow:
         """None is known."""
 
     def answers(self, question):
-        """After a while."""
         if question.message is None:
             raise question.fault
         self.begun.append((question.client, question.subject, question.stamp.fraction))
@@ -54,7 +52,6 @@ class Slow:
         yield Answer("Told", packed("STRING", "Told", question.stamp, content))
 
     def refused(self, subject, stamp, error):
-        """Its code."""
         content = text_content(json.dumps({"subject": subject, "code": error.code}))
         yield Answer("Refused", packed("STRING", "Refused", stamp, content))
 
@@ -83,12 +80,10 @@ class Running:
         return accepted
 
     def run(self):
-        """Until it is stopped."""
         with pytest.raises(KeyboardInterrupt):
             serve(self, self.planner, self.pose_s)
 
     def stop(self):
-        """End, and wait for it."""
         self.ends = True
         with suppress(OSError):
             socket.create_connection(("127.0.0.1", self.port), 1.0).close()  # it wakes
@@ -289,7 +284,6 @@ def test_a_client_that_reads_nothing_is_let_go_and_takes_little_memory(running):
 
 
 def test_one_client_too_many_is_not_heard_and_a_place_is_free_again(running):
-    """The others go on."""
     talks = [Talk(running.port) for _ in range(server.MOST_CLIENTS)]
     for talk in talks:
         talk.send("STRING", "Query", text("x"))
@@ -410,7 +404,6 @@ def test_a_flood_of_others_does_not_hide_that_a_tracker_stopped():
 
 
 def test_a_log_that_many_write_to_stays_short(running, caplog):
-    """Fifty connections of noise: no more lines than the limit."""
     with caplog.at_level(logging.WARNING, logger=server.__name__):
         for _ in range(50):
             with Talk(running.port) as talk:
@@ -420,7 +413,6 @@ def test_a_log_that_many_write_to_stays_short(running, caplog):
 
 
 def test_a_name_cannot_write_lines_of_its_own_into_the_log(running, caplog):
-    """Nor colour a terminal."""
     with caplog.at_level(logging.WARNING, logger=server.__name__), Talk(running.port) as talk:
         talk.send("IMAGE", "\x1b[31m\nlive: client\x07", b"")
         assert talk.receive().document["code"] == "unknown_message"
@@ -440,7 +432,6 @@ def test_the_port_is_free_after_the_end():
 
 
 def test_an_address_that_is_not_loopback_is_warned_of(caplog):
-    """And none that is."""
     with caplog.at_level(logging.WARNING, logger=server.__name__):
         bound("127.0.0.1", 0).close()
         bound("localhost", 0).close()
@@ -453,7 +444,6 @@ def test_an_address_that_is_not_loopback_is_warned_of(caplog):
 
 
 def test_questions_take_turns_and_a_target_comes_before_a_needle():
-    """Of two clients, whatever each has sent in which order."""
     exchange = Exchange()
     stamp = (1, 0, 0, 0)
     for client in (1, 2):
@@ -471,7 +461,6 @@ def test_questions_take_turns_and_a_target_comes_before_a_needle():
 
 
 def test_an_answer_too_long_for_a_text_is_refused():
-    """Its length has two bytes."""
     assert len(text_content("x" * 65_535)) == 65_539
     with pytest.raises(InputError):
         text_content("x" * 65_536)

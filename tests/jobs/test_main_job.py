@@ -45,7 +45,6 @@ def run(capfd, *arguments):
 
 
 def test_a_demo_without_the_simulator_plans(carton, tmp_path, monkeypatch, capfd):
-    """It says what it leaves out, and writes what a plan writes."""
     monkeypatch.setattr(errors, "find_spec", lambda name: None if name == "pybullet" else name)
     with prepared(carton) as context:
         run = demo_case(context, tmp_path)
@@ -55,7 +54,6 @@ def test_a_demo_without_the_simulator_plans(carton, tmp_path, monkeypatch, capfd
 
 
 def test_a_rehearsal_writes_every_file(rehearsed):
-    """Table, map, scene, plan, film, numbers and page."""
     names = {
         "candidates.parquet",
         "map.png",
@@ -73,7 +71,6 @@ def test_a_rehearsal_writes_every_file(rehearsed):
 
 
 def test_the_page_says_where_the_needle_enters_as_check_does(carton, rehearsed, capfd):
-    """The same words, from the nearest marker."""
     plan = json.loads((rehearsed / "plan.json").read_text())
     code, told = run(capfd, "check", carton, "--theta", plan["theta_deg"], "--beta", plan["beta_deg"], "--no-arm")
     words = told["entry_from"]["text"]
@@ -204,7 +201,6 @@ def test_a_plan_whose_marker_file_changed_is_refused(carton, rehearsed, tmp_path
 
 
 def test_search_prints_counts_and_writes_the_table(carton, tmp_path, capfd):
-    """The JSON's counts are the table's."""
     code, found = run(capfd, "search", carton, "--no-arm", "--out", tmp_path)
     assert code == OK
     verdicts = pq.read_table(tmp_path / "candidates.parquet")["verdict"].to_pylist()
@@ -330,7 +326,6 @@ def test_an_arm_that_was_switched_off_is_named(carton, capfd):
 
 @pytest.mark.parametrize("command", [["search"], ["check", "--theta", "0", "--beta", "0"]])
 def test_an_arm_that_is_asked_for_must_have_a_base(without_base, command, capfd):
-    """--arm typed for a case without a base: bad input, one line."""
     refused_command([*command, without_base, "--arm"], capfd, "no_base")
 
 
@@ -357,7 +352,6 @@ def test_a_folder_that_only_looks_writable_is_refused(carton, capfd):
 
 
 def test_a_bug_is_exit_code_3(monkeypatch, capfd):
-    """What nobody foresaw shows its traceback and the third code."""
     monkeypatch.setattr("puncture_twin.twin.jobs.papers.papers.PAPERS", {"chen2019": lambda *_: 1 / 0})
     assert main(["reproduce", "chen2019"]) == PROGRAM_FAILED
     assert "ZeroDivisionError" in capfd.readouterr().err

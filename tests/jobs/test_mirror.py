@@ -46,16 +46,13 @@ class FakeArm:
         self.time = 100.0
 
     def getActualQ(self):  # noqa: N802
-        """The next joint angles."""
         return self.rows.pop(0)
 
     def getTimestamp(self):  # noqa: N802
-        """Half a second later each time."""
         self.time += 0.5
         return self.time
 
     def isConnected(self):  # noqa: N802
-        """It is."""
         return True
 
 
@@ -93,7 +90,6 @@ def test_a_live_arm_is_read_until_its_time_is_over(drive):
 
 @pytest.mark.parametrize("rows", [[[0.0] * 5], [[0.0] * 5 + [np.nan]]])
 def test_joint_angles_that_are_none_are_refused(rows):
-    """Five of them, or one that is no number."""
     with refused("joints"):
         next(rtde.live_states(FakeArm(rows), period_s=0.0, seconds=None))
 
@@ -106,15 +102,12 @@ class SilentArm(FakeArm):
         self.connected = connected
 
     def getActualQ(self):  # noqa: N802
-        """Always the same."""
         return [0.0] * 6
 
     def getTimestamp(self):  # noqa: N802
-        """Always the same."""
         return 7.5
 
     def isConnected(self):  # noqa: N802
-        """As told."""
         return self.connected
 
 
@@ -171,7 +164,6 @@ def test_a_controller_is_mirrored_as_its_recording_is(rows, tmp_path, capfd):
 @needs_the_extra
 @pytest.mark.parametrize(("order", "match"), [("hang up", "robot_silent"), ("hang", "robot_silent")])
 def test_a_controller_that_stops_ends_the_mirror(rows, order, match):
-    """Whether it closes the line or leaves it open."""
     with rtde_server(HOST, rows) as controller:
         states = rtde.live_states(rtde.connect(HOST), period_s=0.02, seconds=None)
         assert len(list(itertools.islice(states, 3))) == 3
@@ -216,7 +208,6 @@ def test_a_recording_is_mirrored(drive, tmp_path, capsys):
     ],
 )
 def test_recordings_that_cannot_be_read_are_refused(tmp_path, text, match):
-    """By column, by row, by file."""
     path = tmp_path / "joints.csv"
     path.write_text(text)
     with refused(*match.split()):
@@ -251,7 +242,6 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch, capsys):
 
 
 def test_one_arm_at_a_time(capsys):
-    """A host or a recording."""
     refused_command(["mirror", "--case", ABDOMEN], capsys, "conflicting_options")
 
 
@@ -266,7 +256,6 @@ class PushedArm(FakeArm):
     """Reads like an arm that moves from row to row, a hundredth of a second each, and stays at the last."""
 
     def getActualQ(self):  # noqa: N802
-        """The next, or the last again."""
         return self.rows.pop(0) if len(self.rows) > 1 else self.rows[0]
 
     def getTimestamp(self):  # noqa: N802
@@ -289,7 +278,6 @@ def test_a_led_arm_is_read_at_rest():
 
 
 def test_an_arm_that_nobody_leads_is_not_waited_for_without_end(monkeypatch):
-    """It rests elsewhere, or never, until its time is over."""
     monkeypatch.setattr(rtde, "LED_S", 3.0)
     for rows in ([np.zeros(6)], np.linspace(0.0, 5.0, 400)[:, None] * np.ones(6)):
         with pytest.raises(NoAnswerError) as error:
@@ -346,7 +334,6 @@ class AtMarkers:
         self.q = list(q)
 
     def measured_jp(self):
-        """The next."""
         return self.q.pop(0)
 
 

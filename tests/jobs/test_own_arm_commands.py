@@ -96,20 +96,17 @@ def test_the_markers_are_touched(folder, tmp_path, capfd):
 
 
 def test_the_needle_turns_about_the_target(folder, tmp_path, capfd):
-    """A sweep keeps its virtual tip in place."""
     told = answer(capfd, "rehearse", folder, "--sweep", "--out", tmp_path)
     assert (tmp_path / "sweep.json").is_file() and not told["contacts"] and told["off_point_max_mm"] < 0.1
     assert told["reached_deg"] == pytest.approx(told["wanted_deg"])
 
 
 def test_a_scan_shows_the_patient(folder, tmp_path, capfd):
-    """The command and its files; the arm stands outside of the bore."""
     answer(capfd, "scan", folder, "--out", tmp_path, "--spacing", "4", "--pixel", "2")
     assert (tmp_path / "markers_ct.csv").is_file() and (tmp_path / "dicom").is_dir()
 
 
 def test_slicer_gets_the_robots_place(folder, tmp_path, capfd):
-    """From base to CT, by the markers."""
     answer(capfd, "export", folder, "--format", "slicer", "--out", tmp_path)
     numbers = re.search(r"\nParameters: (.+)", (tmp_path / "ct_to_robot.tfm").read_text()).group(1).split()
     expected = np.linalg.inv(T_BASE_CT)
@@ -117,7 +114,6 @@ def test_slicer_gets_the_robots_place(folder, tmp_path, capfd):
 
 
 def in_text(file, old, new):
-    """A change of a text."""
 
     def change(folder):
         text = (folder / file).read_text()
@@ -128,7 +124,6 @@ def in_text(file, old, new):
 
 
 def with_bytes(file, data):
-    """Another file."""
     return lambda folder: (folder / file).write_bytes(data)
 
 

@@ -82,7 +82,6 @@ def test_moveit_is_given_the_urdfs_names_and_the_tool(folder, said):
 
 
 def test_a_plan_is_refused_once_a_mesh_has_changed(folder, said, capsys):
-    """Of the arm or of the tool; the line names the file."""
     mesh = folder / "my-case/arm/ulna.stl"
     before = mesh.read_bytes()
     try:

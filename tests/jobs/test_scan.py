@@ -59,7 +59,6 @@ def test_true_places_are_drawn_in_their_cells(carton):
 
 
 def test_the_labels_lie_where_the_series_lies(carton):
-    """And the labelled bolt is of metal."""
     out, _ = carton
     ct, labels = read_volume(out / "ct.nii.gz"), read_volume(out / "labels.nii.gz")
     assert np.array_equal(ct.T_ct_index, labels.T_ct_index)
@@ -114,7 +113,6 @@ def test_what_cannot_be_scanned_is_refused_and_leaves_nothing(arguments, said, t
 
 
 def test_what_a_structure_is_made_of_can_be_stated(tmp_path):
-    """``hu`` of a structure; a bolt of wood is no metal."""
     assert main(["scan", str(of_wood(tmp_path)), "--out", str(tmp_path / "ct"), *COARSE]) == 0
     ct, labels = read_volume(tmp_path / "ct" / "ct.nii.gz"), read_volume(tmp_path / "ct" / "labels.nii.gz")
     assert -430 < np.median(ct.values[labels.values == 3]) < -250  # 8 mm wide in slices of 5 mm

@@ -92,7 +92,6 @@ def test_frames_of_a_seg_that_lie_elsewhere_are_refused(made, capsys):
 
 @pytest.mark.parametrize("name", ["trunk", *READ])
 def test_what_is_right_is_read(made, name):
-    """And one direction gets an answer."""
     folder = made(name)
     assert main(init(folder, T1)) == 0
     assert main(["check", str(folder), "--no-arm", "--theta", "40", "--beta", "90"]) in (0, 1)
@@ -100,13 +99,11 @@ def test_what_is_right_is_read(made, name):
 
 @pytest.mark.parametrize("name", ["mask_npz", "mask_part", "mask_zst", "mask_subfolder"])
 def test_a_mask_that_is_not_read_is_named(made, capsys, name):
-    """The vessel in the path was passed over in silence."""
     command = ["check", made(name), "--no-arm", "--theta", "0", "--beta", "0"]
     refused_command(command, capsys, "entries_not_read", "vessel")
 
 
 def test_what_a_device_cannot_read_is_refused(made, capsys):
-    """Degrees under rad, radians under deg."""
     joints = made("joints_in_degrees") / "joints.csv"
     assert main(["mirror", "--case", "meshes/abdomen", "--from", str(joints)]) == 2
     assert main(["plan", str(made("home_in_radians")), "--theta", "0", "--beta", "0"]) == 2
@@ -131,7 +128,6 @@ def test_a_scale_between_two_lists_is_named(made, capsys):
 @pytest.mark.parametrize("shape", ["cylinder", "box", "trunk"])
 @pytest.mark.parametrize("table", ["", "_table"], ids=["in air", "on a table"])
 def test_a_phantom_is_as_safe_as_geometry_says(made, shape, table):
-    """Every row of its truth; no limb, and the table is no body."""
     folder = made(f"lab_{shape}{table}")
     prepared = prepare(folder, arm=False)
     found = prepared.search()
@@ -148,7 +144,6 @@ def test_a_phantom_is_as_safe_as_geometry_says(made, shape, table):
 
 
 def test_no_part_of_a_real_chest_is_a_limb(made):
-    """Shoulder blades and collar bones without a label."""
     prepared = prepare(made("chest_ct4"), arm=False)
     assert "attached_limb" not in {one.name for one in prepared.anatomy.checked}
     assert prepared.search().safe.sum() >= 1346

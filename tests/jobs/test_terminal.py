@@ -140,12 +140,10 @@ def run_as_installed(environment):
     ],
 )
 def test_a_folder_is_named_after_case_and_command(source, name):
-    """Two cases never share one."""
     assert default_out(Path(source), "search") == Path("out") / name
 
 
 def test_a_search_writes_there_without_out(tmp_path, monkeypatch, capsys):
-    """And nothing beside it."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "carton").symlink_to(CARTON.parent)
     case = tmp_path / "coarse.toml"

@@ -29,7 +29,6 @@ def said_by(command):
 
 
 def test_the_page_has_a_command_for_each_of_its_sections():
-    """All of them are known here."""
     assert len(COMMANDS) == 7
     assert {said_by(command) for command in COMMANDS} == set(SAID.values())
 

@@ -180,7 +180,6 @@ def test_a_plan_is_rehearsed_in_steps(plan):
     ],
 )
 def test_a_list_is_refused_in_one_line(tmp_path, capfd, guidance, seeds, code, named):
-    """Unknown ways, one twice, no trials; nothing is written."""
     case = ball(tmp_path, errors="touch_mm = 0.2\n")
     counted = [] if seeds is None else ["--seeds", seeds]
     command = ["rehearse", case, "--guidance", guidance, *counted, "--out", tmp_path / "out"]

@@ -64,7 +64,6 @@ def wall() -> Box:
 
 
 def floor() -> Box:
-    """The table that the arm stands on."""
     T = np.eye(4)
     T[2, 3] = -60.0
     return Box("table", T, (2000.0, 2000.0, 100.0))
@@ -102,7 +101,6 @@ KINDS = pytest.mark.parametrize("kind", [CellChecker, FastChecker])
 
 @KINDS
 def test_a_free_way_is_straight(kind: type[CellChecker]) -> None:
-    """With nothing between, home and goal are all there is."""
     checker = built(kind, UR3, TOOL, [floor()])
     path = plan_approach(checker, LEFT, RIGHT, seed=1)
     assert len(path.waypoints) == 2 and path.attempts == 1
@@ -209,7 +207,6 @@ def test_of_several_goals_the_cheapest_that_is_reached_is_taken() -> None:
 
 
 def test_home_is_a_goal_too() -> None:
-    """Where home is the goal the path stays there."""
     path = plan_approach(CellChecker(UR3, TOOL), LEFT, LEFT, seed=1)
     assert path.trajectory.duration_s == 0.0 and np.array_equal(path.waypoints, np.stack([LEFT, LEFT]))
 
@@ -410,7 +407,6 @@ def test_a_smooth_drive_keeps_the_tips_speed_and_the_joints_limits(tip_speed: fl
 
 
 def test_a_trajectory_is_sampled_anywhere_and_cannot_be_changed() -> None:
-    """Linear between samples, clamped outside; arrays are read-only."""
     trajectory = Trajectory(np.array([0.0, 1.0, 3.0]), np.array([[0.0] * 6, [1.0] * 6, [2.0] * 6]))
     assert trajectory.at(2.0).tolist() == [1.5] * 6
     assert trajectory.at(np.array([-1.0, 9.0])).tolist() == [[0.0] * 6, [2.0] * 6]
@@ -431,7 +427,6 @@ def test_a_trajectory_is_sampled_anywhere_and_cannot_be_changed() -> None:
     ],
 )
 def test_trajectories_that_make_no_sense_are_refused(times: list[float], q: np.ndarray, code: str) -> None:
-    """Shapes, rising times, finite numbers."""
     with refused(code, "trajectory"):
         Trajectory(np.array(times), q)
 
@@ -445,7 +440,6 @@ def test_a_motion_without_motion_is_refused() -> None:
 @given(waypoints=rows, share=st.floats(0.0, 0.5), limit=st.floats(20.0, 1000.0), tip_mm=st.floats(0.0, 400.0))
 @settings(max_examples=25, deadline=None)
 def test_the_tip_never_exceeds_its_limit(waypoints: np.ndarray, share: float, limit: float, tip_mm: float) -> None:
-    """By forward kinematics of the samples, whatever the corners."""
     lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
     if not lengths.all():
         return
@@ -464,7 +458,6 @@ def test_a_joint_alone_takes_the_tip_to_the_limit() -> None:
 
 
 def test_the_tips_speed_is_that_of_the_samples() -> None:
-    """By the Jacobian and by differences."""
     q, u = np.random.default_rng(3).uniform(-3.0, 3.0, (2, 20, 6))
     step = 1e-6
     pairs = [np.stack([a - step * b, a + step * b]) for a, b in zip(q, u, strict=True)]

@@ -116,7 +116,6 @@ def test_a_long_beam_in_a_foundation_bends_as_hetenyi_says(k):
 
 
 def test_a_tip_that_is_held_needs_the_force_that_brings_it_there():
-    """Displacement and load are one answer, read from either side."""
     beam, foundation = Beam(SOLID_18.bending_stiffness, 1.0, 120), np.linspace(0, 0.2, 120)
     rest = 0.5 * np.sin(np.linspace(0, 2, 121))
     loaded = beam.bent(foundation, rest, tip_load=0.3)
@@ -126,7 +125,6 @@ def test_a_tip_that_is_held_needs_the_force_that_brings_it_there():
 
 
 def test_a_shaft_in_a_stiff_foundation_lies_where_the_foundation_rests():
-    """Whatever line that is, if it leaves the holder straight."""
     x = np.linspace(0, 1, 151)
     rest = 3.0 * x**3
     found = Beam(TUBE_18.bending_stiffness, 1.0, 150).bent(np.full(150, 1e6), rest, tip_mm=3.0)
@@ -151,7 +149,6 @@ def test_shafts_have_the_numbers_of_the_handbook(shaft, stiffness, sag, free, pi
 
 
 def test_gauges_descend():
-    """And a bore is less than its needle."""
     outer = [gauge.outer_mm for gauge in GAUGES.values()]
     assert outer == sorted(outer, reverse=True)
     assert all(0 < gauge.inner_mm < gauge.outer_mm for gauge in GAUGES.values())
@@ -238,7 +235,6 @@ def test_the_path_is_linear_in_the_angle():
 
 
 def test_a_needle_without_a_bevel_goes_straight():
-    """Every term off gives nothing."""
     straight_on = path(0.0)
     assert not straight_on.cut_mm.any() and not straight_on.needle_mm.any()
 

@@ -90,7 +90,6 @@ def test_a_mesh_cylinder_is_the_holder(answers):
 
 
 def shift(x, y, z):
-    """What to add to an identity."""
     T = np.zeros((4, 4))
     T[:3, 3] = x, y, z
     return T
@@ -178,7 +177,6 @@ def test_a_tool_is_sent_to_another_process():
 
 
 def tool_case(folder, *lines, solid=None):
-    """A case with a tool in a file."""
     (solid or rod(20.0, 0.0, 40.0)).export(folder / "holder.stl")
     return write_case(folder, text=CASE + '\n[tool]\nmesh = "holder.stl"\n' + "\n".join(lines) + "\n")
 
@@ -205,6 +203,5 @@ def test_a_case_states_its_tool(tmp_path):
     ],
 )
 def test_a_tool_that_is_not_understood_is_refused(tmp_path, lines, says):
-    """No mesh file says its unit, and none is guessed."""
     with refused(*says.split()):
         load_case(tool_case(tmp_path, *lines))

@@ -97,7 +97,6 @@ def test_of_two_half_turns_the_one_that_lies_off_the_skin_is_not_named(case, cap
 
 
 def test_without_a_couch_the_same_list_is_a_warning(case, capfd):
-    """Nothing tells front from back then."""
     points = on_skin(DIRECTIONS, np.zeros(3))
     here = case(points * [-1, -1, 1], points, couch=False)
     assert main(["register", str(here)]) == 0

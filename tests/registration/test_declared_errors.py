@@ -77,7 +77,6 @@ def _skew(v):
     [(3, 0.57, 3.73, 5.28), (4, 0.64, 2.20, 3.78), (5, 0.69, 1.83, 3.40), (6, 0.72, 1.65, 3.24)],
 )
 def test_interval_and_region_of_an_estimated_size(count, low, high, factor):
-    """The table of intervals and radii, by the number of markers."""
     test = NoiseTest(count, float(3 * count - 6), found=True)
     assert test.estimate == pytest.approx(1.0)
     np.testing.assert_allclose(test.interval, (low, high), atol=0.006)
@@ -99,7 +98,6 @@ def test_weights_take_a_third_off_where_slices_are_thick(rng):
 
 
 def test_alike_axes_are_weighed_alike(rng):
-    """Isotropic noise: the weighted fit is the least-squares fit."""
     told = noise(6, ct=(0.5, 0.5, 0.5))
     ct, base = draws(1, MARKERS, rng, told)
     plain = fit_rigid(ct[0], base[0])
@@ -107,7 +105,6 @@ def test_alike_axes_are_weighed_alike(rng):
 
 
 def test_a_method_without_a_formula_is_differenced(rng):
-    """Of the least-squares fit, which has one, it is the same map."""
     base = apply(T_TRUE, MARKERS)
     np.testing.assert_allclose(
         differenced_map(fit_rigid, MARKERS, base), least_squares_map(design(base, base.mean(axis=0))), atol=1e-6
@@ -129,7 +126,6 @@ def test_residuals_far_beyond_the_declaration_are_refused_and_can_be_accepted():
 
 
 def test_weights_need_a_declaration():
-    """Method weighted without errors is refused."""
     pairs = MarkerPairs(tuple("ABCDEF"), MARKERS, apply(T_TRUE, MARKERS))
     with refused("method_without_errors"):
         register(pairs, method="weighted", target_ct=np.zeros(3))

@@ -41,12 +41,10 @@ def random_transform(kind, rng):
 
 
 def read(file):
-    """What the program reads."""
     return parse_transform(file.read_bytes(), file)
 
 
 def by_itk(transform):
-    """Where SimpleITK puts the points."""
     return np.array([transform.TransformPoint(point) for point in POINTS.tolist()])
 
 
@@ -110,14 +108,12 @@ def replace(group, name, value):
     ("kind", "change"), [(kind, in_single_precision) for kind in KINDS] + [("euler", as_itk_4), ("versor", as_itk_4)]
 )
 def test_single_precision_and_older_files(tmp_path, kind, change):
-    """ITK reads both; so do we, and put points where it puts them."""
     file = rewritten(tmp_path, kind, change)
     expected = by_itk(SimpleITK.ReadTransform(str(file)))
     assert apply(read(file), POINTS) == pytest.approx(expected, abs=SINGLE_MM)
 
 
 def test_a_compressed_file_is_read(tmp_path):
-    """ITK can deflate its lists."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         group = file.create_group("TransformGroup/0")
         replace(group, "TransformType", "AffineTransform_double_3_3")
@@ -150,7 +146,6 @@ def scaled(parent, _):
 
 
 def sheared(parent, _):
-    """x grows with y."""
     numbers = parent["0/TransformParameters"][()]
     numbers[:9] = (numbers[:9].reshape(3, 3) @ [[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]).ravel()
     parent["0/TransformParameters"][...] = numbers
@@ -162,7 +157,6 @@ def set_to(name, value):
 
 
 def renumbered(parent, _):
-    """A part is gone."""
     del parent["2"]
 
 
@@ -285,7 +279,6 @@ def test_a_heap_on_which_hdf5_never_ends_is_refused(tmp_path):
     ("at", "layout", "value"), [(0, "<I", 2**31), (4, "<Q", 2**63), (4, "<Q", 5), (12, "<I", 99), (12, "<I", 0)]
 )
 def test_a_text_elsewhere_is_refused(tmp_path, at, layout, value):
-    """Too long, beyond the end, in no heap, of no number."""
     file = rewritten(tmp_path, "affine", lambda parent, _: None)
     data = bytearray(file.read_bytes())
     with h5py.File(file) as whole:

@@ -86,7 +86,6 @@ def case(tmp_path):
 
 
 def registered(here, capfd):
-    """What `register --json` prints."""
     assert main(["register", str(here), "--json"]) == 0
     return json.loads(capfd.readouterr().out)
 

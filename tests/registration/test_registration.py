@@ -34,7 +34,6 @@ def pairs(points_ct, points_base, names=None):
 
 
 def named(names, points):
-    """A points file's content."""
     return NamedPoints(tuple(names), np.asarray(points, float), Space.LPS)
 
 
@@ -183,13 +182,11 @@ def test_markers_that_cannot_be_trusted_are_refused_by_name(ct, base, message):
 
 
 def test_affine_is_refused_for_planning():
-    """Bending the patient is no registration."""
     with refused("method_bends"):
         register(pairs(MARKERS, MARKERS), method="affine", target_ct=TARGET)
 
 
 def test_triad_takes_three():
-    """A triad of four markers would silently ignore one."""
     with refused("wrong_count"):
         register(pairs(MARKERS, MARKERS), method="triad", target_ct=TARGET)
 

@@ -87,7 +87,6 @@ def test_residuals_of_11_mm_are_refused():
 
 
 def test_accepted_residuals_are_flagged():
-    """The user's word lets them pass, and the registration says so."""
     found = register(pairs(MARKERS[:4], missing_by(11.0)), method="rigid", target_ct=TARGET, accept_residuals=True)
     assert any(flag.code == "residuals_unexplained" for flag in found.flags)
     assert found.fle_mm > 10.0
@@ -109,7 +108,6 @@ def test_a_declared_noise_that_does_not_explain_the_residuals_is_refused_or_scal
 
 
 def test_a_declared_noise_that_explains_the_residuals_stays_as_declared():
-    """No scale, no flag, no interval: what is declared is known."""
     found = register(pairs(MARKERS[:4], missing_by(1.0)), method="rigid", target_ct=TARGET, fle_mm=1.5)
     assert found.fle_mm == 1.5
     assert found.residual_test.fle_interval_mm == (1.5, 1.5)

@@ -81,7 +81,6 @@ def test_it_is_an_input_and_says_that_nothing_is_known_of_its_error(tmp_path):
 
 
 def transform_text(T):
-    """The text of a transform file."""
     numbers = " ".join(map(repr, [*T[:3, :3].ravel().tolist(), *T[:3, 3].tolist()]))
     head = "#Insight Transform File V1.0\n#Transform 0\nTransform: AffineTransform_double_3_3\n"
     return f"{head}Parameters: {numbers}\nFixedParameters: 0 0 0\n"

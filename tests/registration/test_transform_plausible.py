@@ -163,7 +163,6 @@ def test_a_patient_in_a_box_of_the_robots_frame_is_refused(tmp_path, box, wrong)
 
 
 def test_a_base_in_the_patient_is_refused_with_its_causes(tmp_path):
-    """With what would be plausible instead, and without an arm too."""
     inside = pose(UPRIGHT, [20.0, 0.0, 30.0])
     with refused("transform_implausible"):
         prepare(stating(tmp_path, inside), arm=False)
@@ -197,7 +196,6 @@ def test_markers_that_agree_do_not_silence_what_physics_doubts(tmp_path):
 
 
 def test_markers_beside_a_transform_are_checked_as_those_that_place_the_robot(tmp_path):
-    """Some lie far beside the body, in both lists."""
     beside = MARKERS * np.array([[1.1], [1.4], [1.2], [1.7]])
     more = touched(tmp_path, T_BASE_CT) + "fle_mm = 0.5\n"
     path = stating(tmp_path, more=more)
@@ -208,7 +206,6 @@ def test_markers_beside_a_transform_are_checked_as_those_that_place_the_robot(tm
 
 @pytest.mark.parametrize("keys", KEYS[1:])
 def test_markers_refuse_another_reading_and_name_the_one_that_fits(tmp_path, keys):
-    """In mm, before anything is searched."""
     more = touched(tmp_path, T_BASE_CT, 0.1) + "fle_mm = 0.5\n"
     right = " and ".join(
         f'{name} = "{value}"'
@@ -247,7 +244,6 @@ def test_large_declared_errors_allow_more(tmp_path):
 
 
 def test_the_warning_is_in_text_json_and_page(tmp_path, capfd):
-    """As others are."""
     path = stating(tmp_path, keys=("base_to_ct", "LPS"))
     said = "would be more usual than the stated keys"
     main(["search", str(path.parent), "--no-arm", "--out", str(tmp_path / "out")])
@@ -260,7 +256,6 @@ def test_the_warning_is_in_text_json_and_page(tmp_path, capfd):
 
 
 def test_the_markers_are_inputs(tmp_path):
-    """Both lists are hashed, and place nothing."""
     case = load_case(stating(tmp_path, more=touched(tmp_path, T_BASE_CT)))
     assert {"transform", "markers_ct", "markers_base"} <= {one.role for one in case.inputs}
     placement = load_placement(case)

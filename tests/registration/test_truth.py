@@ -27,7 +27,6 @@ TARGET = np.array([50.0, 130, 63])
 
 
 def pose(seed: int) -> np.ndarray:
-    """A rigid motion."""
     rng = np.random.default_rng(seed)
     T = np.eye(4)
     T[:3, :3] = Rotation.random(rng=rng).as_matrix()
@@ -36,7 +35,6 @@ def pose(seed: int) -> np.ndarray:
 
 
 def write_points(path: Path, names: tuple[str, ...], points: np.ndarray) -> None:
-    """A CSV of named points."""
     rows = [f"{name},{x:.9f},{y:.9f},{z:.9f}" for name, (x, y, z) in zip(names, points, strict=True)]
     path.write_text("\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n")
 
@@ -90,7 +88,6 @@ def test_without_markers_truth_is_belief_and_says_so(tmp_path):
 
 
 def test_same_seed_same_truth_other_seed_another(tmp_path):
-    """All randomness comes from the seed, which the truth carries."""
     one, again, other = (draw_truth(case(tmp_path, seed=seed), pose(0)) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one.T_base_ct_true, again.T_base_ct_true)
     np.testing.assert_array_equal(one.joint_offsets, again.joint_offsets)
@@ -101,7 +98,6 @@ def test_same_seed_same_truth_other_seed_another(tmp_path):
 
 
 def test_no_error_means_truth_is_belief(tmp_path):
-    """With exact markers and exact joints nothing differs."""
     exact = case(tmp_path, fle_ct_mm=0.0, fle_touch_mm=0.0, joint_offset_deg=0.0)
     truth = draw_truth(exact, pose(0))
     np.testing.assert_allclose(truth.T_base_ct_true, pose(0), atol=1e-9)
@@ -109,7 +105,6 @@ def test_no_error_means_truth_is_belief(tmp_path):
 
 
 def test_drawn_truth_is_rigid_and_read_only(tmp_path):
-    """A proper rotation, frozen."""
     truth = draw_truth(case(tmp_path), pose(0))
     R = truth.T_base_ct_true[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
@@ -150,7 +145,6 @@ def test_triad_cases_draw_triad_errors(tmp_path):
 
 
 def test_file_of_true_positions_is_found_again(tmp_path):
-    """Exact positions give the exact pose, whatever the belief."""
     write_points(tmp_path / "true.csv", (*NAMES, "M"), apply(pose(9), np.vstack([MARKERS, TARGET])))
     truth = draw_truth(case(tmp_path, truth_base="true.csv"), pose(0))
     np.testing.assert_allclose(truth.T_base_ct_true, pose(9), atol=1e-6)

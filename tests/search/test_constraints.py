@@ -32,7 +32,6 @@ def verdict(skin, structures=(), direction=UP, needle=NEEDLE, target=(0, 0, 0), 
 
 
 def both(*meshes):
-    """One surface of several."""
     offsets = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
     return TriangleMesh(
         np.concatenate([m.vertices for m in meshes]),
@@ -41,7 +40,6 @@ def both(*meshes):
 
 
 def test_free_path_is_safe(box):
-    """Straight out of a box, nothing near: safe."""
     assert verdict(skin_from_mesh(box([100, 100, 100])))[0] == ""
 
 
@@ -130,7 +128,6 @@ def test_reenters_skin(ball):
 
 
 def test_too_close_names_structure_depth_and_mm(ball, box):
-    """The structure that lacks most of its margin is named."""
     near = Structure("vessel", Role.AVOID, 5.0, ball(10, (14, 0, 30), 4), "")
     other = Structure("rib", Role.AVOID, 1.0, ball(10, (-11, 0, 40), 4), "")
     reason, structure, depth, amount = verdict(skin_from_mesh(box([100, 100, 100])), [other, near])
@@ -185,7 +182,6 @@ def test_a_needle_that_leaves_the_image_beside_a_cut_body_is_unknown(box):
 
 
 def test_no_skin_entry_through_a_hole(box):
-    """An open skin with its top missing has no entry there."""
     mesh = box([100, 100, 100])
     top = np.all(mesh.triangles[:, :, 2] == 50, axis=1)
     opened = skin_from_mesh(TriangleMesh(mesh.vertices, mesh.faces[~top]))
@@ -206,7 +202,6 @@ def test_a_ray_through_a_corner_is_judged_like_its_neighbours(box):
 
 
 def test_anatomy_finds_structures_by_name(ball, box):
-    """A wrong name lists the right ones."""
     anatomy = Anatomy((Structure("liver", Role.TARGET, 0, ball(10), ""),), skin_from_mesh(box([100, 100, 100])), ())
     assert anatomy.structure("liver").role is Role.TARGET
     with pytest.raises(Exception, match="no structure 'lver'.*liver"):
@@ -214,7 +209,6 @@ def test_anatomy_finds_structures_by_name(ball, box):
 
 
 def test_search_settings_are_radians():
-    """The case's grid speaks radians inside."""
     assert SearchSettings((0, np.pi), (0, 1), 0.1, 1.0).theta[1] == np.pi
 
 

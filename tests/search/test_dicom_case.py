@@ -73,14 +73,12 @@ def write_scene(folder):
 
 
 def write_case(folder, name, ct):
-    """A case with this CT."""
     text = HEAD + structure("skin", "skin", {"ct": ct}) + LESION + SPINE
     (folder / f"{name}.toml").write_text(whole(text))
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """The folder of both cases."""
     folder = tmp_path_factory.mktemp("scene")
     write_scene(folder)
     return folder
@@ -102,7 +100,6 @@ def test_a_series_gives_the_verdicts_of_the_same_ct_in_nifti(scene):
 
 
 def test_every_slice_is_an_input_with_the_hash_of_its_bytes(scene):
-    """A slice with one other voxel is seen."""
     case = load_case(scene / "dicom.toml")
     slices = [one for one in case.inputs if one.role == "ct"]
     files = sorted((scene / "series").iterdir())
@@ -117,7 +114,6 @@ def test_every_slice_is_an_input_with_the_hash_of_its_bytes(scene):
 
 
 def test_a_file_of_the_series_names_it(scene):
-    """The same files decide."""
     write_case(scene, "file", f"series/{sorted(path.name for path in (scene / 'series').iterdir())[5]}")
     file, folder = (load_case(scene / f"{name}.toml").inputs for name in ("file", "dicom"))
     assert [one for one in file if one.role == "ct"] == [one for one in folder if one.role == "ct"]
@@ -134,7 +130,6 @@ def test_a_case_without_dicom_does_not_load_its_library(scene):
 
 
 def test_a_folder_as_a_label_map_is_refused(scene):
-    """Only a CT may be a folder."""
     text = (scene / "dicom.toml").read_text()
     (scene / "wrong.toml").write_text(text.replace(json.dumps("labels.nii.gz"), json.dumps("series"), 1))
     with refused("no_such_file"):
@@ -194,7 +189,6 @@ WRONG = {
 
 @pytest.mark.parametrize("name", sorted(WRONG))
 def test_what_is_wrong_with_structures_of_dicom_is_said(scene, name):
-    """As for label maps."""
     if not (scene / "rtstruct.toml").is_file():
         write_structures(scene)
     change, message = WRONG[name]

@@ -31,7 +31,6 @@ def carton():
 
 @pytest.fixture(scope="module")
 def found(carton):
-    """Its whole grid."""
     return carton.search()
 
 
@@ -68,7 +67,6 @@ def test_the_ranks_follow_the_cost(found):
 
 
 def test_no_reach_is_asked_without_an_arm(found):
-    """``reachable`` is null when the arm was not asked."""
     assert (found.arm.reachable == -1).all()
 
 
@@ -127,14 +125,12 @@ def test_tissue_is_the_length_inside(carton, found, ball):
 @given(st.lists(st.tuples(*[st.integers(0, 4)] * 3), min_size=1, max_size=40))
 @settings(max_examples=100)
 def test_the_pareto_front_is_what_the_definition_says(rows):
-    """Against the definition, pair by pair."""
     terms = np.array(rows, float)
     expected = [not any((other <= row).all() and (other < row).any() for other in terms) for row in terms]
     np.testing.assert_array_equal(pareto_front(terms), expected)
 
 
 def test_each_term_of_the_cost_says_what_it_should():
-    """Hand-computed terms and cost."""
     weights = RankingSection(clearance=1, path_length=1, skin_angle=1, tissue=1, reach=1, safe_cone=1)
     order = rank(
         min_clearance=np.array([5.0, 40.0]),
@@ -154,7 +150,6 @@ def test_each_term_of_the_cost_says_what_it_should():
 
 
 def test_the_fast_engine_and_fcl_give_the_same_table(carton, found):
-    """Every verdict, reason and number of the grid, by both engines."""
     plain = prepare(folder() / "carton" / "case_m.toml", arm=False, engine="fcl").search()
     np.testing.assert_array_equal(plain.verdict.reason, found.verdict.reason)
     np.testing.assert_array_equal(plain.verdict.structure, found.verdict.structure)
@@ -176,6 +171,5 @@ def test_the_cross_check_sees_a_wrong_engine(carton):
 
 
 def test_an_unknown_engine_is_refused():
-    """The allowed names are listed."""
     with refused("unknown_engine", "quick"):
         prepare(folder() / "carton" / "case_m.toml", engine="quick")

@@ -108,6 +108,5 @@ def test_what_was_unsafe_is_never_safe_with_a_cropped_map(tmp_path, kept):
 
 
 def test_a_map_that_does_not_hold_the_target_is_refused(tmp_path):
-    """All about the target is unknown then."""
     with refused("labels_end", "labels.nrrd"):
         verdicts(tmp_path / "cut", vessels()[:, :, 55:], (0, 0, 55))

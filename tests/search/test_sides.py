@@ -78,7 +78,6 @@ def test_what_is_searched_is_what_the_grid_holds(tmp_path):
 
 
 def test_without_a_ct_the_back_lies_on_something(tmp_path):
-    """Until the case says that there is no table."""
     path = write_case(tmp_path)
     backs = []
     for more in ("", '\n[ct]\ntable = "none"\n'):
@@ -88,5 +87,4 @@ def test_without_a_ct_the_back_lies_on_something(tmp_path):
 
 
 def test_a_place_without_a_head_has_no_sides():
-    """Nothing is said of it."""
     assert sides_of(SimpleNamespace(space=Space.LOCAL), SimpleNamespace()) == ()

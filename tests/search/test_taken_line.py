@@ -110,7 +110,6 @@ def test_what_is_known_worse_elsewhere_than_where_it_is_nearest(context, best):
 
 
 def test_a_tip_outside_of_the_body_has_no_safe_line(context, best):
-    """The needle lies in front of the skin."""
     tip = context.case.target_ct + 140.0 * best
     path = np.stack([tip, tip + 60.0 * best])
     line = check_line(context, path, exact(path))

@@ -55,7 +55,6 @@ def test_a_source_that_shrinks_to_what_is_told_gives_the_wished_chance():
 
 
 def test_where_no_single_source_is_enough_all_together_are():
-    """A radius smaller than every part of the error."""
     _, needle = asked(0.3, **KEYS)
     (goal,) = goals_of(needle, needle.chance("", {}), {})
     assert not goal.remedies and "no single error suffices" in goal.text()
@@ -64,7 +63,6 @@ def test_where_no_single_source_is_enough_all_together_are():
 
 
 def test_a_limit_for_touching_is_mended_too():
-    """The case's limit for touching is reached, to rounding."""
     _, needle = asked(50.0, **KEYS)
     touched = needle.chance("rib", {})
     limit = touched / 3
@@ -124,6 +122,5 @@ def test_explanation_says_the_chances_of_the_table(carton):
 
 
 def test_explanation_says_where_there_are_no_chances(carton):
-    """Of a direction that was rejected before, it says so."""
     found = carton.explain(np.radians(90), np.radians(0))
     assert found.breakdown is None and found.summary()["chances"] is None and "no chances to hit" in found.text()

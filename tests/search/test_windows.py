@@ -89,7 +89,6 @@ def test_a_cone_never_reaches_over_the_ends_of_the_search():
 
 
 def test_rejected_candidates_have_no_cone_and_other_directions_stay_as_they_are():
-    """Only the safe rows of a grid get one."""
     found = with_grid_cone(candidates())
     assert np.isnan(found.safe_cone[~found.safe]).all() and np.isfinite(found.safe_cone[found.safe]).all()
     free = replace(found, grid=None, safe_cone=np.full(len(found), np.nan), cone_source="")
@@ -156,7 +155,6 @@ def test_the_skin_covers_more_where_the_path_enters_obliquely():
 
 
 def test_nothing_safe_has_no_window():
-    """No window, and every row is in none."""
     found = candidates()
     windows = find_windows(with_safe(found, np.zeros(len(found), bool)))
     assert windows.windows == () and (windows.of_row == 0).all()

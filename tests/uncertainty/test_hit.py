@@ -108,7 +108,6 @@ def test_within_a_radius_of_a_target_beside_which_the_tip_is_believed(deviations
 
 
 def test_a_target_on_a_flat_face_is_hit_half_of_the_time_at_most():
-    """The paper's carton aims at the face of a bolt."""
     box = trimesh.creation.box(extents=[50.0, 50.0, 50.0])
     rays = target_rays(TriangleMesh(box.vertices, box.faces), np.array([25.0, 0.0, 0.0]))
     assert hit_in_mesh(rays, np.eye(3)[None])[0] == pytest.approx(0.5, abs=0.002)

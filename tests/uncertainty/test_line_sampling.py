@@ -22,13 +22,11 @@ LEAN = np.diag([0.5, 0.8, 1.2, 0.006**2, 0.009**2, 0.01**2])
 
 
 def moved(mesh, *at):
-    """A body at a place."""
     mesh.apply_translation(at or (0, 0, 0))
     return TriangleMesh(mesh.vertices, mesh.faces)
 
 
 def box(*sizes):
-    """A block about the origin."""
     return trimesh.creation.box(extents=sizes)
 
 

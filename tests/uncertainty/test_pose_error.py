@@ -47,7 +47,6 @@ def test_rooms_err_as_predicted(case, method, keys):
 
 
 def test_a_declaration_that_is_wrong_by_two_is_seen():
-    """The same comparison fails where the rooms err twice as much."""
     w = world("abdomen/case.toml", "rigid", declared())
     rooms = draw_trials(w.puncture, w.errors.scaled(2.0), ROOMS, np.random.default_rng(0))
     error = rooms.tip_ct - rooms.target_ct

@@ -30,7 +30,6 @@ def slab(x):
 
 
 def ball(radius, at):
-    """A fine sphere."""
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=radius)
     mesh.apply_translation(at)
     return mesh

@@ -39,7 +39,6 @@ def test_the_choice_leaves_least(case, method, keys):
 
 
 def test_without_an_arm_s_errors_any_touch_will_do():
-    """Readings alone: the choice changes nothing."""
     w = world("abdomen/case.toml", "rigid", declared(**NO_ARM))
     there = apply(w.puncture.T_base_ct, w.puncture.points_ct)
     q = choose_touches(w.error, there, w.puncture.q_insertion)

@@ -48,7 +48,6 @@ def body(ball):
 
 @pytest.fixture(scope="module")
 def view(abdomen):
-    """Of the abdomen."""
     return probe_view(*abdomen)
 
 
@@ -232,7 +231,6 @@ def test_both_arms_keep_their_clearance_in_the_abdomen(abdomen, view):
 
 
 def placed(bodies, poses):
-    """FCL objects of an arm's bodies."""
     found = []
     for body in bodies:
         body.place(poses)
@@ -284,7 +282,6 @@ def test_an_assumed_place_that_is_taken_is_left_for_another(abdomen, view):
 
 
 def test_what_cannot_be_asked_is_refused(stated, abdomen):
-    """No probe; a base that stands in the patient, by its key."""
     with refused("no_ultrasound", "[ultrasound]"):
         probe_view(*stated("ultrasound"))
     _, plan = abdomen
@@ -300,7 +297,6 @@ def test_a_target_that_lies_too_deep_has_no_window(stated):
 
 
 def test_it_shows_itself(view, stated):
-    """With place, joints and counts; and without a place its reason."""
     assert "mm of depth" in repr(view) and "footprints" in view._repr_html_()
     none = probe_view(*stated("ultrasound", depth_mm=20.0))
     assert "no place for the probe" in none._repr_html_()

@@ -362,7 +362,6 @@ def test_assumed_balls_fit_a_short_needle(tmp_path):
 
 
 def test_a_way_needs_trials():
-    """Unknown ways, physics, and no trials at all are refused."""
     with refused("unknown_guidance"):
         room_count(10, 0, "by hand")
     for rooms, physics in ((None, 0), (10, 2)):
@@ -374,7 +373,6 @@ class Nothing(Sight):
     """Streaks over all of every control scan."""
 
     def hidden(self, out_mm):
-        """Neither tip nor target."""
         return dict.fromkeys(("scanned tip", "scanned target"), "streaks")
 
 
@@ -440,7 +438,6 @@ def test_scans_that_show_nothing_are_the_open_loop(scanned):
 
 
 def test_worse_scans_never_help(scanned):
-    """Thicker slices, and a target that they do not show."""
     stated = ({"slice_mm": 0.5}, {}, {"slice_mm": 5.0}, {"slice_mm": 5.0, "target_seen": False})
     found = [rehearse_trials(*scanned(**one), 1, 3, "ct", steps=2).predicted_rms_mm for one in stated]
     assert found == sorted(found) and found[0] < found[-1] - 0.3

@@ -63,7 +63,6 @@ T_BASE_CT = placed(330.0, 20.0, 60.0)
 
 
 def ball(radius: float, *centre: float) -> TriangleMesh:
-    """A closed ball in the CT frame."""
     mesh = trimesh.creation.icosphere(3, radius)
     return TriangleMesh(mesh.vertices + np.array(centre), mesh.faces)
 
@@ -79,7 +78,6 @@ def anatomy(**spheres: TriangleMesh) -> Anatomy:
 
 
 def case(*obstacles: Obstacle) -> Case:
-    """A local case with a stated mount."""
     return Case(
         path=Path("case.toml"),
         name="ball",
@@ -155,7 +153,6 @@ PLAN = make_plan()
 
 
 def truth(T_base_ct: np.ndarray = T_BASE_CT, offsets: np.ndarray = EXACT) -> Truth:
-    """A truth stated by the test."""
     return Truth(T_base_ct, offsets, 0, "stated by the test")
 
 
@@ -267,7 +264,6 @@ def test_a_needle_bends_without_declared_errors_too():
 
 
 def test_same_truth_same_numbers(exact):
-    """Bit for bit."""
     again = rehearse(PLAN, case(), anatomy(vessel=ball(10.0, 60.0, 0.0, 0.0)), truth())
     np.testing.assert_array_equal(again.tip_true_ct, exact.tip_true_ct)
     np.testing.assert_array_equal(again.q, exact.q)
@@ -374,7 +370,6 @@ def test_too_fast_a_plan_breaks_the_speed_limit():
 
 
 def test_numbers_are_read_only(exact):
-    """A result is a value."""
     for array in (exact.q, exact.tip_true_ct, exact.clearance_mm["vessel"]):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
@@ -435,21 +430,18 @@ def test_the_simulator_ends_where_the_room_did(rooms):
 
 
 def test_a_truth_that_equals_the_belief_is_known(rooms):
-    """A flag for whoever prints it first."""
     done = rehearse(rooms[0], case(), anatomy(), Truth(T_BASE_CT, np.zeros(6), 0, "exact"))
     assert done.truth_is_belief and np.array_equal(done.target_true_ct, TARGET)
 
 
 @pytest.mark.parametrize(("count", "wanted"), [(1, [2]), (5, [0, 1, 2, 3, 4]), (2, [0, 3])])
 def test_rows_are_spread_over_the_order_of_the_errors(count, wanted):
-    """One is the median; several are evenly spaced."""
     error = np.array([0.3, 0.1, 0.5, 0.2, 0.4])
     rows = spread_rows(SimpleNamespace(tip_error_mm=error), count)
     assert sorted(np.argsort(np.argsort(error))[rows]) == wanted
 
 
 def test_standing_in_words():
-    """What headline and film say."""
     assert ErrorRank(50.05, 1000).text == "median of 1,000 trials (50th percentile of their tip errors)"
     assert ErrorRank(2.6).text == "3rd percentile of the predicted tip errors"
     assert [ordinal(n) for n in (1, 2, 3, 4, 11, 12, 13, 21, 99)] == (

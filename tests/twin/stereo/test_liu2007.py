@@ -58,13 +58,11 @@ def one_trial(seed, gain, after=1.0, stop="converged"):
 
 
 def sessions(gains, **keys):
-    """Made-up sessions."""
     trials = tuple(one_trial(seed, gain, **keys) for seed, gain in enumerate(gains))
     return Sessions(paper_case(), None, trials, statistics(trials))
 
 
 def held(gains, **keys):
-    """Which conditions hold."""
     return [one["holds"] for one in conditions(sessions(gains, **keys))]
 
 
@@ -166,7 +164,6 @@ def test_in_a_good_room_the_servo_ends_within_what_it_may():
 
 
 def test_a_seed_repeats_itself_and_another_does_not():
-    """Every number is a function of case and seed."""
     case = load_servo_case(folder() / "head")
     first, again, other = (
         short(case, seed, ("T1",), detector_of=lambda plant: pixel_detector(plant, 0.03)) for seed in (1, 1, 2)

@@ -43,7 +43,6 @@ def unseen(found, target_m):
 
 
 def seen(found, target_m):
-    """The needle at the last look."""
     return servoed_error(found, -1, target_m)
 
 

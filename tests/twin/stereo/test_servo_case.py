@@ -21,7 +21,6 @@ TEXT = (HEAD / "servo.toml").read_text(encoding="utf-8")
 
 @pytest.fixture(scope="module")
 def case():
-    """The embedded case."""
     return load_servo_case(HEAD)
 
 
@@ -50,14 +49,12 @@ def written(tmp_path, text):
     ],
 )
 def test_mistakes_are_named(tmp_path, old, new, what):
-    """The key, what is wrong, and the nearest valid one."""
     assert old in TEXT
     with refused(*what.split()):
         load_servo_case(written(tmp_path, TEXT.replace(old, new, 1)))
 
 
 def test_a_missing_case_is_named(tmp_path):
-    """A folder without one."""
     with refused("no_such_file", "servo.toml"):
         load_servo_case(tmp_path)
 

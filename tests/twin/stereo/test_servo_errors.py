@@ -33,7 +33,6 @@ def without_errors():
 
 
 def test_a_case_that_declares_nothing_has_the_defaults(tmp_path):
-    """The arm is a calibrated one; a target is read as a marker is."""
     errors = read(tmp_path, without_errors()).errors
     assert errors == ServoErrors()
     assert (errors.link_mm, errors.tip_offset_mm, errors.marker_mm, errors.target_mm) == (0.05, 0.3, 0.3, 0.3)

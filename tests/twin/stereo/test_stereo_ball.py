@@ -44,7 +44,6 @@ def tracked(rng, count, *, noise=2.0, hough_only=False, **changes):
 
 
 def rms(errors):
-    """Root mean square distance."""
     return np.sqrt(np.mean(np.sum(errors**2, axis=1)))
 
 
@@ -101,7 +100,6 @@ def test_the_outlines_centre_is_not_the_balls(rng):
 
 
 def test_an_occluder_hides_the_share_asked_for(rng):
-    """Counted on the disc, with ball and occluder of known greys."""
     for share in (0.15, 0.5):
         plain = scene(rng, rod=False, diffuse=1.0, background_grey=0.0, occluder_grey=0.0)
         hidden = BallScene(**(vars(plain) | {"hidden_fraction": share}))
@@ -178,7 +176,6 @@ def test_the_covariance_is_honest(clean):
     ],
 )
 def test_a_ball_that_cannot_be_believed_is_lost(rng, changes, reasons):
-    """Never a number, and the reason is named."""
     answers, _ = tracked(rng, 6, **changes)
     assert all(isinstance(answer, LostBall) for answer in answers)
     assert {answer.reason for answer in answers} <= reasons

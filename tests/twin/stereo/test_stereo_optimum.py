@@ -16,7 +16,6 @@ DRAWS = 40
 
 @pytest.fixture(scope="module")
 def one():
-    """One simulated session."""
     return simulate(0)
 
 

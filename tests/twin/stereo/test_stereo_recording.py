@@ -41,7 +41,6 @@ def test_a_recorded_session_is_estimated_as_when_it_ran(recorded):
 
 
 def edited(table, old, new):
-    """A change of one table's text."""
 
     def change(folder):
         path = folder / table
@@ -53,12 +52,10 @@ def edited(table, old, new):
 
 
 def in_colour(folder):
-    """A picture with three channels."""
     cv2.imwrite(str(folder / "points_001_1_1.png"), np.zeros((960, 1280, 3), np.uint8))
 
 
 def smaller(folder):
-    """A picture of half the size."""
     cv2.imwrite(str(folder / "markers_001_1_1.png"), np.zeros((480, 640), np.uint8))
 
 
@@ -86,7 +83,6 @@ WRONG = {
 
 @pytest.mark.parametrize("wrong", WRONG)
 def test_what_is_wrong_in_a_folder_is_said(recorded, tmp_path, wrong):
-    """One refusal each, with its code."""
     change, code = WRONG[wrong]
     shutil.copytree(recorded[1], tmp_path / "session")
     change(tmp_path / "session")
@@ -95,7 +91,6 @@ def test_what_is_wrong_in_a_folder_is_said(recorded, tmp_path, wrong):
 
 
 def test_joints_in_another_unit_are_noticed(recorded, tmp_path):
-    """Degrees beyond what any joint can read."""
     folder = tmp_path / "session"
     shutil.copytree(recorded[1], folder)
     lines = (folder / "stops.csv").read_text(encoding="utf-8").splitlines()

@@ -191,7 +191,6 @@ def test_pixels_need_a_scale(rng):
 
 
 def test_a_known_tip_needs_seven_poses(rng):
-    """With t_Q known seven poses do, and t_Q stays what it was."""
     recording, truth = simulate_recording(rng, 12)
     with refused("too_few_poses", "12"):
         calibrate(recording)

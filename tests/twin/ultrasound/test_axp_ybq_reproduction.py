@@ -57,7 +57,6 @@ def test_the_bound_is_the_known_one():
 
 
 def test_a_number_beyond_its_limit_does_not_hold(monkeypatch):
-    """A row, the whole and the text all say so."""
     monkeypatch.setattr(axp_ybq, "SCALE_LIMIT_MM", 0.01)
     bad = summary(axp_ybq._scales(2)[:2], 2)
     assert not bad["holds"]
@@ -84,7 +83,6 @@ def test_limits_widen_with_few_runs_alone():
 
 
 def test_the_summary_is_plain(result):
-    """It survives JSON unchanged."""
     assert json.loads(json.dumps(result.summary)) == result.summary
 
 

@@ -16,7 +16,6 @@ real = pytest.mark.skipif(not DATA.is_dir(), reason="the real wire calibration i
 
 @pytest.fixture(scope="module")
 def fcal():
-    """Wires and frames."""
     wires = read_wires(DEVICE_SET)
     return wires, read_results(RESULTS, wires)
 
@@ -93,7 +92,6 @@ def random_views(rng, image, wires, n):
 
 
 def test_a_probe_that_stands_still_is_refused(rng):
-    """The same view three times leaves unknowns free."""
     wires = Wires(("a", "b"), rng.uniform(-20, 20, (2, 3)), np.array([[0.0, 1, 0], [0.6, 0.8, 0]]))
     frames = WireFrames(np.tile(np.eye(4), (3, 1, 1)), np.tile(rng.uniform(0, 500, (1, 2, 2)), (3, 1, 1)))
     with refused("undetermined"):
@@ -112,7 +110,6 @@ def test_a_probe_that_stands_still_is_refused(rng):
     ],
 )
 def test_a_broken_file_is_named(tmp_path, text, says):
-    """Every broken device set is bad input, in words."""
     path = tmp_path / "device.xml"
     path.write_text(text)
     with refused(*says.split()):

@@ -48,7 +48,6 @@ def room():
 
 
 def with_flanges(recording, A, B):
-    """The recording with other flanges."""
     r = recording
     return Recording(A, B, r.P, r.v, r.names, r.pixels, r.q_probe, r.q_needle)
 
@@ -193,7 +192,6 @@ def test_found_parts_solve_the_likelihood_equation(room):
 
 @pytest.fixture(scope="module")
 def thirty():
-    """Thirty rooms of each kind."""
     kinds = {
         "told": Kind(),
         "found": Kind(told=False),
@@ -306,7 +304,6 @@ def test_the_needle_length_and_declared_arms_go_together(room):
 
 
 def test_joints_are_written_and_read(room, tmp_path):
-    """The CSV keeps the joints to rounding."""
     recording = room[3]
     write_recording(recording, tmp_path / "recording.csv")
     again = read_recording(tmp_path / "recording.csv")

@@ -26,7 +26,6 @@ count = 20
 
 @pytest.fixture(scope="module")
 def case_folder(tmp_path_factory):
-    """A small case."""
     here = tmp_path_factory.mktemp("selfcal")
     (here / "selfcal.toml").write_text(CASE)
     return here
@@ -34,7 +33,6 @@ def case_folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def done(case_folder, tmp_path_factory):
-    """Run once: the folder of its files."""
     out = tmp_path_factory.mktemp("out")
     record = out.with_name("kept")
     assert main(["selfcal", str(case_folder), "--seeds", "1", "--out", str(out), "--record", str(record)]) == OK
@@ -42,7 +40,6 @@ def done(case_folder, tmp_path_factory):
 
 
 def test_every_file_is_written(done):
-    """The calibration, the recording, the pictures and the page."""
     names = {"calibration.json", "recording.csv", "bmode.png", "room.png", "report.html"}
     assert {path.name for path in done.iterdir()} == {*names, "manifest.json", "timings.json"}
     assert all((done / name).stat().st_size > 1000 for name in names)
@@ -111,7 +108,6 @@ def test_the_kept_pictures_give_the_same_calibration(case_folder, done, tmp_path
 
 
 def test_pictures_are_not_kept_of_a_recording_or_over_others(case_folder, done, tmp_path, capsys):
-    """One line each, before anything is drawn."""
     kept = done.with_name("kept")
     out = ["--out", tmp_path / "out"]
     refused_command(["selfcal", case_folder, "--record", kept, *out], capsys, "output_exists")

@@ -73,7 +73,6 @@ def test_the_counts_are_the_null_spaces(name):
 
 
 def test_a_constant_insertion_angle_slides_by_the_formula():
-    """t_X += k R_X d, t_Q += k V leaves every residual at zero."""
     truth, A, seen = degenerate_set("constant insertion angle")
     recording, estimate = exact_recording(truth, A, seen), as_estimate(truth)
     d = np.append(recording.v[0], 0.0)

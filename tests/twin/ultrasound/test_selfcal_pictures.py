@@ -169,7 +169,6 @@ def on_file(change, name="3.png"):
 
 
 def as_png(grey):
-    """A picture's file."""
     return cv2.imencode(".png", grey)[1].tobytes()
 
 
@@ -209,7 +208,6 @@ def test_what_is_wrong_in_a_folder_is_one_line(world, tmp_path, capfd, wrong):
 
 
 def test_two_swapped_pictures_are_named(world, tmp_path, capfd):
-    """Neither fits where it lies; the others calibrate as before."""
     folder = tmp_path / "pictures"
     shutil.copytree(world[2], folder)
     (folder / "8.png").rename(folder / "x.png")
@@ -235,7 +233,6 @@ def test_a_case_that_states_another_pixel_is_refused(world, tmp_path):
 
 
 def test_without_a_size_of_the_pixel_nothing_is_read(world, tmp_path):
-    """No default stands in for it."""
     shutil.copytree(world[2], tmp_path / "pictures")
     rewritten(lambda rows: [row.pop("pixel_mm") for row in rows])(tmp_path / "pictures")
     with refused("pixel_size", "0.png"):
@@ -342,7 +339,6 @@ def test_of_a_box_of_flow_the_tissue_about_it_is_read(rng, tmp_path):
 
 
 def test_what_no_decoder_reads_names_its_transfer_syntax(tmp_path):
-    """With a way out, and so do compressed pixels that are damaged."""
     data = ultrasound(np.zeros((1, 60, 80), np.uint8), spacing=(0.2, 0.2))
     data.PixelData = encapsulate([b"abcd" * 8])
     data["PixelData"].is_undefined_length = True
@@ -401,14 +397,12 @@ def test_drawings_are_said_and_cover_a_needle_only_at_its_tip(world, tmp_path):
     ],
 )
 def test_a_dicom_that_contradicts_itself_is_refused(tmp_path, others, code):
-    """With the tag that is to blame."""
     parts = {"delta_cm": (0.02, 0.02), "box": (10, 5, 69, 54), **others}
     with refused(code, "a.dcm"):
         read_frames(write(ultrasound(np.zeros((2, 60, 80), np.uint8), **parts), tmp_path / "a.dcm"))
 
 
 def test_every_truncation_of_a_dicom_is_refused(tmp_path):
-    """Wherever it is cut."""
     path = write(ultrasound(np.zeros((2, 20, 30), np.uint8), spacing=(0.2, 0.2)), tmp_path / "a.dcm")
     whole = path.read_bytes()
     assert read_frames(path).pixel_mm == (0.2, 0.2)

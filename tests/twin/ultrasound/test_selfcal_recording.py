@@ -11,13 +11,11 @@ from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
 @pytest.fixture
 def recording(rng):
-    """Six noisy poses with directions."""
     return simulate_recording(rng, 6)[0]
 
 
 @pytest.mark.parametrize("kind", ["2-D directions", "3-D directions", "no directions", "pixels", "shaft"])
 def test_the_csv_keeps_every_digit(recording, tmp_path, kind):
-    """Writing and reading gives the same numbers, names and units."""
     v = {"2-D directions": recording.v, "no directions": None}.get(
         kind, np.column_stack([recording.v, np.full(6, 0.1)])
     )
@@ -67,7 +65,6 @@ def test_a_shafts_length_needs_a_direction_and_is_one(recording):
     ],
 )
 def test_a_broken_recording_is_refused(recording, key, change, says):
-    """Every broken array is bad input that names the pose."""
     parts = {name: np.array(getattr(recording, name)) for name in "ABPv"}
     parts[key] = change(parts[key])
     with refused(*says.split()):
@@ -75,7 +72,6 @@ def test_a_broken_recording_is_refused(recording, key, change, says):
 
 
 def test_names_must_be_unique(recording):
-    """Two poses of one name could not be told apart in a report."""
     with refused("duplicate_name"):
         Recording(recording.A, recording.B, recording.P, names=("a",) * 6)
 
@@ -103,6 +99,5 @@ def test_a_broken_file_is_refused(recording, tmp_path, edit, says):
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    """A folder without a recording says which file it lacks."""
     with refused("no_such_file"):
         read_recording(tmp_path)

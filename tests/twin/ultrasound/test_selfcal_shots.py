@@ -91,7 +91,6 @@ def many(truth, seed):
 
 
 def test_the_order_of_shots_does_not_matter(taken):
-    """To rounding."""
     _, found, recording = taken
     rows = np.arange(FIRST, ALL)
     one = after(ShotByShot.of(found), recording, rows).calibration()

@@ -32,7 +32,6 @@ def drawn(seed, count=POSES, **ranges):
 
 
 def codes(found):
-    """Of the warnings."""
     return [one.code for one in found.findings if one.severity == "warning"]
 
 

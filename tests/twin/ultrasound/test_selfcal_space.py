@@ -41,7 +41,6 @@ def in_space(rng, n, truth=None):
 
 
 def noisy(rng, exact):
-    """With the noise of flanges and tip."""
     shaken = with_noise(rng, Recording(exact.A, exact.B, exact.P[:, :2]), NOISE)
     return Recording(shaken.A, shaken.B, exact.P + rng.normal(0.0, NOISE.image_mm, exact.P.shape))
 

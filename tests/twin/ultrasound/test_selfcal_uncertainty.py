@@ -118,7 +118,6 @@ def test_with_the_length_the_covariance_has_no_part_along_the_shaft(rng):
 
 @pytest.mark.parametrize("bad", [0.0, -5.0, np.nan])
 def test_an_impossible_needle_length_is_refused(rng, bad):
-    """A length is a positive number."""
     recording, _ = simulate_recording(rng, 20)
     with refused("not_positive"):
         calibrate(recording, needle_length_mm=bad)

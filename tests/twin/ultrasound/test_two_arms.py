@@ -38,7 +38,6 @@ from puncture_twin.twin.report.scene.scene_parts import bar
 
 
 def make_case(**sections):
-    """A case with some sections changed."""
     content = SelfcalFile.model_validate({"schema": 1, "name": "room", **sections})
     return SelfcalCase(path=None, content=content, inputs=())
 
@@ -51,13 +50,11 @@ def case():
 
 @pytest.fixture(scope="module")
 def room(case):
-    """Its checker."""
     return TwoArms(case)
 
 
 @pytest.fixture(scope="module")
 def candidates(case, room):
-    """Its poses."""
     return find_candidates(case, room, np.random.default_rng(5))
 
 
@@ -174,7 +171,6 @@ def test_a_needle_arm_out_of_reach_is_an_answer(room):
 
 
 def test_inside_phantom_against_the_winding_number(case):
-    """The block's formula and its mesh agree away from the surface."""
     phantom = case.content.phantom
     rng = np.random.default_rng(8)
     low, high = phantom_mesh(phantom).bounds
@@ -235,7 +231,6 @@ def test_true_rooms_are_seeded_and_differ_as_asked():
     ],
 )
 def test_bad_cases_are_refused(tmp_path, text, says):
-    """Each with the key and what is allowed."""
     (tmp_path / "selfcal.toml").write_text(text)
     with refused(*says.split()):
         load_selfcal_case(tmp_path)

@@ -19,7 +19,6 @@ PLAIN = NeedleEcho(roughness=0.0, tip_gain=1.0, reverberations=0, steep_loss_db=
 
 
 def needle(steep_deg, tip=(25.0, 30.0, 0.0), lean_deg=0.0):
-    """A needle from the left."""
     steep, lean = np.radians(steep_deg), np.radians(lean_deg)
     direction = np.array([np.cos(steep) * np.cos(lean), np.sin(steep) * np.cos(lean), np.sin(lean)])
     return NeedleInImage(np.array(tip), direction)
@@ -34,7 +33,6 @@ def speckle(rng, count):
 
 @pytest.fixture(scope="module")
 def fields():
-    """Enough speckle for its statistics."""
     return speckle(np.random.default_rng(1), 12)
 
 
@@ -139,7 +137,6 @@ def test_shadow_and_lesion_darken():
 
 
 def test_pictures_are_seeded():
-    """The same seed gives the same picture, another seed another."""
     first, again, other = (render(IMAGER, needle(45.0), np.random.default_rng(seed)) for seed in (1, 1, 2))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
@@ -160,7 +157,6 @@ def test_unusable_needles_are_refused(bad):
 
 
 def test_point_spread_widens():
-    """Both widths grow with depth, from the stated ones at the face."""
     spread = PointSpread()
     depth = np.array([0.0, 30.0, 60.0])
     assert (np.diff(spread.axial_sigma(depth)) > 0).all()
