@@ -8,15 +8,7 @@ from puncture_twin.planning.registration.hand_eye import PosePairs
 
 
 def hand_eye_problem(rng, n, noise=None, *, motions=False, turns=None):
-    """Pairs of n poses or motions, with X and Z.
-
-    Args:
-        rng: Draws all of it.
-        n: How many.
-        noise: A `HandEyeNoise`; None leaves them exact.
-        motions: Whether they are motions, so that Z is X.
-        turns: Rotation vectors of the flange about its mean, (n, 3), rad; None for any within half a radian.
-    """
+    """Pairs of n poses or motions, with X and Z."""
     X = pose(exp_rotation(rng.uniform(-2, 2, 3)), rng.uniform(-100, 100, 3))
     Z = X if motions else pose(exp_rotation(rng.uniform(-2, 2, 3)), rng.uniform(-800, 800, 3))
     turns = rng.uniform(-0.5, 0.5, (n, 3)) if turns is None else turns

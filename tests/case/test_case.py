@@ -37,7 +37,6 @@ def write(tmp_path):
 
 
 def test_a_good_case_is_read(write):
-    """Degrees become radians, defaults are filled in, every input is hashed."""
     case = load_case(write())
     assert (case.name, case.space, case.target_structure) == ("one", Space.LPS, "organ")
     np.testing.assert_array_equal(case.target_ct, [1, 2, 3])
@@ -85,16 +84,12 @@ def test_a_target_may_come_from_a_file_of_points(write, tmp_path):
 
 BAD = {
     "unknown key": (("diameter_mm", "diamter_mm"), "unknown_key diamter_mm diameter_mm"),
-    "unknown section": (("[search]", "[serach]"), "unknown_key serach search"),
-    "wrong unit in a key": (("length_mm", "length_m"), "unknown_key length_m length_mm"),
     "metres under a mm key": (("length_mm = 210.0", "length_mm = 0.21"), "bad_value needle.length_mm 20"),
     "another schema": (("schema = 2", "schema = 1"), "unknown_version"),
     "no schema": (("schema = 2", ""), "unknown_version"),
-    "text for a number": (("diameter_mm = 1.2", 'diameter_mm = "1.2"'), "bad_value needle.diameter_mm"),
     "true for a number": (("diameter_mm = 1.2", "diameter_mm = true"), "bad_value needle.diameter_mm"),
     "nan": (("diameter_mm = 1.2", "diameter_mm = nan"), "bad_value needle.diameter_mm"),
     "negative": (("diameter_mm = 1.2", "diameter_mm = -1.2"), "bad_value needle.diameter_mm 0.1"),
-    "infinite target": (("[1.0, 2.0, 3.0]", "[1.0, inf, 3.0]"), "bad_value target.position_mm"),
     "two coordinates": (("[1.0, 2.0, 3.0]", "[1.0, 2.0]"), "missing_key target.position_mm"),
     "no target": (("position_mm = [1.0, 2.0, 3.0]", ""), "not_one_source position_mm"),
     "shaft longer than the needle": (
@@ -102,8 +97,6 @@ BAD = {
         "out_of_range shaft_mm 250 length_mm 210",
     ),
     "descending range": (("[0, 60]", "[60, 0]"), "range_descends theta_deg"),
-    "range beyond 180": (("[0, 60]", "[0, 200]"), "bad_value search.theta_deg 180"),
-    "zero step": (("step_deg = 5.0", "step_deg = 0"), "bad_value search.step_deg 0.05"),
     "another space": (('"LPS"', '"LAS"'), "bad_value LPS RAS local"),
     "bed frame in a local space": (('space = "LPS"', 'space = "local"'), "local_space search.frame ct"),
     "unknown role": (('role = "target"', 'role = "avoidd"'), "bad_value organ avoid"),

@@ -76,7 +76,6 @@ def sliced(values: np.ndarray) -> np.ndarray:
 
 
 def detached(values: np.ndarray, header: Path) -> None:
-    """A NRRD header with its data beside it."""
     sitk.WriteImage(image_of(sliced(values)), str(header), useCompression=False)
     text = header.read_bytes()
     header.write_bytes(text.replace(b"\n", b"\n# written for a test\n", 1))

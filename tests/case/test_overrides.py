@@ -86,7 +86,6 @@ def test_a_key_takes_the_place_of_the_one_that_is_there():
 
 @pytest.mark.parametrize("write", [write_labels, lambda folder: write_masks(folder / "seg")])
 def test_roles_are_stated_by_name(tmp_path, capfd, write):
-    """In a label map as in a folder of masks; what is ignored is told."""
     write_ct(tmp_path / "ct.nii.gz")
     write(tmp_path)
     code, said = init(capfd, tmp_path, "--ignore", "odd", "--unknown", "aorta")

@@ -10,7 +10,6 @@ from puncture_twin.planning.case.case import load_case
 
 @pytest.fixture
 def carton(tmp_path):
-    """Reads the carton with more lines in [robot]."""
     for file in (folder() / "carton").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     path = tmp_path / "case_m.toml"

@@ -39,7 +39,6 @@ NAMES = {"background": 0, "liver lesion": 1, "aorta": 2, "ignore": 3}
 
 
 def started(folder):
-    """`init` with the first ball's middle as the target."""
     request = Request(folder, "0,0,0", None, "abdomen", Wanted(Space.LPS))
     return start_case(request, NO_CACHE, unnamed)
 

@@ -52,15 +52,6 @@ def test_a_case_cut_anywhere_is_refused(tmp_path):
             load_case(path)
 
 
-def test_the_abdomen_cut_at_a_line_is_refused(tmp_path):
-    lines = (folder() / "abdomen" / "case.toml").read_text().splitlines(keepends=True)
-    path = tmp_path / "case.toml"
-    for count in range(len(lines)):
-        path.write_text("".join(lines[:count]))
-        with pytest.raises(InputError):
-            load_case(path)
-
-
 @pytest.mark.parametrize("kept", [1, 2, 3])
 def test_a_lost_structure_is_refused_with_a_count_at_the_top_too(kept, tmp_path, capfd):
     """structures = N at the top: the command says both numbers, in one line, exit code 2."""

@@ -114,7 +114,6 @@ def test_each_target_is_what_a_case_with_that_target_says(context, tmp_path, cap
     ],
 )
 def test_a_line_that_is_none_is_named_and_nothing_is_written(context, tmp_path, capsys, lines, said):
-    """One line on stderr, exit code 2."""
     listed = write(tmp_path / "bad.csv", *lines)
     arguments = ["check", str(context.case.path), "--no-arm", "--entries", str(listed), "--out", str(tmp_path / "out")]
     refused_command(arguments, capsys, *said.split(), "bad.csv")

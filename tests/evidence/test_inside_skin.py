@@ -11,7 +11,7 @@ from puncture_twin.planning.anatomy.skin import skin_from_mesh
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.evidence.checks import findings
 from puncture_twin.planning.evidence.inside_skin import SAMPLES, inside_skin, near_surface
-from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.context import prepare
 from tests.oracles import point_triangle_distance
 
@@ -22,12 +22,10 @@ def of(mesh, skin, tolerance=0.01):
 
 @pytest.fixture(scope="module")
 def carton():
-    """The carton, lesion M, organs alone."""
     return prepare(folder() / "carton" / "case_m.toml", arm=False)
 
 
 def with_structure(context, structure):
-    """The case's anatomy and one structure more."""
     return replace(context.anatomy, structures=(*context.anatomy.structures, structure))
 
 
@@ -42,7 +40,7 @@ def cap_outside(distance, ball_radius, skin_radius):
     return 0.5 + np.clip(height / ball_radius, -1, 1) / 2
 
 
-@pytest.mark.parametrize("distance", [0.0, 40.0, 75.0, 85.0, 90.0, 95.0, 105.0, 139.0])
+@pytest.mark.parametrize("distance", [0.0, 75.0, 85.0, 95.0, 139.0])
 def test_the_fraction_is_that_of_the_sphere(ball, distance):
     """A ball moved out of a ball: the fraction of its area inside, to half a percent."""
     skin = skin_from_mesh(ball(90, subdivisions=5))
@@ -75,15 +73,6 @@ def test_a_part_of_the_body_beside_the_trunk_counts(ball):
     trunk, arm, bone = ball(90), ball(30, (140, 0, 0)), ball(10, (140, 0, 0))
     assert of(bone, skin_from_mesh(joined(trunk, arm))).fraction == 1.0
     assert of(bone, skin_from_mesh(trunk)).fraction == 0.0
-
-
-def test_samples_are_spread_by_area(box):
-    """A flat box: each face carries its share of the points, and every run makes the same ones."""
-    mesh = box((100, 50, 10))
-    points = spread_on(mesh, 2000).points
-    np.testing.assert_array_equal(points, spread_on(mesh, 2000).points)
-    on_top = np.isclose(points[:, 2], 5).mean()
-    assert on_top == pytest.approx(5000 / (2 * (5000 + 1000 + 500)), abs=0.01)
 
 
 def test_nearness_is_exact(ball, box, rng):

@@ -14,7 +14,6 @@ from puncture_twin.planning.search.context import prepare
 
 @pytest.fixture(scope="module")
 def trunk(tmp_path_factory):
-    """The trunk, its labels where they belong."""
     return prepare(write_trunk(tmp_path_factory.mktemp("trunk"), np.eye(4)), arm=False)
 
 

@@ -17,7 +17,6 @@ def structure(name, mesh, role=Role.AVOID, voxel_ct=None):
 
 
 def found(*structures):
-    """Names and numbers of what overlaps."""
     return [one.numbers for one in overlaps(CASE, SimpleNamespace(structures=structures), NO_CACHE)]
 
 

@@ -187,7 +187,6 @@ def fiducials(points, kind="ball", diameter=8.0):
 
 
 def moved(points, rng):
-    """Turned and shifted anyhow, and read with an error."""
     R = exp_rotation(rng.normal(size=3))
     return points @ R.T + rng.uniform(-200, 200, 3) + rng.normal(0, 0.2, points.shape)
 

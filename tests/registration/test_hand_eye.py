@@ -37,8 +37,8 @@ def all_motions(pairs):
 
 
 @pytest.mark.parametrize("motions", [False, True])
-def test_a_thousand_problems_without_noise_are_solved_exactly(motions):
-    for seed in range(500):  # of each equation
+def test_problems_without_noise_are_solved_exactly(motions):
+    for seed in range(60):  # of each equation
         rng = np.random.default_rng([1, seed])
         pairs, X, Z = hand_eye_problem(rng, 6, motions=motions)
         found = calibrate_hand_eye(pairs, NOISE if seed else None)  # a spread that is found is that of rounding

@@ -44,7 +44,6 @@ def by_hand(points_ct, points_base, alike_mm):
 
 
 def orders(found, count):
-    """The permutations of a result, as orders."""
     result = set()
     for one in found:
         order = list(range(count))

@@ -76,10 +76,9 @@ def test_a_shoulder_in_an_obstacle_of_the_ct_is_told(tmp_path):
     assert "the robot's shoulder would be in obstacle 'table'" in line
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_it_is_in_text_json_and_page(tmp_path, capfd, way):
+def test_it_is_in_text_json_and_page(tmp_path, capfd):
     what, at = next(iter(PLACES.items()))
-    path = stating(tmp_path, way, at)
+    path = stating(tmp_path, "markers", at)
     main(["search", str(path.parent), "--no-arm", "--out", str(tmp_path / "out")])
     out, err = capfd.readouterr()
     assert what in out + err

@@ -4,17 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bare_case import bare_case
 from places import ROOT
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case import Case, load_case, view_frame
-from puncture_twin.planning.case.named_files import CaseVolumes
-from puncture_twin.planning.case.settings import Needle, RobotSettings, SearchSettings
-from puncture_twin.planning.case.tables import MarkerSection, RankingSection, RehearsalSection
+from puncture_twin.planning.case.case import Case, load_case
+from puncture_twin.planning.case.settings import RobotSettings
+from puncture_twin.planning.case.tables import MarkerSection, RehearsalSection
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.residuals import leverage
@@ -40,7 +39,6 @@ def write_points(path: Path, names: tuple[str, ...], points: np.ndarray) -> None
 
 
 def files_in(folder: Path) -> InputFiles:
-    """Every CSV of a folder, as a case has read it."""
     files = InputFiles(folder)
     for path in sorted(folder.glob("*.csv")):
         files.add(path.stem, path.name, path.read_bytes())
@@ -55,27 +53,14 @@ def case(folder: Path, *, markers: bool = True, method: str = "rigid", **rehears
         write_points(folder / "base.csv", NAMES, apply(pose(0), MARKERS))
         use = ("A", "B", "C") if method == "triad" else None
         registration = MarkerSection(method=method, markers_ct="ct.csv", markers_base="base.csv", use=use)
-    return Case(
+    return bare_case(
+        TARGET,
         path=folder / "case.toml",
-        name="box",
-        space=Space.LOCAL,
-        target_ct=TARGET,
         target_name="M",
-        target_structure="lesion",
-        needle=Needle(210.0, 150.0, 1.2, 100.0, 10.0, 30.0),
-        search=SearchSettings((0, 1), (0, 6), 0.1, 1.0),
-        ranking=RankingSection(),
-        T_ct_entry=view_frame(np.eye(3), TARGET),
-        structure=(),
-        structures=(),
         registration=registration,
         robot=RobotSettings("ur3", None, None if markers else pose(0)),
-        obstacles=(),
         rehearsal=RehearsalSection(**rehearsal),
         files=files_in(folder),
-        volumes=CaseVolumes(files_in(folder), folder / "case.toml"),
-        stated_structures=1,
-        region="other",
     )
 
 

@@ -51,7 +51,6 @@ def patient(tmp_path_factory):
 
 
 def searched(patient, **changes):
-    """The organs' verdicts of a case with something else."""
     case = replace(patient.case, **changes)
     return organ_candidates(case, patient.anatomy, patient.engine, case.directions())
 

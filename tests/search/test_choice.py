@@ -26,7 +26,6 @@ CHANGES = (('space = "LPS"', 'space = "RAS"'), ("theta_deg = [0, 10]", 'frame = 
 
 @pytest.fixture(scope="module")
 def context(tmp_path_factory):
-    """Balls about a target, without an arm."""
     return prepare(write_case(tmp_path_factory.mktemp("choice"), *CHANGES), arm=False)
 
 
@@ -35,12 +34,9 @@ def found(context):
     return context.search()
 
 
-def test_nothing_chosen_is_every_safe_candidate_in_the_order_of_ranks(context, found):
-    chosen = choose(context, found, BEST)
-    np.testing.assert_array_equal(chosen.rows, found.ranked)
-
-
-def test_a_rank_is_one_row(context, found):
+def test_nothing_chosen_is_every_safe_candidate_in_the_order_of_ranks_and_a_rank_one_row(context, found):
+    assert parse_choice(None, None, None, None, None) == BEST
+    np.testing.assert_array_equal(choose(context, found, BEST).rows, found.ranked)
     chosen = choose(context, found, Choice(rank=5))
     assert chosen.candidates.ranking.rank[chosen.rows].tolist() == [5]
 
@@ -108,7 +104,6 @@ def test_choices_that_are_none_are_refused(typed, said):
 
 
 def line(path, *points, kind="Line", system="LPS"):
-    """A markups file as Slicer writes it."""
     controls = [{"label": f"L-{n}", "position": list(map(float, p)), "positionStatus": "defined"} for n, p in points]
     markup = {"type": kind, "coordinateSystem": system, "coordinateUnits": "mm", "controlPoints": controls}
     path.write_text(json.dumps({"markups": [markup]}))
@@ -136,7 +131,3 @@ def test_a_line_to_elsewhere_or_many_points_are_no_entry(context, tmp_path):
     many = line(tmp_path / "many.mrk.json", *((n, (n, 0, 0)) for n in range(3)), kind="Fiducial")
     with refused("wrong_count"):
         with_file_read(context.case, Choice(entry_file=many))
-
-
-def test_nothing_stated_is_the_best():
-    assert parse_choice(None, None, None, None, None) == BEST

@@ -71,8 +71,7 @@ def moved_body(patient, breath, s):
     return case, Anatomy(structures, skin, ())
 
 
-@pytest.mark.parametrize("scanned_at", [0.0, 0.6])
-@pytest.mark.parametrize("gate", [None, 0.4])
+@pytest.mark.parametrize(("gate", "scanned_at"), [(None, 0.0), (0.4, 0.6)])
 def test_phases_are_those_of_a_body_that_is_moved_and_searched_anew(patient, gate, scanned_at):
     breath = breathing(gate=gate, scanned_at=scanned_at)
     found, static = searched(patient, breath), searched(patient)

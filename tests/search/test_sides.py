@@ -11,7 +11,6 @@ from puncture_twin.planning.search.sides import BACK, FRONT, Side, grid_of, side
 
 
 def side(name, is_open, why="lies on the table"):
-    """A side that is open, or wholly closed."""
     return Side(name, float(is_open), 1.0, 50.0, "" if is_open else why)
 
 
@@ -36,12 +35,8 @@ def test_it_is_said_in_words():
     """Where, and why not elsewhere; closed for one reason they share a sentence."""
     opened = [side("front", True), side("back", False), side("right", True), side("left", True)]
     assert sides_text(opened) == "front and sides; the back lies on the table"
-    closed = [
-        side("front", False),
-        side("back", False),
-        side("right", True),
-        side("left", False, "is met too obliquely"),
-    ]
+    oblique = side("left", False, "is met too obliquely")
+    closed = [side("front", False), side("back", False), side("right", True), oblique]
     assert sides_text(closed) == "right; the front and back lie on the table; the left is met too obliquely"
 
 

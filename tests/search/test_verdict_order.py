@@ -45,7 +45,6 @@ def rated(skin_rows, clearances=None, structures=(), needle=NEEDLE):
 
 
 def same(found, expected):
-    """Rows equal, NaN where NaN is expected."""
     for row, wanted in zip(found, expected, strict=True):
         assert tuple(row[:2]) == tuple(wanted[:2])
         np.testing.assert_allclose(np.array(row[2:], float), wanted[2:], atol=1e-12)
