@@ -32,7 +32,6 @@ def context():
 
 @pytest.fixture(scope="module")
 def given(context, tmp_path_factory):
-    """Something good for each argument, by its name."""
     tmp = tmp_path_factory.mktemp("values")
     recorded = simulate_recording(np.random.default_rng(1), 24)[0]
     write_recording(recorded, tmp / "recording.csv")

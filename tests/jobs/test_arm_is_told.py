@@ -48,12 +48,6 @@ def test_check_says_so_too(nowhere, switch, capfd):
     assert "theta 0 deg, beta 0 deg: safe for the organs\n" in said and f"arm {NOT_CHECKED}" in said
 
 
-def test_a_robot_with_a_place_is_no_warning(capfd):
-    arguments = ["--theta", "0", "--beta", "0", "--no-arm", "--json"]
-    assert main(["check", str(folder() / "carton" / "case_m.toml"), *arguments]) == OK
-    assert "states a robot" not in capfd.readouterr().out
-
-
 def test_both_ends_of_the_needle_are_told_in_the_robots_axes():
     """The tip is where the registration puts the target, the flange on the direction's line, a needle's length off."""
     context = pt.prepare(folder() / "abdomen")

@@ -12,7 +12,6 @@ DATA = places.DATA / "chen2019"
 
 
 def test_every_number_of_the_paper_holds():
-    """Tables 3, 5, 6, 7 and the worked example agree to 0.01 mm."""
     facts = chen2019.reproduction_facts()
     assert len(facts["rows"]) == 6 + 6 + 3 + 7 + 2
     assert [row for row in facts["rows"] if not row["holds"]] == []

@@ -42,7 +42,6 @@ def class_names():
 
 
 def names_of(path):
-    """What a module defines or imports at its top."""
     found = set()
     for node in tree(path).body:
         found |= {node.name} if hasattr(node, "name") else set()

@@ -9,13 +9,12 @@ import pytest
 from fuzz.runner import Fuzzer
 from fuzz.targets import read_case, whole_case
 
-RUNS = 900
+RUNS = 400
 """Of each of the four parts, which run side by side."""
 
 
 @pytest.fixture(scope="module")
 def fuzzer(tmp_path_factory):
-    """The corpus, and what is made of it."""
     return Fuzzer(tmp_path_factory.mktemp("fuzz"))
 
 

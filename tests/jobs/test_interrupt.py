@@ -32,7 +32,6 @@ def in_a_callback(work):
 
 
 def in_a_destructor(work):
-
     class Closing:
         def __del__(self):
             work()
@@ -64,7 +63,6 @@ def test_an_interruption_that_was_dropped_comes_again(place, capfd):
 
 @pytest.mark.parametrize("prints", [True, False])
 def test_an_interruption_that_was_dropped_at_the_end_leaves_no_answer(prints, capfd):
-
     def command():
         in_a_callback(lambda: signal.raise_signal(signal.SIGINT))
         if prints:
@@ -75,7 +73,6 @@ def test_an_interruption_that_was_dropped_at_the_end_leaves_no_answer(prints, ca
 
 
 def test_an_error_that_a_library_makes_of_an_interruption_is_no_error(capfd):
-
     def command():
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
@@ -177,7 +174,6 @@ def test_llvms_memory_is_freed_once(capfd):
 
 
 def test_a_command_goes_on_after_the_block_that_ctrl_c_ends():
-
     def command():
         with ended_by_ctrl_c():
             signal.raise_signal(signal.SIGINT)

@@ -212,7 +212,6 @@ def test_a_tracked_needle_is_the_same(context, planner, paths):
 
 
 def is_empty(found):
-    """Nothing drawn, nothing free, nothing said to be safe."""
     mesh, grid = found["POLYDATA SafeMap"], np.frombuffer(found["IMAGE SafeGrid"][72:], "<u2")
     assert not any(struct.unpack(">10I", mesh)) and (grid == NO_STRUCTURE).all() and found["POINT Entry"] == b""
     assert document(found, "Verdict")["verdict"] == "refused"

@@ -51,7 +51,6 @@ REFUSED = {
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A function: the folder of one case, made at first use."""
     sys.path.insert(0, str(CASES))
     try:
         spec = importlib.util.spec_from_file_location("make_cases", MAKER)
@@ -78,7 +77,6 @@ def init(folder, target):
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_is_wrong_is_refused_by_its_cause(made, capsys, name):
-    """Exit code 2, one line, nothing written."""
     target, cause = REFUSED[name]
     folder = made(name)
     refused_command(init(folder, target), capsys, *cause.split())
@@ -113,15 +111,8 @@ def test_what_a_device_cannot_read_is_refused(made, capsys):
 def test_a_scale_between_two_lists_is_named(made, capsys):
     """1.6 %, which noise does not explain."""
     folder = made("scale_1.6_percent")
-    command = [
-        "register",
-        str(folder / "markers_ct.csv"),
-        str(folder / "markers_base.csv"),
-        "--target",
-        "0,0,0",
-        "--json",
-    ]
-    assert main(command) == 0
+    lists = [str(folder / name) for name in ("markers_ct.csv", "markers_base.csv")]
+    assert main(["register", *lists, "--target", "0,0,0", "--json"]) == 0
     assert "1.016" in json.dumps(json.loads(capsys.readouterr().out)["flags"])
 
 

@@ -35,7 +35,6 @@ def test_the_page_has_a_command_for_each_of_its_sections():
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_says_what_the_page_says(command, tmp_path, monkeypatch, capsys):
-    """Exit code 0, and the number that is quoted."""
     monkeypatch.chdir(tmp_path)
     words = [str(ROOT / word) if word.startswith("meshes/") else word for word in shlex.split(command)]
     assert main(words) == 0
