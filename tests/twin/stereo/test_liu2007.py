@@ -49,7 +49,6 @@ def test_the_papers_means_are_those_of_its_rows_but_one():
 
 
 def one_trial(seed, gain, after=1.0, stop="converged"):
-    """A trial of four targets with a given gain."""
     rows = tuple(
         TargetRow(seed, name, 1.0, 1.0, after + gain + d, after, 0.1, 1, stop)
         for name, d in zip("abcd", DRAW, strict=True)

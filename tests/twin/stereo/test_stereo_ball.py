@@ -48,10 +48,7 @@ def rms(errors):
 
 
 def test_the_picture_is_that_of_a_dense_plain_ray_caster(rng):
-    """40 x 40 rays per pixel, each met with the sphere by the quadratic formula.
-
-    A pixel is off by less than a grey level of 140, the ball's centre by less than a thousandth of a pixel.
-    """
+    """40 x 40 rays per pixel, each met with the sphere by the quadratic formula."""
     ball = scene(rng, rod=False)
     low = np.round(CAMERA.project(ball.center_c)).astype(int) - 13
     ours = np.full((27, 27), ball.background_grey)
@@ -123,7 +120,6 @@ def test_a_window_is_a_part_of_the_whole_picture(rng):
 
 @pytest.fixture(scope="module")
 def clean():
-    """Twenty-four balls in full view under diffuse light."""
     return tracked(np.random.default_rng(7), 24)
 
 
@@ -191,7 +187,6 @@ def test_a_prediction_out_of_view_is_named(rng):
 
 
 def test_a_plain_array_is_a_whole_picture(rng):
-    """As cv2.imread gives it; the same answer as with an offset of zero."""
     ball = scene(rng)
     whole = render(CAMERA, ball, rng=rng)
     one, other = (find_ball(image, CAMERA, ball.center_c, 4.0, search_px=12) for image in (whole, whole.grey))

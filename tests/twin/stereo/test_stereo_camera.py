@@ -129,7 +129,6 @@ def test_triangulation_returns_the_points(pair, rng):
 
 
 def test_triangulations_covariance_is_honest(pair, rng):
-    """Over noisy pixels the squared error, in units of the covariance, has mean 3."""
     points = rng.uniform(-100, 100, (2000, 3))
     covariance = np.array([[0.04, 0.01], [0.01, 0.02]])
     noise = rng.multivariate_normal(np.zeros(2), covariance, (2, 2000))
@@ -149,7 +148,6 @@ def test_a_pixel_that_is_missing_leaves_its_point_unknown(pair):
 
 
 def test_wrong_cameras_are_refused(pair):
-    """Scaled rotations, no focal length, one camera only, no baseline."""
     scaled = np.diag([2.0, 2.0, 2.0, 1.0])
     with refused("not_rigid"):
         Camera(10, 10, 1.0, 1.0, 0.0, 0.0, np.zeros(4), scaled)

@@ -16,7 +16,6 @@ from puncture_twin.twin.rehearsal.stereo_session import run_session
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A session at one target, with its folder."""
     folder = tmp_path_factory.mktemp("recorded") / "session"
     with new_folder(folder) as kept:
         session = run_session(CASE, 3, targets=("T2",), empty=NoContacts(), record=kept)
@@ -41,7 +40,6 @@ def test_a_recorded_session_is_estimated_as_when_it_ran(recorded):
 
 
 def edited(table, old, new):
-
     def change(folder):
         path = folder / table
         text = path.read_text(encoding="utf-8")

@@ -58,10 +58,8 @@ def test_a_shafts_length_needs_a_direction_and_is_one(recording):
         ("B", lambda a: a * [1.001, 1, 1, 1], "not_rigid"),
         ("A", lambda a: np.where(np.arange(96).reshape(6, 4, 4) == 12, 1.0, a), "not_rigid A pose 1"),
         ("P", lambda a: a[:, :1], "wrong_shape"),
-        ("P", lambda a: a * np.inf, "not_finite"),
         ("v", lambda a: a * 0, "zero_direction"),
         ("v", lambda a: np.column_stack([a * 0.1, np.ones(6)]), "out_of_image"),
-        ("v", lambda a: a[:3], "wrong_shape"),
     ],
 )
 def test_a_broken_recording_is_refused(recording, key, change, says):
@@ -84,13 +82,11 @@ def test_names_must_be_unique(recording):
         (lambda text: text.splitlines()[0] + "\n", "empty"),
         (lambda text: text.rsplit(",", 1)[0] + "\n", "ragged_row 28 29"),
         (lambda text: text.rsplit(",", 1)[0] + ",nan\n", "not_finite v_y nan"),
-        (lambda text: text.rsplit(",", 1)[0] + ",left\n", "not_a_number v_y left"),
         (lambda text: text.replace("\n1,", "\n1,9", 1), "not_rigid"),
         (lambda text: text.replace("\n2,", "\n1,", 1), "duplicate_name"),
     ],
 )
 def test_a_broken_file_is_refused(recording, tmp_path, edit, says):
-    """Every broken file is bad input that names the file and the place in it."""
     path = tmp_path / "recording.csv"
     write_recording(recording, path)
     path.write_text(edit(path.read_text()))

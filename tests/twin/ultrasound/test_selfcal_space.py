@@ -34,7 +34,6 @@ def lifted(recording, w, truth):
 
 
 def in_space(rng, n, truth=None):
-    """An exact recording of n tips in a volume, and its truth."""
     truth = draw_truth(rng) if truth is None else truth
     flat = exact_recording(truth, draw_probe_poses(rng, truth, n), draw_image_poses(rng, n))
     return lifted(flat, rng.uniform(-DEEP_MM, DEEP_MM, n), truth), truth

@@ -6,13 +6,7 @@ from refusals import refused
 from scipy import stats
 
 from puncture_twin.twin.guidance.ultrasound.image.imager import Imager, NeedleEcho, PointSpread
-from puncture_twin.twin.plant.bmode_image import (
-    Lesion,
-    NeedleInImage,
-    blurred_speckle,
-    needle_signal,
-    render,
-)
+from puncture_twin.twin.plant.bmode_image import Lesion, NeedleInImage, blurred_speckle, needle_signal, render
 
 IMAGER = Imager()
 PLAIN = NeedleEcho(roughness=0.0, tip_gain=1.0, reverberations=0, steep_loss_db=0.0)
@@ -151,7 +145,6 @@ def test_pictures_are_seeded():
     ],
 )
 def test_unusable_needles_are_refused(bad):
-    """Not finite, no unit direction, or no 3D point."""
     with refused("not_finite"):
         render(IMAGER, bad, np.random.default_rng(0))
 
