@@ -175,7 +175,6 @@ def test_the_physics_feels_the_gantry(in_gantry):
 
 
 def test_the_gantry_is_drawn(in_gantry):
-    """One see-through ring in the CT frame, with a bore of the stated size."""
     case = load_case(in_gantry(tilt=10.0))
     body = next(body for body in room(case, None) if body.name == "gantry")
     at = (body.mesh.vertices - case.gantry.T_ct_gantry[:3, 3]) @ case.gantry.T_ct_gantry[:3, :3]

@@ -32,11 +32,10 @@ def arm(path, **keys):
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
-    """A URDF whose frames are those of Denavit and Hartenberg."""
     return write_own_arm(tmp_path_factory.mktemp("plain"))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_lengths_and_motion_are_the_urdfs_however_its_frames_lie(tmp_path, seed):
     """Random lengths, frames turned anyhow and shifted along the axes: the flange is where the text alone has it."""
     rng = np.random.default_rng(seed)

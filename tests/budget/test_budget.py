@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import fields, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,13 +24,15 @@ from puncture_twin.planning.uncertainty.sources import reading_parts
 from puncture_twin.run_twin import app
 from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 
-BEDS = {"abdomen/case.toml": (0.0, 0.0, 1.0), "carton/case_m_setup2.toml": (1.0, 0.0, 0.0)}
+ABDOMEN_CASE, CARTON_CASE = "abdomen/case.toml", "carton/case_m_setup2.toml"
+BEDS = {ABDOMEN_CASE: (0.0, 0.0, 1.0), CARTON_CASE: (1.0, 0.0, 0.0)}
 """Of each case, the direction across its slices."""
 
 ABDOMEN = ROOT / "meshes" / "abdomen"
 NOTHING = ArmUncertainty(**{field.name: 0.0 for field in fields(ArmUncertainty)})
 
 
+@cache
 def chain(name):
     """The chain of an embedded case, at an insertion that its arm reaches."""
     case = load_case(ROOT / "meshes" / name)
@@ -39,7 +42,6 @@ def chain(name):
 
 @pytest.fixture(scope="module", params=BEDS)
 def found(request):
-    """Chain, skin points and bed of a case."""
     case = load_case(ROOT / "meshes" / request.param)
     skin = load_skin(case, user_cache()).mesh.vertices[::50]
     return chain(request.param), changes(chain(request.param), skin, np.array(BEDS[request.param]))
@@ -62,7 +64,6 @@ def test_squares_of_the_sources_add_up(name):
 
 
 def _alone(errors, source):
-    """The declaration with one source left."""
     nothing = replace(errors, marker_cov_ct=np.zeros((3, 3)), touch_mm=0.0, target_cov_ct=np.zeros((3, 3)), arm=NOTHING)
     if source in ("ct_slice", "ct_in_plane"):
         return replace(nothing, marker_cov_ct=reading_parts(errors.marker_cov_ct)[source])
@@ -74,8 +75,10 @@ def _alone(errors, source):
     return replace(nothing, arm=replace(NOTHING, **{name: getattr(errors.arm, name)}))
 
 
-@pytest.mark.parametrize("source", ["ct_slice", "touch", "target", "link", "drift", "tip_offset", "repeatability"])
-@pytest.mark.parametrize("name", BEDS)
+SOURCES = ["ct_slice", "touch", "target", "link", "drift"]
+
+
+@pytest.mark.parametrize(("name", "source"), [*((ABDOMEN_CASE, one) for one in SOURCES), (CARTON_CASE, "ct_slice")])
 def test_rooms_drawn_with_one_source_err_as_it_costs(name, source):
     """Whole nonlinear chains, 4,000 of them: their rms is known to 1 %."""
     one = chain(name)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from puncture_twin.planning.geometry import containment
 from puncture_twin.planning.geometry.containment import RAYS, SEED, Side, inside_each, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -114,7 +113,3 @@ def test_an_open_surface_has_no_inside_for_many_points_either(ball):
     mesh = ball(50, subdivisions=1)
     with pytest.raises(ValueError, match="open"):
         inside_each(TriangleMesh(mesh.vertices, mesh.faces[1:]), np.zeros((2, 3)))
-
-
-def test_there_is_no_tie():
-    assert containment.RAYS % 2 == 1

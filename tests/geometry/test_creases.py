@@ -12,7 +12,6 @@ def both_ways(faces, rng):
 
 
 def some_turned(share):
-    """A share of the triangles wound against the others."""
 
     def turn(faces, rng):
         return np.where((rng.random(len(faces)) < share)[:, None], faces[:, ::-1], faces)

@@ -33,7 +33,6 @@ def test_what_nobody_writes_to_is_taken_as_it_is(make: Callable[[], np.ndarray])
 
 
 def behind() -> np.ndarray:
-    """A read-only look at memory that is written to."""
     look = VERTICES.copy()[:]
     look.setflags(write=False)
     return look

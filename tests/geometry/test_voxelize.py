@@ -15,7 +15,6 @@ T_CT_INDEX = np.array([[0.8, 0.0, 0.0, -31.0], [0.0, 1.1, 0.0, 12.0], [0.0, 0.0,
 
 @pytest.fixture
 def blobs(rng):
-    """Random lumps, some of which the border cuts."""
     smooth = scipy.ndimage.gaussian_filter(rng.normal(size=(30, 26, 22)), 2.0)
     return smooth > np.quantile(smooth, 0.8)
 

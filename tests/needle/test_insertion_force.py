@@ -15,7 +15,6 @@ PATH = [Layer(0.0, 8.0, SKIN), Layer(8.0, 25.0, FAT), Layer(25.0, 80.0, LIVER)]
 
 
 def work_n_mm(found):
-    """Work of the arm: the force integrated over the samples."""
     return float(np.trapezoid(found.total_n, found.depth_mm))
 
 

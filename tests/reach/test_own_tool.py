@@ -34,12 +34,10 @@ BENT = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 
 
 def body(solid):
-    """A trimesh in the flange's frame as a tool."""
     return ToolBody(TriangleMesh(solid.vertices, solid.faces), Path("tool.stl"), 1.0, np.eye(4), "case.toml: tool")
 
 
 def rod(radius, low, high, sections=256):
-    """A cylinder along the flange's z axis."""
     made = trimesh.creation.cylinder(radius, high - low, sections=sections)
     made.apply_translation([0.0, 0.0, (low + high) / 2])
     return made
@@ -171,7 +169,6 @@ def test_a_tool_that_does_not_hang_on_the_flange_is_refused(solid, says):
 
 
 def test_a_tool_is_sent_to_another_process():
-    """Placements are rated in several: what arrives is the same tool."""
     tool = replace(NEEDLE, body=body(camera()))
     assert pickle.loads(pickle.dumps(tool)) == tool and hash(tool) != hash(NEEDLE)
 

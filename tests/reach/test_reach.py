@@ -64,12 +64,10 @@ def directions(count: int, seed: int) -> np.ndarray:
 
 
 def request(u: np.ndarray, standoff_mm: float = STANDOFF_MM) -> ReachRequest:
-    """A request for the target and tool of this file."""
     return ReachRequest(TARGET, u, TOOL.needle_length_mm, standoff_mm)
 
 
 def reached(checker: CellChecker, count: int, seed: int) -> list:
-    """Some reachable answers with their requests."""
     found = []
     for u in directions(60, seed):
         answer = assess_reach_all(checker, [request(u)])[0]

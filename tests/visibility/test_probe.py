@@ -52,7 +52,6 @@ def view(abdomen):
 
 
 def ruled_by(feet, why):
-    """Which footprints are ruled out by what."""
     return feet.ruled == ORDER.index(why)
 
 
@@ -294,9 +293,3 @@ def test_a_target_that_lies_too_deep_has_no_window(stated):
     view = probe_view(*stated("ultrasound", depth_mm=20.0))
     assert view.T_ct_image is None and set(view.counts) <= {"no_skin", "too_deep", "tilted"}
     assert "depth_mm" in view.sentence
-
-
-def test_it_shows_itself(view, stated):
-    assert "mm of depth" in repr(view) and "footprints" in view._repr_html_()
-    none = probe_view(*stated("ultrasound", depth_mm=20.0))
-    assert "no place for the probe" in none._repr_html_()
