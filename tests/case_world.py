@@ -93,7 +93,6 @@ def changed(text, *changes):
 
 
 def ball(path, radius=10.0, center=(0, 0, 0)):
-    """A closed sphere on disk."""
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
     mesh.apply_translation(center)
     mesh.export(path)
@@ -106,13 +105,11 @@ def write_balls(folder, *names, ending="stl"):
 
 
 def write_markers(folder, ct=MARKERS, base=MARKERS):
-    """The two lists of markers."""
     (folder / "markers_ct.csv").write_text(ct)
     (folder / "touch.csv").write_text(base)
 
 
 def points_file(points, names="ABCDEFGH"):
-    """The text of a file of points."""
     rows = [",".join([name, *(f"{x:.3f}" for x in point)]) for name, point in zip(names, points, strict=False)]
     return "\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n"
 

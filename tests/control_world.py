@@ -44,7 +44,6 @@ FRICTION_NM = np.array([0.3, 0.3, 0.15, 0.05, 0.05, 0.05])
 
 
 def nearest(T_base_flange, q):
-    """The configuration of a pose nearest to another one."""
     found = nearest_within_limits(UR3, inverse(UR3, T_base_flange)[0], q)
     found = found[~np.isnan(found).any(axis=1)]
     return found[np.argmin(np.abs(found - q).max(axis=1))]
@@ -66,7 +65,6 @@ class Position:
     dt = 1 / 240
 
     def act(self, measured, reference, row):
-        """Goals of the next step."""
         del measured
         return Goals(reference.q[row], reference.speed[row])
 
@@ -78,7 +76,6 @@ class WithFriction:
         self.dt, self._controller, self._friction = controller.dt, controller, friction_nm
 
     def act(self, measured, reference, row):
-        """Torques of the next step, friction taken off."""
         action = self._controller.act(measured, reference, row)
         return action._replace(torque_nm=action.torque_nm - self._friction * np.clip(measured.speed / 2e-3, -1, 1))
 
@@ -104,7 +101,6 @@ def bench(down=DOWN, factors=None, T_world_base=None):
 
 
 def true_tip(q):
-    """The tip of true joints."""
     return tips(UR3, TIP_M, q[None])
 
 
@@ -122,7 +118,6 @@ def follow(bench, controller, trajectory, *, settle_s=0.0, hold_s=0.5, resistanc
 
 
 def impedance(bench, K=2e4, K_i=5.0, dt=5e-4, keep=False):
-    """A spring at the tip."""
     return Impedance(bench.model, Stiffness(K, integral_per_s=K_i), dt, keep_compliance=keep)
 
 
@@ -191,7 +186,6 @@ def free_space(speed_mm_s, friction=None, seed=1, length_mm=20.0):
 
 
 def compliance(K, force_n, direction):
-    """Displacement over F / K under a force at rest."""
     still = along_needle(60.0, 1e-3, 1.0)
     start = true_tip(still.q[-1])
     across = start.R_base_tip[0, :, direction]

@@ -8,15 +8,7 @@ from puncture_twin.planning.registration.hand_eye import PosePairs
 
 
 def hand_eye_problem(rng, n, noise=None, *, motions=False, turns=None):
-    """Pairs of n poses or motions, with X and Z.
-
-    Args:
-        rng: Draws all of it.
-        n: How many.
-        noise: A `HandEyeNoise`; None leaves them exact.
-        motions: Whether they are motions, so that Z is X.
-        turns: Rotation vectors of the flange about its mean, (n, 3), rad; None for any within half a radian.
-    """
+    """Pairs of n poses or motions, with X and Z."""
     X = pose(exp_rotation(rng.uniform(-2, 2, 3)), rng.uniform(-100, 100, 3))
     Z = X if motions else pose(exp_rotation(rng.uniform(-2, 2, 3)), rng.uniform(-800, 800, 3))
     turns = rng.uniform(-0.5, 0.5, (n, 3)) if turns is None else turns
@@ -30,13 +22,11 @@ def hand_eye_problem(rng, n, noise=None, *, motions=False, turns=None):
 
 
 def shaken(rng, T, mm, rad):
-    """Poses with normal errors."""
     n = len(T)
     return pose(T[:, :3, :3] @ exp_rotation(rng.normal(0, rad, (n, 3))), T[:, :3, 3] + rng.normal(0, mm, (n, 3)))
 
 
 def write_pairs(path, pairs):
-    """As a CSV."""
     values = np.column_stack([pose_values(pairs.A), pose_values(pairs.B)]).tolist()
     rows = [(name, *row) for name, row in zip(pairs.names, values, strict=True)]
     path.write_text(table_text(("name", *pose_columns("A"), *pose_columns("B")), rows))

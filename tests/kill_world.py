@@ -66,11 +66,7 @@ def _behind():
 
 
 def kill_while_writing(process, out, rng):
-    """Kill a process at random, half the time while it writes its files and half while they are put in place.
-
-    Returns:
-        Whether it was still running.
-    """
+    """Kill a process at random, half the time while it writes its files and half while they are put in place."""
     aimed = bool(rng.integers(2))
     deadline = time.monotonic() + RUN_TIMEOUT_S
     while process.poll() is None and time.monotonic() < deadline:
@@ -103,14 +99,7 @@ def passing(out):
 
 
 def state_of(out, entry, old, new):
-    """``old``, ``new`` or ``unfinished``; fails on anything else.
-
-    Args:
-        out: The folder.
-        entry: The command's.
-        old: SHA-256 of an input that only the old set has, or None where there was none.
-        new: The same of the new set.
-    """
+    """``old``, ``new`` or ``unfinished``; fails on anything else."""
     manifest = read_manifest(out) if out.is_dir() else None
     if manifest is None or entry not in manifest.entries:
         assert not [name for name, owner in passing(out).items() if owner == entry]
@@ -129,7 +118,6 @@ def temporaries(out):
 
 
 def said(command, counts: Counter):
-    """A row of the table in docs/reference/validation.md."""
     return f"| {command} | {sum(counts.values())} | {counts['old']} | {counts['unfinished']} | {counts['new']} |"
 
 

@@ -46,11 +46,7 @@ def bone(T_link_ends):
 
 
 def write_own_arm(folder, lengths=LENGTHS, *, rng=None, name="toy", limit='lower="-6" upper="6"'):
-    """A URDF and its meshes; with ``rng`` each link's frame lies anywhere along its joint's axis, turned anyhow.
-
-    Returns:
-        The URDF's path.
-    """
+    """A URDF and its meshes; with ``rng`` each link's frame lies anywhere along its joint's axis, turned anyhow."""
     folder.mkdir(parents=True, exist_ok=True)
     frames = [np.eye(4)]
     for step in dh(lengths):
@@ -152,3 +148,10 @@ def about(axis, angle):
     x, y, z = axis
     K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def write_holder(path):
+    """A holder about the flange with something at its side, mm."""
+    side = trimesh.creation.box((70.0, 20.0, 30.0)).apply_translation([30.0, 0.0, 16.0])
+    round_one = trimesh.creation.cylinder(18.0, 50.0).apply_translation([0, 0, 26.0])
+    trimesh.util.concatenate([round_one, side]).export(path)

@@ -31,7 +31,6 @@ DEGENERATE = {
 
 
 def as_estimate(truth):
-    """The truth in the form of an estimate."""
     X, Y = truth.X, truth.Y
     return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], truth.tip_end2, np.ones(2), truth.direction_end2)
 
@@ -96,7 +95,6 @@ def tre(found, A, B, P):
 
 
 def joined(first, second):
-    """Two recordings, one after the other, numbered anew."""
     A, B, P = (np.concatenate([getattr(one, key) for one in (first, second)]) for key in "ABP")
     parts = {
         key: np.concatenate([getattr(one, key) for one in (first, second)])

@@ -25,11 +25,9 @@ class NoContacts:
     model = HELD.model
 
     def first_contact(self, q_path, *, needle_may_touch_patient):
-        """Nothing is touched."""
         return
 
     def sweep_mm(self, q_path):
-        """Nothing moves far."""
         return np.zeros(len(q_path) - 1)
 
 

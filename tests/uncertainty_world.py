@@ -40,7 +40,6 @@ DIRECTIONS = {"abdomen/case.toml": (62.0, 96.0), "carton/case_m.toml": (18.0, 23
 
 
 def declared(**keys):
-    """An error model from keys of ``[errors]``."""
     return error_model(ErrorsSection(**keys), space=Space.LOCAL)
 
 

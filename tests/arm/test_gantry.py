@@ -44,7 +44,6 @@ def test_the_wall_is_whole_and_the_bore_free() -> None:
 
 
 def test_in_a_gantry_both_checkers_agree() -> None:
-    """The same contacts with and without help, some with the gantry."""
     tool = Tool(250.0, 150.0, 1.2, 30.0)
     ahead = trimesh.transformations.rotation_matrix(np.pi / 2.0 + 0.35, [1.0, 0.0, 0.0])
     ahead[:3, 3] = (0.0, 600.0, 150.0)
@@ -97,7 +96,6 @@ def test_a_tilt_leans_the_top_toward_the_feet(in_gantry):
 
 
 def test_a_gantry_in_another_space_stands_at_the_same_place(in_gantry):
-    """The same gantry stated in RAS, its axes as vectors."""
     more = "axis = [0.0, 0.0, 1.0]\nup = [0.0, 1.0, 0.0]\n"
     ras = (('space = "LPS"', 'space = "RAS"'),)
     T = load_case(in_gantry(more, 20.0, ras)).gantry.T_ct_gantry
@@ -142,7 +140,6 @@ def test_an_arm_through_the_wall_is_a_collision_that_names_the_gantry(in_gantry)
     ],
 )
 def test_gantries_that_make_no_sense_are_refused(in_gantry, change, match):
-    """By key."""
     path = in_gantry()
     path.write_text(path.read_text().replace(*change))
     with refused(*match.split()):
@@ -150,7 +147,6 @@ def test_gantries_that_make_no_sense_are_refused(in_gantry, change, match):
 
 
 def test_a_gantry_that_does_not_go_around_the_patient_is_refused(in_gantry):
-    """A bore narrower than he is, or beside him."""
     path = in_gantry()
     path.write_text(path.read_text().replace("bore_diameter_mm = 700.0", "bore_diameter_mm = 300.0"))
     with refused("gantry_in_patient"):
@@ -179,7 +175,6 @@ def test_the_physics_feels_the_gantry(in_gantry):
 
 
 def test_the_gantry_is_drawn(in_gantry):
-    """One see-through ring in the CT frame, with a bore of the stated size."""
     case = load_case(in_gantry(tilt=10.0))
     body = next(body for body in room(case, None) if body.name == "gantry")
     at = (body.mesh.vertices - case.gantry.T_ct_gantry[:3, 3]) @ case.gantry.T_ct_gantry[:3, :3]

@@ -207,7 +207,6 @@ def test_meshes_are_in_millimetres_and_named() -> None:
 
 
 def test_unknown_models_and_models_without_meshes_are_refused() -> None:
-    """The message names what is available."""
     with refused("unknown_robot"):
         ur_model("kuka")
     with refused("no_link_meshes", "ur10", "ur10e", "ur3", "ur3e", "ur5", "ur5e"):

@@ -27,17 +27,15 @@ TOOL = Tool(200.0, 150.0, 1.2, 30.0)
 
 
 def arm(path, **keys):
-    """The arm of a URDF file."""
     return own_arm(path.read_bytes(), path, **{"flange": "tool0", "read": beside(path), **keys})
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
-    """A URDF whose frames are those of Denavit and Hartenberg."""
     return write_own_arm(tmp_path_factory.mktemp("plain"))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_lengths_and_motion_are_the_urdfs_however_its_frames_lie(tmp_path, seed):
     """Random lengths, frames turned anyhow and shifted along the axes: the flange is where the text alone has it."""
     rng = np.random.default_rng(seed)
@@ -174,7 +172,6 @@ def test_rounded_angles_are_a_right_angle_and_two_digits_are_not(plain, tmp_path
 
 
 def test_limits_are_the_urdfs_or_the_cases(plain, tmp_path):
-    """A joint without limits takes the case's; nothing else does."""
     model = arm(plain)
     assert model.joint_limits.tolist() == [[-6.0, 6.0]] * 6 and model.max_torques.tolist() == [100.0] * 6
     stated = StatedLimits(np.array([[-3.0, 3.0]] * 6))
@@ -248,7 +245,6 @@ def test_links_that_do_not_hang_together_are_refused(plain, tmp_path, change, sa
 
 
 def test_flat_shapes_are_refused(plain, tmp_path):
-    """A sheet has no inside."""
     path = edited(plain, tmp_path)
     sheet = trimesh.Trimesh([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0]], [[0, 1, 2]])
     sheet.export(tmp_path / "ulna.stl")

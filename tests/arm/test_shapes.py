@@ -2,16 +2,13 @@
 
 import hashlib
 import json
-from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
-from refusals import refused
 
 from puncture_twin import meshes
 from puncture_twin.planning.arm.kinematics import link_poses
-from puncture_twin.planning.arm.links import LINK_NAMES, model_urdf, visual_links
+from puncture_twin.planning.arm.links import LINK_NAMES, visual_links
 from puncture_twin.planning.arm.ur import ur_model
 
 FOLDER = meshes.folder() / "ur"
@@ -48,23 +45,3 @@ def test_each_shape_begins_where_the_one_before_ends(name):
         low, high = heights
         gap = min(abs(high.min() - low.max()), abs(low.min() - high.max()))
         assert gap < EDGE_MM or (high.min() < low.max() and low.min() < high.max()), LINK_NAMES[joint : joint + 2]
-
-
-@pytest.mark.parametrize("name", ARMS)
-def test_the_urdf_is_the_table(name):
-    """At random angles the last link is where the Denavit-Hartenberg table has it, to 0.1 mm and far below.
-
-    The older URDFs have their links' axes otherwise: there it is the same motion at every angle.
-    """
-    model = ur_model(name)
-    urdf, table = (poses(np.zeros(6))[6] for poses in (model_urdf(model).body_poses, partial(link_poses, model)))
-    T_table_urdf = np.linalg.inv(table) @ urdf
-    assert name not in E_SERIES or np.abs(T_table_urdf - np.eye(4)).max() < 1e-5
-    for q in np.random.default_rng(8).uniform(-np.pi, np.pi, (50, 6)):
-        assert np.abs(model_urdf(model).body_poses(q)[6] - link_poses(model, q)[6] @ T_table_urdf).max() < 1e-5
-
-
-def test_no_arm_without_shapes_is_given_any():
-    """An arm that has no URDF here is refused, with those that have one."""
-    with refused("no_link_meshes", "ur16e", "ur10", "ur10e", "ur3", "ur3e", "ur5", "ur5e"):
-        model_urdf(replace(ur_model("ur10e"), name="ur16e"))

@@ -37,13 +37,11 @@ class Path:
 
 
 def breath(gate, scanned_at=0.0, exponent=2):
-    """Twelve millimetres toward the feet."""
     return Breathing(12.0, np.array([0.0, 0.0, -1.0]), ByName({"*": 1.0}), 8, exponent, scanned_at, gate)
 
 
 @pytest.fixture(scope="module")
 def chain():
-    """Of the embedded abdomen, which declares neither."""
     case = load_case(ABDOMEN)
     placement = load_placement(case)
     return chain_of(case, placement.registration, reached_insertion(case, placement.T_base_ct))
@@ -52,8 +50,6 @@ def chain():
 @pytest.mark.parametrize("exponent", [1, 2, 4, 6])
 @pytest.mark.parametrize("about", [0.0, 0.3])
 def test_the_mean_square_of_the_breath_has_a_closed_form(exponent, about):
-    """Of the even powers of a sine over a whole period."""
-
     def power(n):
         return comb(2 * n, n) / 4**n
 
@@ -114,7 +110,6 @@ def test_a_fixed_body_takes_its_motion_away(chain):
 
 
 def test_narrower_gates_cost_time_and_win_millimetres(chain):
-    """Each other gate, with the part of the time that it leaves."""
     one = replace(chain, breath=Breath(breath(0.5), chain.T_base_ct[:3, :3]))
     found = {c.what: c.rms_mm for c in changes(one, np.empty((0, 3)), None) if c.group == "breath"}
     assert list(found) == [

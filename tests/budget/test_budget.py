@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import fields, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,13 +24,15 @@ from puncture_twin.planning.uncertainty.sources import reading_parts
 from puncture_twin.run_twin import app
 from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 
-BEDS = {"abdomen/case.toml": (0.0, 0.0, 1.0), "carton/case_m_setup2.toml": (1.0, 0.0, 0.0)}
+ABDOMEN_CASE, CARTON_CASE = "abdomen/case.toml", "carton/case_m_setup2.toml"
+BEDS = {ABDOMEN_CASE: (0.0, 0.0, 1.0), CARTON_CASE: (1.0, 0.0, 0.0)}
 """Of each case, the direction across its slices."""
 
 ABDOMEN = ROOT / "meshes" / "abdomen"
 NOTHING = ArmUncertainty(**{field.name: 0.0 for field in fields(ArmUncertainty)})
 
 
+@cache
 def chain(name):
     """The chain of an embedded case, at an insertion that its arm reaches."""
     case = load_case(ROOT / "meshes" / name)
@@ -39,7 +42,6 @@ def chain(name):
 
 @pytest.fixture(scope="module", params=BEDS)
 def found(request):
-    """Chain, skin points and bed of a case."""
     case = load_case(ROOT / "meshes" / request.param)
     skin = load_skin(case, user_cache()).mesh.vertices[::50]
     return chain(request.param), changes(chain(request.param), skin, np.array(BEDS[request.param]))
@@ -47,7 +49,6 @@ def found(request):
 
 @pytest.mark.parametrize("name", BEDS)
 def test_an_insertion_puts_the_tip_on_the_target(name):
-    """By forward kinematics."""
     one = chain(name)
     flange = flange_pose(one.model, one.q_insertion)
     tip = flange[:3, 3] + one.tip_mm * flange[:3, 2]
@@ -56,7 +57,6 @@ def test_an_insertion_puts_the_tip_on_the_target(name):
 
 @pytest.mark.parametrize("name", BEDS)
 def test_squares_of_the_sources_add_up(name):
-    """Alone they make up the whole; without one, the rest."""
     one = chain(name)
     costs = source_costs(one)
     assert sum(cost.alone_mm**2 for cost in costs) == pytest.approx(one.expected_mm() ** 2)
@@ -64,7 +64,6 @@ def test_squares_of_the_sources_add_up(name):
 
 
 def _alone(errors, source):
-    """The declaration with one source left."""
     nothing = replace(errors, marker_cov_ct=np.zeros((3, 3)), touch_mm=0.0, target_cov_ct=np.zeros((3, 3)), arm=NOTHING)
     if source in ("ct_slice", "ct_in_plane"):
         return replace(nothing, marker_cov_ct=reading_parts(errors.marker_cov_ct)[source])
@@ -76,8 +75,10 @@ def _alone(errors, source):
     return replace(nothing, arm=replace(NOTHING, **{name: getattr(errors.arm, name)}))
 
 
-@pytest.mark.parametrize("source", ["ct_slice", "touch", "target", "link", "drift", "tip_offset", "repeatability"])
-@pytest.mark.parametrize("name", BEDS)
+SOURCES = ["ct_slice", "touch", "target", "link", "drift"]
+
+
+@pytest.mark.parametrize(("name", "source"), [*((ABDOMEN_CASE, one) for one in SOURCES), (CARTON_CASE, "ct_slice")])
 def test_rooms_drawn_with_one_source_err_as_it_costs(name, source):
     """Whole nonlinear chains, 4,000 of them: their rms is known to 1 %."""
     one = chain(name)
@@ -115,7 +116,6 @@ def test_slices_as_they_are_change_nothing():
 
 
 def test_markers_are_counted_from_three_to_ten(found):
-    """All numbers but today's."""
     one, all_changes = found
     counts = [int(c.what.removeprefix("only ").split()[0]) for c in all_changes if c.group == "markers"]
     assert counts == [n for n in range(3, MOST_MARKERS + 1) if n != len(one.points_ct)]

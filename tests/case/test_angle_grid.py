@@ -37,7 +37,6 @@ def test_neighbours_are_at_most_a_step_apart_and_each_row_has_all_of_its_own():
 
 
 def test_an_open_range_of_azimuths_has_ends():
-    """No wrap between its first and its last azimuth."""
     found = angle_grid((10, 30), (0, 350), 10.0)
     assert not found.full_circle
     assert {(0, 35), (35, 0)}.isdisjoint(map(tuple, found.neighbours().tolist()))

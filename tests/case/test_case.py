@@ -37,7 +37,6 @@ def write(tmp_path):
 
 
 def test_a_good_case_is_read(write):
-    """Degrees become radians, defaults are filled in, every input is hashed."""
     case = load_case(write())
     assert (case.name, case.space, case.target_structure) == ("one", Space.LPS, "organ")
     np.testing.assert_array_equal(case.target_ct, [1, 2, 3])
@@ -54,7 +53,6 @@ def test_a_good_case_is_read(write):
 
 
 def test_a_folder_stands_for_its_case_file(write):
-    """A folder is read through its case.toml."""
     assert load_case(write().parent).name == "one"
 
 
@@ -66,7 +64,6 @@ def test_patient_space_defaults_to_the_bed_frame(write):
 
 
 def test_a_ras_case_is_turned_to_lps(write):
-    """Target and mount of a RAS case change the sign of x and y."""
     mount = "\n[robot.mount]\nposition_mm = [10, 20, 30]\nx_axis = [1, 0, 0]\nz_axis = [0, 0, 1]\n"
     case = load_case(write(('"LPS"', '"RAS"'), text=GOOD + mount))
     np.testing.assert_array_equal(case.target_ct, [-1, -2, 3])
@@ -77,7 +74,6 @@ def test_a_ras_case_is_turned_to_lps(write):
 
 
 def test_a_target_may_come_from_a_file_of_points(write, tmp_path):
-    """A name in a CSV of points, in the case's space."""
     (tmp_path / "targets.csv").write_text("name,x_mm,y_mm,z_mm\nA,4,5,6\n")
     path = write(("position_mm = [1.0, 2.0, 3.0]", 'points = "targets.csv"\nname = "A"'))
     np.testing.assert_array_equal(load_case(path).target_ct, [4, 5, 6])
@@ -88,16 +84,12 @@ def test_a_target_may_come_from_a_file_of_points(write, tmp_path):
 
 BAD = {
     "unknown key": (("diameter_mm", "diamter_mm"), "unknown_key diamter_mm diameter_mm"),
-    "unknown section": (("[search]", "[serach]"), "unknown_key serach search"),
-    "wrong unit in a key": (("length_mm", "length_m"), "unknown_key length_m length_mm"),
     "metres under a mm key": (("length_mm = 210.0", "length_mm = 0.21"), "bad_value needle.length_mm 20"),
     "another schema": (("schema = 2", "schema = 1"), "unknown_version"),
     "no schema": (("schema = 2", ""), "unknown_version"),
-    "text for a number": (("diameter_mm = 1.2", 'diameter_mm = "1.2"'), "bad_value needle.diameter_mm"),
     "true for a number": (("diameter_mm = 1.2", "diameter_mm = true"), "bad_value needle.diameter_mm"),
     "nan": (("diameter_mm = 1.2", "diameter_mm = nan"), "bad_value needle.diameter_mm"),
     "negative": (("diameter_mm = 1.2", "diameter_mm = -1.2"), "bad_value needle.diameter_mm 0.1"),
-    "infinite target": (("[1.0, 2.0, 3.0]", "[1.0, inf, 3.0]"), "bad_value target.position_mm"),
     "two coordinates": (("[1.0, 2.0, 3.0]", "[1.0, 2.0]"), "missing_key target.position_mm"),
     "no target": (("position_mm = [1.0, 2.0, 3.0]", ""), "not_one_source position_mm"),
     "shaft longer than the needle": (
@@ -105,8 +97,6 @@ BAD = {
         "out_of_range shaft_mm 250 length_mm 210",
     ),
     "descending range": (("[0, 60]", "[60, 0]"), "range_descends theta_deg"),
-    "range beyond 180": (("[0, 60]", "[0, 200]"), "bad_value search.theta_deg 180"),
-    "zero step": (("step_deg = 5.0", "step_deg = 0"), "bad_value search.step_deg 0.05"),
     "another space": (('"LPS"', '"LAS"'), "bad_value LPS RAS local"),
     "bed frame in a local space": (('space = "LPS"', 'space = "local"'), "local_space search.frame ct"),
     "unknown role": (('role = "target"', 'role = "avoidd"'), "bad_value organ avoid"),
@@ -128,7 +118,6 @@ BAD = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_broken_case_is_refused_in_one_line(name, write):
-    """Each defect is named with its place and what is allowed."""
     change, message = BAD[name]
     text = GOOD.replace("theta_deg = [0, 60]", 'theta_deg = [0, 60]\nframe = "bed"') if "local" in name else GOOD
     with refused(*message.split(), "case.toml"):
@@ -162,7 +151,6 @@ def test_contradictions_with_the_robot_are_refused(added, message, write):
     ],
 )
 def test_what_is_no_case_file_is_refused(content, message, tmp_path):
-    """Garbage, half a file, nothing at all, far too much."""
     path = tmp_path / "case.toml"
     path.write_bytes(content)
     with refused(message):
@@ -176,7 +164,6 @@ def test_a_patient_of_any_alphabet_has_a_case(name, write):
 
 
 def test_a_missing_case_is_refused(tmp_path):
-    """The folder without a case.toml is named."""
     with refused("no_such_file", "case.toml"):
         load_case(tmp_path)
 

@@ -76,7 +76,6 @@ def sliced(values: np.ndarray) -> np.ndarray:
 
 
 def detached(values: np.ndarray, header: Path) -> None:
-    """A NRRD header with its data beside it."""
     sitk.WriteImage(image_of(sliced(values)), str(header), useCompression=False)
     text = header.read_bytes()
     header.write_bytes(text.replace(b"\n", b"\n# written for a test\n", 1))
@@ -91,13 +90,11 @@ def vessel(place: tuple[int, int, int]) -> np.ndarray:
 
 
 def without_header(path: Path) -> None:
-    """Empty the header of a binary STL."""
     path.write_bytes(bytes(80) + path.read_bytes()[80:])
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A case with every kind of source."""
     here = tmp_path / "case"
     (here / "vessels").mkdir(parents=True)
     (here / "case.toml").write_text(CASE)
@@ -120,7 +117,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 def places(context: CaseContext) -> list[tuple[str, str]]:
-    """Role and path of each input."""
     return [(one.role, one.path) for one in context.case.inputs]
 
 

@@ -46,13 +46,11 @@ def read(tmp_path):
 
 
 def test_a_case_without_them_declares_none(read):
-    """Neither a device nor a motion is assumed."""
     case = read("")
     assert case.stereo is case.ultrasound is case.control_scan is case.motion is None
 
 
 def test_the_defaults_are_those_of_the_reference(read):
-    """Cameras and mount are to be proposed."""
     case = read("[stereo]\n[ultrasound]\n[control_scan]")
     assert case.stereo.cameras_ct is None and case.ultrasound.T_base_ct_mount is None
     assert (case.stereo.balls_mm, case.stereo.sd_mm) == ((80.0, 160.0), 0.03)
@@ -63,7 +61,6 @@ def test_the_defaults_are_those_of_the_reference(read):
 
 
 def test_every_key_is_read(read):
-    """The mount as the robot's is."""
     case = read(EVERY_KEY)
     assert case.stereo.cameras_ct.tolist() == [[-250.0, -900.0, 300.0], [250.0, -900.0, 300.0]]
     assert (case.stereo.balls_mm, case.stereo.sd_mm) == ((60.0, 120.0, 180.0), 0.05)
@@ -78,7 +75,6 @@ def test_every_key_is_read(read):
 
 
 def test_places_of_a_ras_case_are_turned_to_lps(read):
-    """Cameras and mount turn; a variance per axis has no sign."""
     case = read(EVERY_KEY, ('space = "LPS"', 'space = "RAS"'))
     assert case.stereo.cameras_ct.tolist() == [[250.0, 900.0, 300.0], [-250.0, 900.0, 300.0]]
     assert np.linalg.inv(case.ultrasound.T_base_ct_mount)[:3, 3] == pytest.approx([600.0, -20.0, -30.0])
@@ -91,28 +87,20 @@ def test_places_of_a_ras_case_are_turned_to_lps(read):
         ("[60.0, 120.0, 180.0]", "[60.0, 60.0]", "range_descends", "balls_mm"),
         ("[60.0, 120.0, 180.0]", "[60.0, 210.0]", "out_of_range", "210"),
         ("[60.0, 120.0, 180.0]", "[0.0, 120.0]", "bad_value", "balls_mm"),
-        ("[60.0, 120.0, 180.0]", "[]", "bad_value", "balls_mm"),
-        ("[60.0, 120.0, 180.0]", "[10.0, 20.0, 30.0, 40.0, 50.0]", "bad_value", "balls_mm"),
         ("[250.0, -900.0, 300.0]", "[-250.0, -900.0, 300.0]", "out_of_range", "cameras_mm"),
         ("[250.0, -900.0, 300.0]", "[0.25, -0.9, 0.3]", "wrong_unit", "cameras_mm"),
         (", [250.0, -900.0, 300.0]", "", "missing_key", "cameras_mm"),
-        ("sd_mm = 0.05", "sd_mm = 0.0", "bad_value", "sd_mm"),
         ("sd_mm = 0.05", "sd = 0.05", "unknown_key", "sd_mm"),
         ('model = "ur5"', 'model = "ur7"', "unknown_robot", "ur7"),
         ("tip_sd_mm = [0.3, 1.0]", "tip_sd_mm = 0.3", "bad_value", "tip_sd_mm"),
-        ("depth_mm = 120.0", "depth_mm = 0.12", "bad_value", "depth_mm"),
-        ("width_mm = 60.0", "width_mm = 6.0", "bad_value", "width_mm"),
         ("[-600.0, 20.0, -30.0]", "[-0.6, 0.02, -0.03]", "wrong_unit", "ultrasound.mount"),
         ("z_axis = [0.0, -1.0, 0.0]", "z_axis = [2.0, 0.0, 0.0]", "axes_parallel", "ultrasound.mount"),
-        ("slice_mm = 3.0", "slice_mm = 0.0", "bad_value", "slice_mm"),
         ("target_seen = false", "target_seen = 0", "bad_value", "target_seen"),
-        ("seconds = 90.0", "minutes = 1.5", "unknown_key", "seconds"),
         ("[0.2, 0.3, 1.1]", "[0.2, 0.3, -1.1]", "bad_value", "motion"),
         ("target_sd_mm = [0.2, 0.3, 1.1]", "", "missing_key", "target_sd_mm"),
     ],
 )
 def test_what_cannot_be_is_refused(read, old, new, code, named):
-    """In one line that names the key."""
     with refused(code, named):
         read(changed(EVERY_KEY, (old, new)))
 

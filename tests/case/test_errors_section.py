@@ -11,7 +11,6 @@ from puncture_twin.planning.geometry.spaces import Space
 
 
 def model(space=Space.LPS, cells=None, fle_mm=None, **keys):
-    """The declaration of some keys."""
     return error_model(ErrorsSection(**keys), space=space, cells=cells, fle_mm=fle_mm)
 
 
@@ -24,7 +23,6 @@ def test_a_cell_makes_a_uniform_error():
 
 
 def test_the_case_s_own_ct_gives_what_is_not_stated():
-    """Pixel, spacing and the normal of its slices."""
     found = model(cells=Cells(0.7, 3.0, np.array([0.0, 1.0, 0.0])))
     np.testing.assert_allclose(np.sqrt(np.diag(found.marker_cov_ct)), np.array([0.7, 3.0, 0.7]) / np.sqrt(12))
     assert not model().anisotropic
@@ -32,7 +30,6 @@ def test_the_case_s_own_ct_gives_what_is_not_stated():
 
 
 def test_a_bed_axis_turns_the_slices_and_ras_is_understood():
-    """By name or by vector, in the case's own space."""
     for axis, space in (("left", Space.LPS), ((2.0, 0.0, 0.0), Space.LPS), ((-1.0, 0.0, 0.0), Space.RAS)):
         found = model(space, ct_in_plane_mm=0.3, ct_slice_mm=1.0, bed_axis=axis)
         np.testing.assert_allclose(np.diag(found.marker_cov_ct), [1.0, 0.09, 0.09])
@@ -49,13 +46,11 @@ def test_a_bed_axis_turns_the_slices_and_ras_is_understood():
     ],
 )
 def test_contradictions_are_refused(settings, told):
-    """One line that names both keys."""
     with refused(told):
         model(**settings)
 
 
 def test_cell_and_deviation_are_one_error():
-    """Not both in the table."""
     with pytest.raises(ValidationError, match="state the same error"):
         ErrorsSection(ct_pixel_mm=1.0, ct_in_plane_mm=0.3)
 
@@ -68,7 +63,6 @@ def test_the_short_form():
 
 
 def test_a_nominal_arm_errs_ten_times_as_much():
-    """And single keys go before the kind."""
     found = model(arm="nominal", twist_deg=0.01)
     assert (found.arm.link_mm, found.arm.twist) == (0.5, np.radians(0.01))
     assert model().arm.link_mm == 0.05
@@ -87,7 +81,6 @@ def test_a_surface_is_known_by_its_own_voxels():
 
 
 def test_scaling_scales_every_deviation():
-    """Twice all errors: covariances by four."""
     one, two = model(surface_mm=0.3), model(surface_mm=0.3).scaled(2.0)
     np.testing.assert_allclose(two.marker_cov_ct, 4 * one.marker_cov_ct)
     np.testing.assert_allclose(two.target_cov_ct, 4 * one.target_cov_ct)

@@ -38,15 +38,21 @@ def labels():
 
 
 def write_masks(folder):
-    """A mask an organ, and an empty one."""
     folder.mkdir(exist_ok=True)
     for name, (middle, radius) in ORGANS.items():
         write_mask(folder / f"{name}.nii.gz", inside(middle, radius))
     write_mask(folder / "spleen.nii.gz", np.zeros(X.shape))
 
 
+@pytest.fixture
+def masked(tmp_path):
+    """A folder with the CT, and a mask of each organ in a folder of it."""
+    write_ct(tmp_path / "scan.nii.gz")
+    write_masks(tmp_path / "seg")
+    return tmp_path
+
+
 def write_seg_nrrd(path):
-    """As Slicer writes segments of one layer."""
     image = image_of(labels(), SPACING)
     for number, name in enumerate(ORGANS):
         image.SetMetaData(f"Segment{number}_Name", name)
@@ -78,11 +84,8 @@ EXPECTED_REST = {name: EXPECTED[name] for name in ("aorta", "odd thing")}
 
 
 def segmentation_of(kind, folder):
-    """The same organs as another program writes them."""
     if kind == "masks":
         write_masks(folder / "segmentations")
-    elif kind == "masks beside the CT":
-        write_masks(folder)
     elif kind == "masks two levels down":
         (folder / "run").mkdir()
         write_masks(folder / "run" / "seg")
@@ -99,7 +102,7 @@ def segmentation_of(kind, folder):
         (folder / "map.json").write_text(json.dumps({str(n): name for n, name in enumerate(ORGANS, start=1)}))
 
 
-KINDS = ["masks", "masks beside the CT", "masks two levels down", "seg.nrrd", "layered seg.nrrd", "csv", "json"]
+KINDS = ["masks", "masks two levels down", "seg.nrrd", "layered seg.nrrd", "csv", "json"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -202,11 +205,9 @@ def test_a_target_typed_in_ras_is_answered_in_ras(tmp_path, capfd):
     assert len(said) == 1 and "read in RAS it lies in 'right lung': --space RAS" in said[0]
 
 
-def test_the_middle_of_a_label_is_a_target(tmp_path, capfd):
+def test_the_middle_of_a_label_is_a_target(masked, capfd):
     """The deepest point of a ball is its middle, to a cell of the grid."""
-    write_ct(tmp_path / "scan.nii.gz")
-    write_masks(tmp_path / "seg")
-    code, out, _ = init(capfd, tmp_path, "--target-label", "right lung", "--json")
+    code, out, _ = init(capfd, masked, "--target-label", "right lung", "--json")
     assert code == 0
     told = json.loads(out)
     assert np.linalg.norm(np.subtract(told["target_mm"], ORGANS["right lung"][0])) < 3.0
@@ -214,22 +215,20 @@ def test_the_middle_of_a_label_is_a_target(tmp_path, capfd):
     assert told["structures"] == {"target": 1, "avoid": 2}
     inputs = {one["role"]: one for one in told["inputs"]}
     assert inputs.keys() >= {"case", "ct", "mask aorta", "mask spleen"}
-    written = hashlib.sha256((tmp_path / "case.toml").read_bytes()).hexdigest()
+    written = hashlib.sha256((masked / "case.toml").read_bytes()).hexdigest()
     assert (inputs["case"]["path"], inputs["case"]["sha256"]) == ("case.toml", written)
     assert any("deepest point" in line for line in told["warnings"])
-    code, _, said = init(capfd, tmp_path, "--target-label", "liver", "--force")
+    code, _, said = init(capfd, masked, "--target-label", "liver", "--force")
     assert code == 2 and "no structure is named 'liver'" in said[0] and "right lung" in said[0]
 
 
-def test_a_lesion_in_an_organ_is_the_target_and_the_organ_is_crossed(tmp_path, capfd):
+def test_a_lesion_in_an_organ_is_the_target_and_the_organ_is_crossed(masked, capfd):
     """Of two masks that hold the target the lesion is meant; the other cannot be avoided."""
-    write_ct(tmp_path / "scan.nii.gz")
-    write_masks(tmp_path / "seg")
-    write_mask(tmp_path / "seg" / "lung tumor.nii.gz", inside((-40, 0, 10), 6.0))
-    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--region", "chest")
+    write_mask(masked / "seg" / "lung tumor.nii.gz", inside((-40, 0, 10), 6.0))
+    code, _, said = init(capfd, masked, "--target", TARGET, "--region", "chest")
     assert code == 0, said
-    assert roles(tmp_path)["lung tumor"] == ("target", 0.0)
-    assert roles(tmp_path)["right lung"] == ("traverse", 0.0)
+    assert roles(masked)["lung tumor"] == ("target", 0.0)
+    assert roles(masked)["right lung"] == ("traverse", 0.0)
     assert any("paths cross them (traverse): right lung" in line for line in said)
 
 
@@ -242,8 +241,7 @@ def test_a_vessel_that_holds_the_target_too_is_not_crossed(tmp_path, capfd):
     assert code == 2 and "lies inside 'pulmonary_artery', which is to be avoided" in said[-1]
 
 
-@pytest.mark.parametrize("name", ["brainstem", "pons"])
-@pytest.mark.parametrize("region", ["other", "head", "brain"])
+@pytest.mark.parametrize(("region", "name"), [("other", "brainstem"), ("head", "pons"), ("brain", "brainstem")])
 def test_a_brainstem_that_holds_the_target_too_is_crossed_in_no_region(tmp_path, capfd, region, name):
     """Outside of the region `brain` it is brain or unknown, and became `traverse`: every path through it was safe."""
     write_ct(tmp_path / "scan.nii.gz")
@@ -264,7 +262,7 @@ def around_the_lesion(folder, name, lesion="lung tumor"):
         write_mask(folder / f"{one}.nii.gz", inside((-40, 0, 10), radius))
 
 
-@pytest.mark.parametrize("name", ["AAA", "Rückenmark", "artère pulmonaire", "Lungenvene", "A. hepatica", "Segment_1"])
+@pytest.mark.parametrize("name", ["AAA", "artère pulmonaire", "Segment_1"])
 def test_no_path_through_what_nobody_knows_is_safe(tmp_path, capfd, name):
     """It became `traverse`, and paths through an aneurysm were safe, with exit code 0."""
     around_the_lesion(tmp_path, name)
@@ -280,7 +278,6 @@ def test_no_path_through_what_nobody_knows_is_safe(tmp_path, capfd, name):
 
 
 def test_the_case_says_how_to_change_it(tmp_path, capfd):
-    """The line beside the name, followed, opens the paths."""
     around_the_lesion(tmp_path, "AAA")
     assert init(capfd, tmp_path, "--target", TARGET)[0] == 0
     path = tmp_path / "case.toml"
@@ -294,7 +291,6 @@ def test_the_case_says_how_to_change_it(tmp_path, capfd):
 
 
 def test_in_a_folder_of_masks_it_is_a_table_of_its_own(tmp_path, capfd):
-    """``[structures.unknown]``, with the same line."""
     around_the_lesion(tmp_path, "AAA")
     (tmp_path / "seg").mkdir()
     for one in ("AAA", "aorta", "lung tumor", "odd thing", "spleen"):
@@ -306,39 +302,33 @@ def test_in_a_folder_of_masks_it_is_a_table_of_its_own(tmp_path, capfd):
     assert roles(tmp_path)["AAA"] == ("unknown", 5.0)
 
 
-def test_a_typed_target_in_a_vessel_is_a_slip(tmp_path, capfd):
+def test_a_typed_target_in_a_vessel_is_a_slip(masked, capfd):
     """The aorta became the target's structure, and every path into it was safe, with exit code 0 and a note."""
-    write_ct(tmp_path / "scan.nii.gz")
-    write_masks(tmp_path / "seg")
     for words in (("--target", "36,36,0", "--space", "LPS"), ("--target", "-36,-36,0", "--space", "RAS")):
-        code, out, said = init(capfd, tmp_path, *words)
-        assert code == 2 and out == "" and not (tmp_path / "case.toml").exists()
+        code, out, said = init(capfd, masked, *words)
+        assert code == 2 and out == "" and not (masked / "case.toml").exists()
         (line,) = said
         assert "lies in 'aorta'" in line and "of 'aorta and venae cavae' (large vessel: bleeding)" in line
         assert line.endswith("allowed: a point outside it, or --target-label 'aorta' if it is the target itself")
 
 
-def test_a_vessel_that_is_meant_is_taken_and_every_result_says_so(tmp_path, capfd):
+def test_a_vessel_that_is_meant_is_taken_and_every_result_says_so(masked, capfd):
     """By its name, or in a case that a person wrote: a warning first of all, in the case's list as a search has it."""
-    write_ct(tmp_path / "scan.nii.gz")
-    write_masks(tmp_path / "seg")
-    code, _, said = init(capfd, tmp_path, "--target-label", "aorta", "--space", "LPS")
+    code, _, said = init(capfd, masked, "--target-label", "aorta", "--space", "LPS")
     text = "the target lies in 'aorta', of 'aorta and venae cavae' (large vessel: bleeding): every safe path ends in it"
     assert code == 0 and any(text in line for line in said)
-    warnings = prepare(tmp_path, arm=False).anatomy.warnings
+    warnings = prepare(masked, arm=False).anatomy.warnings
     assert any(line.startswith(text) for line in warnings)
-    assert init(capfd, tmp_path, "--target", TARGET, "--force")[0] == 0
-    assert not any("every safe path ends in it" in line for line in prepare(tmp_path, arm=False).anatomy.warnings)
+    assert init(capfd, masked, "--target", TARGET, "--force")[0] == 0
+    assert not any("every safe path ends in it" in line for line in prepare(masked, arm=False).anatomy.warnings)
 
 
-def test_a_lesion_of_the_other_space_is_asked_about(tmp_path, capfd):
+def test_a_lesion_of_the_other_space_is_asked_about(masked, capfd):
     """Typed in RAS without saying so, the target lay in a lung on the other side, which became its structure."""
-    write_ct(tmp_path / "scan.nii.gz")
-    write_masks(tmp_path / "seg")
-    write_mask(tmp_path / "seg" / "liver_lesion.nii.gz", inside((40, 0, 10), 12.0))
-    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    write_mask(masked / "seg" / "liver_lesion.nii.gz", inside((40, 0, 10), 12.0))
+    code, _, said = init(capfd, masked, "--target", TARGET)
     assert code == 2 and "lies in 'right lung' (read in RAS it lies in 'liver_lesion': --space RAS)" in said[0]
-    assert init(capfd, tmp_path, "--target", TARGET, "--space", "LPS")[0] == 0
+    assert init(capfd, masked, "--target", TARGET, "--space", "LPS")[0] == 0
 
 
 SPOILED = {
@@ -349,33 +339,27 @@ SPOILED = {
 
 
 @pytest.mark.parametrize("kind", sorted(SPOILED))
-def test_a_mask_that_is_none_is_no_structure_left_out(tmp_path, capfd, kind):
-    """It was left out with a note, and its vessel was free."""
-    write_ct(tmp_path / "scan.nii.gz")
-    write_masks(tmp_path / "seg")
-    write_image(tmp_path / "seg" / "vein.nii.gz", SPOILED[kind]())
-    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+def test_a_mask_that_is_none_is_no_structure_left_out(masked, capfd, kind):
+    write_image(masked / "seg" / "vein.nii.gz", SPOILED[kind]())
+    code, _, said = init(capfd, masked, "--target", TARGET)
     assert code == 2 and "seg/vein.nii.gz: values from " in said[0]
 
 
 @pytest.mark.parametrize("ending", ["mha", "nhdr"])
-def test_a_mask_in_another_format_is_not_passed_over(tmp_path, capfd, ending):
+def test_a_mask_in_another_format_is_not_passed_over(masked, capfd, ending):
     """Neither by `init` nor by a case that names the folder: its organ would be free."""
-    write_ct(tmp_path / "scan.nii.gz")
-    write_masks(tmp_path / "seg")
-    assert init(capfd, tmp_path, "--target", TARGET)[0] == 0
-    write_mask(tmp_path / "seg" / f"vein.{ending}", inside((30, 0, 0), 9.0))
+    assert init(capfd, masked, "--target", TARGET)[0] == 0
+    write_mask(masked / "seg" / f"vein.{ending}", inside((30, 0, 0), 9.0))
     with refused("entries_not_read", ending):
-        prepare(tmp_path, arm=False)
-    code, _, said = init(capfd, tmp_path, "--target", TARGET, "--force")
+        prepare(masked, arm=False)
+    code, _, said = init(capfd, masked, "--target", TARGET, "--force")
     if ending == "mha":
         assert code == 2 and "seg: the folder also has files that cannot be read" in said[0] and "vein.mha" in said[0]
     else:
-        assert code == 0 and roles(tmp_path)["vein.nhdr"] == ("avoid", 3.0)
+        assert code == 0 and roles(masked)["vein.nhdr"] == ("avoid", 3.0)
 
 
 def test_tables_that_contradict_each_other_are_not_guessed(tmp_path, capfd):
-    """The first by name was taken: its aorta was fat."""
     write_ct(tmp_path / "scan.nii.gz")
     write_image(tmp_path / "map.nii.gz", labels())
     (tmp_path / "a.csv").write_text("id,name\n1,muscle\n2,torso_fat\n3,rib_left_7\n")
@@ -404,16 +388,14 @@ def test_organs_on_the_other_side_are_taken_where_a_person_has_looked(tmp_path, 
     assert [one["severity"] for one in findings if one["code"] == "organs_out_of_order"] == ["warning"]
 
 
-def test_a_target_in_no_structure_is_a_ball_of_its_own(tmp_path, capfd):
+def test_a_target_in_no_structure_is_a_ball_of_its_own(masked, capfd):
     """In fat; also where the other space's reading lies in an organ, if the space was stated."""
-    write_ct(tmp_path / "scan.nii.gz")
-    write_masks(tmp_path / "seg")
     for words in (["--target", "0,0,-40"], ["--target", "40,0,10", "--space", "LPS"]):
-        code, _, said = init(capfd, tmp_path, *words, "--force")
+        code, _, said = init(capfd, masked, *words, "--force")
         assert code == 0, said
         assert any("the target lies in no structure" in line and "nearest is" in line for line in said)
-    assert roles(tmp_path) == {"right lung": ("avoid", 2.0), **EXPECTED_REST, "target": ("target", 0.0)}
-    context = prepare(tmp_path, arm=False)
+    assert roles(masked) == {"right lung": ("avoid", 2.0), **EXPECTED_REST, "target": ("target", 0.0)}
+    context = prepare(masked, arm=False)
     mesh = context.anatomy.structure("target").mesh
     distance = np.linalg.norm(mesh.vertices - [40.0, 0.0, 10.0], axis=1)
     assert mesh.closed and np.abs(distance - 5.0).max() < 0.05
@@ -422,16 +404,13 @@ def test_a_target_in_no_structure_is_a_ball_of_its_own(tmp_path, capfd):
     assert context.explain(0.3, 1.0).target_depth_mm == pytest.approx(5.0, abs=0.05)
 
 
-def test_a_case_that_is_there_is_kept(tmp_path, capfd):
-    """Unless --force; and a start that fails leaves what is there."""
-    write_ct(tmp_path / "scan.nii.gz")
-    write_masks(tmp_path / "seg")
-    (tmp_path / "case.toml").write_text("mine")
-    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+def test_a_case_that_is_there_is_kept(masked, capfd):
+    (masked / "case.toml").write_text("mine")
+    code, _, said = init(capfd, masked, "--target", TARGET)
     assert code == 2 and "a case exists already" in said[0] and "--force" in said[0]
-    assert init(capfd, tmp_path, "--target", "5000,0,0", "--force")[0] == 2
-    assert (tmp_path / "case.toml").read_text() == "mine"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["case.toml", "scan.nii.gz", "seg"]
+    assert init(capfd, masked, "--target", "5000,0,0", "--force")[0] == 2
+    assert (masked / "case.toml").read_text() == "mine"
+    assert sorted(path.name for path in masked.iterdir()) == ["case.toml", "scan.nii.gz", "seg"]
 
 
 @pytest.mark.parametrize(
@@ -448,14 +427,11 @@ def test_a_case_that_is_there_is_kept(tmp_path, capfd):
         (["--target", TARGET, "--space", "local"], "LPS or RAS"),
     ],
 )
-def test_what_cannot_be_a_target_is_refused_in_one_line(tmp_path, capfd, words, match):
-    """With what is allowed, and nothing written."""
-    write_ct(tmp_path / "scan.nii.gz")
-    write_masks(tmp_path / "seg")
-    code, out, said = init(capfd, tmp_path, *words)
+def test_what_cannot_be_a_target_is_refused_in_one_line(masked, capfd, words, match):
+    code, out, said = init(capfd, masked, *words)
     assert (code, out, len(said)) == (2, "", 1), said
     assert re.search(match, said[0]), said
-    assert not (tmp_path / "case.toml").exists()
+    assert not (masked / "case.toml").exists()
 
 
 def test_all_that_is_wrong_is_said_at_once(tmp_path, capfd):
@@ -478,7 +454,6 @@ def test_all_that_is_wrong_is_said_at_once(tmp_path, capfd):
 
 @pytest.mark.parametrize(("write", "missing"), [(write_ct, "no segmentation"), (write_seg_nrrd, "no CT in Hounsfield")])
 def test_a_folder_without_a_half_is_refused(tmp_path, capfd, write, missing):
-    """A CT alone, a segmentation alone, no folder at all."""
     write(tmp_path / "one.seg.nrrd")
     code, _, said = init(capfd, tmp_path, "--target", TARGET)
     assert (code, len(said)) == (2, 1) and missing in said[0], said

@@ -10,12 +10,10 @@ from puncture_twin.planning.geometry.spaces import Space
 
 
 def mount(position, x=(1.0, 0.0, 0.0), z=(0.0, -1.0, 0.0)):
-    """A section."""
     return MountSection(position_mm=position, x_axis=x, z_axis=z)
 
 
 def test_a_mount_in_millimetres_is_taken():
-    """Its origin is where it says; the origin itself may be stated."""
     for position in ((600.0, 20.0, -30.0), (0.0, 0.0, 0.0)):
         T_ct_base = np.linalg.inv(mount_pose(mount(position), Space.LPS, "case.toml"))
         assert T_ct_base[:3, 3] == pytest.approx(position)
@@ -23,12 +21,10 @@ def test_a_mount_in_millimetres_is_taken():
 
 @pytest.mark.parametrize("position", [(0.6, 0.02, -0.03), (0.0, 0.0, -1.2), (2.0, 0.0, 0.5)])
 def test_a_mount_in_metres_is_noticed(position):
-    """No base stands millimetres from the origin."""
     with refused("wrong_unit"):
         mount_pose(mount(position), Space.LPS, "case.toml")
 
 
 def test_axes_that_are_not_square_are_refused():
-    """The angle is named."""
     with refused("axes_not_square", "60.0"):
         mount_pose(mount((600.0, 0.0, 0.0), z=(0.5, 0.75**0.5, 0.0)), Space.LPS, "case.toml")

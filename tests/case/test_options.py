@@ -9,17 +9,14 @@ from puncture_twin.planning.case.options import case_options
 
 
 def loaded(path, **sections):
-    """A case with options."""
     return load_case(path, case_options(sections, where="test"))
 
 
 def margins(case):
-    """Of the structures that have one."""
     return {one.name: one.margin_mm for one in case.structure if one.margin_mm is not None}
 
 
 def test_each_kind_changes_its_table_alone(tmp_path):
-    """The oracle is a case file with the same lines."""
     path = write_patient(tmp_path / "a")
     case = loaded(path, needle={"length_mm": 200.0}, arm={"model": "ur5"}, search={"step_deg": 15.0})
     assert (case.needle.length_mm, case.needle.shaft_mm) == (200.0, 150.0)
@@ -28,7 +25,6 @@ def test_each_kind_changes_its_table_alone(tmp_path):
 
 
 def test_a_target_by_name_takes_the_place_of_a_position(tmp_path):
-    """And the other way about: a case has one of them."""
     path = write_patient(tmp_path / "a")
     (path.parent / "points.csv").write_text("name,x_mm,y_mm,z_mm\none,1,0,0\ntwo,2,0,0\n")
     assert loaded(path, target={"points": "points.csv", "name": "two"}).target_ct.tolist() == [2.0, 0.0, 0.0]
@@ -69,7 +65,6 @@ def test_of_margins_that_fit_one_structure_the_last_stated_counts(tmp_path, step
 
 
 def test_a_mount_takes_the_place_of_a_registration(tmp_path):
-    """A case has one of them."""
     path = write_patient(
         tmp_path / "a", text=tiny_text() + '[registration]\nmarkers_ct = "a.csv"\nmarkers_base = "b.csv"\n'
     )
@@ -101,7 +96,6 @@ def test_an_option_that_cannot_be_used_is_refused(tmp_path, sections, message):
 
 
 def test_options_are_an_input(tmp_path):
-    """No result with options passes for one without."""
     path = write_patient(tmp_path / "a")
     plain, wide = loaded(path), loaded(path, margins={"rib": 9.0})
     assert [one.role for one in wide.inputs if one not in plain.inputs] == ["options"]

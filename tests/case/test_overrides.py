@@ -27,7 +27,6 @@ def write_labels(folder, names=(*BALLS, "rest")):
 
 
 def write_masks(folder):
-    """A mask a ball."""
     folder.mkdir()
     for name, place in BALLS.items():
         write_mask(folder / f"{name}.nii.gz", inside(*place))
@@ -59,7 +58,6 @@ def test_keys_are_written_and_read_again(tmp_path, capfd):
 
 @pytest.mark.parametrize("words", ["needle.length=3", "ct.arms=some", "search.step_deg=fine"])
 def test_a_key_that_cannot_be_is_refused_and_leaves_nothing(tmp_path, capfd, words):
-    """As a case that states it is."""
     write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path, tuple(BALLS))
     code, said = init(capfd, tmp_path, "--set", words)
@@ -88,7 +86,6 @@ def test_a_key_takes_the_place_of_the_one_that_is_there():
 
 @pytest.mark.parametrize("write", [write_labels, lambda folder: write_masks(folder / "seg")])
 def test_roles_are_stated_by_name(tmp_path, capfd, write):
-    """In a label map as in a folder of masks; what is ignored is told."""
     write_ct(tmp_path / "ct.nii.gz")
     write(tmp_path)
     code, said = init(capfd, tmp_path, "--ignore", "odd", "--unknown", "aorta")
@@ -146,7 +143,6 @@ def test_a_label_map_alone_starts(tmp_path, capfd, name):
 
 
 def test_a_folder_of_masks_alone_starts(tmp_path, capfd):
-    """The body's mask is the skin, and no structure."""
     write_masks(tmp_path / "seg")
     write_mask(tmp_path / "seg" / "body.nii.gz", BODY)
     assert init(capfd, tmp_path)[0] == 0
@@ -154,7 +150,6 @@ def test_a_folder_of_masks_alone_starts(tmp_path, capfd):
 
 
 def test_meshes_alone_start_with_the_skin_that_is_stated(tmp_path, capfd):
-    """None is named like it."""
     for name, (middle, radius) in {**BALLS, "surface": ((0.0, 0.0, 0.0), 90.0)}.items():
         ball(tmp_path / f"{name}.stl", radius, middle)
     code, said = init(capfd, tmp_path, "--unit", "mm")
@@ -193,7 +188,6 @@ def test_the_image_is_proposed_as_statements(tmp_path, capfd):
 
 
 def test_a_phantom_is_taken_as_one(tmp_path, capfd):
-    """The region is written, and no limb is looked for."""
     write_ct(tmp_path / "ct.nii.gz")
     write_labels(tmp_path, tuple(BALLS))
     code, said = init(capfd, tmp_path, "--region", "phantom")

@@ -53,7 +53,6 @@ LIMITS = "[robot.limits]\n"
     ],
 )
 def test_what_contradicts_itself_is_refused(tmp_path, lines, says):
-    """One line, with the key."""
     with refused(*says.split()):
         load_case(own_case(tmp_path, lines))
 
@@ -69,7 +68,6 @@ def test_what_contradicts_itself_is_refused(tmp_path, lines, says):
     ],
 )
 def test_meshes_are_files_beside_the_urdf_and_whole(tmp_path, address, says):
-    """Nothing is looked for elsewhere, and half a mesh is none."""
     path = own_case(tmp_path)
     folder = tmp_path / "arm"
     (folder / "cut.stl").write_bytes((folder / "ulna.stl").read_bytes()[:-200])
@@ -80,7 +78,6 @@ def test_meshes_are_files_beside_the_urdf_and_whole(tmp_path, address, says):
 
 
 def test_limits_narrow_any_arm(tmp_path):
-    """Of an arm of the table too; home must lie within them."""
     lines = ["[robot]", 'model = "ur5"', "[robot.limits]", "max_speed_deg_s = [90, 90, 90, 90, 90, 90]"]
     lines += ["lowest_deg = [-90, -180, -170, -360, -360, -360]", "highest_deg = [90, 0, 170, 360, 360, 360]"]
     case = load_case(write_case(tmp_path, text=CASE + "\n" + "\n".join(lines) + "\n"))
@@ -94,7 +91,6 @@ def test_limits_narrow_any_arm(tmp_path):
 
 
 def test_an_option_puts_one_arm_in_the_place_of_another(tmp_path):
-    """A name in place of a URDF, and a URDF in place of a name."""
     path = own_case(tmp_path, "[robot.limits]", "max_speed_deg_s = [90, 90, 90, 90, 90, 90]")
     assert load_case(path, case_options({"arm": {"model": "ur10"}}, where="test")).robot.model == ur_model("ur10")
     named = write_case(tmp_path, text=CASE + '\n[robot]\nmodel = "ur10"\n')

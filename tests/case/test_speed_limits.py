@@ -10,7 +10,6 @@ from puncture_twin.planning.case.case import load_case
 
 @pytest.fixture
 def carton(tmp_path):
-    """Reads the carton with more lines in [robot]."""
     for file in (folder() / "carton").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     path = tmp_path / "case_m.toml"
@@ -30,7 +29,6 @@ def test_the_default_is_reduced_speed(carton):
 
 
 def test_the_keys_are_read(carton):
-    """All four."""
     lines = ["tip_speed_mm_s = 100", "insertion_speed_mm_s = 5", "joint_speed_fraction = 0.2"]
     assert carton(*lines, "joint_acceleration_fraction = 0.3").robot.speeds == SpeedLimits(100.0, 5.0, 0.2, 0.3)
 
@@ -47,6 +45,5 @@ def test_the_keys_are_read(carton):
     ],
 )
 def test_what_is_no_limit_is_refused(carton, lines):
-    """The key is named."""
     with refused("out_of_range" if len(lines) > 1 else "bad_value", lines[0].split()[0]):
         carton(*lines)

@@ -29,7 +29,6 @@ def searched(folder, out):
 
 
 def same_verdicts(table, other):
-    """Whether two tables say the same of every direction."""
     return all(table.column(name).equals(other.column(name)) for name in COLUMNS)
 
 

@@ -39,13 +39,11 @@ NAMES = {"background": 0, "liver lesion": 1, "aorta": 2, "ignore": 3}
 
 
 def started(folder):
-    """`init` with the first ball's middle as the target."""
     request = Request(folder, "0,0,0", None, "abdomen", Wanted(Space.LPS))
     return start_case(request, NO_CACHE, unnamed)
 
 
 def refusal(folder):
-    """How `init` refuses it."""
     with pytest.raises(InputError) as caught:
         started(folder)
     return caught.value
@@ -67,13 +65,11 @@ def test_an_image_without_hounsfield_units_is_no_label_map(tmp_path):
     ],
 )
 def test_a_segmentation_that_lies_there_is_never_none(tmp_path, labelmap, code, said):
-    """The file is named with the reader's own reason."""
     error = refusal(patient(tmp_path, labelmap=labelmap(), names=NAMES))
     assert error.code == code and "labels.nii.gz (" in error.what and said in error.what
 
 
 def test_labels_between_labels_are_refused_as_blended(tmp_path):
-    """One with a CT that is right."""
     organ = 3 * inside((0, 0, 0), 30.0) + 2 * inside((50, 0, 0), 15.0)
     blended = (organ[1:] / 3 + organ[:-1] * 2 / 3).astype(np.float32)
     error = refusal(patient(tmp_path, labelmap=blended, names=NAMES))
@@ -89,13 +85,11 @@ def test_labels_between_labels_are_refused_as_blended(tmp_path):
     ],
 )
 def test_a_table_that_lies_there_is_never_none(tmp_path, names, said):
-    """What it lacks, or why it is none."""
     error = refusal(patient(tmp_path, names=names))
     assert error.code == "labels_without_names" and said in error.what
 
 
 def test_what_nobody_annotated_is_unknown_and_told(tmp_path):
-    """It was an organ called ignore."""
     start = started(patient(tmp_path, names=NAMES))
     assert '"ignore" = 2' in start.text.split("[structures.unknown]")[1]
     assert any("not annotated" in note and "ignore" in note for note in start.notes)
@@ -103,7 +97,6 @@ def test_what_nobody_annotated_is_unknown_and_told(tmp_path):
 
 
 def test_nothing_at_all_says_so(tmp_path):
-    """One that holds only what nobody reads lists it."""
     (tmp_path / "scan.bin").write_bytes(b"x")
     assert "scan.bin (of an unsupported kind)" in refusal(tmp_path).what
 

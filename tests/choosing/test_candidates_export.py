@@ -16,7 +16,6 @@ CHANGES = (("theta_deg = [0, 10]\nstep_deg = 10.0", 'frame = "ct"\ntheta_deg = [
 
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory):
-    """A case without an arm, and the folder of its search."""
     here = tmp_path_factory.mktemp("candidates")
     case = write_case(here, *CHANGES)
     assert main(["search", str(case), "--no-arm", "--no-pictures", "--out", str(here / "out")]) == OK

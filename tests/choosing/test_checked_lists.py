@@ -33,7 +33,6 @@ def run(capsys, *arguments):
 
 
 def write(path, *lines):
-    """A file of lines."""
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -115,7 +114,6 @@ def test_each_target_is_what_a_case_with_that_target_says(context, tmp_path, cap
     ],
 )
 def test_a_line_that_is_none_is_named_and_nothing_is_written(context, tmp_path, capsys, lines, said):
-    """One line on stderr, exit code 2."""
     listed = write(tmp_path / "bad.csv", *lines)
     arguments = ["check", str(context.case.path), "--no-arm", "--entries", str(listed), "--out", str(tmp_path / "out")]
     refused_command(arguments, capsys, *said.split(), "bad.csv")
@@ -132,7 +130,6 @@ def test_a_line_that_is_none_is_named_and_nothing_is_written(context, tmp_path, 
     ],
 )
 def test_what_does_not_go_together_is_refused(context, arguments, capsys):
-    """Before anything is read."""
     refused_command(["check", context.case.path, *arguments], capsys, "conflicting_options")
 
 

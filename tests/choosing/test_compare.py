@@ -24,7 +24,6 @@ NONE = [], [], [], [], []
 
 @pytest.fixture(scope="module")
 def context(tmp_path_factory):
-    """Balls about a target, without an arm."""
     return prepare(write_case(tmp_path_factory.mktemp("compare"), *CHANGES), arm=False)
 
 
@@ -50,7 +49,6 @@ def test_each_side_is_what_check_says_of_it(context):
 
 
 def test_a_rejected_side_is_said_with_its_reason_and_exit_code_1(context, capsys):
-    """One choice alone stands beside the best."""
     found = context.search()
     row = int(np.flatnonzero(~found.safe)[0])
     at = found.at(row)
@@ -75,25 +73,14 @@ def test_a_rejected_side_is_said_with_its_reason_and_exit_code_1(context, capsys
     ],
 )
 def test_other_than_one_or_two_choices_are_refused(stated, said):
-    """With what is allowed."""
     with refused(said):
         parse_two(*stated)
-
-
-def test_one_choice_is_compared_with_the_best():
-    """Which is what a person with an own idea wants to know."""
     assert parse_two([], [], [], [3], [])[0] == BEST_OF_ALL
 
 
 def test_a_plan_and_a_case_are_not_mixed(tmp_path):
-    """Nor a plan with a choice."""
     plan, case = tmp_path / "plan.json", tmp_path / "case.toml"
-    for arguments in (
-        (plan, None, None, False),
-        (plan, case, None, False),
-        (plan, plan, None, True),
-        (case, plan, None, False),
-    ):
+    for arguments in ((plan, None, None, False), (plan, case, None, False), (plan, plan, None, True)):
         with refused("conflicting_options"):
             two_plans(*arguments)
     assert two_plans(case, None, None, True) is None

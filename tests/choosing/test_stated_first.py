@@ -18,13 +18,11 @@ CHANGES = (("theta_deg = [0, 10]", 'frame = "ct"\ntheta_deg = [0, 60]'),)
 
 @pytest.fixture(scope="module")
 def context(tmp_path_factory):
-    """Balls about a target, without an arm."""
     return prepare(write_case(tmp_path_factory.mktemp("stated"), *CHANGES), arm=False)
 
 
 @pytest.fixture(scope="module")
 def rejected(context):
-    """The angles of a rejected direction."""
     found = context.search()
     row = int(np.flatnonzero(~found.safe)[0])
     return Choice(angles=(found.theta[row], found.beta[row]))
@@ -32,7 +30,6 @@ def rejected(context):
 
 @pytest.fixture
 def unsearched(monkeypatch):
-    """Searching, or wanting an arm, fails."""
 
     def searched(_):
         raise AssertionError("searched for nothing")
@@ -43,7 +40,6 @@ def unsearched(monkeypatch):
 
 @pytest.mark.parametrize("job", [main_job.plan_case, main_job.rehearse_case], ids=["plan", "rehearse"])
 def test_a_rejected_direction_is_told_at_once_and_an_older_plan_goes(job, context, rejected, unsearched, tmp_path):
-    """Nobody takes the plan of another direction for the answer."""
     with writing(tmp_path, "plan") as draft:
         (draft.folder / "plan.json").write_text("{}")
     with refused("direction_rejected", by=NoAnswerError):
@@ -53,7 +49,6 @@ def test_a_rejected_direction_is_told_at_once_and_an_older_plan_goes(job, contex
 
 
 def test_an_entry_off_the_skin_is_told_at_once_and_the_old_set_stays(context, unsearched, tmp_path):
-    """Bad input changes nothing."""
     with writing(tmp_path, "plan") as draft:
         (draft.folder / "plan.json").write_text("{}")
     with refused("entry_elsewhere"):
@@ -62,7 +57,6 @@ def test_an_entry_off_the_skin_is_told_at_once_and_the_old_set_stays(context, un
 
 
 def test_slicer_too(context, rejected, unsearched, tmp_path):
-    """The same of a path for 3D Slicer."""
     with refused("direction_rejected", by=NoAnswerError):
         export_path(context, "slicer", tmp_path / "out", rejected)
     assert not (tmp_path / "out").exists()

@@ -51,7 +51,6 @@ def test_a_fine_ct_is_averaged_in_place(rng):
 
 
 def test_z_is_that_of_the_plain_sum_over_patches(trunk):
-    """By loops over patches, for one shift."""
     _, image, sample = trunk
     T = np.eye(4)
     T[:3, 3] = (0.0, 9.0, 0.0)

@@ -11,29 +11,25 @@ from puncture_twin.planning.anatomy.skin import skin_from_mesh
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.evidence.checks import findings
 from puncture_twin.planning.evidence.inside_skin import SAMPLES, inside_skin, near_surface
-from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.context import prepare
 from tests.oracles import point_triangle_distance
 
 
 def of(mesh, skin, tolerance=0.01):
-    """The one structure's answer."""
     return inside_skin([mesh], skin, np.array([tolerance]))[0]
 
 
 @pytest.fixture(scope="module")
 def carton():
-    """The carton, lesion M, organs alone."""
     return prepare(folder() / "carton" / "case_m.toml", arm=False)
 
 
 def with_structure(context, structure):
-    """The case's anatomy and one structure more."""
     return replace(context.anatomy, structures=(*context.anatomy.structures, structure))
 
 
 def joined(one, other):
-    """Two surfaces as one."""
     vertices = np.concatenate([one.vertices, other.vertices])
     return TriangleMesh(vertices, np.concatenate([one.faces, other.faces + len(one.vertices)]))
 
@@ -44,7 +40,7 @@ def cap_outside(distance, ball_radius, skin_radius):
     return 0.5 + np.clip(height / ball_radius, -1, 1) / 2
 
 
-@pytest.mark.parametrize("distance", [0.0, 40.0, 75.0, 85.0, 90.0, 95.0, 105.0, 139.0])
+@pytest.mark.parametrize("distance", [0.0, 75.0, 85.0, 95.0, 139.0])
 def test_the_fraction_is_that_of_the_sphere(ball, distance):
     """A ball moved out of a ball: the fraction of its area inside, to half a percent."""
     skin = skin_from_mesh(ball(90, subdivisions=5))
@@ -79,15 +75,6 @@ def test_a_part_of_the_body_beside_the_trunk_counts(ball):
     assert of(bone, skin_from_mesh(trunk)).fraction == 0.0
 
 
-def test_samples_are_spread_by_area(box):
-    """A flat box: each face carries its share of the points, and every run makes the same ones."""
-    mesh = box((100, 50, 10))
-    points = spread_on(mesh, 2000).points
-    np.testing.assert_array_equal(points, spread_on(mesh, 2000).points)
-    on_top = np.isclose(points[:, 2], 5).mean()
-    assert on_top == pytest.approx(5000 / (2 * (5000 + 1000 + 500)), abs=0.01)
-
-
 def test_nearness_is_exact(ball, box, rng):
     """Against every triangle, on a surface whose triangles are of very different sizes."""
     mesh = joined(ball(20, subdivisions=2), box((150, 150, 150)))
@@ -99,7 +86,6 @@ def test_nearness_is_exact(ball, box, rng):
 
 @pytest.mark.parametrize("name", ["abdomen", "carton/case_m.toml", "carton/case_h.toml"])
 def test_the_embedded_cases_lie_inside_their_skin(name):
-    """No structure of an embedded case is warned about."""
     context = prepare(folder() / name, arm=False)
     assert not [w for w in findings(context.case, context.anatomy, None) if "outside the skin" in w.sentence]
 
@@ -131,7 +117,6 @@ def test_a_tenth_outside_is_refused(carton, ball):
 
 
 def test_an_open_skin_has_no_inside(carton):
-    """How much lies inside is not known then, and that is said once."""
     mesh = carton.anatomy.skin.mesh
     skin = skin_from_mesh(TriangleMesh(mesh.vertices, mesh.faces[:-3]))
     found = findings(carton.case, replace(carton.anatomy, skin=skin), None)

@@ -79,10 +79,7 @@ def test_structures_that_agree_on_another_place_are_named():
 
 
 def test_one_structure_that_is_off_is_named():
-    """Each of eight by itself 15 mm off to the side: it lies better elsewhere, or its outline is not confirmed.
-
-    Of the true ones none lies better, and fewer than half are not confirmed; a structure beside the image is unseen.
-    """
+    """Each of eight by itself 15 mm off to the side: it lies better elsewhere, or its outline is not confirmed."""
     patient = PHANTOMS["trunk"]
     image, meshes = edge_image(patient.hu, patient.T), meshes_of(patient)
     true = assess(image, source_of(patient, meshes))
@@ -97,10 +94,7 @@ def test_one_structure_that_is_off_is_named():
 
 
 def test_a_better_edge_around_what_is_uneven_is_no_other_place():
-    """A vein of hardly any contrast beside an artery of much: half in it its edges are stronger beyond chance.
-
-    But they are the artery's, and what would lie within is not even.
-    """
+    """A vein of hardly any contrast beside an artery of much: half in it its edges are stronger beyond chance."""
     x, y, z = np.meshgrid(*(np.arange(n) * 2.0 - n + 1 for n in (80, 80, 60)), indexing="ij")
     vein, artery = np.hypot(x, y) < 10, np.hypot(x - 24, y) < 7
     hu = np.where(artery, 300.0, np.where(vein, 24.0, 20.0)) + np.random.default_rng(1).normal(0, 10, x.shape)
@@ -132,7 +126,6 @@ def test_what_edges_cannot_tell_is_said():
 
 
 def test_surfaces_beside_the_image_are_not_said_to_fit():
-    """Nothing of them is seen, so nothing is excluded."""
     patient = PHANTOMS["trunk"]
     far = {n: mesh.transformed(moved(2000.0)) for n, mesh in meshes_of(patient).items()}
     found = assess(edge_image(patient.hu, patient.T), source_of(patient, far))

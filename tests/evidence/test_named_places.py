@@ -14,7 +14,6 @@ from puncture_twin.planning.search.context import prepare
 
 @pytest.fixture(scope="module")
 def trunk(tmp_path_factory):
-    """The trunk, its labels where they belong."""
     return prepare(write_trunk(tmp_path_factory.mktemp("trunk"), np.eye(4)), arm=False)
 
 
@@ -27,7 +26,6 @@ def mirrored(context, axis):
 
 
 def test_organs_in_order_say_nothing(trunk):
-    """Liver on the right, kidneys by their names, the spine behind."""
     assert list(order_of_organs(trunk.case, trunk.anatomy)) == []
 
 

@@ -13,12 +13,10 @@ CASE = SimpleNamespace(region="abdomen")
 
 
 def structure(name, mesh, role=Role.AVOID, voxel_ct=None):
-    """From a file of its own."""
     return Structure(name, role, 2.0, mesh, f"masks/{name}.nii.gz:1", voxel_ct=voxel_ct)
 
 
 def found(*structures):
-    """Names and numbers of what overlaps."""
     return [one.numbers for one in overlaps(CASE, SimpleNamespace(structures=structures), NO_CACHE)]
 
 
@@ -73,7 +71,6 @@ def test_a_mesh_in_another_unit_than_its_siblings_is_named(ball, factor, unit):
 
 
 def test_a_fine_mesh_among_coarse_ones_is_no_other_unit(ball):
-    """Its place in the larger unit would be outside of the body."""
     structures = [structure(f"m{k}", ball(20, (40 * k, 60, 0), 2)) for k in range(3)] + [
         structure("fine", ball(10, (0, -50, 30), 5))
     ]

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from puncture_twin.planning.geometry import containment
 from puncture_twin.planning.geometry.containment import RAYS, SEED, Side, inside_each, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -86,7 +85,6 @@ def test_one_ray_that_meets_an_edge_is_outvoted(ball):
 
 
 def test_a_triangle_given_twice_closes_nothing_and_crosses_once(ball):
-    """Duplicates do not make two crossings of one wall."""
     mesh = ball(50, subdivisions=1)
     doubled = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces, mesh.faces[::2]]))
     assert doubled.closed and not doubled.wound_alike
@@ -112,12 +110,6 @@ def test_many_points_are_inside_where_each_of_them_is(rng, ball, winding):
 
 
 def test_an_open_surface_has_no_inside_for_many_points_either(ball):
-    """It is refused where one point's side is not known."""
     mesh = ball(50, subdivisions=1)
     with pytest.raises(ValueError, match="open"):
         inside_each(TriangleMesh(mesh.vertices, mesh.faces[1:]), np.zeros((2, 3)))
-
-
-def test_there_is_no_tie():
-    """An odd number of rays votes."""
-    assert containment.RAYS % 2 == 1

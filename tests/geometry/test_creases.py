@@ -8,12 +8,10 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, smooth_normals, s
 
 
 def both_ways(faces, rng):
-    """Every triangle twice."""
     return np.concatenate([faces, faces[:, ::-1]])
 
 
 def some_turned(share):
-    """A share of the triangles wound against the others."""
 
     def turn(faces, rng):
         return np.where((rng.random(len(faces)) < share)[:, None], faces[:, ::-1], faces)

@@ -31,7 +31,7 @@ def refuse_unsplit(points, leaf):
 
 
 @pytest.mark.parametrize("cloud", CLOUDS.values(), ids=CLOUDS)
-@pytest.mark.parametrize("count", [0, 1, 16, 17, 100, 4097])
+@pytest.mark.parametrize("count", [0, 1, 17, 1025])
 @pytest.mark.parametrize("leaf", [1, 16])
 def test_every_split_is_in_order(cloud, count, leaf, rng):
     """Every point appears once, and each range is split at its middle across its longest side."""
@@ -42,7 +42,6 @@ def test_every_split_is_in_order(cloud, count, leaf, rng):
 
 
 def test_runs_are_compact(rng):
-    """Runs of 16 are far smaller than the whole."""
     points = rng.uniform(0, 1, (5000, 3))
     runs = points[kd_order(points, 16)][:4992].reshape(-1, 16, 3)
     assert np.median(np.ptp(runs, axis=1)) < 0.2

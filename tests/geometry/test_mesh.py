@@ -33,7 +33,6 @@ def test_what_nobody_writes_to_is_taken_as_it_is(make: Callable[[], np.ndarray])
 
 
 def behind() -> np.ndarray:
-    """A read-only look at memory that is written to."""
     look = VERTICES.copy()[:]
     look.setflags(write=False)
     return look
@@ -73,7 +72,6 @@ def test_surfaces_join_in_order_and_one_alone_is_itself() -> None:
 
 
 def test_what_is_known_of_a_mesh_is_not_looked_for_again() -> None:
-    """A mesh says what it was told; by itself it finds out."""
     assert CLOSED.closed and CLOSED.wound_alike and not OPEN.closed and not OPEN.wound_alike
     told = TriangleMesh(VERTICES, FACES).known(closed=False, wound_alike=False)
     assert not told.closed and not told.wound_alike

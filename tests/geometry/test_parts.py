@@ -32,7 +32,6 @@ def test_parts_are_those_that_share_faces_or_corners(mask, corners):
 
 @pytest.mark.parametrize("mask", MASKS[:4])
 def test_ends_and_middle(mask):
-    """Where lines first and last meet a mask, and its middle."""
     for axis, (first, last) in enumerate((ends_of(mask)[:2], ends_of(mask)[2:])):
         none = ~mask.any(axis=axis)
         assert np.array_equal(first, np.where(none, -1, mask.argmax(axis=axis)))
@@ -43,7 +42,6 @@ def test_ends_and_middle(mask):
 @pytest.mark.parametrize("mask", MASKS)
 @pytest.mark.parametrize("edge", [(1, 1, 1), (2, 3, 4), (5, 1, 2)])
 def test_blocks_hold_what_their_voxels_are(mask, edge):
-    """The last blocks are cut."""
     pads = [(0, -n % size) for n, size in zip(mask.shape, edge, strict=True)]
     whole = np.pad(mask, pads)
     a, b, c = (n // size for n, size in zip(whole.shape, edge, strict=True))

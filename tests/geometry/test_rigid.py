@@ -38,20 +38,17 @@ def assert_rotation(R):
 
 
 def test_skew_is_the_cross_product():
-    """[v]x a = v x a, for many vectors at once."""
     v, a = np.random.default_rng(SEED).normal(size=(2, 20, 3))
     np.testing.assert_allclose((rotations.skew(v) @ a[..., None])[..., 0], np.cross(v, a), atol=1e-15)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_logarithm_undoes_the_exponential(angle):
-    """To rounding, near the identity and near a half turn."""
     w = rotation_vectors(angle)
     np.testing.assert_allclose(rotations.log_rotation(rotations.exp_rotation(w)), w, rtol=1e-9, atol=1e-14)
 
 
 def test_exponential_undoes_the_logarithm_at_a_half_turn():
-    """There the vector's sign is free, the rotation is not."""
     R = rotations.exp_rotation(rotation_vectors(np.pi))
     w = rotations.log_rotation(R)
     np.testing.assert_allclose(np.linalg.norm(w, axis=1), np.pi, atol=1e-7)
@@ -60,7 +57,6 @@ def test_exponential_undoes_the_logarithm_at_a_half_turn():
 
 @pytest.mark.parametrize("angle", ANGLES)
 def test_left_jacobian_is_the_slope_of_the_exponential(angle):
-    """Log(Exp(w + h e) Exp(w)^T) / h by central differences."""
     for w in rotation_vectors(angle):
         R = rotations.exp_rotation(w)
         ends = [rotations.log_rotation(rotations.exp_rotation(w + h * np.eye(3)) @ R.T) for h in (STEP, -STEP)]
@@ -83,7 +79,6 @@ def test_poses_form_a_group():
 
 
 def test_a_turn_about_a_point_leaves_it():
-    """And the shift moves it by itself."""
     center, shift = np.array([10.0, -20.0, 30.0]), np.array([1.0, 2.0, 3.0])
     for T, w in zip(poses(), rotation_vectors(0.7), strict=True):
         moved = rigid.rotated_about(T, center, np.concatenate([w, shift]))
@@ -93,7 +88,6 @@ def test_a_turn_about_a_point_leaves_it():
 
 
 def test_frames_from_axes_keep_the_first_and_lean_to_the_second():
-    """Each is a rotation whose z axis is the one that was given."""
     for z, other in zip(units(), np.roll(units(), 1, axis=0) * 3.0, strict=True):
         of_axes, along, about = frames.frame_of_axes(5 * z, other), frames.frame_along(z, other), frames.frame_about(z)
         for R in (of_axes, along, about):

@@ -25,14 +25,12 @@ def test_the_exponential_is_scipys_to_the_bit(size: float) -> None:
 
 
 def test_no_rotation_is_the_identity_and_no_vectors_are_no_rotations() -> None:
-    """A rotation vector of length zero has no axis to divide by."""
     assert np.array_equal(exp_rotation(np.zeros(3)), np.eye(3))
     assert np.array_equal(exp_rotation([0.0, 0.0, np.pi]).round(12), np.diag([-1.0, -1.0, 1.0]))
     assert exp_rotation(np.zeros((0, 3))).shape == (0, 3, 3)
 
 
 def test_what_is_not_finite_gives_no_rotation() -> None:
-    """As scipy: not a number, and neither an error nor a rotation."""
     for bad in (np.inf, -np.inf, np.nan):
         assert np.isnan(exp_rotation([bad, 0.0, 0.0])).all()
         assert np.isnan(about_fixed_axes([bad, 0.0, 0.0])).any()

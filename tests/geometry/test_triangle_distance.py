@@ -28,7 +28,6 @@ def test_distance_in_every_region():
 
 
 def test_without_area_the_edges_count():
-    """Three points on a line, and three times the same point."""
     line = np.array([[0.0, 0, 0], [10, 0, 0], [5, 0, 0]])
     assert squared_distance(np.array([4.0, 3.0, 0.0]), line) == pytest.approx(9.0)
     assert squared_distance(np.array([2.0, 2.0, 7.0]), np.full((3, 3), 2.0)) == pytest.approx(25.0)
@@ -63,7 +62,6 @@ def test_broadcast_is_every_pair():
 
 
 def test_the_farthest_point_is_farthest_from_its_nearest_triangle():
-    """By all pairs."""
     points, triangles = scattered(30)
     table = squared_distance(points[:, None], triangles)
     assert farthest_from(triangles, points) == pytest.approx(np.sqrt(table.min(axis=1).max()))

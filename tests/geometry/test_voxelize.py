@@ -15,7 +15,6 @@ T_CT_INDEX = np.array([[0.8, 0.0, 0.0, -31.0], [0.0, 1.1, 0.0, 12.0], [0.0, 0.0,
 
 @pytest.fixture
 def blobs(rng):
-    """Random lumps, some of which the border cuts."""
     smooth = scipy.ndimage.gaussian_filter(rng.normal(size=(30, 26, 22)), 2.0)
     return smooth > np.quantile(smooth, 0.8)
 
@@ -32,7 +31,6 @@ def test_the_voxels_inside_a_masks_surface_are_the_mask(blobs):
 
 
 def test_what_is_marked_stays_beside_what_was(blobs, rng):
-    """A union grows structure by structure."""
     mask = rng.random(blobs.shape) < 0.1
     before = mask.copy()
     mark_inside(mask_surface(blobs, T_CT_INDEX, where=WHERE), T_CT_INDEX, mask)
@@ -40,7 +38,6 @@ def test_what_is_marked_stays_beside_what_was(blobs, rng):
 
 
 def test_a_masks_surface_is_that_of_its_field(blobs):
-    """To the byte, although only its box is looked at."""
     blobs[:5], blobs[:, :, -4:] = False, False
     boxed = mask_surface(blobs, T_CT_INDEX, where=WHERE)
     framed, field = frame(blobs.shape)

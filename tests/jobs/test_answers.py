@@ -11,7 +11,7 @@ import typer
 
 from puncture_twin.run_twin import app
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, PROGRAM_FAILED, RULES, finish
-from puncture_twin.twin.jobs.patient.run import Run, rehearsal_failures, trial_failures
+from puncture_twin.twin.jobs.patient.run import rehearsal_failures, trial_failures
 
 ROOT = Path(__file__).parents[2]
 
@@ -71,7 +71,6 @@ def test_a_command_ends_with_the_code_of_its_rule(command, capsys):
 
 
 def test_a_batch_in_which_the_program_failed_ends_with_3():
-    """It says nothing about a case."""
     counts = SimpleNamespace(whole=False, ended=Counter({PROGRAM_FAILED: 1}))
     with pytest.raises(typer.Exit) as ended:
         finish("batch run", counts, {}, "", True)
@@ -111,12 +110,10 @@ class Trials(SimpleNamespace):
     """Some of many rooms."""
 
     def __len__(self):
-        """How many."""
         return len(self.hit)
 
     @property
     def hit_share(self):
-        """Of these, the fraction that hit."""
         return float(np.mean(self.hit)) if len(self) else None
 
 
@@ -133,9 +130,3 @@ def test_trials_say_no_where_more_miss_or_touch_than_the_case_allows():
     assert (failures(max_touch=0.5), failures(max_touch=0.3), failures(max_touch=0.2)) == (0, 1, 2)
     assert failures(max_touch=0.2, max_touch_of={"rib": 0.6}) == 1
     assert len(list(trial_failures(context().case, Trials(hit=np.zeros(0))))) == 1
-
-
-def test_a_run_without_rehearsal_has_nothing_to_fail_by():
-    """Of a search, a plan."""
-    run = Run(None, None, ())
-    assert run.failures == ()

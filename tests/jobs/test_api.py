@@ -30,18 +30,15 @@ HEAVY = ("numba", "pybullet", "matplotlib", "trimesh", "scipy", "ompl", "fcl", "
 
 @pytest.fixture(scope="module")
 def context():
-    """The carton, organs alone."""
     return pt.prepare(folder() / "carton" / "case_m.toml", arm=False)
 
 
 @pytest.fixture(scope="module")
 def candidates(context):
-    """All of its directions."""
     return pt.search(context)
 
 
 def test_every_name_is_there_with_a_docstring():
-    """And the list is short enough to be read."""
     assert 24 <= len(pt.__all__) <= 40
     for name in pt.__all__:
         assert getattr(pt, name).__doc__, name
@@ -54,29 +51,7 @@ def test_importing_it_loads_nothing_heavy_and_prints_nothing():
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
 
 
-def test_what_it_returns_prints_as_one_line(context, candidates):
-    """A prompt is not flooded with arrays: the name of the type, and what is in it."""
-    marker = folder() / "carton" / "markers_ct.csv"
-    rejected = int(np.flatnonzero(~candidates.safe)[0])
-    checked = pt.check(context, *np.degrees((candidates.theta[rejected], candidates.beta[rejected])))
-    values = {
-        "<CaseContext: case carton-m, ": context,
-        "<Case: carton-m, ": context.case,
-        f"<Candidates: {len(candidates):,} directions, ": candidates,
-        "<Explanation: case carton-m, theta ": checked,
-        "<Certificate: case carton-m, ": pt.certify(context, size_deg=10.0),
-        "<NamedPoints: 3 points, ": pt.read_points(marker),
-        "<TriangleMesh: ": context.anatomy.skin.mesh,
-    }
-    for begins, value in values.items():
-        assert repr(value) == str(value) and len(repr(value).splitlines()) == 1
-        assert repr(value).startswith(begins) and repr(value).endswith(">") and len(repr(value)) < 400, repr(value)
-        assert "array(" not in repr(value)
-    assert ": rejected because " in repr(checked)
-
-
 def test_a_value_that_is_half_made_still_prints():
-    """A debugger must not fail over it."""
     half = object.__new__(TriangleMesh)
     assert "TriangleMesh object at" in repr(half)
 
@@ -92,7 +67,6 @@ def test_rerank_orders_the_safe_ones_alone(candidates):
 
 @pytest.mark.parametrize("cost", [np.zeros(3), "nan", "complex"], ids=["another shape", "not a number", "complex"])
 def test_rerank_refuses_a_cost_that_orders_nothing(candidates, cost):
-    """One line that says what is allowed."""
     if isinstance(cost, str):
         cost = np.full(len(candidates), np.nan if cost == "nan" else 1.0 + 2.0j)
     with refused("wrong_type" if cost.dtype.kind == "c" else "wrong_shape"):
@@ -111,19 +85,19 @@ def test_register_takes_two_lists_and_no_case():
         pt.register(ct, {"a": (0, 0, 0), "b": (100, 0, 0), "x": (0, 80, 0)}, target_ct=(0, 0, 0))
 
 
-def test_register_refuses_a_method_that_is_none():
-    """It is not taken for another one."""
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"method": "magic"}, "unknown_method magic"),
+        ({"markers_base": {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 0, "x")}}, "wrong_type"),
+        ({"markers_base": {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 0, float("nan"))}}, "not_finite"),
+        ({"target_ct": (0, 0)}, "wrong_shape target"),
+    ],
+)
+def test_register_refuses_what_is_none_in_one_line(change, code):
     good = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
-    with refused("unknown_method", "magic"):
-        pt.register(good, good, target_ct=(0, 0, 0), method="magic")
-
-
-def test_register_refuses_points_that_are_none():
-    """Two coordinates, or something that is no number, is one line, not a traceback."""
-    good = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
-    for bad, code in (((0, 0), "wrong_shape"), ((0, 0, "x"), "wrong_type"), ((0, 0, float("nan")), "not_finite")):
-        with refused(code):
-            pt.register({**good, "c": bad}, good, target_ct=(0, 0, 0))
+    with refused(*code.split()):
+        pt.register(**{"markers_ct": good, "markers_base": good, "target_ct": (0, 0, 0)} | change)
 
 
 def test_files_are_read_and_written_under_the_one_name(tmp_path):
@@ -147,16 +121,6 @@ def test_check_refuses_an_angle_outside_of_its_range(context, angles):
     """400 degrees would be explained as 40: the command line refuses it, and so does the library."""
     with refused("out_of_range" if np.isfinite(angles).all() else "not_finite"):
         pt.check(context, *angles)
-
-
-@pytest.mark.parametrize(
-    ("target", "code"), [((0, 0), "wrong_shape"), ((0, 0, float("nan")), "not_finite"), ("abc", "wrong_type")]
-)
-def test_register_refuses_a_target_that_is_no_point(target, code):
-    """One line that names the target, not NumPy's complaint."""
-    markers = {"a": (0, 0, 0), "b": (100, 0, 0), "c": (0, 80, 0)}
-    with refused(code, "target"):
-        pt.register(markers, markers, target_ct=target, fle_mm=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -202,24 +166,19 @@ def test_a_case_with_other_values_is_what_a_file_with_them_is(case_text, tmp_pat
 @pytest.mark.parametrize(
     ("options", "code"),
     [
-        ({"needle": {"lenght_mm": 150.0}}, "unknown_key"),
         ({"nedle": {"length_mm": 150.0}}, "unknown_key"),
-        ({"needle": {"length_mm": -1.0}}, "bad_value"),
-        ({"needle": 150.0}, "not_a_table"),
         ({"target_ct": (1.0, 2.0)}, "wrong_shape"),
         ({"target_ct": (1.0, 2.0, float("inf"))}, "not_finite"),
         ({"needle": {"length_mm": 1.0 + 2.0j}}, "bad_value"),
     ],
 )
 def test_a_value_that_no_case_file_could_have_is_refused(options, code):
-    """By the rules of the file itself."""
     case = pt.load_case(folder() / "carton" / "case_m.toml")
     with refused(code):
         case.replace(**options)
 
 
 def test_a_case_is_prepared_as_often_as_one_likes(tmp_path):
-    """What it let go of is read again: a CT and its labels too."""
     case = pt.load_case(write_case(tmp_path))
     one, other = (pt.search(pt.prepare(case, arm=False)) for _ in range(2))
     assert same_candidates(one, other)
@@ -227,7 +186,6 @@ def test_a_case_is_prepared_as_often_as_one_likes(tmp_path):
 
 
 def test_a_case_whose_files_have_changed_is_not_made_into_another(tmp_path):
-    """It would be one half of each."""
     shutil.copytree(folder() / "carton", tmp_path / "carton")
     case = pt.load_case(tmp_path / "carton" / "case_m.toml")
     case.files.release()
@@ -255,10 +213,7 @@ def test_many_directions_are_what_the_search_says_of_each(context, candidates):
         ([], [], "empty"),
         (10.0, 10.0, "wrong_shape"),
         ([10.0, float("nan")], [10.0, 10.0], "out_of_range"),
-        ([10.0, 181.0], [10.0, 10.0], "out_of_range"),
         ([10.0 + 1j], [10.0], "wrong_type"),
-        ([[10.0], [1.0, 2.0]], [10.0, 10.0], "wrong_shape"),
-        (["a"], [1.0], "wrong_type"),
         ([True], [1.0], "wrong_type"),
     ],
 )
@@ -270,13 +225,11 @@ def test_many_directions_that_are_none_are_refused(context, theta, beta, code):
 
 @pytest.fixture(scope="module")
 def arm_context(tmp_path_factory):
-    """The carton with its arm, on a coarse grid."""
     return pt.prepare(coarse_carton(tmp_path_factory.mktemp("arm") / "carton"))
 
 
 @pytest.fixture(scope="module")
 def reached(arm_context):
-    """Its directions, and which of them the arm reaches."""
     return pt.search(arm_context)
 
 
@@ -323,7 +276,6 @@ def test_two_choices_or_an_arm_that_is_switched_off_are_refused(arm_context, rea
 
 
 def test_a_context_goes_to_other_processes_and_is_used_by_threads(arm_context, reached):
-    """Each gives what this process gives, the arm's answer too."""
     parts = np.array_split(np.random.default_rng(1).permutation(len(reached))[:16], 4)
     angles = [(reached.theta_deg[rows], reached.beta_deg[rows]) for rows in parts]
     expected = [pt.check_many(arm_context, *one) for one in angles]
@@ -359,7 +311,6 @@ def test_windows_and_the_best_are_the_searchs(candidates):
 
 
 def test_the_map_is_a_picture(candidates, tmp_path):
-    """For a notebook, and as a file."""
     shown = candidates.plot_map()
     assert "<img" in shown._repr_html_()
     with Image.open(shown.write(tmp_path / "map.png")) as picture:
@@ -370,7 +321,6 @@ class WaryEngine(FastEngine):
     """Measures 1 mm less than there is."""
 
     def measure(self, target_ct, outward_ct, length, *, shown=True):
-        """Of every axis from every structure."""
         axes = super().measure(target_ct, outward_ct, length, shown=shown)
         return replace(axes, distance=np.maximum(axes.distance - 1.0, 0.0))
 
@@ -392,7 +342,6 @@ class HopefulEngine(FastEngine):
     """Measures 5 mm more than there is."""
 
     def measure(self, target_ct, outward_ct, length, *, shown=True):
-        """Of every axis from every structure."""
         axes = super().measure(target_ct, outward_ct, length, shown=shown)
         return replace(axes, distance=axes.distance + 5.0)
 
@@ -401,7 +350,6 @@ class BlindEngine(FastEngine):
     """Measures no number."""
 
     def measure(self, target_ct, outward_ct, length, *, shown=True):
-        """Of every axis from every structure."""
         axes = super().measure(target_ct, outward_ct, length, shown=shown)
         return replace(axes, distance=np.full_like(axes.distance, np.nan))
 
@@ -417,7 +365,7 @@ def test_an_engine_that_finds_more_clearance_than_there_is_ends_with_an_error(co
         pt.check(pickle.loads(pickle.dumps(theirs)), 30.0, 100.0)
 
 
-def test_a_path_of_another_case_is_not_taken_for_one_of_this(context, candidates, tmp_path):
+def test_a_path_of_another_case_is_not_taken_for_one_of_this(context, arm_context, candidates, tmp_path):
     """The angles of a candidate, or the clearances of a checked direction, are another path about another target."""
     case = context.case
     for change in ({"target_ct": case.target_ct + (0.4, 0.0, 0.0)}, {"needle": {"diameter_mm": 1.4}}):
@@ -427,6 +375,9 @@ def test_a_path_of_another_case_is_not_taken_for_one_of_this(context, candidates
         for ask in (
             lambda found=found: pt.check(context, candidate=found.best),
             lambda found=found: pt.compare(context, found.best, pt.check(context)),
+            lambda found=found: pt.compare(context, found.best, found.best, candidates=found),
+            lambda found=found: pt.plan(arm_context, found),
+            lambda found=found: pt.report(context, found, tmp_path / "page"),
             lambda explained=explained: pt.compare(context, explained, pt.check(context)),
             lambda explained=explained: pt.export(explained, "slicer", tmp_path / "slicer", context=context),
             lambda found=found: pt.export(found, "candidates-csv", tmp_path / "csv", context=context),
@@ -453,7 +404,6 @@ def test_what_is_planned_is_checked_anew(arm_context, reached):
 
 
 def test_a_plan_of_another_case_is_neither_rehearsed_nor_shown(arm_context, reached, tmp_path):
-    """And one of another seed is: it is what `plan` was asked for."""
     case = arm_context.case
     plan = pt.plan(arm_context, reached, seed=3)
     other = pt.prepare(case.replace(target_ct=case.target_ct + (0.4, 0.0, 0.0)))
@@ -497,20 +447,7 @@ def test_masked_values_are_no_numbers(context):
 
 
 def test_an_option_without_keys_is_refused():
-    """It changed nothing, and said nothing."""
     case = pt.load_case(folder() / "abdomen")
     for options in ({"mount": {}}, {"needle": {"diameter_mm": 1.0}, "search": {}}):
         with refused("empty"):
             case.replace(**options)
-
-
-def test_candidates_of_another_case_are_not_planned_nor_shown(context, arm_context, tmp_path):
-    """What is safe there says nothing here: a target 0.4 mm aside is another case."""
-    other = pt.search(pt.prepare(context.case.replace(target_ct=context.case.target_ct + (0.4, 0.0, 0.0)), arm=False))
-    with refused("input_changed"):
-        pt.plan(arm_context, other)
-    with refused("input_changed"):
-        pt.report(context, other, tmp_path / "page")
-    with refused("input_changed"):
-        pt.compare(context, other.best, other.best, candidates=other)
-    assert not (tmp_path / "page").exists()

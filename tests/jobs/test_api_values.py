@@ -27,13 +27,11 @@ TARGET = (50.0, 130.0, 63.0)
 
 @pytest.fixture(scope="module")
 def context():
-    """The carton, organs alone."""
     return pt.prepare(CARTON / "case_m.toml", arm=False)
 
 
 @pytest.fixture(scope="module")
 def given(context, tmp_path_factory):
-    """Something good for each argument, by its name."""
     tmp = tmp_path_factory.mktemp("values")
     recorded = simulate_recording(np.random.default_rng(1), 24)[0]
     write_recording(recorded, tmp / "recording.csv")
@@ -60,7 +58,6 @@ def given(context, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def values(given):
-    """What each function gives."""
     tmp, armed, context, candidates = (given[name] for name in ("tmp", "armed", "context", "candidates"))
     found, plan = pt.search(armed), given["plan"]
     rehearsal = pt.rehearse(armed, plan, seeds=3)
@@ -145,7 +142,6 @@ def test_where_the_arm_should_stand_goes_into_a_case(given, monkeypatch):
 
 
 def test_an_export_that_is_not_of_its_source_is_refused(given):
-    """And one whose scene is the case's needs the case."""
     wrong = ((given["plan"], "candidates-csv"), (given["candidates"], "urscript"), (given["plan"], "slicer"))
     for source, name in wrong:
         with refused("wrong_type"):
@@ -209,7 +205,6 @@ def test_no_foreign_exception_leaves_a_function(name, given, tmp_path, monkeypat
 
 @pytest.mark.parametrize("label", HOSTILE)
 def test_no_foreign_exception_leaves_a_case_or_its_candidates(label, given):
-    """What is called on a value keeps the same promise."""
     value, case, candidates = HOSTILE[label], given["context"].case, given["candidates"]
     calls = [partial(case.replace, **{key: value}) for key in ("target_ct", "target", "mount", "needle", "search", "x")]
     calls += [partial(case.replace, needle={"length_mm": value}), partial(candidates.pick, value)]

@@ -27,7 +27,6 @@ def nowhere(tmp_path_factory):
 
 
 def test_terminal_and_page_say_that_no_arm_was_checked(nowhere, tmp_path, capfd):
-    """And that the robot which the case names has no place."""
     assert main(["search", str(nowhere), "--out", str(tmp_path)]) == OK
     told, page = capfd.readouterr().out, (tmp_path / "report.html").read_text()
     assert f"arm {NOT_CHECKED}" in told and f"warning: {NAMED}" in told
@@ -47,13 +46,6 @@ def test_check_says_so_too(nowhere, switch, capfd):
     assert main(candidate) == OK
     said = capfd.readouterr().out
     assert "theta 0 deg, beta 0 deg: safe for the organs\n" in said and f"arm {NOT_CHECKED}" in said
-
-
-def test_a_robot_with_a_place_is_no_warning(capfd):
-    """Nor is a case that names none."""
-    arguments = ["--theta", "0", "--beta", "0", "--no-arm", "--json"]
-    assert main(["check", str(folder() / "carton" / "case_m.toml"), *arguments]) == OK
-    assert "states a robot" not in capfd.readouterr().out
 
 
 def test_both_ends_of_the_needle_are_told_in_the_robots_axes():

@@ -12,7 +12,6 @@ DATA = places.DATA / "chen2019"
 
 
 def test_every_number_of_the_paper_holds():
-    """Tables 3, 5, 6, 7 and the worked example agree to 0.01 mm."""
     facts = chen2019.reproduction_facts()
     assert len(facts["rows"]) == 6 + 6 + 3 + 7 + 2
     assert [row for row in facts["rows"] if not row["holds"]] == []
@@ -45,7 +44,6 @@ def test_a_wrong_number_does_not_hold(monkeypatch):
     ],
 )
 def test_our_tables_are_the_papers(file, table):
-    """The constants equal the independently transcribed CSV."""
     with (DATA / file).open() as stream:
         rows = {row["name"]: tuple(float(row[f"{axis}_mm"]) for axis in "xyz") for row in csv.DictReader(stream)}
     assert rows == dict(table)

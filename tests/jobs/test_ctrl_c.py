@@ -33,9 +33,9 @@ ENDED_BEFORE = 77
 QUICK = {"batch", "init"}
 """Commands that take less than the second after which the others are interrupted."""
 
-WRITING = {"demo", "search", "rehearse", "place", "batch", "selfcal", "servo", "scan", "markers"}
-COMMANDS = sorted(WRITING | {"init", "check", "live"})
-"""Each that loops, draws, simulates, serves or begins processes in its own way. One function ends them all:
+WRITING = {"search", "rehearse", "place", "batch", "selfcal"}
+COMMANDS = sorted(WRITING | {"init", "live"})
+"""One that loops, draws, simulates, serves or begins processes in its own way. One function ends them all:
 tests/jobs/test_interrupt.py; `mirror`, which has then done what it was asked for, is in tests/jobs/test_mirror.py."""
 
 
@@ -53,18 +53,13 @@ def typed(tmp_path_factory):
     for mesh in (folder() / "abdomen").glob("*.ply"):
         shutil.copy(mesh, meshes)
     return {
-        "demo": [],
         "init": [str(meshes), "--target=-90,-10,60"],
         "search": [case],
-        "check": [case, "--theta", "0", "--beta", "0"],
         "rehearse": [case],
         "place": [case, "--jobs", "1"],
         "live": [str(folder() / "abdomen"), "--port", "0"],
         "batch": ["plan", str(cohort)],
-        "scan": [case],
-        "markers": [case, "--propose", "3"],
         "selfcal": [str(here / "selfcal")],
-        "servo": [str(folder() / "head")],
     }
 
 
@@ -91,7 +86,6 @@ def interrupted(seconds, arguments, out):
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_one_line_130_and_nothing_half_written(command, typed, tmp_path):
-    """No traceback, no file, and no folder that was not there."""
     out = tmp_path / "out"
     where = ["--out", str(out)] if command in WRITING else []
     done = interrupted(0.3 if command in QUICK else 1.0, [command, *typed[command], *where], out)

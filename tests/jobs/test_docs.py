@@ -33,18 +33,15 @@ def slug(heading):
 
 @cache
 def anchors(page):
-    """Of all headings of a page."""
     return {slug(line.lstrip("#")) for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("#")}
 
 
 @cache
 def class_names():
-    """Of every class of the product."""
     return {name for path in modules().values() for name in DEFINED.findall(path.read_text(encoding="utf-8"))}
 
 
 def names_of(path):
-    """What a module defines or imports at its top."""
     found = set()
     for node in tree(path).body:
         found |= {node.name} if hasattr(node, "name") else set()
@@ -55,14 +52,12 @@ def names_of(path):
 
 
 def code_blocks(page):
-    """The Python code of a page."""
     for indent, code in CODE.findall(page.read_text(encoding="utf-8")):
         yield "".join(line.removeprefix(indent) for line in code.splitlines(keepends=True))
 
 
 @each_page
 def test_every_link_leads_somewhere(page):
-    """To a file, and to a heading of it."""
     for link in LINK.findall(page.read_text(encoding="utf-8")):
         if "://" not in link:
             name, _, anchor = link.partition("#")
@@ -84,13 +79,11 @@ def test_every_file_and_module_that_is_named_exists(page):
 
 @each_page
 def test_every_class_that_is_named_exists(page):
-    """Renamed classes are renamed on the pages too."""
     assert set(CLASS.findall(page.read_text(encoding="utf-8"))) - class_names() == set()
 
 
 @each_page
 def test_every_make_target_that_is_named_exists(page):
-    """`make nothing` is no help."""
     targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.M))
     assert set(re.findall(r"`make (\w+)`", page.read_text(encoding="utf-8"))) - targets == set()
 
@@ -104,7 +97,6 @@ def test_code_is_python_whose_imports_work(page):
 
 
 def test_the_code_of_the_readme_runs(monkeypatch, capsys):
-    """As it is printed, from the top of the repository."""
     monkeypatch.chdir(ROOT)
     for code in code_blocks(ROOT / "README.md"):
         exec(compile(code, "README.md", "exec"), {})
@@ -119,7 +111,6 @@ def commands(group, before=""):
 
 
 def test_the_command_line_is_described():
-    """Every command and every option."""
     text = (ROOT / "docs" / "reference" / "command-line.md").read_text(encoding="utf-8")
     for name, command in commands(typer.main.get_command(app)):
         section = text.split(f"## `{name}`\n")[1].split("\n## ")[0]
@@ -129,7 +120,6 @@ def test_the_command_line_is_described():
 
 
 def test_every_room_is_on_the_page_of_the_architecture():
-    """Those of the first level."""
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     rooms = {
         path.parent.relative_to(ROOT).as_posix()
@@ -140,7 +130,6 @@ def test_every_room_is_on_the_page_of_the_architecture():
 
 
 def test_every_concept_has_a_picture_and_every_picture_a_page():
-    """One page, one subject, one picture."""
     texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
     for page, text in texts.items():
         if page.parent.name == "concepts":
@@ -150,7 +139,6 @@ def test_every_concept_has_a_picture_and_every_picture_a_page():
 
 
 def test_every_page_is_in_the_index_and_in_the_menu():
-    """A page that nothing leads to is lost."""
     index, menu = ((ROOT / name).read_text(encoding="utf-8") for name in ("docs/index.md", "mkdocs.yml"))
     pages = [path.relative_to(ROOT / "docs").as_posix() for path in PAGES if ROOT / "docs" in path.parents]
     assert [page for page in pages if page != "index.md" and (f"({page})" not in index or page not in menu)] == []
@@ -161,7 +149,6 @@ WITH_DOCTESTS = sorted(name for name, path in modules().items() if "\n    >>> " 
 
 @pytest.mark.parametrize("name", WITH_DOCTESTS)
 def test_what_docstrings_show_is_what_happens(name):
-    """Every ``>>>`` of the product."""
     found = doctest.testmod(importlib.import_module(name))
     assert found.attempted > 0
     assert found.failed == 0

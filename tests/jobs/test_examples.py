@@ -25,7 +25,6 @@ SAYS = {
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs_and_says_its_answer(path, tmp_path, tmp_path_factory):
-    """A process of its own, as a reader would start it."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path_factory.mktemp("scratch"))}
     options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
     runner = [str(ROOT / "tests" / "notebooks.py")] if path.suffix == ".ipynb" else []
@@ -51,6 +50,5 @@ def test_every_example_is_short_and_says_how_it_is_started():
 
 
 def test_the_gallery_holds_the_examples_as_they_are():
-    """``python docs/gallery.py`` writes it."""
     gallery = runpy.run_path(str(ROOT / "docs" / "gallery.py"), run_name="gallery")
     assert gallery["PAGE"].read_text(encoding="utf-8") == gallery["gallery"]()

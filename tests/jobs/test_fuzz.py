@@ -9,13 +9,12 @@ import pytest
 from fuzz.runner import Fuzzer
 from fuzz.targets import read_case, whole_case
 
-RUNS = 900
+RUNS = 400
 """Of each of the four parts, which run side by side."""
 
 
 @pytest.fixture(scope="module")
 def fuzzer(tmp_path_factory):
-    """The corpus, and what is made of it."""
     return Fuzzer(tmp_path_factory.mktemp("fuzz"))
 
 
@@ -52,7 +51,6 @@ def test_a_case_that_lost_a_structure_is_noticed(fuzzer):
 
 
 def test_a_run_is_decided_by_its_number(fuzzer):
-    """A run that failed can be repeated."""
     fuzzer.run(7)
     first = fuzzer.last
     fuzzer.run(8)

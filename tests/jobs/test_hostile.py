@@ -45,7 +45,6 @@ def runner():
 
 
 def task_of(case, folder, out):
-    """What the runner is told."""
     task = {"seconds": case.get("seconds", SECONDS), "megabytes": SPAN_MEGABYTES}
     if "reader" in case:
         return {**task, "reader": case["reader"], "path": str(folder / case["file"])}

@@ -32,8 +32,6 @@ def in_a_callback(work):
 
 
 def in_a_destructor(work):
-    """As an object in C is closed."""
-
     class Closing:
         def __del__(self):
             work()
@@ -65,8 +63,6 @@ def test_an_interruption_that_was_dropped_comes_again(place, capfd):
 
 @pytest.mark.parametrize("prints", [True, False])
 def test_an_interruption_that_was_dropped_at_the_end_leaves_no_answer(prints, capfd):
-    """The command ends before it comes again."""
-
     def command():
         in_a_callback(lambda: signal.raise_signal(signal.SIGINT))
         if prints:
@@ -77,8 +73,6 @@ def test_an_interruption_that_was_dropped_at_the_end_leaves_no_answer(prints, ca
 
 
 def test_an_error_that_a_library_makes_of_an_interruption_is_no_error(capfd):
-    """As pydantic does while it builds a class."""
-
     def command():
         with suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
@@ -139,7 +133,6 @@ def test_a_module_is_imported_to_its_end(tmp_path, monkeypatch):
 
 
 def test_a_program_that_is_itself_imported_can_be_interrupted(tmp_path, monkeypatch):
-    """What it was started from is not what it has entered."""
     (tmp_path / "started_by_import.py").write_text(
         "import signal, time\nfrom puncture_twin.twin.jobs.exit_codes import exit_code_of\n"
         "def command():\n    signal.raise_signal(signal.SIGINT)\n    time.sleep(20)\n"
@@ -181,8 +174,6 @@ def test_llvms_memory_is_freed_once(capfd):
 
 
 def test_a_command_goes_on_after_the_block_that_ctrl_c_ends():
-    """As ``mirror`` prints what it saw."""
-
     def command():
         with ended_by_ctrl_c():
             signal.raise_signal(signal.SIGINT)
@@ -193,7 +184,6 @@ def test_a_command_goes_on_after_the_block_that_ctrl_c_ends():
 
 
 def test_who_hears_the_signal_otherwise_keeps_it():
-    """Another thread, and a program that was started deaf to it."""
     heard = []
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with insistent_ctrl_c():
@@ -211,7 +201,6 @@ def test_who_hears_the_signal_otherwise_keeps_it():
 
 
 def test_an_interruption_while_a_refusal_is_printed_ends_the_command():
-    """The refusal's line, then the word; no traceback."""
     said = []
 
     def print_line(line):

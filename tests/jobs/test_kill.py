@@ -79,14 +79,12 @@ def test_a_writer_killed_at_random_leaves_no_mix(command, tmp_path):
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
-    """Two coarse cases, and the plan of each."""
     here = tmp_path_factory.mktemp("kill")
     return here, coarse_cases(here)
 
 
 @pytest.fixture(scope="module")
 def plans(world):
-    """The plan of each case, in a set of its own."""
     here, cases = world
     for case in cases:
         assert main(["plan", str(case), "--out", str(here / f"planned-{case.parent.name}")]) == OK
@@ -94,15 +92,7 @@ def plans(world):
 
 
 def kills(command, entry, arguments, tells, out):
-    """Kill a command again and again, while it runs, and run it to its end after each kill.
-
-    Args:
-        command: Its name.
-        entry: The name of its entry.
-        arguments: Of the run a and the run b, without the folder.
-        tells: A hash that is among the inputs of run a alone, and one for b.
-        out: The folder.
-    """
+    """Kill a command again and again, while it runs, and run it to its end after each kill."""
     rng, counts = generator(command), Counter()
     assert main([*map(str, arguments[0]), "--out", str(out)]) in (OK, ANSWER_IS_NO)
     old = 0
@@ -125,7 +115,6 @@ def kills(command, entry, arguments, tells, out):
 
 @pytest.mark.parametrize("command", ["search", pytest.param("plan", marks=needs_time)])
 def test_a_command_killed_at_random(command, world, tmp_path):
-    """The whole command, as it is typed."""
     cases = world[1]
     options = ["--no-arm"] if command == "search" else []
     kills(command, command, [[command, case, *options] for case in cases], [sha256(c) for c in cases], tmp_path / "out")
@@ -141,7 +130,6 @@ def test_search_killed_between_a_large_set_and_a_small_one(world, tmp_path):
 
 @needs_time
 def test_rehearse_killed_at_random(world, plans, tmp_path):
-    """Of a plan from another folder."""
     cases = world[1]
     runs = [["rehearse", plan, "--case", case] for plan, case in zip(plans, cases, strict=True)]
     kills("rehearse", "rehearse", runs, [sha256(plan) for plan in plans], tmp_path / "out")
@@ -149,7 +137,6 @@ def test_rehearse_killed_at_random(world, plans, tmp_path):
 
 @needs_time
 def test_export_killed_at_random(plans, tmp_path):
-    """The same."""
     runs = [["export", plan, "--format", "csv"] for plan in plans]
     kills("export", "export plan.csv", runs, [sha256(plan) for plan in plans], tmp_path / "out")
 
@@ -166,39 +153,34 @@ def test_export_killed_at_random(plans, tmp_path):
     ],
 )
 def test_the_experiment_killed_at_random(command, words, world, tmp_path):
-    """Each of its commands on both cases in turn, into one folder."""
     runs = [[words[0], case, *words[1:]] for case in world[1]]
     kills(command, command, runs, [sha256(case) for case in world[1]], tmp_path / "out")
 
 
+def two_of(folder_of, file, changes, here):
+    """Two copies of an embedded folder whose case file differs by what is added or replaced."""
+    for name, (old, new) in zip("ab", changes, strict=True):
+        shutil.copytree(folder_of, here / name)
+        text = (here / name / file).read_text()
+        (here / name / file).write_text(text.replace(old, new) if old else text + new)
+    return [here / name / file for name in "ab"]
+
+
+STEPS = [("step_deg = 2.0", f"step_deg = {step}") for step in ("15.0", "18.0")]
+
+
 @needs_time
 def test_place_killed_at_random(tmp_path):
-    """The abdomen with few places to stand."""
-    cases = []
-    for name, step in (("a", "15.0"), ("b", "18.0")):
-        shutil.copytree(folder() / "abdomen", tmp_path / name)
-        case = tmp_path / name / "case.toml"
-        case.write_text(case.read_text().replace("step_deg = 2.0", f"step_deg = {step}") + PLACE)
-        cases.append(case)
-    kills(
-        "place",
-        "place",
-        [["place", case, "--full"] for case in cases],
-        [sha256(case) for case in cases],
-        tmp_path / "out",
-    )
+    cases = two_of(folder() / "abdomen", "case.toml", STEPS, tmp_path)
+    for case in cases:
+        case.write_text(case.read_text() + PLACE)
+    kills("place", "place", [["place", case, "--full"] for case in cases], list(map(sha256, cases)), tmp_path / "out")
 
 
 @needs_time
 def test_servo_killed_at_random(tmp_path):
-    """The embedded head, with two seeds."""
-    cases = []
-    for name in ("a", "b"):
-        shutil.copytree(folder() / "head", tmp_path / name)
-        case = tmp_path / name / "servo.toml"
-        case.write_text(case.read_text() + f"# {name}\n")
-        cases.append(case)
-    kills("servo", "servo", [["servo", case] for case in cases], [sha256(case) for case in cases], tmp_path / "out")
+    cases = two_of(folder() / "head", "servo.toml", [("", "# a\n"), ("", "# b\n")], tmp_path)
+    kills("servo", "servo", [["servo", case] for case in cases], list(map(sha256, cases)), tmp_path / "out")
 
 
 def state_by_page(out, old, new):
@@ -235,12 +217,9 @@ def test_reproduce_killed_at_random(tmp_path):
 
 @needs_time
 def test_selfcal_killed_at_random(tmp_path):
-    """Simulated, small; the seed tells the runs apart."""
-    cases = []
-    for seed in (3, 4):
-        case = tmp_path / str(seed) / "selfcal.toml"
-        case.parent.mkdir()
-        case.write_text(SELFCAL.replace("seed = 3", f"seed = {seed}"))
-        cases.append(case)
+    (tmp_path / "small").mkdir()
+    (tmp_path / "small" / "selfcal.toml").write_text(SELFCAL)
+    seeds = [("seed = 3", f"seed = {seed}") for seed in (3, 4)]
+    cases = two_of(tmp_path / "small", "selfcal.toml", seeds, tmp_path)
     runs = [["selfcal", case, "--seeds", "1"] for case in cases]
-    kills("selfcal", "selfcal", runs, [sha256(case) for case in cases], tmp_path / "out")
+    kills("selfcal", "selfcal", runs, list(map(sha256, cases)), tmp_path / "out")

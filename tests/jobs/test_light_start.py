@@ -34,7 +34,6 @@ def loaded(*arguments):
     ids=lambda value: "_".join(value) if isinstance(value, list) else None,
 )
 def test_help_and_a_wrong_argument_load_no_library_of_numbers(arguments, code):
-    """They answer at once."""
     assert loaded(*arguments) == f"[] {code}"
 
 
@@ -56,7 +55,6 @@ def test_a_search_without_arm_and_pictures_loads_no_library_that_it_does_not_use
 
 
 def test_a_check_of_one_candidate_loads_no_writer_of_tables():
-    """With arm and chances: pyarrow is a list's."""
     case = ["check", str(ROOT / "meshes" / "abdomen"), "--theta", "64", "--beta", "98"]
     code = f"import sys\nfrom puncture_twin import run_twin\ncode = run_twin.main({case!r})\n"
     said = code + "print(sorted({'pyarrow', 'matplotlib', 'plotly'} & set(sys.modules)), code)"

@@ -38,13 +38,11 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.fixture(scope="module")
 def context():
-    """The abdomen, with few directions."""
     return pt.prepare(load_case(ABDOMEN).replace(search={"step_deg": 10.0}))
 
 
 @pytest.fixture(scope="module")
 def planner(context):
-    """Of it."""
     return Planner(context)
 
 
@@ -65,12 +63,10 @@ def asked(planner, kind, name, content, session=None, stamp=STAMP):
 
 
 def document(found, name):
-    """Of a text."""
     return json.loads(found[f"STRING {name}"][4:])
 
 
 def needle(tip_ras, axis_ras):
-    """A pose with this tip and z-axis."""
     z = axis_ras / np.linalg.norm(axis_ras)
     x = np.cross(z, [0.3, 0.5, 0.8])
     x /= np.linalg.norm(x)
@@ -86,7 +82,6 @@ def toward(context, theta_deg, beta_deg, *, off_mm=0.0, out_mm=150.0):
 
 
 def verdict(planner, pose, **named):
-    """The verdict of a pose."""
     return document(asked(planner, "TRANSFORM", "Needle", transform(pose), **named), "Verdict")
 
 
@@ -202,14 +197,12 @@ def test_what_breath_and_bending_take_is_not_spare():
 
 
 def test_a_needle_held_the_wrong_way_round_is_another_direction(context, planner, paths):
-    """Its hub in the patient: never the verdict of the safe path."""
     pose = toward(context, *paths[0, :2])
     pose[:3, [0, 2]] *= -1.0
     assert verdict(planner, pose)["verdict"] != "safe"
 
 
 def test_a_tracked_needle_is_the_same(context, planner, paths):
-    """Among other tools of a TDATA, whatever the tracker is called."""
     pose = toward(context, *paths[0, :2])
     one = verdict(planner, pose)
     found = asked(planner, "TDATA", "Polaris", tools(Other=np.eye(4), Needle=pose))
@@ -219,7 +212,6 @@ def test_a_tracked_needle_is_the_same(context, planner, paths):
 
 
 def is_empty(found):
-    """Nothing drawn, nothing free, nothing said to be safe."""
     mesh, grid = found["POLYDATA SafeMap"], np.frombuffer(found["IMAGE SafeGrid"][72:], "<u2")
     assert not any(struct.unpack(">10I", mesh)) and (grid == NO_STRUCTURE).all() and found["POINT Entry"] == b""
     assert document(found, "Verdict")["verdict"] == "refused"
@@ -270,7 +262,6 @@ def test_a_needle_without_a_newer_pose_has_no_verdict(context, planner, paths):
 
 
 def refusal(code):
-    """Any."""
     return pt.InputError("damaged", where="here", allowed="none", code=code)
 
 
@@ -286,7 +277,6 @@ def refusal(code):
     ids=["mirrored", "scaled", "zero", "infinite", "huge"],
 )
 def test_a_pose_that_no_needle_has_is_refused(planner, matrix, code):
-    """And its verdict replaces the one before; the entry goes."""
     found = asked(planner, "TRANSFORM", "Needle", transform(matrix))
     said = document(found, "Verdict")
     assert (said["verdict"], said["error"]["code"], found["POINT Entry"]) == ("refused", code, b"")
@@ -294,20 +284,17 @@ def test_a_pose_that_no_needle_has_is_refused(planner, matrix, code):
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_a_signalling_nan_is_refused_without_a_warning(planner):
-    """Some processors warn of it where a number is made wider."""
     for kind, name, subject in (("TRANSFORM", "Needle", "Verdict"), ("TRANSFORM", "Target", "SafeMapInfo")):
         found = document(asked(planner, kind, name, b"\x7f\xa0\0\1" * 12), subject)
         assert found["error"]["code"] == "not_finite"
 
 
 def test_of_a_stranger_nothing_is_wanted(planner):
-    """Only three names, each with its types."""
     for kind, name in (("IMAGE", "Target"), ("POINT", "Needle"), ("POINT", "F"), ("STRING", "Text"), ("STATUS", "x")):
         assert planner.subject(Header(1, kind, name, 0, 0, 0, 0)) is None
 
 
 def test_a_case_in_a_frame_of_its_own_is_refused():
-    """Nobody knows where its RAS would be."""
     with refused("local_space"):
         Planner(SimpleNamespace(case=load_case(folder() / "carton" / "case_m.toml")))
 
@@ -396,6 +383,5 @@ def test_a_port_that_is_taken_is_one_line_before_a_case_is_read(capsys):
 
 
 def test_what_is_packed_for_version_1_has_no_extension():
-    """Header, content, nothing else."""
     assert len(packed("STRING", "x", STAMP._replace(version=1), b"abc")) == 58 + 3
     assert len(packed("STRING", "x", STAMP, b"abc")) == 58 + 12 + 3 + 2

@@ -9,7 +9,7 @@ import struct
 import sys
 import threading
 import time
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -33,7 +33,6 @@ class Slow:
         """Nothing is kept."""
 
     def subject(self, header):
-        """By name."""
         return {"Query": "status", "Target": "target", "Needle": "needle"}.get(header.name)
 
     def begin(self):
@@ -43,7 +42,6 @@ class Slow:
         """None is known."""
 
     def answers(self, question):
-        """After a while."""
         if question.message is None:
             raise question.fault
         self.begun.append((question.client, question.subject, question.stamp.fraction))
@@ -54,7 +52,6 @@ class Slow:
         yield Answer("Told", packed("STRING", "Told", question.stamp, content))
 
     def refused(self, subject, stamp, error):
-        """Its code."""
         content = text_content(json.dumps({"subject": subject, "code": error.code}))
         yield Answer("Refused", packed("STRING", "Refused", stamp, content))
 
@@ -76,19 +73,16 @@ class Running:
         return self.listener.__exit__(*error)
 
     def accept(self):
-        """The next connection, or an interruption."""
         accepted = self.listener.accept()
         if self.ends:
             raise KeyboardInterrupt
         return accepted
 
     def run(self):
-        """Until it is stopped."""
         with pytest.raises(KeyboardInterrupt):
             serve(self, self.planner, self.pose_s)
 
     def stop(self):
-        """End, and wait for it."""
         self.ends = True
         with suppress(OSError):
             socket.create_connection(("127.0.0.1", self.port), 1.0).close()  # it wakes
@@ -98,7 +92,6 @@ class Running:
 
 @pytest.fixture
 def running(monkeypatch):
-    """A server that waits for nobody long."""
     monkeypatch.setattr(server, "MESSAGE_S", 0.3)
     monkeypatch.setattr(server, "STALL_S", 0.4)
     started = Running(Slow())
@@ -107,7 +100,6 @@ def running(monkeypatch):
 
 
 def answers_well(port, said="well"):
-    """Whether another client is answered at once."""
     with Talk(port, 5.0) as talk:
         begun = time.monotonic()
         talk.send("STRING", "Query", text(said), stamp=(3, 4))
@@ -242,33 +234,38 @@ def test_a_target_that_moves_faster_than_its_map_leaves_the_needle_its_turn(runn
     assert abs(2 * needles - sent) <= 2 and sent > 6
 
 
-def test_one_client_that_floods_does_not_keep_another_waiting(running):
-    """Each has its turn: between two answers to the other there is one to the flood."""
-    running.planner.waits_s = 0.01
-    flood = message("TRANSFORM", "Needle", transform(np.eye(4))) * 200
+@contextmanager
+def flooded(running, data, count):
     stop = threading.Event()
 
     def send_on():
         with Talk(running.port) as talk:
             while not stop.is_set():
-                talk.send(flood)
+                talk.send(data)
 
-    floods = [threading.Thread(target=send_on) for _ in range(2)]
+    floods = [threading.Thread(target=send_on) for _ in range(count)]
     for one in floods:
         one.start()
     try:
-        time.sleep(0.1)
-        with Talk(running.port) as talk:
-            for number in range(10):
-                begun = time.monotonic()
-                talk.send("STRING", "Query", text("me"), stamp=(0, number))
-                assert talk.receive().stamp == (0, number) and time.monotonic() - begun < 2.0
+        yield
     finally:
         stop.set()
         running.planner.waits_s = 0.0
         for one in floods:
             one.join(10.0)
     assert not any(one.is_alive() for one in floods)
+
+
+def test_one_client_that_floods_does_not_keep_another_waiting(running):
+    """Each has its turn: between two answers to the other there is one to the flood."""
+    running.planner.waits_s = 0.01
+    with flooded(running, message("TRANSFORM", "Needle", transform(np.eye(4))) * 200, 2):
+        time.sleep(0.1)
+        with Talk(running.port) as talk:
+            for number in range(10):
+                begun = time.monotonic()
+                talk.send("STRING", "Query", text("me"), stamp=(0, number))
+                assert talk.receive().stamp == (0, number) and time.monotonic() - begun < 2.0
 
 
 def test_a_client_that_reads_nothing_is_let_go_and_takes_little_memory(running):
@@ -289,7 +286,6 @@ def test_a_client_that_reads_nothing_is_let_go_and_takes_little_memory(running):
 
 
 def test_one_client_too_many_is_not_heard_and_a_place_is_free_again(running):
-    """The others go on."""
     talks = [Talk(running.port) for _ in range(server.MOST_CLIENTS)]
     for talk in talks:
         talk.send("STRING", "Query", text("x"))
@@ -339,7 +335,6 @@ def test_clients_that_vanish_leave_their_places(running, monkeypatch, waits):
 
 
 def place_is_free(port):
-    """Whether one more client is answered."""
     with suppress(ConnectionError):
         return answers_well(port)
     return False
@@ -380,19 +375,10 @@ def test_a_tracker_that_stops_leaves_no_verdict_behind():
 
 def test_a_flood_of_others_does_not_hide_that_a_tracker_stopped():
     """And a pose that still waits when it counts no longer is not answered as if it were new."""
-    running, stop = Running(Slow(), pose_s=0.3), threading.Event()
+    running = Running(Slow(), pose_s=0.3)
     running.planner.waits_s = 0.05
-
-    def send_on():
-        with Talk(running.port) as talk:
-            while not stop.is_set():
-                talk.send(message("STRING", "Query", text("flood")))
-
-    floods = [threading.Thread(target=send_on) for _ in range(3)]
-    for one in floods:
-        one.start()
     try:
-        with Talk(running.port) as tracked:
+        with flooded(running, message("STRING", "Query", text("flood")), 3), Talk(running.port) as tracked:
             tracked.send("TRANSFORM", "Needle", transform(np.eye(4)), stamp=(0, 1))
             assert tracked.until("Refused").document["code"] == "needle_silent"
             running.planner.waits_s = 0.5
@@ -401,16 +387,11 @@ def test_a_flood_of_others_does_not_hide_that_a_tracker_stopped():
             said = tracked.receive()
             assert (said.name, said.stamp) == ("Refused", (0, 2))
     finally:
-        stop.set()
-        running.planner.waits_s = 0.0
-        for one in floods:
-            one.join(10.0)
         running.stop()
     assert ("needle", 2) not in [one[1:] for one in running.planner.begun]
 
 
 def test_a_log_that_many_write_to_stays_short(running, caplog):
-    """Fifty connections of noise: no more lines than the limit."""
     with caplog.at_level(logging.WARNING, logger=server.__name__):
         for _ in range(50):
             with Talk(running.port) as talk:
@@ -420,7 +401,6 @@ def test_a_log_that_many_write_to_stays_short(running, caplog):
 
 
 def test_a_name_cannot_write_lines_of_its_own_into_the_log(running, caplog):
-    """Nor colour a terminal."""
     with caplog.at_level(logging.WARNING, logger=server.__name__), Talk(running.port) as talk:
         talk.send("IMAGE", "\x1b[31m\nlive: client\x07", b"")
         assert talk.receive().document["code"] == "unknown_message"
@@ -440,7 +420,6 @@ def test_the_port_is_free_after_the_end():
 
 
 def test_an_address_that_is_not_loopback_is_warned_of(caplog):
-    """And none that is."""
     with caplog.at_level(logging.WARNING, logger=server.__name__):
         bound("127.0.0.1", 0).close()
         bound("localhost", 0).close()
@@ -453,7 +432,6 @@ def test_an_address_that_is_not_loopback_is_warned_of(caplog):
 
 
 def test_questions_take_turns_and_a_target_comes_before_a_needle():
-    """Of two clients, whatever each has sent in which order."""
     exchange = Exchange()
     stamp = (1, 0, 0, 0)
     for client in (1, 2):
@@ -471,7 +449,6 @@ def test_questions_take_turns_and_a_target_comes_before_a_needle():
 
 
 def test_an_answer_too_long_for_a_text_is_refused():
-    """Its length has two bytes."""
     assert len(text_content("x" * 65_535)) == 65_539
     with pytest.raises(InputError):
         text_content("x" * 65_536)

@@ -16,7 +16,7 @@ from puncture_twin.planning.base import errors
 from puncture_twin.planning.base.files import sha256
 from puncture_twin.planning.base.output.manifest import problems, read_manifest
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, INTERRUPTED, OK, PROGRAM_FAILED
+from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, OK, PROGRAM_FAILED
 from puncture_twin.twin.jobs.options import prepared
 from puncture_twin.twin.jobs.patient.main_job import demo_case
 from puncture_twin.twin.report.progress import LineDisplay, progress_display
@@ -31,7 +31,6 @@ def carton(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rehearsed(carton, tmp_path_factory):
-    """Rehearsed once: the folder of its files."""
     out = tmp_path_factory.mktemp("out")
     assert main(["rehearse", str(carton), "--out", str(out)]) == OK
     return out
@@ -45,7 +44,6 @@ def run(capfd, *arguments):
 
 
 def test_a_demo_without_the_simulator_plans(carton, tmp_path, monkeypatch, capfd):
-    """It says what it leaves out, and writes what a plan writes."""
     monkeypatch.setattr(errors, "find_spec", lambda name: None if name == "pybullet" else name)
     with prepared(carton) as context:
         run = demo_case(context, tmp_path)
@@ -55,25 +53,13 @@ def test_a_demo_without_the_simulator_plans(carton, tmp_path, monkeypatch, capfd
 
 
 def test_a_rehearsal_writes_every_file(rehearsed):
-    """Table, map, scene, plan, film, numbers and page."""
-    names = {
-        "candidates.parquet",
-        "map.png",
-        "scene.png",
-        "slices.png",
-        "plan.json",
-        "rehearsal.json",
-        "rehearsal.mp4",
-        "report.html",
-        "manifest.json",
-        "timings.json",
-    }
+    names = "candidates.parquet map.png scene.png slices.png plan.json rehearsal.json rehearsal.mp4 report.html"
+    names = {*names.split(), "manifest.json", "timings.json"}
     assert {path.name for path in rehearsed.iterdir()} == names
     assert all(path.stat().st_size > 0 for path in rehearsed.iterdir())
 
 
 def test_the_page_says_where_the_needle_enters_as_check_does(carton, rehearsed, capfd):
-    """The same words, from the nearest marker."""
     plan = json.loads((rehearsed / "plan.json").read_text())
     code, told = run(capfd, "check", carton, "--theta", plan["theta_deg"], "--beta", plan["beta_deg"], "--no-arm")
     words = told["entry_from"]["text"]
@@ -98,7 +84,7 @@ def test_an_expected_error_says_of_what_it_is(carton, rehearsed, capfd):
     assert re.search(r"Expected tip error of this insertion, markers and arm together: .* inserted at theta", said)
 
 
-@pytest.mark.parametrize("name", ["urscript", "ros2", "csv", "moveit"])
+@pytest.mark.parametrize("name", ["urscript", "moveit"])
 def test_an_export_carries_the_warnings_of_its_plan(carton, rehearsed, name, tmp_path, capsys):
     """Printed, in the answer, and in a file that is written; with the direction that it goes."""
     plan = json.loads((rehearsed / "plan.json").read_text())
@@ -117,10 +103,7 @@ def test_an_export_carries_the_warnings_of_its_plan(carton, rehearsed, name, tmp
 
 
 def test_the_carton_errs_like_the_paper(rehearsed):
-    """The truth is where the robot really touched the lesion: 2-3 mm off, as Chen 2019 measured (Table 3: 2.94 mm).
-
-    The approach passes the table by 6 mm as believed; the true patient is turned, and the table's corner with them.
-    """
+    """The truth is where the robot really touched the lesion: 2-3 mm off, as Chen 2019 measured (Table 3: 2.94 mm)."""
     found = json.loads((rehearsed / "rehearsal.json").read_text())
     assert found["tip_error_mm"] == pytest.approx(2.94, abs=0.2)
     assert found["tip_error_mm"] ** 2 == pytest.approx(found["lateral_mm"] ** 2 + found["depth_mm"] ** 2)
@@ -130,10 +113,7 @@ def test_the_carton_errs_like_the_paper(rehearsed):
 
 
 def test_a_written_plan_is_rehearsed_again_with_the_same_result(carton, rehearsed, tmp_path, capfd):
-    """Checked and executed, it ends where it ended before.
-
-    In its own folder the plan and its pictures stay, and the page of the older rehearsal goes.
-    """
+    """Checked and executed, it ends where it ended before."""
     copy = tmp_path / "copy"
     shutil.copytree(rehearsed, copy)
     code, again = run(capfd, "rehearse", copy / "plan.json", "--case", carton, "--out", copy)
@@ -146,7 +126,6 @@ def test_a_written_plan_is_rehearsed_again_with_the_same_result(carton, rehearse
 
 @pytest.fixture
 def one_core(monkeypatch):
-    """Nothing begins in a process beside."""
     monkeypatch.setattr("puncture_twin.twin.jobs.patient.rehearsed.worker_count", lambda wanted, pieces: 1)
 
 
@@ -164,10 +143,7 @@ def no_encoder(monkeypatch):
 
 @pytest.mark.usefixtures("one_core", "no_encoder")
 def test_of_many_rooms_the_median_is_shown(carton, rehearsed, tmp_path, capfd):
-    """Headline, film and numbers are of the room in the middle, which the simulator confirms.
-
-    The page is drawn while the film is made; where that is a GIF, for want of an encoder, again.
-    """
+    """Headline, film and numbers are of the room in the middle, which the simulator confirms."""
     here = tmp_path / "case"
     shutil.copytree(carton.parent, here)
     text = re.sub(r"\n\[errors\].*?(?=\n\[)", "", (here / "case_m.toml").read_text(), flags=re.DOTALL).split("\n[end]")[
@@ -204,7 +180,6 @@ def test_a_plan_whose_marker_file_changed_is_refused(carton, rehearsed, tmp_path
 
 
 def test_search_prints_counts_and_writes_the_table(carton, tmp_path, capfd):
-    """The JSON's counts are the table's."""
     code, found = run(capfd, "search", carton, "--no-arm", "--out", tmp_path)
     assert code == OK
     verdicts = pq.read_table(tmp_path / "candidates.parquet")["verdict"].to_pylist()
@@ -254,21 +229,6 @@ def test_an_export_lists_what_decided_it(rehearsed, tmp_path, capfd):
     assert listed[0] == {"role": "plan", "path": "plan.json", "sha256": sha256(plan)}
     assert listed[1:] == json.loads(plan.read_text())["inputs"] != []
     assert listed == json.loads((tmp_path / "manifest.json").read_text())["entries"]["export plan.csv"]["inputs"]
-
-
-def test_ctrl_c_is_code_130_and_leaves_the_old_set(carton, rehearsed, tmp_path, monkeypatch, capfd):
-    """While a second process executes the plan: one line, and nothing has changed."""
-
-    def interrupted(*arguments, **options):
-        raise KeyboardInterrupt
-
-    copy = tmp_path / "copy"
-    shutil.copytree(rehearsed, copy)
-    monkeypatch.setattr("puncture_twin.twin.jobs.patient.pictures.draw_map", interrupted)
-    assert main(["rehearse", str(carton), "--out", str(copy)]) == INTERRUPTED
-    assert capfd.readouterr().err.splitlines()[-1] == "interrupted"
-    assert {path.name for path in copy.iterdir()} == {path.name for path in rehearsed.iterdir()}
-    assert problems(copy) == ()
 
 
 def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, capfd):
@@ -326,24 +286,12 @@ def test_an_arm_that_was_switched_off_is_named(carton, capfd):
     """--no-arm on a case that says where the base is: the verdict is for the organs, and why is said."""
     code, found = run(capfd, "check", carton, "--theta", 0, "--beta", 0, "--no-arm")
     assert (code, found["arm"]) == (OK, "not checked: switched off (--no-arm)")
+    assert not any("states a robot" in warning for warning in found["warnings"])
 
 
 @pytest.mark.parametrize("command", [["search"], ["check", "--theta", "0", "--beta", "0"]])
 def test_an_arm_that_is_asked_for_must_have_a_base(without_base, command, capfd):
-    """--arm typed for a case without a base: bad input, one line."""
     refused_command([*command, without_base, "--arm"], capfd, "no_base")
-
-
-def test_register_reports_residuals_and_expectation(carton, capfd):
-    """Mean error as in Eq. 16; the paper's residuals are beyond its pixels and slices, and most of all along z."""
-    code, found = run(capfd, "register", carton)
-    assert code == OK
-    assert found["mean_error_mm"] == pytest.approx(1.43, abs=0.005)
-    assert [flag.split(" (")[0] for flag in found["flags"]] == [
-        "residuals do not agree with the declared errors",
-        "markers_base appear 1.0675 times as large as markers_ct along the CT's z",
-    ]
-    assert len(found["expected_tre_along_shaft_mm"]) == 4
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc on this system")
@@ -357,7 +305,6 @@ def test_a_folder_that_only_looks_writable_is_refused(carton, capfd):
 
 
 def test_a_bug_is_exit_code_3(monkeypatch, capfd):
-    """What nobody foresaw shows its traceback and the third code."""
     monkeypatch.setattr("puncture_twin.twin.jobs.papers.papers.PAPERS", {"chen2019": lambda *_: 1 / 0})
     assert main(["reproduce", "chen2019"]) == PROGRAM_FAILED
     assert "ZeroDivisionError" in capfd.readouterr().err

@@ -6,9 +6,8 @@ import re
 
 import numpy as np
 import pytest
-import trimesh
 from case_world import NEEDLE, SEARCH, SKIN, case_text, registration_section, structure, write_case
-from own_arms import write_own_arm
+from own_arms import write_holder, write_own_arm
 from refusals import refused_command
 
 from puncture_twin.planning.geometry.rigid import apply, pose
@@ -48,10 +47,7 @@ def own_case(folder):
     parts = (SKIN, structure("organ", "target"), structure("rib", "avoid", margin_mm=3.0), registration_section())
     write_case(folder, text=case_text(*parts, needle=NEEDLE, search=SEARCH) + ARM)
     write_own_arm(folder / "arm")
-    side = trimesh.creation.box((70.0, 20.0, 30.0)).apply_translation([30.0, 0.0, 16.0])
-    trimesh.util.concatenate([trimesh.creation.cylinder(18.0, 50.0).apply_translation([0, 0, 26.0]), side]).export(
-        folder / "holder.stl"
-    )
+    write_holder(folder / "holder.stl")
     for name, points in (
         ("markers_ct", MARKERS_CT),
         *dict.fromkeys(("touch", "truth"), apply(T_BASE_CT, MARKERS_CT)).items(),
@@ -63,7 +59,6 @@ def own_case(folder):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """That case, for all who only read it."""
     return own_case(tmp_path_factory.mktemp("own") / "case")
 
 
@@ -96,20 +91,12 @@ def test_the_markers_are_touched(folder, tmp_path, capfd):
 
 
 def test_the_needle_turns_about_the_target(folder, tmp_path, capfd):
-    """A sweep keeps its virtual tip in place."""
     told = answer(capfd, "rehearse", folder, "--sweep", "--out", tmp_path)
     assert (tmp_path / "sweep.json").is_file() and not told["contacts"] and told["off_point_max_mm"] < 0.1
     assert told["reached_deg"] == pytest.approx(told["wanted_deg"])
 
 
-def test_a_scan_shows_the_patient(folder, tmp_path, capfd):
-    """The command and its files; the arm stands outside of the bore."""
-    answer(capfd, "scan", folder, "--out", tmp_path, "--spacing", "4", "--pixel", "2")
-    assert (tmp_path / "markers_ct.csv").is_file() and (tmp_path / "dicom").is_dir()
-
-
 def test_slicer_gets_the_robots_place(folder, tmp_path, capfd):
-    """From base to CT, by the markers."""
     answer(capfd, "export", folder, "--format", "slicer", "--out", tmp_path)
     numbers = re.search(r"\nParameters: (.+)", (tmp_path / "ct_to_robot.tfm").read_text()).group(1).split()
     expected = np.linalg.inv(T_BASE_CT)
@@ -117,8 +104,6 @@ def test_slicer_gets_the_robots_place(folder, tmp_path, capfd):
 
 
 def in_text(file, old, new):
-    """A change of a text."""
-
     def change(folder):
         text = (folder / file).read_text()
         assert old in text
@@ -128,56 +113,26 @@ def in_text(file, old, new):
 
 
 def with_bytes(file, data):
-    """Another file."""
     return lambda folder: (folder / file).write_bytes(data)
-
-
-def in_metres(folder):
-    """Of a list that speaks mm."""
-    rows = apply(T_BASE_CT, MARKERS_CT) / 1000.0
-    text = "\n".join(f"{name},{x},{y},{z}" for name, (x, y, z) in zip("ABCD", rows.tolist(), strict=True))
-    (folder / "touch.csv").write_text(f"name,x_mm,y_mm,z_mm\n{text}\n")
 
 
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n"
 BAD = [
     (in_text("arm/toy.urdf", '<axis xyz="', '<axis xyz="0 0 0" was="'), ["register"], "zero_direction toy.urdf j1"),
-    (in_text("arm/toy.urdf", 'velocity="3"', 'velocity="0"'), ["place"], "out_of_range toy.urdf j1"),
     (in_text("arm/toy.urdf", 'effort="100"', 'effort="nan"'), ["rehearse"], "not_a_number toy.urdf effort"),
-    (in_text("arm/toy.urdf", 'name="j4"', 'name="j 4"'), ["touch"], "bad_name toy.urdf"),
     (with_bytes("arm/ulna.stl", b"solid x\nendsolid x\n"), ["scan"], "file_cut ulna ulna.stl"),
-    (with_bytes("arm/toy.urdf", b""), ["plan"], "file_size toy.urdf"),
     (in_text("case.toml", 'holder.stl"\nunit = "mm"', 'holder.stl"\nunit = "m"'), ["plan"], "implausible_size"),
     (with_bytes("holder.stl", b"\0" * 80 + b"\x8c\0\0\0" + b"\0" * 216), ["touch"], "size_mismatch"),
     (in_text("case.toml", "position_mm = [0, 0, 0]", "position_mm = [0, 300, 0]"), ["place"], "tool_detached"),
-    (
-        in_text("case.toml", "position_mm = [0, 0, 0]", "position_mm = [0, 0, nan]"),
-        ["plan"],
-        "bad_value tool.position_mm",
-    ),
     (with_bytes("j.csv", (JOINTS + "1,2,3,4,5,6\n" * 4).encode()), ["pivot", "j.csv"], "joints_unit j.csv"),
-    (
-        with_bytes("j.csv", (JOINTS + "0,-90,90,0,90,0\n10,-90,90,0,90,0,7\n").encode()),
-        ["pivot", "j.csv"],
-        "ragged_row j.csv",
-    ),
-    (
-        with_bytes("j.csv", (JOINTS + "400,-9,9,0,9,0\n0,-9,9,0,9,0\n").encode()),
-        ["pivot", "j.csv"],
-        "joints_beyond j.csv",
-    ),
     (in_text("touch.csv", "\nB,", "\nA,"), ["register"], "duplicate_name touch.csv"),
-    (in_metres, ["plan"], "wrong_unit"),
-    (with_bytes("touch.csv", b"\xff\xfe\n"), ["touch"], "not_text touch.csv"),
     (with_bytes("r.json", b'{"schema": 1}'), ["scan", "--rehearsal", "r.json"], "missing_key r.json"),
-    (with_bytes("r.json", b"\0"), ["scan", "--rehearsal", "r.json"], "not_json r.json"),
     (in_text("case.toml", "[rehearsal]", "[rehearsal]\nhu = 3"), ["scan", "--marker", "cube"], "unknown_choice cube"),
 ]
 
 
 @pytest.mark.parametrize(("change", "command", "says"), BAD)
 def test_bad_input_is_one_line_and_nothing_is_written(tmp_path, capfd, change, command, says):
-    """Of arm, tool, pivot, touches and scan: exit code 2."""
     case = own_case(tmp_path / "case")
     change(case)
     out, words = tmp_path / "out", [str(case / one) if (case / one).is_file() else one for one in command[1:]]

@@ -8,9 +8,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import trimesh
 from case_world import NEEDLE, SKIN, case_text, structure, write_case
-from own_arms import JOINTS, LENGTHS, write_own_arm
+from own_arms import JOINTS, LENGTHS, write_holder, write_own_arm
 from places import ROOT
 from refusals import refused_command
 
@@ -31,10 +30,7 @@ def folder(tmp_path_factory):
     parts = (SKIN, structure("organ", "target"), structure("rib", "avoid", margin_mm=3.0))
     write_case(case, text=case_text(*parts, needle=NEEDLE, search="theta_deg = [0, 20]\nstep_deg = 10.0") + block)
     write_own_arm(case / "arm")
-    side = trimesh.creation.box((70.0, 20.0, 30.0)).apply_translation([30.0, 0.0, 16.0])
-    trimesh.util.concatenate([trimesh.creation.cylinder(18.0, 50.0).apply_translation([0, 0, 26.0]), side]).export(
-        case / "holder.stl"
-    )
+    write_holder(case / "holder.stl")
     return top
 
 
@@ -82,7 +78,6 @@ def test_moveit_is_given_the_urdfs_names_and_the_tool(folder, said):
 
 
 def test_a_plan_is_refused_once_a_mesh_has_changed(folder, said, capsys):
-    """Of the arm or of the tool; the line names the file."""
     mesh = folder / "my-case/arm/ulna.stl"
     before = mesh.read_bytes()
     try:

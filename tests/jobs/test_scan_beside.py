@@ -30,10 +30,8 @@ def settings(seed, spacing, pixel, noise, fov=None):
 SCENES = {
     "arms beside, flat table": Asked(301, OutsideObjects("beside", "flat"), settings(1, 4.0, 3.0, 20.0)),
     "arms pressed, curved table": Asked(302, OutsideObjects("pressed", "curved"), settings(2, 5.0, 4.0, 30.0)),
-    "arms across, pad": Asked(14, OutsideObjects("across", "pad", 1), settings(3, 4.0, 3.0, 20.0)),
     "arms across, no bed": Asked(17, OutsideObjects("across", "none"), settings(4, 5.0, 4.0, 15.0)),
     "arms pressed, cut": Asked(303, OutsideObjects("pressed", "pad"), settings(5, 4.0, 4.0, 20.0, 420.0)),
-    "arms beside, cut": Asked(304, OutsideObjects("beside", "curved", 2), settings(6, 5.0, 3.0, 20.0, 360.0)),
 }
 
 

@@ -51,7 +51,6 @@ REFUSED = {
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """A function: the folder of one case, made at first use."""
     sys.path.insert(0, str(CASES))
     try:
         spec = importlib.util.spec_from_file_location("make_cases", MAKER)
@@ -78,7 +77,6 @@ def init(folder, target):
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_is_wrong_is_refused_by_its_cause(made, capsys, name):
-    """Exit code 2, one line, nothing written."""
     target, cause = REFUSED[name]
     folder = made(name)
     refused_command(init(folder, target), capsys, *cause.split())
@@ -92,7 +90,6 @@ def test_frames_of_a_seg_that_lie_elsewhere_are_refused(made, capsys):
 
 @pytest.mark.parametrize("name", ["trunk", *READ])
 def test_what_is_right_is_read(made, name):
-    """And one direction gets an answer."""
     folder = made(name)
     assert main(init(folder, T1)) == 0
     assert main(["check", str(folder), "--no-arm", "--theta", "40", "--beta", "90"]) in (0, 1)
@@ -100,13 +97,11 @@ def test_what_is_right_is_read(made, name):
 
 @pytest.mark.parametrize("name", ["mask_npz", "mask_part", "mask_zst", "mask_subfolder"])
 def test_a_mask_that_is_not_read_is_named(made, capsys, name):
-    """The vessel in the path was passed over in silence."""
     command = ["check", made(name), "--no-arm", "--theta", "0", "--beta", "0"]
     refused_command(command, capsys, "entries_not_read", "vessel")
 
 
 def test_what_a_device_cannot_read_is_refused(made, capsys):
-    """Degrees under rad, radians under deg."""
     joints = made("joints_in_degrees") / "joints.csv"
     assert main(["mirror", "--case", "meshes/abdomen", "--from", str(joints)]) == 2
     assert main(["plan", str(made("home_in_radians")), "--theta", "0", "--beta", "0"]) == 2
@@ -116,22 +111,14 @@ def test_what_a_device_cannot_read_is_refused(made, capsys):
 def test_a_scale_between_two_lists_is_named(made, capsys):
     """1.6 %, which noise does not explain."""
     folder = made("scale_1.6_percent")
-    command = [
-        "register",
-        str(folder / "markers_ct.csv"),
-        str(folder / "markers_base.csv"),
-        "--target",
-        "0,0,0",
-        "--json",
-    ]
-    assert main(command) == 0
+    lists = [str(folder / name) for name in ("markers_ct.csv", "markers_base.csv")]
+    assert main(["register", *lists, "--target", "0,0,0", "--json"]) == 0
     assert "1.016" in json.dumps(json.loads(capsys.readouterr().out)["flags"])
 
 
 @pytest.mark.parametrize("shape", ["cylinder", "box", "trunk"])
 @pytest.mark.parametrize("table", ["", "_table"], ids=["in air", "on a table"])
 def test_a_phantom_is_as_safe_as_geometry_says(made, shape, table):
-    """Every row of its truth; no limb, and the table is no body."""
     folder = made(f"lab_{shape}{table}")
     prepared = prepare(folder, arm=False)
     found = prepared.search()
@@ -148,7 +135,6 @@ def test_a_phantom_is_as_safe_as_geometry_says(made, shape, table):
 
 
 def test_no_part_of_a_real_chest_is_a_limb(made):
-    """Shoulder blades and collar bones without a label."""
     prepared = prepare(made("chest_ct4"), arm=False)
     assert "attached_limb" not in {one.name for one in prepared.anatomy.checked}
     assert prepared.search().safe.sum() >= 1346

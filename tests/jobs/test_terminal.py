@@ -20,7 +20,6 @@ ONE = ["check", str(CARTON), "--theta", "0", "--beta", "0", "--no-arm"]
 
 
 def test_without_a_command_the_help_is_printed(capsys):
-    """All commands, where the words are explained, exit code 0; nothing is run."""
     assert main([]) == 0
     shown = capsys.readouterr().out
     assert {"demo", "search", "reproduce"} <= set(re.findall(r"\w+", shown))
@@ -90,13 +89,7 @@ def test_a_disk_that_takes_no_more_is_told_in_one_line(name, capsys):
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.parametrize(
-    ("words", "completed"),
-    [
-        (["batch", "co"], {"compare"}),
-        (["check", "--th"], {"--theta"}),
-    ],
-)
+@pytest.mark.parametrize(("words", "completed"), [(["batch", "co"], {"compare"}), (["check", "--th"], {"--theta"})])
 def test_a_shell_completes_commands_and_options(words, completed):
     """As bash asks for it, by typer's own rule; nothing else is said."""
     asked = {
@@ -140,12 +133,10 @@ def run_as_installed(environment):
     ],
 )
 def test_a_folder_is_named_after_case_and_command(source, name):
-    """Two cases never share one."""
     assert default_out(Path(source), "search") == Path("out") / name
 
 
 def test_a_search_writes_there_without_out(tmp_path, monkeypatch, capsys):
-    """And nothing beside it."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "carton").symlink_to(CARTON.parent)
     case = tmp_path / "coarse.toml"
@@ -177,7 +168,6 @@ def test_neither_width_nor_colour_changes_what_is_printed():
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/dev/full is of Linux")
 @pytest.mark.parametrize(("arguments", "unbuffered"), [(["--version"], ""), (["--help"], "1"), (ONE, "")])
 def test_a_full_disk_under_stdout_is_told_in_one_line(arguments, unbuffered):
-    """Exit code 3, the reason, no traceback."""
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
             [sys.executable, "-c", PROGRAM, *arguments],

@@ -29,14 +29,12 @@ def said_by(command):
 
 
 def test_the_page_has_a_command_for_each_of_its_sections():
-    """All of them are known here."""
     assert len(COMMANDS) == 7
     assert {said_by(command) for command in COMMANDS} == set(SAID.values())
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_says_what_the_page_says(command, tmp_path, monkeypatch, capsys):
-    """Exit code 0, and the number that is quoted."""
     monkeypatch.chdir(tmp_path)
     words = [str(ROOT / word) if word.startswith("meshes/") else word for word in shlex.split(command)]
     assert main(words) == 0

@@ -37,7 +37,6 @@ def compared(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def plan(compared):
-    """The context and the plan that it compared along."""
     context = pt.prepare(compared[2])
     return context, checked_plan(context, compared[1] / "plan.json")[1]
 
@@ -85,7 +84,6 @@ def test_the_page_shows_them_best_first(compared):
 
 
 def test_sources_add_up(compared, plan):
-    """The squares of a column are that of its sum, which is the predicted error."""
     document, _, _ = compared
     for row in document["ways"]:
         assert sum(row["predicted_share"].values()) == pytest.approx(1.0)
@@ -117,18 +115,6 @@ def test_a_plan_is_compared_too_and_blind_ways_say_why(compared, plan, tmp_path,
     assert caught.value.code == "lost_sight"
 
 
-def test_devices_that_are_not_declared_are_assumed(plan):
-    """As they would be declared without a value, and it is said of each way that has them."""
-    context, one_plan = plan
-    bare = replace(context, case=replace(context.case, stereo=None, ultrasound=None))
-    (of_bare, _), (declared, _) = (ways._rehearsed(one, one_plan, ("ct", "ct+us"), 50) for one in (bare, context))
-    assert [one.found.predicted_rms_mm for one in of_bare] == pytest.approx(
-        [one.found.predicted_rms_mm for one in declared]
-    )
-    said = {one.found.guidance: " ".join(one.found.assumed) for one in of_bare}
-    assert said["ct"] == "" and "[ultrasound]" in said["ct+us"] and "[stereo]" not in said["ct+us"]
-
-
 def test_failing_is_worse_than_erring(plan, tmp_path):
     """A way that stops most trials has the smallest errors of the rest, and stands last; equal ones are as good."""
     context, one_plan = plan
@@ -152,7 +138,6 @@ def test_failing_is_worse_than_erring(plan, tmp_path):
 
 @pytest.mark.parametrize("options", [["--guidance", "us"], ["--guidance", "ct,us"], []])
 def test_steps_of_another_way_are_refused_in_one_line(tmp_path, capfd, options):
-    """Ultrasound, a list, and no guidance at all; nothing is written."""
     case = ball(tmp_path, errors="touch_mm = 0.2\n")
     command = ["rehearse", case, *options, "--seeds", 10, "--steps", 3, "--out", tmp_path / "out"]
     refused_command(command, capfd, "conflicting_options", "--steps")
@@ -180,7 +165,6 @@ def test_a_plan_is_rehearsed_in_steps(plan):
     ],
 )
 def test_a_list_is_refused_in_one_line(tmp_path, capfd, guidance, seeds, code, named):
-    """Unknown ways, one twice, no trials; nothing is written."""
     case = ball(tmp_path, errors="touch_mm = 0.2\n")
     counted = [] if seeds is None else ["--seeds", seeds]
     command = ["rehearse", case, "--guidance", guidance, *counted, "--out", tmp_path / "out"]

@@ -21,14 +21,12 @@ TURNED = FREE + 2.0 * np.pi * np.eye(6)[1]
 
 
 def floor(thickness_mm: float = 100.0) -> Box:
-    """The table that the arm stands on."""
     T = np.eye(4)
     T[2, 3] = -10.0 - thickness_mm / 2.0
     return Box("table", T, (2000.0, 2000.0, thickness_mm))
 
 
 def cut_of(checker: CellChecker, goals: np.ndarray) -> Cut:
-    """From FREE."""
     return Cut(checker.model, checker.boxes, checker.points_of(UPPER_ARM), FREE, goals)
 
 
@@ -76,5 +74,4 @@ def test_what_is_not_proven_is_unknown() -> None:
 
 
 def test_without_boxes_nothing_is_cut_off() -> None:
-    """An empty workcell proves nothing."""
     assert not cut_of(CellChecker(ur_model("ur3"), TOOL), np.stack([TURNED, FREE])).off.any()

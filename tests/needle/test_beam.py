@@ -23,12 +23,7 @@ TUBE_18 = Shaft(150.0, *GAUGES[18])
 
 
 def beyond(slenderness: float, depth: float = 12.0) -> float:
-    """By which fraction a thin stiff layer before a gap takes the tip beyond the stiffest tissue alone, at most.
-
-    Args:
-        slenderness: lambda L.
-        depth: Of the path, over 1 / lambda.
-    """
+    """By which fraction a thin stiff layer before a gap takes the tip beyond the stiffest tissue alone, at most."""
     rate, count = slenderness / SOLID_18.length_mm, int(16 * min(depth, slenderness))
     stiffest, alpha = 4 * SOLID_18.bending_stiffness * rate**4, np.full(count, 0.01)
     alone = bevel_path(SOLID_18, np.full(count, stiffest), alpha, 1 / 16 / rate).largest_mm[1:]
@@ -40,14 +35,7 @@ def beyond(slenderness: float, depth: float = 12.0) -> float:
 
 
 def in_every_order(shaft: Shaft, tissues: tuple[float, ...], layers: int, longest: float) -> float:
-    """The greatest deflection in any order of equally thick layers over the stiffest tissue's alone, at any depth.
-
-    Args:
-        shaft: The needle's.
-        tissues: k of each tissue, N/mm^2; a layer is one of them.
-        layers: Their number.
-        longest: Depth of the path, mm.
-    """
+    """The greatest deflection in any order of equally thick layers over the stiffest tissue's alone, at any depth."""
     count = layers * int(np.ceil(longest / layers / step_for(shaft, max(tissues))))
     alpha, step = np.full(count, 0.01), longest / count
     alone = bevel_path(shaft, np.full(count, max(tissues)), alpha, step).largest_mm[1:]
@@ -91,7 +79,6 @@ def proven(shaft: Shaft, alpha: float, stiffest: float, longest: float) -> np.nd
 
 
 def straight(elements):
-    """A foundation that rests on the axis."""
     return np.zeros(elements + 1)
 
 
@@ -103,7 +90,7 @@ def test_a_cantilever_bends_as_euler_says():
     assert found.slope[-1] == pytest.approx(0.5 * 200**2 / (2 * beam.stiffness), rel=1e-6)
 
 
-@pytest.mark.parametrize("k", [0.01, 0.1, 0.4])
+@pytest.mark.parametrize("k", [0.01, 0.4])
 def test_a_long_beam_in_a_foundation_bends_as_hetenyi_says(k):
     """2 P l / k under a load at the free end, l = (k / 4 EI)^(1/4); and exp(-l x) cos(l x) behind it."""
     beam = Beam(SOLID_18.bending_stiffness, 0.5, 1200)
@@ -116,7 +103,6 @@ def test_a_long_beam_in_a_foundation_bends_as_hetenyi_says(k):
 
 
 def test_a_tip_that_is_held_needs_the_force_that_brings_it_there():
-    """Displacement and load are one answer, read from either side."""
     beam, foundation = Beam(SOLID_18.bending_stiffness, 1.0, 120), np.linspace(0, 0.2, 120)
     rest = 0.5 * np.sin(np.linspace(0, 2, 121))
     loaded = beam.bent(foundation, rest, tip_load=0.3)
@@ -126,7 +112,6 @@ def test_a_tip_that_is_held_needs_the_force_that_brings_it_there():
 
 
 def test_a_shaft_in_a_stiff_foundation_lies_where_the_foundation_rests():
-    """Whatever line that is, if it leaves the holder straight."""
     x = np.linspace(0, 1, 151)
     rest = 3.0 * x**3
     found = Beam(TUBE_18.bending_stiffness, 1.0, 150).bent(np.full(150, 1e6), rest, tip_mm=3.0)
@@ -151,7 +136,6 @@ def test_shafts_have_the_numbers_of_the_handbook(shaft, stiffness, sag, free, pi
 
 
 def test_gauges_descend():
-    """And a bore is less than its needle."""
     outer = [gauge.outer_mm for gauge in GAUGES.values()]
     assert outer == sorted(outer, reverse=True)
     assert all(0 < gauge.inner_mm < gauge.outer_mm for gauge in GAUGES.values())
@@ -166,7 +150,6 @@ def path(alpha_deg=3.0, k=0.1, step=1.0, depth=100, turned_at=None, shaft=SOLID_
 
 
 def test_the_path_converges():
-    """Halving the step changes its end by less than 1.5 %, and less each time."""
     ends = [path(step=step).cut_mm[-1] for step in (2.0, 1.0, 0.5, 0.25)]
     changes = np.abs(np.diff(ends)) / ends[-1]
     assert changes.max() < 0.015
@@ -216,7 +199,7 @@ def test_a_very_slender_shaft_needs_the_first_steps_most():
     assert changed.max() > 0.015 and changed.max() < 0.03 and changed[16:].max() < 0.015
 
 
-@pytest.mark.parametrize("k", [0.05, 0.1, 0.4])
+@pytest.mark.parametrize("k", [0.05, 0.4])
 def test_a_bevel_steers_a_long_needle_along_a_circle(k):
     """Far from the holder the path's curvature is 2 l alpha: l = (k / 4 EI)^(1/4), a tip that is held, without moment.
 
@@ -238,7 +221,6 @@ def test_the_path_is_linear_in_the_angle():
 
 
 def test_a_needle_without_a_bevel_goes_straight():
-    """Every term off gives nothing."""
     straight_on = path(0.0)
     assert not straight_on.cut_mm.any() and not straight_on.needle_mm.any()
 
@@ -307,10 +289,7 @@ def test_no_order_of_layers_goes_beyond_the_bound(rng):
 
 
 def energy_and_moment(shaft, k, path, step):
-    """Of shaft and foundation once all of a path is cut, N mm, and the bending moment at the clamp, N mm.
-
-    By Gauss's rule from the shape alone, not from the matrices that gave it.
-    """
+    """Of shaft and foundation once all of a path is cut, N mm, and the bending moment at the clamp, N mm."""
     elements, done = round(shaft.length_mm / step), len(k)
     foundation, rest = np.zeros(elements), np.zeros(elements + 1)
     foundation[elements - done :], rest[elements - done :] = k, path
@@ -341,8 +320,7 @@ def test_bevel_and_clamp_do_the_work_that_bends_a_needle(rng):
         np.testing.assert_allclose(stored, work, atol=near * stored.max())
 
 
-@pytest.mark.parametrize(("gauge", "stiffest"), [(18, 0.3), (22, 0.1)])
-def test_every_order_of_layers_is_within_what_is_kept_and_within_what_is_proven(gauge, stiffest):
+def test_every_order_of_layers_is_within_what_is_kept_and_within_what_is_proven(gauge=22, stiffest=0.1):
     """All 81 orders of three tissues in four layers, in 80 mm; the bound by energy holds, and is too wide to keep."""
     shaft, tissues = Shaft(150.0, *GAUGES[gauge]), (0.0, stiffest / 10, stiffest)
     most = in_every_order(shaft, tissues, 4, 80.0)

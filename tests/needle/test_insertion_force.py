@@ -15,7 +15,6 @@ PATH = [Layer(0.0, 8.0, SKIN), Layer(8.0, 25.0, FAT), Layer(25.0, 80.0, LIVER)]
 
 
 def work_n_mm(found):
-    """Work of the arm: the force integrated over the samples."""
     return float(np.trapezoid(found.total_n, found.depth_mm))
 
 
@@ -72,7 +71,6 @@ def test_layers_at_random_keep_the_balance(rng):
     ],
 )
 def test_each_term_can_be_off(tissue, zero):
-    """It is nothing then, and the others are not."""
     found = insertion_force([Layer(0.0, 50.0, tissue)])
     parts = {name: getattr(found, name) for name in ("capsule_n", "cutting_n", "friction_n")}
     assert not parts.pop(zero).any()
@@ -80,7 +78,6 @@ def test_each_term_can_be_off(tissue, zero):
 
 
 def test_a_capsule_gives_way_at_its_force():
-    """The peak is there, and behind it the tip cuts."""
     found = insertion_force(PATH, 0.01)
     assert found.capsule_n.max() == pytest.approx(4.0)
     assert found.peak_n == pytest.approx(4.0)
@@ -89,7 +86,6 @@ def test_a_capsule_gives_way_at_its_force():
 
 
 def test_nothing_to_pass_needs_no_force():
-    """A path without length."""
     assert insertion_force([]).peak_n == 0.0
 
 

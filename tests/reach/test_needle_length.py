@@ -26,7 +26,6 @@ def test_a_standoff_too_short_for_the_way_is_the_same(tmp_path):
 
 
 def test_a_needle_too_short_for_most_directions_is_said_after_the_search(tmp_path, capfd):
-    """In the text and in JSON, with both counts."""
     off = ("position_mm = [0.0, 0.0, 0.0]", "position_mm = [0.0, 15.0, 0.0]")
     path = write_case(tmp_path, off, ("shaft_mm = 150.0", "shaft_mm = 80.0"), ("[0, 10]", "[0, 180]"))
     command = ["search", str(path), "--no-arm", "--no-pictures", "--out", str(tmp_path / "out")]

@@ -34,12 +34,10 @@ BENT = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 
 
 def body(solid):
-    """A trimesh in the flange's frame as a tool."""
     return ToolBody(TriangleMesh(solid.vertices, solid.faces), Path("tool.stl"), 1.0, np.eye(4), "case.toml: tool")
 
 
 def rod(radius, low, high, sections=256):
-    """A cylinder along the flange's z axis."""
     made = trimesh.creation.cylinder(radius, high - low, sections=sections)
     made.apply_translation([0.0, 0.0, (low + high) / 2])
     return made
@@ -90,7 +88,6 @@ def test_a_mesh_cylinder_is_the_holder(answers):
 
 
 def shift(x, y, z):
-    """What to add to an identity."""
     T = np.zeros((4, 4))
     T[:3, 3] = x, y, z
     return T
@@ -172,13 +169,11 @@ def test_a_tool_that_does_not_hang_on_the_flange_is_refused(solid, says):
 
 
 def test_a_tool_is_sent_to_another_process():
-    """Placements are rated in several: what arrives is the same tool."""
     tool = replace(NEEDLE, body=body(camera()))
     assert pickle.loads(pickle.dumps(tool)) == tool and hash(tool) != hash(NEEDLE)
 
 
 def tool_case(folder, *lines, solid=None):
-    """A case with a tool in a file."""
     (solid or rod(20.0, 0.0, 40.0)).export(folder / "holder.stl")
     return write_case(folder, text=CASE + '\n[tool]\nmesh = "holder.stl"\n' + "\n".join(lines) + "\n")
 
@@ -205,6 +200,5 @@ def test_a_case_states_its_tool(tmp_path):
     ],
 )
 def test_a_tool_that_is_not_understood_is_refused(tmp_path, lines, says):
-    """No mesh file says its unit, and none is guessed."""
     with refused(*says.split()):
         load_case(tool_case(tmp_path, *lines))

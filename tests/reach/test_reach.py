@@ -64,12 +64,10 @@ def directions(count: int, seed: int) -> np.ndarray:
 
 
 def request(u: np.ndarray, standoff_mm: float = STANDOFF_MM) -> ReachRequest:
-    """A request for the target and tool of this file."""
     return ReachRequest(TARGET, u, TOOL.needle_length_mm, standoff_mm)
 
 
 def reached(checker: CellChecker, count: int, seed: int) -> list:
-    """Some reachable answers with their requests."""
     found = []
     for u in directions(60, seed):
         answer = assess_reach_all(checker, [request(u)])[0]
@@ -261,7 +259,6 @@ def test_another_roll_is_taken_where_one_meets_something() -> None:
 
 
 def test_a_standoff_that_starts_inside_the_skin_is_a_collision() -> None:
-    """The needle must be outside the patient before the insertion."""
     asked, _ = reached(CellChecker(UR3, TOOL), 1, seed=8)[0]
     ball = trimesh.creation.icosphere(subdivisions=3, radius=STANDOFF_MM + 5.0)
     skin = TriangleMesh(np.asarray(ball.vertices) + TARGET, np.asarray(ball.faces))
@@ -273,7 +270,6 @@ class Unfolded(FastChecker):
     """Never says that an arm is folded: of each motion its contacts are checked."""
 
     def folded(self, q: np.ndarray) -> np.ndarray:
-        """Nowhere."""
         return np.zeros(len(q), np.bool_)
 
 
@@ -328,7 +324,6 @@ def test_the_samples_are_those_of_the_plain_loop() -> None:
 
 
 def test_how_far_a_path_may_have_moved_is_the_sum_of_its_bounds() -> None:
-    """Frames as ``link_poses``; motions and turns as running sums."""
     swept = SweptBodies.of(UR3, TOOL, 5.0)
     path = np.random.default_rng(6).uniform(-3.0, 3.0, (30, 6))
     frames, moved, rotated = swept.moving(path)

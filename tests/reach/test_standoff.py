@@ -67,14 +67,6 @@ def test_steep_paths_keep_the_least_gap_and_oblique_ones_start_farther_out():
     np.testing.assert_array_equal(gaps[5:], MAX_GAP_MM)
 
 
-def test_standoffs():
-    """Path and gap; the case's own where it states one; nothing where there is no skin entry."""
-    angles = np.array([0.0, 45.0, np.nan]) * DEG
-    paths = np.array([20.0, 40.0, np.nan])
-    np.testing.assert_allclose(standoffs(needle(), paths, angles), [30.0, 51.6, np.nan])
-    np.testing.assert_array_equal(standoffs(needle(standoff=60.0), paths, angles), 60.0)
-
-
 def test_the_arms_checker_lets_an_oblique_needle_start():
     """55 degrees to a flat skin: FCL with the whole arm is content at the standoff, and not with the least gap."""
     tool, angle, path_mm = Tool(200.0, 150.0, 1.2, 30.0), 55.0 * DEG, 60.0
@@ -86,7 +78,6 @@ def test_the_arms_checker_lets_an_oblique_needle_start():
     checker = CellChecker(model, tool, patient=TriangleMesh(skin.vertices, skin.faces), padding_mm=ARM_PADDING_MM)
 
     def met(standoff: float) -> set[tuple[str, str]]:
-        """What the needle touches, on every branch."""
         solutions = inverse(model, flange_poses(target, outward, 200.0 + standoff))[0]
         contacts = [
             checker.contact(q, needle_may_touch_patient=False) for q in solutions[~np.isnan(solutions).any(axis=1)]
@@ -119,18 +110,8 @@ def test_the_waiting_flange():
     assert waiting_flange(needle(), 150.0, 45.0 * DEG) == farthest_flange(needle(), 45.0 * DEG)
 
 
-def test_the_farthest_flange():
-    """Shaft or stated standoff, the needle, and the gap at the steepest angle that the case allows."""
-    assert farthest_flange(needle(standoff=60.0), 1.0) == 260.0
-    assert farthest_flange(needle(), 0.0) == 200.0 + 150.0 + 10.0
-    assert farthest_flange(needle(), 45.0 * DEG) == pytest.approx(200.0 + 150.0 + 11.6)
-
-
 def test_axes_are_as_long_as_what_they_are_checked_against_demands():
-    """Against the body up to an inserted needle's flange, against what is outside of it up to a waiting one's.
-
-    Where none ever waits, up to where any could.
-    """
+    """Against the body up to an inserted needle's flange, against what is outside of it up to a waiting one's."""
     case = SimpleNamespace(needle=needle(), search=SimpleNamespace(max_skin_angle=45.0 * DEG))
     structures = [SimpleNamespace(outside=outside) for outside in (False, True, False)]
     path_length, skin_angle = np.array([20.0, 150.0, 170.0, np.nan]), np.radians([0, 45, 0, np.nan])

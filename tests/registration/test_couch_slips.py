@@ -16,7 +16,6 @@ from case_world import (
 from refusals import refused_command
 
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.run_twin import main
 
 STEP_MM = 5.0
 RADII = np.array([140.0, 90.0, 170.0])
@@ -45,7 +44,6 @@ def scan(path, center, couch):
 
 
 def on_skin(directions, center):
-    """Where rays from the body's middle leave it."""
     return center + directions / np.linalg.norm(directions / RADII, axis=1, keepdims=True)
 
 
@@ -73,7 +71,6 @@ def case(tmp_path):
 
 
 def said(here):
-    """What every result says of the markers' axes and places."""
     return [one for one in prepare(here, arm=False).anatomy.warnings if "negated" in one or "behind" in one]
 
 
@@ -94,15 +91,6 @@ def test_of_two_half_turns_the_one_that_lies_off_the_skin_is_not_named(case, cap
     points = on_skin(DIRECTIONS, center)
     command = ["register", case(points * [-1, -1, 1], points, center)]
     assert "y and z negated" not in refused_command(command, capfd, "other_axes", BEHIND, "with x and y negated")
-
-
-def test_without_a_couch_the_same_list_is_a_warning(case, capfd):
-    """Nothing tells front from back then."""
-    points = on_skin(DIRECTIONS, np.zeros(3))
-    here = case(points * [-1, -1, 1], points, couch=False)
-    assert main(["register", str(here)]) == 0
-    assert any("with x and y negated" in one and "too similar to decide" in one for one in said(here))
-    assert BEHIND not in capfd.readouterr().out
 
 
 def test_markers_on_the_front_are_not_doubted_for_readings_behind_the_couch(case):

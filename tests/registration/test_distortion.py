@@ -112,7 +112,6 @@ def test_the_probability_of_true_lists_follows_its_law():
 
 
 def test_lists_that_agree_to_rounding_are_not_called_deformed():
-    """A scale of a millionth may be sure and does not matter."""
     found = registered(MARKERS, apply(T_BASE_CT, MARKERS * (1 + 1e-6))).distortion
     assert found.axes == "xyz"
     assert not found.significant

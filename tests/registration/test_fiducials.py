@@ -111,7 +111,6 @@ def test_what_is_not_clipped_is_not_taken_for_it():
 
 
 def test_without_markers_none_is_seen():
-    """A body with everything that is none, metal inside of it too."""
     rng = np.random.default_rng(5)
     _, solids = scene(Markers(), rng)
     solids = [one for one in solids if one.name != "marker"]
@@ -154,13 +153,11 @@ def test_several_sizes_are_not_guessed(two_sizes):
     [({"kind": "cube"}, "unknown_choice"), ({"diameter_mm": 0.5}, "out_of_range"), ({"count": 2}, "out_of_range")],
 )
 def test_what_no_marker_is_is_refused(stated, code):
-    """Before anything is read."""
     with refused(code):
         Stated(**stated)
 
 
 def test_noise_is_that_of_the_voxels():
-    """Of soft tissue, beside air and bone."""
     hu = np.full((60, 60, 20), -1000.0)
     hu[10:50, 10:50] = 40.0
     hu[20:24, 20:24] = 900.0
@@ -190,7 +187,6 @@ def fiducials(points, kind="ball", diameter=8.0):
 
 
 def moved(points, rng):
-    """Turned and shifted anyhow, and read with an error."""
     R = exp_rotation(rng.normal(size=3))
     return points @ R.T + rng.uniform(-200, 200, 3) + rng.normal(0, 0.2, points.shape)
 
@@ -312,7 +308,6 @@ def test_things_alike_by_one_between_them_are_no_list():
 
 
 def test_a_layout_of_other_distances_is_not_seen():
-    """Nor one of which three remain, which fit by chance too often."""
     rng = np.random.default_rng(4)
     with refused("layout_not_seen", by=NoAnswerError):
         named_by_layout(fiducials(moved(1.2 * LAYOUT, rng)), NamedPoints(NAMES, LAYOUT, None), "layout")

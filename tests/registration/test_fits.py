@@ -79,7 +79,6 @@ def test_the_joint_fit_is_the_least_by_the_whole_covariance(seed):
 
 @pytest.mark.parametrize("method", ["rigid", "triad", "weighted", "joint"])
 def test_many_sets_are_fitted_as_each_alone(method):
-    """Stacks of markers, any number deep."""
     told, count = noise(), 3 if method == "triad" else len(MARKERS)
 
     def fit(ct, base):
@@ -99,7 +98,6 @@ def test_many_sets_are_fitted_as_each_alone(method):
     ("method", "fit"), [("weighted", fit_weighted), ("joint", fit_joint), ("rigid", lambda *given: given[3])]
 )
 def test_a_method_is_its_fit(method, fit):
-    """By its name."""
     given, told = pairs(0.5), noise()
     expected = fit(given.points_ct, given.points_base, told, fit_rigid(given.points_ct, given.points_base))
     found = register(given, method=method, target_ct=TARGET, noise=told, accept_residuals=True)
@@ -157,7 +155,6 @@ def test_what_is_said_of_declared_noise():
 
 @pytest.mark.parametrize("told", [None, noise()])
 def test_the_expected_error_at_a_point_has_the_noises_interval(told):
-    """As wide, relatively; of several points each has its own."""
     given = register(pairs(4.0), method="rigid", target_ct=TARGET, noise=told, accept_residuals=True)
     expected = given.expected_tre_mm(np.array([TARGET, 10.0 * TARGET]))
     assert expected.shape == (2,) and expected[1] > 2 * expected[0]

@@ -1,6 +1,5 @@
 """CT to robot from ITK's HDF5 transforms (.h5), and from all linear kinds as text: TransformPoint is the oracle."""
 
-import re
 import struct
 import subprocess
 import sys
@@ -41,12 +40,10 @@ def random_transform(kind, rng):
 
 
 def read(file):
-    """What the program reads."""
     return parse_transform(file.read_bytes(), file)
 
 
 def by_itk(transform):
-    """Where SimpleITK puts the points."""
     return np.array([transform.TransformPoint(point) for point in POINTS.tolist()])
 
 
@@ -81,7 +78,6 @@ def rewritten(folder, kind, change, name="b.h5"):
 
 
 def in_single_precision(parent, _):
-    """As ITK writes what was computed with float."""
     for group in parent.values():
         kind = group["TransformType"].asstr()[0].replace("double", "float")
         replace(group, "TransformType", kind)
@@ -110,14 +106,12 @@ def replace(group, name, value):
     ("kind", "change"), [(kind, in_single_precision) for kind in KINDS] + [("euler", as_itk_4), ("versor", as_itk_4)]
 )
 def test_single_precision_and_older_files(tmp_path, kind, change):
-    """ITK reads both; so do we, and put points where it puts them."""
     file = rewritten(tmp_path, kind, change)
     expected = by_itk(SimpleITK.ReadTransform(str(file)))
     assert apply(read(file), POINTS) == pytest.approx(expected, abs=SINGLE_MM)
 
 
 def test_a_compressed_file_is_read(tmp_path):
-    """ITK can deflate its lists."""
     with h5py.File(tmp_path / "a.h5", "w") as file:
         group = file.create_group("TransformGroup/0")
         replace(group, "TransformType", "AffineTransform_double_3_3")
@@ -150,37 +144,31 @@ def scaled(parent, _):
 
 
 def sheared(parent, _):
-    """x grows with y."""
     numbers = parent["0/TransformParameters"][()]
     numbers[:9] = (numbers[:9].reshape(3, 3) @ [[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]).ravel()
     parent["0/TransformParameters"][...] = numbers
 
 
 def set_to(name, value):
-    """A change of one dataset of the first transform."""
     return lambda parent, _: replace(parent["0"], name, value)
 
 
 def renumbered(parent, _):
-    """A part is gone."""
     del parent["2"]
 
 
 def no_composite(parent, _):
-    """Two transforms that nothing chains."""
     del parent["0"]
     for number in range(4):
         parent.move(str(number + 1), str(number))
 
 
 def linked_outside(parent, _):
-    """What decides lies in another file of the host."""
     del parent["0/TransformParameters"]
     parent["0/TransformParameters"] = h5py.ExternalLink("/etc/other.h5", "/a")
 
 
 def stored_outside(parent, _):
-    """The same, by a dataset whose bytes are elsewhere."""
     del parent["0/TransformParameters"]
     parent["0"].create_dataset("TransformParameters", (12,), "f8", external=[("/etc/hostname", 0, 96)])
 
@@ -192,10 +180,7 @@ BAD = [
     ("affine", lambda parent, file: file.pop("TransformGroup"), "wrong_format"),
     ("affine", lambda parent, _: parent.pop("0"), "wrong_count"),
     ("affine", set_to("TransformType", "BSplineTransform_double_3_3"), "unknown_type BSplineTransform_double_3_3"),
-    ("affine", set_to("TransformType", "AffineTransform_double_2_2"), "unknown_type AffineTransform_double_2_2"),
-    ("affine", set_to("TransformType", [1.0]), "wrong_type"),
     ("affine", set_to("TransformParameters", np.arange(12)), "wrong_type int64"),
-    ("affine", set_to("TransformParameters", np.ones((3, 4))), "wrong_type float64"),
     ("affine", set_to("TransformParameters", np.ones(13)), "wrong_count 13 12"),
     ("affine", set_to("TransformParameters", np.full(12, np.nan)), "not_finite"),
     ("affine", set_to("TransformFixedParameters", np.ones(2)), "wrong_count"),
@@ -206,7 +191,6 @@ BAD = [
     ("euler", set_to("TransformParameters", np.array([np.inf, 0, 0, 0, 0, 0])), "not_finite"),
     ("composite", renumbered, "wrong_format"),
     ("composite", no_composite, "several_transforms"),
-    ("composite", set_to("TransformType", "SyNTransform_double_3_3"), "unknown_type SyNTransform_double_3_3"),
 ]
 
 
@@ -218,7 +202,6 @@ def test_what_is_not_one_rigid_transform_is_refused(tmp_path, kind, change, says
 
 
 def test_every_truncation_is_refused(tmp_path):
-    """A file that is cut anywhere is not a complete HDF5 file."""
     file = tmp_path / "a.h5"
     SimpleITK.WriteTransform(random_transform("composite", np.random.default_rng(3)), str(file))
     whole = file.read_bytes()
@@ -228,28 +211,22 @@ def test_every_truncation_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "make", "says"),
+    ("content", "says"),
     [
-        ("field.h5", displacement_field, "transform of type 'DisplacementFieldTransform_double_3_3'"),
-        (
-            "cut.h5",
-            lambda folder, name: (folder / name).write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(99)),
-            "not a complete HDF5",
-        ),
-        (
-            "text.h5",
-            lambda folder, name: (folder / name).write_text("#Insight Transform File V1.0"),
-            "not a complete HDF5",
-        ),
+        (b"\x89HDF\r\n\x1a\n" + bytes(99), "not a complete HDF5"),
+        (b"#Insight Transform File V1.0", "not a complete HDF5"),
+        (None, "transform of type 'DisplacementFieldTransform_double_3_3'"),
     ],
 )
-def test_at_the_terminal_it_is_one_line(tmp_path, capsys, name, make, says):
-    """Exit code 2, and nothing is written."""
-    make(tmp_path, name)
-    stating(tmp_path, file=name)
+def test_at_the_terminal_it_is_one_line(tmp_path, capsys, content, says):
+    if content is None:
+        displacement_field(tmp_path, "a.h5")
+    else:
+        (tmp_path / "a.h5").write_bytes(content)
+    stating(tmp_path, file="a.h5")
     assert main(["search", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     told = capsys.readouterr()
-    assert told.out == "" and len(told.err.splitlines()) == 1 and re.search(says, told.err)
+    assert told.out == "" and len(told.err.splitlines()) == 1 and says in told.err
     assert not (tmp_path / "out").exists()
 
 
@@ -285,7 +262,6 @@ def test_a_heap_on_which_hdf5_never_ends_is_refused(tmp_path):
     ("at", "layout", "value"), [(0, "<I", 2**31), (4, "<Q", 2**63), (4, "<Q", 5), (12, "<I", 99), (12, "<I", 0)]
 )
 def test_a_text_elsewhere_is_refused(tmp_path, at, layout, value):
-    """Too long, beyond the end, in no heap, of no number."""
     file = rewritten(tmp_path, "affine", lambda parent, _: None)
     data = bytearray(file.read_bytes())
     with h5py.File(file) as whole:

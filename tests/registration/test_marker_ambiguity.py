@@ -17,7 +17,6 @@ NAMES = tuple("ABCDEFGHIJKL")
 
 
 def moved(points):
-    """The points somewhere else."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
     T[:3, 3] = 300.0, -200.0, 100.0
@@ -45,7 +44,6 @@ def by_hand(points_ct, points_base, alike_mm):
 
 
 def orders(found, count):
-    """The permutations of a result, as orders."""
     result = set()
     for one in found:
         order = list(range(count))

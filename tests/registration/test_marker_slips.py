@@ -53,7 +53,6 @@ def triangle(count=3, radius=50.0):
 
 
 def touched(points):
-    """The points as the robot touches them."""
     return points @ BASE_AXES.T + IN_FRONT
 
 
@@ -86,13 +85,11 @@ def case(tmp_path):
 
 
 def registered(here, capfd):
-    """What `register --json` prints."""
     assert main(["register", str(here), "--json"]) == 0
     return json.loads(capfd.readouterr().out)
 
 
 def warned(here):
-    """Warnings of a case, as search, check and plan have them."""
     return prepare(here, arm=False).anatomy.warnings
 
 
@@ -107,10 +104,7 @@ def test_markers_in_order_raise_no_word(case, capfd):
 
 @pytest.mark.parametrize("name", ["abdomen", "carton/case_h.toml", "carton/case_m.toml", "carton/case_l.toml"])
 def test_of_the_embedded_cases_the_carton_alone_is_beyond_its_noise(name, capfd):
-    """None is ambiguous or slipped; pixels and slices do not explain the paper's touches, which the case accepts.
-
-    What explains some of them better is a stretch of one list, which is said too.
-    """
+    """None is ambiguous or slipped; pixels and slices do not explain the paper's touches, which the case accepts."""
     report = registered(meshes_folder() / name, capfd)
     assert report["warnings"] == []
     told = [flag for flag in report["flags"] if "do not agree with the declared errors" in flag]

@@ -56,7 +56,6 @@ def test_swapped_names_of_near_markers_are_named_too(tmp_path, capfd):
 
 
 def test_a_touch_that_slipped_has_no_permutation(tmp_path, capfd):
-    """Only what would fit is named."""
     moved = TOUCHED.copy()
     moved[2] += (0, 40, 0)
     line = refusal(tmp_path, capfd, "marker_misses", moved, NAMES)
@@ -72,7 +71,6 @@ def test_a_marker_of_another_spelling_is_told(tmp_path, capfd, wrong, near):
 
 
 def test_a_structure_of_another_spelling_is_told(tmp_path, capfd):
-    """By the case and by init."""
     for name, radius, center in (("skin", 90.0, (0, 0, 0)), ("aorta", 8.0, (0, 0, 30)), ("lesion", 9.0, (0, 0, 0))):
         ball(tmp_path / f"{name}.stl", radius, np.array(center))
     target = 'position_mm = [0.0, 0.0, 0.0]\nstructure = "leison"'

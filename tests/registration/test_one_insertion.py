@@ -22,7 +22,6 @@ def test_it_holds_what_it_says_whether_the_noise_is_stated_or_found(markers):
 
 @pytest.mark.parametrize("freedom", [None, 3, 12])
 def test_the_radius_is_the_chance_the_other_way_round(freedom):
-    """Whatever the shape of the error; none where nothing errs."""
     cov = np.diag([4.0, 0.3, 0.01])
     for chance in (0.5, 0.95):
         assert hit_in_ball(cov[None], radius_for_chance(cov, chance, freedom), freedom)[0] == pytest.approx(

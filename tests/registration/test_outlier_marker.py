@@ -27,7 +27,6 @@ def markers(seed, noise_mm=0.4, moved=None, by_mm=0.0):
 
 
 def odd(pairs, fle_mm=None):
-    """The odd marker of a set."""
     return outlier_marker(fit_rigid, pairs.names, pairs.points_ct, pairs.points_base, fle_mm)
 
 

@@ -31,7 +31,6 @@ def stating(folder, way, at, more=""):
 
 
 def said(path, *, arm=False):
-    """What is said of the base."""
     start = ("robot.mount: ", "registration: by the markers ")
     return [line for line in prepare(path, arm=arm).anatomy.warnings if line.startswith(start)]
 
@@ -47,7 +46,6 @@ def test_a_base_that_cannot_be_there_is_told_once(tmp_path, way, what):
 
 @pytest.mark.parametrize("way", WAYS)
 def test_with_the_arm_a_base_in_the_patient_is_refused(tmp_path, way):
-    """Other places that hardly can be are told as without it."""
     (inside, far, _) = PLACES.values()
     key = "registration" if way == "markers" else "robot.mount"
     with refused("base_in_patient", "case.toml", key):
@@ -72,18 +70,15 @@ def test_the_boxes_of_the_robots_frame_tell_it_too(tmp_path, way, center, size, 
 
 
 def test_a_shoulder_in_an_obstacle_of_the_ct_is_told(tmp_path):
-    """A mount in the table, by its name."""
     x, y, z = PLACES[""]
     box = TABLE.replace('"base"', '"ct"').format(center=[x, y, z + 150.0], size=[200.0] * 3)
     (line,) = said(stating(tmp_path, "mount", PLACES[""], box))
     assert "the robot's shoulder would be in obstacle 'table'" in line
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_it_is_in_text_json_and_page(tmp_path, capfd, way):
-    """Of a search without the arm, as other warnings."""
+def test_it_is_in_text_json_and_page(tmp_path, capfd):
     what, at = next(iter(PLACES.items()))
-    path = stating(tmp_path, way, at)
+    path = stating(tmp_path, "markers", at)
     main(["search", str(path.parent), "--no-arm", "--out", str(tmp_path / "out")])
     out, err = capfd.readouterr()
     assert what in out + err

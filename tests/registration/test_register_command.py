@@ -21,13 +21,11 @@ TARGET = "--target=-90,-10,60"
 
 
 def printed(capfd, *words):
-    """The object on stdout."""
     assert main(["register", *words, "--json"]) == OK
     return json.loads(capfd.readouterr().out)
 
 
 def test_two_lists_register_without_a_case(capfd):
-    """The case's least-squares fit to rounding; both files hashed."""
     found = printed(capfd, *LISTS, TARGET)
     assert found["fre_mm"] == pytest.approx(0.295, abs=0.001)
     assert [one["sha256"] for one in found["inputs"]] == [
@@ -63,7 +61,6 @@ def test_two_lists_say_how_sure_they_are_and_what_would_help(fle, capfd):
     [([], "missing_option"), (["1,2"], "wrong_count"), (["1,2,nan"], "not_finite"), (["a,b,c"], "not_a_number")],
 )
 def test_a_target_that_is_none_is_refused_in_one_line(target, code, capfd):
-    """Names what is allowed."""
     refused_command(["register", *LISTS, *(f"--target={one}" for one in target)], capfd, code)
 
 
@@ -79,7 +76,6 @@ def test_declared_errors_say_what_would_help(capfd):
 
 
 def test_a_touch_in_another_branch_is_warned_of(tmp_path, capfd):
-    """The same tip position with the wrist flipped."""
     for path in ABDOMEN.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     lines = (tmp_path / "touch.csv").read_text().split()
@@ -94,7 +90,6 @@ def test_a_touch_in_another_branch_is_warned_of(tmp_path, capfd):
 
 
 def test_joints_that_put_the_tip_elsewhere_are_refused(tmp_path, capfd):
-    """Another needle, or radians."""
     for path in ABDOMEN.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     text = (tmp_path / "case.toml").read_text().replace("length_mm = 210.0", "length_mm = 190.0")

@@ -21,7 +21,6 @@ FLE_MM = 1.5
 
 
 def pairs(points_ct, points_base):
-    """Matched markers with made-up names."""
     return MarkerPairs(tuple("ABCDEF"[: len(points_ct)]), points_ct, points_base)
 
 
@@ -80,14 +79,10 @@ def test_the_interval_of_the_estimated_noise_holds_the_truth_in_95_percent(count
         assert (low, high) == (pytest.approx(0.57, abs=0.005), pytest.approx(3.73, abs=0.005))
 
 
-def test_residuals_of_11_mm_are_refused():
+def test_residuals_of_11_mm_are_refused_and_flagged_where_accepted():
     """Without a declared noise an FRE above 5 mm passes no more."""
     with refused("residuals_too_large"):
         register(pairs(MARKERS[:4], missing_by(11.0)), method="rigid", target_ct=TARGET)
-
-
-def test_accepted_residuals_are_flagged():
-    """The user's word lets them pass, and the registration says so."""
     found = register(pairs(MARKERS[:4], missing_by(11.0)), method="rigid", target_ct=TARGET, accept_residuals=True)
     assert any(flag.code == "residuals_unexplained" for flag in found.flags)
     assert found.fle_mm > 10.0
@@ -109,7 +104,6 @@ def test_a_declared_noise_that_does_not_explain_the_residuals_is_refused_or_scal
 
 
 def test_a_declared_noise_that_explains_the_residuals_stays_as_declared():
-    """No scale, no flag, no interval: what is declared is known."""
     found = register(pairs(MARKERS[:4], missing_by(1.0)), method="rigid", target_ct=TARGET, fle_mm=1.5)
     assert found.fle_mm == 1.5
     assert found.residual_test.fle_interval_mm == (1.5, 1.5)

@@ -13,7 +13,6 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 def points(count, seed):
-    """Within reach of the needle, in front of the base."""
     rng = np.random.default_rng(seed)
     side, away = rng.uniform(-1.0, 1.0, count), rng.uniform(200.0, 380.0, count)
     return np.column_stack([away * np.cos(side), away * np.sin(side), rng.uniform(-50.0, 100.0, count)])
@@ -44,6 +43,5 @@ def test_no_other_configuration_of_the_least_tilt_is_farther_from_singular():
 
 
 def inverse_within(T):
-    """All configurations within the joint limits."""
     q = inverse(UR3, T)[0]
     return q[UR3.within_limits(q)]

@@ -4,17 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bare_case import bare_case
 from places import ROOT
 from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case import Case, load_case, view_frame
-from puncture_twin.planning.case.named_files import CaseVolumes
-from puncture_twin.planning.case.settings import Needle, RobotSettings, SearchSettings
-from puncture_twin.planning.case.tables import MarkerSection, RankingSection, RehearsalSection
+from puncture_twin.planning.case.case import Case, load_case
+from puncture_twin.planning.case.settings import RobotSettings
+from puncture_twin.planning.case.tables import MarkerSection, RehearsalSection
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.residuals import leverage
@@ -27,7 +26,6 @@ TARGET = np.array([50.0, 130, 63])
 
 
 def pose(seed: int) -> np.ndarray:
-    """A rigid motion."""
     rng = np.random.default_rng(seed)
     T = np.eye(4)
     T[:3, :3] = Rotation.random(rng=rng).as_matrix()
@@ -36,13 +34,11 @@ def pose(seed: int) -> np.ndarray:
 
 
 def write_points(path: Path, names: tuple[str, ...], points: np.ndarray) -> None:
-    """A CSV of named points."""
     rows = [f"{name},{x:.9f},{y:.9f},{z:.9f}" for name, (x, y, z) in zip(names, points, strict=True)]
     path.write_text("\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n")
 
 
 def files_in(folder: Path) -> InputFiles:
-    """Every CSV of a folder, as a case has read it."""
     files = InputFiles(folder)
     for path in sorted(folder.glob("*.csv")):
         files.add(path.stem, path.name, path.read_bytes())
@@ -57,27 +53,14 @@ def case(folder: Path, *, markers: bool = True, method: str = "rigid", **rehears
         write_points(folder / "base.csv", NAMES, apply(pose(0), MARKERS))
         use = ("A", "B", "C") if method == "triad" else None
         registration = MarkerSection(method=method, markers_ct="ct.csv", markers_base="base.csv", use=use)
-    return Case(
+    return bare_case(
+        TARGET,
         path=folder / "case.toml",
-        name="box",
-        space=Space.LOCAL,
-        target_ct=TARGET,
         target_name="M",
-        target_structure="lesion",
-        needle=Needle(210.0, 150.0, 1.2, 100.0, 10.0, 30.0),
-        search=SearchSettings((0, 1), (0, 6), 0.1, 1.0),
-        ranking=RankingSection(),
-        T_ct_entry=view_frame(np.eye(3), TARGET),
-        structure=(),
-        structures=(),
         registration=registration,
         robot=RobotSettings("ur3", None, None if markers else pose(0)),
-        obstacles=(),
         rehearsal=RehearsalSection(**rehearsal),
         files=files_in(folder),
-        volumes=CaseVolumes(files_in(folder), folder / "case.toml"),
-        stated_structures=1,
-        region="other",
     )
 
 
@@ -90,7 +73,6 @@ def test_without_markers_truth_is_belief_and_says_so(tmp_path):
 
 
 def test_same_seed_same_truth_other_seed_another(tmp_path):
-    """All randomness comes from the seed, which the truth carries."""
     one, again, other = (draw_truth(case(tmp_path, seed=seed), pose(0)) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one.T_base_ct_true, again.T_base_ct_true)
     np.testing.assert_array_equal(one.joint_offsets, again.joint_offsets)
@@ -101,7 +83,6 @@ def test_same_seed_same_truth_other_seed_another(tmp_path):
 
 
 def test_no_error_means_truth_is_belief(tmp_path):
-    """With exact markers and exact joints nothing differs."""
     exact = case(tmp_path, fle_ct_mm=0.0, fle_touch_mm=0.0, joint_offset_deg=0.0)
     truth = draw_truth(exact, pose(0))
     np.testing.assert_allclose(truth.T_base_ct_true, pose(0), atol=1e-9)
@@ -109,7 +90,6 @@ def test_no_error_means_truth_is_belief(tmp_path):
 
 
 def test_drawn_truth_is_rigid_and_read_only(tmp_path):
-    """A proper rotation, frozen."""
     truth = draw_truth(case(tmp_path), pose(0))
     R = truth.T_base_ct_true[:3, :3]
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
@@ -150,7 +130,6 @@ def test_triad_cases_draw_triad_errors(tmp_path):
 
 
 def test_file_of_true_positions_is_found_again(tmp_path):
-    """Exact positions give the exact pose, whatever the belief."""
     write_points(tmp_path / "true.csv", (*NAMES, "M"), apply(pose(9), np.vstack([MARKERS, TARGET])))
     truth = draw_truth(case(tmp_path, truth_base="true.csv"), pose(0))
     np.testing.assert_allclose(truth.T_base_ct_true, pose(9), atol=1e-6)

@@ -62,13 +62,11 @@ def test_the_words(offset, text):
 
 
 def test_a_local_space_has_axes_and_no_anatomy():
-    """The carton has no head."""
     place = entry_place(np.array([10.0, -20.0, 0.0]), [Landmark("marker A", np.zeros(3))])
     assert place.text(Space.LOCAL) == "10 mm along +x and 20 mm along -y from marker A"
 
 
 def test_without_an_entry_there_is_no_place():
-    """A path that meets no skin."""
     assert entry_place(np.full(3, np.nan), [Landmark("marker A", np.zeros(3))]) is None
 
 
@@ -95,7 +93,6 @@ def test_a_slice_that_is_tilted_so_holds_the_needle(direction):
 
 
 def test_a_needle_along_the_patient_has_no_angle_in_the_slice():
-    """And words that say so."""
     found = needle_planes(HEAD)
     assert np.isnan(found.in_plane)
     assert found.summary()["in_plane_deg"] is None

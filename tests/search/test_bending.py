@@ -47,12 +47,10 @@ def written(folder, needle=BENT, tissue=TISSUE):
 
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
-    """The case, read."""
     return prepare(written(tmp_path_factory.mktemp("bending")), arm=False, engine="fcl")
 
 
 def searched(patient, **changes):
-    """The organs' verdicts of a case with something else."""
     case = replace(patient.case, **changes)
     return organ_candidates(case, patient.anatomy, patient.engine, case.directions())
 
@@ -77,7 +75,6 @@ def test_what_lacks_the_clearance_to_bend_is_rejected_and_nothing_else(patient):
 
 
 def test_a_symmetric_tip_leaves_the_sag_alone(patient):
-    """Nothing but its weight takes the needle off."""
     bending = replace(patient.case.bending, alpha=0.0)
     found = searched(patient, bending=bending)
     known = np.isfinite(found.deflection)
@@ -85,7 +82,6 @@ def test_a_symmetric_tip_leaves_the_sag_alone(patient):
 
 
 def test_a_needle_that_bends_further_than_anything_is_clear_of_leaves_nothing_safe(patient):
-    """And says so of each."""
     found = searched(patient, bending=replace(patient.case.bending, alpha=np.radians(30.0)))
     assert not found.safe.any() and "needle_bends" in found.verdict.reason
 
@@ -132,7 +128,6 @@ def test_a_check_says_how_far_it_bends_and_what_it_needs(patient):
 
 
 def test_a_certificate_refuses_a_needle_that_bends(patient):
-    """It proves straight ones."""
     with refused("not_certifiable"):
         certify(patient.case, patient.anatomy, size=0.1)
 
@@ -153,13 +148,11 @@ def test_a_certificate_refuses_a_needle_that_bends(patient):
     ],
 )
 def test_half_a_declaration_is_refused(tmp_path, needle, tissue, message):
-    """Nothing that is stated may count for nothing."""
     with refused(*message.split()):
         load_case(written(tmp_path, needle, tissue))
 
 
 def test_a_tissue_that_is_nowhere_is_refused(tmp_path):
-    """A pattern without a structure is a slip."""
     path = written(tmp_path, tissue=TISSUE.replace("tissue.organ", "tissue.orgn"))
     with refused("no_match", "orgn"):
         prepare(path, arm=False, engine="fcl")

@@ -26,30 +26,22 @@ CHANGES = (('space = "LPS"', 'space = "RAS"'), ("theta_deg = [0, 10]", 'frame = 
 
 @pytest.fixture(scope="module")
 def context(tmp_path_factory):
-    """Balls about a target, without an arm."""
     return prepare(write_case(tmp_path_factory.mktemp("choice"), *CHANGES), arm=False)
 
 
 @pytest.fixture(scope="module")
 def found(context):
-    """The search of its grid."""
     return context.search()
 
 
-def test_nothing_chosen_is_every_safe_candidate_in_the_order_of_ranks(context, found):
-    """What the planner tries one after the other."""
-    chosen = choose(context, found, BEST)
-    np.testing.assert_array_equal(chosen.rows, found.ranked)
-
-
-def test_a_rank_is_one_row(context, found):
-    """That of the rank."""
+def test_nothing_chosen_is_every_safe_candidate_in_the_order_of_ranks_and_a_rank_one_row(context, found):
+    assert parse_choice(None, None, None, None, None) == BEST
+    np.testing.assert_array_equal(choose(context, found, BEST).rows, found.ranked)
     chosen = choose(context, found, Choice(rank=5))
     assert chosen.candidates.ranking.rank[chosen.rows].tolist() == [5]
 
 
 def test_a_window_is_its_rows_the_best_first(context, found):
-    """None of another window."""
     windows = find_windows(found)
     chosen = choose(context, found, Choice(window=len(windows.windows)))
     assert set(windows.of_row[chosen.rows]) == {len(windows.windows)}
@@ -75,7 +67,6 @@ def test_a_point_off_the_skin_is_refused_with_the_place_of_the_skin(context, fou
 
 
 def test_the_target_itself_gives_no_direction(context, found):
-    """It is refused rather than turned into some direction."""
     typed = tuple((context.case.target_ct * [-1, -1, 1]).tolist())
     with refused("entry_at_target"):
         choose(context, found, Choice(entry_mm=typed))
@@ -92,7 +83,6 @@ def test_a_rejected_direction_is_refused_with_its_reason(context, found):
     ("choice", "allowed"), [(Choice(rank=10**6), "out_of_range"), (Choice(window=500), "out_of_range")]
 )
 def test_what_there_is_not_is_refused_with_what_there_is(context, found, choice, allowed):
-    """A rank and a window beyond the last."""
     with refused(allowed):
         choose(context, found, choice)
 
@@ -109,13 +99,11 @@ def test_what_there_is_not_is_refused_with_what_there_is(context, found, choice,
     ],
 )
 def test_choices_that_are_none_are_refused(typed, said):
-    """One line that says what is allowed."""
     with refused(*said.split()):
         parse_choice(*typed)
 
 
 def line(path, *points, kind="Line", system="LPS"):
-    """A markups file as Slicer writes it."""
     controls = [{"label": f"L-{n}", "position": list(map(float, p)), "positionStatus": "defined"} for n, p in points]
     markup = {"type": kind, "coordinateSystem": system, "coordinateUnits": "mm", "controlPoints": controls}
     path.write_text(json.dumps({"markups": [markup]}))
@@ -137,15 +125,9 @@ def test_the_end_of_a_line_away_from_the_target_is_the_entry(context, found, tmp
 
 
 def test_a_line_to_elsewhere_or_many_points_are_no_entry(context, tmp_path):
-    """Neither end is guessed."""
     elsewhere = line(tmp_path / "line.mrk.json", (1, (80, 0, 0)), (2, (0, 60, 0)))
     with refused("line_misses_target", "60.0"):
         with_file_read(context.case, Choice(entry_file=elsewhere))
     many = line(tmp_path / "many.mrk.json", *((n, (n, 0, 0)) for n in range(3)), kind="Fiducial")
     with refused("wrong_count"):
         with_file_read(context.case, Choice(entry_file=many))
-
-
-def test_nothing_stated_is_the_best():
-    """Which is the default of every command."""
-    assert parse_choice(None, None, None, None, None) == BEST

@@ -9,7 +9,7 @@ from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh, skin_paths
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.anatomy.unseen import beyond_image
 from puncture_twin.planning.base.reasons import Reason
-from puncture_twin.planning.case.settings import Needle, SearchSettings
+from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.clearance.engine import measure
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -32,7 +32,6 @@ def verdict(skin, structures=(), direction=UP, needle=NEEDLE, target=(0, 0, 0), 
 
 
 def both(*meshes):
-    """One surface of several."""
     offsets = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
     return TriangleMesh(
         np.concatenate([m.vertices for m in meshes]),
@@ -41,7 +40,6 @@ def both(*meshes):
 
 
 def test_free_path_is_safe(box):
-    """Straight out of a box, nothing near: safe."""
     assert verdict(skin_from_mesh(box([100, 100, 100])))[0] == ""
 
 
@@ -100,24 +98,12 @@ def test_a_doubled_open_skin_stays_open(ball):
     assert whole.closed
 
 
-def test_too_long(box):
-    """A path longer than the usable shaft is rejected with its length."""
-    assert verdict(skin_from_mesh(box([400, 400, 360])))[::3] == (Reason.TOO_LONG, pytest.approx(180))
-
-
 def test_a_fixed_standoff_limits_the_path(box):
     """With the tip 60 mm from the target before the insertion, and 10 mm off the skin, 50 mm of path are the most."""
     needle = Needle(200.0, 150.0, 1.0, 60.0, 10.0, 30.0)
     assert needle.longest_path_mm == 50
     assert verdict(skin_from_mesh(box([100, 100, 99])), needle=needle)[0] == ""
     assert verdict(skin_from_mesh(box([100, 100, 101])), needle=needle)[0] == Reason.TOO_LONG
-
-
-def test_skin_angle(ball):
-    """A flat path off centre is too oblique for 30°."""
-    found = verdict(skin_from_mesh(ball(100, subdivisions=5)), target=(0, 0, 60), direction=[1, 0, 0], max_angle=30)
-    assert found[0] == Reason.SKIN_ANGLE
-    assert found[3] == pytest.approx(36.87, abs=0.5)
 
 
 def test_reenters_skin(ball):
@@ -130,7 +116,6 @@ def test_reenters_skin(ball):
 
 
 def test_too_close_names_structure_depth_and_mm(ball, box):
-    """The structure that lacks most of its margin is named."""
     near = Structure("vessel", Role.AVOID, 5.0, ball(10, (14, 0, 30), 4), "")
     other = Structure("rib", Role.AVOID, 1.0, ball(10, (-11, 0, 40), 4), "")
     reason, structure, depth, amount = verdict(skin_from_mesh(box([100, 100, 100])), [other, near])
@@ -185,7 +170,6 @@ def test_a_needle_that_leaves_the_image_beside_a_cut_body_is_unknown(box):
 
 
 def test_no_skin_entry_through_a_hole(box):
-    """An open skin with its top missing has no entry there."""
     mesh = box([100, 100, 100])
     top = np.all(mesh.triangles[:, :, 2] == 50, axis=1)
     opened = skin_from_mesh(TriangleMesh(mesh.vertices, mesh.faces[~top]))
@@ -206,16 +190,10 @@ def test_a_ray_through_a_corner_is_judged_like_its_neighbours(box):
 
 
 def test_anatomy_finds_structures_by_name(ball, box):
-    """A wrong name lists the right ones."""
     anatomy = Anatomy((Structure("liver", Role.TARGET, 0, ball(10), ""),), skin_from_mesh(box([100, 100, 100])), ())
     assert anatomy.structure("liver").role is Role.TARGET
     with pytest.raises(Exception, match="no structure 'lver'.*liver"):
         anatomy.structure("lver")
-
-
-def test_search_settings_are_radians():
-    """The case's grid speaks radians inside."""
-    assert SearchSettings((0, np.pi), (0, 1), 0.1, 1.0).theta[1] == np.pi
 
 
 def test_a_skin_mesh_may_say_where_the_body_was_cut(box):

@@ -41,14 +41,12 @@ def test_limits_without_markers_are_refused(tmp_path, base):
 
 
 def test_without_limits_the_same_cases_are_searched(tmp_path):
-    """Chances are blank, as without errors."""
     found = prepare(ball(tmp_path), arm=False).search()
     assert found.safe.any() and np.isnan(found.chances.hit).all()
 
 
 @pytest.mark.parametrize("name", ["ribb", "organ", "skin"])
 def test_a_limit_of_a_structure_that_none_is_judged_by_is_refused(tmp_path, name):
-    """A name that is mistyped, and structures that may be touched."""
     with refused("unknown_structure", name):
         prepare(ball(tmp_path, search=f"max_touch_of = {{ {name} = 0.001 }}")).search()
 
@@ -101,7 +99,6 @@ def test_noise_is_not_found_in_computed_readings(tmp_path):
 
 @pytest.mark.parametrize("name", ["any", "joint"])
 def test_a_structure_with_the_name_of_another_column_is_refused(tmp_path, name):
-    """Its chance would be lost beside the sum's."""
     path = ball(tmp_path)
     path.write_text(path.read_text().replace('name = "rib"', f'name = "{name}"'))
     with refused("reserved_name"):
@@ -109,7 +106,6 @@ def test_a_structure_with_the_name_of_another_column_is_refused(tmp_path, name):
 
 
 def test_a_surface_that_lies_off_takes_from_the_chance_to_hit(tmp_path):
-    """Half a centimetre of a target of six millimetres."""
     chances = []
     for surface in (0.0, 5.0):
         folder = tmp_path / str(surface)
@@ -131,7 +127,6 @@ def test_meshes_of_which_nobody_knows_how_far_they_lie_off_are_named(tmp_path, e
 
 
 def test_an_open_target_has_no_chance_to_be_hit(tmp_path):
-    """A sheet holds no tip; a radius says what a hit is."""
     sheet = trimesh.Trimesh([[-8, -8, -6], [8, -8, -6], [8, 8, -6], [-8, 8, -6]], [[0, 1, 2], [0, 2, 3]])
     path = ball(tmp_path, organ=sheet)
     with refused("open_mesh"):

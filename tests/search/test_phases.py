@@ -51,7 +51,6 @@ def breathing(**keys):
 
 
 def searched(patient, breath=None, case=None, anatomy=None):
-    """The organs' verdicts, with FCL."""
     case, anatomy = replace(case or patient.case, breathing=breath), anatomy or patient.anatomy
     engine = FclEngine([one.mesh for one in anatomy.checked])
     return organ_candidates(case, anatomy, engine, case.directions())
@@ -72,10 +71,8 @@ def moved_body(patient, breath, s):
     return case, Anatomy(structures, skin, ())
 
 
-@pytest.mark.parametrize("scanned_at", [0.0, 0.6])
-@pytest.mark.parametrize("gate", [None, 0.4])
+@pytest.mark.parametrize(("gate", "scanned_at"), [(None, 0.0), (0.4, 0.6)])
 def test_phases_are_those_of_a_body_that_is_moved_and_searched_anew(patient, gate, scanned_at):
-    """Verdicts, the least clearance and where it is."""
     breath = breathing(gate=gate, scanned_at=scanned_at)
     found, static = searched(patient, breath), searched(patient)
     anew = [searched(patient, None, *moved_body(patient, breath, s)) for s in breath.positions]
@@ -144,7 +141,6 @@ def test_a_rejected_direction_names_structure_and_phase(patient):
 
 
 def test_what_is_safe_says_when_and_never_that_a_needle_may_stay(patient):
-    """The words of both kinds of safe."""
     assert searched(patient, breathing()).safe_text.endswith("at each phase if inserted at that phase")
     assert searched(patient, breathing(gate=0.25)).safe_text.endswith("when gated to this window (s <= 0.25)")
     assert "stay" not in searched(patient, breathing()).safe_text
@@ -181,13 +177,11 @@ def test_where_nothing_is_safe_before_the_breath_nothing_is_safe_with_it(patient
 
 
 def test_a_certificate_refuses_a_body_that_moves(patient):
-    """It proves directions for the surfaces where the CT shows them."""
     with refused("not_certifiable"):
         certify(replace(patient.case, breathing=breathing()), patient.anatomy, size=0.1)
 
 
 def test_a_search_that_cannot_be_certified_searches_nothing(patient, tmp_path):
-    """The refusal comes first, and leaves no file."""
     context = replace(patient, case=replace(patient.case, breathing=breathing()))
     with refused("not_certifiable"):
         search_case(context, tmp_path / "out", certify=CertifyOptions(1.0, None))

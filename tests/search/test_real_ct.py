@@ -39,10 +39,7 @@ def _searched(path):
 
 
 def test_every_structure_is_there_and_closed(searches):
-    """58 organs, vessels and bones of version 1 and 60 of version 2, beside the liver; each a closed surface.
-
-    The CT adds what neither names, dense and gas.
-    """
+    """58 organs, vessels and bones of version 1 and 60 of version 2, beside the liver; each a closed surface."""
     for version, count in (("v1", 61), ("v2", 63)):
         structures = searches[version][0].anatomy.structures
         assert len(structures) == count
@@ -58,7 +55,6 @@ def flange_beyond(context, found):
 
 
 def path_of(found):
-    """Length and skin angle of each path."""
     return found.path.length, found.path.skin_angle
 
 

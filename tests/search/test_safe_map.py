@@ -15,7 +15,6 @@ from puncture_twin.planning.search.context import prepare
 
 @pytest.fixture(scope="module")
 def case(tmp_path_factory):
-    """The usual patient with a grid all about."""
     path = write_case(tmp_path_factory.mktemp("map"))
     path.write_text(path.read_text().replace("theta_deg = [0, 10]", "theta_deg = [0, 180]"))
     return path
@@ -110,7 +109,6 @@ def test_a_moved_context_goes_to_another_process_without_its_memory(case):
 
 
 def test_threads_share_a_context(case):
-    """Targets moved at once by several threads are those that one thread finds."""
     context, targets = prepare(case, arm=False), [[0.5 * k, 0.2 * k, -0.3 * k] for k in range(8)]
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda target: pt.safe_map(context, target).structure, targets))

@@ -10,28 +10,26 @@ from hypothesis import given, settings, strategies as st
 from refusals import refused
 
 from puncture_twin.meshes import folder
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.entry import outward
 from puncture_twin.planning.case.tables import RankingSection
 from puncture_twin.planning.clearance.fcl_engine import CrossCheckError
-from puncture_twin.planning.search.constraints import closest_miss
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.ranking import pareto_front, rank, ranked
-from puncture_twin.planning.search.search import inside_length, organ_candidates
+from puncture_twin.planning.search.ranking import pareto_front, rank
+from puncture_twin.planning.search.search import inside_length
 from puncture_twin.planning.search.table import write_table
 from tests.carton_truth import carton_field
 
 
 @pytest.fixture(scope="module")
 def carton():
-    """The carton, lesion M, organs alone."""
     return prepare(folder() / "carton" / "case_m.toml", arm=False)
 
 
 @pytest.fixture(scope="module")
 def found(carton):
-    """Its whole grid."""
     return carton.search()
 
 
@@ -42,6 +40,7 @@ def test_every_direction_has_one_row(carton, found):
     np.testing.assert_allclose(found.outward_ct, outward(found.theta, found.beta) @ R.T, atol=1e-12)
     assert set(found.verdict.reason) <= {reason.value for reason in Reason}
     assert sum(found.counts().values()) == len(found)
+    assert (found.arm.reachable == -1).all()
 
 
 def test_clearances_equal_the_analytic_truth(carton, found, rng):
@@ -56,7 +55,6 @@ def test_clearances_equal_the_analytic_truth(carton, found, rng):
 
 
 def test_the_ranks_follow_the_cost(found):
-    """Safe rows are ranked 1..n by rising cost; rejected rows have neither."""
     order = found.ranked
     assert (
         np.diff(found.ranking.cost[order]) >= -1e-9
@@ -65,11 +63,6 @@ def test_the_ranks_follow_the_cost(found):
     assert np.isnan(found.ranking.cost[~found.safe]).all()
     assert not found.ranking.pareto[~found.safe].any()
     assert found.ranking.pareto[order[0]]
-
-
-def test_no_reach_is_asked_without_an_arm(found):
-    """``reachable`` is null when the arm was not asked."""
-    assert (found.arm.reachable == -1).all()
 
 
 def test_the_table_holds_what_was_found(carton, found, tmp_path):
@@ -91,31 +84,8 @@ def test_the_table_holds_what_was_found(carton, found, tmp_path):
     assert run["step_deg"] == pytest.approx(2)
 
 
-def test_when_nothing_is_safe_the_closest_miss_is_named(carton, found):
-    """With a margin that nothing keeps, the row with the least lack is found."""
-    structures = tuple(replace(s, margin_mm=60.0) for s in carton.anatomy.structures)
-    anatomy = replace(carton.anatomy, structures=structures)
-    refused = ranked(carton.case, organ_candidates(carton.case, anatomy, carton.engine, _directions(found)))
-    assert not refused.safe.any()
-    row = closest_miss(refused)
-    assert refused.verdict.reason[row] == Reason.TOO_CLOSE
-    demanding = ~np.isnan(refused.clearance.margins)
-    least = np.where(
-        refused.verdict.reason == Reason.TOO_CLOSE, refused.clearance.distance[:, demanding].min(axis=1), -np.inf
-    )
-    assert refused.clearance.distance[row, demanding].min() == least.max()
-
-
-def _directions(found):
-    from puncture_twin.planning.case.entry import Directions
-
-    return Directions(found.theta, found.beta, found.outward_ct)
-
-
 def test_tissue_is_the_length_inside(carton, found, ball):
     """Through a ball of radius 20 about a point 60 mm away: two radii where the path goes through its centre."""
-    from puncture_twin.planning.anatomy.structure import Role, Structure
-
     organ = Structure("organ", Role.TRAVERSE, 0, ball(20, (0, 0, 60), 5), "")
     up = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, 1.0], [1.0, 0, 0]])
     lengths = inside_length(organ, np.zeros(3), up, np.array([100.0, 60, 30, 100]))
@@ -127,14 +97,12 @@ def test_tissue_is_the_length_inside(carton, found, ball):
 @given(st.lists(st.tuples(*[st.integers(0, 4)] * 3), min_size=1, max_size=40))
 @settings(max_examples=100)
 def test_the_pareto_front_is_what_the_definition_says(rows):
-    """Against the definition, pair by pair."""
     terms = np.array(rows, float)
     expected = [not any((other <= row).all() and (other < row).any() for other in terms) for row in terms]
     np.testing.assert_array_equal(pareto_front(terms), expected)
 
 
 def test_each_term_of_the_cost_says_what_it_should():
-    """Hand-computed terms and cost."""
     weights = RankingSection(clearance=1, path_length=1, skin_angle=1, tissue=1, reach=1, safe_cone=1)
     order = rank(
         min_clearance=np.array([5.0, 40.0]),
@@ -154,7 +122,6 @@ def test_each_term_of_the_cost_says_what_it_should():
 
 
 def test_the_fast_engine_and_fcl_give_the_same_table(carton, found):
-    """Every verdict, reason and number of the grid, by both engines."""
     plain = prepare(folder() / "carton" / "case_m.toml", arm=False, engine="fcl").search()
     np.testing.assert_array_equal(plain.verdict.reason, found.verdict.reason)
     np.testing.assert_array_equal(plain.verdict.structure, found.verdict.structure)
@@ -176,6 +143,5 @@ def test_the_cross_check_sees_a_wrong_engine(carton):
 
 
 def test_an_unknown_engine_is_refused():
-    """The allowed names are listed."""
     with refused("unknown_engine", "quick"):
         prepare(folder() / "carton" / "case_m.toml", engine="quick")

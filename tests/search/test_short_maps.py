@@ -87,6 +87,11 @@ def verdicts(folder, labels, first):
     return found.safe, found.verdict.reason, found.verdict.structure
 
 
+@pytest.fixture(scope="module")
+def before(tmp_path_factory):
+    return verdicts(tmp_path_factory.mktemp("map") / "whole", vessels(), (0, 0, 0))[0]
+
+
 @pytest.mark.parametrize(
     "kept",
     [
@@ -94,10 +99,9 @@ def verdicts(folder, labels, first):
         np.s_[25:70, 28:70, 31:88], np.s_[:, :, :78], np.s_[:, :70, 25:],
     ],
 )  # fmt: skip
-def test_what_was_unsafe_is_never_safe_with_a_cropped_map(tmp_path, kept):
+def test_what_was_unsafe_is_never_safe_with_a_cropped_map(tmp_path, before, kept):
     """Whichever sides were cut off, with or without the vessel there; and some directions stay safe."""
     labels = vessels()
-    before, *_ = verdicts(tmp_path / "whole", labels, (0, 0, 0))
     after, reason, structure = verdicts(tmp_path / "cut", labels[kept], [one.start or 0 for one in kept])
     assert before.sum() > 1000
     assert not (after & ~before).any()
@@ -108,6 +112,5 @@ def test_what_was_unsafe_is_never_safe_with_a_cropped_map(tmp_path, kept):
 
 
 def test_a_map_that_does_not_hold_the_target_is_refused(tmp_path):
-    """All about the target is unknown then."""
     with refused("labels_end", "labels.nrrd"):
         verdicts(tmp_path / "cut", vessels()[:, :, 55:], (0, 0, 55))

@@ -11,7 +11,6 @@ from puncture_twin.planning.search.sides import BACK, FRONT, Side, grid_of, side
 
 
 def side(name, is_open, why="lies on the table"):
-    """A side that is open, or wholly closed."""
     return Side(name, float(is_open), 1.0, 50.0, "" if is_open else why)
 
 
@@ -36,12 +35,8 @@ def test_it_is_said_in_words():
     """Where, and why not elsewhere; closed for one reason they share a sentence."""
     opened = [side("front", True), side("back", False), side("right", True), side("left", True)]
     assert sides_text(opened) == "front and sides; the back lies on the table"
-    closed = [
-        side("front", False),
-        side("back", False),
-        side("right", True),
-        side("left", False, "is met too obliquely"),
-    ]
+    oblique = side("left", False, "is met too obliquely")
+    closed = [side("front", False), side("back", False), side("right", True), oblique]
     assert sides_text(closed) == "right; the front and back lie on the table; the left is met too obliquely"
 
 
@@ -78,7 +73,6 @@ def test_what_is_searched_is_what_the_grid_holds(tmp_path):
 
 
 def test_without_a_ct_the_back_lies_on_something(tmp_path):
-    """Until the case says that there is no table."""
     path = write_case(tmp_path)
     backs = []
     for more in ("", '\n[ct]\ntable = "none"\n'):
@@ -88,5 +82,4 @@ def test_without_a_ct_the_back_lies_on_something(tmp_path):
 
 
 def test_a_place_without_a_head_has_no_sides():
-    """Nothing is said of it."""
     assert sides_of(SimpleNamespace(space=Space.LOCAL), SimpleNamespace()) == ()

@@ -13,13 +13,11 @@ from puncture_twin.planning.search.taken_line import SAFE, UNCERTAIN, check_line
 
 
 def exact(path):
-    """Covariances of a path that is known."""
     return np.zeros((len(path), 6, 6))
 
 
 @pytest.fixture(scope="module")
 def context():
-    """The embedded abdomen without its arm."""
     return prepare(folder() / "abdomen", arm=False)
 
 
@@ -32,7 +30,6 @@ def best(context):
 
 
 def straight(context, outward, off=(0.0, 0.0, 0.0)):
-    """A needle along a direction, its tip beside the target."""
     tip = context.case.target_ct + np.array(off)
     return np.stack([tip, tip + 60.0 * outward])
 
@@ -110,7 +107,6 @@ def test_what_is_known_worse_elsewhere_than_where_it_is_nearest(context, best):
 
 
 def test_a_tip_outside_of_the_body_has_no_safe_line(context, best):
-    """The needle lies in front of the skin."""
     tip = context.case.target_ct + 140.0 * best
     path = np.stack([tip, tip + 60.0 * best])
     line = check_line(context, path, exact(path))

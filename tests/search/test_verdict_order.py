@@ -32,7 +32,6 @@ def structure(name, margin=2.0, role=Role.AVOID):
 
 
 def nothing(count):
-    """No structure, so no clearance."""
     empty = np.empty((count, 0))
     return Clearances(empty, empty, empty.astype(bool))
 
@@ -46,7 +45,6 @@ def rated(skin_rows, clearances=None, structures=(), needle=NEEDLE):
 
 
 def same(found, expected):
-    """Rows equal, NaN where NaN is expected."""
     for row, wanted in zip(found, expected, strict=True):
         assert tuple(row[:2]) == tuple(wanted[:2])
         np.testing.assert_allclose(np.array(row[2:], float), wanted[2:], atol=1e-12)
@@ -76,7 +74,6 @@ def test_each_reason_of_the_skin_and_its_numbers():
 
 
 def test_the_first_broken_constraint_gives_the_reason():
-    """Whatever else is broken after it, down to the structures."""
     near = Clearances(np.array([[0.5]] * 6), np.array([[40.0]] * 6), np.ones((6, 1), bool))
     rows = [
         (NAN, NAN, 90, 70),
@@ -94,7 +91,6 @@ def test_the_first_broken_constraint_gives_the_reason():
 
 
 def test_limits_themselves_are_kept():
-    """A path of exactly the shaft, an angle of exactly the largest."""
     assert [row[0] for row in rated([(150, 10, NAN, NAN), (100, 60, NAN, NAN)])] == ["", ""]
 
 
@@ -165,7 +161,6 @@ def test_the_closest_miss_lacks_least_of_what_it_lacks_most():
 
 
 def test_without_one_that_lacks_clearance_it_is_the_one_that_passed_most():
-    """The first row of the latest reason; of no rows none."""
     found = rejected([Reason.TOO_LONG, Reason.SKIN_ANGLE, Reason.UNREACHABLE, Reason.UNREACHABLE, Reason.TOO_LONG])
     assert closest_miss(found) == 2
     assert closest_miss(rejected([Reason.UNKNOWN_REGION, Reason.REENTERS_SKIN, Reason.TOO_LONG])) == 2

@@ -147,7 +147,6 @@ def _slice_cut(rng, path):
 
 
 def _slice_moved(rng, path):
-    """One slice where another one is, or between two."""
     data = pydicom.dcmread(path)
     data.ImagePositionPatient[2] += 2.5 * rng.choice([-2, -1, -0.5, 0.5, 1, 2])
     dicom_world.write(data, path)

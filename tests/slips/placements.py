@@ -26,7 +26,6 @@ PHANTOMS = dict(phantoms())
 
 @cache
 def _seen(name, change):
-    """A phantom as an image shows it, with its surfaces."""
     patient = changed(PHANTOMS[name], change, np.random.default_rng(7))
     return patient, edge_image(patient.hu, patient.T), meshes_of(patient)
 

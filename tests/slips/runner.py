@@ -46,7 +46,6 @@ HEAD = f"| kind | draws | {' | '.join(ANSWERS)} | true: refused | true: warned |
 
 
 def row(one: Found) -> str:
-    """Of the table whose head is `HEAD`."""
     cells = [one.slips.total(), *(one.slips[how] for how in ANSWERS), one.true[REFUSED], one.true[WARNED]]
     cells[-1] = f"{cells[-1]} ({', '.join(one.said)})" if one.said else 0
     return f"| {one.name} | {' | '.join(map(str, cells))} |\n"

@@ -19,7 +19,6 @@ def printed():
 
 
 def test_everything_that_is_predicted_stands_there():
-    """To the last digit that is shown."""
     told = printed()
     found = {(name, how): [one.predicted for one in cells] for name, how, cells in rows(0)}
     assert told.keys() == found.keys() and len(told) == 9

@@ -41,7 +41,6 @@ def test_every_column_is_the_derivative(name, rng):
 
 
 def test_the_twins_needle_is_the_plain_one(rng):
-    """Exact, not linearised: errors of centimetres and degrees."""
     model, q, eta = ur_model("ur3"), rng.uniform(-3, 3, (20, 6)), rng.normal(0, 0.05, (20, 28))
     found = true_needle(model, q, eta, 210.0)
     for row in range(20):
@@ -51,7 +50,6 @@ def test_the_twins_needle_is_the_plain_one(rng):
 
 
 def test_a_true_tip_is_driven_onto_its_point(rng):
-    """To a thousandth of a millimetre, however the arm errs."""
     model, eta = ur_model("ur3"), rng.normal(0, 1, (50, 28)) * np.sqrt(np.r_[np.full(11, 0.25), np.full(17, 1e-6)])
     q = np.tile([0.3, -1.2, 1.4, -1.0, -1.5, 0.2], (50, 1)) + rng.normal(0, 0.1, (50, 6))
     points = true_needle(model, q, np.zeros((50, 28)), 210.0).tip_base

@@ -17,7 +17,7 @@ from puncture_twin.planning.uncertainty.hit import (
 
 DRAWS = np.random.default_rng(3).normal(size=(1_000_000, 3))
 
-DEVIATIONS = [(1.0, 1.0, 1.0), (1.0, 1.7, 0.5), (1.0, 5.7, 2.0), (1.0, 1.8, 1.0), (1.0, 10.0, 1.0), (10.0, 10.0, 1.0)]
+DEVIATIONS = [(1.0, 1.0, 1.0), (1.0, 1.7, 0.5), (1.0, 10.0, 1.0), (10.0, 10.0, 1.0)]
 
 
 def covariance(deviations, seed=0):
@@ -27,7 +27,7 @@ def covariance(deviations, seed=0):
 
 
 @pytest.mark.parametrize("deviations", DEVIATIONS)
-@pytest.mark.parametrize("radius", [0.3, 1.0, 2.5, 8.0])
+@pytest.mark.parametrize("radius", [0.3, 2.5, 8.0])
 def test_within_a_radius_as_a_million_draws_say(deviations, radius):
     """Ruben's series to .0015, the draws' own error."""
     found = hit_in_ball(covariance(deviations)[0][None], radius)[0]
@@ -43,7 +43,6 @@ def test_equal_axes_are_a_chi_squared():
 
 
 def test_the_chance_grows_with_the_radius_and_is_never_above_one():
-    """From 0 to 1, for axis ratios up to 30."""
     radii = np.linspace(0, 200, 400)[None]
     for high in (1.0, 5.0, 30.0):
         found = chance_within(np.array([[1.0, 2.0, high**2]]), radii)[0]
@@ -61,7 +60,7 @@ def test_a_size_that_is_all_but_known_gives_the_chance_of_a_known_one():
 
 
 @pytest.mark.parametrize("deviations", DEVIATIONS)
-@pytest.mark.parametrize("off", [0.0, 6.0, 8.0, 12.0])
+@pytest.mark.parametrize("off", [0.0, 8.0, 12.0])
 def test_within_a_ball_of_triangles_from_inside_on_its_face_and_outside(deviations, off):
     """The rays' sum to .004 of a million draws, wherever the target lies."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=8.0)
@@ -72,9 +71,7 @@ def test_within_a_ball_of_triangles_from_inside_on_its_face_and_outside(deviatio
     assert found == pytest.approx(np.mean(np.sum(tips**2, axis=1) < 64), abs=0.004)
 
 
-@pytest.mark.parametrize(
-    ("surface", "off"), [(1.0, 0.0), (1.0, 4.0), (1.0, 6.0), (1.0, 8.0), (2.5, 4.0), (2.5, 8.0), (5.0, 0.0)]
-)
+@pytest.mark.parametrize(("surface", "off"), [(1.0, 0.0), (1.0, 6.0), (2.5, 8.0), (5.0, 0.0)])
 def test_a_surface_that_lies_off_as_a_whole_makes_the_ball_larger_or_smaller(surface, off):
     """By a normal number; a ball that is less than nothing is never hit."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=8.0)
@@ -95,7 +92,7 @@ def test_the_mean_over_faces_is_that_of_the_directions_that_they_face():
 
 
 @pytest.mark.parametrize("deviations", DEVIATIONS)
-@pytest.mark.parametrize("off", [0.0, 0.4, 2.0, 5.0])
+@pytest.mark.parametrize("off", [0.0, 2.0, 5.0])
 def test_within_a_radius_of_a_target_beside_which_the_tip_is_believed(deviations, off):
     """A known offset beside the covariance: to .004 of a million draws; without one it is Ruben's series."""
     cov, axes = covariance(deviations, seed=2)
@@ -108,7 +105,6 @@ def test_within_a_radius_of_a_target_beside_which_the_tip_is_believed(deviations
 
 
 def test_a_target_on_a_flat_face_is_hit_half_of_the_time_at_most():
-    """The paper's carton aims at the face of a bolt."""
     box = trimesh.creation.box(extents=[50.0, 50.0, 50.0])
     rays = target_rays(TriangleMesh(box.vertices, box.faces), np.array([25.0, 0.0, 0.0]))
     assert hit_in_mesh(rays, np.eye(3)[None])[0] == pytest.approx(0.5, abs=0.002)
@@ -126,7 +122,6 @@ def test_an_error_whose_size_was_estimated_follows_fishers_f():
 
 
 def test_no_error_hits_for_certain_and_outside_never():
-    """Sources of 0: P is 1 inside and 0 outside."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=2.0)
     mesh = TriangleMesh(ball.vertices, ball.faces)
     for off, chance in ((0.0, 1.0), (3.0, 0.0)):

@@ -22,13 +22,11 @@ LEAN = np.diag([0.5, 0.8, 1.2, 0.006**2, 0.009**2, 0.01**2])
 
 
 def moved(mesh, *at):
-    """A body at a place."""
     mesh.apply_translation(at or (0, 0, 0))
     return TriangleMesh(mesh.vertices, mesh.faces)
 
 
 def box(*sizes):
-    """A block about the origin."""
     return trimesh.creation.box(extents=sizes)
 
 
@@ -46,7 +44,6 @@ def chances(mesh, cov, surface=0.0, freedom=None, threshold=RADIUS):
 
 
 def displaced(cov, count, seed=0):
-    """Origins and directions of so many needles."""
     errors = np.random.default_rng(seed).multivariate_normal(np.zeros(6), cov, count, method="eigh")
     return errors[:, :3], exp_rotation(errors[:, 3:]) @ UP
 
@@ -58,13 +55,9 @@ def drawn(mesh, cov, count=100_000, threshold=RADIUS):
     return np.mean(faces.distance(origins, outward, LENGTH) < threshold)
 
 
-@pytest.mark.parametrize("freedom", [None, 3, 6])
-@pytest.mark.parametrize("surface", [0.0, 0.7])
+@pytest.mark.parametrize(("surface", "freedom"), [(0.0, None), (0.7, None), (0.0, 3), (0.7, 6)])
 def test_first_order_stays_where_it_is_exact(surface, freedom):
-    """A wide plane: normal, or Student's t where the residuals gave the errors' size.
-
-    A surface that may lie farther away is touched all the same where the needle meets it: that is on the safe side.
-    """
+    """A wide plane: normal, or Student's t where the residuals gave the errors' size."""
     for distance in (1.5, 3.0, 4.5):
         first, found = chances(moved(box(40.0, 4000.0, 4000.0), distance + 20.0, 0, 0), SHIFT, surface, freedom)
         t = -(distance - RADIUS) / np.hypot(1.0, surface)
@@ -72,7 +65,7 @@ def test_first_order_stays_where_it_is_exact(surface, freedom):
         assert first - 0.0015 < found < first + (0.0015 if surface == 0.0 else 0.03)
 
 
-@pytest.mark.parametrize("distance", [1.5, 2.5, 3.5])
+@pytest.mark.parametrize("distance", [1.5, 3.5])
 def test_both_sides_of_a_gap_count(distance):
     """Between two plates of one structure: twice the chance of one, of which first order sees one."""
     plates = trimesh.util.concatenate(
@@ -84,7 +77,7 @@ def test_both_sides_of_a_gap_count(distance):
     assert found == pytest.approx(2 * one, abs=0.003)
 
 
-@pytest.mark.parametrize("inner", [1.6, 2.6, 3.6, 4.6])
+@pytest.mark.parametrize("inner", [1.6, 4.6])
 def test_a_tube_around_the_needle_has_a_closed_form(inner):
     """P of a two-dimensional normal to leave a circle, exp(-d^2 / 2): the worst case of first order."""
     tube = trimesh.creation.annulus(r_min=inner, r_max=inner + 5.0, height=4000.0, sections=512)
@@ -115,8 +108,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("size", [1.0, 2.0])
+@pytest.mark.parametrize(("shape", "size"), list(zip(SHAPES, (1, 2, 2, 1, 2, 1), strict=True)))
 def test_draws_agree(shape, size):
     """Within .006 of 100,000 displaced needles, for bodies met by the tip, the shaft, its end and from behind."""
     mesh, cov = SHAPES[shape](), size**2 * LEAN

@@ -47,7 +47,6 @@ def test_rooms_err_as_predicted(case, method, keys):
 
 
 def test_a_declaration_that_is_wrong_by_two_is_seen():
-    """The same comparison fails where the rooms err twice as much."""
     w = world("abdomen/case.toml", "rigid", declared())
     rooms = draw_trials(w.puncture, w.errors.scaled(2.0), ROOMS, np.random.default_rng(0))
     error = rooms.tip_ct - rooms.target_ct
@@ -86,7 +85,6 @@ def test_an_arms_errors_cancel_where_it_touches_as_it_inserts():
 
 
 def test_no_errors_leave_no_doubt():
-    """All sources 0: the covariance is 0."""
     errors = declared(ct_in_plane_mm=0.0, ct_slice_mm=0.0, touch_mm=1e-9, target_mm=0.0, **NO_ARM)
     w = world("abdomen/case.toml", "rigid", errors)
     assert np.abs(w.error.tip_covariance(w.puncture.q_insertion[None])).max() < 1e-15
@@ -121,7 +119,6 @@ def test_ct_axes_in_another_order_change_nothing_for_the_robot(method, axes):
 
 
 def test_the_budget_adds_up():
-    """The parts of every source are 1 together; lateral and depth are the whole."""
     w = world("carton/case_m.toml", "weighted", declared(**SLICES))
     budget = error_budget(w.error, w.puncture.q_insertion, w.puncture.T_base_ct[:3, :3] @ w.puncture.outward_ct)
     assert sum(budget.fraction.values()) == pytest.approx(1.0, abs=1e-12)

@@ -18,26 +18,22 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def scene(*meshes):
-    """Trimesh bodies as the engine takes them."""
     return [TriangleMesh(mesh.vertices, mesh.faces) for mesh in meshes]
 
 
 def slab(x):
-    """A wide block whose face is the plane at x."""
     box = trimesh.creation.box(extents=[40.0, 4000.0, 4000.0])
     box.apply_translation([x + 20.0, 0, 0])
     return box
 
 
 def ball(radius, at):
-    """A fine sphere."""
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=radius)
     mesh.apply_translation(at)
     return mesh
 
 
 def near(meshes, cov, surface=0.0):
-    """One needle along z from the origin past some meshes."""
     engine = FastEngine(meshes)
     axes = engine.measure(np.zeros(3), UP[None], LENGTH)
     normal = normals_of(engine.triangles, np.zeros(3), UP[None], axes)

@@ -15,15 +15,13 @@ ARM = {"arm": "nominal", "tip_offset_mm": 0.0, "needle_direction_deg": 0.0, "joi
 
 
 def tip_rms(w, q_touch):
-    """Expected error of a world whose markers were touched so."""
     noise = reading_noise(w.errors, w.error.model, w.error.tip_mm, q_touch, known=True)
     error = replace(w.error, fit=replace(w.error.fit, noise=noise))
     return np.sqrt(np.trace(error.covariance(w.puncture.q_insertion[None])[0, :3, :3]))
 
 
 @pytest.mark.parametrize(
-    ("case", "method", "keys"),
-    [("abdomen/case.toml", "rigid", ARM), ("carton/case_m.toml", "weighted", ARM | SLICES)],
+    ("case", "method", "keys"), [("abdomen/case.toml", "rigid", ARM), ("carton/case_m.toml", "weighted", ARM | SLICES)]
 )
 def test_the_choice_leaves_least(case, method, keys):
     """Below touching like the insertion, far below touching far from singular; tips on the markers."""
@@ -39,7 +37,6 @@ def test_the_choice_leaves_least(case, method, keys):
 
 
 def test_without_an_arm_s_errors_any_touch_will_do():
-    """Readings alone: the choice changes nothing."""
     w = world("abdomen/case.toml", "rigid", declared(**NO_ARM))
     there = apply(w.puncture.T_base_ct, w.puncture.points_ct)
     q = choose_touches(w.error, there, w.puncture.q_insertion)

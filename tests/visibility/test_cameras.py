@@ -34,7 +34,6 @@ MIRROR = np.diag([-1.0, 1.0, 1.0])
 
 @pytest.fixture(scope="module")
 def view(abdomen):
-    """Of proposed cameras."""
     return camera_view(*abdomen)
 
 
@@ -87,7 +86,6 @@ def test_what_lies_behind_the_camera_or_next_to_a_marker_hides_nothing():
 
 
 def test_all_points_of_a_ball_must_be_seen():
-    """A box that hides a side of it hides it."""
     surfaces = [("box", box(pose(np.eye(3), [0.0, 13.0, 50.0]), (20.0, 20.0, 20.0)))]  # from y = 3 on
     camera = np.array([[0.0, 0.0, 1e6]])
     middle, side = np.zeros((1, 3)), np.array([[0.0, BALL_MM, 0.0]])
@@ -96,7 +94,6 @@ def test_all_points_of_a_ball_must_be_seen():
 
 
 def test_a_mirrored_scene_hides_the_same(ball, rng):
-    """Names stay where points, cameras and surfaces are mirrored."""
     mesh = ball(radius=60.0, center=(30.0, 10.0, 0.0))
     mirrored = TriangleMesh(mesh.vertices @ MIRROR, mesh.faces[:, ::-1].copy())
     points, cameras = np.array([[100.0, 0.0, 5.0], [110.0, 0.0, 5.0]]), rng.uniform(-900.0, 900.0, (300, 3))

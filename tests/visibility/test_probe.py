@@ -48,12 +48,10 @@ def body(ball):
 
 @pytest.fixture(scope="module")
 def view(abdomen):
-    """Of the abdomen."""
     return probe_view(*abdomen)
 
 
 def ruled_by(feet, why):
-    """Which footprints are ruled out by what."""
     return feet.ruled == ORDER.index(why)
 
 
@@ -232,7 +230,6 @@ def test_both_arms_keep_their_clearance_in_the_abdomen(abdomen, view):
 
 
 def placed(bodies, poses):
-    """FCL objects of an arm's bodies."""
     found = []
     for body in bodies:
         body.place(poses)
@@ -284,7 +281,6 @@ def test_an_assumed_place_that_is_taken_is_left_for_another(abdomen, view):
 
 
 def test_what_cannot_be_asked_is_refused(stated, abdomen):
-    """No probe; a base that stands in the patient, by its key."""
     with refused("no_ultrasound", "[ultrasound]"):
         probe_view(*stated("ultrasound"))
     _, plan = abdomen
@@ -297,10 +293,3 @@ def test_a_target_that_lies_too_deep_has_no_window(stated):
     view = probe_view(*stated("ultrasound", depth_mm=20.0))
     assert view.T_ct_image is None and set(view.counts) <= {"no_skin", "too_deep", "tilted"}
     assert "depth_mm" in view.sentence
-
-
-def test_it_shows_itself(view, stated):
-    """With place, joints and counts; and without a place its reason."""
-    assert "mm of depth" in repr(view) and "footprints" in view._repr_html_()
-    none = probe_view(*stated("ultrasound", depth_mm=20.0))
-    assert "no place for the probe" in none._repr_html_()

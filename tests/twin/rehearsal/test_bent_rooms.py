@@ -14,7 +14,6 @@ Q = np.radians([20, -70, 90, -60, -80, 0])
 
 
 def needles():
-    """The same straight needle in all rooms."""
     T = flange_pose(ur_model("ur3"), Q)
     tips = np.broadcast_to(T[:3, 3] + 210 * T[:3, 2], (COUNT, 3))
     return TrueNeedle(tips, np.broadcast_to(T[:3, :3], (COUNT, 3, 3)))

@@ -1,6 +1,7 @@
 """Rooms under each way of guidance: what is realised is what was predicted, for the same patients."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -35,9 +36,20 @@ BREATH = '[breathing]\namplitude_mm = 4.0\ndirection = [0.0, 0.6, 0.8]\ngate = 0
 
 
 @pytest.fixture(scope="module")
-def insertion(tmp_path_factory):
+def made(tmp_path_factory):
+    """A function: the prepared patient with these tables, made once."""
+
+    @cache
+    def make(tables, **others):
+        return prepared(tmp_path_factory.mktemp("ball"), tables, **others)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def insertion(made):
     """A prepared case with all devices, and one direction that the arm reaches."""
-    return prepared(tmp_path_factory.mktemp("ball"), DEVICES)
+    return made(DEVICES)
 
 
 def prepared(folder, tables, touch_mm=0.2, length_mm=210.0, nearest=False, bevel=False):
@@ -69,12 +81,10 @@ def test_every_way_errs_as_predicted(insertion, way):
     assert found.summary()["guidance"] == way and found.summary()["stopped"] == 0
 
 
-@pytest.mark.parametrize("way", ["ct", "stereo", "all"])
-def test_a_needle_that_shakes_is_led_as_predicted(tmp_path, way):
+@pytest.mark.parametrize("way", ["ct", "all"])
+def test_a_needle_that_shakes_is_led_as_predicted(made, way):
     """It shakes anew at each look, and at the end, which no look tells; touches read a mean, and are none worse."""
-    still, shaking = (
-        prepared(tmp_path, DEVICES.replace("[motion]", f"jitter_deg = {deg}\n[motion]")) for deg in (0, 0.1)
-    )
+    still, shaking = (made(DEVICES.replace("[motion]", f"jitter_deg = {deg}\n[motion]")) for deg in (0, 0.1))
     calm, found = (rehearse_trials(*one, ROOMS, 3, way) for one in (still, shaking))
     assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.03)
     Jq = error_jacobian(found.puncture.model, shaking[2], found.puncture.tip_mm)[:3, PARAMETERS["joint"]]
@@ -96,16 +106,16 @@ friction_n_mm = 0.03
 """
 
 
-def pushing(folder, held_n_mm):
+def pushing(made, held_n_mm):
     """The round patient, whose organ is held by so much; None where the case does not say it."""
     held = "" if held_n_mm is None else f"held_n_mm = {held_n_mm}\n"
-    return prepared(folder, DEVICES + TISSUE + held, bevel=True)
+    return made(DEVICES + TISSUE + held, bevel=True)
 
 
-@pytest.mark.parametrize("way", ["ct", "stereo", "us", "ct+us+tip", "all"])
-def test_a_target_is_pushed_on_by_the_needle(tmp_path, way):
+@pytest.mark.parametrize("way", ["ct", "us", "all"])
+def test_a_target_is_pushed_on_by_the_needle(made, way):
     """As predicted, in size and along the needle; who reads the target late sees it, and touches and cameras do not."""
-    insertion = pushing(tmp_path, 0.8)
+    insertion = pushing(made, 0.8)
     found = rehearse_trials(*insertion, ROOMS, 3, way)
     push = found.puncture.push
     shift = float(push.at(push.target_mm))
@@ -113,16 +123,16 @@ def test_a_target_is_pushed_on_by_the_needle(tmp_path, way):
     assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.05)
     assert found.in_region.mean() == pytest.approx(0.95, abs=0.02)
     short = float(np.mean(found.error_ct @ insertion[1]))
-    assert short == pytest.approx(shift, rel=0.05) if way in ("ct", "stereo") else abs(short) < 0.5 * shift
+    assert short == pytest.approx(shift, rel=0.05) if way == "ct" else abs(short) < 0.5 * shift
     predicted = guided_error(distribution._way(insertion[0], distribution._query(*insertion), way)[0].model, way)
     mean_ct = predicted.about_breath()[1]
     assert mean_ct @ insertion[1] == pytest.approx(short, abs=0.05 * shift)
     assert found.p_hit == pytest.approx(found.hit_share, abs=0.03)
 
 
-def test_what_is_not_held_is_not_pushed(tmp_path):
+def test_what_is_not_held_is_not_pushed(made):
     """Nothing moves where no tissue says how it is held, or nothing guides; twice as firm, half as far."""
-    still, firm, twice = (pushing(tmp_path, held) for held in (None, 1.0, 2.0))
+    still, firm, twice = (pushing(made, held) for held in (None, 1.0, 2.0))
     free = rehearse_trials(*still, 200, 3, "us")
     assert free.puncture.push is None and not free.trials.pushed_ct.any()
     shifts = [rehearse_trials(*one, 200, 3, "ct").trials.pushed_ct for one in (firm, twice)]
@@ -142,7 +152,7 @@ def test_the_second_arm_is_the_first_one():
     np.testing.assert_allclose(theirs.R_base_needle, ours.R_base_needle, atol=1e-12)
 
 
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("way", ["ct", "us", "ct+stereo", "all"])
 def test_what_is_predicted_happens_in_another_plant(insertion, way, monkeypatch):
     """Within 5 %: there no error is normal, and those of the cameras differ by direction."""
     for module in (guiding, trials):
@@ -158,9 +168,9 @@ def test_what_is_predicted_happens_in_another_plant(insertion, way, monkeypatch)
     assert predicted / realised == pytest.approx(1.0, abs=0.05)
 
 
-def test_a_patient_registered_askew_is_led_in_its_own_axes(tmp_path):
+def test_a_patient_registered_askew_is_led_in_its_own_axes(made):
     """Touches that err by 2 mm rotate registrations by 2 degrees: a gain in the nominal axes would err 7 % more."""
-    context, outward, q = prepared(tmp_path, "[stereo]\n[ultrasound]\n", touch_mm=2.0)
+    context, outward, q = made("[stereo]\n[ultrasound]\n", touch_mm=2.0)
     for way in ("stereo", "all"):
         found = rehearse_trials(context, outward, q, ROOMS, 3, way)
         assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.02), way
@@ -214,38 +224,38 @@ def test_what_a_case_does_not_declare_is_said_not_to_be_modelled(insertion):
     assert "tissue motion" not in rehearse_trials(context, outward, q, 1, 3, "us").not_modelled
 
 
-def test_rooms_that_breathe_err_as_predicted(tmp_path):
+def test_rooms_that_breathe_err_as_predicted(made):
     """A phase of each room in the gate: markers and structures follow by their weights, the target wholly."""
-    context, outward, q = prepared(tmp_path, DEVICES + BREATH)
+    context, outward, q = made(DEVICES + BREATH)
     for way in ("ct", "ct+us"):
         found = rehearse_trials(context, outward, q, ROOMS, 3, way)
         assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.03), way
         assert "breathing" not in found.not_modelled
-    resting, _, _ = prepared(tmp_path, DEVICES)
+    resting, _, _ = made(DEVICES)
     still = rehearse_trials(resting, outward, q, 1, 3, "ct").predicted_rms_mm
     assert rehearse_trials(context, outward, q, 1, 3, "ct").predicted_rms_mm > still + 0.03
 
 
-def test_touches_and_insertion_share_the_mean_of_the_breath(tmp_path):
+def test_touches_and_insertion_share_the_mean_of_the_breath(made):
     """Breathed without a gate, scanned at exhale: what all touches and the target have in common is no chance of each.
 
     Independent deviations of that size would put ct 11 % too high and ct+stereo 10 % too low.
     """
     weights = '[breathing]\namplitude_mm = 6.0\ndirection = [0.0, 0.6, 0.8]\nweights = { "skin" = 0.3, "*" = 0.5 }\n'
-    context, outward, q = prepared(tmp_path, "[stereo]\n" + weights, touch_mm=0.4)
+    context, outward, q = made("[stereo]\n" + weights, touch_mm=0.4)
     for way in ("ct", "stereo", "ct+stereo"):
         found = rehearse_trials(context, outward, q, ROOMS, 3, way)
         assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.03), way
 
 
-def test_a_known_mean_of_the_breath_is_no_chance(tmp_path):
+def test_a_known_mean_of_the_breath_is_no_chance(made):
     """Scanned at inhale, inserted near exhale: the target is 4 mm off each time, which a normal error rarely is.
 
     Chances of the same mean square would say .1 to .2 more than the hits within 4 mm, and normal errors about that mean
     .04 more or less: within the gate the breath is skew.
     """
     inhale = 'amplitude_mm = 6.0\nscanned_at = 1.0\ngate = 0.4\ndirection = [0.0, 0.6, 0.8]\nweights = { "*" = 0.3 }\n'
-    context, outward, q = prepared(tmp_path, "[stereo]\n[breathing]\n" + inhale, touch_mm=0.4)
+    context, outward, q = made("[stereo]\n[breathing]\n" + inhale, touch_mm=0.4)
     near = replace(context, case=replace(context.case, hit_radius_mm=4.0))
     for way in ("ct", "stereo"):
         for one in (context, near):
@@ -255,9 +265,9 @@ def test_a_known_mean_of_the_breath_is_no_chance(tmp_path):
         assert found.in_region.mean() == pytest.approx(0.95, abs=0.02)
 
 
-def test_a_stopped_needle_does_not_hit(tmp_path):
+def test_a_stopped_needle_does_not_hit(made):
     """Target moved far beyond the corridor: what is stopped is predicted, is no hit, and is in the chance to hit."""
-    context, outward, q = prepared(tmp_path, "[motion]\ntarget_sd_mm = [9.0, 9.0, 9.0]\n[stereo]\n[ultrasound]\n")
+    context, outward, q = made("[motion]\ntarget_sd_mm = [9.0, 9.0, 9.0]\n[stereo]\n[ultrasound]\n")
     for way in ("us", "all"):
         found = rehearse_trials(context, outward, q, 1500, 3, way)
         said, stopped = found.summary(), found.stopped / 1500
@@ -287,13 +297,13 @@ def test_a_needle_that_bends_is_seen_by_its_tip_alone(insertion, way):
 
 
 @pytest.mark.parametrize("way", ["ct", "us"])
-def test_what_rests_while_the_target_breathes_is_touched_as_often_as_predicted(tmp_path, way):
+def test_what_rests_while_the_target_breathes_is_touched_as_often_as_predicted(made, way):
     """A rib beside the needle, which a registration leaves there, and a picture leads away.
 
     The breath goes to one side: taken as a symmetric error, the picture's chance would be twice too large.
     """
     resting = BREATH.replace("4.0", "9.0").replace("0.5", "0.0").replace("[0.0, 0.6, 0.8]", "[-1.0, 0.0, 0.0]")
-    context, outward, q = prepared(tmp_path, "arm = 'nominal'\n" + DEVICES + resting, nearest=True)
+    context, outward, q = made("arm = 'nominal'\n" + DEVICES + resting, nearest=True)
     query = distribution._query(context, outward, q)
     one, moving = distribution._way(context, query, way)
     truths = draw_truths(query.puncture, query.truth, ROOMS, np.random.default_rng(0), moving)
@@ -335,7 +345,7 @@ def test_what_is_hidden_is_missing_and_named(insertion):
     assert np.trace(guided_error(model, "all").tip_covariance(q[None])[0]) > np.trace(seen)
 
 
-def test_devices_that_the_case_does_not_declare_are_assumed(insertion, tmp_path):
+def test_devices_that_the_case_does_not_declare_are_assumed(insertion):
     """As the reference's defaults are, to the bit, and the answer says so; those that are declared are not touched."""
     context, outward, q = insertion
     bare = replace(context, case=replace(context.case, stereo=None, ultrasound=None))
@@ -352,9 +362,9 @@ def test_devices_that_the_case_does_not_declare_are_assumed(insertion, tmp_path)
     assert declared_ways(bare.case) == ("ct",) and declared_ways(half.case) == ("ct", "stereo", "ct+stereo")
 
 
-def test_assumed_balls_fit_a_short_needle(tmp_path):
+def test_assumed_balls_fit_a_short_needle(made):
     """Half of the shaft and the hub, where 160 mm is beyond the flange; and it is said."""
-    case = prepared(tmp_path, "", length_mm=160.0)[0].case
+    case = made("", length_mm=160.0)[0].case
     found, said = equipped(case, "ct+stereo")
     assert found.stereo.balls_mm == (75.0, 150.0)
     assert said[0].startswith("assumed: [stereo] balls 75 and 150 mm behind the tip (half of the shaft and the hub")
@@ -362,7 +372,6 @@ def test_assumed_balls_fit_a_short_needle(tmp_path):
 
 
 def test_a_way_needs_trials():
-    """Unknown ways, physics, and no trials at all are refused."""
     with refused("unknown_guidance"):
         room_count(10, 0, "by hand")
     for rooms, physics in ((None, 0), (10, 2)):
@@ -374,7 +383,6 @@ class Nothing(Sight):
     """Streaks over all of every control scan."""
 
     def hidden(self, out_mm):
-        """Neither tip nor target."""
         return dict.fromkeys(("scanned tip", "scanned target"), "streaks")
 
 
@@ -382,9 +390,9 @@ MOVED = "[motion]\ntarget_sd_mm = [0.4, 0.4, 1.0]\n"
 
 
 @pytest.fixture(scope="module")
-def scanned(tmp_path_factory):
+def scanned(made):
     """A prepared case whose target moves, one direction, and a function to have other control scans in it."""
-    context, outward, q = prepared(tmp_path_factory.mktemp("scanned"), MOVED)
+    context, outward, q = made(MOVED)
 
     def with_scans(**stated):
         scan = ControlScanSection(**{"slice_mm": 2.0, "target_seen": True, "dose_msv": 0.9, "seconds": 120.0} | stated)
@@ -393,8 +401,7 @@ def scanned(tmp_path_factory):
     return with_scans
 
 
-@pytest.mark.parametrize("steps", [1, 4])
-@pytest.mark.parametrize("stated", [{}, {"target_seen": False, "slice_mm": 5.0}])
+@pytest.mark.parametrize(("steps", "stated"), [(1, {}), (4, {"target_seen": False, "slice_mm": 5.0})])
 def test_a_needle_corrected_after_each_scan_errs_as_predicted(scanned, steps, stated):
     """Predicted over realised and the region, less than the open loop of the same patients; all steps are counted."""
     found = rehearse_trials(*scanned(**stated), 2000, 3, "ct", steps=steps)
@@ -440,23 +447,22 @@ def test_scans_that_show_nothing_are_the_open_loop(scanned):
 
 
 def test_worse_scans_never_help(scanned):
-    """Thicker slices, and a target that they do not show."""
     stated = ({"slice_mm": 0.5}, {}, {"slice_mm": 5.0}, {"slice_mm": 5.0, "target_seen": False})
     found = [rehearse_trials(*scanned(**one), 1, 3, "ct", steps=2).predicted_rms_mm for one in stated]
     assert found == sorted(found) and found[0] < found[-1] - 0.3
 
 
-def test_scans_in_a_breathing_body_err_as_predicted(tmp_path):
+def test_scans_in_a_breathing_body_err_as_predicted(made):
     """Scanned and inserted at one position of the breath, which the target's reading shows."""
-    insertion = prepared(tmp_path, MOVED + BREATH)
+    insertion = made(MOVED + BREATH)
     found = rehearse_trials(*insertion, 2000, 3, "ct", steps=3)
     assert found.predicted_rms_mm / found.realised_rms_mm == pytest.approx(1.0, abs=0.03)
     assert found.assumed[0].startswith("assumed: [control_scan] slices of 2 mm that show the target")
 
 
-def test_a_correction_after_a_scan_stays_in_the_corridor(tmp_path):
+def test_a_correction_after_a_scan_stays_in_the_corridor(made):
     """A target that moved far: stopped as often as predicted, which is no hit; no scan follows where it was stopped."""
-    insertion = prepared(tmp_path, "[motion]\ntarget_sd_mm = [9.0, 9.0, 9.0]\n")
+    insertion = made("[motion]\ntarget_sd_mm = [9.0, 9.0, 9.0]\n")
     found = rehearse_trials(*insertion, 1500, 3, "ct", steps=3)
     said, stopped = found.summary(), found.stopped / 1500
     assert 0.2 < stopped < 0.8 and said["p_stop"] == pytest.approx(stopped, abs=0.025)

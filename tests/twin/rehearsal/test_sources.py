@@ -75,13 +75,11 @@ def agrees(share, chance, more=0.005):
 
 
 def test_every_key_is_walked_over():
-    """A source that is added to the declaration is held here too."""
     assert set(ALONE) == set(ErrorsSection.model_fields)
 
 
 @pytest.mark.parametrize("key", [*ALONE, "all"])
 def test_what_a_source_alone_predicts_happens(tmp_path, key):
-    """The tip's error, the chance to hit and the chance to touch."""
     keys = ALL_OF_IT if key == "all" else NOTHING | ALONE[key]
     done = rehearsed(tmp_path, keys, hit_radius=2.0 if key == "target_mm" else None)
     touched, hit = done.touched[:, 0].mean(), done.hit.mean()

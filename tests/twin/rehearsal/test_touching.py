@@ -51,7 +51,6 @@ def quiet(*_):
 
 @pytest.fixture(scope="module")
 def context():
-    """The carton, without a search."""
     return prepare(CASE)
 
 
@@ -86,7 +85,6 @@ def toured(context, plan, truth, prepared=None):
 
 
 def executed(context, plan, truth):
-    """The readings."""
     return toured(context, plan, truth).readings
 
 
@@ -99,7 +97,6 @@ def test_touches_are_slow_soft_and_exact(done):
 
 
 def test_the_controller_computes_the_reading_from_its_joints(done):
-    """Nominal kinematics of what is written beside the point."""
     run, out = done
     read = read_points(out / "touch.csv")
     assert read.names == tuple(touch.name for touch in run.plan.touches)
@@ -121,7 +118,6 @@ def test_a_case_registers_what_was_written(done, tmp_path):
 
 
 def test_times_add_up(done):
-    """Of the tour: every touch and the motion home."""
     run = done[0]
     assert run.touched.seconds == pytest.approx(
         sum(one.seconds for one in run.touched.readings) + run.plan.leave.duration_s, abs=0.1
@@ -131,12 +127,10 @@ def test_times_add_up(done):
 
 
 def test_the_best_poses_are_better_than_the_worst(done):
-    """Of those that are free."""
     assert 0.0 < done[0].plan.expected_mm < done[0].plan.worst_mm
 
 
 def test_without_errors_the_reading_is_the_marker(context, first):
-    """Where it was believed, within what contact needs to be felt."""
     reading = executed(context, first, exact(context))[0]
     assert np.linalg.norm(reading.point_base - first.touches[0].point_base) < 0.03
     assert reading.aside_mm < 1e-6
@@ -155,16 +149,14 @@ def test_an_erring_arm_reads_what_its_errors_say(context, first):
 
 
 def test_the_same_truth_gives_the_same_numbers(context, first):
-    """Bit for bit, the force sensor's noise included."""
     one, other = (executed(context, first, exact(context))[0] for _ in range(2))
     np.testing.assert_array_equal(one.q, other.q)
     assert one.force_n == other.force_n
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_masses_that_err_by_a_tenth_move_no_reading(context, first, monkeypatch, seed):
+def test_masses_that_err_by_a_tenth_move_no_reading(context, first, monkeypatch):
     """The true arm's are drawn within 10 % of the model's: without the integral readings were .6 mm aside."""
-    factors = np.random.default_rng(seed).uniform(0.9, 1.1, 20)
+    factors = np.random.default_rng(1).uniform(0.9, 1.1, 20)
 
     @contextmanager
     def other_masses(*arguments, **named):
@@ -257,7 +249,6 @@ def test_the_puncture_after_touches_ends_in_the_simulator_where_kinematics_say(c
 
 
 def test_a_registration_out_of_reach_is_no_puncture(context, done):
-    """Said in one line, before anything moves."""
     (q, outward), found = touch_job._puncture(context, CHOICE), done[0].use.registration
     far = dataclasses.replace(found, T_base_ct=pose(found.T_base_ct[:3, :3], found.T_base_ct[:3, 3] + 2000.0))
     with refused("out_of_reach", by=NoAnswerError):
@@ -265,7 +256,6 @@ def test_a_registration_out_of_reach_is_no_puncture(context, done):
 
 
 def readings(plan, names):
-    """What a faultless arm reads at some of the markers."""
     kept = [touch for touch in plan.touches if touch.name in names]
     read = [TouchReading(t.name, t.point_base, t.q_touch, 10.0, 1.0, 0.0) for t in kept]
     felt = {t.name: TrueContact(0.0, 1.0) for t in kept}
@@ -331,7 +321,6 @@ def test_the_true_tip_is_on_the_true_marker(context, done):
 
 
 def test_a_case_without_declared_errors_is_refused(context):
-    """One line: what would have to be there."""
     bare = dataclasses.replace(context, case=dataclasses.replace(context.case, errors=None))
     with refused("no_markers"):
         plan_touches(bare, np.zeros(6), seed=0, progress=quiet)
@@ -345,19 +334,16 @@ class PaperArm:
 
     @contextmanager
     def at_marker(self, touch):
-        """Where it was believed."""
         self.name = touch.name
         yield touch.q_touch
 
     def move(self, motion, *, in_air=False):
-        """One second each."""
         self.log.append((self.name, "air" if in_air else "back"))
         if self.stops_at == self.name:
             raise StoppedError("forearm touches trolley")
         return Moved(motion.q[-1], 1.0, 0.1, False)
 
     def move_until_contact(self, motion, *, yielding):
-        """Felt as stated: on the way, or at its end."""
         self.log.append((self.name, "soft" if yielding else "stiff"))
         return Moved(motion.q[len(motion.q) // 2], 1.0, 0.9, self.contacts[yielding])
 
@@ -383,7 +369,6 @@ def test_a_tour_needs_nothing_but_what_the_arm_says(context, done, arm, read, fa
 
 
 def test_an_arm_that_stops_leaves_the_rest_unread(context, done):
-    """What was read before stays; the reason is the arm's own."""
     plan = done[0].plan
     arm = PaperArm(stops_at=plan.touches[1].name)
     found = touch_tour(plan, arm, approach_checkers(context, TOUCHING_PADDING_MM), quiet)

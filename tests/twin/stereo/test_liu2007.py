@@ -49,7 +49,6 @@ def test_the_papers_means_are_those_of_its_rows_but_one():
 
 
 def one_trial(seed, gain, after=1.0, stop="converged"):
-    """A trial of four targets with a given gain."""
     rows = tuple(
         TargetRow(seed, name, 1.0, 1.0, after + gain + d, after, 0.1, 1, stop)
         for name, d in zip("abcd", DRAW, strict=True)
@@ -58,13 +57,11 @@ def one_trial(seed, gain, after=1.0, stop="converged"):
 
 
 def sessions(gains, **keys):
-    """Made-up sessions."""
     trials = tuple(one_trial(seed, gain, **keys) for seed, gain in enumerate(gains))
     return Sessions(paper_case(), None, trials, statistics(trials))
 
 
 def held(gains, **keys):
-    """Which conditions hold."""
     return [one["holds"] for one in conditions(sessions(gains, **keys))]
 
 
@@ -166,7 +163,6 @@ def test_in_a_good_room_the_servo_ends_within_what_it_may():
 
 
 def test_a_seed_repeats_itself_and_another_does_not():
-    """Every number is a function of case and seed."""
     case = load_servo_case(folder() / "head")
     first, again, other = (
         short(case, seed, ("T1",), detector_of=lambda plant: pixel_detector(plant, 0.03)) for seed in (1, 1, 2)

@@ -19,7 +19,6 @@ HERE = told_of_pixels(CASE)
 
 @pytest.fixture(scope="module")
 def found():
-    """The joint estimate of one simulated session."""
     session = simulate(3)
     return adjust(session.observed, session.guess)
 
@@ -43,7 +42,6 @@ def unseen(found, target_m):
 
 
 def seen(found, target_m):
-    """The needle at the last look."""
     return servoed_error(found, -1, target_m)
 
 
@@ -110,10 +108,7 @@ def test_without_errors_the_needle_is_where_it_is_believed():
 
 
 def test_many_rooms_are_as_predicted():
-    """120 rooms drawn anew, true kinematics: rms, regions of tip and pose and hits, each within 3 standard errors.
-
-    `python -m benchmarks.servo_rooms` holds the same to a percent.
-    """
+    """120 rooms drawn anew, true kinematics: rms, regions of tip and pose and hits, each within 3 standard errors."""
     rooms = [room_outcome(HERE, seed) for seed in range(ROOMS)]
     share = 3 * np.sqrt(0.05 * 0.95 / ROOMS)
     for way in ("open_loop", "servoed"):
@@ -144,11 +139,7 @@ def test_a_declaration_too_small_by_two_is_seen():
 def test_a_session_predicts_every_needle_that_it_saw():
     """Before and after the servo, by the chain; where the arm cannot start there is no prediction."""
     session = run_session(
-        HERE,
-        1,
-        targets=("T1", "T6"),
-        empty=NoContacts(),
-        detector_of=lambda plant: pixel_detector(plant, 0.03),
+        HERE, 1, targets=("T1", "T6"), empty=NoContacts(), detector_of=lambda plant: pixel_detector(plant, 0.03)
     )
     for one in session.trial.targets:
         seen, unseen = one.needle_servoed, one.needle_open_loop

@@ -19,7 +19,6 @@ ROOMS = 400
 
 
 def read(tmp_path, text):
-    """The case that a text states, beside the embedded files."""
     for name in ("head.ply", "markers.csv", "targets.csv"):
         (tmp_path / name).symlink_to(HEAD / name)
     (tmp_path / "servo.toml").write_text(text, encoding="utf-8")
@@ -27,13 +26,11 @@ def read(tmp_path, text):
 
 
 def without_errors():
-    """The embedded case's text without its declaration."""
     start = TEXT.index("[errors]")
     return TEXT[:start] + TEXT[TEXT.index("[servo]") :]
 
 
 def test_a_case_that_declares_nothing_has_the_defaults(tmp_path):
-    """The arm is a calibrated one; a target is read as a marker is."""
     errors = read(tmp_path, without_errors()).errors
     assert errors == ServoErrors()
     assert (errors.link_mm, errors.tip_offset_mm, errors.marker_mm, errors.target_mm) == (0.05, 0.3, 0.3, 0.3)
@@ -47,10 +44,8 @@ def test_a_case_that_declares_nothing_has_the_defaults(tmp_path):
     ("old", "new", "what"),
     [
         ('model = "ur3"', 'model = "ur3"\nlink_mm = 0.3', "unknown_key link_mm"),
-        ('unit = "mm"', 'unit = "mm"\nmarker_mm = 0.3', "unknown_key marker_mm"),
         ("[errors]", "[rehearsal.errors]", "missing_errors"),
         ("ball_offset_mm", "ball_ofset_mm", "unknown_key ball_offset_mm"),
-        ("tip_offset_mm = 0.1", "tip_offset_mm = -0.1", "bad_value errors.tip_offset_mm"),
         ("tip_offset_mm = 0.1", 'arm = ["nominal"]', "bad_value errors.arm"),
         ("hit_radius_mm = 0.5", "hit_radius_mm = 0", "bad_value target.hit_radius_mm"),
     ],
@@ -63,7 +58,6 @@ def test_what_contradicts_itself_is_refused(tmp_path, old, new, what):
 
 
 def test_what_is_stated_is_read_back():
-    """The declaration by its keys is a section that declares the same."""
     again = ServoErrors.model_validate(CASE.errors.stated())
     assert again.arm_deviations() == pytest.approx(CASE.errors.arm_deviations())
     assert again.camera_deviations() == pytest.approx(CASE.errors.camera_deviations())
@@ -85,10 +79,7 @@ def test_the_truth_is_drawn_from_the_declaration():
         "links": (np.array([workcell.arm.true.a - workcell.arm.nominal.a for workcell in rooms]), errors.link_mm),
         "zeros": (np.array([one.arm.true.zeros for one in rooms]), errors.joint),
         "axis": (np.array([one.cameras[0].cx - plan.cx for one in rooms]), errors.camera_axis_px),
-        "k1": (
-            np.array([one.cameras[1].distortion[0] - plan.distortion[0] for one in rooms]),
-            errors.lens[0],
-        ),
+        "k1": (np.array([one.cameras[1].distortion[0] - plan.distortion[0] for one in rooms]), errors.lens[0]),
         "turn": (log_rotation(moved[:, :3, :3]), errors.head_turn),
     }
     for name, (drawn, deviation) in scatter.items():

@@ -23,7 +23,6 @@ GOOD = np.radians([14.0, -73.0, -132.0, -55.0, 88.0, -76.0])
 
 
 def rod_at(q, rod_mm=160.0):
-    """A rod held as the arm has it at q."""
     return CarriedRod(MODEL, rod_mm, flange_pose(MODEL, q)[:3, :3])
 
 

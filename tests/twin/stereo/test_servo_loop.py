@@ -23,7 +23,6 @@ class Touches(NoContacts):
     """A judge who sees a contact on every way."""
 
     def first_contact(self, q_path, *, needle_may_touch_patient):
-        """The needle touches the table."""
         return FirstContact(0, Contact("needle", "table"))
 
 
@@ -43,23 +42,19 @@ class Twin:
         self.looks, self.drives = 0, 0
 
     def ball(self, q_true):
-        """Where the ball truly is, C."""
         flange = self.arm.flange_pose(q_true)
         return (flange[:3, 3] + HELD.rod_mm * flange[:3, 2] - self.T[:3, 3]) @ self.T[:3, :3]
 
     def look(self, q_command):
-        """The ball with noise."""
         self.looks += 1
         return Seen(self.ball(self.q) + self.rng.normal(0.0, self.noise, 3), TARGET_C, self.noise**2 * np.eye(3))
 
     def move_jp(self, q_command):
-        """The play operator and the repeatability."""
         self.drives += 1
         self.q = self.arm.settle(q_command, self.q, self.rng)
 
 
 def task(**changes):
-    """A task with usual limits."""
     usual = {
         "rod": HELD,
         "T_base_c": T_BASE_C,
@@ -73,11 +68,10 @@ def task(**changes):
 
 
 def run(twin, **changes):
-    """The servo from the start pose."""
     return servo(task(**changes), Q_START, twin.look, twin)
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_it_takes_the_arms_own_error_out(seed):
     """An arm that is millimetres off ends within the tolerance, play and all; the target is never told to the arm."""
     twin = Twin(
@@ -93,14 +87,12 @@ def test_it_takes_the_arms_own_error_out(seed):
 
 
 def test_a_perfect_arm_does_not_move():
-    """Within the tolerance at the first look nothing is driven."""
     twin = Twin(off(link_mm=0.0))
     done = run(twin)
     assert (done.stop, done.steps, twin.drives) == (ServoStop.CONVERGED, 0, 0)
 
 
 def test_a_ball_that_is_not_seen_is_lost_and_the_arm_does_not_move():
-    """So many looks as asked for, no drive, the reason kept."""
     twin, looks = Twin(off()), []
 
     def blind(q_command):
@@ -114,7 +106,6 @@ def test_a_ball_that_is_not_seen_is_lost_and_the_arm_does_not_move():
 
 
 def test_one_missed_look_is_tried_again():
-    """A ball that comes back is not lost."""
     twin = Twin(off())
     outcomes = iter([Lost("a fly")])
 
@@ -143,7 +134,6 @@ def test_a_hand_that_trembles_does_not_reach_a_fine_tolerance():
 
 
 def test_a_way_that_touches_something_is_not_driven():
-    """The contact is named and the arm stays."""
     twin = Twin(off())
     done = run(twin, checker=Touches())
     assert (done.stop, twin.drives, done.detail) == (ServoStop.CONTACT, 0, "needle and table")

@@ -46,7 +46,6 @@ def trials():
 
 
 def test_statistics_are_those_of_the_rows():
-    """Means, maxima, medians, shares, against the numbers by hand."""
     ours = statistics(trials())
     by_hand = {"seeds": 3, "targets": 4, "refused": 1, "mapping_mean": 0.25, "before_mean": 0.8, "after_mean": 0.25,
                "after_over_mapping": 1.0, "servo_only_max": 0.15, "median_steps": 1.5, "not_confirmed": 0.25,

@@ -44,15 +44,11 @@ def tracked(rng, count, *, noise=2.0, hough_only=False, **changes):
 
 
 def rms(errors):
-    """Root mean square distance."""
     return np.sqrt(np.mean(np.sum(errors**2, axis=1)))
 
 
 def test_the_picture_is_that_of_a_dense_plain_ray_caster(rng):
-    """40 x 40 rays per pixel, each met with the sphere by the quadratic formula.
-
-    A pixel is off by less than a grey level of 140, the ball's centre by less than a thousandth of a pixel.
-    """
+    """40 x 40 rays per pixel, each met with the sphere by the quadratic formula."""
     ball = scene(rng, rod=False)
     low = np.round(CAMERA.project(ball.center_c)).astype(int) - 13
     ours = np.full((27, 27), ball.background_grey)
@@ -101,7 +97,6 @@ def test_the_outlines_centre_is_not_the_balls(rng):
 
 
 def test_an_occluder_hides_the_share_asked_for(rng):
-    """Counted on the disc, with ball and occluder of known greys."""
     for share in (0.15, 0.5):
         plain = scene(rng, rod=False, diffuse=1.0, background_grey=0.0, occluder_grey=0.0)
         hidden = BallScene(**(vars(plain) | {"hidden_fraction": share}))
@@ -125,7 +120,6 @@ def test_a_window_is_a_part_of_the_whole_picture(rng):
 
 @pytest.fixture(scope="module")
 def clean():
-    """Twenty-four balls in full view under diffuse light."""
     return tracked(np.random.default_rng(7), 24)
 
 
@@ -178,7 +172,6 @@ def test_the_covariance_is_honest(clean):
     ],
 )
 def test_a_ball_that_cannot_be_believed_is_lost(rng, changes, reasons):
-    """Never a number, and the reason is named."""
     answers, _ = tracked(rng, 6, **changes)
     assert all(isinstance(answer, LostBall) for answer in answers)
     assert {answer.reason for answer in answers} <= reasons
@@ -194,7 +187,6 @@ def test_a_prediction_out_of_view_is_named(rng):
 
 
 def test_a_plain_array_is_a_whole_picture(rng):
-    """As cv2.imread gives it; the same answer as with an offset of zero."""
     ball = scene(rng)
     whole = render(CAMERA, ball, rng=rng)
     one, other = (find_ball(image, CAMERA, ball.center_c, 4.0, search_px=12) for image in (whole, whole.grey))

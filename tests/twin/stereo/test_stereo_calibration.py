@@ -17,7 +17,6 @@ LENS = (-0.2, 0.05, 5e-4, -5e-4)
 
 @pytest.fixture
 def pair():
-    """The true cameras."""
     return stereo_pair(*SIZE, 2560, 500, 1000, LENS)
 
 
@@ -87,7 +86,6 @@ def test_unmodelled_distortion_is_as_bad_as_the_prototype_says(pair, rng):
     ids=["too few", "the same point", "a plane", "a ball not found", "no position", "swapped", "shape"],
 )
 def test_degenerate_sets_are_refused_by_name(pair, change, message):
-    """Each says what is wrong, which point, and where."""
     points, pixels = change(GRID, pair[0].project(GRID))
     names = [f"P{i + 1}" for i in range(len(points))]
     with refused(*message.split(), "camera 2"):
@@ -104,7 +102,6 @@ def test_points_behind_the_camera_are_refused_by_name(pair):
 
 
 def test_the_cameras_slope_is_a_finite_difference(pair, rng):
-    """Of every parameter, away from the start."""
     points, x = rng.uniform(-80, 80, (8, 3)), rng.normal(size=14) * [9, 9, 5, 5, *[0.02] * 4, *[0.01] * 3, 2, 2, 2]
     exact = camera_slope(_moved(pair[0], x), points, (x[8:11], x[11:]))
     for column, h in enumerate([1e-2] * 4 + [1e-5] * 7 + [1e-3] * 3):

@@ -58,7 +58,6 @@ def test_undistortion_inverts_distortion(coefficients, seed):
 
 
 def test_rays_pass_through_the_points_that_were_projected(pair, rng):
-    """project and rays are each other's inverse up to the distance."""
     points = rng.uniform(-150, 150, (500, 3))
     for camera in pair:
         toward = points - camera.center_c
@@ -67,7 +66,6 @@ def test_rays_pass_through_the_points_that_were_projected(pair, rng):
 
 
 def test_slopes_are_finite_differences(pair, rng):
-    """Of the lens by the point, and of the pixel by the point."""
     flat, h = rng.uniform(-0.2, 0.2, (20, 2)), 1e-6
     lens = np.array(LENS)
     by_lens = np.stack([(distort(flat + h * e, lens) - distort(flat - h * e, lens)) / (2 * h) for e in np.eye(2)], -1)
@@ -125,14 +123,12 @@ def test_a_moved_frame_changes_nothing_in_the_picture(pair, rng):
 
 
 def test_triangulation_returns_the_points(pair, rng):
-    """Exact pixels give the points back, through the distortion."""
     points = rng.uniform(-200, 200, (100, 3))
     found = triangulate(pair, np.stack([camera.project(points) for camera in pair]))
     np.testing.assert_allclose(found.points_c, points, atol=1e-7)
 
 
 def test_triangulations_covariance_is_honest(pair, rng):
-    """Over noisy pixels the squared error, in units of the covariance, has mean 3."""
     points = rng.uniform(-100, 100, (2000, 3))
     covariance = np.array([[0.04, 0.01], [0.01, 0.02]])
     noise = rng.multivariate_normal(np.zeros(2), covariance, (2, 2000))
@@ -144,7 +140,6 @@ def test_triangulations_covariance_is_honest(pair, rng):
 
 
 def test_a_pixel_that_is_missing_leaves_its_point_unknown(pair):
-    """NaN in one camera gives NaN for that point alone."""
     pixels = np.stack([camera.project(np.zeros((2, 3))) for camera in pair])
     pixels[1, 0] = np.nan
     found = triangulate(pair, pixels).points_c
@@ -153,7 +148,6 @@ def test_a_pixel_that_is_missing_leaves_its_point_unknown(pair):
 
 
 def test_wrong_cameras_are_refused(pair):
-    """Scaled rotations, no focal length, one camera only, no baseline."""
     scaled = np.diag([2.0, 2.0, 2.0, 1.0])
     with refused("not_rigid"):
         Camera(10, 10, 1.0, 1.0, 0.0, 0.0, np.zeros(4), scaled)

@@ -21,7 +21,6 @@ SIZE = (640, 480)
 
 @pytest.fixture(scope="module")
 def cube():
-    """Eight corners in four views, with published answers."""
     if not CUBE.is_file():
         pytest.skip(f"no data at {CUBE}")
     return json.loads(CUBE.read_text(encoding="utf-8"))

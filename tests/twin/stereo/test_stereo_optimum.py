@@ -16,7 +16,6 @@ DRAWS = 40
 
 @pytest.fixture(scope="module")
 def one():
-    """One simulated session."""
     return simulate(0)
 
 
@@ -40,10 +39,7 @@ def bound(observed, guess, at):
 
 
 def test_it_reaches_the_bound():
-    """Over 40 drawn sessions the rms error of target minus ball is within 1.15 of the Cramer-Rao bound at the truth.
-
-    The chi2 of the residuals has the mean that counting residuals and unknowns gives, so nothing is fitted away.
-    """
+    """Over 40 drawn sessions the rms error of target minus ball is within 1.15 of the Cramer-Rao bound at the truth."""
     errors, bounds, chi2, freedom = [], [], [], 0
     for seed in range(DRAWS):
         session = simulate(seed)
@@ -99,7 +95,6 @@ def test_a_perfect_session_is_found_exactly(one):
 
 
 def test_a_gross_error_is_refused(one):
-    """A ball measured behind the cameras does not settle, and says so."""
     measured = one.observed.measured_c.copy()
     measured[3] = [0.0, 0.0, -5000.0]
     broken = type(one.observed)(**{**vars(one.observed), "measured_c": measured})

@@ -16,7 +16,6 @@ from puncture_twin.twin.rehearsal.stereo_session import run_session
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A session at one target, with its folder."""
     folder = tmp_path_factory.mktemp("recorded") / "session"
     with new_folder(folder) as kept:
         session = run_session(CASE, 3, targets=("T2",), empty=NoContacts(), record=kept)
@@ -41,8 +40,6 @@ def test_a_recorded_session_is_estimated_as_when_it_ran(recorded):
 
 
 def edited(table, old, new):
-    """A change of one table's text."""
-
     def change(folder):
         path = folder / table
         text = path.read_text(encoding="utf-8")
@@ -53,12 +50,10 @@ def edited(table, old, new):
 
 
 def in_colour(folder):
-    """A picture with three channels."""
     cv2.imwrite(str(folder / "points_001_1_1.png"), np.zeros((960, 1280, 3), np.uint8))
 
 
 def smaller(folder):
-    """A picture of half the size."""
     cv2.imwrite(str(folder / "markers_001_1_1.png"), np.zeros((480, 640), np.uint8))
 
 
@@ -86,7 +81,6 @@ WRONG = {
 
 @pytest.mark.parametrize("wrong", WRONG)
 def test_what_is_wrong_in_a_folder_is_said(recorded, tmp_path, wrong):
-    """One refusal each, with its code."""
     change, code = WRONG[wrong]
     shutil.copytree(recorded[1], tmp_path / "session")
     change(tmp_path / "session")
@@ -95,7 +89,6 @@ def test_what_is_wrong_in_a_folder_is_said(recorded, tmp_path, wrong):
 
 
 def test_joints_in_another_unit_are_noticed(recorded, tmp_path):
-    """Degrees beyond what any joint can read."""
     folder = tmp_path / "session"
     shutil.copytree(recorded[1], folder)
     lines = (folder / "stops.csv").read_text(encoding="utf-8").splitlines()

@@ -150,8 +150,7 @@ def rms_over_runs(n, runs, **options):
     return np.sqrt(np.mean(squared)), np.sqrt(np.mean(np.square(angles)))
 
 
-@pytest.mark.parametrize(("n", "limit"), [(20, 0.34), (30, 0.24), (50, 0.18)])
-@pytest.mark.parametrize("known_noise", [False, True])
+@pytest.mark.parametrize(("n", "limit", "known_noise"), [(20, 0.34, False), (30, 0.24, True), (50, 0.18, False)])
 def test_the_tre_is_within_the_figures(n, limit, known_noise):
     """At the specified noise and poses, without help from the directions, and V within .2 deg from 30 poses on."""
     tre, angle = rms_over_runs(n, 15, noise=SPEC_NOISE if known_noise else None, direction=False)
@@ -160,7 +159,6 @@ def test_the_tre_is_within_the_figures(n, limit, known_noise):
 
 
 def test_directions_help():
-    """Measured directions that take part in the fit lower the error at the tip."""
     without, _ = rms_over_runs(20, 12, noise=SPEC_NOISE, direction=False)
     tre, angle = rms_over_runs(20, 12, noise=SPEC_NOISE)
     assert tre < 0.95 * without
@@ -191,7 +189,6 @@ def test_pixels_need_a_scale(rng):
 
 
 def test_a_known_tip_needs_seven_poses(rng):
-    """With t_Q known seven poses do, and t_Q stays what it was."""
     recording, truth = simulate_recording(rng, 12)
     with refused("too_few_poses", "12"):
         calibrate(recording)
@@ -202,7 +199,6 @@ def test_a_known_tip_needs_seven_poses(rng):
 
 
 def test_nothing_depends_on_where_the_bases_stand(rng):
-    """Turning and moving base 1 changes Y alone, and by that motion."""
     recording, truth = simulate_recording(rng, 24)
     moved = np.eye(4)
     moved[:3, :3], moved[:3, 3] = truth.X[:3, :3], [200.0, -50.0, 30.0]
@@ -226,7 +222,6 @@ def test_a_needle_that_leans_out_of_the_slice_is_allowed_for():
 
 
 def test_columns_are_named_once():
-    """Every free parameter has its own name, in the order of the covariance."""
     recording, _ = simulate_recording(np.random.default_rng(0), 20)
     found = calibrate(recording, scale=True)
     assert len(set(found.parameters)) == len(found.parameters) == len(found.covariance) == N_PARAMETERS

@@ -9,14 +9,7 @@ import pytest
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
 from puncture_twin.twin.jobs.papers import axp_ybq
-from puncture_twin.twin.jobs.papers.axp_ybq import (
-    COMPARED_WITH,
-    reproduce,
-    reproduction_text,
-    summary,
-    truth_estimate,
-    widened,
-)
+from puncture_twin.twin.jobs.papers.axp_ybq import COMPARED_WITH, reproduction_text, summary, truth_estimate, widened
 from puncture_twin.twin.jobs.papers.papers import PAPERS
 from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
@@ -24,14 +17,15 @@ from puncture_twin.twin.plant.simulated_recording import simulate_recording
 @pytest.fixture(scope="module")
 def result():
     """Few runs: enough to see every row, not to judge the last percent."""
-    return reproduce(4)
+    return PAPERS["axp-ybq"](Path("unused"), 4)
 
 
 def test_every_row_is_there(result):
     """Four methods at four counts, steps, direction, outliers, pixel sizes, and the exact case."""
     rows = result.summary["rows"]
     assert len(rows) == 1 + 16 + 3 + 1 + 3 + 4
-    assert rows[0]["ours"] < 1e-6
+    assert rows[0]["ours"] < 1e-6 and result.summary["runs"] == 4
+    assert json.loads(json.dumps(result.summary)) == result.summary
     assert all(np.isfinite(row["ours"]) for row in rows)
     steps = [row["ours"] for row in rows if row["unit"] == "steps"]
     assert max(steps) <= 10
@@ -57,7 +51,6 @@ def test_the_bound_is_the_known_one():
 
 
 def test_a_number_beyond_its_limit_does_not_hold(monkeypatch):
-    """A row, the whole and the text all say so."""
     monkeypatch.setattr(axp_ybq, "SCALE_LIMIT_MM", 0.01)
     bad = summary(axp_ybq._scales(2)[:2], 2)
     assert not bad["holds"]
@@ -81,15 +74,3 @@ def test_limits_widen_with_few_runs_alone():
     rng = np.random.default_rng(3)
     assert widened(rng.chisquare(3, 200)) == 1.0
     assert 1.1 < widened(rng.chisquare(3, 4)) < 2.0
-
-
-def test_the_summary_is_plain(result):
-    """It survives JSON unchanged."""
-    assert json.loads(json.dumps(result.summary)) == result.summary
-
-
-def test_it_has_a_name_on_the_command_line():
-    """The paper is found by name; one run is enough to see that it answers."""
-    answer = PAPERS["axp-ybq"](Path("unused"), 1)
-    assert answer.summary["runs"] == 1
-    assert "Cramer-Rao bound" in answer.text

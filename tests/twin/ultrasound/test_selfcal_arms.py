@@ -48,7 +48,6 @@ def room():
 
 
 def with_flanges(recording, A, B):
-    """The recording with other flanges."""
     r = recording
     return Recording(A, B, r.P, r.v, r.names, r.pixels, r.q_probe, r.q_needle)
 
@@ -193,19 +192,16 @@ def test_found_parts_solve_the_likelihood_equation(room):
 
 @pytest.fixture(scope="module")
 def thirty():
-    """Thirty rooms of each kind."""
     kinds = {
         "told": Kind(),
-        "found": Kind(told=False),
         "uniform": Kind(uniform=True, told=False),
-        "play, told": Kind(play_deg=0.02),
         "play, found": Kind(play_deg=0.02, told=False),
         "outliers, found": Kind(outliers=3, told=False),
     }
     return {name: [outcome(kind, 1000 + seed) for seed in range(ROOMS)] for name, kind in kinds.items()}
 
 
-KINDS = ("told", "found", "uniform", "play, told", "play, found", "outliers, found")
+KINDS = ("told", "uniform", "play, found", "outliers, found")
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -256,13 +252,13 @@ def test_the_prediction_is_the_error_at_held_out_poses(thirty, name):
 
 def test_the_arms_errors_take_a_third_off_the_held_out_error(thirty):
     """Beside the same rooms calibrated as if all errors were noise; whose region holds the truth in hardly any."""
-    noise_alone = [outcome(Kind(arms=0.0), 1000 + seed) for seed in range(ROOMS)]
+    noise_alone = [outcome(Kind(arms=0.0), 1000 + seed) for seed in range(ROOMS // 2)]
     rms = [
         np.sqrt(np.mean(np.concatenate([one.errors_mm for one in rooms]) ** 2))
-        for rooms in (noise_alone, thirty["told"])
+        for rooms in (noise_alone, thirty["told"][: ROOMS // 2])
     ]
     assert rms[1] < 0.72 * rms[0]
-    assert sum(one.inside for one in noise_alone) <= 4
+    assert sum(one.inside for one in noise_alone) <= 2
 
 
 def test_arms_declared_too_small_show_in_chi_squared():
@@ -306,7 +302,6 @@ def test_the_needle_length_and_declared_arms_go_together(room):
 
 
 def test_joints_are_written_and_read(room, tmp_path):
-    """The CSV keeps the joints to rounding."""
     recording = room[3]
     write_recording(recording, tmp_path / "recording.csv")
     again = read_recording(tmp_path / "recording.csv")

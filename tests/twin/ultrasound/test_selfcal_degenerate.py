@@ -10,11 +10,7 @@ from puncture_twin.planning.geometry.rigid import exp_rotation, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import active_columns
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import tip_residuals
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import (
-    LEAST_RATIO,
-    observe,
-    scaled_jacobian,
-)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import LEAST_RATIO, observe, scaled_jacobian
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
 from puncture_twin.twin.plant.simulated_recording import PoseRanges, exact_recording, simulate_recording, with_noise
 
@@ -22,15 +18,10 @@ ALL = active_columns(tip=True, scale=False, direction=False)
 
 
 @pytest.mark.parametrize("name", DEGENERATE)
-@pytest.mark.parametrize("noisy", [False, True])
-def test_every_degenerate_set_is_refused_and_named(name, noisy):
-    """Exact or noisy, the set is refused as bad input that names the one motion that is free."""
-    truth, A, seen = degenerate_set(name)
-    recording = exact_recording(truth, A, seen)
-    if noisy:
-        recording = with_noise(np.random.default_rng(1), recording, SPEC_NOISE)
+def test_every_degenerate_set_is_refused_and_named(name):
+    """As bad input that names the one motion that is free; noisy ones are refused below."""
     with refused("poses_too_alike") as caught:
-        calibrate(recording, noise=SPEC_NOISE)
+        calibrate(exact_recording(*degenerate_set(name)), noise=SPEC_NOISE)
     assert isinstance(caught.value, InputError)
     assert [(m.cause, m.dimensions) for m in caught.value.motions] == [DEGENERATE[name]]
     assert caught.value.motions[0].text in str(caught.value)
@@ -48,12 +39,11 @@ def test_the_words_are_those_of_a_person():
 
 
 @pytest.mark.parametrize("name", DEGENERATE)
-@pytest.mark.parametrize("seed", [3, 4])
-def test_the_proposed_poses_cure_it(name, seed):
+def test_the_proposed_poses_cure_it(name):
     """The same recording with the proposed poses added is accepted, and its answer is near the truth."""
-    truth, A, seen = degenerate_set(name, seed)
+    truth, A, seen = degenerate_set(name, 3)
     recording = exact_recording(truth, A, seen)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(3)
     noisy = with_noise(rng, recording, SPEC_NOISE)
     with refused("poses_too_alike") as caught:
         calibrate(noisy, noise=SPEC_NOISE)
@@ -73,7 +63,6 @@ def test_the_counts_are_the_null_spaces(name):
 
 
 def test_a_constant_insertion_angle_slides_by_the_formula():
-    """t_X += k R_X d, t_Q += k V leaves every residual at zero."""
     truth, A, seen = degenerate_set("constant insertion angle")
     recording, estimate = exact_recording(truth, A, seen), as_estimate(truth)
     d = np.append(recording.v[0], 0.0)
@@ -82,9 +71,9 @@ def test_a_constant_insertion_angle_slides_by_the_formula():
 
 
 def test_usual_poses_are_accepted():
-    """Of a hundred recordings with usual poses none is refused, and the least ratio is far from the limit."""
+    """Of 40 recordings with usual poses none is refused, and the least ratio is far from the limit."""
     ratios = []
-    for seed in range(100):
+    for seed in range(40):
         recording, truth = simulate_recording(np.random.default_rng(seed), 20, noise=None)
         ratios.append(observe(as_estimate(truth), recording, ALL).ratio)
     assert min(ratios) > 2 * LEAST_RATIO
@@ -92,8 +81,8 @@ def test_usual_poses_are_accepted():
 
 @pytest.mark.parametrize("distance_mm", [1350.0, 5000.0])
 def test_where_the_second_base_stands_does_not_matter(distance_mm):
-    """Thirty usual recordings whose base 2 has its origin elsewhere: none is refused, and the ratio is the same."""
-    for seed in range(30):
+    """Six usual recordings whose base 2 has its origin elsewhere: none is refused, and the ratio is the same."""
+    for seed in range(6):
         recording, _ = simulate_recording(np.random.default_rng(seed), 20)
         away = pose(exp_rotation(np.array([0.2, -0.4, 1.0])), [distance_mm, 0.0, 0.0])
         moved = Recording(recording.A, away @ recording.B, recording.P, recording.v)

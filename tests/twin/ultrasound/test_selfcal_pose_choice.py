@@ -82,7 +82,6 @@ def test_what_is_recorded_counts(world):
 
 @pytest.mark.parametrize("n", [0, 301])
 def test_impossible_numbers_are_refused(world, n):
-    """One to all of the candidates."""
     _, candidates, _, drawing = world
     with refused("out_of_range", "300"):
         choose_poses(candidates, n, SPEC_NOISE, drawing)

@@ -11,13 +11,11 @@ from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
 @pytest.fixture
 def recording(rng):
-    """Six noisy poses with directions."""
     return simulate_recording(rng, 6)[0]
 
 
 @pytest.mark.parametrize("kind", ["2-D directions", "3-D directions", "no directions", "pixels", "shaft"])
 def test_the_csv_keeps_every_digit(recording, tmp_path, kind):
-    """Writing and reading gives the same numbers, names and units."""
     v = {"2-D directions": recording.v, "no directions": None}.get(
         kind, np.column_stack([recording.v, np.full(6, 0.1)])
     )
@@ -60,14 +58,11 @@ def test_a_shafts_length_needs_a_direction_and_is_one(recording):
         ("B", lambda a: a * [1.001, 1, 1, 1], "not_rigid"),
         ("A", lambda a: np.where(np.arange(96).reshape(6, 4, 4) == 12, 1.0, a), "not_rigid A pose 1"),
         ("P", lambda a: a[:, :1], "wrong_shape"),
-        ("P", lambda a: a * np.inf, "not_finite"),
         ("v", lambda a: a * 0, "zero_direction"),
         ("v", lambda a: np.column_stack([a * 0.1, np.ones(6)]), "out_of_image"),
-        ("v", lambda a: a[:3], "wrong_shape"),
     ],
 )
 def test_a_broken_recording_is_refused(recording, key, change, says):
-    """Every broken array is bad input that names the pose."""
     parts = {name: np.array(getattr(recording, name)) for name in "ABPv"}
     parts[key] = change(parts[key])
     with refused(*says.split()):
@@ -75,7 +70,6 @@ def test_a_broken_recording_is_refused(recording, key, change, says):
 
 
 def test_names_must_be_unique(recording):
-    """Two poses of one name could not be told apart in a report."""
     with refused("duplicate_name"):
         Recording(recording.A, recording.B, recording.P, names=("a",) * 6)
 
@@ -88,13 +82,11 @@ def test_names_must_be_unique(recording):
         (lambda text: text.splitlines()[0] + "\n", "empty"),
         (lambda text: text.rsplit(",", 1)[0] + "\n", "ragged_row 28 29"),
         (lambda text: text.rsplit(",", 1)[0] + ",nan\n", "not_finite v_y nan"),
-        (lambda text: text.rsplit(",", 1)[0] + ",left\n", "not_a_number v_y left"),
         (lambda text: text.replace("\n1,", "\n1,9", 1), "not_rigid"),
         (lambda text: text.replace("\n2,", "\n1,", 1), "duplicate_name"),
     ],
 )
 def test_a_broken_file_is_refused(recording, tmp_path, edit, says):
-    """Every broken file is bad input that names the file and the place in it."""
     path = tmp_path / "recording.csv"
     write_recording(recording, path)
     path.write_text(edit(path.read_text()))
@@ -103,6 +95,5 @@ def test_a_broken_file_is_refused(recording, tmp_path, edit, says):
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    """A folder without a recording says which file it lacks."""
     with refused("no_such_file"):
         read_recording(tmp_path)

@@ -14,7 +14,6 @@ from puncture_twin.twin.plant.simulated_recording import simulate_recording
 
 
 def with_outliers(rng, recording, count, size_mm=5.0):
-    """Tips moved in the image, and which."""
     rows = rng.choice(len(recording), count, replace=False)
     angle = rng.uniform(0, 2 * np.pi, count)
     P = np.array(recording.P)
@@ -59,7 +58,6 @@ def test_ten_percent_of_outliers_hardly_matter(known_noise):
 
 
 def test_a_quarter_of_gross_outliers_is_still_found(rng):
-    """Ten of forty tips are 15 mm off: all are set aside, none of the others."""
     recording, _ = simulate_recording(rng, 40)
     broken, rows = with_outliers(rng, recording, 10, 15.0)
     found = calibrate(broken, noise=SPEC_NOISE)
@@ -68,16 +66,12 @@ def test_a_quarter_of_gross_outliers_is_still_found(rng):
 
 
 def test_a_clean_recording_loses_nothing(rng):
-    """Without outliers nearly every recording keeps all of its poses (1 % may lose one)."""
-    lost = [len(calibrate(simulate_recording(rng, 25)[0], noise=SPEC_NOISE).outliers) for _ in range(20)]
-    assert sum(count > 0 for count in lost) <= 2
-
-
-def test_a_clean_recording_counts_every_pose_in_full(rng):
-    """Where nothing is set aside the robust answer is the plain one: every weight is one."""
-    found = calibrate(simulate_recording(rng, 25)[0], noise=SPEC_NOISE)
-    assert found.outliers == ()
-    np.testing.assert_array_equal(found.weights, 1.0)
+    """Nearly every one keeps all of its poses (1 % may lose one), and then each counts in full."""
+    found = [calibrate(simulate_recording(rng, 25)[0], noise=SPEC_NOISE) for _ in range(20)]
+    whole = [one for one in found if one.outliers == ()]
+    assert len(whole) >= 18
+    for one in whole:
+        np.testing.assert_array_equal(one.weights, 1.0)
 
 
 def test_directions_that_point_backwards_are_set_aside(rng):

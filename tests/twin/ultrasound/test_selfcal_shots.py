@@ -42,7 +42,6 @@ def taken():
 
 
 def after(start, recording, rows):
-    """The start with the shots of these rows."""
     for row in rows:
         start = start.with_shot(recording.subset(slice(row, row + 1)))
     return start
@@ -91,7 +90,6 @@ def many(truth, seed):
 
 
 def test_the_order_of_shots_does_not_matter(taken):
-    """To rounding."""
     _, found, recording = taken
     rows = np.arange(FIRST, ALL)
     one = after(ShotByShot.of(found), recording, rows).calibration()
@@ -181,7 +179,6 @@ def test_declared_arms_are_followed_too(with_arms):
 
 
 def test_what_cannot_be_followed_is_refused(taken):
-    """A held needle length, and more than one pose at once; the length is stated at the end instead."""
     _, found, recording = taken
     held = calibrate(recording, noise=SPEC_NOISE, needle_length_mm=170.0)
     with refused("conflicting_options"):

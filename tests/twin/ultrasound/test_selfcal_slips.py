@@ -27,12 +27,10 @@ TURNED = {
 
 
 def drawn(seed, count=POSES, **ranges):
-    """A recording with the usual noise, and its truth."""
     return simulate_recording(np.random.default_rng(seed), count, ranges=PoseRanges(**ranges))
 
 
 def codes(found):
-    """Of the warnings."""
     return [one.code for one in found.findings if one.severity == "warning"]
 
 
@@ -48,7 +46,7 @@ def test_true_recordings_pass_and_one_in_a_hundred_is_warned_of(lean):
     assert warned <= 3
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 def test_directions_from_tip_to_hub_are_refused(seed):
     """Their residuals are those of right ones; the tip says which way the needle points."""
     recording, _ = drawn(seed)
@@ -57,7 +55,7 @@ def test_directions_from_tip_to_hub_are_refused(seed):
 
 
 @pytest.mark.parametrize("every", [2, 9])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_reversed_poses_are_named_and_set_aside(every, seed):
     """Half or a few of them: V is right, and the sentence lists them. Half and a lost tip may be refused instead."""
     recording, truth = drawn(seed)

@@ -34,14 +34,12 @@ def lifted(recording, w, truth):
 
 
 def in_space(rng, n, truth=None):
-    """An exact recording of n tips in a volume, and its truth."""
     truth = draw_truth(rng) if truth is None else truth
     flat = exact_recording(truth, draw_probe_poses(rng, truth, n), draw_image_poses(rng, n))
     return lifted(flat, rng.uniform(-DEEP_MM, DEEP_MM, n), truth), truth
 
 
 def noisy(rng, exact):
-    """With the noise of flanges and tip."""
     shaken = with_noise(rng, Recording(exact.A, exact.B, exact.P[:, :2]), NOISE)
     return Recording(shaken.A, shaken.B, exact.P + rng.normal(0.0, NOISE.image_mm, exact.P.shape))
 

@@ -13,15 +13,7 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.collision.bodies import surface, touch
 from puncture_twin.planning.geometry.containment import winding_number
 from puncture_twin.planning.geometry.mesh import box
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE
-from puncture_twin.twin.guidance.ultrasound.pose_choice import (
-    choose_poses,
-    configurations,
-    draw_geometry,
-    drawing,
-    expected_tre_mm,
-    find_candidates,
-)
+from puncture_twin.twin.guidance.ultrasound.pose_choice import configurations, draw_geometry, find_candidates
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, SelfcalFile, load_selfcal_case
 from puncture_twin.twin.guidance.ultrasound.two_arms import (
     TwoArms,
@@ -38,7 +30,6 @@ from puncture_twin.twin.report.scene.scene_parts import bar
 
 
 def make_case(**sections):
-    """A case with some sections changed."""
     content = SelfcalFile.model_validate({"schema": 1, "name": "room", **sections})
     return SelfcalCase(path=None, content=content, inputs=())
 
@@ -51,13 +42,11 @@ def case():
 
 @pytest.fixture(scope="module")
 def room(case):
-    """Its checker."""
     return TwoArms(case)
 
 
 @pytest.fixture(scope="module")
 def candidates(case, room):
-    """Its poses."""
     return find_candidates(case, room, np.random.default_rng(5))
 
 
@@ -71,7 +60,6 @@ def arm_surfaces(model, tool, extra=()):
 
 
 def meshes_touch(surfaces, poses):
-    """FCL on the meshes themselves, no hulls."""
     for parts, frames in zip(surfaces, poses, strict=True):
         for frame, part in parts:
             part.setTransform(fcl.Transform(frames[frame][:3, :3], frames[frame][:3, 3]))
@@ -131,18 +119,8 @@ def test_candidates_show_the_needle_in_the_image(case, room, candidates):
 
 
 def test_every_draw_is_counted(case, candidates):
-    """The reasons add up to the draws, and what can be taken is what is there."""
     assert sum(candidates.counts.values()) == case.content.poses.samples
     assert candidates.counts["ok"] == len(candidates.q_probe)
-
-
-def test_informative_poses_beat_random_ones(case, candidates):
-    """The bound of 16 chosen poses is below that of every one of 20 random choices."""
-    noise, belief, poses = SPEC_NOISE, drawing(case), candidates.poses
-    rng = np.random.default_rng(10)
-    chosen = expected_tre_mm(poses.subset(choose_poses(poses, 16, noise, belief)), noise, belief, poses)
-    sets = [rng.choice(len(poses), 16, replace=False) for _ in range(20)]
-    assert chosen < min(expected_tre_mm(poses.subset(some), noise, belief, poses) for some in sets)
 
 
 def test_the_face_stays_off_the_phantom(case):
@@ -174,7 +152,6 @@ def test_a_needle_arm_out_of_reach_is_an_answer(room):
 
 
 def test_inside_phantom_against_the_winding_number(case):
-    """The block's formula and its mesh agree away from the surface."""
     phantom = case.content.phantom
     rng = np.random.default_rng(8)
     low, high = phantom_mesh(phantom).bounds
@@ -224,18 +201,14 @@ def test_true_rooms_are_seeded_and_differ_as_asked():
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('schema = 1\nname = "x"\n[probe]\nlenght_mm = 3.0\n', "unknown_key length_mm"),
-        ('schema = 2\nname = "x"\n', "unknown_version"),
         ('schema = 1\nname = "x"\n[probe_arm]\nmodel = "ur3e"\n', "unknown_robot"),
         ('schema = 1\nname = "x"\n[needle]\nshaft_mm = 300.0\n', "out_of_range length_mm"),
         ('schema = 1\nname = "x"\n[phantom]\ntop_mm = [300.0, 0.0, 50.0]\n', "out_of_range"),
         ('schema = 1\nname = "x"\n[poses]\ninsertion_deg = [60.0, 30.0]\n', "range_descends"),
         ('schema = 1\nname = "x"\n[truth]\nclick_mm = "a lot"\n', "bad_value click_mm"),
-        ("schema = \n", "not_toml"),
     ],
 )
 def test_bad_cases_are_refused(tmp_path, text, says):
-    """Each with the key and what is allowed."""
     (tmp_path / "selfcal.toml").write_text(text)
     with refused(*says.split()):
         load_selfcal_case(tmp_path)

@@ -6,20 +6,13 @@ from refusals import refused
 from scipy import stats
 
 from puncture_twin.twin.guidance.ultrasound.image.imager import Imager, NeedleEcho, PointSpread
-from puncture_twin.twin.plant.bmode_image import (
-    Lesion,
-    NeedleInImage,
-    blurred_speckle,
-    needle_signal,
-    render,
-)
+from puncture_twin.twin.plant.bmode_image import Lesion, NeedleInImage, blurred_speckle, needle_signal, render
 
 IMAGER = Imager()
 PLAIN = NeedleEcho(roughness=0.0, tip_gain=1.0, reverberations=0, steep_loss_db=0.0)
 
 
 def needle(steep_deg, tip=(25.0, 30.0, 0.0), lean_deg=0.0):
-    """A needle from the left."""
     steep, lean = np.radians(steep_deg), np.radians(lean_deg)
     direction = np.array([np.cos(steep) * np.cos(lean), np.sin(steep) * np.cos(lean), np.sin(lean)])
     return NeedleInImage(np.array(tip), direction)
@@ -34,7 +27,6 @@ def speckle(rng, count):
 
 @pytest.fixture(scope="module")
 def fields():
-    """Enough speckle for its statistics."""
     return speckle(np.random.default_rng(1), 12)
 
 
@@ -139,7 +131,6 @@ def test_shadow_and_lesion_darken():
 
 
 def test_pictures_are_seeded():
-    """The same seed gives the same picture, another seed another."""
     first, again, other = (render(IMAGER, needle(45.0), np.random.default_rng(seed)) for seed in (1, 1, 2))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
@@ -154,13 +145,11 @@ def test_pictures_are_seeded():
     ],
 )
 def test_unusable_needles_are_refused(bad):
-    """Not finite, no unit direction, or no 3D point."""
     with refused("not_finite"):
         render(IMAGER, bad, np.random.default_rng(0))
 
 
 def test_point_spread_widens():
-    """Both widths grow with depth, from the stated ones at the face."""
     spread = PointSpread()
     depth = np.array([0.0, 30.0, 60.0])
     assert (np.diff(spread.axial_sigma(depth)) > 0).all()
