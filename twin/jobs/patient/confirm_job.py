@@ -415,8 +415,8 @@ def _draw_frame(axes: Axes, done: Confirmed, plane: Plane) -> None:
     axes.tick_params(labelsize=7)
     for at, toward in EDGES.items():
         letter = letters(done.context.case.space, toward[0] * plane.right + toward[1] * plane.up)
-        look = {"color": "white", "ha": "center", "va": "center", "weight": "bold", "path_effects": halo(3, "black")}
-        axes.text(*at, letter, transform=axes.transAxes, **look)
+        look: dict[str, Any] = {"color": "white", "ha": "center", "va": "center", "weight": "bold"}
+        axes.text(*at, letter, transform=axes.transAxes, path_effects=halo(3, "black"), **look)
 
 
 class Learned(NamedTuple):
