@@ -48,8 +48,10 @@ def number(value: float | None, digits: int = 1, unit: str = "") -> str:
 
 
 def percent(fraction: float) -> str:
-    """A share 0..1 in percent; what is there never reads as zero."""
-    return "<0.1 %" if 0 < fraction < 0.0005 else f"{100 * fraction:.1f} %"
+    """A fraction 0..1 in percent; what is there never reads as zero, nor what lacks something as all."""
+    if 0 < fraction < 0.0005:
+        return "<0.1 %"
+    return ">99.9 %" if 0.9995 <= fraction < 1 else f"{100 * fraction:.1f} %"
 
 
 def vector(values: Iterable[float | None], digits: int, unit: str = "") -> str:

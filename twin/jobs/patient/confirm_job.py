@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -160,7 +160,6 @@ class Confirmed(Shown):
         """What terminal and page show; of structures so many, or all."""
         needle, tie, said = self.needle, self.tie, self.predicted()
         at_target = self.against(self.context.case.target_ct, needle.forward_ct)
-        split = "tip {tip_mm:.1f} mm off: {lateral_mm:.1f} across, {depth_mm:+.1f} along"
         rows = [
             ("tip", f"{vector(needle.tip_ct.tolist(), 1, 'mm')}, ± {needle.tip_sd_mm:.2f} mm (sd, worst direction)"),
             ("direction", f"{vector(needle.forward_ct.tolist(), 3)}, ± {np.degrees(needle.axis_sd):.2f}°"),
@@ -169,11 +168,11 @@ class Confirmed(Shown):
                 "frames",
                 f"tied by {tie.how}, residual {tie.residual_mm:.2f} mm (rms), ± {tie.sd_mm:.2f} mm at the target",
             ),
-            ("against the target", split.format(**at_target)),
+            ("against the target", _off_text(at_target)),
         ]
         if self.plan is not None:
             of_plan = self.against(self.plan.target_ct, -self.plan.outward_ct)
-            rows.append(("against the plan", f"{split.format(**of_plan)}; direction {of_plan['angle_deg']:.1f}° off"))
+            rows.append(("against the plan", f"{_off_text(of_plan)}; direction {of_plan['angle_deg']:.1f}° off"))
         if said is not None:
             inside = "{deviations:.1f} of {region_deviations:.1f} deviations".format(**said)
             where = "inside" if said["inside"] else "outside"
@@ -191,6 +190,12 @@ class Confirmed(Shown):
         named = f": {line.structure}" if line.structure else ""
         unsure = ", its margin may be broken by what the reading errs" if line.verdict == UNCERTAIN else ""
         return f"not safe, {line.verdict}{named}{unsure}"
+
+
+def _off_text(off: Mapping[str, float]) -> str:
+    """How a tip misses a point, in the words of who holds the needle."""
+    depth = f"{abs(off['depth_mm']):.1f} {'short' if off['depth_mm'] < 0 else 'too deep'}"
+    return f"tip {off['tip_mm']:.1f} mm off: {off['lateral_mm']:.1f} across, {depth}"
 
 
 LINE_TEXT = (
@@ -327,15 +332,17 @@ def _write_page(done: Confirmed, folder: Path) -> None:
     best, line = done.aims[0], done.line
     cards = [
         Card("line", line.verdict, line.structure, not line.safe),
-        Card("next", best.kind, aim_text(best), best.kind == "withdraw"),
+        Card("next", best.kind, aim_text(best).removeprefix("accept"), best.kind == "withdraw"),
         Card("chance to hit now", percent(next((one.p_hit for one in done.aims if one.kind == "accept"), 0.0)), ""),
     ]
-    warned = [present.Warn(tuple(one.sentence for one in done.findings))] if done.findings else []
+    warned = (
+        [Section("warnings", [present.Warn(tuple(one.sentence for one in done.findings))])] if done.findings else []
+    )
     shown = present.picture(folder / PICTURE, "slices along the needle")
-    picture = Section("slices of the control scan", [shown, *warned, PICTURE_TEXT])
+    sections = [*warned, *done.sections(), Section("slices of the control scan", [shown, PICTURE_TEXT])]
     inputs = (*done.read, *done.context.case.inputs)
-    under = f"{done.context.case.name}: the needle in the control scan"
-    present.write_page(folder / PAGE, "Confirmation", under, cards, [*done.sections(), picture], inputs,
+    under = f"{done.context.case.name}: the needle in the control scan."
+    present.write_page(folder / PAGE, "Confirmation", under, cards, sections, inputs,
                        origin=present.origin_section(None))  # fmt: skip
 
 
