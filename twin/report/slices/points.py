@@ -52,7 +52,8 @@ def write_points_sheet(
     sheet = Image.new("RGB", (max(640, GAP + across * (width + 2 * GAP)), 70 + rows * height), (255, 255, 255))
     draw = ImageDraw.Draw(sheet)
     write(draw, (GAP, 8), title, size=18, bold=True)
-    under = "Left: axial, the patient's right on the left. Right: sagittal, the back to the right. Lines: the skin."
+    under = "Left: axial, the patient's right on the left. Right: sagittal, the back to the right."
+    under += f" Each {2 * half_mm:g} mm wide. Lines: the skin."
     write(draw, (GAP, 36), under, size=13, colour=FAINT)
     for number, one in enumerate(points):
         left, top = GAP + (number % ACROSS) * (width + 2 * GAP), 64 + (number // ACROSS) * height
