@@ -436,13 +436,13 @@ def write_points(points: Points, path: Path | str) -> None:
 
 @checked
 def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS", up: str | None = None) -> TriangleMesh:
-    """One surface from STL, OBJ, PLY, VTP or VTK, in mm and LPS (or its own frame), checked against its own promises.
+    """One surface from STL, OBJ, PLY, GLB or VTP, in mm and LPS (or its own frame), checked against its own promises.
 
     Args:
         path: The file; nothing about unit or space is taken from it.
         unit: ``mm``, ``cm`` or ``m``: of its coordinates.
         space: ``LPS``, ``RAS`` or ``local``: of its coordinates.
-        up: ``y`` or ``z``, its axis that is up.
+        up: ``y`` or ``z``, its axis that is up; of GLB it must be stated.
 
     Raises:
         InputError: It is cut, contradicts itself, is empty, or has coordinates that are no finite numbers.
@@ -846,7 +846,7 @@ def batch(
     from puncture_twin.twin.jobs.batch.jobs import merge_cohort, plan_cohort
 
     out, watcher = check_writable(folder), Silent()
-    plan_cohort(Path(cohort), out, arm=arm, watcher=watcher)
+    plan_cohort(Path(cohort), out, arm=arm, dry=False, watcher=watcher)
     run_cohort(out, Request(jobs=jobs), watcher, run_here if jobs == 1 else None)
     return merge_cohort(out, None if expect is None else Path(expect), tolerance_mm, watcher)
 

@@ -95,6 +95,18 @@ def die_at_one(context, found, folder):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+def sleep(context, found, folder):
+    """Code that never comes to an end."""
+    time.sleep(600)
+
+
+def eat(context, found, folder):
+    """Code that takes memory, and holds it."""
+    held = bytearray(3_000_000_000)
+    held[::4096] = b"x" * len(held[::4096])
+    time.sleep(60)
+
+
 def fail(context, found, folder):
     """A bug."""
     raise ZeroDivisionError("a bug")

@@ -13,7 +13,6 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from multiprocessing.connection import Connection, wait
 from types import MappingProxyType
 from typing import Any
 
@@ -36,7 +35,7 @@ def worker_count(wanted: int, pieces: int) -> int:
     return max(1, min(wanted, cores, pieces))
 
 
-def _begin_worker(stop: Connection) -> None:
+def _begin_worker() -> None:
     """Ctrl-C is the command's, which ends its workers; and no worker outlives a command that was killed.
 
     What a library prints goes to standard error: standard output is the command's answer.
@@ -45,29 +44,23 @@ def _begin_worker(stop: Connection) -> None:
     os.dup2(2, 1)
     command = multiprocessing.parent_process()
     assert command is not None
-    threading.Thread(target=_end_with, args=([command.sentinel, stop],), daemon=True).start()
+    threading.Thread(target=_end_with, args=(command,), daemon=True).start()
 
 
-def _end_with(either: list[Any]) -> None:
-    wait(either)
+def _end_with(command: Any) -> None:
+    command.join()
     os._exit(1)
 
 
 @contextmanager
 def process_pool(jobs: int, pieces: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of `worker_count` spawned processes, which end at once where the block ends early, as by Ctrl-C."""
+    """A pool of `worker_count` spawned processes; where the block ends early, as by Ctrl-C, nothing more begins."""
     context = multiprocessing.get_context("spawn")
-    stop, held = context.Pipe(duplex=False)
-    count = worker_count(jobs, pieces)
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin_worker, initargs=(stop,))
-    with stop, held:
-        try:
-            yield pool
-        except BaseException:
-            held.close()  # which every worker sees
-            raise
-        finally:
-            pool.shutdown(cancel_futures=True)
+    pool = ProcessPoolExecutor(worker_count(jobs, pieces), mp_context=context, initializer=_begin_worker)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 @contextmanager

@@ -35,7 +35,13 @@ MAX_FILE_BYTES = 200_000_000
 
 @dataclass(frozen=True)
 class CohortCase:
-    """One case with its options."""
+    """One case with its options.
+
+    Attributes:
+        path: The case file, or the folder that holds ``case.toml``.
+        name: What people call it; "" leaves it to the case.
+        options: What is stated in place of what the case states.
+    """
 
     stated: str
     path: Path
@@ -87,7 +93,11 @@ def _listed_cases(path: Path) -> tuple[list[CohortCase], tuple[Input, ...]]:
 
 
 def _folder_cases(cohort: Path) -> list[CohortCase]:
-    """Every case file below a folder, also behind links, each folder once; none that cannot be looked into."""
+    """Every case file below a folder, also behind links to folders, each folder once; none that cannot be looked into.
+
+    Raises:
+        InputError: A folder that cannot be read, or a link to nothing next to folders: a patient would be lost.
+    """
     found, seen = [], set[str]()
     for folder, below, files in os.walk(cohort, followlinks=True, onerror=_refuse_unreadable):
         real = os.path.realpath(folder)
@@ -120,7 +130,11 @@ LONGEST_CELL = 20_000
 
 
 def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
-    """The cases that a CSV lists."""
+    """The cases that a CSV lists.
+
+    Raises:
+        InputError: No column ``case``, an unknown column, or a line that cannot be used; names the line.
+    """
     rows = _rows(content, path)
     header = _header(next(rows, []), path)
     cases = []
@@ -231,7 +245,11 @@ class _Choice(NamedTuple):
 
 
 def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
-    """The cases that a cohort file describes: every match of its patterns with every combination of its options."""
+    """The cases that a cohort file describes: every match of its patterns with every combination of its options.
+
+    Raises:
+        InputError: Not of this schema, a pattern that matches nothing, or too many combinations.
+    """
     stated = parse_toml(content, path, CohortFile, allowed=ALLOWED_TOML, keys=KEYS)
     found = _matches(stated.cases, path)
     axes = [axis for name, kind in AXES.items() if (axis := _axis(getattr(stated, name), name, kind, path))]

@@ -68,7 +68,11 @@ def write_dataset(rows: Sequence[dict[str, Any]], out: Path, folder: Path, progr
 
 
 def union_schema(schemas: Sequence[pa.Schema], where: Path) -> pa.Schema:
-    """Every column of any, in the order of their first tables."""
+    """Every column of any, in the order of their first tables.
+
+    Raises:
+        InputError: A column of two types.
+    """
     fields: dict[str, pa.Field] = {}
     for schema in schemas:
         for one in schema:
@@ -175,7 +179,12 @@ CaseKey = tuple[str, str, int]
 
 
 class CaseChange(NamedTuple):
-    """One case in two cohorts."""
+    """One case in two cohorts.
+
+    Attributes:
+        before: The case's row in the first; None where it is not there.
+        after: The second cohort's row of the case.
+    """
 
     case: str
     options: str
@@ -207,7 +216,11 @@ class CaseChange(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two cohorts compared, case by case."""
+    """Two cohorts compared, case by case.
+
+    Attributes:
+        changes: In the order of the second, then what only the first has.
+    """
 
     changes: tuple[CaseChange, ...]
 
@@ -235,6 +248,9 @@ def compare(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, An
 
 def read_cases(place: Path) -> list[dict[str, Any]]:
     """The rows of a merged cohort.
+
+    Args:
+        place: Its folder, or its ``cases.parquet``.
 
     Raises:
         InputError: There is none, or it is something else.

@@ -14,7 +14,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -71,12 +71,27 @@ class PlannedCase:
     refusal: str
 
 
-SCHEMA = pa.schema((one.name, pa.bool_() if one.name == "arm" else pa.string()) for one in fields(PlannedCase))
+SCHEMA = pa.schema(
+    [
+        ("case", pa.string()),
+        ("id", pa.string()),
+        ("name", pa.string()),
+        ("path", pa.string()),
+        ("options", pa.string()),
+        ("arm", pa.bool_()),
+        ("inputs", pa.string()),
+        ("refusal", pa.string()),
+    ]
+)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A cohort's plan."""
+    """A cohort's plan.
+
+    Attributes:
+        version: Of this package, when it was made.
+    """
 
     cases: tuple[PlannedCase, ...]
     sha256: str
@@ -84,7 +99,11 @@ class Plan:
 
 
 def case_id(options: str, arm: bool | None, inputs: Sequence[Input], refusal: str) -> str:
-    """The id of a case: the same bytes, options and version give the same id, wherever the files lie."""
+    """The id of a case: the same bytes, options and version give the same id, wherever the files lie.
+
+    Args:
+        refusal: Why it cannot be read, or "".
+    """
     stated = [(one.role, "" if one.role == CASE_ROLE else one.path, one.sha256) for one in inputs]
     decides = {"version": version("puncture-twin"), "options": options, "arm": arm, "refusal": refusal}
     text = json.dumps({**decides, "inputs": sorted(stated)}, sort_keys=True)

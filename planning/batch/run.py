@@ -1,4 +1,4 @@
-"""Runs of a cohort: all of it or a part ``i/n``, on this machine or a scheduler's; and its state.
+"""Runs of a cohort: all of it or a part ``i/n``, on this machine or a scheduler's; its state, and an estimate.
 
 Cases are run by one process at a time until each has a row; what has one is left as it is.
 
@@ -13,8 +13,11 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import resource
 import shutil
+import tempfile
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
@@ -38,9 +41,11 @@ from puncture_twin.planning.batch.plan import (
     read_row,
 )
 from puncture_twin.planning.batch.run_case import (
+    NO_LIMITS,
     WORKER_DIED,
     CaseEnd,
     CaseTask,
+    Limits,
     WritePage,
     failed,
     run_case,
@@ -105,7 +110,7 @@ def slurm_part(environment: Mapping[str, str]) -> Part | None:
     return Part(place + 1, count)
 
 
-RunTasks = Callable[[Sequence[CaseTask]], Generator[CaseEnd, None, None]]
+RunTasks = Callable[[Sequence[CaseTask], Limits], Generator[CaseEnd, None, None]]
 """Runs cases somewhere, and yields how each ended."""
 
 LOCK_NAME = ".puncture-twin-run-lock"
@@ -114,10 +119,16 @@ ALLOWED_AT_ONCE = "one run at a time, parallel parts (--part i/n), or another fo
 
 @dataclass(frozen=True)
 class Request:
-    """Cases to be run, and how."""
+    """Cases to be run, and how.
+
+    Attributes:
+        jobs: Processes of this machine, at most one a core.
+        write_page: Writes a page for each case that is searched, or None.
+    """
 
     part: Part = WHOLE
     jobs: int = 1
+    limits: Limits = NO_LIMITS
     write_page: WritePage | None = None
 
 
@@ -202,8 +213,8 @@ def distinct(cases: Iterable[PlannedCase]) -> list[PlannedCase]:
 
 def _ends(tasks: Sequence[CaseTask], request: Request, elsewhere: RunTasks | None) -> Generator[CaseEnd, None, None]:
     if elsewhere is not None:
-        return elsewhere(tasks)
-    return run_tasks(tasks, worker_count(request.jobs, len(tasks)))
+        return elsewhere(tasks, request.limits)
+    return run_tasks(tasks, worker_count(request.jobs, len(tasks)), request.limits)
 
 
 def _stored_row(planned: PlannedCase, out: Path, work: Path) -> dict[str, Any] | None:
@@ -256,6 +267,46 @@ def _locked(out: Path, name: str, kind: int) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+COPIES = 2
+"""Of each table: the case's own, and that of the merged dataset."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimated time, memory and disk of a cohort.
+
+    Attributes:
+        refused: That cannot be read.
+        sample: The case that was measured, as the cohort writes it; None where none can be read.
+        seconds: A case, in a worker that is warm.
+        disk_bytes: Of all cases, run and merged.
+        memory_bytes: Of one worker, at its most.
+    """
+
+    cases: int
+    refused: int
+    sample: str | None = None
+    seconds: float = 0.0
+    disk_bytes: int = 0
+    memory_bytes: int = 0
+
+
+def estimate(cases: Sequence[PlannedCase]) -> Estimate:
+    """Estimate a cohort from its first case that can be read, run twice, the second time warm."""
+    readable = [one for one in cases if not one.refusal]
+    refused = len(cases) - len(readable)
+    if not readable:
+        return Estimate(len(cases), refused)
+    for _ in range(2):
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.perf_counter()
+            run_case(CaseTask(readable[0], Path(folder), Path(folder)))
+            seconds = time.perf_counter() - start
+            size = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return Estimate(len(cases), refused, readable[0].case, seconds, COPIES * size * len(readable), peak)
 
 
 @dataclass
@@ -351,13 +402,19 @@ class _WorkerCache:
 def on_scheduler(address: str) -> RunTasks:
     """Make a function that runs cases on a scheduler's workers.
 
+    Args:
+        address: Such as ``tcp://10.0.0.1:8786``.
+
     Raises:
         InputError: The extra ``dask`` is not installed.
     """
     require_extra("dask", "--scheduler")
     import distributed
 
-    def run(tasks: Sequence[CaseTask]) -> Generator[CaseEnd, None, None]:
+    def run(tasks: Sequence[CaseTask], limits: Limits) -> Generator[CaseEnd, None, None]:
+        if limits != NO_LIMITS:
+            what = "Dask's workers limit the memory and time of a case"
+            refuse(what, "--scheduler", "only dask worker --memory-limit", "dask_limits")
         try:
             library: Any = distributed
             client = library.Client(address, timeout=CONNECT_S, set_as_default=False)

@@ -1,26 +1,33 @@
-"""One case as a pure function, its files in, its result's folder out; and the processes that run many.
+"""One case as a pure function, its files in, its result's folder out; and the worker that runs one after the other.
 
-A worker that dies costs the case that it was at one of two tries, and nothing else.
+Workers of this machine: one that dies is replaced, and the case it died of is tried once more.
+
+`concurrent.futures` and joblib give up the whole pool when one process dies; here a death costs one case one try. The
+memory of a worker is watched from outside (its resident set), not limited by the system's address space: compiled code
+and its threads reserve many times what they use.
 """
 
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
 import shutil
+import signal
+import threading
+import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
-from dataclasses import dataclass, replace
-from itertools import groupby
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, NO_MEMORY, Memory
-from puncture_twin.planning.base.errors import InputError, one_line
+from puncture_twin.planning.base.errors import InputError, one_line, refuse
 from puncture_twin.planning.base.output.output_set import disk_is_full
-from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.base.progress import Stages
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
 from puncture_twin.planning.batch.merge import blank_row, searched_row
@@ -48,10 +55,19 @@ WritePage = Callable[[CaseContext, Candidates, Path], None]
 
 BAD_INPUT = 2
 
+READY = "ready"
+"""A worker's first message: its modules are loaded."""
+
 
 @dataclass(frozen=True)
 class CaseTask:
-    """One case to be run, with all that a worker needs."""
+    """One case to be run, with all that a worker needs.
+
+    Attributes:
+        work: For what is being written, on the same file system.
+        write_page: Writes the case's page too, or None.
+        attempt: 1, or 2 after a worker has died of it.
+    """
 
     planned: PlannedCase
     out: Path
@@ -79,7 +95,11 @@ STALE = "its files differ from those of the plan"
 
 
 def run_case(task: CaseTask, memory: Memory = NO_MEMORY) -> CaseEnd:
-    """Search a case and commit its result; nothing is done where there is a final one."""
+    """Search a case and commit its result; nothing is done where there is a final one.
+
+    Args:
+        memory: What this process keeps from one case to the next.
+    """
     known = ended(task)
     if known is not None and known.exit_code != PROGRAM_FAILED:
         return known
@@ -101,7 +121,7 @@ def ended(task: CaseTask) -> CaseEnd | None:
 
 
 def failed(task: CaseTask, reason: str) -> CaseEnd:
-    """Commit the row of a case that no worker survived, unless it had just ended."""
+    """Commit the row of a case that no worker survived, or that ran into a limit, unless it had just ended."""
     end = ended(task)
     if end is not None:
         return end
@@ -159,70 +179,227 @@ def _committed(
     return CaseEnd(task.planned.id, row["exit_code"], row["reason"])
 
 
-def run_here(tasks: Iterable[CaseTask]) -> Generator[CaseEnd, None, None]:
-    """Run cases in this process; yields how each ended."""
+def run_here(tasks: Sequence[CaseTask], limits: object) -> Generator[CaseEnd, None, None]:
+    """Run cases in this process, which no limit holds for; yields how each ended."""
+    del limits
     memory = Memory(MEMORY_BYTES)
     for task in tasks:
         yield run_case(task, memory)
 
 
-WORKER_DIED = "worker_died"
-"""The reason of a row that no worker could write."""
+def work(connection: Connection, memory_bytes: int) -> None:
+    """Run tasks from the queue until none is left.
 
-CHUNK = 8
-"""Cases of one folder, a guess at the patient, that a worker runs one after the other, the patient in its memory."""
-
-Chunk = list[CaseTask]
-
-
-def chunks(tasks: Iterable[CaseTask]) -> Iterator[Chunk]:
-    """Neighbours of one folder, at most `CHUNK` of them together."""
-    for _, near in groupby(tasks, lambda task: Path(task.planned.path).parent):
-        of_folder = list(near)
-        for first in range(0, len(of_folder), CHUNK):
-            yield of_folder[first : first + CHUNK]
-
-
-def run_tasks(tasks: Iterable[CaseTask], jobs: int) -> Generator[CaseEnd, None, None]:
-    """Run cases in processes of this machine; yields how each ended.
-
-    A pool ends with the first of its workers that dies. What was at work then is tried once more, each case in a pool
-    of its own, so that a second death tells whose it is; then a new pool takes the rest.
+    Args:
+        connection: Gives `CaseTask`, takes `READY` and then a `CaseEnd` for each.
+        memory_bytes: What is kept from one case to the next.
     """
-    waiting = deque(chunks(tasks))
-    while waiting:
-        for chunk in (yield from _in_pool(waiting, jobs)):
-            yield from _after_death(chunk, waiting)
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    memory = Memory(memory_bytes)
+    connection.send(READY)
+    while True:
+        try:
+            task: CaseTask = connection.recv()
+        except EOFError:
+            return
+        connection.send(run_case(task, memory))
 
 
-def _in_pool(waiting: deque[Chunk], jobs: int) -> Generator[CaseEnd, None, list[Chunk]]:
-    """Run what waits in one pool, until all is done or a worker dies; returns what was at work then."""
-    at_work: dict[Future[list[CaseEnd]], Chunk] = {}
-    with process_pool(jobs, len(waiting)) as pool, suppress(BrokenProcessPool):
-        while waiting or at_work:
-            while waiting and len(at_work) < jobs:
-                at_work[pool.submit(_run_chunk, waiting[0])] = waiting[0]
-                waiting.popleft()
-            for done in wait(at_work, return_when=FIRST_COMPLETED).done:
-                yield from done.result()
-                del at_work[done]
-    return list(at_work.values())
+def _leave_with_parent() -> None:
+    """A worker without its main process would write on while the next run begins."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
 
 
-def _run_chunk(chunk: Chunk) -> list[CaseEnd]:
-    return list(run_here(chunk))
+WORKER_DIED, TIMED_OUT, OUT_OF_MEMORY = "worker_died", "timed_out", "out_of_memory"
+"""Reasons of the rows that no worker could write."""
+
+TRIES = 2
+"""Tries of a case whose worker dies."""
+
+LOOK_EVERY_S = 0.2
+"""Seconds between two checks of memory and time."""
+
+STATM = "/proc/{}/statm"
+SPAWN = multiprocessing.get_context("spawn")
 
 
-def _after_death(chunk: Chunk, waiting: deque[Chunk]) -> Generator[CaseEnd, None, None]:
-    """The ends of what a dead worker had done, and of the case that it was at; the cases behind that one wait again."""
-    for number, task in enumerate(chunk):
-        end = ended(task)
-        if end is not None:
-            yield end
-            continue
-        again = replace(task, attempt=2)
-        if (yield from _in_pool(deque([[again]]), 1)):
-            yield failed(again, WORKER_DIED)
-        if chunk[number + 1 :]:
-            waiting.appendleft(chunk[number + 1 :])
-        return
+class Limits(NamedTuple):
+    """Time and memory limits of one case.
+
+    Attributes:
+        memory_mb: Resident set of its worker, 10^6 bytes; None sets no limit.
+        timeout_s: From when a warm worker begins; None sets no limit.
+    """
+
+    memory_mb: int | None = None
+    timeout_s: float | None = None
+
+
+NO_LIMITS = Limits()
+
+
+@dataclass
+class _Worker:
+    """A process and the case that it runs."""
+
+    process: SpawnProcess
+    connection: Connection
+    task: CaseTask
+    ready: bool = False
+    since: float = field(default_factory=time.monotonic)
+
+    def give(self, task: CaseTask) -> None:
+        """Hand a case to the worker; one that has just died is noticed by its sentinel."""
+        self.task, self.since = task, time.monotonic()
+        with suppress(OSError):
+            self.connection.send(task)
+
+    def end(self) -> None:
+        """Kill the process."""
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+
+
+class TaskQueue:
+    """Cases in groups: a worker that has a group's patient in memory gets the next case of that group.
+
+    Args:
+        tasks: What is to be done; neighbours of one folder are one group.
+    """
+
+    def __init__(self, tasks: Iterable[CaseTask]) -> None:
+        self._groups: dict[str, deque[CaseTask]] = {}
+        for task in tasks:
+            self._groups.setdefault(group_of(task), deque()).append(task)
+        self._taken: set[str] = set()
+
+    def __bool__(self) -> bool:
+        return bool(self._groups)
+
+    def next(self, last: CaseTask | None) -> CaseTask:
+        """The next case for a worker: of its last one's group, of one that nobody is at, or of any."""
+        mine = None if last is None else group_of(last)
+        fresh = (name for name in self._groups if name not in self._taken)
+        name = mine if mine in self._groups else next(fresh, next(iter(self._groups)))
+        self._taken.add(name)
+        task = self._groups[name].popleft()
+        if not self._groups[name]:
+            del self._groups[name]
+        return task
+
+    def again(self, task: CaseTask) -> None:
+        """Requeue a case before the others of its group."""
+        self._groups.setdefault(group_of(task), deque()).appendleft(task)
+
+
+def group_of(task: CaseTask) -> str:
+    """Folder of a case's files: a guess at the patient, which decides which worker runs it and nothing else."""
+    return str(Path(task.planned.path).parent)
+
+
+def run_tasks(tasks: Iterable[CaseTask], jobs: int, limits: Limits) -> Generator[CaseEnd, None, None]:
+    """Run cases in workers; yields how each ended, as they end.
+
+    Raises:
+        InputError: Memory cannot be watched on this system.
+    """
+    if limits.memory_mb is not None and not Path(STATM.format(os.getpid())).exists():
+        refuse("memory cannot be monitored on this system", "--memory-mb", "a system with /proc", "memory_not_watched")
+    queue, workers = TaskQueue(tasks), list[_Worker]()
+    try:
+        while queue or workers:
+            while queue and len(workers) < jobs:
+                with _without_interrupt():  # until the worker is listed: one that is not would be left alone
+                    workers.append(_started(queue.next(None), limits))
+            for worker in _spoken(workers):
+                yield from _heard(worker, workers, queue)
+            for worker in list(workers):
+                reason = _beyond(worker, limits)
+                if reason:
+                    workers.remove(worker)
+                    worker.end()
+                    yield failed(worker.task, reason)
+    finally:
+        for worker in workers:
+            worker.end()
+
+
+def _started(task: CaseTask, limits: Limits) -> _Worker:
+    """A new process that begins with a case as soon as its modules are loaded."""
+    ours, theirs = SPAWN.Pipe()
+    kept = MEMORY_BYTES if limits.memory_mb is None else min(MEMORY_BYTES, limits.memory_mb * 1_000_000 // 4)
+    process = SPAWN.Process(target=work, args=(theirs, kept), daemon=True)
+    process.start()
+    theirs.close()
+    return _Worker(process, ours, task)
+
+
+@contextmanager
+def _without_interrupt() -> Iterator[None]:
+    """Put Ctrl-C off; a process that is started within never sees it, and the main process ends it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _spoken(workers: list[_Worker]) -> list[_Worker]:
+    """Workers that have sent something, or have died."""
+    handles = [handle for one in workers for handle in (one.connection, one.process.sentinel)]
+    found = wait(handles, timeout=LOOK_EVERY_S)
+    return [one for one in workers if one.connection in found or one.process.sentinel in found]
+
+
+def _heard(worker: _Worker, workers: list[_Worker], queue: TaskQueue) -> Iterator[CaseEnd]:
+    """Handle a worker's message and its next case; or its death."""
+    try:
+        message = worker.connection.recv() if worker.connection.poll() else None
+    except (EOFError, OSError):
+        message = None
+    if message == READY:
+        worker.ready = True
+        worker.give(worker.task)
+    elif isinstance(message, CaseEnd):
+        yield message
+        if queue:
+            worker.give(queue.next(worker.task))
+        else:
+            workers.remove(worker)
+            worker.end()
+    elif not worker.process.is_alive():
+        workers.remove(worker)
+        worker.end()
+        yield from _died(worker.task, queue)
+
+
+def _died(task: CaseTask, queue: TaskQueue) -> Iterator[CaseEnd]:
+    """Requeue the case of a dead worker, or write its row; a result from before the death counts."""
+    if task.attempt < TRIES and ended(task) is None:
+        queue.again(replace(task, attempt=task.attempt + 1))
+    else:
+        yield failed(task, WORKER_DIED)
+
+
+def _beyond(worker: _Worker, limits: Limits) -> str:
+    """The limit that a worker's case has passed; "" where none."""
+    if not worker.ready:
+        return ""
+    if limits.timeout_s is not None and time.monotonic() - worker.since > limits.timeout_s:
+        return TIMED_OUT
+    if limits.memory_mb is not None and resident_bytes(worker.process.pid or 0) > limits.memory_mb * 1_000_000:
+        return OUT_OF_MEMORY
+    return ""
+
+
+def resident_bytes(process: int) -> int:
+    """Memory of a process; 0 where it is gone."""
+    try:
+        pages = Path(STATM.format(process)).read_text(encoding="ascii").split()[1]
+    except (OSError, IndexError):
+        return 0
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")

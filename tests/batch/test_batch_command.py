@@ -31,6 +31,18 @@ def said(capfd, code, *words):
     return capfd.readouterr()
 
 
+def test_a_dry_run_measures_and_writes_nothing(tmp_path, capfd):
+    """How many, how long, how much memory and disk."""
+    write_cohort(tmp_path / "c", 3)
+    words = ("batch", "plan", tmp_path / "c", "--out", tmp_path / "out", "--no-arm", "--dry-run", "--jobs", "2")
+    lines = said(capfd, 0, *words).out.splitlines()
+    assert lines[0] == "3 cases, 0 already with a row" and "p2/case.toml" in lines[1]
+    assert (
+        lines[2].startswith("measured at p0/case.toml: 0.") and "MB of memory" in lines[3] and "MB of disk" in lines[3]
+    )
+    assert not (tmp_path / "out").exists()
+
+
 def test_ctrl_c_stops_with_130_and_a_second_run_continues(planned):
     """What is done stays; no worker, no draft is left; nothing is said but that it was interrupted."""
     for number in range(3, 40):

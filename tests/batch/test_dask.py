@@ -15,6 +15,7 @@ from refusals import refused
 from puncture_twin.planning.base.progress import Silent
 from puncture_twin.planning.batch.plan import read_plan_table
 from puncture_twin.planning.batch.run import Request, on_scheduler, run_cohort
+from puncture_twin.planning.batch.run_case import Limits
 from puncture_twin.run_twin import main
 
 TIME_LIMIT_S = 300.0
@@ -88,7 +89,7 @@ def test_a_killed_worker_costs_no_case_and_none_is_committed_twice(scheduler, tm
 
 
 def test_no_scheduler_is_one_line(tmp_path, monkeypatch, capfd):
-    """Nobody answers, or it is no address."""
+    """Nobody answers, or it is no address; limits are Dask's own."""
     write_cohort(tmp_path / "c", 2)
     out = tmp_path / "out"
     assert main(["batch", "plan", str(tmp_path / "c"), "--out", str(out), "--no-arm"]) == 0
@@ -96,3 +97,5 @@ def test_no_scheduler_is_one_line(tmp_path, monkeypatch, capfd):
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
         with refused("no_scheduler"):
             run_cohort(out, Request(), Silent(), on_scheduler(address))
+    with refused("dask_limits"):
+        run_cohort(out, Request(limits=Limits(1000, None)), Silent(), on_scheduler("tcp://127.0.0.1:1"))

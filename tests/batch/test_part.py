@@ -73,4 +73,11 @@ def test_the_array_of_the_page_is_a_script_that_runs_its_part():
     assert words[:3] == ["run-twin", "batch", "run"]
     command = typer.main.get_command(app).commands["batch"].commands["run"]
     parsed = command.make_context("run", words[3:], resilient_parsing=True).params
-    assert (parsed["jobs"], parsed["part"], str(parsed["out_dir"])) == (4, None, "/shared/cohort")
+    assert (parsed["jobs"], parsed["memory_mb"], parsed["part"], str(parsed["out_dir"])) == (
+        4,
+        3500,
+        None,
+        "/shared/cohort",
+    )
+    memory_mb = int(directives["mem"].removesuffix("G")) * 1000
+    assert parsed["jobs"] * parsed["memory_mb"] < memory_mb

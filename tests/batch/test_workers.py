@@ -1,4 +1,4 @@
-"""Workers that die: one case costs one row, and the others go on."""
+"""Workers that die, hang, or take too much: one case costs one row, and the others go on."""
 
 import cohort_world
 import pytest
@@ -8,7 +8,7 @@ from refusals import refused
 from puncture_twin.planning.base.progress import Silent
 from puncture_twin.planning.batch.plan import read_plan_table
 from puncture_twin.planning.batch.run import Part, Request, run_cohort, running
-from puncture_twin.planning.batch.run_case import CHUNK
+from puncture_twin.planning.batch.run_case import NO_LIMITS, Limits
 from puncture_twin.run_twin import main
 
 
@@ -19,8 +19,8 @@ def planned(tmp_path):
     out = tmp_path / "out"
     assert main(["batch", "plan", str(tmp_path / "c"), "--out", str(out), "--no-arm"]) == 0
 
-    def run(write_page=None, **keys):
-        counts = run_cohort(out, Request(write_page=write_page, **keys), Silent())
+    def run(write_page=None, limits=NO_LIMITS, **keys):
+        counts = run_cohort(out, Request(write_page=write_page, limits=limits, **keys), Silent())
         assert not list(out.glob(".puncture-twin-cases-*"))
         return counts
 
@@ -50,6 +50,20 @@ def test_a_worker_that_dies_once_costs_nothing_but_time(planned):
     assert run(cohort_world.die_once).ended == {0: 2, 2: 1}
     ids = [one.id for one in read_plan_table(out).cases]
     assert [timings(out / one)["attempt"] for one in ids] == [2, 2, 1]
+
+
+@pytest.mark.parametrize(
+    ("page", "limits", "reason"),
+    [
+        (cohort_world.sleep, Limits(timeout_s=4.0), "timed_out"),
+        (cohort_world.eat, Limits(memory_mb=1500), "out_of_memory"),
+    ],
+)
+def test_a_case_beyond_a_limit_is_stopped(planned, page, limits, reason):
+    """With its reason, and the refused one is reached."""
+    out, run = planned
+    assert run(page, limits).reasons[reason] == 2
+    assert [code for code, _ in rows(out)] == [3, 3, 2]
 
 
 def test_a_full_disk_stops_the_run_with_one_line(planned):
@@ -84,17 +98,3 @@ def test_the_same_case_twice_is_run_once(tmp_path, capfd):
     assert main(["batch", "run", "--out", str(tmp_path / "out")]) == 0
     assert "2 cases: 1 the same as other cases, 0 already had a row, 1 done, 0 failed" in capfd.readouterr().out
     assert rows(tmp_path / "out") == [(0, None)] * 2
-
-
-def test_of_cases_that_a_worker_runs_together_a_death_costs_one(tmp_path):
-    """Those before it count, those behind it run on, in whatever chunk they are."""
-    folder = tmp_path / "c" / "p"
-    write_patient(folder)
-    targets = "".join(f"[{number}.0, 0.0, 0.0], " for number in range(CHUNK + 2))
-    (tmp_path / "cohort.toml").write_text(f'cases = ["c/p"]\ntargets = [{targets}]\n')
-    out = tmp_path / "out"
-    assert main(["batch", "plan", str(tmp_path / "cohort.toml"), "--out", str(out), "--no-arm"]) == 0
-    counts = run_cohort(out, Request(write_page=cohort_world.die_at_one, jobs=2), Silent())
-    assert counts.ended == {0: CHUNK + 1, 3: 1} and counts.reasons == {"worker_died": 1}
-    attempts = [timings(out / one.id)["attempt"] for one in read_plan_table(out).cases]
-    assert attempts[:3] == [1, 2, 1]

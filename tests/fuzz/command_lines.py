@@ -73,6 +73,8 @@ OPTIONS = {
     "--certify": None,
     "--part": "word",
     "--expect": "path",
+    "--memory-mb": "number",
+    "--timeout-s": "number",
     "--nonsense": "word",
     "-": None,
     "--": None,

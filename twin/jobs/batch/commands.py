@@ -22,6 +22,8 @@ def _plan(
     cohort: Annotated[Path, typer.Argument(metavar="COHORT", help="Folder, CSV with column case, or cohort.toml.")],
     out_dir: CohortOption,
     no_arm: Annotated[bool, typer.Option("--no-arm", help="Do not check the arm in any case.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Estimate time, memory and disk; write nothing.")] = False,
+    jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """List every case of a cohort. Stores the hash of its inputs, options and version."""
@@ -29,8 +31,8 @@ def _plan(
     from puncture_twin.twin.jobs.batch.report import plan_text
 
     with progress_display() as progress:
-        run = plan_cohort(cohort, out_dir, arm=False if no_arm else None, watcher=progress)
-    finish("batch plan", run, run.summary(), plan_text(run), as_json)
+        run = plan_cohort(cohort, out_dir, arm=False if no_arm else None, dry=dry_run, watcher=progress)
+    finish("batch plan", run, run.summary(jobs), plan_text(run, jobs), as_json)
 
 
 @batch_app.command("run")
@@ -43,14 +45,17 @@ def _run(
         str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler; its workers run the cases.")
     ] = None,
     jobs: JobsOption = 1,
+    memory_mb: Annotated[int | None, typer.Option("--memory-mb", min=100, help="Memory limit of a worker, MB.")] = None,
+    timeout_s: Annotated[float | None, typer.Option("--timeout-s", min=0.1, help="Time limit of a case, s.")] = None,
     pages: Annotated[bool, typer.Option("--pages", help="Also draw the pictures and the page of each case.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run the cases that have no result yet. Finished cases are kept if the run is stopped."""
+    from puncture_twin.planning.batch.run_case import Limits
     from puncture_twin.twin.jobs.batch.jobs import Where, run_part, run_summary
     from puncture_twin.twin.jobs.batch.report import run_text
 
-    where = Where(part, scheduler, jobs, pages)
+    where = Where(part, scheduler, jobs, pages, Limits(memory_mb, timeout_s))
     with progress_display() as progress:
         counts = run_part(out_dir, where, progress)
     finish("batch run", counts, run_summary(out_dir, counts), run_text(out_dir, counts), as_json)

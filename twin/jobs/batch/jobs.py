@@ -43,14 +43,17 @@ from puncture_twin.planning.batch.plan import (
 from puncture_twin.planning.batch.run import (
     TASK,
     WHOLE,
+    Estimate,
     Part,
     Request,
     RunCounts,
+    estimate,
     on_scheduler,
     parse_part,
     run_cohort,
     slurm_part,
 )
+from puncture_twin.planning.batch.run_case import Limits
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.jobs.batch.report import write_cohort_page
@@ -62,29 +65,47 @@ PLAN_ENTRY = "batch plan"
 
 @dataclass(frozen=True)
 class PlanRun:
-    """A cohort's plan, and where it was written, if it was."""
+    """A cohort's plan, and where it was written, if it was.
+
+    Attributes:
+        known: Cases that have a row there already.
+        guess: How long the cohort will take; of a dry run alone.
+    """
 
     cases: tuple[PlannedCase, ...]
     out: Path
     known: int
+    guess: Estimate | None = None
 
     @property
     def refused(self) -> list[PlannedCase]:
         """Cases that cannot be read; each gets a row with its reason."""
         return [one for one in self.cases if one.refusal]
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self, jobs: int) -> dict[str, Any]:
         """Plain values for JSON."""
-        return {
+        found: dict[str, Any] = {
             "cases": len(self.cases),
             "refused": [{"case": one.case, "reason": one.refusal} for one in self.refused],
             "known": self.known,
-            "files": [str(self.out / PLAN_NAME)],
+            "files": [] if self.guess else [str(self.out / PLAN_NAME)],
         }
+        return found if self.guess is None else found | {"estimate": estimate_summary(self.guess, jobs)}
 
 
-def plan_cohort(cohort: Path, out: Path, *, arm: bool | None, watcher: Watcher) -> PlanRun:
-    """Read every case of a cohort and write ``plan.parquet``.
+def estimate_summary(guess: Estimate, jobs: int) -> dict[str, Any]:
+    """An estimate as plain values."""
+    return {
+        "sample": guess.sample,
+        "seconds_per_case": round(guess.seconds, 3),
+        "seconds": round(guess.seconds * (guess.cases - guess.refused) / jobs, 1),
+        "memory_mb": round(guess.memory_bytes * jobs / 1e6),
+        "disk_mb": round(guess.disk_bytes / 1e6, 1),
+    }
+
+
+def plan_cohort(cohort: Path, out: Path, *, arm: bool | None, dry: bool, watcher: Watcher) -> PlanRun:
+    """Read every case of a cohort and write ``plan.parquet``; a dry run measures one case and writes nothing.
 
     Raises:
         InputError: No cohort, or a folder that cannot be written to.
@@ -95,6 +116,8 @@ def plan_cohort(cohort: Path, out: Path, *, arm: bool | None, watcher: Watcher) 
         rows.append(row)
         count(number)
     known = sum(read_row(out, one) is not None for one in {row.id for row in rows}) if out.is_dir() else 0
+    if dry:
+        return PlanRun(tuple(rows), out, known, estimate(rows))
     with writing(out, PLAN_ENTRY, inputs=inputs, names=[PLAN_NAME], note=watcher.note) as draft:
         write_plan_table(rows, draft.folder / PLAN_NAME)
     return PlanRun(tuple(rows), out, known)
@@ -113,6 +136,7 @@ class Where:
     scheduler: str | None
     jobs: int
     pages: bool
+    limits: Limits
 
 
 def run_part(out: Path, where: Where, watcher: Watcher) -> RunCounts:
@@ -123,7 +147,7 @@ def run_part(out: Path, where: Where, watcher: Watcher) -> RunCounts:
     """
     part = _part(where.part, watcher)
     write_page = write_case_page if where.pages else None
-    request = Request(part, where.jobs, write_page)
+    request = Request(part, where.jobs, where.limits, write_page)
     elsewhere = None if where.scheduler is None else on_scheduler(where.scheduler)
     return run_cohort(out, request, watcher, elsewhere)
 
@@ -228,6 +252,9 @@ def change_summary(change: CaseChange) -> dict[str, Any]:
 
 def merge_cohort(out: Path, expect: Path | None, tolerance_mm: float, watcher: Watcher) -> Merged:
     """Write ``cases.parquet``, the dataset of candidates and the page.
+
+    Args:
+        tolerance_mm: By so much a best clearance may differ from it.
 
     Raises:
         InputError: No plan, nothing that can be expected, or a folder that cannot be written to.

@@ -18,6 +18,7 @@ from puncture_twin.planning.search.candidates import ARM_CHECKED
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.report.page.template import Card, packed, script_json
 from puncture_twin.twin.report.present import Block, Field, Section, Table, grid, picture, text, write_page
+from puncture_twin.twin.report.progress import duration_text
 
 MOST_LINES = 10
 """Of a list; the rest is counted. ``--json`` has all."""
@@ -29,12 +30,24 @@ STALE = "inputs changed since the plan"
 NOW = "for the inputs as planned; batch status lists those that changed since"
 
 
-def plan_text(run: Any) -> str:
-    """How many cases, and how many of them are refused or known."""
+def plan_text(run: Any, jobs: int) -> str:
+    """How many cases, how many of them are refused or known, and the estimate of a dry run."""
     refused = _listed(f"{one.case}: {one.refusal}" for one in run.refused)
     head = Section(f"{_cases(len(run.cases))}, {run.known} already with a row", refused)
-    plan = Section(f"plan: {run.out / 'plan.parquet'}", [])
-    return text([head, plan, Section(f"next: run-twin batch run --out {run.out}", [])])
+    if run.guess is None:
+        plan = Section(f"plan: {run.out / 'plan.parquet'}", [])
+        return text([head, plan, Section(f"next: run-twin batch run --out {run.out}", [])])
+    if run.guess.sample is None:
+        return text([head, Section("nothing to estimate from: no case can be read", [])])
+    estimate = run.summary(jobs)["estimate"]
+    return text([
+        head,
+        Section(f"measured at {estimate['sample']}: {estimate['seconds_per_case']:.2f} s per case", []),
+        Section(
+            f"{plural(jobs, 'worker')}: about {duration_text(estimate['seconds'])}, "
+            f"{estimate['memory_mb']} MB of memory, {estimate['disk_mb']:.1f} MB of disk, "
+            "if every case is like it; nothing was written", []),
+    ])  # fmt: skip
 
 
 def run_text(out: Path, counts: RunCounts) -> str:
