@@ -100,7 +100,7 @@ def init(
     unit: Annotated[Unit | None, typer.Option("--unit", help="Unit of meshes; default: inferred from size.")] = None,
     up: Annotated[
         Up | None,
-        typer.Option("--up", help="Up axis of meshes: y (rotated to z) or z.", show_default="z"),
+        typer.Option("--up", help="Up axis of meshes: y (rotated to z) or z; required for GLB.", show_default="z"),
     ] = None,
     ct: Annotated[str | None, typer.Option("--ct", help="CT to use if FOLDER holds several.")] = None,
     segmentation: Annotated[

@@ -28,7 +28,7 @@ from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.named_files import CaseVolumes
-from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, mesh_extent, read_mesh
+from puncture_twin.planning.formats.meshes.mesh_files import MESH_SUFFIXES, UP_NOT_STATED, mesh_extent, read_mesh
 from puncture_twin.planning.formats.volumes.volume_files import MAX_FILE_BYTES
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh, spread_on
@@ -200,6 +200,9 @@ def mesh_folder(
     """
     if len({mesh_name(one) for one in names}) < len(names):
         refuse("two meshes have the same name", place.folder / source, "one mesh per structure", "duplicate_name")
+    if up is None and any(name.lower().endswith(".glb") for name in names):
+        what = f"GLB: {UP_NOT_STATED} (--up y rotates them to z up, --up z keeps them)"
+        refuse(what, place.folder / source, "--up y or --up z", "up_not_stated")
     extents = [mesh_extent(place.folder / name) for name in names]
     boxes = np.stack([one.box for one in extents])
     diagonal = float(np.linalg.norm(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0)))

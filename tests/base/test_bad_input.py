@@ -248,7 +248,10 @@ BREAKS = {
     "mesh: unknown kind": (mesh_file("rib.step", "ISO-10303-21;"), "unknown_format rib.step"),
     "obj: half a line": (mesh_file("rib.obj", OBJ[:-4]), "file_cut rib.obj"),
     "ply: fewer faces than promised": (mesh_file("rib.ply", PLY.replace("face 1", "face 5")), "file_cut rib.ply"),
-    "glb: not read": (mesh_file("rib.glb", b"glTF" + b"\0" * 40), "unknown_format rib.glb .vtp"),
+    "glb: false length": (
+        mesh_file("rib.glb", b"glTF" + struct.pack("<II", 2, 99999) + b"\0" * 40),
+        "size_mismatch rib.glb",
+    ),
     "vtp: not XML": (mesh_file("rib.vtp", "<VTKFile"), "xml_damaged rib.vtp"),
     # label maps
     "nifti: cut": (cut("labels.nii.gz", 0.6), "size_mismatch labels.nii.gz"),

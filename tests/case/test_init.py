@@ -502,15 +502,17 @@ def test_the_unit_of_meshes_is_guessed_and_told(tmp_path, capfd, unit, scale):
     assert stated[0] == 0 and any("as stated" in line for line in stated[2])
 
 
-def test_meshes_whose_y_is_up_are_rotated(tmp_path, capfd):
-    """Where the same meshes lie with z up, as soon as somebody says so."""
+def test_glb_are_read_with_the_axis_that_is_stated(tmp_path, capfd):
+    """As glTF has them, y up: refused until somebody says so, and then where the same meshes lie with z up."""
     (tmp_path / "meshes").mkdir()
     for name, (middle, radius) in {"skin": ((0.0, 0.0, 0.0), 90.0), **ORGANS}.items():
         mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
         mesh.apply_translation(middle)
         x, y, z = np.array(mesh.vertices).T
         mesh.vertices = np.stack([x, z, -y], axis=1)
-        mesh.export(tmp_path / "meshes" / f"{name}.stl")
+        mesh.export(tmp_path / "meshes" / f"{name}.glb")
+    code, _, said = init(capfd, tmp_path, "--target", TARGET)
+    assert code == 2 and "--up" in said[0]
     assert init(capfd, tmp_path, "--target", TARGET, "--up", "y")[0] == 0
     structures = prepare(tmp_path, arm=False).anatomy.structures
     middles = {one.name: one.mesh.bounds.mean(axis=0) for one in structures if one.name in ORGANS}

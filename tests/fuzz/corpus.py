@@ -13,7 +13,7 @@ import numpy as np
 import SimpleITK
 import trimesh
 from case_world import MARKERS, registration_section, whole
-from hostile.makers import CASE, MOUNT, RIB, certificate, recording, sound_case
+from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_case
 from pydicom.uid import ImplicitVRLittleEndian, JPEGBaseline8Bit, RLELossless
 from slicer_files import vtk_model
 
@@ -116,12 +116,38 @@ def make_meshes(folder):
     mesh.export(folder / "a.obj", include_normals=False, include_texture=False)
     mesh.export(folder / "a.ply", encoding="binary", vertex_normal=False)
     mesh.export(folder / "ascii.ply", encoding="ascii", vertex_normal=False)
+    vertices, faces = mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")
+    glb(folder, gltf(vertices, faces), vertices.tobytes() + faces.tobytes())
+    (folder / "rib.glb").rename(folder / "a.glb")
     (folder / "ascii.vtp").write_text(
         vtp(mesh, lambda array: ("ascii", " ".join(map(str, array.reshape(-1).tolist()))))
     )
     (folder / "base64.vtp").write_text(vtp(mesh, lambda array: ("binary", packed(array))))
     (folder / "a.vtk").write_bytes(vtk_model(mesh.vertices, mesh.faces))
     (folder / "ascii.vtk").write_bytes(vtk_model(mesh.vertices, mesh.faces, binary=False))
+
+
+def gltf(vertices, faces):
+    """A glTF document of one mesh, placed twice."""
+    return {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [
+            {"mesh": 0, "children": [1]},
+            {"mesh": 0, "translation": [0.0, 50.0, 0.0], "rotation": [0.0, 0.6, 0.0, 0.8], "scale": [1.0, 2.0, 1.0]},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"componentType": 5126, "count": len(vertices), "type": "VEC3", "bufferView": 0},
+            {"componentType": 5125, "count": faces.size, "type": "SCALAR", "bufferView": 1},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": vertices.nbytes},
+            {"buffer": 0, "byteLength": faces.nbytes, "byteOffset": vertices.nbytes},
+        ],
+        "buffers": [{"byteLength": vertices.nbytes + faces.nbytes}],
+    }
 
 
 def vtp(mesh, encode):

@@ -207,6 +207,20 @@ def _places(tree):
                 waiting.append(node[key])
 
 
+def change_glb(rng, data, others):
+    """The JSON of a GLB changed as a tree, and its lengths made right again; or the numbers of its data."""
+    if len(data) < 28 or data[:4] != b"glTF":
+        return flip(rng, data, others)
+    length = struct.unpack("<I", data[12:16])[0]
+    text, rest = data[20 : 20 + length], data[20 + length :]
+    if rng.random() < 0.75:
+        text = change_tree(rng, text, others)
+    else:
+        rest = rest[:8] + change_floats(rng, rest[8:], others)
+    text += b" " * (-len(text) % 4)
+    return b"glTF" + struct.pack("<III", 2, 20 + len(text) + len(rest), len(text)) + b"JSON" + text + rest
+
+
 def change_floats(rng, data, others):
     """One aligned number of binary data is another: NaN, infinity, huge, or an index out of range."""
     if len(data) < 8:
@@ -284,6 +298,7 @@ KINDS = {
     "text": TEXT,
     "table": [*TEXT, change_cells, change_cells, change_cells],
     "tree": [*PLAIN, change_number, change_word, *[change_tree] * 6],
+    "glb": [*PLAIN, *[change_glb] * 5],
     "stl": [*PLAIN, change_head, change_floats, change_floats, change_floats],
     "headed": [*PLAIN, change_floats, change_floats, *[change_text_head] * 4],
     "hdf5": [*PLAIN, flip, flip, change_floats, change_word],

@@ -221,6 +221,7 @@ MESHES = {
     "a.obj": "text",
     "a.ply": "headed",
     "ascii.ply": "text",
+    "a.glb": "glb",
     "ascii.vtp": "text",
     "base64.vtp": "text",
     "a.vtk": "headed",

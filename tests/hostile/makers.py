@@ -1,6 +1,7 @@
 """Hostile inputs, by name: each function writes what a story of cases.toml is about into a folder."""
 
 import json
+import struct
 
 import numpy as np
 from case_world import case_text, structure, whole, write_balls
@@ -46,6 +47,40 @@ def toml_file(name, text):
         (folder / name).write_text(text)
 
     return make
+
+
+def glb(folder, document, data):
+    """A GLB file from its JSON and its binary chunk."""
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    data += b"\0" * (-len(data) % 4)
+    parts = [(b"JSON", text), (b"BIN\0", data)]
+    body = b"".join(struct.pack("<I", len(content)) + kind + content for kind, content in parts)
+    (folder / "rib.glb").write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body)
+
+
+def glb_document(vertices, primitives, nodes):
+    """Triangles without indices, in as many primitives and nodes as wished."""
+    size = 12 * vertices
+    return {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": size}],
+        "bufferViews": [{"buffer": 0, "byteLength": size}],
+        "accessors": [{"componentType": 5126, "count": vertices, "type": "VEC3", "bufferView": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}] * primitives}],
+        "nodes": [{"mesh": 0}] * nodes,
+        "scenes": [{"nodes": list(range(nodes))}],
+    }
+
+
+def glb_placed_often(folder):
+    """One triangle, placed by 200,000 nodes: a file of 4 MB."""
+    glb(folder, glb_document(3, 1, 200_000), np.eye(3, dtype="<f4").tobytes())
+
+
+def glb_of_one_array(folder):
+    """6,000 vertices of 72 kB, named by 9,000 primitives: 54 million vertices."""
+    glb(folder, glb_document(6000, 9000, 1), np.random.default_rng(1).normal(size=(6000, 3)).astype("<f4").tobytes())
 
 
 def certificate(folder):
@@ -227,4 +262,6 @@ MAKERS = {
     "plan that overflows": plan_with(overflow),
     "plan of a vast rotation": plan_with(vast_rotation),
     "certificate of a vast size": certificate_with('"size_rad": 0.5', '"size_rad": 1e308'),
+    "GLB placed often": glb_placed_often,
+    "GLB of one array": glb_of_one_array,
 }

@@ -37,7 +37,7 @@ REFUSED = {
     "mesh_mirrored_z": (T2, "labels_beside_image"),
     "mesh_lps_as_ras": (T1, "labels_beside_image"),
     "labels_grid_lost": (T1, "grid_lost"),
-    "mesh_glb_y_up": (T1, "entries_not_read aorta.glb .stl .vtp"),
+    "mesh_glb_y_up": (T1, "up_not_stated --up"),
     "mask_link_dangles": (T2, "entries_not_read portal_vein.nii.gz"),
     "ct_offset_1024": (T1, "no_ct -1024"),
     "labels_blended": (T1, "labels_blended"),

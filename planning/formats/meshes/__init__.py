@@ -1,1 +1,1 @@
-"""Mesh files: STL, OBJ, PLY, VTP and legacy VTK, each by a reader of its own, behind `parse_mesh`."""
+"""Mesh files: STL, OBJ, PLY, GLB and VTP, each by a reader of its own, behind `parse_mesh`."""

@@ -1,4 +1,4 @@
-"""Mesh files of other programs, as guarded meshes in mm: STL, OBJ, PLY, VTP and legacy VTK.
+"""Mesh files of other programs, as guarded meshes in mm: STL, OBJ, PLY, GLB, VTP and legacy VTK.
 
 Each format has its own strict reader, because a lost triangle makes a path "free": a file must hold what it promises to
 the byte. General loaders are made to show something. trimesh 5.2, measured on a box of 12 triangles: half an ASCII STL
@@ -195,9 +195,17 @@ MAX_FILE_BYTES = 2_000_000_000
 """Twenty million triangles of binary STL are 1 GB; a file beyond twice that is refused before it is read."""
 
 
+def _read_glb(data: bytes, where: str) -> RawMesh:
+    from puncture_twin.planning.formats.meshes.glb import read_glb  # here: its schema costs all others 0.02 s
+
+    return read_glb(data, where)
+
+
 _READERS: Mapping[str, Callable[[bytes, str], RawMesh]] = MappingProxyType(
-    {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".vtp": read_vtp, ".vtk": read_vtk}
+    {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": _read_glb, ".vtp": read_vtp, ".vtk": read_vtk}
 )
+
+UP_NOT_STATED = "the glTF standard says y is up, some programs write z up, and the file does not state it"
 
 _STATEMENT = re.compile(rb"\bSPACE=(LPS|RAS)\b")
 
@@ -213,14 +221,15 @@ def read_mesh(
 ) -> TriangleMesh:
     """One mesh file, checked against its own promises, in mm and LPS (or its own local frame).
 
-    The caller declares the unit and the space. A file that Slicer wrote states its space, which must be the declared
-    one. All parts of a file become one surface, in the file's order; nothing is welded and no triangle dropped. Axes of
-    a file whose y is up are rotated about x, so that z is.
+    The caller declares the unit, also for GLB, whose standard says metres, and the space. A file that Slicer wrote
+    states its space, which must be the declared one. All parts of a file become one surface, placed by their node
+    transforms, in the file's order; nothing is welded and no triangle dropped. Axes of a file whose y is up are rotated
+    about x, so that z is; of a GLB it must be stated.
 
     Args:
         unit: The unit of its coordinates.
         space_is_default: Whether a patient space that the file states holds instead of ``space``.
-        up: Its axis that is up in the file; without it, z.
+        up: Its axis that is up in the file; without it, z of all but GLB.
 
     Raises:
         InputError: If it is missing, cut, contradicts itself or the caller, is empty, or fails the guard.
@@ -256,12 +265,15 @@ def parse_mesh(
         raw = reader(data, name)
         stated = raw.space or in_text
         actual = space if stated is None else _actual_space(stated, space, default=space_is_default, where=name)
-        vertices = to_lps(_z_up(raw.vertices, up), actual) * (unit.mm if stretch is None else unit.mm * stretch)
+        vertices = to_lps(_z_up(raw.vertices, up, path), actual) * (unit.mm if stretch is None else unit.mm * stretch)
     return guard_mesh(vertices, raw.faces, where=name)
 
 
-def _z_up(vertices: NDArray[np.float64], up: Up | None) -> NDArray[np.float64]:
+def _z_up(vertices: NDArray[np.float64], up: Up | None, path: Path) -> NDArray[np.float64]:
     """Points (n, 3) of a file, rotated by a quarter about x where its y is up."""
+    if up is None and path.suffix.lower() == ".glb":
+        allowed = 'up = "y" (rotated to z up) or up = "z" (kept as it is), or another format'
+        refuse(UP_NOT_STATED, path, allowed, "up_not_stated")
     return vertices if up is not Up.Y else vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
 
 
