@@ -511,7 +511,7 @@ def export(
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="urscript, ros2, moveit, csv, slicer, dicom, candidates-csv, or another package's.",
+            help="urscript, ros2, moveit, csv, slicer, dicom, candidates-csv, candidates-json, or another package's.",
         ),
     ],
     case: Annotated[Path | None, typer.Option("--case", help="Case of the plan: checks the plan again.")] = None,

@@ -760,11 +760,11 @@ def export(
 
     Args:
         source: A plan (``urscript``, ``ros2``, ``csv``, ``moveit``, or another package's format; ``plan.json`` is
-            written beside it), candidates (``candidates-csv``), or a checked direction
+            written beside it), candidates (``candidates-csv``, ``candidates-json``), or a checked direction
             (``slicer``, ``dicom``).
         format_name: One of these.
         folder: Where the files go; made where it is missing.
-        context: The plan is checked again against this case; ``moveit``,
+        context: The plan is checked again against this case, and corners are rounded where that is free; ``moveit``,
             ``slicer`` and ``dicom`` need it.
 
     Raises:

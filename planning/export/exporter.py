@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -16,22 +17,107 @@ from typing import NamedTuple
 
 import numpy as np
 
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.base.text import Shown, plural
+from puncture_twin.planning.base.text import Shown
+from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.export.program import (
     SampledMotion,
     check_program,
     check_sampled,
     heading,
     program_of,
+    waypoint_rows,
 )
 from puncture_twin.planning.export.ros2 import TIME_RESOLUTION_S, read_ros2, ros2_text
 from puncture_twin.planning.export.urscript import read_urscript, urscript_text
+from puncture_twin.planning.motion.path_check import MAX_SWEEP_MM
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_geometry
+
+GRID_MM = MAX_SWEEP_MM / 2.0
+"""In two directions: no state of the triangle is farther from a checked one than half of ``MAX_SWEEP_MM``."""
+
+LARGEST_BLEND_MM = 5.0
+"""The first radius tried: enough not to stop, small against the space that a plan leaves."""
+
+SMALLEST_BLEND_MM = 1.0
+"""Radii are halved down to this; then the arm stops at the waypoint."""
+
+LARGEST_FRACTION = 0.45
+"""Fraction of each segment, so that two blends never overlap: the controller skips a waypoint whose blend overlaps the
+next."""
+
+SAMPLES = 400
+"""Along a segment, to find where the tip comes within the radius."""
+
+
+def blend_radii_mm(checker: StateChecker, waypoints: Floats) -> Floats:
+    """Blend radius of each waypoint between the ends, mm; 0 where no corner may be cut.
+
+    Args:
+        checker: Checks contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
+        waypoints: Shape (k, 6), rad.
+
+    Returns:
+        Shape (k - 2,), mm.
+    """
+    corners = range(1, len(waypoints) - 1)
+    return np.array([_radius_mm(checker, waypoints[at - 1 : at + 2]) for at in corners])
+
+
+def _radius_mm(checker: StateChecker, waypoints: Floats) -> float:
+    """The largest radius tried that is free, of the corner between three waypoints (3, 6)."""
+    before, corner, after = waypoints
+    radius = LARGEST_BLEND_MM
+    while radius >= SMALLEST_BLEND_MM:
+        starts, ends = (_fraction_within(checker, corner, other, radius) for other in (before, after))
+        if max(starts, ends) <= LARGEST_FRACTION and _free(
+            checker, corner, starts * (before - corner), ends * (after - corner)
+        ):
+            return radius
+        radius /= 2.0
+    return 0.0
+
+
+def _fraction_within(checker: StateChecker, corner: Floats, other: Floats, radius_mm: float) -> float:
+    """The last fraction of the path from a corner at which the tip is still within a radius of it, or the next sample.
+
+    1 where the tip is so near the other end, so that half of the distance between two tips bounds both radii.
+    """
+    fractions = np.linspace(0.0, 1.0, SAMPLES + 1)
+    poses = flange_pose(checker.model, corner + fractions[:, None] * (other - corner))
+    tips = poses[:, :3, 3] + checker.tool.needle_length_mm * poses[:, :3, 2]
+    far = np.linalg.norm(tips - tips[0], axis=1)  # mm from the tip at the corner
+    if radius_mm > LARGEST_FRACTION * far[-1]:
+        return 1.0
+    return float(fractions[min(SAMPLES, int(np.flatnonzero(far <= radius_mm)[-1]) + 1)])
+
+
+def _free(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats) -> bool:
+    """Whether every state of the triangle corner, corner + back, corner + ahead is free of contact."""
+    states = _triangle(checker, corner, back, ahead)
+    return all(checker.contact(q, needle_may_touch_patient=False) is None for q in states)
+
+
+def _triangle(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats) -> Floats:
+    """States of a triangle, (m, 6), in rays from its corner: neighbours on a ray or across are within ``GRID_MM``."""
+    rays, steps = 1, 1
+    while True:
+        turn = np.linspace(0.0, 1.0, rays + 1)[:, None, None]
+        along = np.linspace(0.0, 1.0, steps + 1)[None, :, None]
+        grid = corner + along * ((1.0 - turn) * back + turn * ahead)
+        outward = max(float(checker.sweep_mm(ray).max()) for ray in grid)
+        across = max(float(checker.sweep_mm(arc).max()) for arc in grid.swapaxes(0, 1)[1:])
+        if max(outward, across) <= GRID_MM:
+            return grid[:, 1:].reshape(-1, 6)
+        rays = math.ceil(rays * max(1.0, across / GRID_MM))  # refine until neighbours are near enough
+        steps = math.ceil(steps * max(1.0, outward / GRID_MM))
+
 
 COLUMNS = ("phase", "time_s", *(f"q{joint}_rad" for joint in range(1, 7)))
 
@@ -52,7 +138,11 @@ def csv_text(plan: Plan, *, case_checked: bool) -> str:
 
 
 def read_csv(text: str, *, where: Path) -> SampledMotion:
-    """Read such a CSV back."""
+    """Read such a CSV back.
+
+    Raises:
+        InputError: Another header, another phase, or rows that are no motion.
+    """
     rows = list(csv.reader(io.StringIO("\n".join(line for line in text.splitlines() if not line.startswith("#")))))
     if not rows or tuple(rows[0]) != COLUMNS:
         refuse("the table has another header", where, ",".join(COLUMNS), "wrong_columns")
@@ -88,14 +178,17 @@ class _Draft(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def export_plan(plan: Plan, format_name: str, folder: Path, *, source: Path, case_checked: bool = False) -> Exported:
+def export_plan(
+    plan: Plan, format_name: str, folder: Path, *, source: Path, checker: StateChecker | None = None
+) -> Exported:
     """Write a plan for a robot.
 
     Args:
         plan: A plan that has been read (and so checked), or made.
         folder: Where the file goes, under the plan file's name.
         source: The plan's file, for its name and for errors.
-        case_checked: Whether the plan has been checked against its own case (``plan_check``), which the file says.
+        checker: Of the plan's own case, against which the plan has been checked (``plan_check``); without it nothing is
+            known off the plan's path, so no corner is rounded, and the file says so.
 
     Raises:
         InputError: Another format, a plan that contradicts itself, or a number beyond the arm's limits; then nothing
@@ -105,7 +198,7 @@ def export_plan(plan: Plan, format_name: str, folder: Path, *, source: Path, cas
     check_geometry(plan, source)
     if len(plan.insertion.q) < 2:
         refuse("the insertion is a single state", source, "a motion", "no_motion")
-    checked = format_of(format_name)[1](plan, source, case_checked)
+    checked = format_of(format_name)[1](plan, source, checker)
     with atomic(path) as temporary:
         temporary.write_bytes(checked.text.encode("ascii"))
     return Exported(path, format_name, checked.notes, plan.inputs, plan)
@@ -116,17 +209,22 @@ def export_name(source: Path, format_name: str) -> str:
     return f"{source.stem}{format_of(format_name)[0]}"
 
 
-def _urscript(plan: Plan, source: Path, case_checked: bool) -> _Draft:
-    program = program_of(plan)
-    text = urscript_text(program, plan, case_checked=case_checked)
-    check_program(read_urscript(text, where=source), plan, where=source)
+def _urscript(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
+    rows = waypoint_rows(plan)
+    waypoints = plan.approach.q[rows]
+    blends = None if checker is None or len(rows) < 3 else blend_radii_mm(checker, waypoints)
+    program = program_of(plan, blends)
+    text = urscript_text(program, plan, case_checked=checker is not None)
+    check_program(read_urscript(text, where=source), plan, blends, where=source)
     if len(program.stream_q):
         return _Draft(text, ("the approach is smooth and streamed (servoj): the controller follows it with a lag",))
-    return _Draft(text, (f"{plural(len(program.moves), 'joint move')}, with a stop after each",))
+    rounded = 0 if blends is None else int(np.count_nonzero(blends))
+    why = "" if checker is not None else "; without the case, corners are not rounded (--case)"
+    return _Draft(text, (f"{len(program.moves)} joint moves, {rounded} of them rounding a corner{why}",))
 
 
-def _ros2(plan: Plan, source: Path, case_checked: bool) -> _Draft:
-    text, model = ros2_text(plan, case_checked=case_checked), plan.model
+def _ros2(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
+    text, model = ros2_text(plan, case_checked=checker is not None), plan.model
     check_sampled(read_ros2(text, model, where=source), plan, time_resolution_s=TIME_RESOLUTION_S, where=source)
     return _Draft(text, ("two messages: send 'insertion' only when the operator says so",))
 
@@ -147,14 +245,14 @@ class Exporter(NamedTuple):
     time_resolution_s: float = 0.0
     notes: tuple[str, ...] = ()
 
-    def draft(self, plan: Plan, source: Path, case_checked: bool) -> _Draft:
+    def draft(self, plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
         """The text, read back and equal to the plan."""
-        text = self.write(plan, case_checked=case_checked)
+        text = self.write(plan, case_checked=checker is not None)
         check_sampled(self.read(text, where=source), plan, time_resolution_s=self.time_resolution_s, where=source)
         return _Draft(text, self.notes)
 
 
-Drafting = Callable[[Plan, Path, bool], _Draft]
+Drafting = Callable[[Plan, Path, StateChecker | None], _Draft]
 
 FORMATS: Mapping[str, tuple[str, Drafting]] = MappingProxyType(
     {
@@ -175,7 +273,11 @@ def format_names() -> tuple[str, ...]:
 
 
 def format_of(name: str) -> tuple[str, Drafting]:
-    """The ending of a format's files, and who writes them."""
+    """The ending of a format's files, and who writes them.
+
+    Raises:
+        InputError: There is no such format, or its package has no `Exporter` under that name.
+    """
     if name in FORMATS:
         return FORMATS[name]
     if name not in format_names():

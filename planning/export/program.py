@@ -82,6 +82,8 @@ class JointMove(NamedTuple):
     """Peak speed of the joint that turns farthest, rad/s."""
     acceleration: float
     """Peak acceleration of the same joint, rad/s^2."""
+    blend_mm: float
+    """Radius about its end within which the tip may round the corner; 0 stops there."""
 
 
 class _Ramp(NamedTuple):
@@ -91,14 +93,21 @@ class _Ramp(NamedTuple):
     acceleration: float
 
 
-def program_of(plan: Plan) -> Program:
-    """The program of a plan; the arm stops at each waypoint, where the controller would round a corner unchecked.
+def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
+    """The program of a plan.
+
+    Args:
+        blends_mm: Shape (k - 2,), a radius for each waypoint between the ends of :func:`waypoint_rows`; None for 0.
 
     Raises:
         InputError: The insertion does not move the tip, or a smooth approach takes too long to stream.
     """
     rows = waypoint_rows(plan)
-    moves = tuple(_joint_move(plan.approach, first, last) for first, last in pairwise(rows.tolist()))
+    between = np.zeros(max(0, len(rows) - 2)) if blends_mm is None else np.asarray(blends_mm, dtype=np.float64)
+    moves = tuple(
+        _joint_move(plan.approach, first, last, blend)
+        for (first, last), blend in zip(pairwise(rows.tolist()), [*between.tolist(), 0.0], strict=False)
+    )
     steps = math.ceil(plan.approach.duration_s / STREAM_S) if len(rows) == 0 else 0
     if steps > MOST_SAMPLES:
         what = f"a smooth approach of {plan.approach.duration_s:.0f} s"
@@ -129,7 +138,11 @@ def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
 
 
 def straight_move(model: UrModel, program: Program) -> Trajectory:
-    """The insertion as the controller runs it: the tip straight, a trapezoid in time, on the standoff's branch."""
+    """The insertion as the controller runs it: the tip straight, a trapezoid in time, on the standoff's branch.
+
+    Raises:
+        InputError: No branch leads from the standoff to the target.
+    """
     start, end = program.T_base_standoff[:3, 3], program.T_base_target[:3, 3]
     length = float(np.linalg.norm(end - start))
     times, travelled = _trapezoid(length, program.insertion_mm_s, program.insertion_mm_s2)
@@ -146,12 +159,12 @@ def straight_move(model: UrModel, program: Program) -> Trajectory:
     return Trajectory(times, np.concatenate([first[None], first + np.cumsum(wrap_to_pi(np.diff(q, axis=0)), axis=0)]))
 
 
-def _joint_move(trajectory: Trajectory, first: int, last: int) -> JointMove:
+def _joint_move(trajectory: Trajectory, first: int, last: int, blend_mm: float) -> JointMove:
     """The move over the samples first..last, in the time that the plan takes."""
     q, times = trajectory.q[first : last + 1], trajectory.times_s[first : last + 1]
     leading = int(np.argmax(np.abs(q[-1] - q[0])))  # movej's speed is that of the joint that moves farthest
     ramp = _ramp(np.abs(q[:, leading] - q[0, leading]), times)
-    return JointMove(q[-1], ramp.speed, ramp.acceleration)
+    return JointMove(q[-1], ramp.speed, ramp.acceleration, blend_mm)
 
 
 def _ramp(travelled: Floats, times: Floats) -> _Ramp:
@@ -256,6 +269,9 @@ def check_positions(model: UrModel, q: Floats, *, what: str, where: Path) -> Non
 
     Args:
         q: Shape (m, 6), rad.
+
+    Raises:
+        InputError: Names the joint and the angle. NaN is outside.
     """
     inside = (q >= model.joint_limits[:, 0] - POSITION_SLACK_RAD) & (q <= model.joint_limits[:, 1] + POSITION_SLACK_RAD)
     if not inside.all():
@@ -444,8 +460,11 @@ TURN_TOLERANCE_RAD = 1e-3
 """How far the straight move's orientation may be from the plan's: 0.2 mm over 200 mm of needle."""
 
 
-def check_program(program: Program, plan: Plan, *, where: Path) -> None:
+def check_program(program: Program, plan: Plan, blends_mm: Floats | None = None, *, where: Path) -> None:
     """Refuse a program that is not the plan's motion, or that breaks a limit.
+
+    Args:
+        blends_mm: The radii that were found free, as for :func:`program_of`.
 
     Raises:
         InputError: Says what differs or which limit is broken.
@@ -457,20 +476,20 @@ def check_program(program: Program, plan: Plan, *, where: Path) -> None:
         ("target", program.target_q, plan.insertion.q[-1]),
     ):
         _check_same(read, planned, f"the {name}", where)
-    wanted = program_of(plan)
+    wanted = program_of(plan, blends_mm)
     if not (
         len(program.moves) == len(wanted.moves)
         and np.allclose(_rates(program), _rates(wanted), rtol=SAME_RATE, atol=0.0)
     ):
-        what = "a speed or an acceleration does not read back"
+        what = "a speed, an acceleration or a radius does not read back"
         refuse(what, where, "the plan's, above 1e-6", "not_read_back")
     _check_approach(program, plan, model, where)
     _check_insertion(program, plan, model, where)
 
 
 def _rates(program: Program) -> Floats:
-    """All numbers that a program prints except angles and poses."""
-    moves = [(move.speed, move.acceleration) for move in program.moves]
+    """All numbers that a program prints except angles and poses; 1 + mm for radii, which may be 0."""
+    moves = [(move.speed, move.acceleration, 1.0 + move.blend_mm) for move in program.moves]
     return np.array([program.tcp_mm, program.insertion_mm_s, program.insertion_mm_s2, *np.ravel(moves)])
 
 
@@ -489,6 +508,8 @@ def _check_approach(program: Program, plan: Plan, model: UrModel, where: Path) -
         rates = fraction[None] * move.speed, fraction[None] * move.acceleration
         check_rates(model, *rates, what="approach", where=where)
         _check_tip(model, start, end, fraction * move.speed * np.sign(end - start), plan, where)
+    if program.moves and program.moves[-1].blend_mm != 0.0:
+        refuse("the approach does not stop at its end", where, "a blend radius of 0 at the end", "not_read_back")
 
 
 def _check_tip(model: UrModel, start: Floats, end: Floats, speeds: Floats, plan: Plan, where: Path) -> None:

@@ -46,7 +46,7 @@ FIRST_WORDS = 90
 
 _NUMBER = r"-?\d+\.\d+"
 _LIST = rf"\[{_NUMBER}(?:, {_NUMBER}){{5}}\]"
-_MOVEJ = re.compile(rf"  movej\(({_LIST}), a=({_NUMBER}), v=({_NUMBER})\)")
+_MOVEJ = re.compile(rf"  movej\(({_LIST}), a=({_NUMBER}), v=({_NUMBER}), r=({_NUMBER})\)")
 _SERVOJ = re.compile(rf"  servoj\(({_LIST}), 0, 0, {_NUMBER}, 0.1, 300\)")
 _SETTLE = "  movej(standoff_q, a=0.1, v=0.05)"
 _VALUE = re.compile(rf"  (start_q|standoff_q|target_q|standoff_m|target_m|tcp_m) = (p?{_LIST})")
@@ -90,8 +90,10 @@ _FUNCTIONS = """\
 
 def urscript_text(program: Program, plan: Plan, *, case_checked: bool) -> str:
     """The program as URScript: radians, metres, the controller's base frame."""
+    blended = any(move.blend_mm > 0.0 for move in program.moves)
     notes = [
         "units: metres and radians; poses in the controller's base frame; TCP at the needle tip",
+        "corners of the approach: " + ("rounded where they are free in the plan's case" if blended else "not rounded"),
         "not set here: payload, safety limits. While it inserts, tool_contact stops the arm, with the controller's own",
         "threshold: it does not distinguish tissues and does not protect people.",
     ]
@@ -126,7 +128,9 @@ def _checks() -> list[str]:
 
 def _approach(program: Program) -> list[str]:
     lines = [
-        f"  movej({_list(move.q)}, a={_number(move.acceleration)}, v={_number(move.speed)})" for move in program.moves
+        f"  movej({_list(move.q)}, a={_number(move.acceleration)}, v={_number(move.speed)}, "
+        f"r={_number(move.blend_mm * M_PER_MM)})"
+        for move in program.moves
     ]
     lines += [f"  servoj({_list(q)}, 0, 0, {_number(STREAM_S)}, 0.1, 300)" for q in program.stream_q]
     return [*lines, *(["  stopj(1.4)", _SETTLE] if len(program.stream_q) else [])]
@@ -218,7 +222,7 @@ def read_urscript(text: str, *, where: Path) -> Program:
     return Program(
         tcp_mm=float(values["tcp_m"][2]) / M_PER_MM,
         start_q=values["start_q"],
-        moves=tuple(JointMove(_floats(m[1]), float(m[3]), float(m[2])) for m in moves),
+        moves=tuple(JointMove(_floats(m[1]), float(m[3]), float(m[2]), float(m[4]) / M_PER_MM) for m in moves),
         stream_q=np.array([_floats(match[1]) for match in streamed]).reshape(-1, 6),
         T_base_standoff=_pose_mm(values["standoff_m"]),
         T_base_target=_pose_mm(values["target_m"]),

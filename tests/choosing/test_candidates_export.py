@@ -1,4 +1,4 @@
-"""The table of candidates as CSV: the same rows, round degrees, and whose table it is."""
+"""The table of candidates as CSV and JSON: the same rows, round degrees, and whose table it is."""
 
 import csv
 import json
@@ -16,6 +16,7 @@ CHANGES = (("theta_deg = [0, 10]\nstep_deg = 10.0", 'frame = "ct"\ntheta_deg = [
 
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory):
+    """A case without an arm, and the folder of its search."""
     here = tmp_path_factory.mktemp("candidates")
     case = write_case(here, *CHANGES)
     assert main(["search", str(case), "--no-arm", "--no-pictures", "--out", str(here / "out")]) == OK
@@ -49,6 +50,16 @@ def test_the_csv_is_the_table(searched, tmp_path, capsys):
             else:
                 assert (None if got[name] == "" and value is None else type(value)(got[name])) == value
     assert [one["role"] for one in told["inputs"]][:2] == ["candidates", "case"]
+
+
+def test_the_json_is_the_table_with_its_origin(searched, tmp_path, capsys):
+    """Columns once, a list a row; the run's case, version and hashes beside them."""
+    table = searched[1] / "candidates.parquet"
+    assert main(["export", str(table), "--format", "candidates-json", "--out", str(tmp_path)]) == OK
+    capsys.readouterr()
+    read = json.loads((tmp_path / "candidates.json").read_text())
+    assert [dict(zip(read["columns"], row, strict=True)) for row in read["rows"]] == expected(searched[1])
+    assert read["run"] == json.loads(pq.read_schema(table).metadata[b"run"])
 
 
 def test_a_case_is_searched_first(searched, tmp_path, capsys):

@@ -19,11 +19,12 @@ from scipy.spatial.transform import Rotation
 from puncture_twin.planning.arm.insertion import needle_lines
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import SpeedLimits, flange_pose, jacobian
-from puncture_twin.planning.arm.tool import Tool
+from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import JOINT_NAMES, UR_MODELS, ur_model
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.export.exporter import FORMATS, GROUP, csv_text, export_plan, read_csv
+from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.export.exporter import FORMATS, GROUP, blend_radii_mm, csv_text, export_plan, read_csv
 from puncture_twin.planning.export.program import (
     PLAIN,
     check_program,
@@ -249,9 +250,9 @@ class Controller:
         self.events.append(("stopj",))
 
 
-def script(plan):
+def script(plan, blends=None):
     """The plan as URScript."""
-    return urscript_text(program_of(plan), plan, case_checked=False)
+    return urscript_text(program_of(plan, blends), plan, case_checked=False)
 
 
 def finer(trajectory):
@@ -319,12 +320,12 @@ def test_the_program_keeps_the_plans_time(plan):
 
 
 def test_the_insertion_is_slow_and_separate(plan):
-    """The plan's own time, never faster than its 10 mm/s; the approach rounds no corner."""
-    found = program_of(plan)
+    """The plan's own time, never faster than its 10 mm/s; the approach ends at rest, whatever its corners do."""
+    found = program_of(plan, np.array([3.0, 2.0]))
     assert 9.5 < found.insertion_mm_s <= 10.0
     takes = STANDOFF_MM / found.insertion_mm_s + found.insertion_mm_s / found.insertion_mm_s2
     assert takes == pytest.approx(plan.insertion.duration_s, rel=1e-6)
-    assert ", r=" not in script(plan)
+    assert [move.blend_mm for move in found.moves] == [3.0, 2.0, 0.0]
     assert f"movel(target_m, a={found.insertion_mm_s2 / 1000:.12f}, v={found.insertion_mm_s / 1000:.12f})" in script(
         plan
     )
@@ -415,6 +416,34 @@ def test_accelerations_are_held_to_the_limit_alone(plan):
             assert caught and "rad/s^2" in str(error)
         else:
             assert not caught
+
+
+def free_checker(*boxes):
+    """The UR3 with its needle, and some boxes."""
+    return CellChecker(UR3, TOOL, boxes)
+
+
+def test_a_corner_is_rounded_only_where_all_of_it_is_free(plan):
+    """A pin inside a corner, which neither segment meets: a smaller blend there; the other corner keeps its own."""
+    waypoints = plan.approach.q[waypoint_rows(plan)]
+    free = blend_radii_mm(free_checker(), waypoints)
+    assert (free == 5.0).all()
+    corner = waypoints[1]
+    tips = tip_poses(UR3, np.stack([waypoints[0], corner, waypoints[2]]), TOOL.needle_length_mm)[:, :3, 3]
+    inward = sum((t - tips[1]) / np.linalg.norm(t - tips[1]) for t in tips[[0, 2]])
+    T = np.eye(4)
+    T[:3, 3] = tips[1] + 1.5 * inward / np.linalg.norm(inward)
+    blocked = free_checker(Box("pin", T, (0.4, 0.4, 0.4)))
+    on_path = [waypoints[0] + s * (corner - waypoints[0]) for s in np.linspace(0.97, 1.0, 40)]
+    assert all(blocked.contact(q, needle_may_touch_patient=False) is None for q in on_path)
+    np.testing.assert_array_equal(blend_radii_mm(blocked, waypoints)[1], 5.0)
+    assert blend_radii_mm(blocked, waypoints)[0] < 5.0
+
+
+def test_a_tip_that_hardly_moves_is_not_rounded():
+    """Where a segment turns the needle about itself the radius would swallow it whole."""
+    turned = BENT + [0, 0, 0, 0, 0, 1.0]
+    assert blend_radii_mm(free_checker(), np.stack([turned + 0.2, turned, BENT])).tolist() == [0.0]
 
 
 @pytest.mark.parametrize("name", FORMATS)
@@ -682,7 +711,7 @@ def test_the_operator_is_told_of_warnings_before_the_insertion(plan, warnings, w
     assert popup.startswith(f'  popup("Needle at standoff. {words}')
     assert popup.endswith('Continue inserts it.", title="Insertion", blocking=True)')
     assert popup.count('"') == 4 and len(popup) < 250
-    check_program(read_urscript(text, where=SOURCE), doubted, where=SOURCE)
+    check_program(read_urscript(text, where=SOURCE), doubted, None, where=SOURCE)
 
 
 def test_the_program_is_one_function(plan):
@@ -717,15 +746,16 @@ TAMPERED = {
     ),
     "no thread": (lambda t: t.replace("  insertion = run insert()\n", ""), "insertion_unguarded"),
     "a joint changed": (lambda t: t.replace("  movej([0.3000", "  movej([0.3001"), "not_read_back"),
+    "a blend at the end": (lambda t: re.sub(r"r=0\.0+\)(?!(?:.*\n)+  movej)", "r=0.010000000000)", t), "not_read_back"),
     "another target": (lambda t: re.sub(r"target_m = p\[.", "target_m = p[-1", t), "not_read_back"),
     "another move": (lambda t: t.replace("  stopl", "  movel(start_q)\n  stopl"), "not_read_back"),
     "a fast insertion": (
         lambda t: re.sub(r"(movel\(target_m, a=)[\d.]+(, v=)[\d.]+", r"\g<1>90.0\g<2>9.0", t),
         "insertion_unguarded",
     ),
-    "a fast approach": (lambda t: re.sub(r"(movej.*v=)\d\.\d+", r"\g<1>9.0", t), "not_read_back"),
-    "a blend that nobody looked at": (lambda t: re.sub(r"(movej.*v=\d\.\d+)", r"\1, r=0.002", t), "not_read_back"),
-    "no speed at all": (lambda t: re.sub(r"(movej.*v=)\d\.\d+", r"\g<1>0.0", t), "not_read_back"),
+    "a fast approach": (lambda t: re.sub(r"v=\d\.\d+(, r=)", r"v=9.0\1", t), "not_read_back"),
+    "a blend that nobody looked at": (lambda t: t.replace("r=0.0000", "r=0.0020", 1), "not_read_back"),
+    "no speed at all": (lambda t: re.sub(r"v=\d\.\d+(, r=)", r"v=0.0\1", t), "not_read_back"),
     "another tool": (lambda t: t.replace("0.250000000000, 0.0", "0.200000000000, 0.0"), "not_read_back"),
 }
 

@@ -95,7 +95,7 @@ def values(given):
         "check_folder": pt.check_folder(tmp / "report"),
         "windows": candidates.windows,
         "window": candidates.windows[0],
-        "of a table": pt.export(candidates, "candidates-csv", tmp / "table"),
+        "of a table": pt.export(candidates, "candidates-json", tmp / "table"),
     }
 
 

@@ -1,6 +1,6 @@
 """A plan for MoveIt and ROS 2: the scene, the goals, the arm with its needle and a sender, as one set.
 
-The table of candidates for programs that read no Parquet, as CSV, read back and equal before it is shown.
+The table of candidates for programs that read no Parquet: CSV or JSON, read back and equal before it is shown.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Silent, Watcher
 from puncture_twin.planning.base.provenance import Input, read_inputs
+from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.budget.guidance import check_ways
 from puncture_twin.planning.export.archive import DICOM
 from puncture_twin.planning.export.exporter import export_name, export_plan, format_names
@@ -47,7 +49,11 @@ ROUNDED = ("theta_deg", "beta_deg")
 
 
 def table_of(source: Path, choice: Choice) -> Path | None:
-    """The table that a source is or holds; None of a case, whose folder has a ``case.toml``."""
+    """The table that a source is or holds; None of a case, whose folder has a ``case.toml``.
+
+    Raises:
+        InputError: One candidate is chosen, or a plan is the source.
+    """
     if choice != BEST or is_plan(source):
         refuse("a table holds all candidates", source, f"{ALLOWED}; no choice", "conflicting_options")
     if source.suffix.lower() == ".parquet":
@@ -56,22 +62,29 @@ def table_of(source: Path, choice: Choice) -> Path | None:
     return table if table.is_file() and not (source / "case.toml").is_file() else None
 
 
-def export_candidates(table_path: Path, out: Path, note: Callable[[str], None]) -> Written:
-    """Write a table of candidates as CSV, beside its own set or elsewhere."""
+def export_candidates(table_path: Path, format_name: str, out: Path, note: Callable[[str], None]) -> Written:
+    """Write a table of candidates as text, beside its own set or elsewhere.
+
+    Raises:
+        InputError: No table of candidates, or not the one that its folder's manifest lists.
+    """
     found = read_output(table_path, max_bytes=MAX_TABLE_BYTES)
     if found.note:
         note(f"warning: {found.note}")
     table, source = _table(found.data, table_path), found.input("candidates")
-    inputs = (source, *read_inputs(json.loads(table.schema.metadata[b"run"])["inputs"]))
-    name, rows = "candidates.csv", _rows(table)
-    text = csv_text(table.column_names, rows)  # the manifest lists the inputs
-    if _read_csv(text, table) != rows:
+    run = json.loads(table.schema.metadata[b"run"])
+    inputs = (source, *read_inputs(run["inputs"]))
+    name = f"candidates.{format_name.removeprefix('candidates-')}"
+    columns, rows = table.column_names, _rows(table)
+    write, read = _WRITERS[format_name], _READERS[format_name]
+    text = write(run, columns, rows)
+    if read(text, table) != rows:
         raise ArithmeticError(f"{name} does not read back as the table")
     made_from = {source.path: source.sha256}
     with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
         files = put(draft, {name: text})
-    said = [Section(f"{CANDIDATES_CSV}: {len(rows)} rows in {files[0]}", [])]
-    return Written(CANDIDATES_CSV, files, {"rows": len(rows)}, said, inputs)
+    said = [Section(f"{format_name}: {len(rows)} rows in {files[0]}", [])]
+    return Written(format_name, files, {"rows": len(rows)}, said, inputs)
 
 
 def _table(data: bytes, path: Path) -> pa.Table:
@@ -91,6 +104,11 @@ def _rows(table: pa.Table) -> list[list[Any]]:
         if name in ROUNDED:
             columns[at] = [round(value, ANGLE_DIGITS) for value in columns[at]]
     return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _csv(run: Mapping[str, Any], columns: list[str], rows: list[list[Any]]) -> str:
+    del run  # a CSV has no place for it; the manifest lists the inputs
+    return csv_text(columns, rows)
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -124,7 +142,22 @@ def _value_of(kind: pa.DataType) -> Callable[[str], Any]:
     return lambda field: None if field == "" else number(field)
 
 
-CANDIDATES_CSV = "candidates-csv"
+def _json(run: Mapping[str, Any], columns: list[str], rows: list[list[Any]]) -> str:
+    return json.dumps({"run": run, "columns": columns, "rows": rows}, allow_nan=False) + "\n"
+
+
+def _read_json(text: str, table: pa.Table) -> list[list[Any]]:
+    document = parse_json(text.encode(), where="candidates.json", allowed="what was written")
+    return list(document["rows"]) if document["columns"] == table.column_names else []
+
+
+_WRITERS: Mapping[str, Callable[[Mapping[str, Any], list[str], list[list[Any]]], str]] = MappingProxyType(
+    {"candidates-csv": _csv, "candidates-json": _json}
+)
+_READERS: Mapping[str, Callable[[str, pa.Table], list[list[Any]]]] = MappingProxyType(
+    {"candidates-csv": _read_csv, "candidates-json": _read_json}
+)
+CANDIDATE_FORMATS = tuple(_WRITERS)
 """Of ``export --format``."""
 
 
@@ -145,9 +178,15 @@ def export_robot(
     *,
     seed: int | None = None,
 ) -> Written:
-    """Write a plan for a robot; with its case, after it has been checked again.
+    """Write a plan for a robot; with its case, after it has been checked again, and with rounded corners where free.
 
     For MoveIt and ROS 2, which need the case: the scene, the goals, the arm with its needle and a sender, as one set.
+
+    Args:
+        seed: That the plan must state; the case's by default.
+
+    Raises:
+        InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
     source, plan = read_noted_plan(plan_path, note)
     if context is not None:
@@ -163,8 +202,8 @@ def export_robot(
         if moves:
             files, notes = put(draft, moves), MOVEIT_NOTES
         else:
-            checked = context is not None
-            done = export_plan(plan, format_name, draft.folder, source=plan_path, case_checked=checked)
+            checker = None if context is None or context.reach is None else context.reach.checker
+            done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
             files, notes = draft.final((done.path,)), done.notes
     return _of_robot(format_name, files[0], plan, notes, inputs, case_checked=context is not None)
 
@@ -196,7 +235,7 @@ def export_value(
         InputError: A format of another source, or see the functions that write.
     """
     refuse_format(format_name)
-    kind = Candidates if format_name == CANDIDATES_CSV else Explanation if format_name in PATH_FORMATS else Plan
+    kind = Candidates if format_name in CANDIDATE_FORMATS else Explanation if format_name in PATH_FORMATS else Plan
     if not isinstance(source, kind):
         what = f"'{format_name}' is not written from a value of type {type(source).__name__}"
         refuse(what, "export", f"one of type {kind.__name__}", "wrong_type")
@@ -206,7 +245,7 @@ def export_value(
         context.own(source if isinstance(source, Candidates) else source.candidates)
     out, note = check_writable(folder), Silent().note
     if isinstance(source, Candidates):
-        return export_candidates(source.write(out), out, note)
+        return export_candidates(source.write(out), format_name, out, note)
     if isinstance(source, Explanation):
         assert context is not None
         one = source.candidates
@@ -218,7 +257,7 @@ def export_value(
 
 def refuse_format(name: str) -> None:
     """Refuse a format that nothing writes."""
-    known = (*format_names(), MOVEIT, *PATH_FORMATS, CANDIDATES_CSV)
+    known = (*format_names(), MOVEIT, *PATH_FORMATS, *CANDIDATE_FORMATS)
     if name not in known:
         refuse(f"format '{name}' is not known", "--format", ", ".join(known), "unknown_format")
 
@@ -242,12 +281,12 @@ def export_source(
         InputError: A source of which the format is not, or see the functions that write.
         NoAnswerError: No plan.
     """
-    if format_name == CANDIDATES_CSV:
+    if format_name in CANDIDATE_FORMATS:
         table = table_of(source, choice)
         if table is None:
             search_case(prepare(source, watcher=watcher), out, pictures=False)
             table = out / TABLE
-        return export_candidates(table, out, watcher.note)
+        return export_candidates(table, format_name, out, watcher.note)
     if scan is not None:
         if format_name != DICOM or choice != BEST or case is not None or not is_plan(source):
             allowed = f"--format {DICOM} alone, with a confirm.json"
