@@ -168,6 +168,9 @@ UR_MODELS: Mapping[str, UrModel] = MappingProxyType(
 def ur_model(name: str) -> UrModel:
     """The model of that name.
 
+    Args:
+        name: Such as ``ur3``; upper case is accepted.
+
     Raises:
         InputError: If no such model is known.
     """

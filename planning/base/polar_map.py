@@ -96,7 +96,11 @@ NO_MAP = PolarMap(b"", "")
 
 
 def polar_map(cells: Sectors, legend: Sequence[Entry], bin_rad: float = FINEST) -> PolarMap:
-    """The map with its legend; empty without cells."""
+    """The map with its legend; empty without cells.
+
+    Args:
+        bin_rad: Wanted size of a bin; it is made no smaller than `FINEST`.
+    """
     rim = float(cells.theta.max(initial=0.0))
     if rim <= 0.0:
         return NO_MAP

@@ -123,6 +123,10 @@ class InputFiles:
     def read(self, role: str, name: str, *, max_bytes: int, key: str, where: Path) -> bytes:
         """The content of a file, which is read where no role has wanted it before.
 
+        Args:
+            name: As ``where`` states it.
+            key: Of ``where``, for errors.
+
         Raises:
             InputError: It is missing, no plain file, empty, too large or not readable.
         """

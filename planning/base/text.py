@@ -134,7 +134,11 @@ def escape(value: object) -> str:
 
 
 def card(title: str, facts: Facts, picture: str = "") -> str:
-    """A title, a table of facts and, beside it, a picture."""
+    """A title, a table of facts and, beside it, a picture.
+
+    Args:
+        picture: HTML, such as an image; "" for none.
+    """
     rows = "".join(
         f'<tr style="{ROW}"><th style="{NAME}">{escape(name)}</th><td style="{CELL}">{escape(value)}</td></tr>'
         for name, value in facts

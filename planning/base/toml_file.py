@@ -92,6 +92,9 @@ def parse_toml(
 ) -> Model:
     """Validate the bytes of such a file; it is not opened again.
 
+    Args:
+        change: States some values otherwise, before any is looked at.
+
     Raises:
         InputError: Not TOML, or not of the schema: names the first key that is wrong.
     """
@@ -137,7 +140,11 @@ def _place(data: Any, keys: tuple[str | int, ...]) -> str:
 
 
 def check_toml_bounds(text: str, where: Path | str, allowed: str) -> None:
-    """Refuse a text that is nested too deep, or has a key, a number or a line too long; it need not be TOML."""
+    """Refuse a text that is nested too deep, or has a key, a number or a line too long; it need not be TOML.
+
+    Args:
+        allowed: What would have been accepted in its place, for the error.
+    """
     tables = 0
     for number, line in enumerate(text.split("\n"), start=1):
         tables += line.lstrip().startswith("[")

@@ -141,7 +141,11 @@ VOLUME_ROLES = ("labelmap", "ct")
 
 
 class CaseVolumes:
-    """The CT and the label maps of a case."""
+    """The CT and the label maps of a case.
+
+    Args:
+        path: The case file, to whose folder names are relative.
+    """
 
     def __init__(self, files: InputFiles, path: Path) -> None:
         self._files = files
@@ -152,6 +156,9 @@ class CaseVolumes:
 
     def read(self, role: str, name: str, *, key: str) -> None:
         """Read every file of a volume; those that hold its voxels decide as much as its header.
+
+        Args:
+            role: One of ``VOLUME_ROLES``.
 
         Raises:
             InputError: A file that is missing, too large or not readable, or a header that is damaged.

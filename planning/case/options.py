@@ -105,6 +105,9 @@ NO_OPTIONS = CaseOptions()
 def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
     """Options from plain values.
 
+    Args:
+        sections: Kind of option to a table of keys and values.
+
     Raises:
         InputError: An unknown kind, something that is no table, or a value that is no number, text or list of them.
     """

@@ -347,6 +347,9 @@ URDF_ROLE, MESH_ROLE = "urdf", "urdf mesh"
 def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> RobotSettings:
     """The arm with its home, its speeds, and where it is located, as far as mount or transform say so.
 
+    Args:
+        files: What it names; each file that decides the arm is added.
+
     Raises:
         InputError: An arm, a mount or a transform that cannot be used.
     """
@@ -443,6 +446,9 @@ def _shaft(needle: tables.NeedleSection, where: str | Path) -> Shaft:
 
 def breathing_of(section: tables.BreathingSection | None, space: Space, where: str | Path) -> Breathing | None:
     """The breathing of a case; None where it declares none.
+
+    Args:
+        space: Of the case, in which a direction is meant.
 
     Raises:
         InputError: A direction without length, or an anatomical one in a space that knows no patient.

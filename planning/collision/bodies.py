@@ -183,7 +183,11 @@ def padded_links(links: Sequence[Link], padding_mm: float) -> tuple[Link, ...]:
 
 
 class Solid:
-    """A moving shape; its bounding spheres and planes answer most questions before FCL builds it."""
+    """A moving shape; its bounding spheres and planes answer most questions before FCL builds it.
+
+    Args:
+        make: Makes its geometry, mm.
+    """
 
     def __init__(self, make: Callable[[], fcl.CollisionGeometry], pose: fcl.Transform | None = None) -> None:
         self._make = make

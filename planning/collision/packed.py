@@ -358,7 +358,11 @@ MOST_CELLS = 4_000_000
 
 
 def packed_skin(patient: TriangleMesh | None, skin_triangles: int, cache: Cache) -> SkinTree:
-    """The skin's tree and its field, of which nothing is known yet; or some that no check wants."""
+    """The skin's tree and its field, of which nothing is known yet; or some that no check wants.
+
+    Args:
+        patient: The skin, and behind it what the CT shows besides.
+    """
     if patient is None:
         nothing = (np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 1, 3, 3)))
         return SkinTree(nothing, np.zeros((1, 1, 1), np.float32), np.zeros(3), np.zeros((1, 1), np.bool_))

@@ -48,6 +48,9 @@ class FclSkin:
     To build a tree takes longer than most questions, and the arm comes near to few parts of a patient. FCL tests a
     triangle by itself, whichever tree it is in, so the surface touches what one of its parts touches.
 
+    Args:
+        mesh: The surface, mm.
+
     Raises:
         InputError: FCL calls a NaN vertex free and dies of an index out of range: so that is looked for first.
     """
@@ -215,6 +218,9 @@ CARRIERS = ("wrist_3", "holder", "needle")
 
 def check_hanging(tool: ToolBody, bodies: Sequence[Body]) -> None:
     """Refuse a tool of which a part touches neither wrist, holder nor needle, nor a part that does.
+
+    Args:
+        bodies: Of the arm; those of the flange all move with one frame.
 
     Raises:
         InputError: Says how large the tool is and where it lies.

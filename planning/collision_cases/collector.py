@@ -156,7 +156,13 @@ class CollisionMismatchError(AssertionError):
 
 @dataclass(frozen=True)
 class Table:
-    """One table of expectations, as a test needs it."""
+    """One table of expectations, as a test needs it.
+
+    Attributes:
+        kind: ``check``, ``window`` or ``plan``.
+        at: Its number among those, from 0 on.
+        line: Where it begins, from 1 on; None where nothing tells.
+    """
 
     kind: str
     at: int

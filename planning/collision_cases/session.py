@@ -128,7 +128,13 @@ def updating(config: pytest.Config) -> bool:
 
 @dataclass(frozen=True)
 class Change:
-    """A number of one table to be rewritten."""
+    """A number of one table to be rewritten.
+
+    Attributes:
+        kind: The array of the table, such as ``check``.
+        at: Its number in the array, from 0 on.
+        number: What is to be written.
+    """
 
     kind: str
     at: int

@@ -39,6 +39,9 @@ STEP_SLACK = 1e-9
 def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache = NO_CACHE) -> tuple[Finding, ...]:
     """Hold the inputs of a case against each other.
 
+    Args:
+        placement: Where the patient lies for the robot, or None.
+
     Returns:
         Warnings and notes, in the order in which they are shown.
 

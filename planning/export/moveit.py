@@ -153,6 +153,9 @@ def moveit_names(stem: str) -> tuple[str, ...]:
 def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> Mapping[str, str]:
     """Name to text of the MoveIt files.
 
+    Args:
+        source: The plan's file, for the names and for errors.
+
     Raises:
         InputError: A plan that contradicts itself, or a number beyond the arm's limits.
     """

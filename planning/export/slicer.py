@@ -51,7 +51,11 @@ _SHOWN = {
 
 @dataclass(frozen=True)
 class SceneNode:
-    """One node of a scene."""
+    """One node of a scene.
+
+    Attributes:
+        file: Where it is stored, next to the scene.
+    """
 
     kind: Kind
     name: str

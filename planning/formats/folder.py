@@ -103,6 +103,9 @@ def unaccounted(folder: Path, found: tuple[Entry, ...], known: Callable[[Path], 
     """The entries of a folder that are neither known nor harmless.
 
     A folder in it is accounted for if it is passed over, or if all that it holds is accounted for.
+
+    Args:
+        known: Whether a path is read, by whoever asks or by someone else.
     """
     names = {one.name for one in found}
     return [

@@ -484,6 +484,9 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
 
     Separated by commas, or by spaces as RTDE's own client writes it.
 
+    Args:
+        timed: Whether it must hold times.
+
     Raises:
         InputError: A column is missing, something is no number, or the angles or times are of no arm.
     """

@@ -66,7 +66,15 @@ LEAST_MARKERS = 3
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the user says of the files."""
+    """What the user says of the files.
+
+    Attributes:
+        space: Of meshes, and of lists that do not say theirs.
+        naming: Of label maps without names.
+        up: The axis of meshes that is up.
+        ct: The CT, where there are several.
+        segmentation: The label map or folder, where there are several.
+    """
 
     space: Space
     naming: str | None = None

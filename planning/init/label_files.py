@@ -117,6 +117,9 @@ def mask_of(file: str, labels: LabelMap) -> Mask | None:
 def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str | None) -> Segmentation:
     """A label map with the names of its labels: stated, inside the file, in a table beside it, or TotalSegmentator's.
 
+    Args:
+        naming: As the user states it, or None.
+
     Raises:
         InputError: No names are found, or they do not name every label.
     """
@@ -239,6 +242,10 @@ def _table(path: Path) -> bytes:
 def file_masks(place: Place, source: str, key: str, ct: str | None) -> Segmentation:
     """The structures of a file: of DICOM on the slices of the CT, or segments of Slicer, of which some overlap.
 
+    Args:
+        key: Of the case: ``seg`` or ``rtstruct``.
+        ct: The CT of the case, read before, or None.
+
     Raises:
         InputError: Structures that cannot be trusted, or were drawn on another CT.
     """
@@ -298,7 +305,11 @@ BESIDE_SPINE = (
 
 
 class Plausibility(NamedTuple):
-    """Agreement of a naming with the places of organs in a label map."""
+    """Agreement of a naming with the places of organs in a label map.
+
+    Attributes:
+        nameless: Labels present that the naming does not know.
+    """
 
     rules: int
     broken: int

@@ -102,7 +102,11 @@ def _is_toml(value: str) -> bool:
 
 
 def with_keys(text: str, keys: Mapping[str, str], reasons: Mapping[str, str] = REASONS) -> str:
-    """The text of a case in which keys have these values: in place of theirs, else first in their table."""
+    """The text of a case in which keys have these values: in place of theirs, else first in their table.
+
+    Args:
+        text: Of the case; every table but ``[end]`` may be missing.
+    """
     for key, value in keys.items():
         table, _, name = key.rpartition(".")
         text = with_line(text, table, f"{name} = {value}  # {reasons.get(key, STATED)}", name)

@@ -195,6 +195,10 @@ def mesh_folder(
 ) -> Segmentation:
     """The meshes of a folder, in the unit that their extent tells.
 
+    Args:
+        stated: Unit of the coordinates where the user says it, or None.
+        up: Their axis that is up where the user says it.
+
     Raises:
         InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.
     """
@@ -400,7 +404,11 @@ round holds it: the target was carved out of it, and no path comes to it otherwi
 
 
 def bordering(target: str | None, segmentations: Sequence[Segmentation]) -> dict[str, float]:
-    """Of the target's surface the fraction that each structure borders on whose box may go round it."""
+    """Of the target's surface the fraction that each structure borders on whose box may go round it.
+
+    Args:
+        target: The structure that the case names, or None.
+    """
     every = [SkinOf(one, label) for one in segmentations for label in one.names]
     found = {}
     for own in (one for one in every if one.name == target):
@@ -414,7 +422,11 @@ def bordering(target: str | None, segmentations: Sequence[Segmentation]) -> dict
 
 
 def carved_notes(rows: Sequence[Assigned], target: str | None, border: Mapping[str, float]) -> Iterator[str]:
-    """That an avoided structure goes round the target's, one sentence each."""
+    """That an avoided structure goes round the target's, one sentence each.
+
+    Args:
+        target: The structure that the case names, or None.
+    """
     for row in rows:
         if row.kind == "avoid" and border.get(row.name, 0.0) >= MOST_OF_BORDER:
             yield (

@@ -142,7 +142,12 @@ def _target(request: Request, point: Floats | None, outlines: segmentation.Outli
 
 
 class Body(NamedTuple):
-    """Where the skin comes from."""
+    """Where the skin comes from.
+
+    Attributes:
+        ct: The CT, where there is one.
+        structure: The structure that is the skin, where the CT is not asked.
+    """
 
     ct: Ct | None
     structure: segmentation.SkinOf | None

@@ -93,6 +93,9 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
 
     No path is shorter than the straight line to its goal, so once there is one, only goals nearer than it is long are
     sought.
+
+    Args:
+        max_samples: Of the planner, in each of its runs.
     """
     away = _distances(task.home, task.goals)
     best = _straight(task.contact_of, task.home, task.goals, away)

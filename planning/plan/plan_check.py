@@ -211,6 +211,9 @@ def arm_document(model: UrModel) -> dict[str, Any] | None:
 def read_arm(name: str, document: Any) -> UrModel:
     """The arm of a plan that was read; one of the user's own has no shapes yet, which its case holds.
 
+    Args:
+        document: Of `arm_document`, or None.
+
     Raises:
         InputError: No arm of that name.
         TypeError, KeyError, ValueError: Numbers that are no arm's.

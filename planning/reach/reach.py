@@ -94,7 +94,11 @@ def assess_reach_all(
 
 
 def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswer]:
-    """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first."""
+    """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first.
+
+    Args:
+        checker: Checks contacts, in the base frame.
+    """
     found = _surveyed(checker, [request], ROLLS)[0]
     tried = tried_all(checker, [(found, insertion) for insertion in found.insertions()])
     return [answer for answer in tried if isinstance(answer, ReachAnswer)]
@@ -233,7 +237,11 @@ class Blocked(NamedTuple):
 
 
 def tried_all(checker: StateChecker, motions: Sequence[tuple[Surveyed, Insertion]]) -> list[ReachAnswer | Blocked]:
-    """Check motions for contacts: the standoffs of all at once, then those motions whose standoff is clear."""
+    """Check motions for contacts: the standoffs of all at once, then those motions whose standoff is clear.
+
+    Args:
+        checker: Checks contacts, in the base frame.
+    """
     standoffs = np.array([insertion.standoff for _, insertion in motions]).reshape(-1, 6)
     found: list[ReachAnswer | Blocked] = []
     for motion, contact in zip(motions, checker.contacts(standoffs, needle_may_touch_patient=False), strict=True):

@@ -126,6 +126,9 @@ class PosePairs(Shown):
 def read_pose_pairs(path: Path, *, motions: bool = False) -> PosePairs:
     """Pairs of poses from a CSV: ``name``, ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``, and the same for B.
 
+    Args:
+        motions: Whether its rows are motions.
+
     Raises:
         InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
     """

@@ -37,7 +37,12 @@ from puncture_twin.planning.search.candidates import Candidates, Verdict
 
 
 def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBound | None) -> Candidates:
-    """Reject candidates whose clearance is less than the margin and the largest deflection."""
+    """Reject candidates whose clearance is less than the margin and the largest deflection.
+
+    Args:
+        anatomy: The structures of ``candidates``.
+        bound: How far the needle may bend; None bends nothing.
+    """
     if bound is None:
         return candidates
     deflection = bound.at(candidates.path.length)

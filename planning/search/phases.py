@@ -69,7 +69,12 @@ def with_breathing(
 
 
 def with_breathing_reach(case: Case, anatomy: Anatomy, candidates: Candidates, reach: ArmReach) -> Candidates:
-    """Reject candidates that the arm cannot reach, or insert along, at a phase in the gate's window."""
+    """Reject candidates that the arm cannot reach, or insert along, at a phase in the gate's window.
+
+    Args:
+        case: The case; nothing is done where it declares no breathing.
+        candidates: Checked with the arm where the CT shows the body.
+    """
     breathing = case.breathing
     if breathing is None:
         return candidates

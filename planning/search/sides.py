@@ -71,7 +71,11 @@ class Grid(NamedTuple):
 
 
 def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
-    """The sides of the body by skin, what lies outside of it and the needle's length; organs do not count."""
+    """The sides of the body by skin, what lies outside of it and the needle's length; organs do not count.
+
+    Args:
+        case: The validated case; none of a patient has no sides.
+    """
     if case.space is Space.LOCAL:
         return ()
     around = grid((0.0, np.pi), (0.0, 2.0 * np.pi), STEP, np.eye(3))

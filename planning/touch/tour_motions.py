@@ -58,7 +58,12 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class TouchTour:
-    """Touches one after another."""
+    """Touches one after another.
+
+    Attributes:
+        touches: In the order in which they are touched.
+        leave: From the last standoff home.
+    """
 
     model: UrModel
     tip_mm: float
@@ -103,6 +108,9 @@ class Stops(NamedTuple):
 
 def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Count) -> TouchTour:
     """Plan the motions of a tour through stops.
+
+    Args:
+        stops: Each with a straight line to it that the arm can follow.
 
     Raises:
         NoMotionError: None to a stop.

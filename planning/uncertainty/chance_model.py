@@ -36,7 +36,11 @@ TAKEN = frozenset({"any", "joint"})
 
 @dataclass(frozen=True, eq=False)
 class ChanceModel:
-    """Chances of any needles of one case."""
+    """Chances of any needles of one case.
+
+    Attributes:
+        engine: Prepared for the meshes of ``anatomy.checked``.
+    """
 
     case: Case
     anatomy: Anatomy

@@ -186,7 +186,11 @@ def _outer(J: Floats, variances: Floats) -> Floats:
 
 
 def pose_error(case: Case, registration: Registration | None) -> PoseError | None:
-    """The pose error of a case; None where it declares no errors, or no markers tie its frames."""
+    """The pose error of a case; None where it declares no errors, or no markers tie its frames.
+
+    Args:
+        registration: Of its markers, with the case's own declaration.
+    """
     if case.errors is None or registration is None or registration.uncertainty is None:
         return None
     target = apply(registration.T_base_ct, case.target_ct)

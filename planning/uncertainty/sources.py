@@ -28,7 +28,11 @@ NAMED = 3
 
 
 def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
-    """Sentences on what the chances of a case leave out: undeclared errors, and those counted elsewhere."""
+    """Sentences on what the chances of a case leave out: undeclared errors, and those counted elsewhere.
+
+    Args:
+        counted: Of breathing, bending and motion, what these chances count.
+    """
     declared = {"breathing": case.breathing, "bending": case.bending}
     left_out = [texts[declared[name] is not None] for name, texts in NOT_MODELLED.items() if name not in counted]
     moving = [] if "motion" in counted else ["tissue motion"]

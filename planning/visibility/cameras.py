@@ -137,6 +137,9 @@ def camera_view(context: CaseContext, plan: Plan | Watched) -> CameraView:
     bed, where at most depths a ball is seen, then most balls, then most markers, then the needle from its side; and
     where neither patient, surroundings nor the moving arm comes near.
 
+    Args:
+        context: The case, with ``[stereo]``.
+
     Raises:
         InputError: The case declares no cameras, or states one in the patient.
         NoAnswerError: Whatever lies around the target leaves no place for two cameras.

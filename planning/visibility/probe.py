@@ -165,6 +165,9 @@ FREE = "free"
 def probe_view(context: CaseContext, plan: Plan | Watched) -> ProbeView:
     """Where the probe goes while a plan's needle is inserted.
 
+    Args:
+        context: The case, with ``[ultrasound]``.
+
     Raises:
         InputError: The case declares no probe, or a stated base of its arm is in the patient.
     """

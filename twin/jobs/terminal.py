@@ -47,7 +47,11 @@ class Answer(NamedTuple):
 
 
 def default_out(source: Path, command: str) -> Path:
-    """The folder for a command's files where none is named, such as ``out/abdomen-search``."""
+    """The folder for a command's files where none is named, such as ``out/abdomen-search``.
+
+    Args:
+        source: What the command reads: a case, its folder, or a plan.
+    """
     place = source.absolute()
     if place.suffix.lower() not in {".toml", ".json"}:
         name = place.name

@@ -39,7 +39,12 @@ TRIED = 16
 
 
 def drawn_truth(puncture: Puncture, trials: Trials, row: int, seed: int, source: str) -> Truth:
-    """The truth whose execution ends as one of the trials did."""
+    """The truth whose execution ends as one of the trials did.
+
+    Args:
+        seed: Of their draws.
+        source: In words for the report.
+    """
     T_base_tip = np.array(flange_pose(puncture.model, puncture.q_insertion))
     T_base_tip[:3, 3] += puncture.tip_mm * T_base_tip[:3, 2]
     T_ct_tip = np.eye(4)
@@ -50,6 +55,9 @@ def drawn_truth(puncture: Puncture, trials: Trials, row: int, seed: int, source:
 
 def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Truth:
     """The truth of one rehearsal: a trial of the declared errors, unless the case states true positions or none.
+
+    Args:
+        seed: Instead of the case's own.
 
     Raises:
         InputError: A file of true positions that cannot be used.

@@ -44,6 +44,11 @@ CLEARANCE_SAMPLES = 48
 def rehearse(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> Rehearsal:
     """Execute a plan where the ground truth differs from the belief; no randomness but that in ``truth``.
 
+    Args:
+        plan: What was planned on the belief.
+        case: The case of the plan.
+        truth: The patient's pose and the joints' offsets, already drawn.
+
     Raises:
         InputError: The twin has no body of this arm, or its base stands in the patient.
     """

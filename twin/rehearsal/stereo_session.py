@@ -180,7 +180,12 @@ class Reached(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Result of a session."""
+    """Result of a session.
+
+    Attributes:
+        calibration: Result of the robot's points.
+        reached: One for each target.
+    """
 
     workcell: StereoWorkcell
     calibration: RobotCalibration

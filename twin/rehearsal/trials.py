@@ -139,7 +139,11 @@ class Truths(NamedTuple):
 def draw_truths(
     puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator, moving: Moving | None = None
 ) -> Truths:
-    """Draw the truth of trials from declared errors; what moves has a generator of its own."""
+    """Draw the truth of trials from declared errors; what moves has a generator of its own.
+
+    Args:
+        moving: None moves nothing.
+    """
     motion, breath, skin = _moved(moving, count, rng)
     eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))  # stays for all touches of a trial
     read_ct, touched = _touched(puncture, errors, eta, skin, rng)

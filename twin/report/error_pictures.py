@@ -1,6 +1,7 @@
 """What each source of the needle's error costs, and what a change of scan, markers or arm leaves of it, drawn.
 
-``rooms.png``: where the tips of many rooms ended, and how often, beside what was predicted.
+``rooms.png``: where the tips of many rooms ended, and how often, beside what was predicted. And of one rehearsal, how
+far tip and needle were from target and structures over time.
 """
 
 from __future__ import annotations
@@ -253,3 +254,47 @@ def _reliability(axes: Axes, found: Any) -> None:
     axes.set_ylabel("observed fraction of trials")
     axes.set_title("predicted and observed chances", fontsize=10)
     axes.legend(fontsize=7.5, loc="upper left")
+
+
+MOST_STRUCTURES = 6
+"""Curves of clearance: so many of the nearest structures; the table has the rest."""
+
+NAMED_PHASE = 0.07
+"""Fraction of the time that a phase must last to carry its name; shorter ones would overlap."""
+
+CURVES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
+"""Okabe and Ito's, one for each curve."""
+
+
+def rehearsal_png(rehearsal: Any, keep_away: frozenset[str]) -> bytes:
+    """A PNG over time: the true tip to the true target, with the phases, and the true needle to true structures."""
+    figure = Figure(figsize=(12.0, 3.6), dpi=DPI, facecolor="white", layout="constrained")
+    distance, clearance = figure.subplots(1, 2)
+    away = np.linalg.norm(rehearsal.tip_true_ct - rehearsal.target_true_ct, axis=1)
+    distance.plot(rehearsal.times_s, away, color="#00684a")
+    distance.set_ylabel("true tip to true target, mm")
+    for phase, start, length in _phases(rehearsal):
+        distance.axvline(start, color="0.6", linestyle=":", linewidth=1)
+        if length > NAMED_PHASE * rehearsal.times_s[-1]:
+            distance.annotate(phase, (start, 1.0), (3, -10), ("data", "axes fraction"), textcoords="offset points")
+    names = [name for name in rehearsal.clearance_mm if name in keep_away]
+    nearest = sorted(names, key=lambda n: float(np.min(rehearsal.clearance_mm[n], initial=np.inf)))
+    for name, colour in zip(nearest, CURVES[:MOST_STRUCTURES], strict=False):
+        label = name.replace("_", " ")
+        clearance.plot(rehearsal.clearance_times_s, rehearsal.clearance_mm[name], color=colour, label=label)
+    clearance.axhline(0, color="#d6001e", linewidth=1)
+    clearance.set_ylabel("true needle to true structure, mm")
+    if nearest:
+        clearance.legend(fontsize=8)
+    for axes in (distance, clearance):
+        axes.set_xlabel("time, s")
+        axes.grid(color="0.9")
+    return png(figure)
+
+
+def _phases(rehearsal: Any) -> list[tuple[str, float, float]]:
+    """Name, start and length of each phase, s."""
+    phase, times = rehearsal.phase, rehearsal.times_s
+    starts = np.concatenate([[0], np.flatnonzero(phase[1:] != phase[:-1]) + 1])
+    ends = np.append(starts[1:], len(times) - 1)
+    return [(str(phase[i]), float(times[i]), float(times[j] - times[i])) for i, j in zip(starts, ends, strict=True)]

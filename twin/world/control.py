@@ -135,6 +135,9 @@ class VirtualMass:
 class Admittance:
     """The controller: it keeps the virtual mass's place and speed, shape (3,) each, m and m/s, base frame.
 
+    Args:
+        dt: Its step, s.
+
     Raises:
         InputError: The virtual mass would diverge with this step.
     """
@@ -324,7 +327,11 @@ class Reference:
 
 
 def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float, hold_s: float = 0.0) -> Reference:
-    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then constant."""
+    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then constant.
+
+    Args:
+        dt: The controller's step, s.
+    """
     moving = int(np.ceil(trajectory.duration_s / dt)) + 1
     times = np.minimum(dt * np.arange(moving + round(hold_s / dt)), trajectory.duration_s)
     if len(trajectory.q) == 1:
@@ -463,7 +470,14 @@ class Surroundings:
 def run(
     arm: Arm, controller: Controller, reference: Reference, tip_of: Callable[[Floats], Tip], around: Surroundings
 ) -> Run:
-    """Follow a reference from where the arm is."""
+    """Follow a reference from where the arm is.
+
+    Args:
+        arm: Of an open workcell whose world is the base frame.
+        controller: Its step becomes that of the physics.
+        reference: The motion to follow, a row a step.
+        around: What else acts.
+    """
     set_time_step(arm.client, controller.dt)
     arm.release()  # motors that hold on would work against torques; goals switch them on again
     q, places, forces = [], [], []

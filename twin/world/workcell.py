@@ -27,7 +27,12 @@ from puncture_twin.twin.world.client import physics_client, pose_to_m, pybullet,
 
 @dataclass(frozen=True)
 class SimulatedWorkcell:
-    """An open simulated workcell."""
+    """An open simulated workcell.
+
+    Attributes:
+        arm: The arm; its base frame is the world frame.
+        bodies: Body id to name, the arm not among them.
+    """
 
     client: int
     arm: Arm

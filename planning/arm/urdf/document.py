@@ -107,7 +107,12 @@ class UrdfJoint:
 
 @dataclass(frozen=True, eq=False)
 class UrdfDocument:
-    """A whole URDF."""
+    """A whole URDF.
+
+    Attributes:
+        links: By name, in the file's order.
+        joints: In the file's order.
+    """
 
     name: str
     links: Mapping[str, UrdfLink]

@@ -169,7 +169,11 @@ class Memory:
         return self._held
 
     def get(self, key: tuple[Hashable, ...], make: Callable[[], Value], size: Callable[[Value], int]) -> Value:
-        """The value of a key, made where it is not there."""
+        """The value of a key, made where it is not there.
+
+        Args:
+            size: About how many bytes it holds.
+        """
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)

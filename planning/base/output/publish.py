@@ -169,7 +169,11 @@ def uninterrupted() -> Iterator[None]:
 def with_timings(
     folder: Path, kept: Iterable[str], command: str, started: datetime, seconds: Mapping[str, float]
 ) -> str:
-    """The folder's timings with those of a command put in."""
+    """The folder's timings with those of a command put in.
+
+    Args:
+        kept: Commands whose entries stay, and so their timings.
+    """
     before = _read(folder / manifest.TIMINGS_NAME)
     timings = {name: before[name] for name in kept if name in before}
     timings[command] = {

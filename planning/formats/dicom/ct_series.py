@@ -50,7 +50,11 @@ class _Series:
 
 @dataclass(frozen=True, eq=False)
 class CtSeries:
-    """A CT series in one folder. Its headers are read once, its pixels at each call of `volume`."""
+    """A CT series in one folder. Its headers are read once, its pixels at each call of `volume`.
+
+    Attributes:
+        files: Every file of the series, by its key in ``content``.
+    """
 
     path: Path
     files: tuple[str, ...]

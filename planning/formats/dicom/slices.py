@@ -76,6 +76,9 @@ class Slice:
 def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     """The slices of a CT file; scouts among the frames of an enhanced one are left out.
 
+    Args:
+        frames: How many images it holds.
+
     Raises:
         InputError: A position, an axis, a spacing or a rescaling is missing, contradictory or not in Hounsfield units.
     """

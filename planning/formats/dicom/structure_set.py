@@ -61,6 +61,9 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     slices out and interpolate, and a gap in an organ would count as free. What encloses no pixel's centre counts for
     the pixels along it. Both are noted.
 
+    Args:
+        file: The file's key in ``content``.
+
     Raises:
         InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that
             lie off the CT's slices.

@@ -49,6 +49,10 @@ def structure_name(file: str) -> str:
 def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path) -> tuple[str, ...]:
     """The names of the masks in a folder, sorted; nothing else may lie in it that could be an organ.
 
+    Args:
+        known: Whether a path in it is something else that the case names.
+        where: The file and key that name the folder, for errors.
+
     Raises:
         InputError: No folder, no mask in it, too many, two of one structure, or entries that would be passed over.
     """

@@ -329,7 +329,11 @@ def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:
 
 
 def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
-    """Warnings about a structure's mesh, one sentence each."""
+    """Warnings about a structure's mesh, one sentence each.
+
+    Args:
+        mesh: The structure's surface, mm.
+    """
     warnings = []
     flat = np.count_nonzero(mesh.areas == 0.0)
     if flat:

@@ -96,7 +96,11 @@ def read_volume(path: Path) -> Volume:
 
 
 def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volume:
-    """Parse a volume file that has been read; it is not opened again."""
+    """Parse a volume file that has been read; it is not opened again.
+
+    Args:
+        data: The file that `data_file` names, where it names one.
+    """
     header = parse_header(content, path)
     stored = content if data is None else data
     try:
@@ -161,7 +165,11 @@ class VolumeSource(Protocol):
 
 @dataclass(frozen=True)
 class VolumeFile:
-    """A volume in one file, or in a header and a file of voxels beside it."""
+    """A volume in one file, or in a header and a file of voxels beside it.
+
+    Attributes:
+        files: That file, and the one beside it.
+    """
 
     path: Path
     files: tuple[str, ...]

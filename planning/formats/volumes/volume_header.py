@@ -189,6 +189,9 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
 
     Stops one byte after the promised length, so what a bomb would inflate to is never made.
 
+    Args:
+        promised: Bytes that the header says they inflate to.
+
     Returns:
         Shape (promised,).
 

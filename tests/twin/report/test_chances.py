@@ -12,7 +12,7 @@ from puncture_twin.planning.search.uncertainty_breakdown import Goal, Remedy, Un
 from puncture_twin.planning.uncertainty.chance_model import Chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
 from puncture_twin.twin.report.error_pictures import draw_rooms_picture, needle_frame
-from puncture_twin.twin.report.page.page import Shown, Uncertainty, write_page
+from puncture_twin.twin.report.page.page import Shown, Uncertainty, methods_text, write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.patient import rooms
 from puncture_twin.twin.report.present import Section, text
@@ -71,6 +71,10 @@ def test_the_page_says_how_sure_it_is(shown, tmp_path):
         assert words in text
     for words in ("How sure it is", "In many trials"):
         assert words not in plain.read_text()
+    none = replace(found, chances=replace(found.chances, hit=np.full(len(found), np.nan)))
+    for one, computed in ((found, True), (none, False), (replace(found, chances=None), False)):
+        said = methods_text(case, anatomy, one)
+        assert ("Chances to hit and to touch were propagated" in said) == computed
     known, unknown = (map_data(case, one, None) for one in (found, replace(found, chances=None)))
     assert "p_touch_any" in known and "p_touch_any" not in unknown
 

@@ -244,7 +244,11 @@ class Side:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Shown):
-    """Two paths."""
+    """Two paths.
+
+    Attributes:
+        case_name: The case, or those that two plans name.
+    """
 
     case_name: str
     inputs: tuple[Input, ...]

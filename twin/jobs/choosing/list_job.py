@@ -120,7 +120,14 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CheckedList:
-    """All rows of a list."""
+    """All rows of a list.
+
+    Attributes:
+        arm: Whether the arm was checked: see `Candidates.arm_note`.
+        inputs: The list, then what the case names.
+        rows: In the order of the list, by `COLUMNS`.
+        warnings: Of the list and of the case.
+    """
 
     case_name: str
     arm: str
@@ -165,7 +172,12 @@ def check_entries(context: CaseContext, listed: ReadList) -> CheckedList:
 
 
 def check_targets(context: CaseContext, listed: ReadList, aimed: Callable[[Listed], CaseContext]) -> CheckedList:
-    """Search the case again for every listed target, and explain the choice, or the best."""
+    """Search the case again for every listed target, and explain the choice, or the best.
+
+    Args:
+        context: Of the case, for what does not depend on the target.
+        aimed: The case with a row's point as its target, read anew.
+    """
 
     def outcome(row: Listed) -> Outcome:
         there = aimed(row)

@@ -38,6 +38,9 @@ DRAWS = 400
 def physical_runs(context: CaseContext, runs: int) -> dict[str, Any]:
     """Run the experiment of a case's best candidate, each run with a truth of its own.
 
+    Args:
+        context: Of a case with declared errors, markers and an arm.
+
     Returns:
         Plain values: the tip's rms error that the declaration predicts for these touches and that of the runs that
         ended, each of these, why others were refused, and the errors of truths without physics, the same and many.

@@ -129,6 +129,9 @@ class TouchRun(Shown):
 def touch_case(context: CaseContext, out: Path, choice: Choice, seed: int) -> TouchRun:
     """Plan the touches of a case's markers for a chosen puncture, execute them in the twin, write what they read.
 
+    Args:
+        context: Of a case with declared errors, markers and an arm.
+
     Raises:
         InputError: The case declares no errors, or has no markers.
         NoAnswerError: Nothing is safe, or too few markers can be touched, with the reasons.

@@ -139,6 +139,9 @@ def readings_of(
 ) -> Readings:
     """The readings of a running arm, or of a recording.
 
+    Args:
+        seconds: How long it is read; None until it is interrupted.
+
     Raises:
         InputError: Not one of the two, an arm that does not answer, or a file that cannot be used.
     """

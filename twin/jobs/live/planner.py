@@ -122,7 +122,12 @@ SUBJECTS = ("status", "target", "needle")
 
 @dataclass(eq=False)
 class Session:
-    """What a client has said: its target, and its needle."""
+    """What a client has said: its target, and its needle.
+
+    Attributes:
+        context: Of the target; None after one that was refused.
+        needle: Its last question.
+    """
 
     context: CaseContext | None
     needle: Question | None = None

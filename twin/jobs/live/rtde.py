@@ -95,6 +95,9 @@ def _check_host(host: str, command: str) -> None:
 def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[RecordedState]:
     """What a receiver reads, every so often; nothing twice. Time and angles may be one package (8 ms) apart.
 
+    Args:
+        seconds: How long, by the robot's clock; None for ever.
+
     Raises:
         InputError: The robot hangs up or falls silent, or tells something that is no joint angles.
     """
@@ -123,7 +126,12 @@ def told(time_s: float, q: list[float]) -> RecordedState:
 
 @dataclass(frozen=True)
 class LedArm:
-    """A UR that somebody else moves, by hand or by its pendant: an `Arm` that reads, and waits until it is there."""
+    """A UR that somebody else moves, by hand or by its pendant: an `Arm` that reads, and waits until it is there.
+
+    Attributes:
+        receiver: As `connect` gives it.
+        period_s: Between two readings.
+    """
 
     receiver: Receiver
     period_s: float = 0.02

@@ -202,7 +202,12 @@ def bound(host: str, port: int) -> socket.socket:
 
 
 def serve(listener: socket.socket, planner: Planner, pose_s: float = POSE_S) -> None:
-    """Answer clients until it is interrupted; the port is free then."""
+    """Answer clients until it is interrupted; the port is free then.
+
+    Args:
+        listener: From `bound`; closed at the end.
+        pose_s: How long a needle's pose counts.
+    """
     exchange, log, clients = Exchange(pose_s), Log(), dict[int, Client]()
     computing = threading.Thread(target=_compute, args=(exchange, planner), daemon=True)
     computing.start()

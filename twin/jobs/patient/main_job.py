@@ -108,6 +108,9 @@ def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
 def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = None, choice: Choice = BEST) -> Run:
     """Plan, rehearse the plan, in many rooms too where a number is given, and write everything.
 
+    Args:
+        rooms: How many, beside the one that is filmed.
+
     Raises:
         InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
         NoAnswerError: No plan; the search's files are written all the same.

@@ -196,6 +196,9 @@ def look_for_markers(
 ) -> MarkersRun:
     """Find the markers of a CT.
 
+    Args:
+        where: Of the layout, for a refusal.
+
     Raises:
         InputError: Nothing that can be read, or a mirrored layout.
         NoAnswerError: No markers, too few or many, or several sizes.

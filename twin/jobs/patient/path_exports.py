@@ -156,6 +156,10 @@ def export_path(
 def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str], None]) -> Written:
     """Write the needle that `confirm` read, on the slices of its control scan.
 
+    Args:
+        source: Its ``confirm.json``.
+        scan: The scan, whose bytes must be those that were confirmed.
+
     Raises:
         InputError: No confirmation, another scan than its own, or one that is no DICOM series.
     """

@@ -33,7 +33,13 @@ RANDOM_SETS = 50
 
 @dataclass(frozen=True, eq=False)
 class SelfcalRun:
-    """What the command did."""
+    """What the command did.
+
+    Attributes:
+        trials: In the twin, one per seed; empty for a recording.
+        warnings: What the recording leaves open, one sentence each.
+        shots: What came of each shot after the recording.
+    """
 
     name: str
     calibration: Calibration

@@ -97,6 +97,9 @@ def refuse_with_recording(out_dir: Path | None, record: Path | None, seeds: int)
 def follow_recording(path: Path, recording: Path) -> Answer:
     """Calibrate and map from a recorded session, and say what each of its looks at the ball says.
 
+    Args:
+        recording: Its folder; see `twin.guidance.stereo.recording`.
+
     Raises:
         InputError: Case or recording cannot be used.
         NoAnswerError: A point or a marker is not found in its pictures.

@@ -85,7 +85,12 @@ OF_NAME = MappingProxyType({"bolt": METAL_HU, "unnamed_dense": 700.0, "unnamed_g
 
 
 def default_hu(name: str, region: str) -> float:
-    """Hounsfield units of a structure by its name."""
+    """Hounsfield units of a structure by its name.
+
+    Args:
+        name: In any spelling.
+        region: As the case states it.
+    """
     for start, hu in OF_NAME.items():
         if name.lower().startswith(start):
             return hu

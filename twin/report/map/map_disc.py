@@ -54,7 +54,11 @@ class Label(NamedTuple):
 
 
 def draw_disc(axes: Axes, candidates: Candidates, view: MapView, raster: MapRaster, pick: Pick | None) -> None:
-    """Draw it in the disc's radii; what stands at the rim lies outside of the axes."""
+    """Draw it in the disc's radii; what stands at the rim lies outside of the axes.
+
+    Args:
+        axes: A square of 2 `RADIUS` pixels.
+    """
     axes.set_axis_off()
     axes.set(xlim=(-1, 1), ylim=(-1, 1), autoscale_on=False)
     codes, names = region_codes(candidates.verdict, raster.rows)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +22,9 @@ from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, chance_text
 from puncture_twin.twin.report import patient
-from puncture_twin.twin.report.error_pictures import budget_png
+from puncture_twin.twin.report.error_pictures import budget_png, rehearsal_png
 from puncture_twin.twin.report.map.map_raster import MapRaster
+from puncture_twin.twin.report.map_view import step_of
 from puncture_twin.twin.report.numbers import (
     TRUTH_IS_BELIEF,
     demanding,
@@ -44,6 +46,8 @@ from puncture_twin.twin.report.page.template import (
     write_html,
 )
 from puncture_twin.twin.report.present import (
+    PROJECT,
+    Block,
     Warn,
     blocks_html,
     inputs_table,
@@ -116,8 +120,7 @@ def write_page(shown: Shown, path: Path) -> None:
     """Write the page; it appears whole or not at all."""
     case, found, plan, done = shown.case, shown.candidates, shown.plan, shown.rehearsal
     at_patient = () if shown.facts is None else shown.facts.rows()
-    declared, away = shown.uncertainty is not None, demanding(shown.anatomy)
-    rehearsed = [] if done is None else patient.rehearsal(done, away, shown.film, shown.failures)
+    declared = shown.uncertainty is not None
     write_html(
         "report.html",
         path,
@@ -126,7 +129,7 @@ def write_page(shown: Shown, path: Path) -> None:
         dates=dates_text(case),
         needle=needle_text(case),
         tones=() if shown.anatomy.scan is None else tuple(TONES),
-        left_out=_left_out(case),
+        methods=methods_text(case, shown.anatomy, found),
         notice=TRUTH_IS_BELIEF if done is not None and done.truth_is_belief else "",
         refused=_refused(found),
         cards=_cards(shown),
@@ -135,7 +138,7 @@ def write_page(shown: Shown, path: Path) -> None:
         plan=blocks_html(patient.plan(plan, at_patient, shown.refusal, declared=declared, notes=shown.notes)),
         planned="Plan" if plan is not None or shown.refusal else "The best path at the patient",
         registration=blocks_html(patient.registration(shown.registration)) if shown.registration else "",
-        rehearsal=blocks_html(rehearsed) if rehearsed else "",
+        rehearsal="" if done is None else blocks_html(_rehearsed(done, shown)),
         study=scan_date(case),
         warnings=_doubts(found, shown.anatomy),
         inputs=inputs_table(case.inputs),
@@ -160,6 +163,13 @@ def _drawn(shown: Shown) -> dict[str, Any]:
         "probe_mm": float(case.needle.length_mm),
     }
     return {"data": script_json(data), "ct": base64_text(ct), "surfaces": base64_text(surfaces)}
+
+
+def _rehearsed(rehearsal: Any, shown: Shown) -> list[Block]:
+    """The rehearsal's numbers, and its curves over time."""
+    alt, away = "True tip to true target, and true needle to true structures, over time", demanding(shown.anatomy)
+    curves = picture(rehearsal_png(rehearsal, away), alt)
+    return [*patient.rehearsal(rehearsal, away, shown.film, shown.failures), curves]
 
 
 def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -255,6 +265,33 @@ def _direction_card(candidates: Candidates, row: int, scan: Any | None, *, best:
 
 def _angles(candidates: Candidates, row: int) -> str:
     return f"θ {np.degrees(candidates.theta[row]):.4g}°, β {np.degrees(candidates.beta[row]):.4g}°"
+
+
+def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
+    """What was checked, by what, and what was not."""
+    theta, step = np.degrees(candidates.theta), np.degrees(step_of(candidates))
+    checked = sum(1 for one in anatomy.checked if str(one.role) in {"avoid", "unknown"})
+    arm_name = case.robot.model.name.upper()
+    arm = (
+        f"For each remaining direction it was checked whether a {arm_name} reaches it and inserts the "
+        "needle without contact."
+        if candidates.arm_checked
+        else "The arm was not checked."
+    )
+    chances = (
+        "Chances to hit and to touch were propagated from the declared errors of markers, touches and arm."
+        if candidates.chances is not None and np.isfinite(candidates.chances.hit).any()
+        else "No chances were computed: they need declared errors, markers, and the arm."
+    )
+    return (
+        f"Straight needle paths to the target were searched with {PROJECT} {version(PROJECT)} over {len(candidates):,} "
+        f"entry directions, θ {theta.min():g}° to {theta.max():g}° and every azimuth β of the case, in steps of "
+        f"{step:g}° (angles as in Chen et al. 2019, Eq. 10-15; {needle_text(case)}). For each direction the distance "
+        f"between the needle and each of {checked} structures to keep away from was computed exactly on their triangle "
+        f"meshes and compared with the structure's margin; a direction through a region that the images or labels do "
+        f"not show was rejected as unknown. {arm} {chances} Every input is listed below with its SHA-256. "
+        + _left_out(case)
+    )
 
 
 def _left_out(case: Any) -> str:

@@ -53,6 +53,9 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
 
     The pixel-to-row table is stored run by run, row after row of the picture: ``runs`` is [candidate, length, ...],
     candidate -1 outside the grid. A pick that the search has no row of is one row more.
+
+    Args:
+        raster: The map's pixels where somebody has them already.
     """
     view, windows = map_view(case, candidates), candidates.windows
     raster = map_raster(candidates, view) if raster is None else raster

@@ -41,6 +41,9 @@ class Card(NamedTuple):
 def write_html(template: str, path: Path, **parts: object) -> None:
     """Fill a template and write the page, whole or not at all.
 
+    Args:
+        parts: What the template names: plain text, or `Markup`.
+
     Raises:
         jinja2.UndefinedError: The template names a part that is not given.
     """

@@ -95,7 +95,11 @@ CELLS = (
 
 
 class FilmFrames:
-    """Whole frames: the overview is upper left, the close-up beside it, numbers below."""
+    """Whole frames: the overview is upper left, the close-up beside it, numbers below.
+
+    Args:
+        cameras: Of the overview and of the close-up.
+    """
 
     def __init__(
         self, rehearsal: Any, cameras: tuple[ViewCamera, ViewCamera], case: Any, speed: float, keep_away: frozenset[str]
