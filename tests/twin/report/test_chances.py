@@ -12,6 +12,10 @@ from puncture_twin.planning.search.uncertainty_breakdown import Goal, Remedy, Un
 from puncture_twin.planning.uncertainty.chance_model import Chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
 from puncture_twin.twin.report.error_pictures import draw_rooms_picture, needle_frame
+from puncture_twin.twin.report.map.map_disc import chance_raster, touch_nothing
+from puncture_twin.twin.report.map.map_picture import draw_map
+from puncture_twin.twin.report.map.map_raster import map_raster
+from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Shown, Uncertainty, methods_text, write_page
 from puncture_twin.twin.report.page.page_map import map_data
 from puncture_twin.twin.report.patient import rooms
@@ -54,6 +58,26 @@ def shown():
         found.clearance.structures, blank, wide, wide, touch, touch, blank, blank, np.ones(len(found), bool)
     )
     return case, replace(found, chances=chances)
+
+
+def test_the_layer_shows_what_the_table_holds(shown):
+    """Within the safe region, smoothed by less than half a cell; nothing of a case without chances."""
+    case, found = shown
+    rows = map_raster(found, map_view(case, found), 400).rows
+    chance = chance_raster(found, rows)
+    known = np.append(found.safe, False)[rows]
+    assert np.array_equal(np.isfinite(chance), known)
+    assert np.median(np.abs(chance[known] - touch_nothing(found)[rows[known]])) < 0.02
+    assert chance_raster(replace(found, chances=None), rows) is None
+
+
+def test_the_map_has_the_layer_only_with_chances(shown, tmp_path):
+    """Hatched and lined, with its legend."""
+    case, found = shown
+    draw_map(found, case, tmp_path / "with.png")
+    draw_map(replace(found, chances=None), case, tmp_path / "without.png")
+    with_it, without = (np.asarray(Image.open(tmp_path / name)) for name in ("with.png", "without.png"))
+    assert (with_it != without).any(axis=2).mean() > 0.01
 
 
 def test_the_page_says_how_sure_it_is(shown, tmp_path):

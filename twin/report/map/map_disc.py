@@ -1,4 +1,9 @@
-"""The disc of the map: verdicts as colours, rings and azimuths, names of regions, and marks."""
+"""The disc of the map: verdicts as colours, rings and azimuths, the layer of chances, names of regions, and marks.
+
+The chance that a needle touches nothing that it must not touch is hatching and lines, no colours: they read over every
+shade of safe, in print, and for colour-blind people. The chance to hit hardly changes with the direction, so that it
+stands beside the map as a number.
+"""
 
 from __future__ import annotations
 
@@ -64,6 +69,7 @@ def draw_disc(axes: Axes, candidates: Candidates, view: MapView, raster: MapRast
     codes, names = region_codes(candidates.verdict, raster.rows)
     axes.imshow(_lined(raster, candidates, codes), extent=(-1, 1, -1, 1), interpolation="hanning")
     _frame(axes, view)
+    _chances(axes, candidates, raster.rows)
     bests = [window.best for window in candidates.windows.windows[:MOST_WINDOWS]]
     marked = view.place(candidates.theta[bests], candidates.beta[bests])
     chosen = np.zeros((0, 2)) if pick is None else view.place(*_angles(pick))
@@ -140,6 +146,61 @@ def ring_labels(view: MapView, marks: Floats) -> list[Label]:
     clear = [np.linalg.norm(line[:, None] - marks, axis=2).min(initial=2.0) for line in lines]
     line = next((line for line, far in zip(lines, clear, strict=True) if far > RINGS_CLEAR), lines[0])
     return [Label(x, y, f"θ {ring}°") for (x, y), (ring, _) in zip(line.tolist(), ring_radii(view), strict=True)]
+
+
+LEVELS = (0.5, 0.9, 0.99)
+STYLES = (":", "--", "-")
+"""Of the line of each level."""
+
+HATCHES = ("xxxx", "////", "..", "")
+"""Below the first level, between the levels, above the last."""
+
+HATCH_INK = (0.0, 0.0, 0.0, 0.55)
+
+COARSE = 2
+"""Every so manyth pixel is looked at: what is smoothed needs no more."""
+
+SMOOTHED = 0.006
+"""Of the picture's side: the cells' corners are rounded off, and lines move by less than half a cell."""
+
+
+def touch_nothing(candidates: Candidates) -> NDArray[np.float64] | None:
+    """1 - p_touch_any of every direction, shape (n,), NaN where there is none; None without any."""
+    if candidates.chances is None or not np.isfinite(candidates.chances.touch_any).any():
+        return None
+    return np.asarray(1.0 - candidates.chances.touch_any)
+
+
+def chance_raster(candidates: Candidates, rows: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    """The chance under each pixel, smoothed within the region that has chances; NaN elsewhere; None without any.
+
+    Args:
+        rows: Shape (n, n), the candidate under each pixel, -1 outside.
+    """
+    chance = touch_nothing(candidates)
+    if chance is None:
+        return None
+    picture = np.append(chance, np.nan)[rows]
+    known = np.isfinite(picture)
+    wide = SMOOTHED * len(rows)
+    weight = ndimage.gaussian_filter(known.astype(float), wide)
+    smooth = ndimage.gaussian_filter(np.where(known, picture, 0.0), wide) / np.maximum(weight, 1e-9)
+    return np.asarray(np.where(known, smooth, np.nan))
+
+
+def _chances(axes: Axes, candidates: Candidates, rows: NDArray[np.int64]) -> None:
+    """Hatching and lines over the region that has chances, where they are not all above the last level."""
+    chance = chance_raster(candidates, rows[::COARSE, ::COARSE])
+    if chance is None or not (chance < LEVELS[-1]).any():
+        return
+    axis = (np.arange(len(chance)) + 0.5) / len(chance) * 2 - 1
+    shown = np.ma.masked_invalid(chance)
+    with_ends = (-1.0, *LEVELS, 2.0)
+    hatched = axes.contourf(axis, -axis, shown, levels=with_ends, colors="none", hatches=list(HATCHES))
+    hatched.set_edgecolor(HATCH_INK)
+    hatched.set_linewidth(0.0)
+    for width, colour in ((3.4, "white"), (1.5, "black")):
+        axes.contour(axis, -axis, shown, levels=LEVELS, colors=colour, linestyles=STYLES, linewidths=width)
 
 
 NAMED_FRACTION = 0.006

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
-from puncture_twin.planning.base.reasons import NOT_SEARCHED_TEXT, UNSEEN_AIR, Reason, css
+from puncture_twin.planning.base.reasons import NOT_SEARCHED_TEXT, UNSEEN_AIR, Reason, Rgb, css
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
@@ -28,8 +29,13 @@ from puncture_twin.twin.report.map.map_disc import (
     CHOSEN,
     DPI,
     FRONT,
+    HATCH_INK,
+    HATCHES,
+    LEVELS,
     RADIUS,
+    STYLES,
     draw_disc,
+    touch_nothing,
 )
 from puncture_twin.twin.report.map.map_raster import (
     HATCH,
@@ -113,6 +119,7 @@ def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None
     axes.set(xlim=(0, 1), ylim=(1, 0), autoscale_on=False)
     y = _reasons(axes, reason_counts(candidates))
     y = _scale(axes, candidates, y + GAP)
+    y = _chance_key(axes, candidates, y)
     y = _mark_key(axes, candidates, view, y)
     _chosen(axes, candidates, pick, y, scan)
     whole = candidates.grid is None or (candidates.grid.full_circle and candidates.theta.min() < step_of(candidates))
@@ -189,6 +196,27 @@ def _even_text(scale: ClearanceScale) -> str:
     if not np.isfinite(scale.low):
         return "no structure has a margin"
     return f"least clearance {number(scale.low, SCALE_DIGITS, 'mm')} everywhere"
+
+
+PALE: Rgb = (205, 235, 220)
+"""Below the legend's hatching."""
+
+
+def _chance_key(axes: Axes, candidates: Candidates, y: float) -> float:
+    """What hatching and lines mean; nothing without chances."""
+    if touch_nothing(candidates) is None:
+        return y
+    text = (f"< {LEVELS[0]:g}", *(f"{low:g}–{high:g}" for low, high in pairwise(LEVELS)), f"> {LEVELS[-1]:g}")
+    hatched = [
+        Patch(facecolor=css(PALE), edgecolor=HATCH_INK, hatch=hatch, label=name)
+        for name, hatch in zip(text, HATCHES, strict=True)
+    ]
+    lines = [
+        Line2D([], [], color="black", ls=style, label=f"at {level:g}")
+        for level, style in zip(LEVELS, STYLES, strict=True)
+    ]
+    by_column = [one for pair in zip_longest(hatched, lines) for one in pair if one is not None]
+    return _key(axes, y, by_column, "chance to touch no structure to avoid: hatched, and lines", ncols=len(hatched))
 
 
 def _mark_key(axes: Axes, candidates: Candidates, view: MapView, y: float) -> float:
