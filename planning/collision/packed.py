@@ -37,7 +37,7 @@ from puncture_twin.planning.collision.kernels.proofs import Movers, SkinTree
 from puncture_twin.planning.collision.kernels.surfaces import CELL_MM
 from puncture_twin.planning.collision.patient import Check
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rigid import apply, even_directions
 from puncture_twin.planning.geometry.triangle_distance import farthest_from
 
 NO_BOX = -1.0
@@ -201,19 +201,11 @@ def coarse_hull(corners: Floats) -> Coarse:
     """
     if len(corners) <= COARSE_DIRECTIONS:
         return Coarse(corners, 0.0)
-    few = corners[np.unique(np.argmax(_directions(COARSE_DIRECTIONS) @ corners.T, axis=1))]
+    few = corners[np.unique(np.argmax(even_directions(COARSE_DIRECTIONS) @ corners.T, axis=1))]
     hull = scipy.spatial.ConvexHull(few)
     outside = (corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > -SLACK_MM  # beyond a face
     triangles = np.ascontiguousarray(few[hull.simplices])
     return Coarse(few, float(farthest_from(triangles, corners[outside])) + SLACK_MM)
-
-
-def _directions(count: int) -> Floats:
-    """Unit vectors (count, 3) spread evenly: a spiral of equal steps in z and golden turns."""
-    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
-    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
-    ring = np.sqrt(1.0 - z * z)
-    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
 
 
 class Neighbours(NamedTuple):

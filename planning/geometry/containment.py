@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import even_directions
 
 RAYS, SEED = 5, 3
 """Random directions that vote, always the same: where one of them happens to hit an edge, the others do not."""
@@ -149,7 +150,7 @@ def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
         point: Shape (3,), mm, in the mesh's frame.
     """
     surface = TriangleMesh(mesh.vertices, mesh.faces[mesh.distinct])
-    return float(np.mean(crossings(surface, point, _rays()).count % 2))
+    return float(np.mean(crossings(surface, point, even_directions(SUM_RAYS)).count % 2))
 
 
 def hit_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
@@ -161,14 +162,7 @@ def hit_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
         mesh: The surface, mm.
         point: Shape (3,), mm, in the mesh's frame.
     """
-    return float(np.mean(crossings(mesh, point, _rays()).count > 0))
-
-
-def _rays() -> NDArray[np.float64]:
-    """Unit vectors, shape (SUM_RAYS, 3), evenly about: a spiral of equal steps in z and golden turns."""
-    z = 1.0 - (2.0 * np.arange(SUM_RAYS) + 1.0) / SUM_RAYS
-    turn, ring = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(SUM_RAYS), np.sqrt(1.0 - z * z)
-    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
+    return float(np.mean(crossings(mesh, point, even_directions(SUM_RAYS)).count > 0))
 
 
 MOST_POLAR_BINS = 120

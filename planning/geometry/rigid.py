@@ -29,6 +29,14 @@ def pose(R: ArrayLike, t: ArrayLike) -> Floats:
     return T
 
 
+def even_directions(count: int) -> Floats:
+    """Unit vectors (count, 3) spread evenly over the sphere: a spiral of equal steps in z, each a golden angle on."""
+    number = np.arange(count)
+    z = 1 - (2 * number + 1) / count
+    angle, across = number * np.pi * (3 - np.sqrt(5)), np.sqrt(1 - z**2)
+    return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
+
+
 def inverse(T_b_a: Floats) -> Floats:
     """T_a_b of poses (..., 4, 4)."""
     # T⁻¹ = [R^T, -R^T t; 0, 1]

@@ -33,7 +33,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import skew
+from puncture_twin.planning.geometry.rigid import even_directions, skew
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 
@@ -208,7 +208,7 @@ DIRECTIONS = 512
 
 def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
     """Cast the directions once; the mesh is closed."""
-    directions = _fibonacci(DIRECTIONS)
+    directions = even_directions(DIRECTIONS)
     found = crossings(mesh, target_ct, directions)
     from_last = (found.first + found.count - 1)[found.ray] - np.arange(len(found.ray))  # 0 for a ray's last
     sign = np.where(from_last % 2 == 0, 1.0, -1.0)
@@ -219,15 +219,6 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
     return TargetRays(directions, found.ray, found.depth, sign, sign / np.maximum(facing, GRAZING))
 
 
-def _fibonacci(count: int) -> Floats:
-    """Unit vectors spread evenly over the ball, shape (n, 3)."""
-    number = np.arange(count)
-    z = 1 - (2 * number + 1) / count
-    angle = number * np.pi * (3 - np.sqrt(5))  # golden angle
-    across = np.sqrt(1 - z**2)
-    return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
-
-
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
     """A ball about the target for a tip that is believed elsewhere: a known mean error besides the covariance.
 
@@ -235,7 +226,7 @@ def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
         offset: Shape (3,), mm, believed tip minus target, in the covariance's axes.
         radius_mm: Of the ball.
     """
-    directions = _fibonacci(DIRECTIONS)
+    directions = even_directions(DIRECTIONS)
     along = directions @ offset
     inside = along**2 - offset @ offset + radius_mm**2  # below 0 the ray misses the ball
     half = np.sqrt(np.maximum(inside, 0.0))
