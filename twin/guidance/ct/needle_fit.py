@@ -251,11 +251,11 @@ def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hid
 
 def _alike(seen: _Seen, x: Floats, full: float) -> bool:
     """Whether what is seen is the image of a needle, as dense, as blurred, and as long as that of numbers (11,)."""
-    blur, gain = np.exp(x[5:7])
+    (blur, gain), blurs, gains = x[5:7], np.log(BLURS), np.log(GAINS)
     metal = seen.parts > 0.5 * min(full, float(seen.parts.max()))
     ahead = float(seen.local[metal, 0].max(initial=-np.inf) - x[0])
     farthest = FARTHEST_MM + WIDE_MM + WIDEST_SLICE * float(np.linalg.norm(seen.thick[1:]))
-    dense, blurred = GAINS[0] < gain < GAINS[1], BLURS[0] < blur < BLURS[1]
+    dense, blurred = gains[0] < gain < gains[1], blurs[0] < blur < blurs[1]
     return bool(_unlike(seen, x) <= UNLIKE and abs(ahead) <= farthest and dense and blurred)
 
 

@@ -30,6 +30,8 @@ LAYER_MM, SOFT = 0.6, 1.5
 across it: their Gaussians add up to its even profile, whose edges tell where a needle lies that runs within it."""
 LEVER_MM = 50.0
 """At which a bend is counted."""
+LIKE_NONE = 50.0
+"""Logarithm of a blur or a gain that no needle has, nor a number overflows by: a step of the fit may go anywhere."""
 NUMBERS = 11
 """Of a curve: shift of the tip (3), mm; slopes (2); logarithms of blur and gain (2); bends (2 + 2), mm at the lever."""
 FAR = 20.0
@@ -86,8 +88,9 @@ class CurveImage(NamedTuple):
         return slopes
 
     def _rendered(self, x: Floats, local: Floats, slopes: Floats) -> Floats:
-        plane, image = np.exp(2 * x[5]) * self.plane, np.empty(len(local))
-        factor = np.exp(x[6]) * self.diameter_mm**2 / 8 / len(self.layers)
+        blur, gain = np.exp(np.clip(x[5:7], -LIKE_NONE, LIKE_NONE))
+        plane, image = blur**2 * self.plane, np.empty(len(local))
+        factor = gain * self.diameter_mm**2 / 8 / len(self.layers)
         _render(local, self.layers, x, plane + self.fixed, 2 * plane, factor, self.full, image, slopes)
         return image
 
