@@ -197,7 +197,7 @@ def mesh_folder(
 
     Args:
         stated: Unit of the coordinates where the user says it, or None.
-        up: Their axis that is up where the user says it.
+        up: Their axis that is up where the user says it; of GLB it must.
 
     Raises:
         InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.

@@ -115,12 +115,7 @@ def _render(points, layers, x, blur, by_blur, factor, full, image, slopes):  # t
             by = slopes[row]
             by[:] = 0.0
         for layer in range(len(layers)):
-            s = points[row, 0] + layers[layer, 0] - x[0]
-            u = min(s, 0.0) / LEVER_MM
-            y0 = points[row, 1] + layers[layer, 1] - x[1] - s * x[3] - u * u * (x[7] + u * x[9])
-            y1 = points[row, 2] + layers[layer, 2] - x[2] - s * x[4] - u * u * (x[8] + u * x[10])
-            lean0 = x[3] + (2.0 * u * x[7] + 3.0 * u * u * x[9]) / LEVER_MM
-            lean1 = x[4] + (2.0 * u * x[8] + 3.0 * u * u * x[10]) / LEVER_MM
+            s, u, y0, y1, lean0, lean1 = _beside(points[row], layers[layer], x)
             _leant(blur, lean0, lean1, C)
             det = C[3] * C[5] - C[4] * C[4]
             Q00, Q01, Q11 = C[5] / det, -C[4] / det, C[3] / det
@@ -158,6 +153,18 @@ def _render(points, layers, x, blur, by_blur, factor, full, image, slopes):  # t
             if sloped:
                 by[:] = 0.0
         image[row] = total
+
+
+@nb.njit(cache=True, error_model="numpy")
+def _beside(point, layer, x):  # type: ignore[no-untyped-def]
+    """A layer's point: along the needle (mm, and in levers), across it from its bend, and the lean of the bend."""
+    s = point[0] + layer[0] - x[0]
+    u = min(s, 0.0) / LEVER_MM
+    y0 = point[1] + layer[1] - x[1] - s * x[3] - u * u * (x[7] + u * x[9])
+    y1 = point[2] + layer[2] - x[2] - s * x[4] - u * u * (x[8] + u * x[10])
+    lean0 = x[3] + (2.0 * u * x[7] + 3.0 * u * u * x[9]) / LEVER_MM
+    lean1 = x[4] + (2.0 * u * x[8] + 3.0 * u * u * x[10]) / LEVER_MM
+    return s, u, y0, y1, lean0, lean1
 
 
 @nb.njit(cache=True, error_model="numpy")
