@@ -18,6 +18,7 @@ from puncture_twin.planning.anatomy.metal import (
     AROUND_MM,
     BLUR_MM,
     METAL_HU,
+    SOLID_HU,
     Metal,
     centroid,
     full_part,
@@ -98,7 +99,7 @@ def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = N
     if diameter_mm is not None:
         found = [one for one in _needles(volume, target_ct, diameter_mm, None) if not one[0].unclear]
         if not found:
-            _refuse_none(volume, "")
+            _refuse_none(volume, _dilution(volume, diameter_mm))
         nearest = min(found, key=lambda one: float(np.linalg.norm(one[0].path_ct - target_ct, axis=1).min()))
         _check_tip(volume, *nearest, target_ct)
         return nearest[0]
@@ -135,7 +136,7 @@ def read_needle(
     """
     found = list(_needles(volume, target_ct, diameter_mm, inside, markers))
     if not found:
-        _refuse_none(volume, ", that enters the body")
+        _refuse_none(volume, f", that enters the body{_dilution(volume, diameter_mm)}")
     findings: list[Finding] = []
     chosen = found[0]
     if len(found) > 1:
@@ -157,7 +158,8 @@ def read_needle(
         what = (
             f"long metal ends in the body at {at} in the scan, but has not the image of a needle of {diameter_mm:g} mm"
         )
-        refuse(what, volume.path, "one needle of the case's diameter, apart from other metal", "needle_unclear")
+        allowed = f"one needle of the case's diameter, apart from other metal{_dilution(volume, diameter_mm)}"
+        refuse(what, volume.path, allowed, "needle_unclear")
     _check_tip(volume, needle, hidden, target_ct)
     if needle.tip_sd_mm > UNSURE_MM:
         sd = f"{needle.tip_sd_mm:.1f} mm (standard deviation)"
@@ -177,6 +179,15 @@ def read_needle(
 def _refuse_none(volume: Volume, how: str) -> None:
     allowed = f"a straight or slightly bent piece of metal of {SHORTEST_MM:g} mm or more{how}"
     raise InputError("no needle in the image", where=volume.path, allowed=allowed, code="needle_not_seen")
+
+
+def _dilution(volume: Volume, diameter_mm: float) -> str:
+    """That slices are too thick for so thin a needle, if one within a slice may be darker than bone."""
+    thick_mm = float(spacing_mm(volume)[2])
+    shown_hu = SOLID_HU * np.pi * diameter_mm**2 / 4 / (thick_mm * np.sqrt(2 * np.pi) * BLUR_SIGMA_MM)
+    if shown_hu > METAL_HU:
+        return ""
+    return f"; thinner slices: of {thick_mm:g} mm they may show one of {diameter_mm:g} mm as {shown_hu:.0f} HU"
 
 
 def _chosen(
