@@ -85,10 +85,11 @@ def connect(host: str, command: str = "mirror") -> Receiver:
 
 
 def _check_host(host: str, command: str) -> None:
-    longest = max(len(label) for label in host.split("."))
-    if not 0 < len(host) <= MAX_HOST or longest > MAX_LABEL or not host.isprintable() or any(map(str.isspace, host)):
-        what = f"host name of {len(host)} characters, {longest} between dots, or with spaces"
-        allowed = f"a name or address of 1 to {MAX_HOST} characters, {MAX_LABEL} between dots"
+    labels = [len(label) for label in host.removesuffix(".").split(".")]
+    fits = len(host) <= MAX_HOST and 0 < min(labels) and max(labels) <= MAX_LABEL
+    if not fits or not host.isprintable() or any(map(str.isspace, host)):
+        what = f"host name of {len(host)} characters, {min(labels)} to {max(labels)} between dots, or with spaces"
+        allowed = f"a name or address of 1 to {MAX_HOST} characters, 1 to {MAX_LABEL} between dots"
         refuse(what, f"{command} {host}", allowed, "bad_host")
 
 
