@@ -86,7 +86,7 @@ def connect(host: str, command: str = "mirror") -> Receiver:
 
 def _check_host(host: str, command: str) -> None:
     labels = [len(label) for label in host.removesuffix(".").split(".")]
-    fits = len(host) <= MAX_HOST and 0 < min(labels) and max(labels) <= MAX_LABEL
+    fits = len(host) <= MAX_HOST and min(labels) > 0 and max(labels) <= MAX_LABEL
     if not fits or not host.isprintable() or any(map(str.isspace, host)):
         what = f"host name of {len(host)} characters, {min(labels)} to {max(labels)} between dots, or with spaces"
         allowed = f"a name or address of 1 to {MAX_HOST} characters, 1 to {MAX_LABEL} between dots"
