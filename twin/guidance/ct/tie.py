@@ -366,7 +366,7 @@ def _mirrored(picture: _Picture, sample: Sample, T: Floats) -> tuple[_Fit, Float
 
 
 def _fall(picture: _Picture, organs: Sample, T: Floats) -> Floats:
-    """By how much grey values fall from inside of the organs to outside, shape (n,), HU: the same sign on each organ."""
+    """By how much grey values fall out of the organs, shape (n,), HU; of one that is darker, by how much they rise."""
     points, normals = organs.placed(T)
     fall = picture.at(points - INNER_MM * normals) - picture.at(points + INNER_MM * normals)
     fall = np.clip(fall, -ORGAN_HU, ORGAN_HU)
