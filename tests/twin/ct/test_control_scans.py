@@ -236,7 +236,9 @@ def test_a_body_of_another_size_is_refused(size):
 
 
 ORGANS, FEET = (
-    [(-44.0, 16.0, z) for z in (-46.0, -16.0, 10.0)] + [(44.0, 16.0, z) for z in (-40.0, 18.0, 48.0)],
+    [(-44.0, 16.0, z) for z in (-46.0, -16.0, 10.0)]
+    + [(44.0, 16.0, z) for z in (-40.0, 18.0, 48.0)]
+    + [(40.0, -8.0, -25.0), (-40.0, -8.0, -25.0)],
     np.array([0.0, 0.0, -1.0]),
 )
 
@@ -244,7 +246,7 @@ ORGANS, FEET = (
 @pytest.mark.parametrize("moved", [0.0, 10.0])
 def test_organs_that_breath_has_moved_are_seen(monkeypatch, moved):
     """Against skin and bone, which alone tie the frames: it is said how far, and so far the target may have moved."""
-    there = [Solid("organ", ball(at + moved * FEET, 24.0), 110.0) for at in ORGANS]
+    there = [Solid("organ", ball(at + moved * FEET, 24.0), 200.0) for at in ORGANS]
     monkeypatch.setattr("benchmarks.confirm._extras", lambda *_: there)
     one = control(np.random.default_rng(21), extra="none", bent=False, spacing=2.0)
     known = body_of(
