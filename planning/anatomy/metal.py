@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 
@@ -61,8 +63,9 @@ def wide_metal(volume: Volume, diameter_mm: float) -> Bools:
     metal, spacing = volume.values > METAL_HU, spacing_mm(volume)
     radius, wide = diameter_mm / 2 + BLUR_MM, np.zeros(metal.shape, np.bool_)
     reach = np.ceil((radius + EDGE_MM + BLUR_MM) / spacing).astype(int) + 1
-    for found in ndimage.find_objects(ndimage.label(metal)[0]):  # boxes: metal is a small part of an image
-        box = tuple(slice(max(one.start - more, 0), one.stop + more) for one, more in zip(found, reach, strict=True))
+    for at in connected(metal):  # boxes: metal is a small part of an image
+        ends = zip(np.maximum(at.min(axis=0) - reach, 0), at.max(axis=0) + 1 + reach, strict=True)
+        box = tuple(slice(low, high) for low, high in ends)
         core = ndimage.distance_transform_edt(np.pad(metal[box], 1), spacing)[1:-1, 1:-1, 1:-1] > radius  # erosion
         if core.any():
             wide[box] |= ndimage.distance_transform_edt(~core, spacing) <= radius + EDGE_MM + BLUR_MM
@@ -72,16 +75,39 @@ def wide_metal(volume: Volume, diameter_mm: float) -> Bools:
 def metal_pieces(volume: Volume, level_hu: float = METAL_HU, without: Bools | None = None) -> Iterator[Metal]:
     """Every connected piece of metal, diagonal neighbours included, from a level on, but for some voxels."""
     metal = volume.values > level_hu
-    labels, _ = ndimage.label(metal if without is None else metal & ~without, structure=np.ones((3, 3, 3)))
-    spacing = spacing_mm(volume)
+    spacing, shape = spacing_mm(volume), np.array(metal.shape)
     around = np.ceil(AROUND_MM / spacing).astype(int)
-    for number, found in enumerate(ndimage.find_objects(labels), start=1):
-        low, high = np.array([(one.start, one.stop) for one in found]).T
-        begin, end = np.maximum(low - around, 0), np.minimum(high + around, volume.values.shape)
+    for at in connected(metal if without is None else metal & ~without):
+        low, high = at.min(axis=0), at.max(axis=0) + 1
+        begin, end = np.maximum(low - around, 0), np.minimum(high + around, shape)
         box = (slice(begin[0], end[0]), slice(begin[1], end[1]), slice(begin[2], end[2]))
-        voxels = labels[box] == number
-        middle = apply(volume.T_ct_index, np.argwhere(voxels).mean(axis=0) + begin)
-        yield Metal(box, voxels, middle, float(((high - low) * spacing).max()))
+        voxels = np.zeros(end - begin, np.bool_)
+        voxels[tuple((at - begin).T)] = True
+        yield Metal(box, voxels, apply(volume.T_ct_index, at.mean(axis=0)), float(((high - low) * spacing).max()))
+
+
+def connected(mask: Bools) -> list[Ints]:
+    """The voxels (n, 3) of each connected piece of a mask, diagonal neighbours included, in the order of their first.
+
+    By the few voxels that are set: labelling a whole image takes as long as it is large.
+    """
+    ny, nz = mask.shape[1] + 2, mask.shape[2] + 2  # a border, over which no neighbour is reached
+    order: Literal["F", "C"] = "F" if mask.flags.f_contiguous else "C"
+    i, j, k = np.unravel_index(np.flatnonzero(mask.ravel(order)), mask.shape, order)
+    key = (i * ny + j) * nz + k
+    first = np.argsort(key)
+    i, j, k, key = i[first], j[first], k[first], key[first]
+    pairs = []
+    for step in (d for d in itertools.product((-1, 0, 1), repeat=3) if d > (0, 0, 0)):
+        other = key + (step[0] * ny + step[1]) * nz + step[2]
+        place = np.minimum(np.searchsorted(key, other), max(len(key) - 1, 0))
+        pairs.append(np.stack([np.flatnonzero(key[place] == other), place[key[place] == other]]))
+    one, two = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(len(one), np.bool_), (one, two)), shape=(len(key), len(key)))
+    _, number = connected_components(graph, directed=False)
+    rows = np.argsort(number, kind="stable")
+    parts = np.split(np.stack([i, j, k], axis=1)[rows], np.flatnonzero(np.diff(number[rows])) + 1)
+    return sorted(parts, key=lambda at: tuple(at[0])) if len(key) else []
 
 
 def metal_parts(

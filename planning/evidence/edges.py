@@ -193,7 +193,10 @@ class Sample:
 
     def thinned(self, count: int) -> Sample:
         """About so many of its points."""
-        rows = slice(None, None, max(1, len(self.points_ct) // count))
+        return self.rows(slice(None, None, max(1, len(self.points_ct) // count)))
+
+    def rows(self, rows: NDArray[np.intp] | slice) -> Sample:
+        """Some of its points."""
         return Sample(self.points_ct[rows], self.normals_ct[rows], self.structure[rows], self.patch[rows])
 
     def moved(self, T: Floats) -> Sample:

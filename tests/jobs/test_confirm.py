@@ -11,7 +11,7 @@ from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.patient.confirm_job import ScanFiles, confirm_needle
+from puncture_twin.twin.jobs.patient.confirm_job import ScanFiles, _body, confirm_needle
 from puncture_twin.twin.plant.scanner.case_scene import TrueRod, VirtualScanner, case_scene
 from puncture_twin.twin.plant.scanner.image import ScanSettings
 from puncture_twin.twin.plant.scanner.writers import write_nifti, write_series
@@ -77,6 +77,14 @@ def test_a_scan_is_read_off_the_scanner_as_off_its_files(control):
     np.testing.assert_allclose(live.needle.cov_ct, kept.needle.cov_ct, rtol=1e-3)
     assert [one.kind for one in live.aims] == [one.kind for one in kept.aims]
     assert not live.read and [one.role for one in kept.read] == ["control ct"]
+
+
+def test_every_bone_ties_the_frames():
+    """Ribs, sternum and pelvis too, whose names have a side or a number; organs are what is no bone."""
+    context = prepare(CASE, arm=False)
+    known = _body(context)
+    counts = [len(np.unique(one.structure)) for one in (known.sample, known.organs)]
+    assert counts == [1 + 6, len(context.anatomy.structures) - 6]
 
 
 def test_a_mirrored_scan_and_one_without_a_needle(tmp_path, capfd, control):

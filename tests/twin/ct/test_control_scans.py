@@ -10,9 +10,9 @@ from benchmarks.confirm import MUST_REFUSE, control, errors, read, reading
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply, inverse, pose, rotation_angle
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation, inverse, pose, rotation_angle
 from puncture_twin.twin.guidance.ct.tie import body_of, tie_frames
-from puncture_twin.twin.plant.scanner.image import Solid, rod
+from puncture_twin.twin.plant.scanner.image import Solid, ball, rod
 
 CODES = {
     "second": {"two_needles"},
@@ -233,3 +233,65 @@ def test_a_body_of_another_size_is_refused(size):
     skin, *bones = (TriangleMesh(mesh.vertices * np.array(size), mesh.faces) for mesh in (one.skin, *one.bones))
     with refused("other_body"):
         tie_frames(one.volume, body(replace(one, skin=skin, bones=tuple(bones))), same_frame=True)
+
+
+ORGANS, FEET = (
+    [(-44.0, 16.0, z) for z in (-46.0, -16.0, 10.0)]
+    + [(44.0, 16.0, z) for z in (-40.0, 18.0, 48.0)]
+    + [(40.0, -8.0, -25.0), (-40.0, -8.0, -25.0)],
+    np.array([0.0, 0.0, -1.0]),
+)
+
+
+@pytest.mark.parametrize("moved", [0.0, 10.0])
+def test_organs_that_breath_has_moved_are_seen(monkeypatch, moved):
+    """Against skin and bone, which alone tie the frames: it is said how far, and so far the target may have moved."""
+    there = [Solid("organ", ball(at + moved * FEET, 24.0), 200.0) for at in ORGANS]
+    monkeypatch.setattr("benchmarks.confirm._extras", lambda *_: there)
+    one = control(np.random.default_rng(21), extra="none", bent=False, spacing=2.0)
+    known = body_of(
+        one.skin, one.bones, [ball(np.array(at), 24.0) for at in ORGANS], one.tip, one.markers, 0.04 * np.eye(3)
+    )
+    tie = tie_frames(one.volume, known, same_frame=False)
+    said = {finding.code: finding.numbers for finding in tie.findings}
+    assert set(said) == ({"organs_moved"} if moved else set())
+    if moved:
+        assert said["organs_moved"]["moved_mm"] == pytest.approx(moved, abs=1.5)
+        assert np.sqrt(FEET @ tie.cov_ct[:3, :3] @ FEET) == pytest.approx(moved, abs=1.5)
+
+
+@pytest.mark.parametrize("shift", [(0.0, -4.0, 0.0), (0.0, 0.0, 5.0)])
+def test_markers_that_moved_together_against_the_body_tie_nothing(shift):
+    """Their distances are as declared, so that nothing but skin and bone tells: as a breath moves them."""
+    one = control(np.random.default_rng(0), extra="none", spacing=2.0)
+    elsewhere = replace(one.markers, points=one.markers.points + shift)
+    tie = tie_frames(one.volume, body(one, elsewhere), same_frame=False)
+    assert tie.how == "body" and [said.code for said in tie.findings] == ["markers_moved"]
+    assert np.linalg.norm(off(one, tie)[0]) < 1.2
+
+
+def test_any_three_markers_find_the_frame():
+    """The three farthest apart are not all in the image: others say where it is, over any rotation."""
+    one = control(np.random.default_rng(3), extra="none", spacing=2.0, moved=False)
+    away = pose(exp_rotation([0.0, 0.0, 1.5]), np.array([310.0, -45.0, 620.0]))
+    moved = replace(
+        one, volume=Volume(one.volume.values, away @ one.volume.T_ct_index, one.volume.path), T_scan_ct=away
+    )
+    names, points = ("D", "E"), np.array([[-75.0, 30.0, 0.0], [75.0, 35.0, 60.0]])
+    known = replace(one.markers, names=(*one.markers.names, *names), points=np.vstack([one.markers.points, points]))
+    tie = tie_frames(moved.volume, body(moved, known), same_frame=False)
+    assert tie.how == "markers" and np.linalg.norm(off(moved, tie)[0]) < 1.2
+
+
+def test_a_small_field_of_view_is_tied_by_what_it_shows():
+    """A tenth of the body, in a frame of its own, without markers: the points that it shows are looked at."""
+    one = control(np.random.default_rng(3), extra="none", spacing=2.0, moved=False)
+    low = apply(np.linalg.inv(one.volume.T_ct_index), np.array([0.0, -15.0, 5.0])) - [45, 45, 18]
+    i, j, k = np.maximum(low.astype(int), 0)
+    values = np.ascontiguousarray(one.volume.values[i : i + 100, j : j + 100, k : k + 36])
+    away = pose(np.eye(3), np.array([14.0, -9.0, 11.0]))
+    T = away @ one.volume.T_ct_index @ pose(np.eye(3), np.array([i, j, k], float))
+    small = replace(one, volume=Volume(values, T, one.volume.path), T_scan_ct=away)
+    tie = tie_frames(small.volume, body(small), same_frame=False)
+    gap = off(small, tie)[0]
+    assert np.linalg.norm(gap) < 1.5 and gap @ np.linalg.solve(tie.cov_ct[:3, :3], gap) < 16.3

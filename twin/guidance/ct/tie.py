@@ -6,14 +6,16 @@ With q_i = T p_i, c their middle and d_i the distance of that place along n_i:
     min sum w_i (n_i . (t + r x (q_i - c)) - d_i)^2      Gauss-Newton over shift t and rotation r, w by Tukey
 
 The fit is held to the same surfaces mirrored: a body that lies better so is another patient's, or was turned over. The
-needle's own metal, and the markers', show no surface.
+needle's own metal, and the markers', show no surface. Organs move against skin and bone, with breath above all: by how
+much all of them together is looked for, s, and what is known of the target gets s s' more covariance.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +26,7 @@ from scipy.optimize import linear_sum_assignment
 from puncture_twin.planning.anatomy.metal import METAL_HU, centroid, metal_pieces, metal_weights
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
-from puncture_twin.planning.evidence.edges import Sample, sample_surfaces
+from puncture_twin.planning.evidence.edges import Placement, Sample, fit_of, sample_surfaces
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -32,7 +34,11 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rot
 from puncture_twin.planning.registration.fits import carried, design, fit_rigid, least_squares_map
 
 SAMPLES, COARSE_SAMPLES = 1800, 500
-"""Points of the surfaces: of the fit, and of the search for where it starts."""
+"""Points of the surfaces in the image: of the fit, and of the search for where it starts."""
+SPREAD = 12 * SAMPLES
+"""Over the whole body, of which an image may show a small part."""
+BORDER_MM = 5.0
+"""Points so far beyond the image may come into it as they are fitted."""
 WINDOWS_MM = (14.0, 14.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 4.0, 4.0, 4.0)
 """How far along its normal a surface is looked for, step by step."""
 STEP_MM = 0.5
@@ -57,6 +63,14 @@ LEAST_MM, LEAST_DEG = 0.4, 0.2
 INNER_MM, LEAST_OF_ORGAN, MOST_OF_ORGAN, OF_MARKER = 3.0, 40, 20.0, 20.0
 """Of the evidence that a symmetric body is not mirrored: how far from an organ's surface grey values are compared, on
 how many points at least; and the most that an organ, and a marker, says."""
+ORGAN_HU = 150.0
+"""More contrast counts as so much: lungs alone do not say where all organs are."""
+BREATH_MM, BREATH_STEP_MM = 30.0, 5.0
+"""So far along the body organs are looked for, and in which steps first."""
+FINER_MM = (5.0, 2.5, 1.25)
+"""Steps along each axis from there."""
+SURELY, LEAST_MOVED_MM = 5.0, 2.5
+"""Deviations by which organs lie better elsewhere, and how far at least, to be said to have moved."""
 SEARCH_MM, SEARCH_STEP_MM = 60.0, 12.0
 """Shifts that are tried where no frame is shared."""
 MARKER_MM = 12.0
@@ -67,8 +81,9 @@ LARGEST_MM = 25.0
 """A larger piece of metal is no marker."""
 MARKER_SD_VOXEL = 0.15
 """Of a marker's middle, in voxels along each axis."""
-LOOSE = 3.0
-"""Residuals of markers this many times what is declared: one has moved, and the body ties the frames instead."""
+LOOSE, APART = 3.0, 4.0
+"""Residuals of markers this many times what is declared, or deviations by which they and the body disagree about the
+target: some have moved, on the skin or with it, and the body ties the frames instead."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +92,7 @@ class Body:
 
     Attributes:
         sample: Points on skin and bones.
-        organs: Points on every structure.
+        organs: Points on what is no bone.
         markers: Those of the registration, or None.
         marker_cov: Shape (3, 3), mm², of their reading in the case's CT.
         target_ct: Shape (3,), where the tie must be known.
@@ -99,9 +114,7 @@ def body_of(
     cov: Floats,
 ) -> Body:
     """The body of surfaces and markers; arguments as the attributes of `Body`."""
-    return Body(
-        sample_surfaces([skin, *bones], 4 * SAMPLES), sample_surfaces(organs, 4 * SAMPLES), markers, cov, target_ct
-    )
+    return Body(sample_surfaces([skin, *bones], SPREAD), sample_surfaces(organs, SPREAD), markers, cov, target_ct)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,12 +181,11 @@ def tie_frames(volume: Volume, body: Body, *, same_frame: bool) -> Tie:
     picture = _Picture(volume)
     own = [np.eye(4)] if same_frame else []
     pieces = _small_metal(volume)
-    starts = [*own, *_by_distances(body.markers, pieces), *(() if own else _searched(picture, body))]
-    fits = [_fitted(picture, body.sample, start) for start in starts]
+    fits = [_fitted(picture, body.sample, start) for start in (*own, *_by_distances(body.markers, pieces))]
     best = min(fits, key=lambda fit: fit.misfit_mm, default=None)
-    if own and (best is None or not _believed(best)):
+    if best is None or not _believed(best):
         fits += [_fitted(picture, body.sample, start) for start in _searched(picture, body)]
-        best = min(fits, key=lambda fit: fit.misfit_mm)
+        best = min(fits, key=lambda fit: fit.misfit_mm, default=None)
     allowed = "a scan of the same patient that shows skin and bone of the case, or three of its markers"
     if best is None or not _believed(best):
         shown = (
@@ -181,8 +193,11 @@ def tie_frames(volume: Volume, body: Body, *, same_frame: bool) -> Tie:
         )
         refuse(f"the scan does not fit the case's body{shown}", volume.path, allowed, "frames_not_tied")
     flipped, T_flipped = _mirrored(picture, body.sample, best.T)
+    shift = _organs_moved(picture, body.organs, best.T)
     if best.misfit_mm > MIRRORED * flipped.misfit_mm:  # as symmetric as that: organs and markers tell
-        here, there = (_evidence(picture, body, T, pieces) for T in (best.T, T_flipped))
+        moved = _organs_moved(picture, body.organs, T_flipped)
+        here = _evidence(picture, body, best.T, shift, pieces)
+        there = _evidence(picture, body, T_flipped, moved, pieces)
         if MIRRORED * best.misfit_mm > flipped.misfit_mm or not here * MIRRORED > there:
             said = f"{best.misfit_mm:.2f} mm off, mirrored {flipped.misfit_mm:.2f} mm"
             refuse(f"the body fits the scan mirrored as well ({said})", volume.path, allowed, "mirrored")
@@ -193,7 +208,20 @@ def tie_frames(volume: Volume, body: Body, *, same_frame: bool) -> Tie:
         refuse(
             f"the scan's body has another size than the case's ({sizes} along LPS)", volume.path, allowed, "other_body"
         )
-    return tie
+    return _with_organs(tie, shift)
+
+
+def _with_organs(tie: Tie, shift: Floats) -> Tie:
+    """A tie that counts by how much organs (3,), mm, have moved against skin and bone: so far may the target have."""
+    moved = float(np.linalg.norm(shift))
+    if moved < LEAST_MOVED_MM:
+        return tie
+    cov = tie.cov_ct.copy()
+    cov[:3, :3] += np.outer(shift, shift)
+    way = ", ".join(f"{one:+.0f}" for one in shift)
+    said = f"organs lie {moved:.0f} mm ({way} along LPS) from where skin and bone have them: another breath?"
+    finding = Finding("organs_moved", Severity.WARNING, said, {"moved_mm": moved})
+    return replace(tie, cov_ct=cov, findings=(*tie.findings, finding))
 
 
 def _believed(fit: _Fit) -> bool:
@@ -215,6 +243,13 @@ class _Picture:
         self.T_index_ct = np.linalg.inv(volume.T_ct_index)
         corners = np.array(list(itertools.product(*((0, n - 1) for n in volume.values.shape))), dtype=float)
         self.bounds = apply(volume.T_ct_index, corners)
+
+    def shown(self, sample: Sample, T: Floats) -> Sample:
+        """About `SAMPLES` of the points that a placement (4, 4) has in the image, or near its border."""
+        points, _ = sample.placed(T)
+        low, high = self.bounds.min(axis=0) - BORDER_MM, self.bounds.max(axis=0) + BORDER_MM
+        rows = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+        return sample.rows(rows[:: max(1, len(rows) // SAMPLES)])
 
     def at(self, points: Floats) -> Floats:
         """Values at points (..., 3), clipped to `SHOWN_HU`."""
@@ -246,14 +281,9 @@ def _edges(picture: _Picture, points: Floats, normals: Floats, window_mm: float)
 
 def _fitted(picture: _Picture, sample: Sample, start: Floats) -> _Fit:
     """Skin and bone fitted from a start."""
-    points, normals = sample.placed(start)
-    low, high = picture.bounds.min(axis=0), picture.bounds.max(axis=0)
-    near = np.flatnonzero(((points > low - 5.0) & (points < high + 5.0)).all(axis=1))
-    rows = near[:: max(1, len(near) // SAMPLES)]
-    some = Sample(sample.points_ct[rows], sample.normals_ct[rows], sample.structure[rows], sample.patch[rows])
-    T = start
-    if len(rows) < LEAST_SEEN:
-        return _Fit(T, np.inf, np.inf, 0.0, len(rows), np.zeros(3), np.full((6, 6), np.inf))
+    some, T = picture.shown(sample, start), start
+    if len(some.points_ct) < LEAST_SEEN:
+        return _Fit(T, np.inf, np.inf, 0.0, len(some.points_ct), np.zeros(3), np.full((6, 6), np.inf))
     for window in WINDOWS_MM:
         points, normals = some.placed(T)
         off = _edges(picture, points, normals, window)
@@ -288,7 +318,7 @@ def _stretch(picture: _Picture, sample: Sample, T: Floats) -> Floats:
     A fit looks for each surface nearby, so another patient's may be found near enough; from farther off all of them
     agree on another size. Least squares as `_step`, with n_k (p - c)_k for each axis k.
     """
-    points, normals = sample.thinned(SAMPLES).placed(T)
+    points, normals = picture.shown(sample, T).placed(T)
     off = _edges(picture, points, normals, WINDOWS_MM[0])
     good = np.isfinite(off)
     points, normals, off = points[good], normals[good], off[good]
@@ -335,35 +365,70 @@ def _mirrored(picture: _Picture, sample: Sample, T: Floats) -> tuple[_Fit, Float
     return min(fits, key=lambda one: one[0].misfit_mm)
 
 
-def _evidence(picture: _Picture, body: Body, T: Floats, pieces: Floats) -> float:
-    """How plainly grey values change at the organs, in standard errors, and markers that are where they should be."""
-    points, normals = body.organs.placed(T)
-    step = picture.at(points - INNER_MM * normals) - picture.at(points + INNER_MM * normals)
-    known, total = np.isfinite(step), 0.0
+def _fall(picture: _Picture, organs: Sample, T: Floats) -> Floats:
+    """By how much grey values fall out of the organs, shape (n,), HU; of one that is darker, by how much they rise."""
+    points, normals = organs.placed(T)
+    fall = picture.at(points - INNER_MM * normals) - picture.at(points + INNER_MM * normals)
+    fall = np.clip(fall, -ORGAN_HU, ORGAN_HU)
+    total = np.bincount(organs.structure, np.nan_to_num(fall))
+    return np.asarray(fall * np.sign(total)[organs.structure])
+
+
+def _organs_moved(picture: _Picture, organs: Sample, T: Floats) -> Floats:
+    """The shift (3,), mm in the case's axes, at which all organs together surely lie better; else 0."""
+    here = _fall(picture, organs, T)
+
+    def fall(shift: Floats) -> Floats:
+        return _fall(picture, organs, T @ pose(np.eye(3), shift))
+
+    def gain(shift: Floats) -> float:
+        there = fall(shift)
+        both = np.isfinite(here) & np.isfinite(there)
+        return float((there - here)[both].sum())
+
+    along = np.arange(-BREATH_MM, BREATH_MM + 1.0, BREATH_STEP_MM)
+    best = max((np.array([0.0, 0.0, z]) for z in along), key=gain)
+    for step in FINER_MM:
+        for axis in np.eye(3):
+            best = max((best + sign * step * axis for sign in (0.0, -1.0, 1.0)), key=gain)
+    surely = fit_of(Placement("shift", pose(np.eye(3), best)), organs, here, fall(best)).z > SURELY
+    return best if surely else np.zeros(3)
+
+
+def _evidence(picture: _Picture, body: Body, T: Floats, shift: Floats, pieces: Floats) -> float:
+    """How plainly grey values change at the organs, in standard errors, and markers that are where they should be.
+
+    Args:
+        shift: Shape (3,), of the organs against skin and bone, mm.
+    """
+    total, step = 0.0, _fall(picture, body.organs, T @ pose(np.eye(3), shift))
+    known = np.isfinite(step)
     for number in np.unique(body.organs.structure):
         own = step[known & (body.organs.structure == number)]
         if len(own) > LEAST_OF_ORGAN:
-            total += min(abs(float(own.mean())) / (float(own.std()) / np.sqrt(len(own)) + 1e-9), MOST_OF_ORGAN)
+            total += min(float(own.mean()) / (float(own.std()) / np.sqrt(len(own)) + 1e-9), MOST_OF_ORGAN)
     if body.markers is not None and len(pieces):
         gaps = np.linalg.norm(apply(T, body.markers.points)[:, None] - pieces, axis=2).min(axis=1)
-        total += OF_MARKER * float((gaps < SIDES_MM).sum())
+        total += OF_MARKER * float((gaps < MARKER_MM).sum())
     return total
 
 
 def _searched(picture: _Picture, body: Body) -> Iterator[Floats]:
     """The shift from which skin and bone show most contrast: about the frame's own, and with the middles together."""
-    some = body.sample.thinned(COARSE_SAMPLES * 4)
-    middle = picture.bounds.mean(axis=0)
+    sample = body.sample.thinned(4 * SAMPLES)
+    points, normals = sample.points_ct, sample.normals_ct
+    low, high = picture.bounds.min(axis=0), picture.bounds.max(axis=0)
     steps = np.arange(-SEARCH_MM, SEARCH_MM + 1.0, SEARCH_STEP_MM)
     tried = []
-    for about in (np.zeros(3), middle - body.target_ct):
+    for about in (np.zeros(3), picture.bounds.mean(axis=0) - body.target_ct):
         for shift in itertools.product(steps, repeat=3):
             move = about + shift
-            points = some.points_ct[::4] + move
-            inner, outer = (picture.at(points + side * 4.0 * some.normals_ct[::4]) for side in (-1.0, 1.0))
+            rows = np.flatnonzero(((points > low - move) & (points < high - move)).all(axis=1))
+            some = rows[:: max(1, len(rows) // COARSE_SAMPLES)]
+            inner, outer = (picture.at(points[some] + move + side * 4.0 * normals[some]) for side in (-1.0, 1.0))
             fall = inner - outer
-            known = np.isfinite(fall)
-            score = np.mean(np.clip(fall[known], -600, 600)) * np.sqrt(known.mean()) if known.sum() > 60 else -np.inf
+            fall = fall[np.isfinite(fall)]
+            score = np.clip(fall, -600, 600).mean() * np.sqrt(len(rows)) if len(fall) > LEAST_SEEN / 2 else -np.inf
             tried.append((float(score), move))
     tried.sort(key=lambda one: -one[0])
     yield from (pose(np.eye(3), move) for _, move in tried[:3])
@@ -378,19 +443,19 @@ def _small_metal(volume: Volume) -> Floats:
 
 def _by_distances(markers: NamedPoints | None, pieces: Floats) -> Iterator[Floats]:
     """The placements that bring three markers or more to pieces of metal, by the distances between them."""
-    if markers is None or len(markers.points) < 3 or not 3 <= len(pieces) <= 40:
+    if markers is None or not 3 <= len(pieces) <= 40:
         return
-    points = markers.points
-    a, b, c = max(itertools.combinations(range(len(points)), 3), key=lambda rows: _area(points[list(rows)]))
-    known = np.linalg.norm(points[[a, b, c]] - points[[b, c, a]], axis=1)
-    gaps = np.linalg.norm(pieces[:, None] - pieces, axis=2)
+    points, gaps = markers.points, np.linalg.norm(pieces[:, None] - pieces, axis=2)
     found = []
-    for i, j in zip(*np.nonzero(np.abs(gaps - known[0]) < SIDES_MM), strict=True):
-        fits = (np.abs(gaps[j] - known[1]) < SIDES_MM) & (np.abs(gaps[i] - known[2]) < SIDES_MM)
-        for k in np.flatnonzero(fits & (np.arange(len(pieces)) != i) & (np.arange(len(pieces)) != j)):
-            T = fit_rigid(points[[a, b, c]], pieces[[i, j, k]])
-            left = np.linalg.norm(apply(T, points)[:, None] - pieces, axis=2).min(axis=1)
-            found.append((float(np.minimum(left, SIDES_MM).sum()), T))
+    for rows in itertools.combinations(range(len(points)), 3):  # any of the others may be off, or outside
+        corners = points[list(rows)]
+        known = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
+        for i, j in zip(*np.nonzero(np.abs(gaps - known[0]) < SIDES_MM), strict=True):
+            fits = (np.abs(gaps[j] - known[1]) < SIDES_MM) & (np.abs(gaps[i] - known[2]) < SIDES_MM)
+            for k in np.flatnonzero(fits & (np.arange(len(pieces)) != i) & (np.arange(len(pieces)) != j)):
+                T = fit_rigid(corners, pieces[[i, j, k]])
+                left = np.linalg.norm(apply(T, points)[:, None] - pieces, axis=2).min(axis=1)
+                found.append((float(np.minimum(left, SIDES_MM).sum()), T))
     yield from (T for _, T in sorted(found, key=lambda one: one[0])[:3])
 
 
@@ -400,35 +465,47 @@ def _area(corners: Floats) -> float:
 
 def _by_markers(volume: Volume, body: Body, fit: _Fit, pieces: Floats, same_frame: bool) -> Tie:
     """The tie by three markers or more that the scan shows where the body has them; else by the body."""
-    findings: list[Finding] = []
     R = fit.T[:3, :3]
-    if body.markers is not None and len(pieces):
-        expected = apply(fit.T, body.markers.points)
-        distance = np.linalg.norm(expected[:, None] - pieces, axis=2)
-        rows, columns = linear_sum_assignment(np.minimum(distance, 10 * MARKER_MM))
-        kept = distance[rows, columns] < MARKER_MM
-        rows, columns = rows[kept], columns[kept]
-        if len(rows) >= 3 and _area(body.markers.points[rows][:3]) > 100.0:
-            known, seen = body.markers.points[rows], pieces[columns]
-            T = fit_rigid(known, seen)
-            voxel = MARKER_SD_VOXEL * volume.T_ct_index[:3, :3]
-            each = body.marker_cov + R.T @ voxel @ voxel.T @ R
-            left = apply(np.linalg.inv(T), seen) - known
-            expected_ms = float(np.trace(each)) * (1 - 2 / len(rows))
-            size = float(np.mean((left**2).sum(axis=1))) / expected_ms
-            if size < LOOSE**2:
-                center = known.mean(axis=0)
-                L = carried(center, body.target_ct) @ least_squares_map(design(known, center))
-                cov = max(size, 1.0) * L @ np.kron(np.eye(len(rows)), each) @ L.T
-                residual = float(np.sqrt(np.mean((left**2).sum(axis=1))))
-                return _tie(T, cov, body, "markers", residual, fit.found, same_frame, findings)
-            times = f"{np.sqrt(size):.1f} times as far from their places as declared"
-            said = f"markers lie {times}: skin and bone tie the frames"
-            findings.append(Finding("markers_moved", Severity.WARNING, said, {"times": float(np.sqrt(size))}))
     X = carried(fit.center, apply(fit.T, body.target_ct))
     turn = np.kron(np.eye(2), R)
-    cov = turn.T @ X @ fit.cov @ X.T @ turn
-    return _tie(fit.T, cov, body, "body", fit.residual_mm, fit.found, same_frame, findings)
+    cov_body = turn.T @ X @ fit.cov @ X.T @ turn
+    by_body = partial(_tie, fit.T, cov_body, body, "body", fit.residual_mm, fit.found, same_frame)
+    rows, columns = _paired(body.markers, pieces, fit.T)
+    if body.markers is None or len(rows) < 3 or not _area(body.markers.points[rows][:3]) > 100.0:
+        return by_body([])
+    known, seen = body.markers.points[rows], pieces[columns]
+    T = fit_rigid(known, seen)
+    voxel = MARKER_SD_VOXEL * volume.T_ct_index[:3, :3]
+    each = body.marker_cov + R.T @ voxel @ voxel.T @ R
+    left = apply(np.linalg.inv(T), seen) - known
+    expected_ms = float(np.trace(each)) * (1 - 2 / len(rows))
+    size = float(np.mean((left**2).sum(axis=1))) / expected_ms
+    center = known.mean(axis=0)
+    L = carried(center, body.target_ct) @ least_squares_map(design(known, center))
+    cov = max(size, 1.0) * L @ np.kron(np.eye(len(rows)), each) @ L.T
+    off = R.T @ (apply(T, body.target_ct) - apply(fit.T, body.target_ct))
+    apart = float(off @ np.linalg.solve(cov[:3, :3] + cov_body[:3, :3], off))
+    if size < LOOSE**2 and apart < APART**2:
+        residual = float(np.sqrt(np.mean((left**2).sum(axis=1))))
+        return _tie(T, cov, body, "markers", residual, fit.found, same_frame, [])
+    what = (
+        f"lie {np.sqrt(size):.1f} times as far from their places as declared"
+        if size >= LOOSE**2
+        else f"have the target {np.linalg.norm(off):.1f} mm from where skin and bone have it"
+    )
+    numbers = {"times": float(np.sqrt(size)), "apart_mm": float(np.linalg.norm(off))}
+    said = f"markers {what}: skin and bone tie the frames"
+    return by_body([Finding("markers_moved", Severity.WARNING, said, numbers)])
+
+
+def _paired(markers: NamedPoints | None, pieces: Floats, T: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of markers and of the pieces of metal that lie where a placement (4, 4) has them."""
+    if markers is None or not len(pieces):
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    distance = np.linalg.norm(apply(T, markers.points)[:, None] - pieces, axis=2)
+    rows, columns = linear_sum_assignment(np.minimum(distance, 10 * MARKER_MM))
+    kept = distance[rows, columns] < MARKER_MM
+    return rows[kept], columns[kept]
 
 
 def _tie(

@@ -317,15 +317,16 @@ def _frame_of(source: object) -> str:
 def _body(context: CaseContext) -> Body:
     """Skin, bones and markers of a case, by which a scan is tied to it."""
     case, anatomy = context.case, context.anatomy
-    bones = [one.mesh for one in anatomy.structures if BONES & set(plain_name(one.name).split()) or "spine" in one.name]
+    rigid = [bool(BONES & set(plain_name(one.name).split("_"))) or "spine" in one.name for one in anatomy.structures]
+    meshes = [one.mesh for one in anatomy.structures]
+    bones, organs = ([mesh for mesh, hard in zip(meshes, rigid, strict=True) if hard == kind] for kind in (True, False))
     registration = None if context.placement is None else context.placement.registration
     markers, cov = None, np.zeros((3, 3))
     if registration is not None:
         pairs = registration.markers
         markers = NamedPoints(tuple(pairs.names), pairs.points_ct, case.space)
         cov = np.eye(3) * 0.25 if case.errors is None else case.errors.marker_cov_ct
-    organs = [one.mesh for one in anatomy.structures]
-    return body_of(anatomy.skin.mesh, bones, organs, case.target_ct, markers, cov)
+    return body_of(anatomy.skin.mesh, bones, organs or bones, case.target_ct, markers, cov)
 
 
 def _write_page(done: Confirmed, folder: Path) -> None:
