@@ -388,12 +388,14 @@ def test_no_certificate_is_refused(tmp_path, content, code):
         read_certificate(tmp_path / "none.json")
 
 
-@pytest.mark.parametrize(("old", "new"), [("R", "S"), ("U", "S"), ("S", "R"), ("U", "R")])
-def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new):
-    """The checker proves claims; it does not trust the file's own arithmetic."""
+@pytest.mark.parametrize(
+    ("old", "new", "which"), [("R", "S", 0), ("U", "S", -1), ("S", "R", 0), ("U", "R", 0)], ids=str
+)
+def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new, which):
+    """The checker proves claims, the first and the last; it does not trust the file's own arithmetic."""
     context, found = carton
     verdict, reason, structure = found.verdict.copy(), found.reason.copy(), found.structure.copy()
-    row = int(np.flatnonzero(verdict == old)[-1])
+    row = int(np.flatnonzero(verdict == old)[which])
     verdict[row] = new
     reason[row], structure[row] = ("too_close", found.question.structures[0]) if new == "R" else ("", "")
     tree, letters = [], iter(verdict)
