@@ -395,7 +395,8 @@ def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new
     """The checker proves claims, the first and the last; it does not trust the file's own arithmetic."""
     context, found = carton
     verdict, reason, structure = found.verdict.copy(), found.reason.copy(), found.structure.copy()
-    row = int(np.flatnonzero(verdict == old)[which])
+    near = (reason == "too_close") if old == "R" else True  # the skin alone says nothing against it
+    row = int(np.flatnonzero((verdict == old) & near)[which])
     verdict[row] = new
     reason[row], structure[row] = ("too_close", found.question.structures[0]) if new == "R" else ("", "")
     tree, letters = [], iter(verdict)
