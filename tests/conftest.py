@@ -4,6 +4,8 @@ import gc
 import os
 from importlib.util import find_spec
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy comes, as the command line does
+
 import numpy as np
 import pytest
 from hypothesis import settings

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -10,9 +9,9 @@ import time
 from collections import Counter
 
 import numpy as np
+from case_world import coarse_carton
 from places import ROOT
 
-from puncture_twin.meshes import folder
 from puncture_twin.planning.base.errors import InputError
 from puncture_twin.planning.base.output.manifest import (
     MANIFEST_NAME,
@@ -41,13 +40,7 @@ height_mm = [450.0, 550.0]
 
 def coarse_cases(here):
     """The carton twice, coarse, with two grids: whose files lie in a folder can be told by the case's hash."""
-    cases = []
-    for name, step in (("a", "15.0"), ("b", "18.0")):
-        shutil.copytree(folder() / "carton", here / name)
-        case = here / name / "case_m.toml"
-        case.write_text(case.read_text().replace("step_deg = 2.0", f"step_deg = {step}"))
-        cases.append(case)
-    return cases
+    return [coarse_carton(here / name, step) for name, step in (("a", 15.0), ("b", 18.0))]
 
 
 def start(arguments):

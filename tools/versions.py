@@ -139,9 +139,11 @@ def main() -> int:
     here = Environment("here", sys.executable, ())
     tried = environments(OUT)
     try:
-        _run(here, [sys.executable, "run_twin.py", "search", CASE, "--no-pictures", "--out", str(OUT / "here")])
-        with ThreadPoolExecutor(len(tried) or 1) as pool:
+        with ThreadPoolExecutor(1 + len(tried)) as pool:  # pip waits for others, and the search here need not wait
+            search = [sys.executable, "run_twin.py", "search", CASE, "--no-pictures", "--out", str(OUT / "here")]
+            searched = pool.submit(_run, here, search)
             tables = list(pool.map(lambda one: try_out(one, OUT), tried))
+            searched.result()
     except FailedError as error:
         print(error, file=sys.stderr)
         return 1

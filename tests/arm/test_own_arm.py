@@ -313,7 +313,8 @@ def test_a_shape_that_hangs_on_nothing_is_refused(plain, tmp_path):
 def test_holder_and_needle_are_asked_of_what_wrist_2_carries(tmp_path):
     """A plate that hangs on wrist 2 and stands across the needle, 60 mm before the flange, at every angle."""
     path = write_own_arm(tmp_path)
-    flange = np.linalg.inv(link_poses(arm(path), np.zeros(6))[4]) @ flange_pose(arm(path), np.zeros(6))
+    bare = arm(path)
+    flange = np.linalg.inv(link_poses(bare, np.zeros(6))[4]) @ flange_pose(bare, np.zeros(6))
     reach_mm = LENGTHS[5] + 70.0
     boxes = ((40, 0, -LENGTHS[5], 90, 20, 20), (80, 0, 35 - LENGTHS[5] / 2, 20, 20, reach_mm), (30, 0, 60, 120, 40, 10))
     shapes = ""
@@ -325,7 +326,8 @@ def test_holder_and_needle_are_asked_of_what_wrist_2_carries(tmp_path):
         shapes += f'<collision><geometry><mesh filename="bracket{number}.stl"/></geometry></collision>'
     before, link, after = path.read_text().partition(f'<link name="{LINKS[5]}">')
     path.write_text(before + link + after.replace("</link>", f"{shapes}</link>", 1))
-    for checker in (CellChecker(arm(path), TOOL), FastChecker(arm(path), TOOL)):
+    model = arm(path)
+    for checker in (CellChecker(model, TOOL), FastChecker(model, TOOL)):
         for q in np.random.default_rng(0).uniform(-2.5, 2.5, (20, 6)):
             contact = checker.contact(q, needle_may_touch_patient=False)
             assert contact is not None

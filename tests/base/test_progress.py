@@ -2,11 +2,11 @@
 
 import io
 import logging
-import shutil
 import subprocess
 import sys
 
 import pytest
+from case_world import coarse_carton
 
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.progress import Silent, Stages
@@ -127,10 +127,7 @@ def test_an_engine_counts_what_a_person_counts(engine, most, tmp_path):
             self.totals.setdefault(stage, set()).add(total)
 
     heard = Heard()
-    case = tmp_path / "carton" / "case_m.toml"
-    shutil.copytree(folder() / "carton", case.parent)
-    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 15.0"))
-    context = prepare(case, engine=engine, watcher=heard)
+    context = prepare(coarse_carton(tmp_path / "carton", 15.0), engine=engine, watcher=heard)
     found = context.search()
     whole = {"structures": len(context.anatomy.checked), "directions": len(found)}
     assert {stage: totals for stage, totals in heard.totals.items() if stage in whole} == {

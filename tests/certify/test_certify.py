@@ -38,7 +38,7 @@ from puncture_twin.twin.jobs.exit_codes import OK
 REAL = TESTS / "real"
 DATA = REAL_CT
 
-CASES = {"abdomen": ("abdomen", 2.0), "carton": ("carton/case_m.toml", 2.0)}
+CASES = {"abdomen": ("abdomen", 3.0), "carton": ("carton/case_m.toml", 3.0)}
 """Case, and the size in degrees to which the tests certify it."""
 
 unit_interval = st.floats(0, 1)
@@ -59,9 +59,9 @@ def certified(request):
 
 @pytest.fixture(scope="module")
 def carton():
-    """The carton with its certificate at 4°."""
+    """The carton with its certificate at 6°."""
     context = prepare(folder() / "carton" / "case_m.toml", arm=False)
-    return context, certify(context.case, context.anatomy, size=np.radians(4))
+    return context, certify(context.case, context.anatomy, size=np.radians(6))
 
 
 def _directions(case, theta, beta):
@@ -152,7 +152,7 @@ def _random_cell(rng, size):
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_what_is_said_of_a_cell_holds_for_its_axes(seed):
     """Random triangles and a random cell: brute force on axes all over it, also at its corners, never contradicts.
 
@@ -217,7 +217,7 @@ def test_the_skin_bounds_hold(shape, ball, box, rng):
     everything = Lists.one(np.arange(len(mesh.faces)))
     length, longest = 75.0, 70.0
     proven = 0
-    for _ in range(150):
+    for _ in range(60):
         u, rho = outward(rng.uniform(0, np.pi), rng.uniform(0, 6.3)), 10 ** rng.uniform(-3, -0.8)
         cone = u[None], np.array([rho])
         found = skin_bounds(surface, everything, *cone, _turned(u, rho, rng)[None], length=length, longest=longest)
@@ -233,7 +233,7 @@ def test_the_skin_bounds_hold(shape, ball, box, rng):
             assert (within == (found.count[0] >= 1)).all()
             assert (~np.isnan(paths.reentry_depth) == (found.count[0] >= 2)).all()
             assert (paths.path_length[within] <= found.farthest[0] + 1e-9).all()
-    assert proven > 30
+    assert proven > 12
 
 
 def _bumpy(mesh):
@@ -251,15 +251,15 @@ def test_random_directions_never_contradict(certified, rng):
     """Directions thrown into the cells and at the cap: the search, with FCL, agrees with every certified one."""
     context, found = certified
     case = context.case
-    rows = rng.integers(0, len(found.leaves), 1500)
+    rows = rng.integers(0, len(found.leaves), 600)
     theta, beta = _thrown_into(found.leaves, rows, rng)
-    theta = np.concatenate([theta, np.arccos(rng.uniform(0, 1, 1000))])
-    beta = np.concatenate([beta, rng.uniform(0, 2 * np.pi, 1000)])
+    theta = np.concatenate([theta, np.arccos(rng.uniform(0, 1, 400))])
+    beta = np.concatenate([beta, rng.uniform(0, 2 * np.pi, 400)])
     letters = found.at(theta, beta)
     rated = _judged(context, context.anatomy, _directions(case, theta, beta))
     assert rated.safe[letters == "S"].all()
     assert not rated.safe[letters == "R"].any()
-    assert min((letters == "S").sum(), (letters == "R").sum()) > 300
+    assert min((letters == "S").sum(), (letters == "R").sum()) > 120
 
 
 def test_nearly_all_of_the_cap_is_decided(certified):
@@ -388,12 +388,15 @@ def test_no_certificate_is_refused(tmp_path, content, code):
         read_certificate(tmp_path / "none.json")
 
 
-@pytest.mark.parametrize(("old", "new"), [("R", "S"), ("U", "S"), ("S", "R"), ("U", "R")])
-def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new):
-    """The checker proves claims; it does not trust the file's own arithmetic."""
+@pytest.mark.parametrize(
+    ("old", "new", "which"), [("R", "S", 0), ("U", "S", -1), ("S", "R", 0), ("U", "R", 0)], ids=str
+)
+def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new, which):
+    """The checker proves claims, the first and the last; it does not trust the file's own arithmetic."""
     context, found = carton
     verdict, reason, structure = found.verdict.copy(), found.reason.copy(), found.structure.copy()
-    row = int(np.flatnonzero(verdict == old)[-1])
+    near = (reason == "too_close") if old == "R" else True  # the skin alone says nothing against it
+    row = int(np.flatnonzero((verdict == old) & near)[which])
     verdict[row] = new
     reason[row], structure[row] = ("too_close", found.question.structures[0]) if new == "R" else ("", "")
     tree, letters = [], iter(verdict)
@@ -404,11 +407,19 @@ def test_a_flipped_cell_is_refused_even_with_a_matching_summary(carton, old, new
         verify(forged, context.case, context.anatomy)
 
 
-@pytest.mark.parametrize("reason", ["too_long", "unknown_region", "reenters_skin", "skin_angle", "no_skin_entry"])
-def test_a_false_reason_is_refused(carton, reason):
-    """A cell that is too close does not break another constraint."""
+@pytest.mark.parametrize(
+    ("true", "reason"),
+    [
+        ("too_close", "too_long"),
+        ("too_close", "skin_angle"),
+        ("too_close", "no_skin_entry"),
+        ("too_long", "reenters_skin"),
+    ],
+)
+def test_a_false_reason_is_refused(carton, true, reason):
+    """A cell that is too close breaks no other constraint; one that is too long, whose skin is known, no second."""
     context, found = carton
-    row = int(np.flatnonzero(found.reason == "too_close")[0])
+    row = int(np.flatnonzero(found.reason == true)[0])
     reasons = found.reason.copy()
     reasons[row] = reason
     with refused("cell_not_proven", reason):
@@ -514,7 +525,7 @@ def test_when_nothing_is_safe_the_map_proves_it(carton):
     context, _ = carton
     structures = tuple(replace(s, margin_mm=60.0) for s in context.anatomy.structures)
     anatomy = replace(context.anatomy, structures=structures)
-    found = certify(context.case, anatomy, size=np.radians(4))
+    found = certify(context.case, anatomy, size=np.radians(8))
     assert found.areas["S"] == 0
     assert found.fraction("R") == pytest.approx(1)
     verify(found, context.case, anatomy)
@@ -523,9 +534,9 @@ def test_when_nothing_is_safe_the_map_proves_it(carton):
 @pytest.mark.parametrize(
     ("margin", "size", "says"),
     [
-        ("80.0", "2", "proven: no direction of the cap is safe, to 2 deg; "),
+        ("80.0", "4", "proven: no direction of the cap is safe, to 4 deg; "),
         ("29.0", "10", "proven: no direction of the cap is safe, to 10 deg, except perhaps in "),
-        ("2.0", "4", "certified to 4 deg: safe "),
+        ("2.0", "8", "certified to 8 deg: safe "),
     ],
 )
 def test_the_command_line_says_what_is_proven(tmp_path, capfd, margin, size, says):
@@ -566,7 +577,7 @@ def test_without_organs_the_skin_alone_decides(carton):
     """No structure with a margin: no query, and still a map."""
     context, _ = carton
     anatomy = Anatomy((), context.anatomy.skin, ())
-    found = certify(context.case, anatomy, size=np.radians(3))
+    found = certify(context.case, anatomy, size=np.radians(6))
     assert found.queries == 0
     assert found.fraction("S") > 0.5
     verify(found, context.case, anatomy)
@@ -581,7 +592,7 @@ def test_an_open_skin_is_only_certified_where_it_stands(carton, rng):
     skin = Skin(TriangleMesh(mesh.vertices, mesh.faces[keep]), np.zeros(keep.sum(), bool), None, ())
     anatomy = replace(context.anatomy, skin=skin)
     found = certify(context.case, anatomy, size=np.radians(2))
-    theta, beta = np.arccos(rng.uniform(0, 1, 3000)), rng.uniform(0, 2 * np.pi, 3000)
+    theta, beta = np.arccos(rng.uniform(0, 1, 1000)), rng.uniform(0, 2 * np.pi, 1000)
     rated = _judged(context, anatomy, _directions(context.case, theta, beta))
     letters = found.at(theta, beta)
     assert rated.safe[letters == "S"].all()

@@ -25,7 +25,7 @@ DRAWN = 400
 def certified():
     """A case with its arm, its plain certificate, and the one that keeps the chance."""
     context = prepare(folder() / "abdomen")
-    size = np.radians(1.0)
+    size = np.radians(2.0)
     plain = certify(context.case, context.anatomy, size=size)
     found = certify(context.case, context.anatomy, size=size, touch=CHANCE, error=context.pose_error)
     return context, plain, found
@@ -83,8 +83,7 @@ def test_the_checker_proves_it_and_refuses_another_chance(certified, tmp_path):
     again = parse_certificate(path.read_bytes(), path)
     assert again.question.touch == found.question.touch
     assert any("chance to touch" in text for text in again.summary()["certified"])
-    if len(found.leaves) < 5000:
-        verify(again, case, anatomy, error=error)
+    verify(again, case, anatomy, error=error)
     for touch in (None, 0.01):
         with refused("certificate_of_another"):
             verify(replace(again, question=replace(again.question, touch=touch)), case, anatomy, error=error)
@@ -160,18 +159,18 @@ def drawn_clearances(pose, surface_mm, freedom, rng):
     return most + np.abs(rng.normal(0.0, surface_mm, MANY) * (1.0 if freedom is None else scale[:, 0]))
 
 
-@pytest.mark.parametrize("chance", [0.3, 0.05, 0.01])
 @pytest.mark.parametrize("freedom", [None, 6])
 @pytest.mark.parametrize(("pose", "surface_mm"), POSES)
-def test_in_a_tube_no_needle_touches_more_often(pose, surface_mm, freedom, chance, rng):
+def test_in_a_tube_no_needle_touches_more_often(pose, surface_mm, freedom, rng):
     """The worst shape, all around the needle, at exactly the clearance that is kept; a plane's quantile fails there."""
     corner = np.hypot(TUBE_MM, 10.0)
     far, length, surface = (np.array([mm]) for mm in (corner, NEEDLE_MM, surface_mm))
-    kept = pose.margin(chance, freedom, far, length, RADIUS_MM, surface)[0]
-    off = drawn_clearances(pose, surface_mm, freedom, rng)
-    assert np.mean(off > kept) <= chance + 4 * np.sqrt(chance / MANY)
-    plane = (-ndtri(chance) if freedom is None else -stdtrit(freedom, chance)) * pose.of_distance(TUBE_MM, surface_mm)
-    assert np.mean(off > plane) > chance
+    off, deviation = drawn_clearances(pose, surface_mm, freedom, rng), pose.of_distance(TUBE_MM, surface_mm)
+    for chance in (0.3, 0.05, 0.01):
+        kept = pose.margin(chance, freedom, far, length, RADIUS_MM, surface)[0]
+        assert np.mean(off > kept) <= chance + 4 * np.sqrt(chance / MANY)
+        plane = (-ndtri(chance) if freedom is None else -stdtrit(freedom, chance)) * deviation
+        assert np.mean(off > plane) > chance
 
 
 def test_the_margin_grows_as_the_chance_falls():

@@ -249,14 +249,14 @@ def test_the_inner_prism_lies_in_the_cylinder() -> None:
 
 @pytest.fixture(scope="module")
 def states() -> np.ndarray:
-    """Ten thousand: anywhere, and in small steps away from where the needle is about to go in."""
+    """Four thousand: anywhere, and in small steps away from where the needle is about to go in."""
     rng = np.random.default_rng(7)
-    anywhere = rng.uniform(-np.pi, np.pi, (5000, 6))
-    near = CLEAR + rng.normal(size=(5000, 6)) * rng.choice([0.02, 0.2, 0.6], (5000, 1))
+    anywhere = rng.uniform(-np.pi, np.pi, (2000, 6))
+    near = CLEAR + rng.normal(size=(2000, 6)) * rng.choice([0.02, 0.2, 0.6], (2000, 1))
     return np.concatenate([anywhere, near])
 
 
-def test_ten_thousand_verdicts_are_those_of_fcl(states: np.ndarray) -> None:
+def test_thousands_of_verdicts_are_those_of_fcl(states: np.ndarray) -> None:
     """The same contact or none at every state, the needle being allowed in or not; no state is falsely free.
 
     What the bounds alone call free is free to FCL, and they settle nearly all of the free states.
@@ -274,7 +274,7 @@ def test_ten_thousand_verdicts_are_those_of_fcl(states: np.ndarray) -> None:
         free += verdict is None
         proven += not open_checks
         met.add(verdict)
-    assert 2000 < free < 8000 and proven >= 0.9 * free
+    assert 800 < free < 3200 and proven >= 0.9 * free
     others = {verdict.other for verdict in met if verdict}
     assert {"patient", "table", "lamp", "base", "upper_arm"} <= others
 
@@ -282,7 +282,7 @@ def test_ten_thousand_verdicts_are_those_of_fcl(states: np.ndarray) -> None:
 def test_along_a_path_the_first_contact_is_the_one_that_asking_every_state_finds(states: np.ndarray) -> None:
     """The same index and bodies on straight joint paths, long and short, clear and not."""
     slow, fast = scene(CellChecker), scene(FastChecker)
-    free = [q for q in states[::25] if slow.contact(q, needle_may_touch_patient=False) is None]
+    free = [q for q in states[::10] if slow.contact(q, needle_may_touch_patient=False) is None]
     met = clear = 0
     for k in range(100):
         path = free[k] + np.linspace(0.0, 0.1 + 0.009 * k, 40)[:, None] * (free[-1 - k] - free[k])
@@ -342,8 +342,8 @@ def test_the_proof_holds_for_the_whole_stretch_that_is_skipped() -> None:
     """A wrist that turns in place skips nothing it should not: tiny steps end at the state where FCL ends."""
     slow, fast = scene(CellChecker, 0.0), scene(FastChecker, 0.0)
     for joint in range(6):
-        path = np.tile(CLEAR, (1500, 1))
-        path[:, joint] += np.linspace(0.0, 3.0, 1500)
+        path = np.tile(CLEAR, (500, 1))
+        path[:, joint] += np.linspace(0.0, 3.0, 500)
         expected = slow.first_contact(path, needle_may_touch_patient=False)
         assert fast.first_contact(path, needle_may_touch_patient=False) == expected
 
@@ -361,11 +361,11 @@ def test_an_empty_room_and_a_needle_that_may_go_in() -> None:
 
 @pytest.fixture(scope="module")
 def abdomen(tmp_path_factory: pytest.TempPathFactory) -> CaseContext:
-    """The embedded abdomen at 6 degrees."""
+    """The embedded abdomen at 10 degrees."""
     here = tmp_path_factory.mktemp("abdomen") / "case"
     shutil.copytree(ROOT / "meshes" / "abdomen", here)
     case = here / "case.toml"
-    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 6.0"))
+    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 10.0"))
     return prepare(case)
 
 
@@ -379,7 +379,7 @@ def test_reach_answers_over_the_abdomen_are_those_of_fcl(abdomen: CaseContext) -
     slow, fast = (built(kind, UR3, *room, padding_mm=ARM_PADDING_MM) for kind in (CellChecker, FastChecker))
     reports: list[tuple[int, int]] = []
     answers = assess_reach_all(fast, requests, lambda done, total: reports.append((done, total)))
-    assert reports[-1] == (len(requests), len(requests)) and len(requests) > 300
+    assert reports[-1] == (len(requests), len(requests)) and len(requests) > 100
     for asked, answer in zip(requests, answers, strict=True):
         assert_same(answer, assess_reach_all(slow, [asked])[0])
     reasons = {answer.reason.value for answer in answers}
@@ -447,7 +447,7 @@ def test_a_segment_keeps_the_clearance_of_its_ends() -> None:
         return min(pair.mm for pair in fast.distances(q)) - padding
 
     passed, refused = 0, 0
-    for start, end in segments(np.random.default_rng(21), 150):
+    for start, end in segments(np.random.default_rng(21), 60):
         ends = np.stack([start, start + 4.0 * (end - start)])
         if free(*ends) is not None:
             assert keeps(*ends) is not None
@@ -459,7 +459,7 @@ def test_a_segment_keeps_the_clearance_of_its_ends() -> None:
             assert least >= 0.9 * wanted - 1.5  # a bound is loose by up to a tenth; a prism is fuller than its needle
         else:
             refused += 1
-    assert passed > 10 and refused > 0
+    assert passed > 4 and refused > 0
 
 
 def test_what_a_judge_remembers_changes_no_verdict() -> None:

@@ -233,6 +233,11 @@ def reached(arm_context):
     return pt.search(arm_context)
 
 
+@pytest.fixture(scope="module")
+def planned(arm_context, reached):
+    return pt.plan(arm_context, reached)
+
+
 def test_a_direction_is_the_same_however_it_is_chosen(context, candidates):
     """By angles, as a candidate, as a window's best, by its entry, or as the best."""
     best = candidates.best
@@ -245,13 +250,12 @@ def test_a_direction_is_the_same_however_it_is_chosen(context, candidates):
     assert pt.check(context, candidate=other).candidates.at(0) == candidates.at(other.row)
 
 
-def test_a_plan_is_of_what_was_chosen(arm_context, reached):
+def test_a_plan_is_of_what_was_chosen(arm_context, reached, planned):
     """Without a choice of the best that the arm can come to; a rejected direction has none."""
     other = reached.pick(int(reached.ranked[1]))
     mine = pt.plan(arm_context, candidate=other)
     assert np.allclose((mine.theta_deg, mine.beta_deg), (other.theta_deg, other.beta_deg))
-    best = pt.plan(arm_context, reached)
-    assert np.allclose((best.theta_deg, best.beta_deg), (reached.best.theta_deg, reached.best.beta_deg))
+    assert np.allclose((planned.theta_deg, planned.beta_deg), (reached.best.theta_deg, reached.best.beta_deg))
     rejected = reached.pick(int(np.flatnonzero(~reached.safe)[0]))
     with refused("direction_rejected", by=pt.NoAnswerError):
         pt.plan(arm_context, candidate=rejected)
@@ -403,9 +407,8 @@ def test_what_is_planned_is_checked_anew(arm_context, reached):
         pt.plan(arm_context, replace(reached, verdict=verdict, ranking=ranking))
 
 
-def test_a_plan_of_another_case_is_neither_rehearsed_nor_shown(arm_context, reached, tmp_path):
-    case = arm_context.case
-    plan = pt.plan(arm_context, reached, seed=3)
+def test_a_plan_of_another_case_is_neither_rehearsed_nor_shown(arm_context, planned, tmp_path):
+    case, plan = arm_context.case, planned
     other = pt.prepare(case.replace(target_ct=case.target_ct + (0.4, 0.0, 0.0)))
     for ask in (
         lambda: pt.rehearse(other, plan),

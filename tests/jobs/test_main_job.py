@@ -29,6 +29,16 @@ def carton(tmp_path_factory):
     return coarse_carton(tmp_path_factory.mktemp("carton") / "case")
 
 
+@pytest.fixture(autouse=True, scope="module")
+def short_film():
+    """Three frames, in this process: a whole film, and one of another process, are made in test_reproducible."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("puncture_twin.twin.jobs.patient.rehearsed.worker_count", lambda wanted, pieces: 1)
+        times = "puncture_twin.twin.report.scene.film.film_times"
+        patch.setattr(times, lambda total: FilmTimes((0.0, total), 1.0, 1))
+        yield
+
+
 @pytest.fixture(scope="module")
 def rehearsed(carton, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
@@ -125,23 +135,16 @@ def test_a_written_plan_is_rehearsed_again_with_the_same_result(carton, rehearse
 
 
 @pytest.fixture
-def one_core(monkeypatch):
-    monkeypatch.setattr("puncture_twin.twin.jobs.patient.rehearsed.worker_count", lambda wanted, pieces: 1)
-
-
-@pytest.fixture
 def no_encoder(monkeypatch):
-    """A short film, and nothing that makes an MP4 of it."""
+    """Nothing that makes an MP4 of a film."""
 
     def absent(*arguments, **options):
         raise RuntimeError("no ffmpeg")
 
-    film = "puncture_twin.twin.report.scene.film"
-    monkeypatch.setattr(f"{film}_text.imageio_ffmpeg.write_frames", absent)
-    monkeypatch.setattr(f"{film}.film_times", lambda total: FilmTimes((0.0, total), 1.0, 1))
+    monkeypatch.setattr("puncture_twin.twin.report.scene.film_text.imageio_ffmpeg.write_frames", absent)
 
 
-@pytest.mark.usefixtures("one_core", "no_encoder")
+@pytest.mark.usefixtures("no_encoder")
 def test_of_many_rooms_the_median_is_shown(carton, rehearsed, tmp_path, capfd):
     """Headline, film and numbers are of the room in the middle, which the simulator confirms."""
     here = tmp_path / "case"

@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from case_world import coarse_carton
 from places import ROOT
 
 from puncture_twin.meshes import folder
@@ -62,10 +63,7 @@ def twice(words, case, tmp_path):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_environment_gives_the_same_bytes(command, tmp_path):
     """Page, pictures, table, certificate, plan, film and manifest, byte for byte; only the timings differ."""
-    here = tmp_path / "case"
-    shutil.copytree(folder() / "carton", here)
-    case = here / "case_m.toml"
-    case.write_text(case.read_text().replace("step_deg = 2.0", "step_deg = 15.0"))
+    case = coarse_carton(tmp_path / "case", 15.0)
     names, differ = twice([command, *COMMANDS[command]], case, tmp_path)
     assert {"report.html", "candidates.parquet", TIMINGS_NAME} < names
     assert ("plan.json" in names) == (command != "search")

@@ -58,8 +58,8 @@ def rows(path: str) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def inside() -> dict[str, np.ndarray]:
-    """Which nodes of a 7 mm grid over the trunk lie in which structure."""
-    axes = [np.arange(low, high, 7.0) for low, high in ((-170, 171), (-118, 119), (-195, 262))]
+    """Which nodes of a 10 mm grid over the trunk lie in which structure."""
+    axes = [np.arange(low, high, 10.0) for low, high in ((-170, 171), (-118, 119), (-195, 262))]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     return {name: abdomen_field(name)(nodes) < 0 for name in STRUCTURES}
 
@@ -123,14 +123,12 @@ def test_structures_are_disjoint_on_a_grid(inside):
 
 def test_no_vertex_lies_in_another_structure():
     """Also between the nodes of the grid: every third vertex is outside every other structure."""
-    for a in ORGANS:
-        points = vertices(a)[::3]
-        for b in ORGANS:
-            if a == b or ("liver" in (a, b) and {a, b} & set(INSIDE_THE_LIVER)):
-                continue
-            low, high = abdomen(b).bounds
-            close = points[np.all((points > low) & (points < high), axis=1)]
-            assert not len(close) or abdomen_field(b)(close).min() > 0, (a, b)
+    for b in ORGANS:
+        own = {b, *INSIDE_THE_LIVER} if b == "liver" else {b, "liver"} if b in INSIDE_THE_LIVER else {b}
+        points = np.concatenate([vertices(a)[::3] for a in ORGANS if a not in own])
+        low, high = abdomen(b).bounds
+        close = points[np.all((points > low) & (points < high), axis=1)]  # all at once: a body has hundreds of parts
+        assert not len(close) or abdomen_field(b)(close).min() > 0, b
 
 
 @pytest.mark.parametrize("name", ["liver", "spleen", "ribs_right", "hepatic_veins", "colon"])

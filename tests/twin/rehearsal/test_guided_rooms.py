@@ -321,7 +321,7 @@ def test_no_correction_leaves_the_corridor(insertion):
     query = distribution._query(context, outward, q)
     way, moving = distribution._way(context, query, "ct+us")
     narrow = replace(way, corridor_mm=0.8)
-    truths = draw_truths(query.puncture, query.truth, 10_000, np.random.default_rng(0), moving)
+    truths = draw_truths(query.puncture, query.truth, 3000, np.random.default_rng(0), moving)
     done = guided_trials(query.puncture, truths, query.truth, narrow, np.random.default_rng(1))
     assert np.linalg.norm(done.aside_base, axis=1).max() <= narrow.corridor_mm
     assert 0.2 < done.stopped.mean() < 1.0

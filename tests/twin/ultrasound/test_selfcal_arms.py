@@ -30,8 +30,10 @@ from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording
 from puncture_twin.twin.plant.simulated_recording import simulate_recording
 from puncture_twin.twin.plant.ultrasound_workcell import draw_workcell
 
-ROOMS = 30
-PICTURED = 12
+ROOMS = 16
+"""A covariance that is a third too small, or a half too large, moves the mean of e^T C^-1 e / p out of its bounds: 18
+parameters leave a room a standard deviation of .33, the mean of sixteen .08."""
+PICTURED = 6
 """Rooms of rendered pictures: one takes a second and a half."""
 ALL = active_columns(tip=True, scale=False, direction=True)
 NOISE = Noise(0.0, 0.0, 0.1, float(np.radians(0.3)), off_plane_mm=0.15)
@@ -191,7 +193,7 @@ def test_found_parts_solve_the_likelihood_equation(room):
 
 
 @pytest.fixture(scope="module")
-def thirty():
+def outcomes():
     kinds = {
         "told": Kind(),
         "uniform": Kind(uniform=True, told=False),
@@ -205,11 +207,11 @@ KINDS = ("told", "uniform", "play, found", "outliers, found")
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_the_region_holds_the_truth(thirty, name):
-    """The 95 % region of all parameters, in thirty rooms: as often as the binomial distribution allows (99.9 %)."""
-    inside = sum(one.inside for one in thirty[name])
+def test_the_region_holds_the_truth(outcomes, name):
+    """The 95 % region of all parameters, in every room: as often as the binomial distribution allows (99.9 %)."""
+    inside = sum(one.inside for one in outcomes[name])
     assert max(binom.ppf(0.001, ROOMS, 0.95), 0.85 * ROOMS - 1) <= inside <= ROOMS
-    assert np.mean([one.mahalanobis for one in thirty[name]]) == pytest.approx(1.0, abs=0.25)
+    assert np.mean([one.mahalanobis for one in outcomes[name]]) == pytest.approx(1.0, abs=0.25)
 
 
 def test_a_direction_counts_by_how_much_of_the_shaft_shows():
@@ -242,23 +244,23 @@ def test_the_region_holds_the_truth_of_rendered_pictures():
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_the_prediction_is_the_error_at_held_out_poses(thirty, name):
+def test_the_prediction_is_the_error_at_held_out_poses(outcomes, name):
     """Real and predicted rms agree, and the 95 % ellipsoids of single tips hold what they say."""
-    real = np.concatenate([one.errors_mm for one in thirty[name]])
-    predicted = np.concatenate([one.predicted_mm for one in thirty[name]])
+    real = np.concatenate([one.errors_mm for one in outcomes[name]])
+    predicted = np.concatenate([one.predicted_mm for one in outcomes[name]])
     assert np.sqrt(np.mean(real**2)) == pytest.approx(np.sqrt(np.mean(predicted**2)), rel=0.12)
-    assert 0.91 < np.mean([one.held for one in thirty[name]]) < 0.98
+    assert 0.91 < np.mean([one.held for one in outcomes[name]]) < 0.98
 
 
-def test_the_arms_errors_take_a_third_off_the_held_out_error(thirty):
+def test_the_arms_errors_take_a_third_off_the_held_out_error(outcomes):
     """Beside the same rooms calibrated as if all errors were noise; whose region holds the truth in hardly any."""
     noise_alone = [outcome(Kind(arms=0.0), 1000 + seed) for seed in range(ROOMS // 2)]
     rms = [
         np.sqrt(np.mean(np.concatenate([one.errors_mm for one in rooms]) ** 2))
-        for rooms in (noise_alone, thirty["told"][: ROOMS // 2])
+        for rooms in (noise_alone, outcomes["told"][: ROOMS // 2])
     ]
     assert rms[1] < 0.72 * rms[0]
-    assert sum(one.inside for one in noise_alone) <= 2
+    assert sum(one.inside for one in noise_alone) <= 1
 
 
 def test_arms_declared_too_small_show_in_chi_squared():
@@ -267,9 +269,9 @@ def test_arms_declared_too_small_show_in_chi_squared():
     assert np.mean(small) > 1.15
 
 
-def test_wrong_tips_are_set_aside_with_declared_arms(thirty):
+def test_wrong_tips_are_set_aside_with_declared_arms(outcomes):
     """Three tips 5 mm off are found in every room, others hardly ever."""
-    rooms = thirty["outliers, found"]
+    rooms = outcomes["outliers, found"]
     assert all(one.lost >= 3 for one in rooms)
     assert np.mean([one.lost for one in rooms]) < 3.5
 
