@@ -49,7 +49,7 @@ app = typer.Typer(no_args_is_help=False, pretty_exceptions_enable=False, rich_ma
 """Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
 app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
 calibrate_app = typer.Typer(no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
-app.add_typer(calibrate_app, name="calibrate", help="Calibrate what an arm holds: hand-eye.")
+app.add_typer(calibrate_app, name="calibrate", help="Calibrate an arm: hand-eye, dynamics.")
 
 
 @app.callback(invoke_without_command=True, epilog="Terms in the output: docs/words.md.")
@@ -586,7 +586,7 @@ def selfcal(
 
 @calibrate_app.callback()
 def _calibrate() -> None:
-    """Calibrate what an arm holds."""
+    """Calibrate an arm and what it holds."""
 
 
 @calibrate_app.command("hand-eye")
@@ -611,6 +611,27 @@ def _hand_eye(
     found = calibrate_hand_eye(pairs, parse_noise(noise))
     summary = hand_eye_summary(found)
     finish("calibrate hand-eye", found, summary, hand_eye_text(summary), as_json)
+
+
+@calibrate_app.command("dynamics")
+def _dynamics(
+    case: CaseArgument,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", metavar="FILE", help="CSV of joints and torques over time.")
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", metavar="FILE", help="Write such a file with the simulated arm first.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of what --record draws.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Identify the arm's dynamics from torques, and what their error costs at the tip."""
+    require_extra("twin", "calibrate dynamics")
+    from puncture_twin.twin.jobs.experiment.dynamics_job import calibrate_dynamics, recorded_or_given
+
+    with prepared(case, arm=True) as context:
+        found = calibrate_dynamics(context, recorded_or_given(context, recording, record, seed))
+    finish("calibrate dynamics", found, found.summary(), found.text(), as_json)
 
 
 @app.command()

@@ -48,6 +48,7 @@ NO = {
     "register": "never: markers that contradict each other are refused",
     "selfcal": "never: a recording that does not determine the calibration is refused",
     "calibrate hand-eye": "never: poses that do not determine the calibration, or contradict it, are refused",
+    "calibrate dynamics": "with `--record` the arm has no space for an exciting motion",
     "servo": "a servo did not converge",
     "scan": "never: it only reports",
     "confirm": "the line is not safe, or the needle had better be moved",

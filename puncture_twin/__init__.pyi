@@ -2,6 +2,7 @@ from .api import (
     batch as batch,
     best_target as best_target,
     calibrate as calibrate,
+    calibrate_dynamics as calibrate_dynamics,
     calibrate_hand_eye as calibrate_hand_eye,
     camera_view as camera_view,
     certify as certify,

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
     from puncture_twin.twin.jobs.batch.jobs import Merged
     from puncture_twin.twin.jobs.choosing.compare_job import Comparison
+    from puncture_twin.twin.jobs.experiment.dynamics_job import Dynamics
     from puncture_twin.twin.jobs.experiment.touch_job import TouchRun
     from puncture_twin.twin.jobs.patient.confirm_job import Confirmed
     from puncture_twin.twin.jobs.patient.markers_job import MarkersRun
@@ -539,6 +540,22 @@ def calibrate_hand_eye(
     from puncture_twin.planning.registration.hand_eye import calibrate_hand_eye, noise_of
 
     return calibrate_hand_eye(pairs, noise_of((robot_mm, robot_deg, camera_mm, camera_deg)))
+
+
+@checked
+def calibrate_dynamics(context: CaseContext, recording: Path | str) -> Dynamics:
+    """The dynamics of a case's arm from joints and torques over time, and what their error costs at the tip.
+
+    Args:
+        context: With the arm.
+        recording: Columns ``time_s``, ``q1_deg .. q6_deg``, ``tau1_nm .. tau6_nm``, or RTDE's.
+
+    Raises:
+        InputError: It cannot be read, its motion shows too little, or its torques are of another motion.
+    """
+    from puncture_twin.twin.jobs.experiment.dynamics_job import calibrate_dynamics
+
+    return calibrate_dynamics(context, Path(recording))
 
 
 @checked

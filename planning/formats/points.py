@@ -409,6 +409,9 @@ RTDE_JOINTS = tuple(f"actual_q_{number}" for number in range(6))
 RTDE_TOOL = tuple(f"actual_TCP_pose_{number}" for number in range(3))
 """Where the controller has its tool, m, base frame."""
 
+TORQUES = tuple(f"tau{number}_nm" for number in range(1, 7)), tuple(f"target_moment_{number}" for number in range(6))
+"""Columns of joint torques, N m: ours, and RTDE's."""
+
 TIMES = ("time_s", "timestamp")
 
 MOST_RAD = np.radians([363.0, 363.0, 363.0, 363.0, 363.0, 720.0])
@@ -431,6 +434,8 @@ class JointRecording(NamedTuple):
     """Shape (n,); None where the file has no times."""
     tool_base: Floats | None
     """Where the controller had its tool, shape (n, 3), mm; None where the file does not say it."""
+    torque_nm: Floats | None = None
+    """Shape (n, 6); None where the file has no torques."""
 
 
 def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, names: Sequence[str] = ()) -> Floats:
@@ -504,7 +509,8 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     if len(rows) < 2:
         refuse("has no row", path, _ALLOWED_JOINTS, "empty")
     tool = RTDE_TOOL if set(RTDE_TOOL) <= set(header) else ()
-    wanted = [*joints, *([time] if time else []), *tool]
+    torques = next((names for names in TORQUES if set(names) <= set(header)), ())
+    wanted = [*joints, *([time] if time else []), *torques, *tool]
     table = np.array([row_numbers(row, header, wanted, f"{path}: row {i}") for i, row in enumerate(rows[1:], start=1)])
     names = tuple(row[header.index("name")].strip() for row in rows[1:]) if "name" in header else ()
     q = joint_readings(table[:, :6], unit, where=path, names=names)
@@ -512,7 +518,8 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     if times is not None:
         check_times(times, where=path)
     names = names or tuple(str(i) for i in range(1, len(rows)))
-    return JointRecording(names, q, times, 1000.0 * table[:, -3:] if tool else None)
+    torque_nm = table[:, 6 + bool(time) :][:, :6] if torques else None
+    return JointRecording(names, q, times, 1000.0 * table[:, -3:] if tool else None, torque_nm)
 
 
 def _joint_columns(header: Sequence[str], path: Path) -> tuple[tuple[str, ...], AngleUnit]:

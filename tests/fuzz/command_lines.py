@@ -8,7 +8,16 @@ from fuzz.mutate import NUMBERS, pick
 COMMANDS = [
     *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "live", "export", "register"],
     *["touch", "pivot", "markers"],
-    *["calibrate", "calibrate hand-eye", "batch", "batch run", "batch status", "batch merge", "batch compare"],
+    *[
+        "calibrate",
+        "calibrate hand-eye",
+        "calibrate dynamics",
+        "batch",
+        "batch run",
+        "batch status",
+        "batch merge",
+        "batch compare",
+    ],
     *[
         "schema",
         "init",

@@ -99,9 +99,9 @@ def values(given):
     }
 
 
-WITHOUT = {"write_plan", "write_points", "read_certificate", "read_volume", "confirm", "markers"}
-"""They return nothing, or what another one of the list returns; a volume is shown below, a confirmation where one is
-made (test_confirm.py), markers with their command."""
+WITHOUT = {"write_plan", "write_points", "read_certificate", "read_volume", "confirm", "markers", "calibrate_dynamics"}
+"""They return nothing, or what another one of the list returns; a volume is shown below, a confirmation where one
+is made (test_confirm.py), markers with their command, dynamics where they are identified (test_dynamics.py)."""
 
 
 def test_everything_that_a_function_returns_shows_itself(values):

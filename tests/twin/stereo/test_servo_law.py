@@ -114,12 +114,13 @@ def test_five_joints_bring_ball_and_needle_to_where_six_do(seed):
     rod, start = rod_at(GOOD), GOOD + 0.03 * rng.normal(size=6)
     goal, q, six = ball_base(rod, GOOD) + rng.uniform(-8, 8, 3), start, start
     for _ in range(300):
-        z = flange_pose(MODEL, q)[:3, 2]
-        J = ball_jacobian(rod, q)[:, :5] / np.repeat([300.0, 1.0], 3)[:, None]
-        q = q + np.append(
-            np.linalg.pinv(J) @ np.append((goal - ball_base(rod, q)) / 300.0, np.cross(z, rod.R_base_flange[:, 2])), 0.0
-        )
+        q = servo_step(rod, q, goal - ball_base(rod, q), StepLimits(joints=5)).q_path[-1]
         six = servo_step(rod, six, goal - ball_base(rod, six), StepLimits()).q_path[-1]
+    z = flange_pose(MODEL, start)[:3, 2]  # one step is the paper's own
+    J = ball_jacobian(rod, start)[:, :5] / np.repeat([300.0, 1.0], 3)[:, None]
+    own = np.linalg.pinv(J) @ np.append(np.array([0.1, 0, 0]) / 300.0, np.cross(z, rod.R_base_flange[:, 2]))
+    step = servo_step(rod, start, np.array([0.1, 0, 0]), StepLimits(joints=5)).q_path[-1] - start
+    np.testing.assert_allclose(step, np.append(own, 0.0), atol=1e-12)
     for joints in (q, six):
         np.testing.assert_allclose(ball_base(rod, joints), goal, atol=1e-3)
         np.testing.assert_allclose(flange_pose(MODEL, joints)[:3, 2], rod.R_base_flange[:, 2], atol=1e-5)

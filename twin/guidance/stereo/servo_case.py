@@ -117,6 +117,7 @@ class ServoSection(Section):
     max_step_mm: Annotated[Number, Field(ge=0.1, le=200)] = 10.0
     max_joint_step_deg: Annotated[Number, Field(ge=0.01, le=90)] = 10.0
     max_drift_deg: Annotated[Number, Field(ge=0, le=45)] = 1.0
+    joints: Literal[5, 6] = 6
     hover_mm: Annotated[Number, Field(ge=5, le=300)] = 70.0
     padding_mm: Annotated[Number, Field(ge=1, le=50)] = 2.0
 

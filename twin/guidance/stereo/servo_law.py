@@ -78,6 +78,8 @@ class StepLimits(NamedTuple):
     """The largest rotation of any joint."""
     drift_rad: float = math.radians(1.0)
     """How far the needle may rotate away while only the position is controlled."""
+    joints: int = 6
+    """That move: of 5, the sixth, which turns the rod about itself, is held."""
 
 
 class Step(NamedTuple):
@@ -121,7 +123,7 @@ def orientation_error(rod: CarriedRod, q: Floats) -> Floats:
 
 
 def smallest_sigma(J: Floats) -> float:
-    """Smallest singular value of a Jacobian (6, 6) with its lengths over ``CHARACTERISTIC_MM``."""
+    """Smallest singular value of a Jacobian (6, 6) or (6, 5) with its lengths over ``CHARACTERISTIC_MM``."""
     return float(np.linalg.svd(_scaled(J), compute_uv=False)[-1])
 
 
@@ -140,7 +142,7 @@ def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits
     for piece in range(1, count + 1):
         q_now = path[-1]
         goal = start + move * (piece / count)  # on the straight line: what the last pieces missed is made up for
-        dq, without_orientation = _piece(rod, q_now, goal - ball_base(rod, q_now))
+        dq, without_orientation = _piece(rod, q_now, goal - ball_base(rod, q_now), limits.joints)
         slack = limits.joint_step_rad - np.abs(q_now - q).max()
         fraction = min(1.0, max(slack, 0.0) / max(float(np.abs(dq).max()), 1e-12))
         q_next = q_now + fraction * dq
@@ -154,13 +156,18 @@ def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits
     return Step(np.array(path), None, position_only)
 
 
-def _piece(rod: CarriedRod, q: Floats, move: Floats) -> tuple[Floats, bool]:
+def _piece(rod: CarriedRod, q: Floats, move: Floats, joints: int) -> tuple[Floats, bool]:
     """Joint rotations (6,) of one piece, and whether the orientation was given up."""
-    J = ball_jacobian(rod, q)
-    goal = np.concatenate([move / CHARACTERISTIC_MM, orientation_error(rod, q)])
-    if smallest_sigma(J) >= MIN_SIGMA:
-        return np.linalg.solve(_scaled(J), goal), False
-    return damped(_scaled(J)[:3], goal[:3]), True
+    J, turn = ball_jacobian(rod, q)[:, :joints], orientation_error(rod, q)
+    if joints == 5:  # what is left of the turn brings the rod's axis back
+        turn = np.cross(flange_pose(rod.model, q)[:3, 2], rod.R_base_flange[:, 2])
+    goal, dq = np.concatenate([move / CHARACTERISTIC_MM, turn]), np.zeros(6)
+    together = smallest_sigma(J) >= MIN_SIGMA
+    if together:
+        dq[:joints] = np.linalg.lstsq(_scaled(J), goal)[0] if joints == 5 else np.linalg.solve(_scaled(J), goal)
+    else:
+        dq[:joints] = damped(_scaled(J)[:3], goal[:3])
+    return dq, not together
 
 
 def damped(J: Floats, goal: Floats) -> Floats:

@@ -120,9 +120,8 @@ class Aims:
 def step_limits(case: ServoCase) -> StepLimits:
     """What one step of the servo may do."""
     limits = case.file.servo
-    return StepLimits(
-        limits.max_step_mm, float(np.radians(limits.max_joint_step_deg)), float(np.radians(limits.max_drift_deg))
-    )
+    joint_step, drift = np.radians([limits.max_joint_step_deg, limits.max_drift_deg]).tolist()
+    return StepLimits(limits.max_step_mm, joint_step, drift, limits.joints)
 
 
 def aims_of(

@@ -41,18 +41,13 @@ def budget_facts(
         anatomy: Its structures; called where they bend a needle alone.
         q_insertion: Shape (6,), rad, the tip on the target; None takes one that the arm reaches.
     """
-    if registration.uncertainty is None:
+    chain = budget_chain(case, registration, anatomy, q_insertion)
+    if chain is None:
         return None
-    q = _insertion(case, registration) if q_insertion is None else q_insertion
-    if q is None:
-        return None
-    outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(case.robot.model, q)[:3, 2])
-    path = None if case.bending is None else bent_path(case, anatomy(), outward_ct)
-    chain = chain_of(case, registration, q, path)
     found = changes(chain, skin_points_ct, _bed_ct(case, chain.errors.marker_cov_ct))
     best = best_change(found)
     return {
-        **needle_angles(case, registration, q),
+        **needle_angles(case, registration, chain.q_insertion),
         "expected_mm": chain.expected_mm(),
         "limit_95_mm": radius_for_chance(chain.tip_mean_square(), INTERVAL, registration.freedom),
         **_across_and_along(chain),
@@ -64,6 +59,20 @@ def budget_facts(
         "best": _change(case, best),
         "not_modelled": not_modelled(case, counted=_counted(chain)),
     }
+
+
+def budget_chain(
+    case: Case, registration: Registration, anatomy: Callable[[], Anatomy], q_insertion: Floats | None = None
+) -> Chain | None:
+    """The chain of one insertion; arguments as of `budget_facts`."""
+    if registration.uncertainty is None:
+        return None
+    q = _insertion(case, registration) if q_insertion is None else q_insertion
+    if q is None:
+        return None
+    outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(case.robot.model, q)[:3, 2])
+    path = None if case.bending is None else bent_path(case, anatomy(), outward_ct)
+    return chain_of(case, registration, q, path)
 
 
 def _across_and_along(chain: Chain) -> dict[str, float]:
