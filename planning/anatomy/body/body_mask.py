@@ -194,8 +194,6 @@ def body_mask(
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
-        spacing_mm: Shape (3,).
-        unscanned: What was not measured, where that is known.
         at: Shape (3,), a voxel of the part that is meant, where that need not be the largest.
 
     Raises:

@@ -23,7 +23,6 @@ from puncture_twin.planning.anatomy.default_roles import default_role, plain_nam
 from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.geometry.parts import in_blocks, voxels_inside
-from puncture_twin.planning.geometry.rigid import even_directions
 
 SAMPLING_MM = 4.0
 """Spacing of the grid on which limbs are looked for."""
@@ -135,10 +134,14 @@ def _pieces(body: Bools, solid: Bools, bone: Bools, spacing_mm: Floats) -> Itera
     deepest = min(DEEPEST_MM, DEEPEST_FRACTION * float(depth_mm[body].max()))
     index = np.argwhere(bone & (depth_mm <= deepest))
     air = np.zeros(body.shape)
-    for direction in even_directions(DIRECTIONS):
+    step = np.arange(DIRECTIONS) + 0.5
+    z, angle = 1.0 - 2.0 * step / DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * step  # golden angle
+    wide = np.sqrt(1.0 - z * z)
+    for direction in np.stack([wide * np.cos(angle), wide * np.sin(angle), z], axis=1):
         away = SPHERE * depth_mm[tuple(index.T)][:, None] * direction / spacing_mm
         at = np.clip(np.rint(index + away).astype(int), 0, np.array(body.shape) - 1)
-        air[tuple(index.T)] += ~solid[tuple(at.T)] / DIRECTIONS
+        air[tuple(index.T)] += ~solid[tuple(at.T)]
+    air /= DIRECTIONS
     partly, exposed = air >= PARTLY, air >= EXPOSED
     gap_mm = scipy.ndimage.distance_transform_edt(~partly, sampling=spacing_mm)
     groups, count = scipy.ndimage.label(gap_mm <= GAP_MM / 2.0, FULL)

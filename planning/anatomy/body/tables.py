@@ -95,7 +95,6 @@ class TableSide(NamedTuple):
     """A section, drawn along the bed, at which a body or what it lies on ends.
 
     Attributes:
-        face: The side of the image toward which it ends.
         line: Shape (n, nz), by line of sight and slice, where it ends or may end, voxels along the face's axis.
         lines: Shape (n,), which lines of sight are those of the table.
         slope: How it moves along the face's axis, mm per mm along the bed.
@@ -133,7 +132,6 @@ def touching_tables(
     Args:
         hu: Shape (nx, ny, nz), axis 2 along the bed.
         trunk: Same shape; what is as dense and connected with it counts too, however thin.
-        spacing_mm: Shape (3,).
         shown: Of a phantom only what can be cut off is a table, unless there is said to be one.
         level: Where the body's surface is, of the values.
     """
