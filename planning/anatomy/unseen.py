@@ -44,7 +44,7 @@ USUAL_MM = 150.0
 ARM_MM3 = 1.5e5
 """An adult's arm has this in 40 mm of its length, a child's in 100; no bottle or cushion lies at both sides."""
 OUTLINE_MM = 10.0
-"""The outline at a face is that of the body's last so many mm: slices of twice as much show it."""
+"""So near to a face points belong to its outline: half of the thickest slice."""
 SAME_MM = 0.01
 """Corners of an outline that are no farther apart are one."""
 TANGENTS = 32
@@ -71,7 +71,8 @@ def beyond_images(case: Case, skin: Skin, scan: Scan | None, memory: Memory = NO
     Args:
         memory: Holds each solid: of one patient it is the same for every target.
     """
-    ends = [] if skin.field_of_view is None else [(skin.field_of_view, skin.mesh.vertices)]
+    at_ends = skin.mesh.vertices[np.unique(skin.mesh.faces[skin.cut_faces])]  # their outlines, and nothing before them
+    ends = [] if skin.field_of_view is None else [(skin.field_of_view, at_ends)]
     of_scan = None if scan is None else scan.end()
     ends = [end for end in [*ends, *([] if of_scan is None else [of_scan])] if end[0].cut.any()]
     if not ends:

@@ -7,7 +7,7 @@ circle of reconstruction, beside the slab of a tilted gantry, in slices that fil
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -194,19 +194,14 @@ def body_mask(
 
     Args:
         hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
-        spacing_mm: Shape (3,).
-        unscanned: What was not measured, where that is known.
         at: Shape (3,), a voxel of the part that is meant, where that need not be the largest.
 
     Raises:
         InputError: No body, an implausibly small one, or no air around it.
     """
     voxel_ml, dense = float(np.prod(spacing_mm)) / 1000.0, hu > BODY_HU
-    trunk, parts = np.zeros(hu.shape, bool), thick_parts(dense, spacing_mm)
-    first = next(parts, None)
-    if at is not None:
-        first = next((part for part in parts if part.holds(at)), first)
-    if first is not None:
+    trunk, parts = np.zeros(hu.shape, bool), thick_parts(dense, spacing_mm, at)
+    for first in itertools.islice(parts, 1):
         trunk[first.box] = largest_part(first.mask)
     if np.count_nonzero(trunk) * voxel_ml < MIN_BODY_ML:
         what = f"no body found: {np.count_nonzero(trunk) * voxel_ml:.3g} ml above {BODY_HU:g} HU are connected"
@@ -218,7 +213,7 @@ def body_mask(
         if touching.cut_off.any():
             dense &= ~touching.cut_off  # what is left of parts is still drawn from it
             trunk = largest_part(trunk & dense)
-    limbs = detached_limbs(hu, parts if shown.limbs else (), spacing_mm)
+    limbs = [part for part in (parts if shown.limbs else ()) if _is_limb(part.mask, hu[part.box], spacing_mm)]
     warnings += limb_warnings(limbs, trunk, voxel_ml)
     filled = filled_slices(trunk)
     for box, limb in limbs:
@@ -233,19 +228,13 @@ def body_mask(
 
 
 def filled_slices(mask: Bools) -> Bools:
-    """The mask with every hole filled that it encloses in a slice across axis 2: what no way within it leads out of."""
-    air = np.packbits(~mask, axis=2)  # eight slices at a time
-    outside = np.zeros_like(air)
-    ways = [(outside.swapaxes(0, axis)[::step], air.swapaxes(0, axis)[::step]) for axis in (0, 1) for step in (1, -1)]
-    for reached, free in ways:
-        reached[0] = free[0]
-    before = None
-    while before is None or not np.array_equal(before, outside):
-        before = outside.copy()
-        for reached, free in ways:
-            for k in range(1, len(free)):
-                reached[k] |= reached[k - 1] & free[k]
-    return ~np.unpackbits(outside, axis=2, count=mask.shape[2]).view(bool)
+    """The mask with every hole filled that it encloses in a slice across axis 2."""
+    filled = mask.copy()
+    for k in range(mask.shape[2]):
+        air = parts_of(np.pad(~mask[:, :, k], 1, constant_values=True)[None])
+        outside = air.painted(np.arange(len(air.sizes)) == 0)  # the part of the corner is the first
+        filled[:, :, k] = ~outside[0, 1:-1, 1:-1]
+    return filled
 
 
 def _fill_cut_lungs(body: Bools, hu: NDArray[Any], voxel_ml: float, warnings: list[str]) -> None:
@@ -265,27 +254,25 @@ class Piece(NamedTuple):
     box: tuple[slice, ...]
     mask: Bools
 
-    def holds(self, at: Ints) -> bool:
-        """Whether a voxel (3,) of the image belongs to it."""
-        index = at - [one.start for one in self.box]
-        return bool(np.all((index >= 0) & (index < self.mask.shape)) and self.mask[tuple(index)])
 
+def thick_parts(mask: Bools, spacing_mm: Floats, at: Ints | None = None) -> Iterator[Piece]:
+    """The parts of a mask (nx, ny, nz) into which a ball of ``OPENING_MM`` fits, with what lies near.
 
-def thick_parts(mask: Bools, spacing_mm: Floats) -> Iterator[Piece]:
-    """The parts of a mask (nx, ny, nz) into which a ball of ``OPENING_MM`` fits, with what lies near, largest first.
-
-    The border counts as mask. Of others than the first only those that may be as large as a limb.
+    The border counts as mask. First the one that holds a voxel (3,), or the largest; then those as large as a limb.
     """
     stride = np.maximum(1, (SAMPLING_MM / spacing_mm).astype(int))
     coarse_mm = spacing_mm * stride
     near_mm = CORNER * OPENING_MM + coarse_mm.max()
     parts = nearest_parts(mask[:: stride[0], :: stride[1], :: stride[2]], OPENING_MM, coarse_mm, near_mm)
     most_ml = np.bincount(parts.ravel()) * float(np.prod(coarse_mm)) / 1000.0
-    for number, coarse in enumerate(scipy.ndimage.find_objects(parts), start=1):
-        if number == 1 or most_ml[number] >= MIN_LIMB_ML:
-            ends = zip(coarse, stride, mask.shape, strict=True)
+    boxes, first = scipy.ndimage.find_objects(parts), 1
+    if at is not None:
+        first = int(parts[tuple(np.clip(at // stride, 0, np.array(parts.shape) - 1))]) or first
+    for number in sorted(range(1, len(boxes) + 1), key=lambda number: number != first):
+        if number == first or most_ml[number] >= MIN_LIMB_ML:
+            ends = zip(boxes[number - 1], stride, mask.shape, strict=True)
             box = tuple(slice(one.start * step, min(one.stop * step, size)) for one, step, size in ends)
-            whole = parts[coarse] == number
+            whole = parts[boxes[number - 1]] == number
             for axis in (2, 1, 0):
                 whole = whole.repeat(stride[axis], axis=axis)
             yield Piece(box, mask[box] & whole[tuple(map(slice, mask[box].shape))])
@@ -309,23 +296,18 @@ def nearest_parts(mask: Bools, radius_mm: float, spacing_mm: Floats, most_mm: fl
     return np.asarray(parts[tuple(slice(r, -r) for r in reach)])
 
 
-def detached_limbs(hu: NDArray[Any], parts: Iterable[Piece], spacing_mm: Floats) -> tuple[Piece, ...]:
-    """Those parts of an image (nx, ny, nz) beside the trunk that are the patient's: of soft tissue, with bone in it."""
-    limbs = []
-    for part in parts:
-        values = hu[part.box][part.mask]
-        if len(values) * np.prod(spacing_mm) >= 1000.0 * MIN_LIMB_ML:
-            soft = SOFT_TISSUE_HU[0] <= float(np.median(values)) <= SOFT_TISSUE_HU[1]
-            if soft and _holds_bone(part.mask, hu[part.box], spacing_mm):
-                limbs.append(part)
-    return tuple(limbs)
+def _is_limb(part: Bools, hu: NDArray[Any], spacing_mm: Floats) -> bool:
+    """Whether a part beside the trunk is the patient's: of soft tissue, with a bone in it.
 
-
-def _holds_bone(part: Bools, hu: NDArray[Any], spacing_mm: Floats) -> bool:
-    """Whether a bone lies within a part: it holds together, which noise does not, and is no table's hard cover."""
+    A bone holds together, which noise does not, and lies deeper than a table's hard cover.
+    """
+    voxel_ml = float(np.prod(spacing_mm)) / 1000.0
+    small = np.count_nonzero(part) * voxel_ml < MIN_LIMB_ML
+    if small or not SOFT_TISSUE_HU[0] <= np.median(hu[part]) <= SOFT_TISSUE_HU[1]:
+        return False
     cover = widened(np.pad(~part, 1, constant_values=True), np.ceil(OPENING_MM / spacing_mm).astype(int))
     bone = parts_of(~cover[1:-1, 1:-1, 1:-1] & (hu > BONE_HU))
-    return bool(bone.sizes.max(initial=0) * np.prod(spacing_mm) >= 1000.0 * MIN_BONE_ML)
+    return bool(bone.sizes.max(initial=0) * voxel_ml >= MIN_BONE_ML)
 
 
 def limb_warnings(limbs: Sequence[Piece], trunk: Bools, voxel_ml: float) -> Iterator[str]:

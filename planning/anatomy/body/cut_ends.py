@@ -110,20 +110,17 @@ class Content:
 
 def content_of(dense: Bools, T_ct_index: Floats) -> Content:
     """Where, and how, what is denser than air ends in an image (nx, ny, nz), axes to the left, back and head."""
-    spacing_mm = spacing_of(T_ct_index)
-    last, area = np.zeros((3, 2), np.int64), np.zeros((3, 2))
-    thick, wide = np.zeros((3, 2), bool), np.zeros((3, 2), bool)
-    counts = slice_counts(dense)
-    for axis in range(3):
+    spacing_mm, ends = spacing_of(T_ct_index), []
+    for axis, counts in enumerate(slice_counts(dense)):
         step_mm, across_mm = float(spacing_mm[axis]), np.delete(spacing_mm, axis)
-        areas = counts[axis] * float(np.prod(across_mm))
+        areas = counts * float(np.prod(across_mm))
         held = np.flatnonzero(areas >= SPECK_MM2)
-        for end, k in enumerate(held[[0, -1]] if len(held) else (0, len(areas) - 1)):
-            next_area = areas[np.clip(k + (1, -1)[end], 0, len(areas) - 1)]
-            last[axis, end], area[axis, end] = k, areas[k]
-            thick[axis, end] = _is_thick(dense.take(k, axis=axis), across_mm)
-            wide[axis, end] = areas[k] > min(WIDE * next_area, 2.0 * np.pi * ROUND_MM * step_mm)
-    return Content((dense.shape[0], dense.shape[1], dense.shape[2]), T_ct_index, last, area, thick, wide)
+        for k, inward in zip(held[[0, -1]] if len(held) else (0, len(areas) - 1), (1, -1), strict=True):
+            next_area = areas[np.clip(k + inward, 0, len(areas) - 1)]
+            wide = areas[k] > min(WIDE * next_area, 2.0 * np.pi * ROUND_MM * step_mm)
+            ends.append((k, areas[k], _is_thick(dense.take(k, axis=axis), across_mm), wide))
+    found = (np.array(column).reshape(3, 2) for column in zip(*ends, strict=True))
+    return Content((dense.shape[0], dense.shape[1], dense.shape[2]), T_ct_index, *found)
 
 
 def _is_thick(section: Bools, spacing_mm: Floats) -> bool:
@@ -186,25 +183,20 @@ def shifted(T_ct_index: Floats, box: Box) -> Floats:
 
 def stated_ends(names: Iterable[str]) -> Bools:
     """Sides by their names, shape (3, 2)."""
-    cut = np.zeros((3, 2), bool)
-    for name in names:
-        cut[SIDES[name]] = True
-    return cut
+    stated = frozenset(names)
+    return np.array([name in stated for name in SIDES]).reshape(3, 2)
 
 
 def end_warnings(content: Content, cut: Bools, whole: bool) -> tuple[str, ...]:
     """Warnings of what was left out behind cut faces, and of flat ends of a phantom that count as its own."""
     filled = cut & (content.beyond > 0)
     flat = np.array([[False], [False], [whole]]) & content.thick & content.wide & (content.beyond > 0) & ~cut
-    said = []
-    if filled.any():
-        or_phantom = "" if whole else '; or region = "phantom"'
-        said.append(
-            FILLED.format(names=_names(filled), voxels=int(content.beyond[filled].max()), or_phantom=or_phantom)
-        )
-    if flat.any():
-        said.append(ENDS_FLAT.format(names=_names(flat)))
-    return tuple(said)
+    voxels, or_phantom = content.beyond[filled].max(initial=0), "" if whole else '; or region = "phantom"'
+    said = (
+        (filled, FILLED.format(names=_names(filled), voxels=voxels, or_phantom=or_phantom)),
+        (flat, ENDS_FLAT.format(names=_names(flat))),
+    )
+    return tuple(sentence for sides, sentence in said if sides.any())
 
 
 def _names(sides: Bools) -> str:

@@ -12,13 +12,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, CtImage, nearest_parts
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
@@ -68,126 +66,35 @@ class Piece(NamedTuple):
     ml: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class BodyPart:
-    """A part of the body that holds together, on a grid of some 4 mm, axes running to the left, back and head.
-
-    Attributes:
-        body: Shape (nx, ny, nz); a block counts where any of its voxels does.
-        solid: Same shape, the whole body, and what was not scanned: neither is air.
-        bone: Same shape, bone that is evidence of a limb; a block counts where an eighth of it is, which noise is not.
-        spacing_mm: Shape (3,).
-    """
-
-    body: Bools
-    solid: Bools
-    bone: Bools
-    spacing_mm: Floats
-
-    def volume_ml(self, mask: Bools) -> float:
-        """Of a mask."""
-        return float(np.count_nonzero(mask) * np.prod(self.spacing_mm)) / 1000.0
-
-    @cached_property
-    def depth_mm(self) -> Floats:
-        """From the air, shape of ``body``; beyond the border the body goes on."""
-        padded = np.pad(self.solid, 1, mode="edge")
-        return np.asarray(scipy.ndimage.distance_transform_edt(padded, sampling=self.spacing_mm)[1:-1, 1:-1, 1:-1])
-
-    @cached_property
-    def pieces(self) -> tuple[Piece, ...]:
-        """Parts beyond a narrow neck, and what lies about exposed bones; the same for every target."""
-        parts = [self._core == number for number in range(1, int(self._core.max(initial=0)) + 1)]
-        necks = (Piece(part, part, self.volume_ml(part)) for part in parts if len(parts) > 1)
-        return (*necks, *map(self._about, self._exposed()))
-
-    def chosen(self, at: tuple[int, ...]) -> Iterator[int]:
-        """Of each piece: no limb (0), near (1) or whole (2), where a block holds the target."""
-        own_ml = self.volume_ml(self._core == self._core[at]) if self.pieces else 0.0
-        for piece in self.pieces:
-            none = piece.near[at] or min(own_ml, piece.ml) > MOST_ML
-            yield 0 if none else 2 - int(piece.whole[at])
-
-    @cached_property
-    def _core(self) -> Ints32:
-        parts = nearest_parts(self.body, NECK_MM, self.spacing_mm)
-        return np.where(self.body, parts, 0).astype(np.int32) if parts.any() else self.body.astype(np.int32)
-
-    def _exposed(self) -> Iterator[Bools]:
-        """Bones about which air is on more sides than about a bone of the trunk, of one limb each."""
-        deepest = min(DEEPEST_MM, DEEPEST_FRACTION * float(self.depth_mm[self.body].max()))
-        near, air = self.bone & (self.depth_mm <= deepest), np.zeros(self.body.shape)
-        air[near] = self._air_about(np.argwhere(near))
-        partly = air >= PARTLY
-        gap_mm = scipy.ndimage.distance_transform_edt(~partly, sampling=self.spacing_mm)
-        groups, count = scipy.ndimage.label(gap_mm <= GAP_MM / 2.0, FULL)
-        for number in range(1, count + 1) if partly.any() else ():
-            group = partly & (groups == number)
-            exposed = group & (air >= EXPOSED)
-            long = exposed.any() and np.linalg.norm(np.ptp(np.argwhere(exposed), axis=0) * self.spacing_mm) >= LEAST_MM
-            if long and self.volume_ml(exposed) >= MIN_BONE_ML and np.median(air[group]) >= EXPOSED:
-                yield self._along(group)
-
-    def _along(self, bones: Bools) -> Bools:
-        """With what continues them in a line, where the limb lies deeper."""
-        labels, _ = scipy.ndimage.label(self.bone, FULL)
-        index = np.argwhere(np.isin(labels, np.unique(labels[bones])))
-        middle, axis = _axis(np.argwhere(bones) * self.spacing_mm)
-        off_mm = index * self.spacing_mm - middle
-        off_mm -= np.outer(off_mm @ axis, axis)
-        line = bones.copy()
-        line[tuple(index[np.linalg.norm(off_mm, axis=1) <= LINE_MM].T)] = True
-        return line
-
-    def _air_about(self, index: NDArray[np.int64]) -> Floats:
-        """How much of a sphere about each block (n, 3) is air; 0..1."""
-        step = np.arange(DIRECTIONS) + 0.5
-        z = 1.0 - 2.0 * step / DIRECTIONS
-        angle, wide = np.pi * (1.0 + 5.0**0.5) * step, np.sqrt(1.0 - z * z)  # golden angle
-        radius_mm, last = SPHERE * self.depth_mm[tuple(index.T)], np.array(self.body.shape) - 1
-        air = np.zeros(len(index))
-        for direction in np.stack([wide * np.cos(angle), wide * np.sin(angle), z], axis=1):
-            at = np.clip(np.rint(index + radius_mm[:, None] * direction / self.spacing_mm).astype(int), 0, last)
-            air += ~self.solid[tuple(at.T)]
-        return air / DIRECTIONS
-
-    def _about(self, bones: Bools) -> Piece:
-        """What may belong to the limb about some bones, also some way beyond their ends."""
-        gap, nearest = scipy.ndimage.distance_transform_edt(~bones, sampling=self.spacing_mm, return_indices=True)
-        radius = self.depth_mm[tuple(nearest)]
-        reach = gap <= FLAT * radius + SLACK_MM
-        along = _axis(np.argwhere(bones) * self.spacing_mm)[1] / self.spacing_mm
-        steps = np.arange(-BEYOND_ENDS_MM, BEYOND_ENDS_MM + 1e-9, 0.5 * float(self.spacing_mm.min()))
-        line = np.rint(steps[:, None] * along).astype(int)
-        rod = np.zeros(2 * np.abs(line).max(axis=0) + 1, bool)
-        rod[tuple((line + np.array(rod.shape) // 2).T)] = True
-        return Piece(np.asarray(gap < radius), scipy.ndimage.binary_dilation(reach, rod))
-
-
 class LimbSearch(NamedTuple):
     """Limbs of a body: all that takes long is found once, and chosen of for each target.
 
     Attributes:
         parts: Shape (nx, ny, nz), from 1 the number of the part that a block belongs to, 0 outside.
         T_ct_index: Shape (4, 4), LPS mm.
+        pieces: Of a part by its number: those beyond a narrow neck, and what lies about exposed bones.
     """
 
     parts: Ints32
     T_ct_index: Floats
-    part: Callable[[int], BodyPart]
+    pieces: Callable[[int], tuple[Piece, ...]]
 
     def chosen(self, target_ct: Floats) -> tuple[int, ...]:
-        """The number of the part that holds a target (3,), LPS mm, and what `BodyPart.chosen` says of its pieces."""
+        """The number of the part that holds a target (3,), LPS mm; what each piece gives: 0 none, 1 near, 2 whole."""
         index = np.rint(np.linalg.solve(self.T_ct_index, np.append(target_ct, 1.0))[:3]).astype(int)
         at = tuple(np.clip(index, 0, np.array(self.parts.shape) - 1).tolist())
-        return int(self.parts[at]), *self.part(int(self.parts[at])).chosen(at)
+        pieces = self.pieces(int(self.parts[at]))
+        own_ml = max((piece.ml for piece in pieces if piece.whole[at]), default=0.0)
+        none = (piece.near[at] or min(own_ml, piece.ml) > MOST_ML for piece in pieces)
+        found = (0 if no else 2 - int(piece.whole[at]) for no, piece in zip(none, pieces, strict=True))
+        return int(self.parts[at]), *found
 
     def limbs(self, chosen: Sequence[int]) -> Bools:
         """Blocks of the body that belong to a limb without the target, by what was `chosen` for it."""
-        part, limbs = self.part(chosen[0]), np.zeros(self.parts.shape, bool)
-        for piece, how in zip(part.pieces, chosen[1:], strict=True):
+        limbs = np.zeros(self.parts.shape, bool)
+        for piece, how in zip(self.pieces(chosen[0]), chosen[1:], strict=True):
             limbs |= piece[how - 1] if how else False
-        return limbs & part.body
+        return limbs & (self.parts == chosen[0])
 
 
 def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> LimbSearch:
@@ -197,18 +104,76 @@ def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> Lim
     T[:3, 3] += T[:3, :3] @ ((stride - 1) / 2.0)
     T[:3, :3] *= stride
     coarse = in_blocks(body, stride) > 0
+    solid = coarse | (2 * in_blocks(image.unscanned, stride) >= np.prod(stride))  # neither is air
+    bone = 8 * in_blocks(body & (image.hu > BONE_HU), stride) >= np.prod(stride)  # of a block, which noise is not
+    bone &= ~_explained(bone, T, structures)
     parts, _ = scipy.ndimage.label(coarse)
-    solid = coarse | (2 * in_blocks(image.unscanned, stride) >= np.prod(stride))
-    every_bone = 8 * in_blocks(body & (image.hu > BONE_HU), stride) >= np.prod(stride)
-    bone = every_bone & ~_explained(every_bone, T, structures)
-    spacing_mm = image.spacing_mm * stride
 
     @cache
-    def part(number: int) -> BodyPart:
-        own = parts == number
-        return BodyPart(own, solid, bone & own, spacing_mm)
+    def pieces(number: int) -> tuple[Piece, ...]:
+        return tuple(_pieces(parts == number, solid, bone & (parts == number), image.spacing_mm * stride))
 
-    return LimbSearch(parts, T, part)
+    return LimbSearch(parts, T, pieces)
+
+
+def _pieces(body: Bools, solid: Bools, bone: Bools, spacing_mm: Floats) -> Iterator[Piece]:
+    """Parts of a body beyond narrow necks, and what lies about bones with air on more sides than a trunk's have.
+
+    Args:
+        body: Shape (nx, ny, nz), what holds together; a block counts where any of its voxels does.
+        solid: Same shape, what is no air; beyond the border it goes on.
+        bone: Same shape, what is evidence.
+    """
+    block_ml = float(np.prod(spacing_mm)) / 1000.0
+    cores = np.where(body, nearest_parts(body, NECK_MM, spacing_mm), 0)
+    for number in range(1, int(cores.max()) + 1) if cores.max() > 1 else ():
+        core = cores == number
+        yield Piece(core, core, np.count_nonzero(core) * block_ml)
+    padded = np.pad(solid, 1, mode="edge")
+    depth_mm = scipy.ndimage.distance_transform_edt(padded, sampling=spacing_mm)[1:-1, 1:-1, 1:-1]
+    deepest = min(DEEPEST_MM, DEEPEST_FRACTION * float(depth_mm[body].max()))
+    index = np.argwhere(bone & (depth_mm <= deepest))
+    air = np.zeros(body.shape)
+    step = np.arange(DIRECTIONS) + 0.5
+    z, angle = 1.0 - 2.0 * step / DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * step  # golden angle
+    wide = np.sqrt(1.0 - z * z)
+    for direction in np.stack([wide * np.cos(angle), wide * np.sin(angle), z], axis=1):
+        away = SPHERE * depth_mm[tuple(index.T)][:, None] * direction / spacing_mm
+        at = np.clip(np.rint(index + away).astype(int), 0, np.array(body.shape) - 1)
+        air[tuple(index.T)] += ~solid[tuple(at.T)]
+    air /= DIRECTIONS
+    partly, exposed = air >= PARTLY, air >= EXPOSED
+    gap_mm = scipy.ndimage.distance_transform_edt(~partly, sampling=spacing_mm)
+    groups, count = scipy.ndimage.label(gap_mm <= GAP_MM / 2.0, FULL)
+    for number in range(1, count + 1) if partly.any() else ():
+        group = partly & (groups == number)
+        seen = np.argwhere(group & exposed) * spacing_mm
+        large = len(seen) * block_ml >= MIN_BONE_ML and np.linalg.norm(np.ptp(seen, axis=0)) >= LEAST_MM
+        if large and np.median(air[group]) >= EXPOSED:
+            yield _about(_along(group, bone, spacing_mm), depth_mm, spacing_mm)
+
+
+def _along(group: Bools, bone: Bools, spacing_mm: Floats) -> Bools:
+    """Bones of a limb with what continues them in a line, where the limb lies deeper."""
+    labels, _ = scipy.ndimage.label(bone, FULL)
+    index = np.argwhere(np.isin(labels, np.unique(labels[group])))
+    middle, axis = _axis(np.argwhere(group) * spacing_mm)
+    off_mm = np.linalg.norm(np.cross(index * spacing_mm - middle, axis), axis=1)
+    line = group.copy()
+    line[tuple(index[off_mm <= LINE_MM].T)] = True
+    return line
+
+
+def _about(bones: Bools, depth_mm: Floats, spacing_mm: Floats) -> Piece:
+    """What may belong to the limb about some bones, also some way beyond their ends."""
+    gap, nearest = scipy.ndimage.distance_transform_edt(~bones, sampling=spacing_mm, return_indices=True)
+    radius = depth_mm[tuple(nearest)]
+    axis = _axis(np.argwhere(bones) * spacing_mm)[1] / spacing_mm
+    steps = np.arange(-BEYOND_ENDS_MM, BEYOND_ENDS_MM + 1e-9, 0.5 * float(spacing_mm.min()))
+    line = np.rint(steps[:, None] * axis).astype(int)
+    rod = np.zeros(2 * np.abs(line).max(axis=0) + 1, bool)
+    rod[tuple((line + np.array(rod.shape) // 2).T)] = True
+    return Piece(np.asarray(gap < radius), scipy.ndimage.binary_dilation(gap <= FLAT * radius + SLACK_MM, rod))
 
 
 def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[Named]) -> Bools:

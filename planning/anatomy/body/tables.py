@@ -8,7 +8,6 @@ no table, but a phantom.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.body.cut_ends import SIDES
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.parts import ends_of, middle_of, parts_of
 
@@ -27,8 +27,6 @@ DRAWN_WIDTH_MM, RUN_MM = 100.0, 20.0
 ONE_PIECE_MM, ONE_PIECE = 0.25, 0.945
 """Ends of a table keep so near to one another from slice to slice, or thrice their noise, .955 of them and more in
 drawn CTs. Of a trunk's straight back it is .80, of flanks .93: a back has no edge, flanks are none beside a table."""
-SMOOTH_ALONG_MM = 12.0
-"""Ends are averaged so far along the bed: a table is constant there, noise is not."""
 THICKEST_MM, ALIKE_MM = 80.0, 5.0
 """No table is thicker, and beside the body it is as thick to so much all over."""
 LEAST_LENGTH_MM, LEAST_SLICES, TILTS_FROM_MM = 50.0, 12, 100.0
@@ -57,9 +55,9 @@ PRISM = (
 )
 
 Face = tuple[int, int]
-FACES: tuple[Face, ...] = tuple(itertools.product((0, 1), (0, -1)))
-NAMES = dict(zip(FACES, ("right", "left", "front", "back"), strict=True))
-"""Array axis and end of a face of the image beside the bed's two ends; axes run to the left, back and head."""
+NAMES: dict[Face, str] = {(axis, -end): name for name, (axis, end) in SIDES.items() if axis < 2}
+FACES = tuple(NAMES)
+"""Array axis and end (0, -1) of a face of the image beside the bed's two ends."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,6 @@ class TableSide(NamedTuple):
     """A section, drawn along the bed, at which a body or what it lies on ends.
 
     Attributes:
-        face: The side of the image toward which it ends.
         line: Shape (n, nz), by line of sight and slice, where it ends or may end, voxels along the face's axis.
         lines: Shape (n,), which lines of sight are those of the table.
         slope: How it moves along the face's axis, mm per mm along the bed.
@@ -135,7 +132,6 @@ def touching_tables(
     Args:
         hu: Shape (nx, ny, nz), axis 2 along the bed.
         trunk: Same shape; what is as dense and connected with it counts too, however thin.
-        spacing_mm: Shape (3,).
         shown: Of a phantom only what can be cut off is a table, unless there is said to be one.
         level: Where the body's surface is, of the values.
     """
@@ -150,15 +146,12 @@ def touching_tables(
             thick_mm = float(np.median(deep[deep > 0]) * spacing_mm[side.face[0]])
             said.append(CUT_OFF.format(thick=thick_mm, name=NAMES[side.face]))
             cut_off |= table
-        else:
+        elif side.firm or not any(one.firm for one in drawn):  # beside a table straight flanks are none
             left.append(side)
-    if len(drawn) == len(FACES) and not shown.phantom and shown.table != "present":
+    prism = len(drawn) == len(FACES)
+    if prism and not shown.phantom and shown.table != "present":
         said.append(PRISM)
-    if (len(drawn) == len(FACES) or shown.phantom) and shown.table != "present":
-        left = []
-    if any(side.firm for side in drawn):  # what a body lies on is seen: its straight flanks are no tables
-        left = [side for side in left if side.firm]
-    if cut_off.any() and shown.table == "present":
+    if cut_off.any() if shown.table == "present" else prism or shown.phantom:
         left = []
     overrule = NO_OTHER if cut_off.any() else NO_TABLE
     said += [TOUCHES.format(name=NAMES[side.face], width=side.width_mm, overrule=overrule) for side in left]
@@ -213,125 +206,98 @@ def surface_ends(hu: NDArray[Any], body: Bools, level: float = 0.0) -> dict[Face
 
 
 def drawn_sides(
-    surfaces: dict[Face, Floats], body: Bools, spacing_mm: Floats, own: dict[Face, Bools] | None = None
+    surfaces: dict[Face, Floats], body: Bools, spacing_mm: Floats, *, touching: bool = True
 ) -> tuple[TableSide, ...]:
     """The sides at which surfaces end in one section along the bed, beyond the middle of a body.
 
     Args:
         surfaces: By face, as `surface_ends` gives them.
         body: Shape (nx, ny, nz).
-        own: Which ends count, by face, where not all do: these are known to a voxel.
+        touching: Whether the body itself ends there, or what is apart from it: that is known to a voxel.
     """
     if body.shape[2] * spacing_mm[2] < LEAST_LENGTH_MM:
         return ()
-    found, middle = [], middle_of(body)
+    found, middle = list[TableSide | None](), middle_of(body)
     for face, ends in surfaces.items():
-        counts = np.isfinite(ends) if own is None else own[face]
-        near_mm = DRAWN_MM if own is None else max(DRAWN_MM, float(spacing_mm[face[0]]))
-        side = _View(face, ends, counts, spacing_mm, near_mm, own is None).side(middle)
-        if side is not None:
-            found.append(side)
-    return tuple(found)
+        view = _View(face, ends, spacing_mm, touching)
+        parts = (view.side(middle, part) for part in view.parts())
+        found.append(view.side(middle) or max(filter(None, parts), key=lambda side: side.width_mm, default=None))
+    return tuple(filter(None, found))
 
 
 class _View(NamedTuple):
     """Where lines of sight end at one side of a body.
 
     Attributes:
-        ends: Shape (n, nz), voxels along its axis, NaN where they end at nothing.
-        counts: Shape (n, nz), which of them count.
-        near_mm: How near to a line ends are drawn.
+        ends: Shape (n, nz), voxels along its axis, NaN where they end at nothing that counts.
         touching: Whether the body itself ends there: then beyond both edges nothing is free either.
     """
 
     face: Face
     ends: Floats
-    counts: Bools
     spacing_mm: Floats
-    near_mm: float
     touching: bool
 
-    def side(self, middle: Floats) -> TableSide | None:
-        """The table's side, if there is one beyond the middle of the body, voxels."""
+    def side(self, middle: Floats, part: slice = slice(None)) -> TableSide | None:
+        """The table's side in some of the slices, if there is one beyond the middle of the body, voxels."""
         axis, end = self.face
-        along_mm, across_mm = float(self.spacing_mm[axis]), float(self.spacing_mm[1 - axis])
-        ends_mm = np.where(self.counts, _smooth(self.ends * along_mm, float(self.spacing_mm[2])), np.nan)
-        slope, outward = self._slope(ends_mm), 1.0 if end else -1.0
-        at, drawn, off_mm = self._drawn(ends_mm, slope)
-        drawn &= outward * (at + slope * middle[2] * self.spacing_mm[2]) > outward * middle[axis] * along_mm
-        width_mm = drawn.sum() * across_mm
-        if self.touching and width_mm < DRAWN_WIDTH_MM:
-            return max(filter(None, self._parts(middle)), key=lambda side: side.width_mm, default=None)
-        firm = not self.touching or self._one_piece(off_mm[drawn])
-        edge_mm = (EDGE_MM if firm else 0.0) if self.touching else -np.inf
-        sink = slope[:, None] * np.arange(ends_mm.shape[1]) * self.spacing_mm[2]
-        closed = scipy.ndimage.binary_closing(drawn, np.ones(3))
+        along_mm, across_mm, step_mm = self.spacing_mm[[axis, 1 - axis, 2]].tolist()
+        near_mm, outward = DRAWN_MM if self.touching else max(DRAWN_MM, along_mm), 1.0 if end else -1.0
+        along_bed, ends_mm = np.arange(self.ends.shape[1]) * step_mm, self.ends[:, part] * along_mm
+        slope = _slopes(ends_mm, step_mm, across_mm)
+        level_mm = ends_mm - slope[:, None] * along_bed[part]
+        at = _medians(level_mm)
+        off_mm = level_mm - at[:, None]
+        drawn = (np.abs(off_mm) <= near_mm).mean(axis=1) >= DRAWN_FRACTION
+        drawn &= outward * (at + slope * middle[2] * step_mm) > outward * middle[axis] * along_mm
+        width_mm, closed = float(drawn.sum() * across_mm), scipy.ndimage.binary_closing(drawn, np.ones(3))
         runs = scipy.ndimage.binary_opening(closed, np.ones(max(1, int(RUN_MM / across_mm))))
-        if width_mm < DRAWN_WIDTH_MM or not runs.any():
+        first, last = np.flatnonzero(runs)[[0, -1]] if runs.any() else (np.inf, -np.inf)
+        if width_mm < DRAWN_WIDTH_MM or not first <= middle[1 - axis] <= last:
             return None
-        first, last = np.flatnonzero(runs)[[0, -1]]
-        if not first <= middle[1 - axis] <= last:
-            return None
-        farthest = outward * np.fmax.reduce(outward * (self.ends * along_mm - sink), axis=1)
+        farthest = outward * np.fmax.reduce(outward * level_mm, axis=1)
         at, across = np.where(drawn, at, farthest), np.arange(len(at))
-        known = np.isfinite(at) & (across >= first) & (across <= last)
+        within = (across >= first) & (across <= last)
+        known = np.isfinite(at) & within
         line = np.interp(across, across[known], at[known])
-        line[(across < first) | (across > last)] -= outward * edge_mm
-        steady = np.interp(across, across[drawn], slope[drawn])[:, None] * np.arange(sink.shape[1]) * self.spacing_mm[2]
-        of_bed, lines = float(np.median(slope[drawn])), runs | (known & drawn)
-        return TableSide(self.face, (line[:, None] + steady) / along_mm, lines, of_bed, float(width_mm), firm)
+        firm = not self.touching or _one_piece(ends_mm, off_mm[drawn])
+        line[~within] -= outward * ((EDGE_MM if firm else 0.0) if self.touching else -np.inf)
+        steady = np.interp(across, across[drawn], slope[drawn])[:, None] * along_bed
+        lines, of_bed = runs | (known & drawn), float(np.median(slope[drawn]))
+        return TableSide(self.face, (line[:, None] + steady) / along_mm, lines, of_bed, width_mm, firm)
 
-    def _slope(self, ends_mm: Floats) -> Floats:
-        """How the ends of each line of sight move along the bed, shape (n,), mm per mm; steep after a tilted gantry."""
-        count, step_mm = ends_mm.shape[1], float(self.spacing_mm[2])
-        if count * step_mm < TILTS_FROM_MM:
-            return np.zeros(len(ends_mm))
-        lag = count // 2
-        slope = _medians(ends_mm[:, lag:] - ends_mm[:, :-lag]) / (lag * step_mm)
-        slope = np.where(np.isfinite(slope), slope, 0.0)
-        return scipy.ndimage.median_filter(slope, 2 * round(RUN_MM / float(self.spacing_mm[1 - self.face[0]])) + 1)
-
-    def _drawn(self, ends_mm: Floats, slope: Floats) -> tuple[Floats, Bools, Floats]:
-        """Where most ends of each line of sight are in slice 0, shape (n,), mm; which are drawn; how far off each."""
-        off_mm = ends_mm - slope[:, None] * np.arange(ends_mm.shape[1]) * self.spacing_mm[2]
-        at = _medians(off_mm)
-        off_mm -= at[:, None]
-        return at, (np.abs(off_mm) <= self.near_mm).mean(axis=1) >= DRAWN_FRACTION, off_mm
-
-    def _one_piece(self, off_mm: Floats) -> bool:
-        """Whether ends (n, nz), mm off their lines, keep to one another but for their noise: a back does so less."""
-        noise_mm = float(np.nanmedian(np.abs(np.diff(self.ends, 2, axis=1)))) * float(self.spacing_mm[self.face[0]])
-        apart_mm = np.abs(off_mm - _medians(off_mm.T))
-        near = apart_mm <= max(ONE_PIECE_MM, 3.0 * noise_mm)
-        return bool(near.sum() >= ONE_PIECE * np.isfinite(apart_mm).sum())
-
-    def _parts(self, middle: Floats) -> Iterator[TableSide | None]:
-        """The sides of the parts of the bed between slices at which something as wide as a table begins or ends."""
+    def parts(self) -> Iterator[slice]:
+        """The parts of the bed between slices at which something as wide as a table begins or ends."""
         axis, count = self.face[0], self.ends.shape[1]
         ends_mm = np.nan_to_num(self.ends, nan=-1e6) * self.spacing_mm[axis]
         moved = np.abs(ends_mm[:, 2:] - ends_mm[:, :-2]) >= ALIKE_MM
         whole = np.pad(moved.sum(axis=0) * self.spacing_mm[1 - axis] < DRAWN_WIDTH_MM, 1, constant_values=True)
         for (part,) in scipy.ndimage.find_objects(scipy.ndimage.label(whole)[0]):
-            slices = part.stop - part.start
-            if max(LEAST_SLICES, LEAST_LENGTH_MM / self.spacing_mm[2]) <= slices < count:
-                view = self._replace(ends=self.ends[:, part], counts=self.counts[:, part])
-                side, steps = view.side(middle - [0.0, 0.0, part.start]), np.arange(count) - part.start
-                yield side and side._replace(line=side.line[:, :1] + np.diff(side.line[:, :2]) * steps)
+            if max(LEAST_SLICES, LEAST_LENGTH_MM / self.spacing_mm[2]) <= part.stop - part.start < count:
+                yield part
+
+
+def _slopes(ends_mm: Floats, step_mm: float, across_mm: float) -> Floats:
+    """How the ends (n, nz) of lines of sight move along the bed, shape (n,), mm per mm; steep after a tilted gantry."""
+    lag = ends_mm.shape[1] // 2
+    if ends_mm.shape[1] * step_mm < TILTS_FROM_MM:
+        return np.zeros(len(ends_mm))
+    slope = np.nan_to_num(_medians(ends_mm[:, lag:] - ends_mm[:, :-lag]) / (lag * step_mm))
+    return scipy.ndimage.median_filter(slope, 2 * round(RUN_MM / across_mm) + 1)
+
+
+def _one_piece(ends_mm: Floats, off_mm: Floats) -> bool:
+    """Whether ends (k, nz), off their lines, keep to one another but for the noise of all: a back does so less."""
+    noise_mm = float(np.nanmedian(np.abs(np.diff(ends_mm, 2, axis=1))))
+    apart_mm = np.abs(off_mm - _medians(off_mm.T))
+    near = apart_mm <= max(ONE_PIECE_MM, 3.0 * noise_mm)
+    return bool(near.sum() >= ONE_PIECE * np.isfinite(apart_mm).sum())
 
 
 def _medians(values: Floats) -> Floats:
     """Of each row (n, k) the median of those that are known, shape (n,), the lower one of two; NaN without any."""
     ordered, count = np.sort(values, axis=1), np.isfinite(values).sum(axis=1)  # NaN comes last
     return np.asarray(ordered[np.arange(len(values)), np.maximum(count - 1, 0) // 2])
-
-
-def _smooth(ends_mm: Floats, step_mm: float) -> Floats:
-    """Means along the bed of the ends that are known."""
-    size = 2 * round(SMOOTH_ALONG_MM / step_mm / 2) + 1
-    known = np.isfinite(ends_mm)
-    weight = scipy.ndimage.uniform_filter1d(known.astype(float), size, axis=1, mode="nearest")
-    mean = scipy.ndimage.uniform_filter1d(np.where(known, ends_mm, 0.0), size, axis=1, mode="nearest")
-    return np.where(known & (weight > 0.5), mean / np.maximum(weight, 0.5), np.nan)
 
 
 class Support(NamedTuple):
@@ -361,22 +327,26 @@ def find_support(
     """
     if shown.table == "none":
         return Support((), False, ())
-    surfaces, own = {}, {}
-    for face, first, outer in zip(FACES, ends_of(outside | body), ends_of(outside), strict=True):
-        surfaces[face] = np.where(first < 0, np.nan, first + (0.5 if face[1] else -0.5))  # the voxel's outer face
-        own[face] = outer == first
-    sides = drawn_sides(surfaces, body, spacing_mm, own)
+    surfaces = {}
+    for face, first, own in zip(FACES, ends_of(outside | body), ends_of(outside), strict=True):
+        outer_face = first + (0.5 if face[1] else -0.5)
+        surfaces[face] = np.where((first == own) & (own >= 0), outer_face, np.nan)
+    sides = drawn_sides(surfaces, body, spacing_mm, touching=False)
     drawn = tuple(sorted(sides, key=lambda side: side.width_mm)[-1:])
     supports = {side.face[0] for side in (*drawn, *touching)}
-    near = [face for face in FACES if _gap_mm(body, face, spacing_mm) <= NEAR_MM]
     arms = shown.limbs and bool(body[:, :, [0, -1]].any())  # of a body that ends in the image its arms are there too
-    arms_apart = arms and shown.arms != "present"  # else they lie in the image, but for what a face cuts
-    near = [face for face in near if face[0] == 1 or arms_apart or (arms and _gap_mm(body, face, spacing_mm) == 0.0)]
-    if supports:  # arms may lie on what a face cuts beside the body
-        beside = [face for face in near if any(face[0] != axis for axis in supports)]
-        cut = [face for face in beside if outside.take(face[1], axis=face[0]).any(axis=0).mean() >= CUT_FRACTION]
-        near = [face for face in cut if _gap_mm(body, face, spacing_mm) > 0.0]
-    return Support(drawn, bool(supports), () if shown.phantom and not supports else tuple(near))
+
+    def hides(face: Face) -> bool:
+        axis, gap_mm = face[0], _gap_mm(body, face, spacing_mm)
+        arm = arms and (shown.arms != "present" or gap_mm == 0.0)  # else they lie in the image
+        if gap_mm > NEAR_MM or not (axis == 1 or arm):
+            return False
+        if not supports:
+            return not shown.phantom
+        cuts = outside.take(face[1], axis=axis).any(axis=0).mean() >= CUT_FRACTION  # arms may lie on it beside the body
+        return bool(supports - {axis} and gap_mm > 0.0 and cuts)
+
+    return Support(drawn, bool(supports), tuple(face for face in FACES if hides(face)))
 
 
 def support_warnings(seen: bool, open_faces: Sequence[Face]) -> Iterator[str]:
