@@ -426,6 +426,19 @@ def test_a_false_reason_is_refused(carton, true, reason):
         verify(replace(found, reason=reasons), context.case, context.anatomy)
 
 
+@pytest.mark.parametrize("reason", ["too_long", "reenters_skin"])
+def test_a_false_reason_is_refused_where_the_skin_is_known(carton, reason):
+    """Only a cell in which the skin's place is bounded can tell: one that is crossed too flatly, soon and once."""
+    context, _ = carton
+    flat = replace(context.case, search=replace(context.case.search, max_skin_angle=np.radians(10.0)))
+    found = certify(flat, context.anatomy, size=np.radians(6))
+    row = int(np.flatnonzero(found.reason == "skin_angle")[0])
+    reasons = found.reason.copy()
+    reasons[row] = reason
+    with refused("cell_not_proven", reason):
+        verify(replace(found, reason=reasons), flat, context.anatomy)
+
+
 def test_a_large_undecided_cell_is_refused(carton):
     """A certificate may not claim a smaller size than it has."""
     context, found = carton
