@@ -110,6 +110,28 @@ def test_between_cut_sections_of_a_bulky_piece_nothing_is_free(axis, end):
     assert side_of(surface, point) is Side.INSIDE
 
 
+@pytest.mark.parametrize("rises", [True, False])
+def test_a_cradle_goes_on_rising_beyond_the_sides(rises):
+    """A shell of 20 mm about an arc of 215 mm, cut at 140 mm of its 205: all of it is covered. A flat one is flat."""
+    step = 3.0
+    x, y, z = np.meshgrid(*(np.arange(a, b, step) for a, b in ((-140, 141), (-60, 131), (-30, 31))), indexing="ij")
+    shell = np.abs(np.hypot(x, y + 110.0) - 215.0) <= 10.0 if rises else np.abs(y - 53.0) <= 10.0
+    shell &= y > -50.0
+    T = np.diag([step, step, step, 1.0])
+    T[:3, 3] = x.flat[0], y.flat[0], z.flat[0]
+    nothing = np.zeros(x.shape, bool)
+    image = OutsideImage(np.where(shell, 100.0, -1000.0), nothing, nothing, T, np.full(3, step))
+    surface = outside_surface(image, shell, where="cradle")
+    assert surface is not None
+    turn = np.radians(np.arange(45.0, 73.0, 2.0))
+    for sign in (-1.0, 1.0):
+        arc = np.column_stack([sign * 215.0 * np.sin(turn), 215.0 * np.cos(turn) - 110.0, 0.0 * turn])
+        above = np.column_stack([np.full(3, sign * 200.0), [-40.0, 0.0, 30.0], np.zeros(3)])
+        assert inside_each(surface, arc).all() == rises
+        assert not rises or not inside_each(surface, arc - [0.0, 130.0, 0.0]).any()
+        assert rises or not inside_each(surface, above).any()
+
+
 def test_it_goes_on_as_far_as_is_said(bar):
     """Along the bed, from the outer face of the last voxels; it is closed."""
     ends = -0.5 * SPACING[2] - BEYOND_MM[2], (SHAPE[2] - 0.5) * SPACING[2] + BEYOND_MM[2]

@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU
-from puncture_twin.planning.anatomy.body.tables import FACES, Face
+from puncture_twin.planning.anatomy.body.tables import DRAWN_FRACTION, FACES, Face
 from puncture_twin.planning.base.arrays import Bools, Floats, widened
 from puncture_twin.planning.formats.labels.labelmaps import box_in, mask_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -48,6 +48,9 @@ CUT_AT_MM = (30.0, 120.0, 480.0)
 BLOCK_MM = 2.0
 """The surface is drawn about blocks of at most this edge that hold any of it, or lie less than half a block beside it:
 means have no finer shape, and a table of .8 mm voxels has a million triangles."""
+RISES_OVER_MM, STEEPEST, ON_AN_ARC = 20.0, 2.0, 2.25
+"""How steeply a cradle rises at the border is seen so far from it; a larger step is that of another piece. Where it
+rises at 40 degrees, an arc's chord up to 75 is so much steeper."""
 RIM_MM = 50.0
 """Where what is dense ends at voxels that were not scanned, they count as dense so far from it."""
 
@@ -112,7 +115,8 @@ def outside_surface(
     """The closed surface of what is dense outside of the body, LPS mm; None where there is only air.
 
     Where the border of the image cuts it, it goes on beyond: every cut section is drawn out by ``beyond_mm``, and of
-    bulky pieces also what lies between cut sections at one side. So does all that lies beyond an open face.
+    bulky pieces also what lies between cut sections at one side. A cradle goes on rising: what is drawn out of it is a
+    wedge from its back on. So does all that lies beyond an open face.
     """
     edge = np.maximum(1, (BLOCK_MM / image.spacing_mm).astype(int))
     # A surface bevels the corners of its blocks. So what it holds lies half a block deep: no voxel in a corner is lost.
@@ -129,7 +133,35 @@ def outside_surface(
     if not layered.any():
         return None
     T_blocks_layered = pose(np.eye(3), [-float(count) for count, _ in pads])
-    return _drawn_out(mask_surface(layered, T_blocks_layered, where=where), edge, image)
+    solid = bulky & (in_blocks(image.hu > DENSE_HU, edge) > 0)  # not what lies beyond a table's back
+    arcs = [_Arc.at_side(solid, end, edge * image.spacing_mm) for end in (0, -1)]
+    return _drawn_out(mask_surface(layered, T_blocks_layered, where=where), edge, image, arcs)
+
+
+class _Arc(NamedTuple):
+    """How what a side of the image cuts goes on.
+
+    Attributes:
+        back: Shape (nz,), by block along the bed, the block in which its back lies at the border.
+        rise: How much it rises toward the front, mm per mm to the side.
+    """
+
+    back: Floats
+    rise: float
+
+    @classmethod
+    def at_side(cls, solid: Bools, end: int, block_mm: Floats) -> _Arc:
+        """Of solid pieces (nx, ny, nz) at one end of axis 0."""
+        steps = min(max(1, round(RISES_OVER_MM / block_mm[0])), len(solid) - 1)
+        columns = solid[::-1][: steps + 1] if end else solid[: steps + 1]
+        backs = columns.shape[1] - 1.0 - columns[:, ::-1].argmax(axis=1)
+        known = columns.any(axis=1)
+        one = known.all(axis=0) & (np.abs(np.diff(backs, axis=0)) * block_mm[1] <= STEEPEST * block_mm[0]).all(axis=0)
+        if one.sum() < max(1.0, DRAWN_FRACTION * known[0].sum()):
+            return cls(backs[0], 0.0)
+        risen_mm = float(np.median((backs[-1] - backs[0])[one])) * block_mm[1]
+        back = np.where(one, backs[0], np.median(backs[0, one]))
+        return cls(back, ON_AN_ARC * max(risen_mm, 0.0) / (steps * block_mm[0]))
 
 
 def _layers_mm(image: OutsideImage) -> tuple[tuple[float, ...], ...]:
@@ -138,8 +170,12 @@ def _layers_mm(image: OutsideImage) -> tuple[tuple[float, ...], ...]:
     return (float(image.spacing_mm[0]), to_side), (float(image.spacing_mm[1]), to_back), (*CUT_AT_MM, along)
 
 
-def _drawn_out(surface: TriangleMesh, edge: NDArray[np.int_], image: OutsideImage) -> TriangleMesh:
+def _drawn_out(
+    surface: TriangleMesh, edge: NDArray[np.int_], image: OutsideImage, arcs: Sequence[_Arc]
+) -> TriangleMesh:
     """A surface that counts blocks of ``edge`` voxels, in LPS mm; layers beyond the border moved outward with the bed.
+
+    Those beyond a side, of which a cradle rises along one of the arcs, in front of its back to the front.
 
     Every vertex lies on a face between two blocks; caps half a voxel after the last layer's centre.
     """
@@ -155,6 +191,10 @@ def _drawn_out(surface: TriangleMesh, edge: NDArray[np.int_], image: OutsideImag
             np.concatenate([-beyond[::-1], [0.0], np.arange(last) + 0.5, [last], last + beyond]),
             np.concatenate([-moved[::-1], ends[:1], at[1:] - 0.5, ends[1:], size - 1.0 + moved]),
         )
+    for arc, beyond in zip(arcs, (-index[:, 0], index[:, 0] - (image.hu.shape[0] - 1.0)), strict=True):
+        backs = np.interp(surface.vertices[:, 2], np.arange(len(arc.back)), arc.back)
+        risen = arc.rise * np.maximum(beyond, 0.0) * image.spacing_mm[0] / image.spacing_mm[1]
+        index[:, 1] -= np.where(surface.vertices[:, 1] < backs, risen, 0.0)
     beyond = index[:, 2] - np.clip(index[:, 2], 0.0, image.hu.shape[2] - 1.0)
     index[:, :2] += beyond[:, None] * image.slopes * image.spacing_mm[2] / image.spacing_mm[:2]
     return TriangleMesh(apply(image.T_ct_index, index), surface.faces)
