@@ -86,14 +86,19 @@ def metal_pieces(volume: Volume, level_hu: float = METAL_HU, without: Bools | No
         yield Metal(box, voxels, apply(volume.T_ct_index, at.mean(axis=0)), float(((high - low) * spacing).max()))
 
 
+def where_set(mask: Bools) -> Ints:
+    """Indices (n, 3) of the voxels that are set, in the order of memory: `np.argwhere` crosses a large image."""
+    order: Literal["F", "C"] = "F" if mask.flags.f_contiguous else "C"
+    return np.stack(np.unravel_index(np.flatnonzero(mask.ravel(order)), mask.shape, order), axis=1)
+
+
 def connected(mask: Bools) -> list[Ints]:
     """The voxels (n, 3) of each connected piece of a mask, diagonal neighbours included, in the order of their first.
 
     By the few voxels that are set: labelling a whole image takes as long as it is large.
     """
     ny, nz = mask.shape[1] + 2, mask.shape[2] + 2  # a border, over which no neighbour is reached
-    order: Literal["F", "C"] = "F" if mask.flags.f_contiguous else "C"
-    i, j, k = np.unravel_index(np.flatnonzero(mask.ravel(order)), mask.shape, order)
+    i, j, k = where_set(mask).T
     key = (i * ny + j) * nz + k
     first = np.argsort(key)
     i, j, k, key = i[first], j[first], k[first], key[first]

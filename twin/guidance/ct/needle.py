@@ -26,6 +26,7 @@ from puncture_twin.planning.anatomy.metal import (
     metal_pieces,
     metal_weights,
     spacing_mm,
+    where_set,
     wide_metal,
 )
 from puncture_twin.planning.base.arrays import Bools, Floats
@@ -353,7 +354,7 @@ def _lines(
 def _taken(volume: Volume, known: Sequence[FoundNeedle]) -> Bools:
     """The voxels that needles explain: a lower level would join them to what lies beside."""
     taken = np.zeros(volume.values.shape, np.bool_)
-    at = np.argwhere(volume.values > LEVELS_HU[-1])
+    at = where_set(volume.values > LEVELS_HU[-1])
     places, reach = apply(volume.T_ct_index, at.astype(float)), WIDE_MM + WIDEST_SLICE * float(spacing_mm(volume)[2])
     for path in (one.path_ct for one in known if not one.unclear):
         start, steps = path[:-1, None], np.diff(path, axis=0)[:, None]
@@ -443,7 +444,7 @@ def _check_tip(volume: Volume, found: FoundNeedle, hidden: Bools, target_ct: Flo
 
 def _whole(volume: Volume, metal: Metal, line: Line, hidden: Bools) -> tuple[Metal, Line]:
     """The whole needle along its line or bend, where thick slices dilute it and show it only in pieces at first."""
-    at = np.argwhere((volume.values > LEVELS_HU[-1]) & ~hidden)
+    at = where_set((volume.values > LEVELS_HU[-1]) & ~hidden)
     places = apply(volume.T_ct_index, at.astype(float))
     for _ in range(GROWTHS):
         axes = frame_about(line.forward).T
