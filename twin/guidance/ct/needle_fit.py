@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.special import expit, ndtri, stdtrit
+from scipy.special import expit
 
 from puncture_twin.planning.anatomy.metal import BLUR_MM, SOLID_HU, Metal, full_part, metal_parts, spacing_mm
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
@@ -57,7 +57,7 @@ BEND_SD = np.array([2.0, 2.0, 0.5, 0.5])
 """How far needles bend at the lever, mm, square and cube, each across two axes; ours: a sagitta of 2 mm over 95 mm."""
 PIECE_MM = 10.0
 """A needle's path is given in pieces no longer than this."""
-EDGE_PIXELS = 0.05
+EDGE_PIXELS = 0.06
 """Standard deviation of where a needle ends, in pixels along it: no blur is an exact Gaussian, and its tails move an
 edge, which has one side, though not an axis, which has two. Tips err by so much without noise and streaks."""
 ASLANT = np.sqrt(2.0)
@@ -70,8 +70,6 @@ ROUNDED = 1.0 / SOLID_HU / np.sqrt(12.0)
 """No image has less noise than its whole Hounsfield units."""
 LEAST_OWN = 0.01
 """What a piece of a slice leaves to others of a number that it alone decides."""
-FEWEST = 2.0
-"""Degrees of freedom; of fewer Student's deviation says nothing."""
 FEW_SLICES = 4.0
 """A needle through fewer slices may lie in several ways across them."""
 SPREAD, STEPS = 0.75, 9
@@ -397,13 +395,13 @@ def _weights(seen: _Seen, x: Floats) -> Floats:
 
 
 def _scatter(seen: _Seen, fit: OptimizeResult, noise: float = 0.0) -> tuple[Floats, float]:
-    """Covariance of a fit's numbers by what each piece of a slice leaves, and the noise.
+    """Covariance of a fit's numbers by how far they move when each piece of a slice is left out, and the noise.
 
-        cov = A (sum_k t_k t_k') A,   t_k = (1 - J_k' J_k A)^-1/2 J_k' r_k,   A = (J'J)^-1
+        cov = A (sum_k t_k t_k') A,   t_k = (1 - J_k' J_k A)^-1 J_k' r_k,   A = (J'J)^-1
 
-    linearised, without bias (Bell and McCaffrey 2002): no assumption on how voxels of a piece err together. What holds
-    the bends counts as one more observation each. The noise is the standard deviation of voxels that err on their own
-    and scatter the numbers as much.
+    the jackknife (Bell and McCaffrey 2002, their equation 3): no assumption on how voxels of a piece err together.
+    What holds the bends counts as one more observation each. The noise is the standard deviation of voxels that err on
+    their own and scatter the numbers as much.
     """
     pieces = seen.pieces
     count = len(pieces)
@@ -414,26 +412,11 @@ def _scatter(seen: _Seen, fit: OptimizeResult, noise: float = 0.0) -> tuple[Floa
     first = np.flatnonzero(np.diff(pieces[order], prepend=-1))
     rows = (fit.jac[:count] @ root)[order]
     pulls = np.add.reduceat(rows * fit.fun[:count][order, None], first)
-    shares = np.add.reduceat(rows[:, :, None] * rows[:, None, :], first)
-    own, turns = np.linalg.eigh(np.eye(len(root)) - shares)
-    turned = np.einsum("kji,kj->ki", turns, pulls) / np.sqrt(np.maximum(own, LEAST_OWN))
+    own, turns = np.linalg.eigh(np.eye(len(root)) - np.add.reduceat(rows[:, :, None] * rows[:, None, :], first))
+    turned = np.einsum("kji,kj->ki", turns, pulls) / np.maximum(own, LEAST_OWN)
     moved, held = np.einsum("kij,kj->ki", turns, turned), noise * fit.jac[count:] @ root
-    scatter, bends = moved.T @ moved, held.T @ held
-    cov = root @ (_widened(scatter, shares) + bends) @ root.T
-    return cov, float(np.sqrt(max(np.trace(scatter + bends) / len(root), ROUNDED**2)))
-
-
-def _widened(scatter: Floats, shares: Floats) -> Floats:
-    """A scatter (m, m) whose 95 % regions hold, though few pieces, of shares (k, m, m) of what is known, decide it.
-
-    The shares p_k of each of its axes give Satterthwaite's degrees of freedom, 1 / sum p_k^2, as Bell and McCaffrey use
-    them, and so how much wider Student's interval is than the normal one.
-    """
-    sizes, axes = np.linalg.eigh(scatter)
-    parts = np.einsum("ic,kij,jc->kc", axes, shares, axes)
-    freedoms = parts.sum(axis=0) ** 2 / np.sum(parts**2, axis=0)
-    wider = stdtrit(np.maximum(freedoms, FEWEST), 0.975) / ndtri(0.975)
-    return np.asarray((axes * sizes * wider**2) @ axes.T)
+    whole = moved.T @ moved + held.T @ held
+    return root @ whole @ root.T, float(np.sqrt(max(np.trace(whole) / len(root), ROUNDED**2)))
 
 
 def _bent(seen: _Seen, straight: OptimizeResult) -> tuple[OptimizeResult, OptimizeResult, float]:
