@@ -237,12 +237,11 @@ def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hid
         if around.typical < GAINS[0] / 2 * usual:
             return None
         straight = _straight(seen, begun)
-        if again + 1 < STRAIGHTENED:
-            if abs(straight.x[0]) <= FARTHEST_MM:  # once more about the line that was found; else a bent needle left it
-                start = start + straight.x[1:3] @ seen.axes[1:]
-                forward = np.concatenate([[1.0], straight.x[3:5]]) @ seen.axes
-                line = line._replace(forward=forward / np.linalg.norm(forward))
-                begun = straight.x * [1, 0, 0, 0, 0, 1, 1]
+        if again + 1 < STRAIGHTENED:  # once more about the line that was found
+            start = start + straight.x[1:3] @ seen.axes[1:]  # not along it, where a bent needle leaves a straight rod
+            forward = np.concatenate([[1.0], straight.x[3:5]]) @ seen.axes
+            line = line._replace(forward=forward / np.linalg.norm(forward))
+            begun = straight.x * [1, 0, 0, 0, 0, 1, 1]
             length = min(length, _slim(seen, np.concatenate([straight.x, np.zeros(4)])))
     weighed = _weighed(seen, straight) if straight.jac.any() else None  # no slope: its image has left the metal
     if weighed is None or not _alike(seen, weighed[0], full_part(volume)):
