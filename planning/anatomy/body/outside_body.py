@@ -156,8 +156,9 @@ class _Arc(NamedTuple):
         columns = solid[::-1][: steps + 1] if end else solid[: steps + 1]
         backs = columns.shape[1] - 1.0 - columns[:, ::-1].argmax(axis=1)
         known = columns.any(axis=1)
-        one = known.all(axis=0) & (np.abs(np.diff(backs, axis=0)) * block_mm[1] <= STEEPEST * block_mm[0]).all(axis=0)
-        if one.sum() < max(1.0, DRAWN_FRACTION * known[0].sum()):
+        level = np.abs(np.diff(backs, axis=0)) * block_mm[1] <= STEEPEST * block_mm[0]
+        one = np.asarray(np.concatenate([known, level]).all(axis=0))
+        if np.count_nonzero(one) < max(1.0, DRAWN_FRACTION * columns[0].any(axis=0).sum()):
             return cls(backs[0], 0.0)
         risen_mm = float(np.median((backs[-1] - backs[0])[one])) * block_mm[1]
         back = np.where(one, backs[0], np.median(backs[0, one]))
