@@ -20,8 +20,7 @@ from puncture_twin.planning.base.output.manifest import (
     read_manifest,
     read_output,
 )
-from puncture_twin.planning.base.output.output_set import LOCK_NAME
-from puncture_twin.planning.base.output.publish import DRAFT_PREFIX
+from puncture_twin.planning.base.output.output_set import DRAFT_PREFIX, LOCK_NAME
 
 REPOSITORY = ROOT
 RUN_TIMEOUT_S = 600.0

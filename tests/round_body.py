@@ -1,11 +1,15 @@
 """A folder that `init` starts from: the CT of a round body about the origin on a grid of 4 mm, and masks in it."""
 
+from pathlib import Path
+from unittest.mock import Mock, patch
+
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from case_world import image_of
 
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
+from puncture_twin.twin.report.slices import sheet
 
 SPACING = (4.0, 4.0, 4.0)
 AT = np.arange(50) * 4.0 - 98.0
@@ -41,13 +45,14 @@ def write_mask(path, voxels):
 
 
 def run_init(capfd, folder, *words):
-    """Run `init`; exit code, stdout, and stderr's lines that are no progress."""
-    code = main(["init", str(folder), *words])
+    """Run `init` without its picture; exit code, stdout, and stderr's lines that are no progress."""
+    with patch.multiple(sheet, draw_slices=Mock(), write_sheet=Mock()):
+        code = main(["init", str(folder), *words])
     out, err = capfd.readouterr()
     return code, out, [line for line in err.splitlines() if not line.startswith("stage") and ", took " not in line]
 
 
-def roles(folder):
-    """Name to role and margin of the case's structures, as a search reads them."""
-    context = prepare(folder, arm=False)
+def roles(case):
+    """Name to role and margin of the case's structures, as a search reads them; of a folder, or as prepared."""
+    context = prepare(case, arm=False) if isinstance(case, Path) else case
     return {one.name: (str(one.role), one.margin_mm) for one in context.anatomy.structures}

@@ -25,21 +25,10 @@ from puncture_twin.planning.base.errors import InputError, refuse
 Given = ParamSpec("Given")
 Found = TypeVar("Found")
 Word = TypeVar("Word", bound=StrEnum)
-
-RANGES: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {
-        "seed": (0, 2**31 - 1),
-        "seeds": (1, 1_000_000),
-        "jobs": (1, 1024),
-        "points": (1, 100_000),
-        "size_deg": (0.05, 10),
-        "fle_mm": (0.001, 1e3),
-        "physics": (0, 10_000),
-        "touch": (0, 1),
-        "quick_s": (1, 1e9),
-        "tolerance_mm": (0, 1e3),
-    }
-)
+RANGES: Mapping[str, tuple[float, float]] = MappingProxyType({
+    "seed": (0, 2**31 - 1), "seeds": (1, 1_000_000), "jobs": (1, 1024), "points": (1, 100_000), "size_deg": (0.05, 10),
+    "fle_mm": (0.001, 1e3), "physics": (0, 10_000), "touch": (0, 1), "quick_s": (1, 1e9), "tolerance_mm": (0, 1e3),
+})  # fmt: skip
 """Least and greatest of an argument, by its name."""
 
 
@@ -60,20 +49,17 @@ def checked(function: Callable[Given, Found]) -> Callable[Given, Found]:
                 allowed = " or ".join(KINDS[word].text if word in KINDS else word for word in words[name])
                 refuse(f"{name} is {shown_value(value)}", function.__name__, allowed, "wrong_type")
             if isinstance(value, numbers.Real):
-                _check_number(name, float(value), function.__name__)
+                low, high = RANGES.get(name, (-math.inf, math.inf))
+                if not math.isfinite(value):
+                    refuse(f"{name} is {float(value)}", function.__name__, "a finite number", "not_finite")
+                if not low <= value <= high:
+                    allowed = f"{low:g} to {high:g}"
+                    refuse(f"{name} is {float(value):g}", function.__name__, allowed, "out_of_range")
                 if not isinstance(value, bool | int):  # half precision counts no further
                     bound.arguments[name] = int(value) if isinstance(value, numbers.Integral) else float(value)
         return function(*bound.args, **bound.kwargs)
 
     return guarded
-
-
-def _check_number(name: str, value: float, where: str) -> None:
-    low, high = RANGES.get(name, (-math.inf, math.inf))
-    if not math.isfinite(value):
-        refuse(f"{name} is {value}", where, "a finite number", "not_finite")
-    if not low <= value <= high:
-        refuse(f"{name} is {value:g}", where, f"{low:g} to {high:g}", "out_of_range")
 
 
 def is_kind(word: str, value: object) -> bool:
@@ -133,11 +119,7 @@ def shown_value(value: object) -> str:
 
 
 def word_of(kind: type[Word], word: str | None) -> Word | None:
-    """One of a few words; None for none.
-
-    Raises:
-        InputError: Another word.
-    """
+    """One of a few words; None for none. Raises InputError: another word."""
     try:
         return None if word is None else kind(word)
     except ValueError as error:
@@ -146,11 +128,7 @@ def word_of(kind: type[Word], word: str | None) -> Word | None:
 
 
 def checked_degrees(angles_deg: ArrayLike, most: float, where: str) -> Floats:
-    """Angles in degrees, shape (n,), each from 0 to the largest that there is.
-
-    Raises:
-        InputError: Another shape, none, or what is no such number.
-    """
+    """Angles in degrees, shape (n,), each from 0 to ``most``. Raises InputError: another shape, none, or no number."""
     allowed = f"numbers of degrees from 0 to {most:g}, shape (n,)"
     given = real_numbers(angles_deg, where, allowed)
     if not len(given):
@@ -162,11 +140,7 @@ def checked_degrees(angles_deg: ArrayLike, most: float, where: str) -> Floats:
 
 
 def real_numbers(values: ArrayLike, where: str, allowed: str) -> Floats:
-    """Real numbers, shape (n,).
-
-    Raises:
-        InputError: Another shape, or values that are no real numbers.
-    """
+    """Real numbers, shape (n,). Raises InputError: another shape, or values that are no real numbers."""
     try:
         given = np.asarray(values)
     except ValueError as error:

@@ -13,10 +13,8 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 Ints32 = NDArray[np.int32]
 """Faces: three rows of vertices a triangle; labels; ranks."""
-
 Pixels = NDArray[np.uint8]
 """Pictures: rows, columns, and RGB where there is a third axis."""
-
 Texts = NDArray[np.object_]
 """Strings of any length: an array of a fixed width would cut a name."""
 

@@ -20,7 +20,6 @@ from typing import Any, NoReturn, Self
 
 MOST_WHAT, MOST_WHERE, MOST_ALLOWED = 400, 300, 600
 """Characters of an error's parts: what is longer loses its middle, so that the line can still be read."""
-
 MOST_MESSAGE = 1_500
 """Characters of any other line."""
 
@@ -155,11 +154,7 @@ class CacheWarning(UserWarning):
 
 
 def one_line(text: str, most: int = MOST_MESSAGE) -> str:
-    """A text as one printable line.
-
-    Args:
-        most: Characters, from 3 on; a longer text loses its middle.
-    """
+    """A text as one printable line; one of more than so many characters, from 3 on, loses its middle."""
     line = " ".join(text.split())
     if len(line) > most:
         head = (most - 3) // 2
@@ -177,19 +172,14 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that the inputs say of each other.
-
-    Attributes:
-        severity: A refusal stops the work, a warning stands in every result, a note is for those who look.
-        numbers: What was measured, by name with its unit.
-        way_out: Of a refusal, what would be accepted.
-    """
+    """One thing that the inputs say of each other."""
 
     code: str
-    severity: Severity
+    severity: Severity  # a refusal stops the work, a warning stands in every result, a note is for those who look
     sentence: str
+    # what was measured, by name with its unit
     numbers: Mapping[str, float | list[float] | str] = field(default_factory=dict)
-    way_out: str = ""
+    way_out: str = ""  # of a refusal, what would be accepted
 
     def document(self) -> dict[str, object]:
         """The finding as it is listed under ``findings`` of ``--json``."""
@@ -212,7 +202,6 @@ MODULES: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """Extra to the modules that it installs: the simulator, the cameras' pictures, the film; a running robot; and so on."""
-
 NO_WHEEL_FROM: Mapping[str, tuple[str, tuple[int, int]]] = MappingProxyType(
     {"pybullet": ("pybullet", (3, 12)), "rtde_receive": ("ur-rtde", (3, 13))}
 )
@@ -220,11 +209,7 @@ NO_WHEEL_FROM: Mapping[str, tuple[str, tuple[int, int]]] = MappingProxyType(
 
 
 def require_extra(extra: str, where: str, *, else_allowed: str = "") -> None:
-    """Refuse what needs a missing part of the installation, before it works for minutes.
-
-    Raises:
-        InputError: A module of the extra is not installed.
-    """
+    """Refuse what needs a missing part of the installation, before it works for minutes."""
     missing = [name for name in MODULES[extra] if find_spec(name) is None]
     if missing:
         what = f"it needs the extra '{extra}', which is not installed (no {', '.join(missing)})"

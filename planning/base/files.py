@@ -44,11 +44,7 @@ OUTPUT_NAMES = (
 
 
 def sha256(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file's bytes.
-
-    Raises:
-        InputError: The file cannot be read.
-    """
+    """Hexadecimal SHA-256 of a file's bytes. Raises InputError: the file cannot be read."""
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -75,11 +71,7 @@ def is_folder(path: Path) -> bool:
 
 @contextmanager
 def atomic(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; move it there when the block ends without an exception.
-
-    Raises:
-        InputError: Nothing can be created in that folder.
-    """
+    """A temporary path beside ``path``, moved there if the block ends well. Raises InputError: nothing can be made."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
@@ -100,11 +92,7 @@ def atomic(path: Path) -> Iterator[Path]:
 
 
 def check_writable(folder: Path | str) -> Path:
-    """Refuse a folder into which nothing can be written, before any work is done; nothing is created.
-
-    Raises:
-        InputError: The name cannot be used, something else stands there, or it may not be written to.
-    """
+    """Refuse a folder into which nothing can be written, or of no usable name, before any work; nothing is created."""
     allowed = "a writable folder, or a new name"
     if not isinstance(folder, str | Path):
         refuse(f"a {type(folder).__name__} is no path", "output folder", allowed, "wrong_type")
@@ -124,11 +112,7 @@ def check_writable(folder: Path | str) -> Path:
 
 @contextmanager
 def new_folder(path: Path | None) -> Iterator[Path | None]:
-    """A folder that appears whole or not at all; None for none.
-
-    Raises:
-        InputError: Something is there already, or it cannot be made.
-    """
+    """A folder that appears whole or not at all; None for none. Raises InputError: something is there or in the way."""
     if path is None:
         yield None
         return
@@ -153,11 +137,7 @@ def _shown(path: Path) -> str:
 
 
 def read_input(path: Path, *, max_bytes: int, where: str, allowed: str = "") -> bytes:
-    """Read all bytes of a file.
-
-    Raises:
-        InputError: If it is missing, no regular file, empty, too large, or not readable.
-    """
+    """All bytes of a file. Raises InputError: it is missing, no regular file, empty, too large, or not readable."""
     allowed = allowed or f"a readable file of 1 to {max_bytes} bytes"
     try:
         if not path.exists():
@@ -208,11 +188,7 @@ def unfinished_warnings(content: bytes, name: str) -> tuple[str, ...]:
 
 
 def decode_text(data: bytes, where: str) -> str:
-    """The text of a file in UTF-8.
-
-    Raises:
-        InputError: If it is anything else.
-    """
+    """The text of a file in UTF-8. Raises InputError if it is anything else."""
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -39,30 +39,22 @@ from puncture_twin.planning.base.errors import CacheWarning
 from puncture_twin.planning.base.files import atomic
 
 __all__ = ["allocation_free", "nb"]
-
 config: Any = nb.config
 """It makes its attributes when it is loaded."""
-
 FOLDER_VARIABLE = "NUMBA_CACHE_DIR"
 """Numba's own: what the user says with it is the place of all folders. Processes that this one begins learn it so."""
-
 LOCATORS = "UserProvidedCacheLocator,IPythonCacheLocator"
 """Numba's names: that place alone, and what a notebook's cells have. It would go on to folders of other states."""
-
 PREFIX = "kernels-"
 COMPILERS = ("numba", "llvmlite", "numpy")
 """Whose versions decide what is compiled."""
-
 KEPT_FOLDERS = 4
 KEPT_S = 7 * 86_400.0
 """Folders of other sources stay while they are among the newest, or were used within a week: checkouts share them."""
-
 ENDINGS = (".nbi", ".nbc")
 """Of numba's indices and data; it writes under another name first."""
-
 LAST_BYTE = b"."
 """Of every pickle: a file that ends otherwise was cut, as by a system that went down while it was written."""
-
 SUMS = "sums.json"
 """What the folder's files were when a process that had used them ended: size, time and CRC-32. A bit that flips later
 is seen before the code runs; that costs 10 ms for the 17 MB of all commands."""
@@ -100,7 +92,12 @@ def _own_folder(folder: Path) -> Path:
     if not folder.is_dir():
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         check_own_folder(folder)
-        _remove_older(folder)
+        with suppress(FileNotFoundError):  # another process removes them too
+            others = (one for one in folder.parent.glob(f"{PREFIX}*") if one != folder)
+            used = sorted(((one.lstat().st_mtime, one) for one in others), reverse=True)
+            for when, one in used[KEPT_FOLDERS:]:
+                if time.time() - when > KEPT_S:
+                    shutil.rmtree(one, ignore_errors=True)
     check_own_folder(folder)
     tempfile.TemporaryFile(dir=folder).close()
     os.utime(folder)
@@ -109,16 +106,6 @@ def _own_folder(folder: Path) -> Path:
         what = "cache: a compiled kernel is cut or damaged; it is compiled again and replaced"
         warnings.warn(what, CacheWarning, stacklevel=1)
     return folder
-
-
-def _remove_older(folder: Path) -> None:
-    """Remove the folders of other sources that have not been used for long."""
-    with suppress(FileNotFoundError):  # another process removes them too
-        others = (one for one in folder.parent.glob(f"{PREFIX}*") if one != folder)
-        used = sorted(((one.lstat().st_mtime, one) for one in others), reverse=True)
-        for when, one in used[KEPT_FOLDERS:]:
-            if time.time() - when > KEPT_S:
-                shutil.rmtree(one, ignore_errors=True)
 
 
 State = list[int]
@@ -176,7 +163,6 @@ UNCOUNTED: dict[str, Any] = {"_nrt": False} if nb.version_info.short <= (0, 68) 
 """Numba's option of that meaning, in versions that were tried: it is no public one. Without it answers are the same, a
 search takes a third more and compiling half. Arrays without a counter, which an intrinsic of public names can hand on,
 buy two thirds of that in the smallest kernel (.49 s plain, .15 so, .01 with the option)."""
-
 allocation_free: Any = partial(nb.njit, cache=True, **UNCOUNTED)
 """Compile a kernel that makes no array: all that it works on, and works in, its caller owns.
 

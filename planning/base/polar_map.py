@@ -24,19 +24,14 @@ from puncture_twin.planning.base.text import escape
 
 FINEST = np.radians(0.5)
 """rad: a smaller bin is smaller than a pixel at the rim."""
-
 MOST_BINS = 720
 """Around the circle, and from the pole to the rim."""
-
 SLACK = 1e-6
 """Share of a bin by which rounding may move a cell's edge."""
-
 SIZE = 320
 """Width and height on the page, CSS pixels; the picture is twice as fine."""
-
 RING_DEG = 30.0
 """Between two circles of equal θ."""
-
 INK = 0.45
 """Opacity of circles and axes."""
 
@@ -61,15 +56,10 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True)
 class PolarMap:
-    """A map with its legend: what a notebook shows, and a file.
+    """A map with its legend: what a notebook shows, and a file."""
 
-    Attributes:
-        png: The picture; no bytes where nothing is mapped.
-        under: Below it, HTML: what is drawn, and a line for each verdict that occurs.
-    """
-
-    png: bytes
-    under: str
+    png: bytes  # the picture; no bytes where nothing is mapped
+    under: str  # below it, HTML: what is drawn, and a line for each verdict that occurs
 
     def _repr_html_(self) -> str:
         """HTML for a notebook; "" where nothing is mapped."""
@@ -78,11 +68,7 @@ class PolarMap:
         return f"<div>{image}{self.under}</div>" if self.png else ""
 
     def write(self, path: Path | str) -> Path:
-        """Write the picture, a PNG without the legend, whole or not at all.
-
-        Raises:
-            InputError: Nothing is mapped, or a place that cannot be written to.
-        """
+        """Write the picture, a PNG without the legend, whole. Raises InputError: nothing is mapped, or no place."""
         if not self.png:
             refuse("nothing is mapped", "plot_map", "a search with directions", "empty")
         path = Path(path)
@@ -96,11 +82,7 @@ NO_MAP = PolarMap(b"", "")
 
 
 def polar_map(cells: Sectors, legend: Sequence[Entry], bin_rad: float = FINEST) -> PolarMap:
-    """The map with its legend; empty without cells.
-
-    Args:
-        bin_rad: Wanted size of a bin; it is made no smaller than `FINEST`.
-    """
+    """The map with its legend, of bins of this size, at least `FINEST`; empty without cells."""
     rim = float(cells.theta.max(initial=0.0))
     if rim <= 0.0:
         return NO_MAP
@@ -114,7 +96,11 @@ def polar_map(cells: Sectors, legend: Sequence[Entry], bin_rad: float = FINEST) 
     said = (
         f"θ from 0 in the middle to {np.degrees(rim):g}° at the rim, a circle every {RING_DEG:g}°; β from the right, up"
     )
-    return PolarMap(_png(_drawn(bins, legend, rim)), f"<div>{said}</div>{lines}")
+    from PIL import Image  # here: only a notebook shows it
+
+    stream = BytesIO()
+    Image.fromarray(_drawn(bins, legend, rim)).save(stream, format="PNG")
+    return PolarMap(stream.getvalue(), f"<div>{said}</div>{lines}")
 
 
 def _drawn(bins: Ints, legend: Sequence[Entry], rim: float) -> Pixels:
@@ -130,14 +116,6 @@ def _drawn(bins: Ints, legend: Sequence[Entry], rim: float) -> Pixels:
     lined = (beside.min(axis=-1) < 0.5 / SIZE) | ((radius < 1.0) & (np.minimum(np.abs(x), np.abs(y)) < 0.5 / SIZE))
     picture[lined] = np.round(picture[lined] * (1.0 - INK))
     return np.asarray(picture)
-
-
-def _png(picture: Pixels) -> bytes:
-    from PIL import Image  # here: only a notebook shows it
-
-    stream = BytesIO()
-    Image.fromarray(picture).save(stream, format="PNG")
-    return stream.getvalue()
 
 
 def _painted(cells: Sectors, rim: float, size: float) -> Ints:

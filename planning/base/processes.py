@@ -26,11 +26,7 @@ copyreg.pickle(MappingProxyType, lambda mapping: (_mapping, (dict(mapping),)))
 
 
 def worker_count(wanted: int, pieces: int) -> int:
-    """Processes for some pieces of work: no more than wanted, than the processor's cores, or than pieces.
-
-    Returns:
-        At least 1.
-    """
+    """Processes for some pieces of work: no more than wanted, than the processor's cores, or than pieces; 1 or more."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(wanted, cores, pieces))
 

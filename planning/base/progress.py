@@ -17,8 +17,6 @@ LOG.addHandler(logging.NullHandler())  # nothing is printed unless a program say
 
 Count = Callable[[int, int], None]
 """Called with (done, to do), as often as something is done."""
-
-
 Names = Callable[[str], None]
 """Called with the name of each thing as it is come to."""
 
@@ -64,13 +62,10 @@ class Silent:
 
 @dataclass
 class Stages:
-    """A stopwatch with names; seconds, in the order in which the stages ended.
-
-    Attributes:
-        announce: Called with a stage's name when it begins, for whoever shows progress.
-    """
+    """A stopwatch with names; seconds, in the order in which the stages ended."""
 
     seconds: dict[str, float] = field(default_factory=dict)
+    # called with a stage's name when it begins, for whoever shows progress
     announce: Callable[[str], None] | None = None
 
     @contextmanager

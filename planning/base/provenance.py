@@ -19,7 +19,6 @@ from puncture_twin.planning.base.strict_json import text
 
 CASE_ROLE = "case"
 """The file that names the others; what it is called decides nothing."""
-
 KEPT_BYTES = 10_000_000
 """So much in all stays in memory with its case, the smallest files first: points and names. Volumes, and the many
 slices of a series, are let go of once parsed."""
@@ -27,17 +26,11 @@ slices of a series, are let go of once parsed."""
 
 @dataclass(frozen=True, order=True)
 class Input:
-    """A file that decided a result.
+    """A file that decided a result."""
 
-    Attributes:
-        role: What it is to the result: ``case``, ``mesh liver``, ``labelmap``, ``labelmap data``, ``markers_ct``, ...
-        path: As the file that names it states it, relative to the case's folder.
-        sha256: Hexadecimal, of the bytes that were read.
-    """
-
-    role: str
-    path: str
-    sha256: str
+    role: str  # what it is to the result: ``case``, ``mesh liver``, ``labelmap``, ``labelmap data``, ``markers_ct``,
+    path: str  # as the file that names it states it, relative to the case's folder
+    sha256: str  # hexadecimal, of the bytes that were read
 
 
 def inputs_document(inputs: Iterable[Input]) -> list[dict[str, str]]:
@@ -46,11 +39,7 @@ def inputs_document(inputs: Iterable[Input]) -> list[dict[str, str]]:
 
 
 def read_inputs(document: Any) -> tuple[Input, ...]:
-    """The list of a result that was read from a file.
-
-    Raises:
-        TypeError, KeyError, ValueError: It is no such list, or an input has two hashes in it.
-    """
+    """The list of a result that was read from a file; TypeError, KeyError or ValueError for what is no such list."""
     if not isinstance(document, list):
         raise TypeError("inputs is not a list")
     inputs = tuple(Input(*(text(one[key]) for key in ("role", "path", "sha256"))) for one in document)
@@ -101,11 +90,7 @@ class InputFiles:
         return tuple(self._inputs.values())
 
     def add(self, role: str, name: str, content: bytes) -> bytes:
-        """List bytes that were read already, and keep them.
-
-        Raises:
-            InputError: They are not those that were read `again`.
-        """
+        """List bytes that were read already, and keep them. Raises InputError: not those that were read `again`."""
         one = self._inputs[role, name] = content_input(role, name, content)
         if self._known.get(name, one.sha256) != one.sha256:
             self._refuse_changed(name)
@@ -126,13 +111,14 @@ class InputFiles:
         Args:
             name: As ``where`` states it.
             key: Of ``where``, for errors.
-
-        Raises:
-            InputError: It is missing, no plain file, empty, too large or not readable.
         """
         content = self._held.get(name)
         if content is None:
-            content = read_input(self._existing(name, key, where), max_bytes=max_bytes, where=str(self._folder / name))
+            file = self._folder / name
+            if not is_plain_file(file):
+                what = f"{key}: file '{name[:200]}' {absence(file)}"
+                refuse(what, where, f"a file in {self._folder}", "no_such_file")
+            content = read_input(file, max_bytes=max_bytes, where=str(self._folder / name))
         return self.add(role, name, content)
 
     def held(self, name: str) -> bytes | None:
@@ -140,11 +126,7 @@ class InputFiles:
         return self._held.get(name)
 
     def content(self, name: str) -> bytes:
-        """The bytes of a file that was read; one that was let go of is read again and must be the same.
-
-        Raises:
-            InputError: It has changed since.
-        """
+        """The bytes of a file that was read; what was let go of is read again. Raises InputError: it has changed."""
         held = self._held.get(name)  # looked at once: another thread may let go of it
         if held is not None:
             return held
@@ -173,9 +155,3 @@ class InputFiles:
     def __getstate__(self) -> dict[str, Any]:
         """Another process is not sent gigabytes: it reads what it needs, and holds that against the hash."""
         return {**self.__dict__, "_held": {}}
-
-    def _existing(self, name: str, key: str, where: Path) -> Path:
-        file = self._folder / name
-        if not is_plain_file(file):
-            refuse(f"{key}: file '{name[:200]}' {absence(file)}", where, f"a file in {self._folder}", "no_such_file")
-        return file

@@ -32,16 +32,12 @@ class Reason(StrEnum):
 
 
 Rgb = tuple[int, int, int]
-
 SAFE: Rgb = (0, 158, 115)
 """Safe, where no shade is meant: legends, the corridor in 3D."""
-
 UNSEEN_AIR: Rgb = (190, 190, 196)
 """An unknown region outside of the body; one within it is darker, as `REASON_COLOURS` has it."""
-
 UNSEEN_AIR_TEXT = "unknown outside the body (image ends, or no air)"
 NOT_SEARCHED_TEXT = "outside the grid, not searched"
-
 REASON_COLOURS = MappingProxyType(
     {
         Reason.NO_SKIN_ENTRY: (221, 221, 221),
@@ -60,7 +56,6 @@ REASON_COLOURS = MappingProxyType(
         Reason.APPROACH_NOT_FOUND: (51, 34, 136),
     }
 )
-
 REASON_TEXT = MappingProxyType(
     {
         Reason.NONE: "safe",

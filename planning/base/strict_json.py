@@ -20,29 +20,19 @@ from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import read_input
 
 Value = TypeVar("Value")
-
 MAX_NUMBER = 1e6
 """Of millimetres, degrees, radians and seconds: products of larger ones overflow."""
-
 SHOWN = 60
 """Characters of a damaged value that an error shows."""
 
 
 def read_json(path: Path, *, max_bytes: int, allowed: str) -> Any:
-    """A JSON file, see `parse_json`.
-
-    Raises:
-        InputError: It cannot be read, is larger than ``max_bytes``, or see `parse_json`.
-    """
+    """A JSON file. Raises InputError: it cannot be read, is larger than ``max_bytes``, or see `parse_json`."""
     return parse_json(read_input(path, max_bytes=max_bytes, where=str(path)), where=path, allowed=allowed)
 
 
 def parse_json(data: bytes, *, where: str | Path, allowed: str) -> Any:
-    """The tree that some bytes hold: UTF-8 (a byte order mark is passed over), every key once, every number finite.
-
-    Raises:
-        InputError: Not such JSON, or nested without end.
-    """
+    """The tree that bytes hold in UTF-8: each key once, each number finite, no endless nest. Raises InputError else."""
     try:
         text = data.decode("utf-8-sig")
         return json.loads(text, parse_constant=_refused, parse_float=_finite, object_pairs_hook=_unique_keys)
@@ -51,11 +41,7 @@ def parse_json(data: bytes, *, where: str | Path, allowed: str) -> Any:
 
 
 def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str) -> dict[str, Any]:
-    """A JSON object whose ``version`` is this one.
-
-    Raises:
-        InputError: Another version, no object, or see `parse_json`.
-    """
+    """A JSON object of this ``version``. Raises InputError: another version, no object, or see `parse_json`."""
     document = parse_json(data, where=where, allowed=allowed)
     stated = document.get("version") if isinstance(document, dict) else None
     if isinstance(stated, bool) or stated != version:
@@ -65,27 +51,18 @@ def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str
 
 @contextmanager
 def fitting(where: str | Path, allowed: str) -> Iterator[None]:
-    """Whatever a value of the wrong kind raises within, as one line about its file.
-
-    Raises:
-        InputError: A key that is missing, or a value of another type, shape or size.
-    """
+    """Whatever a value of the wrong kind raises within (a missing key, another type, shape, size), as one line."""
     try:
         yield
     except KeyError as error:
         raise InputError(f"key {error} is missing", where=where, allowed=allowed, code="missing_key") from error
     except (TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
-        raise InputError(
-            f"does not fit: {error}", where=where, allowed=allowed, code=getattr(error.__cause__, "code", "bad_value")
-        ) from error
+        code = getattr(error.__cause__, "code", "bad_value")
+        raise InputError(f"does not fit: {error}", where=where, allowed=allowed, code=code) from error
 
 
 def field(document: dict[str, Any], name: str, read: Callable[[Any], Value]) -> Value:
-    """A value by its key, which errors name.
-
-    Raises:
-        KeyError, ValueError: It is missing, or ``read`` refuses it.
-    """
+    """A value by its key, which errors name. Raises KeyError, ValueError: it is missing, or ``read`` refuses it."""
     value = document[name]
     try:
         return read(value)
@@ -98,33 +75,21 @@ def field(document: dict[str, Any], name: str, read: Callable[[Any], Value]) -> 
 
 
 def text(value: Any) -> str:
-    """A text, and nothing that only prints as one.
-
-    Raises:
-        TypeError: Something else.
-    """
+    """A text, and nothing that only prints as one. Raises TypeError: something else."""
     if not isinstance(value, str):
         raise TypeError(f"{_shown(value)} is not a text")
     return value
 
 
 def whole(value: Any) -> int:
-    """A whole number, written as one.
-
-    Raises:
-        TypeError: Something else.
-    """
+    """A whole number, written as one. Raises TypeError: something else."""
     if isinstance(value, bool) or not isinstance(value, int):
         raise TypeError(f"{_shown(value)} is not a whole number")
     return value
 
 
 def number(value: Any) -> float:
-    """A number within ±`MAX_NUMBER`.
-
-    Raises:
-        TypeError, ValueError: Something else, or a larger one.
-    """
+    """A number within ±`MAX_NUMBER`. Raises TypeError, ValueError: something else, or a larger one."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{_shown(value)} is not a number")
     if not abs(value) <= MAX_NUMBER:
@@ -138,11 +103,7 @@ def number_or_nan(value: Any) -> float:
 
 
 def array(value: Any, shape: tuple[int, ...]) -> Floats:
-    """Numbers within ±`MAX_NUMBER` of a known shape; read-only.
-
-    Raises:
-        ValueError: Another shape, a larger number, or something else than numbers.
-    """
+    """Numbers within ±`MAX_NUMBER` of a known shape, read-only; ValueError for anything else."""
     if not _numbers_only(value):
         raise ValueError("an array with values other than numbers")
     try:
@@ -163,11 +124,7 @@ def point(value: Any) -> Floats:
 
 
 def texts(value: Any) -> tuple[str, ...]:
-    """A list of texts.
-
-    Raises:
-        TypeError: Something else.
-    """
+    """A list of texts. Raises TypeError: something else."""
     if not isinstance(value, list):
         raise TypeError(f"{_shown(value)} is not a list")
     return tuple(map(text, value))

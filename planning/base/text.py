@@ -21,19 +21,11 @@ from puncture_twin.planning.base.errors import one_line, refuse
 MAX_NAME = 200
 """Characters of a name; the longest of TotalSegmentator has 29. A longer one is refused, never cut: two names that
 differ at their end must not become one."""
-
 ALLOWED_NAME = f"printable characters on one line, {MAX_NAME} at most: no escape sequence, line break or direction mark"
 
 
 def check_name(name: str, what: str, *, where: str | Path) -> str:
-    """Check a name that is printed as it is, and return it.
-
-    Args:
-        what: What it names, for the error: "label 3", "point 2".
-
-    Raises:
-        InputError: An empty name, one of more than `MAX_NAME` characters, or one with a control or format character.
-    """
+    """Check a name that is printed as it is, and return it; ``what`` it names, as "label 3", is in the error."""
     if not name.strip():
         refuse(f"{what} has an empty name", where, ALLOWED_NAME, "bad_name")
     if len(name) > MAX_NAME:
@@ -116,8 +108,6 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 Facts = Iterable[tuple[str, str]]
 """Names and values, as plain text."""
-
-
 STYLE = (
     "font:13px/1.45 system-ui,sans-serif;display:flex;flex-wrap:wrap;gap:16px;align-items:flex-start;padding:10px 12px;"
     "border:1px solid #d9dce1;border-radius:8px;max-width:880px;background:#fff;color:#1b1e23"
@@ -134,11 +124,7 @@ def escape(value: object) -> str:
 
 
 def card(title: str, facts: Facts, picture: str = "") -> str:
-    """A title, a table of facts and, beside it, a picture.
-
-    Args:
-        picture: HTML, such as an image; "" for none.
-    """
+    """A title, a table of facts and, beside it, a picture: HTML, such as an image, or ""."""
     rows = "".join(
         f'<tr style="{ROW}"><th style="{NAME}">{escape(name)}</th><td style="{CELL}">{escape(value)}</td></tr>'
         for name, value in facts
@@ -177,7 +163,6 @@ class Shown:
 
 SHORT = 40
 """Characters of a fact that stands in the one line."""
-
 UNITS = (("_mm", "mm"), ("_cm2", "cm²"), ("_deg", "°"), ("_s", "s"), ("_n", "N"))
 """Endings of names, and the unit that they say."""
 

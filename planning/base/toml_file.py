@@ -15,24 +15,17 @@ from puncture_twin.planning.base.files import read_input
 
 MAX_BYTES = 1_000_000
 """Such a file is written by hand; a larger one is something else."""
-
 Model = TypeVar("Model", bound=BaseModel)
-
 MAX_DEPTH = 20
 """Brackets inside brackets; a case has four."""
-
 MAX_KEY_PARTS = 8
 """Parts of a dotted key or table name; a case has three."""
-
 MAX_WORD = 100
 """Characters of a number, a bare key or any other word outside of strings."""
-
 MAX_LINE = 20_000
 """Characters of a line: a rule for each of a thousand organs fits."""
-
 MAX_TABLES = 20_000
 """Lines that begin with a bracket: each may be a table of eight levels."""
-
 _TOKEN = re.compile(
     r'(?P<text>"""(?:[^\\]|\\.)*?(?:"""|\Z)|\'\'\'.*?(?:\'\'\'|\Z)|"(?:[^"\\\n]|\\.)*"?|\'[^\'\n]*\'?)'
     r"|(?P<comment>#[^\n]*)|(?P<open>[\[{])|(?P<close>[\]}])|(?P<dot>\.)|(?P<word>[^\s\"'#\[\]{}.=,]+)"
@@ -49,17 +42,12 @@ def _one(value: object) -> object:
 
 CODES = {"extra_forbidden": "unknown_key", "missing": "missing_key"}
 """What is wrong with a key, by Pydantic's word; any other is ``bad_value``."""
-
 SchemaOne = Annotated[int, BeforeValidator(_one)]
 """The key ``schema``: 1."""
 
 
 def find_toml(path: Path | str, usual_name: str) -> Path:
-    """The file itself, also of a folder that holds one of the usual name.
-
-    Raises:
-        InputError: A name that the system cannot look up, or something that is no plain file.
-    """
+    """The file itself, also of a folder that holds one of the usual name. Raises InputError: no plain file, or name."""
     path = Path(path)
     allowed = f"a TOML file, or a folder that holds {usual_name}"
     try:
@@ -73,11 +61,7 @@ def find_toml(path: Path | str, usual_name: str) -> Path:
 
 
 def read_toml_bytes(path: Path, allowed: str) -> bytes:
-    """The bytes of such a file.
-
-    Raises:
-        InputError: Unreadable, or too large.
-    """
+    """The bytes of such a file. Raises InputError: unreadable, or too large."""
     return read_input(path, max_bytes=MAX_BYTES, where=str(path), allowed=allowed)
 
 
@@ -90,14 +74,7 @@ def parse_toml(
     keys: str,
     change: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Model:
-    """Validate the bytes of such a file; it is not opened again.
-
-    Args:
-        change: States some values otherwise, before any is looked at.
-
-    Raises:
-        InputError: Not TOML, or not of the schema: names the first key that is wrong.
-    """
+    """Validate the bytes of such a file, after ``change`` stated some values otherwise; it is not opened again."""
     try:
         text = content.decode("utf-8")
         check_toml_bounds(text, path, allowed)
@@ -109,18 +86,13 @@ def parse_toml(
         return model.model_validate(data)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        place, said = _said(data, first["loc"], schema_words(first), first["type"])
+        place, said = _place(data, first["loc"]) or "top level", schema_words(first)
+        if first["type"] == "missing" and first["loc"] and isinstance(first["loc"][-1], int):  # the list is too short
+            place, said = _place(data, first["loc"][:-1]), f"number {first['loc'][-1] + 1} of the list is missing"
         value = "" if isinstance(first["input"], dict | list | tuple | None) else f" (given: {first['input']!r:.60})"
         allowed = f"the keys, types and ranges of {keys}"
         code = getattr(first.get("ctx", {}).get("error"), "code", CODES.get(first["type"], "bad_value"))
         raise InputError(f"{place}: {said}{value}", where=path, allowed=allowed, code=code) from error
-
-
-def _said(data: object, keys: tuple[str | int, ...], message: str, kind: str) -> tuple[str, str]:
-    """Which key, and what is wrong with it; of a list that is too short the list's own."""
-    if kind == "missing" and keys and isinstance(keys[-1], int):
-        return _place(data, keys[:-1]), f"number {keys[-1] + 1} of the list is missing"
-    return _place(data, keys) or "top level", message
 
 
 def _place(data: Any, keys: tuple[str | int, ...]) -> str:
@@ -140,45 +112,26 @@ def _place(data: Any, keys: tuple[str | int, ...]) -> str:
 
 
 def check_toml_bounds(text: str, where: Path | str, allowed: str) -> None:
-    """Refuse a text that is nested too deep, or has a key, a number or a line too long; it need not be TOML.
-
-    Args:
-        allowed: What would have been accepted in its place, for the error.
-    """
+    """Refuse a text that is nested too deep, or has a key, a number or a line too long; it need not be TOML."""
     tables = 0
     for number, line in enumerate(text.split("\n"), start=1):
         tables += line.lstrip().startswith("[")
         if len(line) > MAX_LINE:
-            _refuse(f"has {len(line)} characters, more than {MAX_LINE}", where, number, allowed)
+            refuse(f"line {number} has {len(line)} characters, more than {MAX_LINE}", where, allowed, "toml_bounds")
         if tables > MAX_TABLES:
-            _refuse(f"starts more than {MAX_TABLES} tables", where, number, allowed)
+            refuse(f"line {number} starts more than {MAX_TABLES} tables", where, allowed, "toml_bounds")
     depth = parts = 0
     for token in _TOKEN.finditer(text):
-        kind, found = str(token.lastgroup), token.group()
+        kind, length, wrong = str(token.lastgroup), len(token.group()), ""
         depth += (kind == "open") - (kind == "close")
-        parts = _parts(parts, kind)
-        wrong = _beyond(kind, found, depth, parts)
+        # Parts of the key that the text is in: dots join, spaces do not part, all else ends it.
+        parts = parts + (kind == "dot") if kind in {"dot", "word", "text", "space"} else 0
+        if depth > MAX_DEPTH:
+            wrong = f"is nested more than {MAX_DEPTH} deep"
+        elif parts > MAX_KEY_PARTS:
+            wrong = f"has a dotted key of more than {MAX_KEY_PARTS} parts"
+        elif kind == "word" and length > MAX_WORD:
+            wrong = f"has a number or a key of {length} characters, more than {MAX_WORD}"
         if wrong:
-            _refuse(wrong, where, text.count("\n", 0, token.start()) + 1, allowed)
-
-
-def _parts(parts: int, kind: str) -> int:
-    """Parts of the key that the text is in after a token: dots join, spaces do not part, all else ends it."""
-    if kind == "dot":
-        return parts + 1
-    return parts if kind in {"word", "text", "space"} else 0
-
-
-def _beyond(kind: str, found: str, depth: int, parts: int) -> str:
-    """Which bound a token breaks, in words; the empty string where none."""
-    if depth > MAX_DEPTH:
-        return f"is nested more than {MAX_DEPTH} deep"
-    if parts > MAX_KEY_PARTS:
-        return f"has a dotted key of more than {MAX_KEY_PARTS} parts"
-    if kind == "word" and len(found) > MAX_WORD:
-        return f"has a number or a key of {len(found)} characters, more than {MAX_WORD}"
-    return ""
-
-
-def _refuse(wrong: str, where: Path | str, line: int, allowed: str) -> None:
-    refuse(f"line {line} {wrong}", where, allowed, "toml_bounds")
+            before = text.count("\n", 0, token.start())
+            refuse(f"line {before + 1} {wrong}", where, allowed, "toml_bounds")

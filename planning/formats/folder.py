@@ -19,9 +19,7 @@ from puncture_twin.planning.base.output.manifest import is_output_folder
 
 FILE, FOLDER, HIDDEN = "", "is a folder", "is hidden"
 """What most entries are; of all others it is said why they are neither."""
-
 NOT_READ = "of an unsupported kind"
-
 HARMLESS = (
     *(".ds_store", "thumbs.db", "desktop.ini", ".directory", ".git*", ".datalad", ".dvc", ".dvcignore"),
     *(".nfs*", ".~lock.*", ".ipynb_checkpoints"),
@@ -34,38 +32,28 @@ HARMLESS = (
 )
 """Names of what can hold no organ, in lower case: of file managers, of versions, what segmentation programs write
 with their masks, cases, scenes, tables, lists of points, pictures and plain text."""
-
 STRUCTURE_LIKE = re.compile(
     r"\.(nii|nrrd|nhdr|mha|mhd|hdr|img|mgz|mgh|mnc|npz|npy|dcm|stl|obj|ply|glb|gltf|vtp|vtk|vtu|3mf|wrl)(?![a-z0-9])",
     re.I,
 )
 """Names of what may be a structure: of volumes and meshes, also those that are not read, packed, cut or renamed."""
-
 ABOUT_MASK = (".dvc", ".json")
 """Endings of files about a file next to them, whose name they have with or without its own ending."""
-
 PROBABILITIES, VOLUMES = (".npz", ".pkl"), (".nii.gz", ".nii", ".nrrd")
 """Endings of what nnU-Net writes about each mask, and of the mask next to it."""
-
 THUMBNAILS = "@eaDir"
 """The folder in which a file server keeps previews, each named like the file that it shows."""
-
 APPLE_DOUBLE = "._"
 """How the name of a file begins in which macOS keeps what another file system cannot, next to the file itself."""
-
 MOST_DEPTH, MOST_INSIDE = 6, 100_000
 """Folders in folders, and entries of each, that are looked through for something that is not accounted for."""
 
 
 class Entry(NamedTuple):
-    """One entry of a folder.
-
-    Attributes:
-        what: `FILE`, `FOLDER`, `HIDDEN` (either, by its name), or why it is neither.
-    """
+    """One entry of a folder."""
 
     name: str
-    what: str
+    what: str  # `FILE`, `FOLDER`, `HIDDEN` (either, by its name), or why it is neither
 
     @property
     def line(self) -> str:
@@ -74,11 +62,7 @@ class Entry(NamedTuple):
 
 
 def entries(folder: Path, *, most: int, allowed: str = "a readable folder") -> tuple[Entry, ...]:
-    """Everything that lies in a folder, by name: also hidden files and links to nothing.
-
-    Raises:
-        InputError: It cannot be listed, or holds too much.
-    """
+    """All in a folder, by name: also hidden files and dead links. Raises InputError: not to be listed, or too many."""
     try:
         with os.scandir(folder) as listed:
             found = sorted(Entry(one.name, _what(one)) for one in listed)

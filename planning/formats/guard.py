@@ -23,12 +23,10 @@ from puncture_twin.planning.geometry.spaces import Space
 
 Many = ArrayLike | Sequence[ArrayLike]
 """An array, or a list of them."""
-
 MAX_COORDINATE_MM = 100_000.0
 """Farthest from the origin: no workcell is 100 m wide; beyond, a sentinel value or a broken float is likely."""
 ROTATION_TOLERANCE = 1e-5
 """Largest entry of |R^T R - I|: files write 6 to 7 digits; at 500 mm this still is only 0.005 mm."""
-
 _TRANSFORM_ALLOWED = (
     "a rigid 4x4 transform: rotation with determinant +1, translation in mm, last row 0 0 0 1, "
     f"R^T R = 1 to {ROTATION_TOLERANCE:g}"
@@ -36,17 +34,9 @@ _TRANSFORM_ALLOWED = (
 
 
 def guard_transform(T: ArrayLike, *, where: str | Path) -> NDArray[np.float64]:
-    """A rigid motion that passed the guard: finite, a rotation, near the origin.
+    """A rigid motion (4, 4), mm, that passed the guard, read-only: finite, a rotation, near the origin.
 
-    Args:
-        T: Shape (4, 4), maps coordinates between two frames, mm.
-        where: The file and the place in it, for the error.
-
-    Returns:
-        The same numbers, float64, read-only.
-
-    Raises:
-        InputError: If it is not a rotation with a translation; a mirrored one is named so, never repaired.
+    Raises InputError: It is not a rotation with a translation; a mirrored one is named so, never repaired.
     """
     matrix = _float_array(T, what="transform", where=where, allowed=_TRANSFORM_ALLOWED)
     if matrix.shape != (4, 4):
@@ -55,7 +45,18 @@ def guard_transform(T: ArrayLike, *, where: str | Path) -> NDArray[np.float64]:
         refuse("transform has a value that is not finite", where, _TRANSFORM_ALLOWED, "not_finite")
     if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
         refuse(f"last row of the transform is {matrix[3].tolist()}", where, _TRANSFORM_ALLOWED, "not_rigid")
-    _check_rotation(matrix[:3, :3], where=where)
+    R = matrix[:3, :3]
+    largest = float(np.abs(R).max())
+    if not largest <= MAX_ROTATION_ENTRY:  # squares of huge entries are infinite, and their differences NaN
+        refuse(f"not a rotation: an entry of {largest:.3g}", where, _TRANSFORM_ALLOWED, "not_rigid")
+    determinant = float(np.linalg.det(R))
+    if determinant < 0.0:
+        what = f"the transform is mirrored (determinant {determinant:.4g}): it swaps left and right"
+        refuse(what, where, _TRANSFORM_ALLOWED, "mirrored")
+    error = float(np.abs(R.T @ R - np.eye(3)).max())
+    if not error <= ROTATION_TOLERANCE:
+        what = f"not a rotation: R^T R is off by {error:.3g}, determinant {determinant:.6g}"
+        refuse(what, where, _TRANSFORM_ALLOWED, "not_rigid")
     if np.abs(matrix[:3, 3]).max() > MAX_COORDINATE_MM:
         limit = f"a translation within {MAX_COORDINATE_MM:g} mm"
         refuse(f"the transform moves by {matrix[:3, 3].tolist()} mm", where, limit, "too_far")
@@ -64,18 +65,9 @@ def guard_transform(T: ArrayLike, *, where: str | Path) -> NDArray[np.float64]:
 
 
 def guard_points(points: Many, names: Sequence[str], *, where: str | Path) -> NDArray[np.float64]:
-    """Named points that passed the guard: finite, near the origin, each name once.
+    """Named points (n, 3), mm, any frame, that passed the guard, read-only: finite, near the origin, each name once.
 
-    Args:
-        points: Shape (n, 3), mm, any frame.
-        names: One per point: unique, not empty.
-
-    Returns:
-        Shape (n, 3), float64, mm, read-only.
-
-    Raises:
-        InputError: If there is no point, a name is missing, doubled, too long or not printable, or a coordinate is not
-            finite or too far.
+    Raises InputError: No point, a name is missing, doubled, too long or not printable, a coordinate not finite or far.
     """
     allowed = "one printable name per point, not empty, each used once"
     array = points_array(points, names, what="point", where=where)
@@ -123,24 +115,8 @@ def points_array(points: Many, names: Sequence[str], *, what: str, where: str | 
     return array
 
 
-def _check_rotation(R: NDArray[np.float64], *, where: str | Path) -> None:
-    largest = float(np.abs(R).max())
-    if not largest <= MAX_ROTATION_ENTRY:  # squares of huge entries are infinite, and their differences NaN
-        refuse(f"not a rotation: an entry of {largest:.3g}", where, _TRANSFORM_ALLOWED, "not_rigid")
-    determinant = float(np.linalg.det(R))
-    if determinant < 0.0:
-        what = f"the transform is mirrored (determinant {determinant:.4g}): it swaps left and right"
-        refuse(what, where, _TRANSFORM_ALLOWED, "mirrored")
-    error = float(np.abs(R.T @ R - np.eye(3)).max())
-    if not error <= ROTATION_TOLERANCE:
-        what = f"not a rotation: R^T R is off by {error:.3g}, determinant {determinant:.6g}"
-        refuse(what, where, _TRANSFORM_ALLOWED, "not_rigid")
-
-
 MAX_ROTATION_ENTRY = 1e3
 """Far above 1, so that what is a scaled or sheared matrix is named by its error; far below what overflows."""
-
-
 MIN_DIAGONAL_MM = 0.5
 """Smallest bounding box diagonal of a structure: less than any vessel. An organ in metres is below."""
 MAX_DIAGONAL_MM = 5_000.0
@@ -149,7 +125,6 @@ FIRST = 16
 """Triangles that nearly always answer whether any has an area, without a kernel."""
 MAX_TRIANGLES = 20_000_000
 """Fifty times our finest whole body; more would only exhaust the memory (1.4 GB of corner coordinates)."""
-
 _EXTENT_ALLOWED = (
     f"bounding box diagonal from {MIN_DIAGONAL_MM:g} to {MAX_DIAGONAL_MM:g} mm, "
     f"coordinates within {MAX_COORDINATE_MM:g} mm"
@@ -168,16 +143,28 @@ def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> T
         vertices: Shape (n, 3), mm, any frame.
         faces: Shape (m, 3), whole numbers, indices into ``vertices``.
         where: The file and the place in it, for the error.
-
-    Raises:
-        InputError: If it is empty, not finite, out of range, without area, or of an implausible size.
     """
     points = points_array(vertices, [], what="vertex", where=where)
     indices = _index_array(faces, len(points), where=where)
-    _check_not_huge(points, where=where)
-    mesh = _without_unused(points, indices)
-    _check_not_tiny(mesh.vertices, where=where)
-    if not (_areas(mesh.vertices[mesh.faces[:FIRST]]).any() or mesh.areas.any()):
+    farthest = float(max(-points.min(), points.max()))
+    if farthest > MAX_COORDINATE_MM:
+        refuse(f"a coordinate lies {farthest:.6g} mm from the origin", where, _EXTENT_ALLOWED, "too_far")
+    diagonal = _diagonal(points)
+    if diagonal > MAX_DIAGONAL_MM:
+        hint = "looks like mm declared as cm or m, or an outlier vertex"
+        refuse(f"bounding box diagonal of {diagonal:.6g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
+    used = np.zeros(len(points), dtype=bool)
+    used[indices.reshape(-1)] = True
+    if not used.all():
+        points, indices = points[used], (np.cumsum(used, dtype=np.int32) - np.int32(1))[indices]
+    points.setflags(write=False)  # nobody else has it: it is taken as it is
+    mesh = TriangleMesh(points, indices)
+    diagonal = _diagonal(mesh.vertices)
+    if diagonal < MIN_DIAGONAL_MM:
+        hint = "looks like metres declared as mm" if diagonal > 0.0 else "all corners in one place"
+        refuse(f"bounding box diagonal of {diagonal:.4g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces[:FIRST]], 1, 0)
+    if not (np.cross(b - a, c - a).any() or mesh.areas.any()):
         what = f"none of the {len(indices)} triangles has an area"
         refuse(what, where, "at least one triangle with an area", "no_area")
     return mesh
@@ -186,12 +173,6 @@ def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> T
 def fits(mesh: TriangleMesh) -> bool:
     """Whether a mesh, mm, is no larger than one that `guard_mesh` accepts."""
     return _diagonal(mesh.vertices) <= MAX_DIAGONAL_MM
-
-
-def _areas(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Twice those of a few triangles, shape (m, 3, 3), mm."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
 def _index_array(faces: ArrayLike, n_vertices: int, *, where: str | Path) -> NDArray[np.int32]:
@@ -217,35 +198,9 @@ def _index_array(faces: ArrayLike, n_vertices: int, *, where: str | Path) -> NDA
     return np.ascontiguousarray(raw, dtype=np.int32)
 
 
-def _without_unused(points: NDArray[np.float64], indices: NDArray[np.int32]) -> TriangleMesh:
-    used = np.zeros(len(points), dtype=bool)
-    used[indices.reshape(-1)] = True
-    if not used.all():
-        points, indices = points[used], (np.cumsum(used, dtype=np.int32) - np.int32(1))[indices]
-    points.setflags(write=False)  # nobody else has it: it is taken as it is
-    return TriangleMesh(points, indices)
-
-
 def _diagonal(points: NDArray[np.float64]) -> float:
     columns = (points[:, axis] for axis in range(3))  # one by one: numpy is five times slower with axis=0
     return float(np.linalg.norm([np.ptp(column) for column in columns]))
-
-
-def _check_not_huge(points: NDArray[np.float64], *, where: str | Path) -> None:
-    farthest = float(max(-points.min(), points.max()))
-    if farthest > MAX_COORDINATE_MM:
-        refuse(f"a coordinate lies {farthest:.6g} mm from the origin", where, _EXTENT_ALLOWED, "too_far")
-    diagonal = _diagonal(points)
-    if diagonal > MAX_DIAGONAL_MM:
-        hint = "looks like mm declared as cm or m, or an outlier vertex"
-        refuse(f"bounding box diagonal of {diagonal:.6g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
-
-
-def _check_not_tiny(used: NDArray[np.float64], *, where: str | Path) -> None:
-    diagonal = _diagonal(used)
-    if diagonal < MIN_DIAGONAL_MM:
-        hint = "looks like metres declared as mm" if diagonal > 0.0 else "all corners in one place"
-        refuse(f"bounding box diagonal of {diagonal:.4g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
 
 
 MAX_TOKEN_LENGTH = 64
@@ -255,25 +210,15 @@ MAX_VERTICES = 3 * MAX_TRIANGLES
 
 
 class RawMesh(NamedTuple):
-    """One surface as its file states it; the guard has not seen it yet.
+    """One surface as its file states it; the guard has not seen it yet."""
 
-    Attributes:
-        vertices: Shape (n, 3), in the file's unit and space.
-        faces: Shape (m, 3), indices into ``vertices``.
-        space: What the file says of its axes, None if nothing.
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
-    space: Space | None = None
+    vertices: NDArray[np.float64]  # shape (n, 3), in the file's unit and space
+    faces: NDArray[np.int64]  # shape (m, 3), indices into ``vertices``
+    space: Space | None = None  # what the file says of its axes, None if nothing
 
 
 def token_array(tokens: list[str], where: str) -> NDArray[np.str_]:
-    """Tokens as an array of their widest one's width, shape (n,), which one endless token must not blow up.
-
-    Raises:
-        InputError: If a token is longer than any number or keyword.
-    """
+    """Tokens (n,) as an array of their widest one's width. Raises InputError: one is longer than any number or word."""
     longest = max(tokens, key=len, default="")
     if len(longest) > MAX_TOKEN_LENGTH:
         refuse(f"a word of {len(longest)} characters", where, f"numbers of at most {MAX_TOKEN_LENGTH}", "word_too_long")
@@ -281,17 +226,11 @@ def token_array(tokens: list[str], where: str) -> NDArray[np.str_]:
 
 
 def triangulate(corners: NDArray[np.int64], counts: NDArray[np.int64], where: str) -> NDArray[np.int64]:
-    """Triangles of polygons: each a fan from its first corner, which is exact for convex ones.
+    """Triangles (m, 3) of polygons: each a fan from its first corner, which is exact for convex ones.
 
     Args:
         corners: Shape (k,), the vertex indices of all polygons, one after the other.
         counts: Shape (p,), how many of them each polygon has; they sum to k.
-
-    Returns:
-        Shape (m, 3): count - 2 triangles per polygon, in the order of the polygons.
-
-    Raises:
-        InputError: If a polygon has fewer than three corners, or the triangles are too many.
     """
     if len(counts) == 0:
         refuse("no face", where, "at least one triangle", "empty")
@@ -303,12 +242,9 @@ def triangulate(corners: NDArray[np.int64], counts: NDArray[np.int64], where: st
     total = int(counts.sum() - 2 * len(counts))
     if total > MAX_TRIANGLES:
         refuse(f"{total} triangles", where, f"at most {MAX_TRIANGLES}", "too_many")
-    first = np.cumsum(counts) - counts
-    triangle_first = np.cumsum(counts - 2) - (counts - 2)
-    polygon = np.repeat(np.arange(len(counts)), counts - 2)
-    step = np.arange(total) - triangle_first[polygon]
-    start = first[polygon]
-    return np.stack([corners[start], corners[start + step + 1], corners[start + step + 2]], axis=1)
+    start = np.repeat(np.cumsum(counts) - counts, counts - 2)
+    second = start + 1 + np.arange(total) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2)
+    return np.stack([corners[start], corners[second], corners[second + 1]], axis=1)
 
 
 def join(parts: list[RawMesh]) -> RawMesh:

@@ -22,7 +22,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse, require_extra
 from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.guard import guard_transform
-from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.planning.geometry.rigid import exp_rotation, pose
 
 TEXT_ENDINGS, HDF5_ENDINGS = (".tfm", ".txt"), (".h5", ".hdf5")
 MAX_TEXT_BYTES = 100_000
@@ -43,32 +43,23 @@ def most_bytes(name: str) -> int:
 
 
 def parse_transform(data: bytes, path: Path) -> Floats:
-    """The rigid motion of points that a file states, shape (4, 4), mm.
-
-    Raises:
-        InputError: Another format or kind of transform, several of them, or one that is not rigid.
-    """
+    """The rigid motion of points (4, 4), mm, that a file states. Raises InputError: another, several, or not rigid."""
     name = str(path)
     if name.lower().endswith(HDF5_ENDINGS):
         stated = hdf5_transforms(data, name)
     elif name.lower().endswith(TEXT_ENDINGS):
-        stated = _text_transforms(data, name)
+        lines = [line.strip() for line in _LINE_END.split(decode_text(data, name)) if line.strip()]
+        if not lines or lines[0] != _HEADER:
+            refuse("not an ITK transform file", name, ALLOWED, "wrong_format")
+        stated = _text_transforms(lines, name)
     else:
         refuse(f"transform file of the kind {path.suffix!r}", path, ALLOWED, "unknown_format")
     return guard_transform(linear_motion(stated, name), where=path)
 
 
-def _text_transforms(data: bytes, where: str) -> list[StatedTransform]:
-    """The transforms of a text, in its order."""
-    lines = [line.strip() for line in _LINE_END.split(decode_text(data, where)) if line.strip()]
-    if not lines or lines[0] != _HEADER:
-        refuse("not an ITK transform file", where, ALLOWED, "wrong_format")
-    return [StatedTransform(kind, *(_numbers(one, key, where) for key in _KEYS)) for kind, one in _blocks(lines, where)]
-
-
-def _blocks(lines: list[str], where: str) -> list[tuple[str, dict[str, str]]]:
-    """The kind of each transform, and its values by their keys."""
-    blocks: list[tuple[str, dict[str, str]]] = []
+def _text_transforms(lines: list[str], where: str) -> list[StatedTransform]:
+    """The transforms of a text in its order; a key that is not stated has no numbers."""
+    blocks: list[tuple[str, dict[str, Floats]]] = []
     for line in lines:
         key, mark, value = (part.strip() for part in line.partition(":"))
         if line.startswith("#"):
@@ -78,17 +69,13 @@ def _blocks(lines: list[str], where: str) -> list[tuple[str, dict[str, str]]]:
         elif not blocks or key not in _KEYS or not mark or key in blocks[-1][1]:
             refuse(f"line {line[:60]!r}", where, ALLOWED, "unknown_line")
         else:
-            blocks[-1][1][key] = value
-    return blocks
-
-
-def _numbers(stated: dict[str, str], key: str, where: str) -> Floats:
-    words = stated.get(key, "").split()
-    try:
-        return np.array([float(word if _NUMBER.fullmatch(word) else f"not a number: {word}") for word in words])
-    except ValueError as error:
-        what = f"{key} are not numbers ({str(error)[:80]})"
-        raise InputError(what, where=where, allowed=ALLOWED, code="not_a_number") from error
+            try:
+                numbers = [float(one if _NUMBER.fullmatch(one) else f"not a number: {one}") for one in value.split()]
+            except ValueError as error:
+                what = f"{key} are not numbers ({str(error)[:80]})"
+                raise InputError(what, where=where, allowed=ALLOWED, code="not_a_number") from error
+            blocks[-1][1][key] = np.array(numbers)
+    return [StatedTransform(kind, *(one.get(key, np.empty(0)) for key in _KEYS)) for kind, one in blocks]
 
 
 def transform_text(T: Floats) -> str:
@@ -124,17 +111,11 @@ _VERSOR_SLACK = 1e-6
 
 
 class StatedTransform(NamedTuple):
-    """One transform as a file states it.
+    """One transform as a file states it."""
 
-    Attributes:
-        kind: ITK's name with precision and dimensions, such as ``AffineTransform_double_3_3``.
-        parameters: Shape (n,).
-        fixed: Shape (m,): the centre of rotation, mm, LPS; of Euler angles also the flag for their order.
-    """
-
-    kind: str
-    parameters: Floats
-    fixed: Floats
+    kind: str  # ITK's name with precision and dimensions, such as ``AffineTransform_double_3_3``
+    parameters: Floats  # shape (n,)
+    fixed: Floats  # shape (m,): the centre of rotation, mm, LPS; of Euler angles also the flag for their order
 
 
 def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
@@ -146,7 +127,8 @@ def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
         refuse("not a linear transform", where, ALLOWED, "no_linear_transform")
     T = np.eye(4)
     for part in parts:
-        _check_kind(part.kind, where)
+        if _LINEAR.fullmatch(part.kind) is None:
+            refuse(f"transform of type {part.kind[:60]!r}", where, ALLOWED, "unknown_type")
     if len(parts) > 1 and parts is stated:
         refuse("several transforms: harden them into one", where, ALLOWED, "several_transforms")
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by the guard
@@ -155,45 +137,23 @@ def linear_motion(stated: list[StatedTransform], where: str) -> Floats:
     return T
 
 
-def _check_kind(kind: str, where: str) -> None:
-    if _LINEAR.fullmatch(kind) is None:
-        refuse(f"transform of type {kind[:60]!r}", where, ALLOWED, "unknown_type")
-
-
 def _motion(stated: StatedTransform, where: str) -> Floats:
     """The motion of points by one part, shape (4, 4)."""
     name = stated.kind.partition("_")[0]
     count, fixed_counts = _SIZES.get(name, _MATRIX_SIZES)
-    _check_count(stated.parameters, (count,), "Parameters", where)
-    _check_count(stated.fixed, fixed_counts, "FixedParameters", where)
+    for numbers, counts, key in zip((stated.parameters, stated.fixed), ((count,), fixed_counts), _KEYS, strict=True):
+        if len(numbers) not in counts:
+            allowed = " or ".join(f"{one}" for one in counts) + " numbers"
+            refuse(f"{len(numbers)} {key}", where, allowed, "wrong_count")
     if name == "Euler3DTransform":
-        M = _euler(stated.parameters[:3], zyx=bool(stated.fixed[3:].any()))
+        x, y, z = map(exp_rotation, np.diag(stated.parameters[:3]))
+        M = z @ y @ x if stated.fixed[3:].any() else z @ x @ y
     elif name == "VersorRigid3DTransform":
         M = _versor(stated.parameters[:3], where)
     else:
         M = stated.parameters[:9].reshape(3, 3)
     centre = stated.fixed[:3]
     return pose(M, stated.parameters[-3:] + centre - M @ centre)
-
-
-def _check_count(numbers: Floats, counts: tuple[int, ...], key: str, where: str) -> None:
-    if len(numbers) not in counts:
-        refuse(f"{len(numbers)} {key}", where, " or ".join(f"{count}" for count in counts) + " numbers", "wrong_count")
-
-
-def _euler(angles: Floats, *, zyx: bool) -> Floats:
-    """Rotation by the angles about x, y and z, rad."""
-    x, y, z = (_about(axis, angle) for axis, angle in enumerate(angles))
-    product: Floats = z @ y @ x if zyx else z @ x @ y
-    return product
-
-
-def _about(axis: int, angle: float) -> Floats:
-    c, s = np.cos(angle), np.sin(angle)
-    R = np.eye(3)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    R[i, i], R[i, j], R[j, i], R[j, j] = c, -s, s, c
-    return R
 
 
 def _versor(v: Floats, where: str) -> Floats:
@@ -227,7 +187,7 @@ _AS_TEXT = (
 )
 
 
-def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
+def hdf5_transforms(content: bytes, where: str) -> list[StatedTransform]:
     """The transforms of a file in its order, linear or not; lists too long for a linear one come empty.
 
     A file has a group ``TransformGroup`` with groups ``0``, ``1``, ... of ``TransformType`` (one text),
@@ -239,74 +199,62 @@ def hdf5_transforms(data: bytes, where: str) -> list[StatedTransform]:
     require_extra("hdf5", where, else_allowed=_AS_TEXT)
     import h5py
 
-    try:
-        with h5py.File(BytesIO(data), "r") as file:
-            return [_transform(_Members(h5py, group, data, where), where) for group in _groups(h5py, file, where)]
-    except _DAMAGED as error:
-        what = f"not a complete HDF5 file ({str(error)[:120]})"
-        raise InputError(what, where=where, allowed=ALLOWED, code="file_damaged") from error
+    def own(parent: Any, name: str, kind: type) -> Any:
+        """A member of the file itself; a link could name any file of the host, and is refused."""
+        if not isinstance(parent.get(name, getlink=True), h5py.HardLink) or not isinstance(parent[name], kind):
+            refuse(f"{parent.name}/{name} is a link or of another type", where, ALLOWED, "wrong_format")
+        return parent[name]
 
+    def dataset(group: Any, name: str) -> Any:
+        data = own(group, name, h5py.Dataset)
+        if data.is_virtual or data.external:
+            refuse(f"{data.name} is in another file", where, ALLOWED, "data_elsewhere")
+        if data.size <= MAX_NUMBERS and data.id.get_storage_size() > MAX_STORED_BYTES:
+            refuse(f"{data.name} takes {data.id.get_storage_size()} bytes", where, ALLOWED, "file_size")
+        return data
 
-def _groups(h5py: Any, file: Any, where: str) -> list[Any]:
-    """The groups of the transforms by their numbers."""
-    if _GROUP not in file:
-        refuse(f"HDF5 without {_GROUP}", where, ALLOWED, "wrong_format")
-    parent = _own(h5py, file, _GROUP, h5py.Group, where)
-    if not 0 < len(parent) <= MAX_PARTS + 1:
-        what = f"{len(parent)} transforms"
-        refuse(what, where, f"1, or at most {MAX_PARTS} parts of a CompositeTransform", "wrong_count")
-    names = [str(number) for number in range(len(parent))]
-    if set(parent) != set(names):
-        what = f"{_GROUP} with {', '.join(sorted(parent))[:60]}"
-        refuse(what, where, f"transforms numbered {', '.join(names)}", "wrong_format")
-    return [_own(h5py, parent, name, h5py.Group, where) for name in names]
-
-
-def _own(h5py: Any, parent: Any, name: str, kind: type, where: str) -> Any:
-    """A member of the file itself; a link could name any file of the host, and is refused."""
-    if not isinstance(parent.get(name, getlink=True), h5py.HardLink) or not isinstance(parent[name], kind):
-        refuse(f"{parent.name}/{name} is a link or of another type", where, ALLOWED, "wrong_format")
-    return parent[name]
-
-
-class _Members:
-    """The members of one transform's group."""
-
-    def __init__(self, h5py: Any, group: Any, content: bytes, where: str) -> None:
-        self._h5py, self._group, self._content, self._where = h5py, group, content, where
-
-    def text(self, name: str) -> str:
+    def text(group: Any, name: str) -> str:
         """The one text of a dataset."""
-        if name not in self._group:
-            refuse(f"{self._group.name} without {name}", self._where, ALLOWED, "missing_key")
-        data = self._dataset(name)
-        info = self._h5py.check_string_dtype(data.dtype)
+        if name not in group:
+            refuse(f"{group.name} without {name}", where, ALLOWED, "missing_key")
+        data = dataset(group, name)
+        info = h5py.check_string_dtype(data.dtype)
         if data.size != 1 or info is None:
-            refuse(f"{data.name} is not a text", self._where, ALLOWED, "wrong_type")
-        if info.length is None:
-            return heap_text(self._content, data.id.get_offset())
-        return str(np.ravel(data.asstr()[()])[0])
+            refuse(f"{data.name} is not a text", where, ALLOWED, "wrong_type")
+        return heap_text(content, data.id.get_offset()) if info.length is None else str(np.ravel(data.asstr()[()])[0])
 
-    def numbers(self, names: tuple[str, ...]) -> Floats:
+    def numbers(group: Any, names: tuple[str, ...]) -> Floats:
         """The numbers of a dataset by either of its names; none where there is none or it is too large."""
-        there = [name for name in names if name in self._group]
+        there = [name for name in names if name in group]
         if len(there) > 1:
-            refuse(f"{self._group.name} with {' and '.join(there)}", self._where, ALLOWED, "stated_twice")
-        data = self._dataset(there[0]) if there else None
+            refuse(f"{group.name} with {' and '.join(there)}", where, ALLOWED, "stated_twice")
+        data = dataset(group, there[0]) if there else None
         if data is None or data.size > MAX_NUMBERS:
             return np.empty(0)
         if data.dtype not in (np.float64, np.float32) or data.ndim != 1:
             what = f"{data.name} of {data.dtype} with shape {data.shape}"
-            refuse(what, self._where, "a list of floats or doubles", "wrong_type")
+            refuse(what, where, "a list of floats or doubles", "wrong_type")
         return np.asarray(data[()], dtype=np.float64)
 
-    def _dataset(self, name: str) -> Any:
-        data = _own(self._h5py, self._group, name, self._h5py.Dataset, self._where)
-        if data.is_virtual or data.external:
-            refuse(f"{data.name} is in another file", self._where, ALLOWED, "data_elsewhere")
-        if data.size <= MAX_NUMBERS and data.id.get_storage_size() > MAX_STORED_BYTES:
-            refuse(f"{data.name} takes {data.id.get_storage_size()} bytes", self._where, ALLOWED, "file_size")
-        return data
+    try:
+        with h5py.File(BytesIO(content), "r") as file:
+            if _GROUP not in file:
+                refuse(f"HDF5 without {_GROUP}", where, ALLOWED, "wrong_format")
+            parent = own(file, _GROUP, h5py.Group)
+            if not 0 < len(parent) <= MAX_PARTS + 1:
+                what = f"{len(parent)} transforms"
+                refuse(what, where, f"1, or at most {MAX_PARTS} parts of a CompositeTransform", "wrong_count")
+            names = [str(number) for number in range(len(parent))]
+            if set(parent) != set(names):
+                what = f"{_GROUP} with {', '.join(sorted(parent))[:60]}"
+                refuse(what, where, f"transforms numbered {', '.join(names)}", "wrong_format")
+            groups = [own(parent, name, h5py.Group) for name in names]
+            return [
+                StatedTransform(text(one, _TYPE), numbers(one, _PARAMETERS), numbers(one, _FIXED)) for one in groups
+            ]
+    except _DAMAGED as error:
+        what = f"not a complete HDF5 file ({str(error)[:120]})"
+        raise InputError(what, where=where, allowed=ALLOWED, code="file_damaged") from error
 
 
 def heap_text(content: bytes, offset: int | None) -> str:
@@ -339,7 +287,3 @@ def _unpacked(layout: str, content: bytes, start: int) -> tuple[Any, ...]:
     if start + struct.calcsize(layout) > len(content):
         raise ValueError("an address beyond the end")
     return struct.unpack_from(layout, content, start)
-
-
-def _transform(members: _Members, where: str) -> StatedTransform:
-    return StatedTransform(members.text(_TYPE), members.numbers(_PARAMETERS), members.numbers(_FIXED))

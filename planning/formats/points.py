@@ -4,10 +4,7 @@ A CSV states its unit in the header (``name,x_mm,y_mm,z_mm``) and leaves the spa
 both. Whatever states a patient space arrives in LPS, in mm. Source: Slicer documentation, "Markups" module, file
 formats, and its published schema of versions 1.0.0 to 1.0.3; in older files the coordinate system is a number. Version
 1.0.0 knows no ``coordinateUnits``: Slicer works in mm.
-
-`joint_readings` is the one gate for joint angles and times, of a recording, a list of touches, a case's home or a live
-controller: angles that a joint can have, in the stated unit, at times that do not run backwards. Whose arm they are of
-is checked in `planning/arm/kinematics.py`.
+`joint_readings` is the one gate for joint angles: whose arm they are of is checked in `planning/arm/kinematics.py`.
 """
 
 from __future__ import annotations
@@ -20,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -72,7 +69,6 @@ class NamedPoints(Shown):
 
 MAX_FILE_BYTES = 10_000_000
 """A hundred thousand points; a larger file is no list of markers."""
-
 MOST_NAMED = 8
 """Points that a line about a list names."""
 
@@ -83,9 +79,6 @@ def read_points(path: Path, *, default_space: Space | None = None, default_unit:
     Args:
         default_space: The space of a file that states none: the case's, or None for a robot's base.
         default_unit: The unit of a file that states none; None refuses such a file.
-
-    Raises:
-        InputError: If it cannot be read, contradicts the caller, or its points fail the guard.
     """
     _reader(path, str(path))  # an unknown ending is refused before anything is read
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
@@ -95,11 +88,7 @@ def read_points(path: Path, *, default_space: Space | None = None, default_unit:
 def parse_points(
     data: bytes, path: Path, *, default_space: Space | None = None, default_unit: Unit | None = None
 ) -> NamedPoints:
-    """Parse a points file that has been read, like `read_points`; it is not opened again.
-
-    Raises:
-        InputError: As `read_points`, but for reading.
-    """
+    """Parse a points file that has been read, as `read_points` does; it is not opened again."""
     name = str(path)
     raw = _reader(path, name)(data, name)
     unit = raw.unit or default_unit
@@ -127,13 +116,7 @@ def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
 
 
 def write_points(path: Path, points: NamedPoints) -> None:
-    """A CSV with ``name,x_mm,y_mm,z_mm``, and joints, that reads back to the same numbers; whole, or not at all.
-
-    The space is not written: a CSV speaks in the space of its case.
-
-    Raises:
-        InputError: If the place cannot be written to.
-    """
+    """Write a CSV ``name,x_mm,y_mm,z_mm`` and joints, whole, in the space of its case; it reads back the same."""
     joints = points.joints is not None
     header = ["name", *(["kind"] if points.kinds else []), "x_mm", "y_mm", "z_mm"]
     header += JOINTS_DEG if joints else []
@@ -145,11 +128,7 @@ def write_points(path: Path, points: NamedPoints) -> None:
 
 
 def parse_triple(text: str, where: str, allowed: str = "X,Y,Z in mm") -> tuple[float, float, float]:
-    """Three numbers as they are typed, with commas between them.
-
-    Raises:
-        InputError: More or fewer, or one that is no finite number.
-    """
+    """Three numbers as they are typed, with commas between. Raises InputError: more or fewer, or none finite."""
     numbers = [parse_coordinate(part.strip(), where) for part in text.split(",")]
     if len(numbers) != 3:
         refuse(f"{len(numbers)} numbers", where, allowed, "wrong_count")
@@ -157,30 +136,19 @@ def parse_triple(text: str, where: str, allowed: str = "X,Y,Z in mm") -> tuple[f
 
 
 class RawPoints(NamedTuple):
-    """Points as their file states them; the guard has not seen them yet.
-
-    Attributes:
-        points: Three coordinates per point, in ``unit`` and ``space``.
-        unit: None if the file states none.
-        space: None if the file states none.
-        kinds: One per point, if the file has them.
-        joints_deg: Six joint angles per point, if the file says how the robot stood there.
-    """
+    """Points as their file states them; the guard has not seen them yet."""
 
     names: list[str]
-    points: list[tuple[float, float, float]]
-    unit: Unit | None
-    space: Space | None
-    kinds: tuple[str, ...] | None = None
+    points: list[tuple[float, float, float]]  # three coordinates per point, in ``unit`` and ``space``
+    unit: Unit | None  # None if the file states none
+    space: Space | None  # None if the file states none
+    kinds: tuple[str, ...] | None = None  # one per point, if the file has them
+    # six joint angles per point, if the file says how the robot stood there
     joints_deg: list[tuple[float, ...]] | None = None
 
 
 def parse_coordinate(text: str, where: str) -> float:
-    """A finite decimal number.
-
-    Raises:
-        InputError: If the text is anything else, such as a decimal comma, NaN or an empty field.
-    """
+    """A finite decimal number. Raises InputError: anything else, such as a decimal comma, NaN or an empty field."""
     allowed = "a finite number with a decimal point"
     if "_" in text:  # Python would read 1_0 as 10
         refuse(f"{text[:40]!r} is not a number", where, allowed, "not_a_number")
@@ -212,49 +180,6 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
     if not rows:
         refuse("no line", where, _ALLOWED, "empty")
     header = [field.strip() for field in rows[0].fields]
-    unit = _unit(header, where)
-    columns = {name.partition("_")[0]: index for index, name in enumerate(header)}
-    for line, fields in rows[1:]:
-        if len(fields) != len(header):
-            refuse(f"{len(fields)} fields instead of {len(header)}", f"{where}, line {line}", _ALLOWED, "ragged_row")
-        if not fields[columns["name"]].strip():
-            refuse("the name is empty", f"{where}, line {line}", _ALLOWED, "bad_name")
-    points = [
-        tuple(parse_coordinate(fields[columns[axis]], f"{where}, line {line}") for axis in "xyz")
-        for line, fields in rows[1:]
-    ]
-    return RawPoints(
-        names=[fields[columns["name"]].strip() for _, fields in rows[1:]],
-        points=[(x, y, z) for x, y, z in points],
-        unit=unit,
-        space=None,
-        kinds=tuple(f[columns["kind"]].strip() for _, f in rows[1:]) if "kind" in columns else None,
-        joints_deg=[
-            tuple(row_numbers(fields, header, JOINTS_DEG, f"{where}, line {line}")) for line, fields in rows[1:]
-        ]
-        if "q1" in columns
-        else None,
-    )
-
-
-def csv_lines(data: bytes, where: str, allowed: str) -> Iterator[CsvLine]:
-    """The lines of a CSV that are not empty.
-
-    Raises:
-        InputError: It is no CSV; names the line, and what is ``allowed``.
-    """
-    reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
-    try:
-        for fields in reader:
-            if any(field.strip() for field in fields):
-                yield CsvLine(reader.line_num, fields)
-    except csv.Error as error:
-        place = f"{where}, line {reader.line_num}"
-        raise InputError(f"is not a CSV file ({error})", where=place, allowed=allowed, code="not_csv") from error
-
-
-def _unit(header: list[str], where: str) -> Unit | None:
-    """The one unit of the three coordinate columns, None if they have none."""
     units: dict[str, str] = {}
     for name in header:
         axis = re.fullmatch(r"([xyz])(?:_(\w+))?", name)
@@ -270,54 +195,83 @@ def _unit(header: list[str], where: str) -> Unit | None:
     if len(set(units.values())) != 1:
         refuse(f"mixed units {sorted(set(units.values()))}", f"{where}, header", _ALLOWED, "mixed_units")
     text = units["x"]
-    return parse_unit(text, where=f"{where}, header") if text else None
+    unit = parse_unit(text, where=f"{where}, header") if text else None
+    columns = {name.partition("_")[0]: index for index, name in enumerate(header)}
+    names, points, kinds, turned = [], [], [], []
+    for line, fields in rows[1:]:
+        place = f"{where}, line {line}"
+        if len(fields) != len(header):
+            refuse(f"{len(fields)} fields instead of {len(header)}", place, _ALLOWED, "ragged_row")
+        if not fields[columns["name"]].strip():
+            refuse("the name is empty", place, _ALLOWED, "bad_name")
+        names.append(fields[columns["name"]].strip())
+        x, y, z = (parse_coordinate(fields[columns[axis]], place) for axis in "xyz")
+        points.append((x, y, z))
+        if "kind" in columns:
+            kinds.append(fields[columns["kind"]].strip())
+        if joints:
+            turned.append(tuple(row_numbers(fields, header, JOINTS_DEG, place)))
+    return RawPoints(names, points, unit, None, tuple(kinds) if "kind" in columns else None, turned or None)
+
+
+def csv_lines(data: bytes, where: str, allowed: str) -> Iterator[CsvLine]:
+    """The lines of a CSV that are not empty. Raises InputError: it is none; names the line, and what is ``allowed``."""
+    reader = csv.reader(io.StringIO(decode_text(data, where), newline=""), strict=True)
+    try:
+        for fields in reader:
+            if any(field.strip() for field in fields):
+                yield CsvLine(reader.line_num, fields)
+    except csv.Error as error:
+        place = f"{where}, line {reader.line_num}"
+        raise InputError(f"is not a CSV file ({error})", where=place, allowed=allowed, code="not_csv") from error
 
 
 _MARKUPS_ALLOWED = "one Slicer markup of type Fiducial or Line with labelled, defined control points"
-
-_LINE_POINTS = 2
-
 _SPACES = {"LPS": Space.LPS, "RAS": Space.RAS, "0": Space.RAS, "1": Space.LPS}
-
 _FCSV_ALLOWED = "a Slicer fiducial list with '# CoordinateSystem = ' and '# columns = id,x,y,z,...,label,...'"
-
 _FCSV_DEFINED = "2"
 """Slicer 5 writes two fields more than its header names: whether the position is defined (2), and one other."""
-
 _FCSV_SYSTEM = "# coordinatesystem"
-
 _FCSV_COLUMNS = "# columns"
 
 
 def read_markups_points(data: bytes, where: str) -> RawPoints:
-    """The control points of a Slicer markups file: a list of fiducials, or a line, each by its label.
-
-    Which end of a line is the target no file says: the case names it by its label.
-    """
+    """The points of a Slicer markups file, fiducials or the ends of a line, by label: the case names the target's."""
     tree = parse_json(data, where=where, allowed=_MARKUPS_ALLOWED)
     markups = tree.get("markups") if isinstance(tree, dict) else None
     if not isinstance(markups, list) or len(markups) != 1 or not isinstance(markups[0], dict):
         refuse("not exactly one entry in 'markups'", where, _MARKUPS_ALLOWED, "wrong_count")
     markup = markups[0]
-    points = _control_points(markup, where)
-    places = [f"{where}, control point {number}" for number in range(1, len(points) + 1)]
-    return RawPoints(
-        names=[_label(point, place) for point, place in zip(points, places, strict=True)],
-        points=[_position(point, place) for point, place in zip(points, places, strict=True)],
-        unit=_slicer_unit(markup.get("coordinateUnits"), where),
-        space=_space(markup.get("coordinateSystem"), where),
-    )
-
-
-def _control_points(markup: dict[str, Any], where: str) -> list[Any]:
-    kind, points = markup.get("type", "Fiducial"), markup.get("controlPoints")
+    kind, listed = markup.get("type", "Fiducial"), markup.get("controlPoints")
     if kind not in ("Fiducial", "Line"):
         refuse(f"markup of type {str(kind)[:40]!r}", where, _MARKUPS_ALLOWED, "unknown_type")
-    if not isinstance(points, list) or not points:
+    if not isinstance(listed, list) or not listed:
         refuse("no control point", where, _MARKUPS_ALLOWED, "empty")
-    if kind == "Line" and len(points) != _LINE_POINTS:
-        refuse(f"a line of {len(points)} control points", where, "both ends of a line: 2 control points", "wrong_count")
-    return points
+    if kind == "Line" and len(listed) != 2:
+        refuse(f"a line of {len(listed)} control points", where, "both ends of a line: 2 control points", "wrong_count")
+    names, points = [], []
+    for number, point in enumerate(listed, start=1):
+        place = f"{where}, control point {number}"
+        label = point.get("label") if isinstance(point, dict) else None
+        if not isinstance(label, str) or not label.strip():
+            refuse(f"label {str(label)[:40]!r}", place, "a label that is not empty", "bad_name")
+        names.append(label.strip())
+        status, position = point.get("positionStatus", "defined"), point.get("position")
+        if status != "defined":
+            refuse(f"positionStatus is {str(status)[:40]!r}", place, '"defined"', "point_undefined")
+        numbers = [one for one in position if type(one) in (int, float)] if isinstance(position, list) else []
+        if len(numbers) != 3 or len(position) != 3:
+            refuse(f"position {str(position)[:60]!r}", place, "three numbers", "not_a_number")
+        x, y, z = (parse_coordinate(str(value), place) for value in numbers)
+        points.append((x, y, z))
+    stated = markup.get("coordinateUnits")
+    stated = "mm" if stated is None else stated  # the schema's default
+    text = stated[0] if isinstance(stated, list) and stated else stated
+    if not isinstance(text, str):
+        what = f"coordinateUnits {str(stated)[:40]!r}"
+        refuse(what, where, 'such as "mm" or ["mm", "UCUM", "millimeter"]', "unknown_unit")
+    unit = parse_unit(text, where=where)
+    return RawPoints(names, points, unit, _space(markup.get("coordinateSystem"), where))
 
 
 def read_fcsv_points(data: bytes, where: str) -> RawPoints:
@@ -332,7 +286,10 @@ def read_fcsv_points(data: bytes, where: str) -> RawPoints:
         if not line.strip() or line.startswith("#"):
             continue
         place = f"{where}, line {number}"
-        fields = _fcsv_fields(line, place)
+        try:
+            fields = next(csv.reader([line], strict=True))
+        except csv.Error as error:
+            raise InputError(f"{error}", where=place, allowed=_FCSV_ALLOWED, code="not_csv") from error
         if len(fields) - len(columns) not in (0, 2):
             refuse(f"{len(fields)} fields instead of {len(columns)}", place, _FCSV_ALLOWED, "ragged_row")
         if (status := (*fields, _FCSV_DEFINED)[len(columns)]) != _FCSV_DEFINED:
@@ -350,76 +307,27 @@ def _space(value: object, where: str) -> Space:
     return _SPACES[key]
 
 
-def _slicer_unit(value: object, where: str) -> Unit:
-    """From "mm", or a coded entry such as ["mm", "UCUM", "millimeter"]; mm, the schema's default, if there is none."""
-    if value is None:
-        return Unit.MM
-    text = value[0] if isinstance(value, list) and value else value
-    if not isinstance(text, str):
-        what = f"coordinateUnits {str(value)[:40]!r}"
-        refuse(what, where, 'such as "mm" or ["mm", "UCUM", "millimeter"]', "unknown_unit")
-    return parse_unit(text, where=where)
-
-
-def _label(point: object, where: str) -> str:
-    label = point.get("label") if isinstance(point, dict) else None
-    if not isinstance(label, str) or not label.strip():
-        refuse(f"label {str(label)[:40]!r}", where, "a label that is not empty", "bad_name")
-    return label.strip()
-
-
-def _position(point: dict[str, Any], where: str) -> tuple[float, float, float]:
-    status = point.get("positionStatus", "defined")
-    if status != "defined":
-        refuse(f"positionStatus is {str(status)[:40]!r}", where, '"defined"', "point_undefined")
-    position = point.get("position")
-    if not isinstance(position, list) or len(position) != 3:
-        refuse(f"position {str(position)[:60]!r}", where, "three numbers", "not_a_number")
-    for value in position:
-        if not isinstance(value, (int, float)) or isinstance(value, bool):
-            refuse(f"position {str(position)[:60]!r}", where, "three numbers", "not_a_number")
-    x, y, z = (parse_coordinate(str(value), where) for value in position)
-    return x, y, z
-
-
 def _fcsv_value(lines: list[str], key: str) -> str | None:
     found = [line.partition("=")[2].strip() for line in lines if line.lower().startswith(key)]
     return found[0] if len(found) == 1 else None
 
 
-def _fcsv_fields(line: str, where: str) -> list[str]:
-    try:
-        return next(csv.reader([line], strict=True))
-    except csv.Error as error:
-        raise InputError(f"{error}", where=where, allowed=_FCSV_ALLOWED, code="not_csv") from error
-
-
 _READERS: Mapping[str, Callable[[bytes, str], RawPoints]] = MappingProxyType(
     {".csv": read_csv_points, ".mrk.json": read_markups_points, ".fcsv": read_fcsv_points}
 )
-
 AngleUnit = Literal["rad", "deg"]
-
 JOINTS_DEG = tuple(f"q{number}_deg" for number in range(1, 7))
-
 JOINTS_RAD = tuple(f"q{number}_rad" for number in range(1, 7))
-
 RTDE_JOINTS = tuple(f"actual_q_{number}" for number in range(6))
-
 RTDE_TOOL = tuple(f"actual_TCP_pose_{number}" for number in range(3))
 """Where the controller has its tool, m, base frame."""
-
 TORQUES = tuple(f"tau{number}_nm" for number in range(1, 7)), tuple(f"target_moment_{number}" for number in range(6))
 """Columns of joint torques, N m: ours, and RTDE's."""
-
 TIMES = ("time_s", "timestamp")
-
 MOST_RAD = np.radians([363.0, 363.0, 363.0, 363.0, 363.0, 720.0])
 """A UR's joint reads a whole turn to either side, and 3 degrees that its limits leave; wrist 3 may turn on."""
-
 WHOLE_TURN = 2.0 * np.pi + 0.05
 """Six angles that all lie within it are none in degrees: an arm that lies stretched out, or radians."""
-
 _ALLOWED_JOINTS = "six angles, q1_deg to q6_deg, q1_rad to q6_rad or RTDE's actual_q_0 to actual_q_5, one row per pose"
 
 
@@ -443,9 +351,6 @@ def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, nam
 
     Args:
         values: Shape (n, 6), in the unit.
-
-    Raises:
-        InputError: Not six finite angles each, beyond what a joint can read, or plainly in the other unit.
     """
     given = np.asarray(values)
     if given.dtype.kind not in "iuf" or given.ndim != 2 or given.shape[1] != 6 or not np.isfinite(given).all():
@@ -475,15 +380,6 @@ def plainly_radians(angles_deg: ArrayLike) -> bool:
     return 0.0 < most <= WHOLE_TURN
 
 
-def check_times(time_s: Floats, *, where: str | Path) -> None:
-    """Refuse times (n,) that run backwards."""
-    back = np.flatnonzero(np.diff(time_s) < 0.0)
-    if len(back):
-        row = int(back[0])
-        what = f"row {row + 2}: time goes backwards, from {time_s[row]:g} to {time_s[row + 1]:g} s"
-        refuse(what, where, "rows in order of time", "times_not_rising")
-
-
 def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecording:
     """The joints of a CSV: a header, then a row a pose; other columns and lines with # do not count.
 
@@ -491,9 +387,6 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
 
     Args:
         timed: Whether it must hold times.
-
-    Raises:
-        InputError: A column is missing, something is no number, or the angles or times are of no arm.
     """
     lines = [line for line in decode_text(data, str(path)).splitlines() if line.strip() and not line.startswith("#")]
     comma = bool(lines) and "," in lines[0]
@@ -502,7 +395,13 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     except csv.Error as error:
         raise InputError(f"is not a CSV file ({error})", where=path, allowed=_ALLOWED_JOINTS, code="not_csv") from error
     header = [cell.strip().strip('"') for cell in rows[0]] if rows else []
-    joints, unit = _joint_columns(header, path)
+    kinds: tuple[tuple[tuple[str, ...], AngleUnit], ...]
+    kinds = (JOINTS_RAD, "rad"), (JOINTS_DEG, "deg"), (RTDE_JOINTS, "rad")
+    joints, unit = max(kinds, key=lambda kind: sum(name in header for name in kind[0]))
+    missing = [name for name in joints if name not in header]
+    if missing:
+        what = "no joints" if len(missing) == len(joints) else f"lacks {', '.join(missing)}"
+        refuse(what, path, _ALLOWED_JOINTS, "missing_column")
     time = next((name for name in TIMES if name in header), None)
     if timed and time is None:
         refuse(f"lacks {' or '.join(TIMES)}", path, _ALLOWED_JOINTS, "missing_column")
@@ -516,44 +415,25 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     q = joint_readings(table[:, :6], unit, where=path, names=names)
     times = table[:, 6] if time else None
     if times is not None:
-        check_times(times, where=path)
+        back = np.flatnonzero(np.diff(times) < 0.0)
+        if len(back):
+            row = int(back[0])
+            what = f"row {row + 2}: time goes backwards, from {times[row]:g} to {times[row + 1]:g} s"
+            refuse(what, path, "rows in order of time", "times_not_rising")
     names = names or tuple(str(i) for i in range(1, len(rows)))
     torque_nm = table[:, 6 + bool(time) :][:, :6] if torques else None
     return JointRecording(names, q, times, 1000.0 * table[:, -3:] if tool else None, torque_nm)
 
 
-def _joint_columns(header: Sequence[str], path: Path) -> tuple[tuple[str, ...], AngleUnit]:
-    """The columns of the joints, and the unit of their angles."""
-    kinds: tuple[tuple[tuple[str, ...], AngleUnit], ...] = (
-        (JOINTS_RAD, "rad"),
-        (JOINTS_DEG, "deg"),
-        (RTDE_JOINTS, "rad"),
-    )
-    columns, unit = max(kinds, key=lambda kind: sum(name in header for name in kind[0]))
-    missing = [name for name in columns if name not in header]
-    if missing:
-        what = "no joints" if len(missing) == len(columns) else f"lacks {', '.join(missing)}"
-        refuse(what, path, _ALLOWED_JOINTS, "missing_column")
-    return columns, unit
-
-
 def row_numbers(row: Sequence[str], header: Sequence[str], wanted: Sequence[str], where: str) -> list[float]:
-    """The numbers of one row of a table in the columns that are wanted.
-
-    Raises:
-        InputError: More or fewer fields than the header has, or one that is no finite number.
-    """
+    """A row's numbers in the columns wanted. Raises InputError: fields unlike the header, or one that is not finite."""
     if len(row) != len(header):
         refuse(f"{len(row)} fields", where, f"{len(header)} fields, as in the header", "ragged_row")
     return [parse_coordinate(row[header.index(name)].strip(), f"{where}, {name}") for name in wanted]
 
 
 def named_points(points: NamedPoints | Mapping[str, ArrayLike], where: str) -> NamedPoints:
-    """Named points, from whichever form.
-
-    Raises:
-        InputError: A point that is not three finite numbers.
-    """
+    """Named points, from whichever form. Raises InputError: a point that is not three finite numbers."""
     if isinstance(points, NamedPoints):
         return points
     if not all(isinstance(name, str) for name in points):
@@ -562,9 +442,5 @@ def named_points(points: NamedPoints | Mapping[str, ArrayLike], where: str) -> N
 
 
 def typed_point(point: ArrayLike, where: str) -> str:
-    """A point, shape (3,), mm, as it is typed on a command line.
-
-    Raises:
-        InputError: It is not three finite numbers.
-    """
+    """A point, shape (3,), mm, as it is typed on a command line. Raises InputError: it is not three finite numbers."""
     return ",".join(map(repr, named_points({"point": point}, where).points[0].tolist()))

@@ -52,9 +52,6 @@ def parse_table(
         fits: Whether the groups that are there belong together.
         example: Groups of a usual file, for the error.
         texts: Groups of one column that is text.
-
-    Raises:
-        InputError: Another header, no row, a row of another length, or a field that is no finite number.
     """
     allowed = ", ".join((first, *(column for group in example for column in groups[group])))
     lines = [one for one in csv_lines(content, str(path), allowed) if not one.fields[0].startswith("#")]
@@ -104,11 +101,7 @@ def pose_values(T: Floats) -> Floats:
 
 
 def finite_rows(values: Floats, what: str, names: Sequence[str], *, widths: tuple[int, ...]) -> Floats:
-    """A copy of an array with a row per pose, shape (n, k), k one of ``widths``; read-only.
-
-    Raises:
-        InputError: Another shape, or a number that is not finite or out of range; names the pose.
-    """
+    """A read-only copy of an array with a row per pose, shape (n, k), k one of ``widths``, all finite and in range."""
     array = np.array(values, dtype=np.float64)
     if array.ndim != 2 or len(array) != len(names) or array.shape[1] not in widths:
         wanted = " or ".join(f"({len(names)}, {width})" for width in widths)
@@ -121,11 +114,7 @@ def finite_rows(values: Floats, what: str, names: Sequence[str], *, widths: tupl
 
 
 def rigid_poses(T: Floats, what: str, names: Sequence[str]) -> Floats:
-    """A copy of poses (n, 4, 4) that are rigid motions; read-only.
-
-    Raises:
-        InputError: Another shape, or one that is no rigid motion; names the pose.
-    """
+    """A read-only copy of poses (n, 4, 4). Raises InputError: another shape, or one that is no rigid motion."""
     array = np.array(T, dtype=np.float64)
     if array.shape != (len(names), 4, 4):
         refuse(f"{what} has shape {array.shape}", "recording", f"({len(names)}, 4, 4)", "wrong_shape")
@@ -140,11 +129,7 @@ def rigid_poses(T: Floats, what: str, names: Sequence[str]) -> Floats:
 
 
 def pose_names(names: Sequence[str], n: int) -> tuple[str, ...]:
-    """Names of n poses; numbers where none are given.
-
-    Raises:
-        InputError: No pose, or a name that is missing or used twice.
-    """
+    """Names of n poses; numbers where none are given. Raises InputError: no pose, or a name missing or used twice."""
     names = tuple(names) or tuple(str(i + 1) for i in range(n))
     if n == 0 or len(names) != n or len(set(names)) != n:
         refuse(f"{n} poses and {len(set(names))} different names", "recording", "one name per pose", "duplicate_name")

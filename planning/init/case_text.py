@@ -78,30 +78,20 @@ structures = {count}  # the last line: a truncated file lacks it
 
 @dataclass(frozen=True, eq=False)
 class CaseParts:
-    """What a new case is made of.
-
-    Attributes:
-        target_ct: Shape (3,), LPS mm.
-        structure: Which holds the target, or None.
-        hit_radius_mm: Of the ball that is hit, where none does.
-        ct: The CT, or None.
-        skin: What the skin is, for a person: the CT, or a structure.
-        left_out: The files that a person states to be left out.
-        keys: Key of the case to its value, where a person states it.
-    """
+    """What a new case is made of."""
 
     name: str
     space: Space
     region: str
-    target_ct: Floats
-    structure: str | None
-    hit_radius_mm: float
-    ct: str | None
-    skin: str
+    target_ct: Floats  # shape (3,), LPS mm
+    structure: str | None  # which holds the target, or None
+    hit_radius_mm: float  # of the ball that is hit, where none does
+    ct: str | None  # the CT, or None
+    skin: str  # what the skin is, for a person: the CT, or a structure
     sources: tuple[tuple[Segmentation, Sequence[Assigned]], ...]
     markers: tuple[Markers, ...]
-    left_out: tuple[str, ...]
-    keys: Mapping[str, str]
+    left_out: tuple[str, ...]  # the files that a person states to be left out
+    keys: Mapping[str, str]  # key of the case to its value, where a person states it
 
     @property
     def rows(self) -> list[Assigned]:
@@ -124,9 +114,22 @@ def case_text(parts: CaseParts) -> str:
     skin = "" if parts.ct is None else (CT_BESIDE if of_structure else SKIN_OF_CT).format(ct=quoted(parts.ct))
     count = sum(row.kind != "ignore" for row in parts.rows) + (not of_structure)
     sections = "\n".join(segmentation.section(rows) for segmentation, rows in parts.sources)
-    errors = _errors_text([segmentation for segmentation, _ in parts.sources])
+    sources = [segmentation for segmentation, _ in parts.sources]
+    # What may be taken for declared of contours: of voxels their own, of meshes a question.
+    voxels, meshes = ([one for one in sources if (one.voxel_ct is None) == mesh] for mesh in (False, True))
+    model = error_model(ErrorsSection(), space=Space.LPS)
+    off = [np.sqrt(np.linalg.eigvalsh(model.surface_cov_ct(one.voxel_ct))[-1]) for one in voxels]
+    stated = ((OF_VOXELS, voxels), (OF_MESHES, meshes))
+    reasons = [text.format(sources=", ".join(one.source for one in some)) for text, some in stated if some]
+    errors = ERRORS.format(known=f"{max(off):.2f}" if off else "0.5", reason="; ".join(reasons))
+    markers = ""
+    for first in parts.markers[:1]:
+        same = (one.source for one in parts.markers[1:] if set(one.points.names) == set(first.points.names))
+        json = first.source.endswith(".json")
+        own = "its file states the space" if json else f"read in {parts.space}, the case's space"
+        markers = REGISTRATION.format(ct=quoted(first.source), base=quoted(next(same, "touch.csv")), space=own)
     gone = "".join(LEFT_OUT.format(file=quoted(one)) for one in parts.left_out)
-    text = head + skin + gone + sections + _markers_text(parts.markers, parts.space) + errors + END.format(count=count)
+    text = head + skin + gone + sections + markers + errors + END.format(count=count)
     return with_keys(text, parts.keys)
 
 
@@ -158,27 +161,7 @@ def with_image_seen(text: str, anatomy: Anatomy) -> str:
     return with_line(text, "ct", seen)
 
 
-def _errors_text(sources: Sequence[Segmentation]) -> str:
-    """What may be taken for declared of contours: of voxels their own, of meshes a question."""
-    voxels, meshes = ([one for one in sources if (one.voxel_ct is None) == mesh] for mesh in (False, True))
-    model = error_model(ErrorsSection(), space=Space.LPS)
-    off = [np.sqrt(np.linalg.eigvalsh(model.surface_cov_ct(one.voxel_ct))[-1]) for one in voxels]
-    parts = ((OF_VOXELS, voxels), (OF_MESHES, meshes))
-    reasons = [text.format(sources=", ".join(one.source for one in some)) for text, some in parts if some]
-    return ERRORS.format(known=f"{max(off):.2f}" if off else "0.5", reason="; ".join(reasons))
-
-
 def case_name(folder: str) -> str:
     """A folder's name as a case may be called."""
     plain = re.sub(r"[^\w.\-]+", "_", unicodedata.normalize("NFC", folder)).strip("_.-")[:80]
     return plain or "case"
-
-
-def _markers_text(markers: Sequence[Markers], space: Space) -> str:
-    if not markers:
-        return ""
-    base = next(
-        (one.source for one in markers[1:] if set(one.points.names) == set(markers[0].points.names)), "touch.csv"
-    )
-    own = "its file states the space" if markers[0].source.endswith(".json") else f"read in {space}, the case's space"
-    return REGISTRATION.format(ct=quoted(markers[0].source), base=quoted(base), space=own)

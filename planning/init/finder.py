@@ -66,22 +66,14 @@ LEAST_MARKERS = 3
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the user says of the files.
+    """What the user says of the files."""
 
-    Attributes:
-        space: Of meshes, and of lists that do not say theirs.
-        naming: Of label maps without names.
-        up: The axis of meshes that is up.
-        ct: The CT, where there are several.
-        segmentation: The label map or folder, where there are several.
-    """
-
-    space: Space
-    naming: str | None = None
+    space: Space  # of meshes, and of lists that do not say theirs
+    naming: str | None = None  # of label maps without names
     unit: Unit | None = None
-    ct: str | None = None
-    segmentation: str | None = None
-    up: Up | None = None
+    ct: str | None = None  # the CT, where there are several
+    segmentation: str | None = None  # the label map or folder, where there are several
+    up: Up | None = None  # the axis of meshes that is up
     overrides: Overrides = field(default_factory=Overrides)
 
     def takes(self, kind: str, name: str) -> bool:
@@ -110,29 +102,19 @@ class Markers:
 
 @dataclass(eq=False)
 class Found:
-    """What a folder holds.
-
-    Attributes:
-        markers: Lists of at least three points.
-        problems: What could not be read or told, one line each.
-        passed: What was not read, with the reason.
-        drawn: DICOM files of structures, which are read once the CT is known.
-    """
+    """What a folder holds."""
 
     cts: list[Ct] = field(default_factory=list)
     segmentations: list[Segmentation] = field(default_factory=list)
-    markers: list[Markers] = field(default_factory=list)
-    problems: list[InputError] = field(default_factory=list)
-    passed: list[tuple[str, str]] = field(default_factory=list)
+    markers: list[Markers] = field(default_factory=list)  # lists of at least three points
+    problems: list[InputError] = field(default_factory=list)  # what could not be read or told, one line each
+    passed: list[tuple[str, str]] = field(default_factory=list)  # what was not read, with the reason
+    # DICOM files of structures, which are read once the CT is known
     drawn: list[tuple[str, Kind]] = field(default_factory=list)
 
 
 def find(place: Place, wanted: Wanted) -> Found:
-    """Look through a folder and the folders below it, `DEPTH` levels deep.
-
-    Raises:
-        InputError: A folder that cannot be read, or is no patient's.
-    """
+    """Look through a folder and those below it, `DEPTH` deep. Raises InputError: one is unreadable, or no patient's."""
     found = Found()
     for folder, listed, entered in _folders(place.folder, DEPTH):
         _Looker(place, wanted, folder, listed, found).look(entered)
@@ -160,11 +142,8 @@ class _Looker:
     """Asks each kind's recogniser about one folder."""
 
     def __init__(self, place: Place, wanted: Wanted, folder: Path, listed: tuple[Entry, ...], found: Found) -> None:
-        self._place = place
-        self._wanted = wanted
-        self._found = found
-        self._folder = folder
-        self._listed = listed
+        self._place, self._wanted, self._found = place, wanted, found
+        self._folder, self._listed = folder, listed
         self._source = folder.relative_to(place.folder).as_posix()
         self._names = [self._name(one.name) for one in listed if one.what == FILE]
         self._read: set[str] = set()
@@ -185,10 +164,21 @@ class _Looker:
         self._volumes(volumes)
         if meshes and not volumes:
             self._only = "meshes"
-        self._meshes([name for name in meshes if self._wanted.takes("labels", name)])
+        wanted = self._wanted
+        if taken := [name for name in meshes if wanted.takes("labels", name)]:
+            with self._noting("FILE"):
+                found = mesh_folder(self._place, self._source, taken, wanted.space, wanted.unit, wanted.up)
+                self._found.segmentations.append(found)
         for name in self._names:
             if name.lower().endswith(POINT_ENDINGS):
-                self._points(name)
+                try:
+                    points = read_points(self._place.folder / name, default_space=wanted.space, default_unit=Unit.MM)
+                except InputError as error:
+                    if not name.lower().endswith(".csv"):  # other tables are no lists of points, and no problem
+                        self._found.passed.append((name, error.what))
+                    continue
+                if len(points.names) >= LEAST_MARKERS:
+                    self._found.markers.append(Markers(name, points))
         self._account()
 
     def _hollow(self, name: str) -> bool:
@@ -208,18 +198,17 @@ class _Looker:
         images = {structure_name(one) for one in (*(ct.source for ct in self._found.cts), *dict(self._found.passed))}
         of_image = [one for one in self._listed if one.name.endswith(".npz") and one.name[:-4] in images]
         left = [*unaccounted(self._folder, self._listed, known), *of_image]  # nnU-Net's stand beside labels
-        wanted = [one for one in left if self._wanted.takes("labels", self._name(one.name))]
-        lost = {one.name: said for one in wanted if (said := one if self._only else self._like_structure(one))}
+        lost: dict[str, Entry] = {}
+        for one in left:
+            if self._wanted.takes("labels", self._name(one.name)):
+                if not self._only and one.what == FOLDER and (below := structure_below(self._folder / one.name)):
+                    lost[one.name] = one._replace(what=f"is nested too deep to search, with {below}")
+                elif self._only or STRUCTURE_LIKE.search(one.name):
+                    lost[one.name] = one
         if lost:
             with self._noting(self._name(next(iter(lost)))):
                 raise not_read([*lost.values()], self._only or "files", self._folder)
         self._found.passed += [(self._name(one.name), one.what or NOT_READ) for one in left if one.name not in lost]
-
-    def _like_structure(self, one: Entry) -> Entry | None:
-        """An entry that is named like a structure, or a folder too deep to be looked through that holds one."""
-        if one.what == FOLDER and (below := structure_below(self._folder / one.name)):
-            return one._replace(what=f"is nested too deep to search, with {below}")
-        return one if STRUCTURE_LIKE.search(one.name) else None
 
     def _dicom(self) -> None:
         """Each CT series of the folder: it is named by the folder, or where there are several by a file of each."""
@@ -243,13 +232,12 @@ class _Looker:
         self._found.passed += [(self._source, f"{count} {kind}") for kind, count in sorted(others.items())]
 
     @contextmanager
-    def _noting(self, name: str = "") -> Iterator[None]:
+    def _noting(self, name: str) -> Iterator[None]:
         """What is refused within is a problem, one of all; a file can be left out."""
         try:
             yield
         except InputError as error:
-            way = f"; or --ignore {name}: its content then counts as free" if name else ""
-            error.allowed += way
+            error.allowed += f"; or --ignore {name}: its content then counts as free"
             self._found.problems.append(error)
 
     def _volumes(self, names: Sequence[str]) -> None:
@@ -301,45 +289,18 @@ class _Looker:
         elif kind == "labels":
             self._label_file(name, surfaces)
         else:
-            self._refuse_spoiled_mask(surfaces.volume, name)
+            low, high = float(surfaces.volume.values.min()), float(surfaces.volume.values.max())
+            if low >= -1 and high <= 1 and self._wanted.takes("labels", name):
+                what = f"values from {low:.3g} to {high:.3g} are neither a mask nor a CT"
+                refuse(what, self._place.folder / name, "0 and one other whole number in a mask", "not_a_mask")
             self._found.passed.append((name, why))
-
-    def _refuse_spoiled_mask(self, volume: Volume, name: str) -> None:
-        """A probability, or a mask with -1 or without background: an organ that would be left out."""
-        low, high = float(volume.values.min()), float(volume.values.max())
-        if low >= -1 and high <= 1 and self._wanted.takes("labels", name):
-            what = f"values from {low:.3g} to {high:.3g} are neither a mask nor a CT"
-            refuse(what, self._place.folder / name, "0 and one other whole number in a mask", "not_a_mask")
 
     def _label_file(self, name: str, surfaces: VolumeSurfaces) -> None:
         self._found.segmentations.append(label_file(self._place, name, surfaces, self._wanted.naming))
 
-    def _meshes(self, names: Sequence[str]) -> None:
-        if not names:
-            return
-        with self._noting("FILE"):
-            wanted = self._wanted
-            found = mesh_folder(self._place, self._source, names, wanted.space, wanted.unit, wanted.up)
-            self._found.segmentations.append(found)
-
-    def _points(self, name: str) -> None:
-        """Other tables are no lists of points, and no problem; a list of Slicer's is nothing else."""
-        try:
-            points = read_points(self._place.folder / name, default_space=self._wanted.space, default_unit=Unit.MM)
-        except InputError as error:
-            if not name.lower().endswith(".csv"):
-                self._found.passed.append((name, error.what))
-            return
-        if len(points.names) >= LEAST_MARKERS:
-            self._found.markers.append(Markers(name, points))
-
 
 def volume_kind(volume: Volume) -> tuple[str, str]:
-    """What a volume shows: ``ct`` (Hounsfield units), ``labels`` (few whole numbers from 0 on), or ``other``, and why.
-
-    Raises:
-        InputError: A label map that was blended by an interpolation.
-    """
+    """A volume's kind: ``ct`` (Hounsfield units), ``labels`` (few whole numbers from 0 on), or ``other``, and why."""
     low, high = float(volume.values.min()), float(volume.values.max())
     if low <= AIR_HU:
         return ("ct", "") if high > 0 else (OTHER, f"no CT: nothing is above 0, from {low:g} to {high:g}")

@@ -1,17 +1,12 @@
-"""Label maps in one file, and masks, as segmentations.
+"""Label maps, masks and files of structures that may overlap (DICOM, a layered .seg.nrrd), as segmentations.
 
-Structures of one file that may overlap, as a segmentation: DICOM SEG or RTSTRUCT, or a layered .seg.nrrd.
-
-Which version of TotalSegmentator numbered a label map, inferred from whether its organs lie where organs lie.
-
-Versions 1 and 2 give the same numbers to other organs. Under the wrong one, left organs lie on the right, or vertebrae
-lie in no order.
+TotalSegmentator's versions 1 and 2 give the same numbers to other organs. Under the wrong one, left organs lie on the
+right, or vertebrae lie in no order: that tells the version.
 """
 
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -51,27 +46,18 @@ NUMBERING_UNSURE = (
 
 
 class Mask(NamedTuple):
-    """One mask that is not empty.
+    """One mask that is not empty."""
 
-    Attributes:
-        file: Relative to the case's folder.
-        T_ct_index: Shape (4, 4), voxel index to LPS mm.
-    """
-
-    file: str
+    file: str  # relative to the case's folder
     label: int
     box: Box
-    T_ct_index: Floats
+    T_ct_index: Floats  # shape (4, 4), voxel index to LPS mm
 
 
 def masks_of(
     place: Place, source: str, found: Sequence[Mask], notes: tuple[str, ...], *, whole_folder: bool
 ) -> Segmentation:
-    """Masks of one folder, one file a structure.
-
-    Args:
-        whole_folder: Whether the folder holds nothing else, so that the case can name it.
-    """
+    """Masks of one folder, one file a structure; the case names the ``whole_folder`` where it holds nothing else."""
     masks = dict(enumerate(found, start=1))
 
     def single(row: Assigned) -> str:
@@ -119,9 +105,6 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
 
     Args:
         naming: As the user states it, or None.
-
-    Raises:
-        InputError: No names are found, or they do not name every label.
     """
     present = surfaces.labels_present()
     if naming is None and surfaces.names is None:
@@ -175,9 +158,6 @@ def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool
     Args:
         label: The only one in it.
         only: Whether no other map or mask lies beside it, so that the table may have any name.
-
-    Raises:
-        InputError: It is one organ by the file's name, and another by a table of another name.
     """
     tables = [one for one in _tables_beside(place.folder, source) if only or _is_named_like(one, source)]
     table, _ = _one_table(place, source, [label], tables)
@@ -245,9 +225,6 @@ def file_masks(place: Place, source: str, key: str, ct: str | None) -> Segmentat
     Args:
         key: Of the case: ``seg`` or ``rtstruct``.
         ct: The CT of the case, read before, or None.
-
-    Raises:
-        InputError: Structures that cannot be trusted, or were drawn on another CT.
     """
     place.content(source)
     place.volumes.read_masks(StructuresSection.model_validate({key: source}), ct)
@@ -280,10 +257,8 @@ LEAST_RULES = 3
 MOST_BROKEN, LEAST_BROKEN = 0.1, 0.15
 """Fractions of the rules: so few may be broken in the right naming (curved spines, moved organs), so many are in the
 wrong."""
-
 LEAST_WRONG = 2
 """One rule alone may be broken by a patient."""
-
 _SPINE = [f"vertebrae_{part}{n}" for part, last in (("C", 7), ("T", 12), ("L", 5)) for n in range(1, last + 1)]
 _RIBS = [[f"rib_{side}_{n}" for n in range(1, 13)] for side in ("left", "right")]
 FROM_HEAD = (
@@ -295,8 +270,6 @@ FROM_HEAD = (
 """Chains of structures, each farther from the head than the one before."""
 FROM_RIGHT = (["liver", "aorta", "spleen"], ["gallbladder", "stomach"], ["inferior_vena_cava", "aorta"])
 """Chains of structures from the patient's right to the left."""
-
-
 BESIDE_SPINE = (
     "kidney", "adrenal", "rib", "hip", "femur", "lung", "gluteus", "iliopsoas", "autochthon",
     "scapula", "humerus", "clavicula",
@@ -304,60 +277,28 @@ BESIDE_SPINE = (
 """How names of structures begin of which each lies on its own side of the spine."""
 
 
-class Plausibility(NamedTuple):
-    """Agreement of a naming with the places of organs in a label map.
-
-    Attributes:
-        nameless: Labels present that the naming does not know.
-    """
-
-    rules: int
-    broken: int
-    nameless: int
-
-    @property
-    def fits(self) -> bool:
-        """Whether organs lie in the order of a body."""
-        return self.nameless == 0 and self.rules >= LEAST_RULES and self.broken <= MOST_BROKEN * self.rules
-
-    @property
-    def fails(self) -> bool:
-        """Whether organs certainly lie in another order."""
-        return self.nameless > 0 or self.broken >= max(LEAST_WRONG, LEAST_BROKEN * self.rules)
-
-
 def likely_numbering(labelmap: LabelMap) -> str | None:
     """The built-in naming in which the organs of a map lie where they do in a body; None where that is not sure."""
-    centres = label_centres(labelmap)
-    found = {name: plausibility(table, centres) for name, table in BUILT_IN.items()}
-    fitting = [name for name, one in found.items() if one.fits]
-    others_fail = all(one.fails for name, one in found.items() if name not in fitting)
-    return fitting[0] if len(fitting) == 1 and others_fail else None
-
-
-def label_centres(labelmap: LabelMap) -> dict[int, Floats]:
-    """The middle of each label present, shape (3,), LPS mm."""
-    middles = {}
+    centres: dict[int, Floats] = {}
     for label, box in labelmap.boxes.items():
         index = np.array(scipy.ndimage.center_of_mass(labelmap.labels[box] == label)) + [axis.start for axis in box]
-        middles[label] = apply(labelmap.T_ct_index, index[None])[0]
-    return middles
-
-
-def plausibility(table: Mapping[int, str], centres: Mapping[int, Floats]) -> Plausibility:
-    """Check the order of organs from right to left and from head to feet.
-
-    Args:
-        centres: Label to its middle, LPS mm.
-    """
-    at = {table[label]: centre for label, centre in centres.items() if label in table}
-    kept = list(_rules(at))
-    return Plausibility(len(kept), kept.count(False), sum(label not in table for label in centres))
+        centres[label] = apply(labelmap.T_ct_index, index[None])[0]
+    fitting, unsure = [], False
+    for naming, table in BUILT_IN.items():
+        nameless = any(label not in table for label in centres)
+        rules = list(_rules({table[label]: centre for label, centre in centres.items() if label in table}))
+        broken = rules.count(False)
+        if not nameless and len(rules) >= LEAST_RULES and broken <= MOST_BROKEN * len(rules):
+            fitting.append(naming)
+        elif not nameless and broken < max(LEAST_WRONG, LEAST_BROKEN * len(rules)):
+            unsure = True
+    return fitting[0] if len(fitting) == 1 and not unsure else None
 
 
 def _rules(at: Mapping[str, Floats]) -> Iterator[bool]:
+    """Whether organs lie in the order of a body from right to left and from head to feet, by their middles, LPS mm."""
     for name in at:
-        other = re.sub("left", "right", name)
+        other = name.replace("left", "right")
         if other != name and other in at:
             yield bool(at[name][0] > at[other][0])
     spine = [centre[0] for name, centre in at.items() if name.startswith("vertebrae")]

@@ -18,40 +18,27 @@ WAYS = (
     "for one that no path may cross, --skin NAME for another skin"
 )
 """What `init` can write for what a case would state; the refusals of a case name its keys and roles."""
-
-OWN_OPTION: Mapping[str, str] = MappingProxyType(
-    {
-        "region": "--region",
-        "space": "--space",
-        "target.position_mm": "--target",
-        "target.structure": "--target-label",
-        "target.hit_radius_mm": "--hit-radius",
-    }
-)
+OWN_OPTION: Mapping[str, str] = MappingProxyType({
+    "region": "--region", "space": "--space", "target.position_mm": "--target",
+    "target.structure": "--target-label", "target.hit_radius_mm": "--hit-radius",
+})  # fmt: skip
 """Keys by which `init` decides other things, so that each has an option of its own."""
-
 SKIN, SKIN_ROLE = "skin", 'role = "skin"'
 """The structure whose ``cut`` is a key too, and the line after which that stands."""
-
 LISTS = frozenset(("structure", "structures", "obstacle", "end", "schema"))
 """What `--set` cannot write: tables that stand several times, and what belongs to the file."""
-
 REASONS: Mapping[str, str] = MappingProxyType({"search.trust_labels": "a person checked the structures on the CT"})
 STATED = "stated to init"
 
 
 @dataclass(frozen=True)
 class Overrides:
-    """What a person states.
+    """What a person states."""
 
-    Attributes:
-        skin: The structure that is the skin, or None.
-        roles: Name of a structure, or of a file, to ``ignore`` or ``unknown``.
-        keys: Key of the case, as ``ct.arms``, to its value as TOML writes it.
-    """
-
-    skin: str | None = None
+    skin: str | None = None  # the structure that is the skin, or None
+    # name of a structure, or of a file, to ``ignore`` or ``unknown``
     roles: Mapping[str, str] = field(default_factory=dict)
+    # key of the case, as ``ct.arms``, to its value as TOML writes it
     keys: Mapping[str, str] = field(default_factory=dict)
 
     def leaves_out(self, file: str) -> bool:
@@ -59,11 +46,7 @@ class Overrides:
         return "ignore" in {self.roles.get(file), self.roles.get(file.rpartition("/")[2])}
 
     def check_names(self, structures: Collection[str], files: Iterable[str]) -> None:
-        """Whether each name is that of something that is there.
-
-        Raises:
-            InputError: One is not, or it is a file that was to be unknown: what is in it is not read.
-        """
+        """Refuse a name of nothing that is there, or an unknown one of a file: what is in it is not read."""
         left_out = {name for file in files for name in (file, file.rpartition("/")[2])}
         for name, kind in (*self.roles.items(), *((one, "skin") for one in (self.skin,) if one is not None)):
             if name not in structures and not (kind == "ignore" and name in left_out):
@@ -72,11 +55,7 @@ class Overrides:
 
 
 def overrides_of(skin: str | None, ignore: Iterable[str], unknown: Iterable[str], settings: Iterable[str]) -> Overrides:
-    """The options as they were typed; a value that is no TOML is a text, so that ``ct.arms=none`` needs no quotes.
-
-    Raises:
-        InputError: No ``KEY=VALUE``, a key that has an option of its own or is no key of a table.
-    """
+    """The options as they were typed; a value that is no TOML is a text, so that ``ct.arms=none`` needs no quotes."""
     keys = {}
     for text in settings:
         key, sign, value = (part.strip() for part in text.partition("="))
@@ -102,11 +81,7 @@ def _is_toml(value: str) -> bool:
 
 
 def with_keys(text: str, keys: Mapping[str, str], reasons: Mapping[str, str] = REASONS) -> str:
-    """The text of a case in which keys have these values: in place of theirs, else first in their table.
-
-    Args:
-        text: Of the case; every table but ``[end]`` may be missing.
-    """
+    """The text of a case in which keys have these values: in place of theirs, else first in their table."""
     for key, value in keys.items():
         table, _, name = key.rpartition(".")
         text = with_line(text, table, f"{name} = {value}  # {reasons.get(key, STATED)}", name)

@@ -1,6 +1,4 @@
-"""A segmentation, whatever file or folder it comes from.
-
-A folder of meshes as a segmentation: the unit is guessed by their extent, and told.
+"""A segmentation, whatever file or folder it comes from; a folder of meshes, whose unit is guessed by their extent.
 
 Is what is named like the body its outline? A path crosses the skin anyway, so an outline is left out; a ball in the
 body that somebody called ``External`` or ``patient`` is not.
@@ -36,53 +34,35 @@ from puncture_twin.planning.geometry.spaces import Space, Unit, Up
 
 CASE_FILE = "case.toml"
 """What the new case will be called."""
-
 STATED = DefaultRole("stated", (), "unknown", 0.0, "stated to init")
 """Of a role that a person states."""
-
 HOLDS_TARGET = "it also contains the target, and its name is not known as an organ that a needle may cross"
 """Why a structure is unknown."""
 
 
 class Assigned(NamedTuple):
-    """What the case says of one structure.
-
-    Attributes:
-        kind: ``target``, ``avoid``, ``unknown``, ``traverse``, ``ignore`` or ``skin``.
-        margin_mm: The clearance that it demands.
-        line: Of the table of default roles.
-    """
+    """What the case says of one structure."""
 
     label: int
     name: str
-    kind: str
-    margin_mm: float
-    line: DefaultRole
+    kind: str  # ``target``, ``avoid``, ``unknown``, ``traverse``, ``ignore`` or ``skin``
+    margin_mm: float  # the clearance that it demands
+    line: DefaultRole  # of the table of default roles
 
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """Structures of one file or folder, whatever it is.
+    """Structures of one file or folder, whatever it is."""
 
-    Attributes:
-        source: The file or folder, relative to the case's.
-        names: Label to name, of the structures that are there.
-        near: The labels whose box holds a point (3,), LPS mm.
-        surface: Of one structure, LPS mm.
-        skin: One structure as the skin of the body, with what the image cut; an `InputError` where it cannot be one.
-        section: The part of the case file that names all of its structures.
-        voxel_ct: Shape (3, 3), the edges of its voxels as columns, mm; None of meshes.
-        notes: What a person should be told, one sentence each.
-    """
-
-    source: str
-    names: Mapping[int, str]
-    near: Callable[[Floats], tuple[int, ...]]
-    surface: Callable[[int], TriangleMesh]
+    source: str  # the file or folder, relative to the case's
+    names: Mapping[int, str]  # label to name, of the structures that are there
+    near: Callable[[Floats], tuple[int, ...]]  # the labels whose box holds a point (3,), LPS mm
+    surface: Callable[[int], TriangleMesh]  # of one structure, LPS mm
+    # one structure as the skin of the body, with what the image cut; an `InputError` where it cannot be one
     skin: Callable[[int], Skin]
-    section: Callable[[Sequence[Assigned]], str]
-    voxel_ct: Floats | None = None
-    notes: tuple[str, ...] = ()
+    section: Callable[[Sequence[Assigned]], str]  # the part of the case file that names all of its structures
+    voxel_ct: Floats | None = None  # shape (3, 3), the edges of its voxels as columns, mm; None of meshes
+    notes: tuple[str, ...] = ()  # what a person should be told, one sentence each
 
 
 def in_boxes(boxes: Mapping[int, Floats], point_ct: Floats) -> tuple[int, ...]:
@@ -105,11 +85,7 @@ class Place:
         object.__setattr__(self, "volumes", CaseVolumes(self.files, self.folder / CASE_FILE))
 
     def volume(self, name: str) -> VolumeSurfaces:
-        """A volume file of the folder, or a DICOM series.
-
-        Raises:
-            InputError: It cannot be read.
-        """
+        """A volume file of the folder, or a DICOM series. Raises InputError: it cannot be read."""
         self.progress(name)
         self.volumes.read("ct", name, key=name)
         return self.surfaces(name)
@@ -154,7 +130,10 @@ def rules_text(rows: Sequence[Assigned]) -> str:
         demanding = [row for row in rows if row.kind == kind]
         if demanding:
             head = "" if all(row.line in {NOT_ANNOTATED, STATED} for row in demanding) else head
-            parts.append(f"\n[structures.{kind}]  # margins, mm\n{head}{_grouped(demanding)}")
+            parts.append(f"\n[structures.{kind}]  # margins, mm\n{head}")
+        for line in dict.fromkeys(row.line for row in demanding):
+            parts.append(f"# {line.group}: {line.reason}\n")
+            parts += [f"{quoted(row.name)} = {row.margin_mm:g}\n" for row in demanding if row.line == line]
     return "".join(parts)
 
 
@@ -163,20 +142,9 @@ def skin_text(name: str, file: str, label: int) -> str:
     return f'\n[[structure]]\nname = {quoted(name)}\nlabelmap = {quoted(file)}\nlabel = {label}\nrole = "skin"\n'
 
 
-def _grouped(rows: Sequence[Assigned]) -> str:
-    """The rows of each line of the table below its reason, in the order of the rows."""
-    lines = dict.fromkeys(row.line for row in rows)
-    parts = []
-    for line in lines:
-        parts.append(f"# {line.group}: {line.reason}\n")
-        parts += [f"{quoted(row.name)} = {row.margin_mm:g}\n" for row in rows if row.line == line]
-    return "".join(parts)
-
-
 LEAST_EXTENT = ((Unit.MM, 130.0), (Unit.CM, 5.0), (Unit.M, 0.0))
 """From which diagonal of all meshes together on a unit is guessed. A body in mm, with its skin, is seldom smaller than
 130 mm, and in cm (13 to 130) seldom larger; in metres it is smaller than 5."""
-
 BOTH_MM_AND_CM = (130.0, 250.0)
 """A diagonal between these is a child's or a limb's in mm, or an adult's in cm, ten times as wide."""
 
@@ -193,15 +161,7 @@ def mesh_name(file: str) -> str:
 def mesh_folder(
     place: Place, source: str, names: Sequence[str], space: Space, stated: Unit | None, up: Up | None
 ) -> Segmentation:
-    """The meshes of a folder, in the unit that their extent tells.
-
-    Args:
-        stated: Unit of the coordinates where the user says it, or None.
-        up: Their axis that is up where the user says it; of GLB it must.
-
-    Raises:
-        InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.
-    """
+    """The meshes of a folder, in the unit that their extent tells where none is stated; of GLB ``up`` must be."""
     if len({mesh_name(one) for one in names}) < len(names):
         refuse("two meshes have the same name", place.folder / source, "one mesh per structure", "duplicate_name")
     if up is None and any(name.lower().endswith(".glb") for name in names):
@@ -215,8 +175,11 @@ def mesh_folder(
         refuse(what, place.folder / source, "--unit mm or --unit cm", "unit_not_stated")
     unit = stated or next(one for one, least in LEAST_EXTENT if diagonal >= least)
     guess = "as stated" if stated else "inferred from their size (--unit overrides it)"
+    counts = Counter(one.space for one in extents)
+    spaces = [f"{one}, as {count} of their files state" for one, count in counts.items() if one]
+    spaces += [f"{space}, not stated in {counts[None]} of them"] if counts[None] else []
     said = (
-        f"{source}: {len(names)} meshes in {unit} ({guess}) and {_spaces([one.space for one in extents], space)}, "
+        f"{source}: {len(names)} meshes in {unit} ({guess}) and {' and '.join(spaces)}, "
         f"together {diagonal * unit.mm:.0f} mm from corner to corner; mesh files do not state their unit"
     )
     files = dict(enumerate(sorted(names), start=1))
@@ -249,13 +212,6 @@ def mesh_folder(
     )
 
 
-def _spaces(stated: Sequence[Space | None], space: Space) -> str:
-    """Of what space meshes are: of what their files state, else of what the user does."""
-    counts = Counter(stated)
-    parts = [f"{one}, as {count} of their files state" for one, count in counts.items() if one]
-    return " and ".join([*parts, f"{space}, not stated in {counts[None]} of them"] if counts[None] else parts)
-
-
 def is_mesh(name: str) -> bool:
     """Whether a file's ending is that of a mesh."""
     return name.lower().endswith(MESH_SUFFIXES)
@@ -264,57 +220,52 @@ def is_mesh(name: str) -> bool:
 NEAR_MM, NEAR = 8.0, 0.02
 """An outline follows the skin to 8 mm: the coarsest voxels in use are 6 mm wide. In a small body, such as an animal's,
 an organ is so near to it too: there to 2 % of the box's diagonal."""
-
 MOST_OF_SKIN = 0.7
 """Of the skin, which a shell or the whole body covers; what covers it is crossed by every path."""
-
 PART_OF_SKIN, MOST_OF_OUTLINE = 0.25, 0.6
 """A body that was cropped, or cut at its limbs, covers a part of the skin, and is bounded by it but for the cuts."""
-
 POINTS, PLACES = 4_000, 200_000
 """Points that are asked about, and places of the other surface that they are compared with: on 2 square metres these
 lie 3 mm apart, so that what is within 8 mm is found."""
-
-
 LEAST_HELD = 0.9
 """Of the other structures, which the skin holds: a line or a bed may have been drawn too, and lies outside."""
-
 SLACK_MM = 2.0
 """So far a structure may reach out of the skin's box: both were drawn."""
 
 
-class SkinOf(NamedTuple):
-    """A structure that is the skin."""
+class Structure(NamedTuple):
+    """One structure of a segmentation."""
 
     segmentation: Segmentation
     label: int
 
     @property
     def name(self) -> str:
-        """Of the structure."""
+        """As its segmentation calls it."""
         return self.segmentation.names[self.label]
 
-    def skin(self) -> Skin:
-        """The skin that it is."""
-        return self.segmentation.skin(self.label)
+    @property
+    def surface(self) -> TriangleMesh:
+        """Of it, LPS mm."""
+        return self.segmentation.surface(self.label)
 
 
-def skin_of(segmentations: Sequence[Segmentation], stated: str | None) -> SkinOf | None:
+def structures_of(segmentations: Sequence[Segmentation]) -> list[Structure]:
+    """Every structure of some segmentations."""
+    return [Structure(one, label) for one in segmentations for label in one.names]
+
+
+def skin_of(segmentations: Sequence[Segmentation], stated: str | None) -> Structure | None:
     """The structure that is stated to be the skin, else the largest that is named like the body; None for neither."""
-
-    def extent(one: SkinOf) -> float:
-        return float(np.ptp(one.segmentation.surface(one.label).bounds, axis=0).prod())
-
-    every = (SkinOf(one, label) for one in segmentations for label in one.names)
+    every = structures_of(segmentations)
     named = [one for one in every if (named_like_body(one.name) if stated is None else one.name == stated)]
-    return max(named, key=extent, default=None)
+    return max(named, key=lambda one: float(np.ptp(one.surface.bounds, axis=0).prod()), default=None)
 
 
-def skin_problems(found: SkinOf, segmentations: Sequence[Segmentation]) -> Iterator[str]:
+def skin_problems(found: Structure, segmentations: Sequence[Segmentation]) -> Iterator[str]:
     """Why what is named like the skin cannot be it: what lies outside of a skin counts as air beside the patient."""
-    every = [SkinOf(one, label) for one in segmentations for label in one.names]
-    boxes = [one.segmentation.surface(one.label).bounds for one in every if one != found]
-    low, high = found.segmentation.surface(found.label).bounds
+    boxes = [one.surface.bounds for one in structures_of(segmentations) if one != found]
+    low, high = found.surface.bounds
     held = [bool(np.all((one[0] >= low - SLACK_MM) & (one[1] <= high + SLACK_MM))) for one in boxes]
     if sum(held) < LEAST_HELD * len(held):
         noun = "meshes" if found.segmentation.voxel_ct is None else "structures"
@@ -332,30 +283,25 @@ class Agreement(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Outlines:
-    """The structures that are named like the body, held against its skin.
-
-    Attributes:
-        stated: The names of those that a person states to be the skin, or to be left out.
-    """
+    """The structures that are named like the body, held against its skin."""
 
     segmentations: Sequence[Segmentation]
     skin: Skin
-    stated: frozenset[str] = frozenset()
+    stated: frozenset[str] = frozenset()  # the names of those that a person states to be the skin, or to be left out
 
     @cached_property
     def _named(self) -> dict[str, tuple[TriangleMesh, Agreement]]:
-        meshes = {
-            name: one.surface(label)
-            for one in self.segmentations
-            for label, name in one.names.items()
-            if named_like_body(name)
-        }
+        meshes = {one.name: one.surface for one in structures_of(self.segmentations) if named_like_body(one.name)}
         return {name: (mesh, agreement(mesh, self.skin)) for name, mesh in meshes.items()}
 
     def at(self, point_ct: Floats) -> frozenset[str]:
-        """The names of those that are outlines of the body about a point (3,), LPS mm."""
-        found = [name for name, (mesh, found) in self._named.items() if _is_one(found, mesh, point_ct)]
-        return self.stated.union(found)
+        """The names of those that are outlines of the body, or of the part of it that holds a point (3,), LPS mm."""
+        found = set(self.stated)
+        for name, (mesh, one) in self._named.items():
+            part = one.skin_covered >= PART_OF_SKIN and one.on_skin >= MOST_OF_OUTLINE
+            if one.skin_covered >= MOST_OF_SKIN or (part and side_of(mesh, point_ct) is Side.INSIDE):
+                found.add(name)
+        return frozenset(found)
 
     def notes(self, point_ct: Floats) -> Iterator[str]:
         """What a person should know of those that are none, one sentence each."""
@@ -370,12 +316,6 @@ class Outlines:
 def named_like_body(name: str) -> bool:
     """Whether a structure is called as outlines of the body are."""
     return default_role(name, "other") == BODY
-
-
-def _is_one(found: Agreement, mesh: TriangleMesh, point_ct: Floats) -> bool:
-    """Whether a surface is the outline of the body, or of the part of it that holds a point (3,), LPS mm."""
-    part = found.skin_covered >= PART_OF_SKIN and found.on_skin >= MOST_OF_OUTLINE
-    return found.skin_covered >= MOST_OF_SKIN or (part and side_of(mesh, point_ct) is Side.INSIDE)
 
 
 def agreement(mesh: TriangleMesh, skin: Skin) -> Agreement:
@@ -397,24 +337,19 @@ def fraction_near(points: Floats, other: TriangleMesh, within_mm: float) -> floa
 
 BORDER_MM = 2.0
 """The surfaces of two labels that border on each other are this near: both lie between the same voxels."""
-
 MOST_OF_BORDER, ALL_ROUND = 0.5, 0.9
 """Of the target's surface, which an organ about it borders on; one below the organ's surface has more. What goes all
 round holds it: the target was carved out of it, and no path comes to it otherwise."""
 
 
 def bordering(target: str | None, segmentations: Sequence[Segmentation]) -> dict[str, float]:
-    """Of the target's surface the fraction that each structure borders on whose box may go round it.
-
-    Args:
-        target: The structure that the case names, or None.
-    """
-    every = [SkinOf(one, label) for one in segmentations for label in one.names]
+    """Of the target's surface the fraction that each structure borders on whose box may go round it."""
+    every = structures_of(segmentations)
     found = {}
     for own in (one for one in every if one.name == target):
-        points = spread_on(own.segmentation.surface(own.label), POINTS).points
+        points = spread_on(own.surface, POINTS).points
         for one in (one for one in every if one.name != target):
-            mesh = one.segmentation.surface(one.label)
+            mesh = one.surface
             low, high = mesh.bounds
             if np.all((points >= low - BORDER_MM) & (points <= high + BORDER_MM), axis=1).mean() >= MOST_OF_BORDER:
                 found[one.name] = fraction_near(points, mesh, BORDER_MM)
@@ -422,11 +357,7 @@ def bordering(target: str | None, segmentations: Sequence[Segmentation]) -> dict
 
 
 def carved_notes(rows: Sequence[Assigned], target: str | None, border: Mapping[str, float]) -> Iterator[str]:
-    """That an avoided structure goes round the target's, one sentence each.
-
-    Args:
-        target: The structure that the case names, or None.
-    """
+    """That an avoided structure goes round the target's, one sentence each."""
     for row in rows:
         if row.kind == "avoid" and border.get(row.name, 0.0) >= MOST_OF_BORDER:
             yield (

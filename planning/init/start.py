@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from puncture_twin.planning.init import segmentation
 from puncture_twin.planning.init.case_text import CaseParts, case_text
 from puncture_twin.planning.init.finder import AIR_HU, LEFT_OUT, Ct, Found, Markers, Wanted, find
 from puncture_twin.planning.init.target import (
-    Target,
+    Holding,
     assign,
     label_target,
     likely_region,
@@ -40,8 +39,6 @@ ALLOWED = (
     "a folder with a segmentation, and a CT (NIfTI, NRRD or a DICOM series) or a structure named skin or body, see "
     "docs/how-to/your-own-ct.md"
 )
-
-
 SEEN = "markers_ct.csv"
 """Where markers are listed that the CT shows."""
 OUTSIDE_WAYS = "a point in the body, mm, in the space given by --space; or --skin NAME for another skin"
@@ -53,219 +50,139 @@ PHANTOM = (
 
 @dataclass(frozen=True)
 class Request:
-    """What the user wants.
-
-    Attributes:
-        target: ``X,Y,Z`` in mm, or None for ``target_label``.
-        region: As a case states it, or None to be told by the structures.
-        space_stated: Whether the user said in which space the target is.
-        hit_radius_mm: Of the ball that the target is, if the user says that it lies in no structure; else None.
-    """
+    """What the user wants."""
 
     folder: Path
-    target: str | None
+    target: str | None  # ``X,Y,Z`` in mm, or None for ``target_label``
     target_label: str | None
-    region: str | None
+    region: str | None  # as a case states it, or None to be told by the structures
     wanted: Wanted
-    space_stated: bool = True
+    space_stated: bool = True  # whether the user said in which space the target is
+    # of the ball that the target is, if the user says that it lies in no structure; else None
     hit_radius_mm: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A new case, not yet written.
-
-    Attributes:
-        seen: Markers that the CT shows where no list of them is given, as they are to be written beside the case.
-    """
+    """A new case, not yet written."""
 
     text: str
     parts: CaseParts
     notes: tuple[str, ...]
+    # markers that the CT shows where no list of them is given, as they are to be written beside the case
     seen: Markers | None = None
 
 
 def start_case(request: Request, cache: Cache, progress: Names) -> Start:
-    """Find the files of a folder, and write the text of a case with them.
-
-    Raises:
-        InputError: All that keeps a case from being made, in one line.
-    """
+    """The text of a case with the files of a folder. Raises InputError: all that keeps it from being made, in one."""
     space, overrides = request.wanted.space, request.wanted.overrides
     point = None if request.target is None else parse_point(request.target, space)
     found = find(segmentation.Place(request.folder, cache, progress), request.wanted)
     names = [name for one in found.segmentations for name in one.names.values()]
     if not found.problems:
         overrides.check_names(names, [name for name, _ in found.passed])
-    body = _checked(found, point, request)
+    ct, own = _checked(found, names, point, request)
     progress("skin")
-    skin = body.skin()
-    seen, of_seen = _seen_in_ct(request.folder, found, body, skin)
+    skin = ct.surfaces.imaged().skin() if own is None else own.segmentation.skin(own.label)
+    seen, of_seen = _seen_in_ct(request.folder, found, ct, skin)
     progress("structures")
-    if point is not None and body.ct is not None:
-        _refuse_outside(point, body.ct, skin, space)
-    stated = dict(overrides.roles) | ({} if body.structure is None else {body.structure.name: "skin"})
+    if point is not None and ct is not None:
+        grid = ct.surfaces.source.grid
+
+        def in_body(one: Floats) -> bool:
+            return grid.holds(one) and side_of(skin.mesh, one) is not Side.OUTSIDE
+
+        if not in_body(point):
+            place = "the body in" if grid.holds(point) else "the CT"
+            hint = readings_inside(point, space, in_body)
+            what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
+            refuse(what, "--target", OUTSIDE_WAYS, "target_outside_body")
+    stated = dict(overrides.roles) | ({} if own is None else {own.name: "skin"})
     gone = frozenset(name for name, kind in stated.items() if kind != "unknown")
     outlines = segmentation.Outlines(found.segmentations, skin, gone)
-    target = _target(request, point, outlines)
+    if point is None:
+        target = label_target(str(request.target_label), outlines, space)
+    else:
+        hit_radius_mm, space_stated = request.hit_radius_mm, request.space_stated
+        target = typed_target(point, outlines, space, space_stated=space_stated, hit_radius_mm=hit_radius_mm)
     region = request.region or likely_region(names, target.holding.target)
     left_out = outlines.at(target.point_ct)
     border = segmentation.bordering(target.holding.target, found.segmentations)
     carved = {name for name, fraction in border.items() if fraction >= segmentation.ALL_ROUND}
-    target = replace(target, holding=target.holding._replace(others=target.holding.others | carved))
+    holding = target.holding._replace(others=target.holding.others | carved)
+    # Those whose points lie in the CT come first.
+    within = [ct is None or all(map(ct.surfaces.source.grid.holds, one.points.points)) for one in found.markers]
+    order = sorted(zip(within, found.markers, strict=True), key=lambda pair: (not pair[0], pair[1].source))
+    markers = [one for _, one in order]
     parts = CaseParts(
         name=request.folder.resolve().name,
         space=space,
         region=region,
         target_ct=target.point_ct,
-        structure=target.holding.target,
+        structure=holding.target,
         hit_radius_mm=target.hit_radius_mm,
-        ct=None if body.ct is None else body.ct.source,
-        skin=body.source,
-        sources=tuple(
-            (one, assign(one.names, region, target.holding, left_out, stated)) for one in found.segmentations
-        ),
-        markers=tuple(_markers_of_ct(found.markers, body.ct)) or tuple(filter(None, [seen])),
+        ct=None if ct is None else ct.source,
+        skin=ct.source if own is None else f"'{own.name}' of {own.segmentation.source}",
+        sources=tuple((one, assign(one.names, region, holding, left_out, stated)) for one in found.segmentations),
+        markers=tuple(markers) or tuple(filter(None, [seen])),
         left_out=tuple(name for name, why in found.passed if why == LEFT_OUT),
         keys=overrides.keys,
     )
-    told = segmentation.carved_notes(parts.rows, target.holding.target, border)
-    notes = (*_notes(request, found, target, parts), *of_seen, *told, *outlines.notes(target.point_ct))
-    return Start(case_text(parts), parts, notes, seen)
+    notes = [*_notes(request, found, target.notes, parts, holding), *of_seen]
+    notes += segmentation.carved_notes(parts.rows, holding.target, border)
+    return Start(case_text(parts), parts, (*notes, *outlines.notes(target.point_ct)), seen)
 
 
-def _target(request: Request, point: Floats | None, outlines: segmentation.Outlines) -> Target:
-    if point is not None:
-        space, radius = request.wanted.space, request.hit_radius_mm
-        return typed_target(point, outlines, space, space_stated=request.space_stated, hit_radius_mm=radius)
-    return label_target(str(request.target_label), outlines, request.wanted.space)
+def _checked(
+    found: Found, names: Sequence[str], point: Floats | None, request: Request
+) -> tuple[Ct | None, segmentation.Structure | None]:
+    """The one CT, and the structure that is the skin where the CT is not asked: one of the two is there."""
+    problems, stated = list(found.problems), request.wanted.overrides.skin
 
+    def problem(what: str, code: str, allowed: str = ALLOWED) -> None:
+        problems.append(InputListError(what, where=HERE, allowed=allowed, code=code))
 
-class Body(NamedTuple):
-    """Where the skin comes from.
-
-    Attributes:
-        ct: The CT, where there is one.
-        structure: The structure that is the skin, where the CT is not asked.
-    """
-
-    ct: Ct | None
-    structure: segmentation.SkinOf | None
-
-    def skin(self) -> Skin:
-        """The body's."""
-        if self.structure is not None:
-            return self.structure.skin()
-        assert self.ct is not None
-        return self.ct.surfaces.imaged().skin()
-
-    @property
-    def source(self) -> str:
-        """For a person."""
-        if self.structure is not None:
-            return f"'{self.structure.name}' of {self.structure.segmentation.source}"
-        return "" if self.ct is None else self.ct.source
-
-
-def _checked(found: Found, point: Floats | None, request: Request) -> Body:
-    """The one CT, and what is the skin."""
-    problems = list(found.problems)
-    cts, stated = _holding(found.cts, point), request.wanted.overrides.skin
+    holding = [one for one in found.cts if point is not None and one.surfaces.source.grid.holds(point)]
+    cts = holding or found.cts
+    listed = [f"{name} ({why})" for name, why in found.passed]
+    listed += [f"{one.source} (a CT)" for one in found.cts]
+    listed += [f"{one.source} (a segmentation)" for one in found.segmentations]
+    lies = f"; found here: {first_few(listed)}" if listed else "; no file here has a supported format"
     if len(cts) > 1:
-        what = f"several CTs: {', '.join(one.source for one in cts)} (choose with --ct)"
-        problems.append(_problem(what, "several_cts", "--ct with the intended one"))
+        sources = ", ".join(one.source for one in cts)
+        problem(f"several CTs: {sources} (choose with --ct)", "several_cts", "--ct with the intended one")
     if not found.segmentations and not problems:
-        problems.append(_problem(f"no segmentation (label map, masks or meshes){_lies(found)}", "no_segmentation"))
+        problem(f"no segmentation (label map, masks or meshes){lies}", "no_segmentation")
     skin = None if cts and stated is None else segmentation.skin_of(found.segmentations, stated)
     if skin is None and not cts and not found.problems:
-        problems.append(_no_skin(found))
+        no_ct = f"no CT in Hounsfield units (min below {AIR_HU}), and no structure named like the skin{lies}"
+        way = f"; --skin NAME if one of these is the skin: {first_few(names)}" if names else ""
+        problem(no_ct, "no_ct", f"{ALLOWED}{way}")
     elif skin is not None and stated is None:
-        wrong = segmentation.skin_problems(skin, found.segmentations)
-        problems += [_problem(one, "no_skin", "--skin NAME with the structure that is the skin") for one in wrong]
-    problems += [
-        _problem(one, "doubled", "--segmentation with the intended one") for one in _doubled(found.segmentations)
-    ]
+        for why in segmentation.skin_problems(skin, found.segmentations):
+            problem(why, "no_skin", "--skin NAME with the structure that is the skin")
+    counts = Counter(name for one in found.segmentations for name in set(one.names.values()))
+    if twice := [name for name, count in counts.items() if count > 1]:  # one of the two is meant
+        sources = ", ".join(one.source for one in found.segmentations if set(one.names.values()) & set(twice))
+        doubled = f"{sources} have structures with the same name, such as '{twice[0]}' (choose with --segmentation)"
+        problem(doubled, "doubled", "--segmentation with the intended one")
     if problems:
-        said = [
-            one.what if one.where == HERE else f"{_below(one.where, request.folder)}: {one.what}" for one in problems
-        ]
-        ways = dict.fromkeys(one.allowed for one in problems)
-        code = problems[0].code
-        raise InputListError("; ".join(said), where=request.folder, allowed="; ".join(ways), code=code)
-    return Body(cts[0] if cts else None, skin)
-
-
-def _no_skin(found: Found) -> InputListError:
-    """Nothing says where the body ends; what is there may."""
-    what = f"no CT in Hounsfield units (min below {AIR_HU}), and no structure named like the skin{_lies(found)}"
-    names = [name for one in found.segmentations for name in one.names.values()]
-    way = f"; --skin NAME if one of these is the skin: {first_few(names)}" if names else ""
-    return _problem(what, "no_ct", f"{ALLOWED}{way}")
+        places = ["" if one.where == HERE else f"{one.where.removeprefix(f'{request.folder}/')}: " for one in problems]
+        said = "; ".join(place + one.what for place, one in zip(places, problems, strict=True))
+        ways = "; ".join(dict.fromkeys(one.allowed for one in problems))
+        raise InputListError(said, where=request.folder, allowed=ways, code=problems[0].code)
+    return cts[0] if cts else None, skin
 
 
 HERE = "folder"
 """Where a problem of the folder itself is."""
 
 
-def _problem(what: str, code: str, allowed: str = ALLOWED) -> InputListError:
-    return InputListError(what, where=HERE, allowed=allowed, code=code)
-
-
-def _lies(found: Found) -> str:
-    """What lies in the folder, and why it is neither."""
-    taken = [(one.source, "a CT") for one in found.cts] + [
-        (one.source, "a segmentation") for one in found.segmentations
-    ]
-    listed = [f"{name} ({why})" for name, why in (*found.passed, *taken)]
-    return f"; found here: {first_few(listed)}" if listed else "; no file here has a supported format"
-
-
-def _below(where: str, folder: Path) -> str:
-    return where.removeprefix(f"{folder}/")
-
-
-def _holding(cts: Sequence[Ct], point: Floats | None) -> list[Ct]:
-    """The CTs that hold a point, or all where none does."""
-    holding = [one for one in cts if point is not None and one.surfaces.source.grid.holds(point)]
-    return holding or list(cts)
-
-
-def _doubled(segmentations: Sequence[segmentation.Segmentation]) -> Iterator[str]:
-    """Names that two segmentations have: one of the two is meant."""
-    counts = Counter(name for one in segmentations for name in set(one.names.values()))
-    twice = [name for name, count in counts.items() if count > 1]
-    if twice:
-        sources = ", ".join(one.source for one in segmentations if set(one.names.values()) & set(twice))
-        yield f"{sources} have structures with the same name, such as '{twice[0]}' (choose with --segmentation)"
-
-
-def _refuse_outside(point: Floats, ct: Ct, skin: Skin, space: Space) -> None:
-    """A target outside of the CT or of the body in it."""
-    grid = ct.surfaces.source.grid
-
-    def in_body(one: Floats) -> bool:
-        return grid.holds(one) and side_of(skin.mesh, one) is not Side.OUTSIDE
-
-    if not in_body(point):
-        place = "the body in" if grid.holds(point) else "the CT"
-        hint = readings_inside(point, space, in_body)
-        what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
-        refuse(what, "--target", OUTSIDE_WAYS, "target_outside_body")
-
-
-def _markers_of_ct(markers: Sequence[Markers], ct: Ct | None) -> list[Markers]:
-    """Lists of points, those whose points lie in the CT first; without a CT those of the patient's space first."""
-    if ct is None:
-        return sorted(markers, key=lambda one: one.source)
-    grid = ct.surfaces.source.grid
-    return sorted(markers, key=lambda one: (not all(grid.holds(point) for point in one.points.points), one.source))
-
-
-def _seen_in_ct(folder: Path, found: Found, body: Body, skin: Skin) -> tuple[Markers | None, tuple[str, ...]]:
+def _seen_in_ct(folder: Path, found: Found, ct: Ct | None, skin: Skin) -> tuple[Markers | None, tuple[str, ...]]:
     """Markers on the skin in the CT, where no list is given and none would be replaced; and notes for a person."""
-    if found.markers or body.ct is None or (folder / SEEN).exists():
+    if found.markers or ct is None or (folder / SEEN).exists():
         return None, ()
-    imaged = body.ct.surfaces.imaged()
+    imaged = ct.surfaces.imaged()
 
     def look() -> Arrays:
         volume = Volume(imaged.image.hu, imaged.image.T_ct_index, folder)
@@ -284,7 +201,9 @@ def _seen_in_ct(folder: Path, found: Found, body: Body, skin: Skin) -> tuple[Mar
     return Markers(SEEN, NamedPoints(names, points, Space.LPS)), (note,)
 
 
-def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> Iterator[str]:
+def _notes(
+    request: Request, found: Found, of_target: Sequence[str], parts: CaseParts, holding: Holding
+) -> Iterator[str]:
     if found.passed:
         yield f"left out: {first_few([f'{name} ({why})' for name, why in found.passed])}"
     others = [one.source for one in found.cts if one.source != parts.ct]
@@ -292,8 +211,8 @@ def _notes(request: Request, found: Found, target: Target, parts: CaseParts) -> 
         yield f"the CT is {parts.ct}, which contains the target; left out: {', '.join(others)}"
     for one in found.segmentations:
         yield from one.notes
-    yield from target.notes
-    yield from role_notes(parts.rows, target.holding)
+    yield from of_target
+    yield from role_notes(parts.rows, holding)
     if request.region is None:
         if_phantom = ", phantom for a phantom" if parts.region == "other" else ""
         yield f'region = "{parts.region}" was inferred from the structures; use --region to change it{if_phantom}'

@@ -10,33 +10,20 @@ from puncture_twin.planning.base.files import absence, read_input
 
 @pytest.fixture
 def place(tmp_path):
-    """A folder, a file in upper case, a link to nothing."""
     (tmp_path / "folder").mkdir()
     (tmp_path / "Liver.STL").write_bytes(b"x")
     (tmp_path / "link.stl").symlink_to("gone.stl")
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
+def test_what_is_in_the_place_is_said(place, monkeypatch):
+    for name, said in (
         ("folder", "is a folder"),
         ("link.stl", "is a link to a missing file"),
         ("liver.stl", "does not exist; did you mean 'Liver.STL'?"),
-        ("spleen.stl", "does not exist"),
-        ("folder/spleen.stl", "does not exist"),
-        ("none/spleen.stl", "does not exist"),
-        ("a" * 5000, "does not exist"),
-        ("nul\0", "does not exist"),
-    ],
-)
-def test_what_is_in_the_place_is_said(place, name, said):
-    """A folder, a link, another case, or nothing."""
-    assert absence(place / name) == said
-
-
-def test_what_may_not_be_looked_at_is_not_missing(place, monkeypatch):
-    """Permission is another thing than absence."""
+        *((one, "does not exist") for one in ("spleen.stl", "folder/spleen.stl", "none/a", "a" * 5000, "nul\0")),
+    ):
+        assert absence(place / name) == said
 
     def refused(path, **_):
         raise PermissionError(13, "Permission denied", str(path))

@@ -9,7 +9,6 @@ from puncture_twin.planning.base.arrays import counts_of, grown, widened
 
 @pytest.fixture(params=[(7, 9, 11), (1, 4, 30), (40, 3, 2)], ids=str)
 def mask(request, rng):
-    """A few voxels of a grid, some at its border."""
     return rng.random(request.param) < 0.06
 
 
@@ -23,11 +22,9 @@ def test_a_widened_mask_is_one_dilated_by_a_box(mask, reach):
 
 
 def test_a_grown_mask_has_its_neighbours_by_a_face(mask):
-    """Not those by an edge or a corner."""
     assert np.array_equal(grown(mask), scipy.ndimage.binary_dilation(mask))
 
 
 def test_numbers_are_counted_as_by_bincount(rng):
-    """Those that no voxel has are 0."""
     numbers = rng.integers(0, 9, (6, 7, 8))
     assert np.array_equal(counts_of(numbers, 12), np.bincount(numbers.ravel(), minlength=13))

@@ -25,7 +25,6 @@ CASE = case_text(
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small case, the kernels that are compiled already, and no surfaces."""
     here = tmp_path_factory.mktemp("kept")
     write_balls(here, "skin", "organ")
     labels = np.zeros((100, 100, 100), np.uint8)
@@ -37,7 +36,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def search(world: Path) -> tuple[dict[str, object], list[str]]:
-    """The summary of a search in a process of its own, without times, and what stderr says."""
     folders = {"NUMBA_CACHE_DIR": str(world / "kernels"), "PUNCTURE_TWIN_CACHE": str(world / "surfaces")}
     options = ["--no-arm", "--no-pictures", "--json", "--out", str(world / "out")]
     root = ROOT
@@ -51,7 +49,6 @@ def search(world: Path) -> tuple[dict[str, object], list[str]]:
 
 
 def damage(folder: Path, ending: str, every: int = 1) -> int:
-    """Cut files in half or, where that ends as a whole kernel does, a byte before; how many."""
     files = sorted(path for path in folder.rglob("*") if path.name.endswith(ending))[::every]
     for path in files:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2].rstrip(b"."))
@@ -62,8 +59,8 @@ def test_a_search_survives_damage_of_what_is_kept(world: Path) -> None:
     """Kernels and surfaces cut in half: no error, the same numbers, a line for each kind, and then silence again."""
     first, said = search(world)
     assert said == []
-    assert damage(world / "kernels", ".nbi", every=25) > 1
-    assert damage(world / "kernels", ".nbc", every=25) > 1
+    assert damage(world / "kernels", ".nbi", every=60) > 1
+    assert damage(world / "kernels", ".nbc", every=60) > 1
     assert damage(world / "surfaces", ".arrays") > 0
     again, said = search(world)
     assert again == first

@@ -31,7 +31,6 @@ HOSTILE = {
 
 @pytest.fixture(scope="module")
 def long_named():
-    """The carton with bolts whose names have 200 characters and differ in the last one."""
     carton = prepare(folder() / "carton" / "case_m.toml", arm=False)
     names = {"bolt_h": 199 * "v" + "h", "bolt_l": 199 * "v" + "l"}
     structures = tuple(replace(s, name=names.get(s.name, s.name)) for s in carton.anatomy.structures)
@@ -40,7 +39,6 @@ def long_named():
 
 
 def test_a_long_name_is_whole_in_the_verdict_and_in_the_table(long_named, tmp_path):
-    """Reason, text, JSON and Parquet hold every character of a name."""
     found = long_named.check(np.radians(50), np.radians(270))
     name = 199 * "v" + "h"
     assert found.verdict.structure[0] == name
@@ -53,7 +51,6 @@ def test_a_long_name_is_whole_in_the_verdict_and_in_the_table(long_named, tmp_pa
 
 
 def test_a_long_sentence_is_whole(long_named):
-    """What kept the arm may take more than 200 characters."""
     found = long_named.check(0.0, 0.0)
     detail = found.verdict.detail.copy()
     detail[0] = 300 * "a" + " end"
@@ -61,22 +58,16 @@ def test_a_long_sentence_is_whole(long_named):
     assert to_table(long)["reason_detail"].to_pylist()[0].endswith("a end")
 
 
-@pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_label_name_is_refused(name, tmp_path):
-    """From a CSV and from a .seg.nrrd: one line that names the label."""
-    labelmap = LabelMap(np.ones((2, 2, 2), np.int32), np.eye(4), {1: HOSTILE[name]}, tmp_path / "a.seg.nrrd")
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_a_hostile_name_of_a_label_or_a_point_is_refused(kind, tmp_path):
+    name = HOSTILE[kind]
+    labelmap = LabelMap(np.ones((2, 2, 2), np.int32), np.eye(4), {1: name}, tmp_path / "a.seg.nrrd")
     with refused("bad_name") as caught:
         names_for(None, tmp_path, lambda _: b"", labelmap)
     assert str(caught.value).isprintable()
-    content = f'id,name\n1,"{HOSTILE[name]}"\n'.encode()
     with refused("bad_name"):
-        names_for("names.csv", tmp_path, lambda _: content, labelmap)
-
-
-@pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_point_name_is_refused(name, tmp_path):
-    """From Slicer's JSON: one line that names the point."""
-    point = {"label": HOSTILE[name], "position": [0, 0, 0]}
+        names_for("names.csv", tmp_path, lambda _: f'id,name\n1,"{name}"\n'.encode(), labelmap)
+    point = {"label": name, "position": [0, 0, 0]}
     markup = {"type": "Fiducial", "coordinateSystem": "LPS", "coordinateUnits": "mm", "controlPoints": [point]}
     (tmp_path / "a.mrk.json").write_text(json.dumps({"markups": [markup]}))
     with refused("bad_name") as caught:
@@ -84,21 +75,17 @@ def test_a_hostile_point_name_is_refused(name, tmp_path):
     assert str(caught.value).isprintable()
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
+def test_a_hostile_text_of_the_case_is_refused(tmp_path):
+    for changes in (
         ('structure = "organ"', 'structure = "organ"\nname = "a\\u001b[31mb"'),
         ('mesh = "organ.stl"', 'mesh = "organ\\u202e.stl"'),
         ('markers_base = "touch.csv"', 'markers_base = "touch.csv"\nuse = ["A\\n", "B", "C"]'),
         ("[[structure]]", '[[structures]]\nlabelmap = "labels.nrrd"\navoid = { "\\u0007*" = 1 }\n[[structure]]'),
-    ],
-)
-def test_a_hostile_text_of_the_case_is_refused(changes, tmp_path):
-    """Names, patterns and paths of a case file are plain text."""
-    path = write_case(tmp_path, changes)
-    with refused("bad_name") as caught:
-        load_case(path)
-    assert str(caught.value).isprintable()
+    ):
+        path = write_case(tmp_path, changes)
+        with refused("bad_name") as caught:
+            load_case(path)
+        assert str(caught.value).isprintable()
 
 
 def test_names_of_other_scripts_are_names(tmp_path):

@@ -29,7 +29,6 @@ OURS = {MANIFEST_NAME, TIMINGS_NAME}
 
 
 def write(out, command, files, **options):
-    """Write files as a command does."""
     with writing(out, command, inputs=INPUTS, **options) as draft:
         for name, content in files.items():
             path = draft.folder / name
@@ -39,23 +38,23 @@ def write(out, command, files, **options):
 
 
 def read(path):
-    """Read as rehearse, export and verify do."""
     return read_output(path, max_bytes=1000)
 
 
 def names(folder):
-    """Every file of a folder, hidden ones too."""
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
 
 
 def digest(text):
-    """SHA-256 of a text."""
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def contents(folder):
+    return {name: (folder / name).read_bytes() for name in names(folder)}
 
 
 @pytest.fixture
 def planned(tmp_path):
-    """A folder with a plan, its export and its rehearsal."""
     write(tmp_path, "plan", {"candidates.parquet": "c", "plan.json": "p", "map.png": "m"})
     for command, name in (("export plan.csv", "plan.csv"), ("rehearse", "rehearsal.json")):
         write(tmp_path, command, {name: "x"}, made_from={"plan.json": digest("p")})
@@ -128,42 +127,32 @@ def test_a_sub_folder_that_is_somebody_elses_is_refused(tmp_path, kind):
     assert list(elsewhere.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("content", "code"),
-    [
+def test_another_manifest_is_not_overwritten(tmp_path):
+    for content, code in (
         ('{"version": 1, "files": []}', "not_an_output_folder"),
         ("", "file_size"),
         ("{", "not_json"),
         ('{"format": "puncture-twin output set"}', "missing_key"),
-    ],
-)
-def test_another_manifest_is_not_overwritten(tmp_path, content, code):
-    """Of another program, or damaged: one line, and nothing changes."""
-    (tmp_path / MANIFEST_NAME).write_text(content)
-    with refused(code, MANIFEST_NAME):
-        write(tmp_path, "search", {"candidates.parquet": "c"})
-    assert (tmp_path / MANIFEST_NAME).read_text() == content
-    assert names(tmp_path) == {MANIFEST_NAME}
+    ):
+        (tmp_path / MANIFEST_NAME).write_text(content)
+        with refused(code, MANIFEST_NAME):
+            write(tmp_path, "search", {"candidates.parquet": "c"})
+        assert (tmp_path / MANIFEST_NAME).read_text() == content
+        assert names(tmp_path) == {MANIFEST_NAME}
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *["../mine.txt", "/tmp/mine.txt", "a/../../mine.txt", "", "a//b", "./a", "..\\b"],
-        *["a\0b", "x" * 256, "é" * 128, "a/" * 600 + "b", "\ud800"],
-    ],
-    ids=ascii,
-)
-def test_a_manifest_cannot_name_a_file_elsewhere(tmp_path, name):
+def test_a_manifest_cannot_name_a_file_elsewhere(tmp_path):
     """What it lists is removed one day: a name that leads out of the folder is refused, and one that no file has."""
     out = tmp_path / "out"
     write(out, "search", {"a": "1"})
     manifest = json.loads((out / MANIFEST_NAME).read_text())
-    manifest["entries"]["search"]["files"] = {name: digest("1")}
-    (out / MANIFEST_NAME).write_text(json.dumps(manifest))
     (tmp_path / "mine.txt").write_text("mine")
-    with refused("bad_value"):
-        write(out, "search", {"a": "2"})
+    leading = ("../mine.txt", "/tmp/mine.txt", "a/../../mine.txt", "", "a//b", "./a", "..\\b")
+    for name in (*leading, "a\0b", "x" * 256, "é" * 128, "a/" * 600 + "b", "\ud800"):
+        manifest["entries"]["search"]["files"] = {name: digest("1")}
+        (out / MANIFEST_NAME).write_text(json.dumps(manifest))
+        with refused("bad_value"):
+            write(out, "search", {"a": "2"})
     assert (tmp_path / "mine.txt").exists()
 
 
@@ -180,28 +169,21 @@ def test_a_manifest_that_lists_a_file_twice_is_damaged(planned, also):
         read(planned / "plan.json")
 
 
-def test_readers_refuse_what_the_manifest_does_not_list(planned):
+def test_readers_refuse_what_the_manifest_does_not_list(planned, tmp_path_factory):
     """An edited file, and one that was put there: one line each; outside of any set a file is read with a warning."""
-    assert read(planned / "plan.json").note == ""
+    link = tmp_path_factory.mktemp("elsewhere") / "my-plan.json"
+    link.symlink_to(planned / "plan.json")
+    assert read(planned / "plan.json").note == read(link).note == ""
     (planned / "plan.json").write_text("edited")
-    with refused("output_not_whole"):
-        read(planned / "plan.json")
+    for path in (planned / "plan.json", link):
+        with refused("output_not_whole"):
+            read(path)
     (planned / "other.json").write_text("p")
     with refused("output_not_whole"):
         read(planned / "other.json")
     loose = planned.parent / "loose.json"
     loose.write_text("p")
     assert "not part of an output set" in read(loose).note
-
-
-def test_a_reader_behind_a_link_finds_the_set(planned, tmp_path_factory):
-    """A link to a file of a set is the file of that set."""
-    link = tmp_path_factory.mktemp("elsewhere") / "my-plan.json"
-    link.symlink_to(planned / "plan.json")
-    assert read(link).note == ""
-    (planned / "plan.json").write_text("edited")
-    with refused("output_not_whole"):
-        read(link)
 
 
 def test_what_comes_from_another_plan_does_not_lie_beside_this_one(planned):
@@ -217,32 +199,25 @@ def test_a_second_command_is_refused_while_one_writes(tmp_path):
         (draft.folder / "a").write_text("1")
         with refused("folder_in_use", os.getpid()):
             write(tmp_path, "plan", {"b": "2"})
+    (tmp_path / ".puncture-twin-lock").write_text("1")  # of the dead
+    with locked(tmp_path):
+        pass
     assert names(tmp_path) == {"a"} | OURS
 
 
-def test_a_lock_of_the_dead_locks_nothing(tmp_path):
-    """The file that a killed process left is taken over and removed."""
-    (tmp_path / ".puncture-twin-lock").write_text("1")
-    with locked(tmp_path):
-        pass
-    assert names(tmp_path) == set()
-
-
-@pytest.mark.parametrize(
-    "failure",
-    [InputError("x", where="y", allowed="z", code="odd"), KeyboardInterrupt(), NoAnswerError("no", code="odd")],
-)
-def test_whatever_ends_a_run_early_leaves_the_old_set(planned, failure):
-    """A refusal, Ctrl-C, no answer: byte for byte what was there."""
-    before = {name: (planned / name).read_bytes() for name in names(planned)}
-    with pytest.raises(type(failure)), writing(planned, "search") as draft:
-        (draft.folder / "candidates.parquet").write_text("half")
-        raise failure
-    assert {name: (planned / name).read_bytes() for name in names(planned)} == before
+def test_whatever_ends_a_run_early_leaves_the_old_set(planned):
+    before = contents(planned)
+    full = [OSError(number, os.strerror(number)) for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)]
+    odd = InputError("x", where="y", allowed="z", code="odd")
+    for failure in (odd, KeyboardInterrupt(), NoAnswerError("no", code="odd"), *full):
+        expected = refused("unwritable") if isinstance(failure, OSError) else pytest.raises(type(failure))
+        with expected, writing(planned, "search") as draft:
+            (draft.folder / "candidates.parquet").write_text("half")
+            raise failure
+        assert contents(planned) == before
 
 
 def test_a_folder_that_a_run_made_for_nothing_goes_again(tmp_path):
-    """No empty folders, as deep as they were made."""
     with pytest.raises(KeyboardInterrupt), writing(tmp_path / "a" / "b", "search"):
         raise KeyboardInterrupt
     assert list(tmp_path.iterdir()) == []
@@ -250,7 +225,6 @@ def test_a_folder_that_a_run_made_for_nothing_goes_again(tmp_path):
 
 @pytest.fixture
 def interruptible():
-    """Ctrl-C raises, though a shell that starts the tests in the background has it ignored."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -293,42 +267,24 @@ def test_entries_split_from_a_command_go_with_it(tmp_path):
     assert manifest.entries["rehearse"].depends_on == ("plan",)
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
-def test_a_full_disk_is_bad_input(planned, number):
-    """One line, and the old set untouched, byte for byte."""
-    before = {name: (planned / name).read_bytes() for name in names(planned)}
-    with refused("unwritable"), writing(planned, "plan") as draft:
-        (draft.folder / "plan.json").write_text("half")
-        raise OSError(number, os.strerror(number))
-    assert {name: (planned / name).read_bytes() for name in names(planned)} == before
-
-
 def test_a_file_that_may_not_grow_is_bad_input(planned):
-    """The system's own limit on file sizes, as a quota sets it."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    before = {name: (planned / name).read_bytes() for name in names(planned)}
+    before = contents(planned)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
         with refused("unwritable"):
             write(planned, "plan", {"plan.json": "p" * 100_000})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert {name: (planned / name).read_bytes() for name in names(planned)} == before
+    assert contents(planned) == before
 
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A file system of 256 kB, where the system lets us make one."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    done = (
-        subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)], capture_output=True, check=False
-        )
-        if shutil.which("mount")
-        else None
-    )
-    if done is None or done.returncode != 0:
+    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)]
+    if not shutil.which("mount") or subprocess.run(mount, capture_output=True, check=False).returncode:
         pytest.skip("may not mount a file system")
     yield disk
     subprocess.run(["umount", str(disk)], check=True)
@@ -338,23 +294,22 @@ def test_a_disk_that_is_really_full_is_bad_input(small_disk):
     """A real file system without space, at every fill level around what a set needs: old or new, never between."""
     out = small_disk / "out"
     write(out, "plan", {"plan.json": "p" * 50_000})
-    before = {name: (out / name).read_bytes() for name in names(out)}
+    before = contents(out)
     refused = 0
     for size in range(40_000, 240_000, 20_000):
         try:
             write(out, "plan", {"plan.json": "q" * size, "b": "b" * 10_000})
         except InputError as error:
             assert "cannot be written" in str(error)
-            assert {name: (out / name).read_bytes() for name in names(out)} == before
+            assert contents(out) == before
             refused += 1
         else:
-            before = {name: (out / name).read_bytes() for name in names(out)}
+            before = contents(out)
         assert problems(out) == ()
     assert refused > 0
 
 
 def die_at(count):
-    """Make the process kill itself at the count-th time that it moves or removes a file."""
     left = iter(range(count))
     for name in ("replace", "unlink", "rmdir"):
         plain = getattr(Path, name)
@@ -394,7 +349,6 @@ def test_a_kill_between_any_two_steps_leaves_old_new_or_unfinished(tmp_path):
 
 
 def what_passes(out):
-    """The contents of all files that a reader would accept."""
     passing = set()
     for name in ("plan.json", "map.png", "report.html", "plan.csv"):
         if (out / name).exists():

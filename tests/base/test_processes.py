@@ -24,7 +24,6 @@ from puncture_twin.planning.base.processes import process_pool
     ],
 )
 def test_errors_are_made_again_with_all_their_parts(error):
-    """Not from their message alone."""
     found = pickle.loads(pickle.dumps(error))
     assert (type(found), str(found), vars(found)) == (type(error), str(error), vars(error))
 

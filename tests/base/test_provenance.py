@@ -14,7 +14,6 @@ LISTED = (Input("case", "case.toml", "a" * 64), Input("mesh liver", "liver.stl",
 
 @pytest.fixture
 def files(tmp_path: Path) -> InputFiles:
-    """A folder with one file, which was read."""
     (tmp_path / "a.csv").write_bytes(b"first")
     files = InputFiles(tmp_path)
     assert files.read("markers_ct", "a.csv", max_bytes=100, key="x", where=tmp_path) == b"first"
@@ -31,7 +30,6 @@ def test_the_hash_is_that_of_the_bytes_that_are_parsed(files: InputFiles, tmp_pa
 
 
 def test_a_large_file_that_was_let_go_of_must_be_the_same_when_it_is_read_again(tmp_path: Path) -> None:
-    """Also in another process, which is sent the hashes alone."""
     (tmp_path / "ct.nii").write_bytes(bytes(11_000_000))
     files = InputFiles(tmp_path)
     files.read("ct", "ct.nii", max_bytes=1 << 30, key="x", where=tmp_path)
@@ -59,24 +57,18 @@ def test_many_files_are_let_go_of_as_one_large_file_is(tmp_path: Path) -> None:
         files.content("2.dcm")
 
 
-@pytest.mark.parametrize("name", ["gone.csv", "folder", "x" * 5000, "a\0b", "../none"])
-def test_a_file_that_is_not_there_is_named_by_its_key(files: InputFiles, tmp_path: Path, name: str) -> None:
-    """Missing, a folder, a name that no file system takes."""
+def test_a_file_that_is_not_there_is_named_by_its_key(files: InputFiles, tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
-    with refused("no_such_file", "case.toml", "liver"):
-        files.read("mesh liver", name, max_bytes=100, key="structure 'liver'", where=tmp_path / "case.toml")
+    for name in ("gone.csv", "folder", "x" * 5000, "a\0b", "../none"):
+        with refused("no_such_file", "case.toml", "liver"):
+            files.read("mesh liver", name, max_bytes=100, key="structure 'liver'", where=tmp_path / "case.toml")
 
 
-def test_a_list_survives_its_document() -> None:
-    """A list of role, path and sha256 reads back to the same inputs."""
+def test_a_list_survives_its_document_and_no_other_is_read() -> None:
     assert read_inputs(inputs_document(LISTED)) == LISTED
-
-
-@pytest.mark.parametrize("wrong", [{"case.toml": "a"}, "x", [["case"]], [{"role": "case", "path": 1, "sha256": "a"}]])
-def test_what_is_no_list_of_inputs_is_refused(wrong: object) -> None:
-    """Older plans hold a mapping; numbers are no paths."""
-    with pytest.raises((TypeError, KeyError)):
-        read_inputs(wrong)
+    for wrong in ({"case.toml": "a"}, "x", [["case"]], [{"role": "case", "path": 1, "sha256": "a"}]):
+        with pytest.raises((TypeError, KeyError)):
+            read_inputs(wrong)
 
 
 def test_an_input_with_two_hashes_is_refused() -> None:

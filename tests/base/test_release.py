@@ -16,7 +16,6 @@ CHANGELOG = f"# Changelog\n\n{UNRELEASED}### Added\n- A thing.\n\n## [0.0.1] - 2
 
 @pytest.fixture
 def clone(tmp_path, monkeypatch):
-    """The files that a release changes, committed."""
     for name, value in {"AUTHOR": "A", "COMMITTER": "B"}.items():
         monkeypatch.setenv(f"GIT_{name}_NAME", value)
         monkeypatch.setenv(f"GIT_{name}_EMAIL", "a@b")
@@ -32,12 +31,10 @@ def clone(tmp_path, monkeypatch):
 
 
 def line_of(text):
-    """The line that says the version."""
     return next(line for line in text.splitlines() if line.startswith("version = "))
 
 
 def state(clone):
-    """What a release may change: commits, tags, and files that differ."""
     return [git(clone, *words) for words in (("log", "--oneline"), ("tag",), ("status", "--porcelain"))]
 
 
@@ -57,65 +54,44 @@ def test_a_release_is_a_commit_and_a_tag(clone):
         release(clone, "0.11.0", DAY, lambda *_: None)
 
 
-@pytest.mark.parametrize("version", ["", "0.9.9", "0.9.8", "0.10", "v0.10.0", "0.10.0rc1", "0.010.0", "1.0.0\n"])
-def test_another_version_is_refused(clone, version):
-    """Three numbers, higher than those that are there."""
-    begun = state(clone)
-    with pytest.raises(RefusedError, match="higher than 0.9.9"):
-        release(clone, version, DAY, lambda *_: None)
-    assert state(clone) == begun
-
-
-@pytest.mark.parametrize("name", ["CITATION.cff", "new.txt"])
-def test_a_tree_with_changes_is_refused(clone, name):
-    """A file that differs, and one that git does not know."""
-    (clone / name).write_text("another\n")
-    begun = state(clone)
-    with pytest.raises(RefusedError, match=name):
-        release(clone, "0.10.0", DAY, lambda *_: None)
-    assert state(clone) == begun
-
-
-def test_a_tag_that_is_there_is_refused(clone):
-    """Also where the version in the files is lower."""
-    git(clone, "tag", "v0.10.0")
-    begun = state(clone)
-    with pytest.raises(RefusedError, match=r"tag v0\.10\.0"):
-        release(clone, "0.10.0", DAY, lambda *_: None)
-    assert state(clone) == begun
-
-
-def test_a_section_of_many_pages_is_refused(clone):
-    """It is condensed first."""
-    (clone / "CHANGELOG.md").write_text(CHANGELOG.replace("- A thing.\n", "- A thing.\n" * MOST_LINES))
-    git(clone, "commit", "--quiet", "--all", "--message", "much")
-    with pytest.raises(RefusedError, match=f"{MOST_LINES + 1} lines"):
-        release(clone, "0.10.0", DAY, lambda *_: None)
-
-
-@pytest.mark.parametrize("error", [RefusedError("a test fails"), KeyboardInterrupt()])
-def test_where_a_check_fails_everything_is_as_it_was(clone, error):
-    """So it is where somebody interrupts."""
+def test_what_is_refused_changes_nothing(clone):
+    """A version that is not higher, a tree with changes, a tag that is there, a section of many pages, a check."""
 
     def fails(*_):
-        raise error
+        raise RefusedError("a test fails")
 
-    begun = state(clone)
-    with pytest.raises(type(error)):
-        release(clone, "0.10.0", DAY, fails)
-    assert state(clone) == begun
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    def is_refused(match, version="0.10.0", check=lambda *_: None, error=RefusedError):
+        begun = state(clone)
+        with pytest.raises(error, match=match):
+            release(clone, version, DAY, check)
+        assert state(clone) == begun
+
+    for version in ("", "0.9.9", "0.9.8", "0.10", "v0.10.0", "0.10.0rc1", "0.010.0", "1.0.0\n"):
+        is_refused("higher than 0.9.9", version)
+    is_refused("a test fails", check=fails)
+    is_refused("", check=interrupted, error=KeyboardInterrupt)
+    before = (clone / "CITATION.cff").read_text()
+    for name, text in (("CITATION.cff", before), ("new.txt", None)):
+        (clone / name).write_text("another\n")
+        is_refused(name)
+        (clone / name).write_text(text) if text else (clone / name).unlink()
+    git(clone, "tag", "v0.10.0")
+    is_refused(r"tag v0\.10\.0")
+    (clone / "CHANGELOG.md").write_text(CHANGELOG.replace("- A thing.\n", "- A thing.\n" * MOST_LINES))
+    git(clone, "commit", "--quiet", "--all", "--message", "much")
+    is_refused(f"{MOST_LINES + 1} lines", "0.11.0")
 
 
 def test_this_changelog_can_be_released():
-    """Its unreleased section is two pages at most."""
     text = (ROOT / "CHANGELOG.md").read_text("utf-8")
     assert text.count(UNRELEASED) == 1
     assert len(text.partition(UNRELEASED)[2].partition("\n## ")[0].splitlines()) <= MOST_LINES
 
 
 def test_make_refuses_without_a_version():
-    """The target's own script, on this tree, which it does not touch."""
-    done = subprocess.run(
-        [sys.executable, "-m", "tools.release"], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-m", "tools.release"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and "VERSION=" in done.stderr

@@ -20,26 +20,22 @@ HU = world.phantom().astype(np.float32) - 1024
 
 
 def place(T, *index):
-    """Where a voxel's centre lies."""
     return (T @ [*index, 1.0])[:3]
 
 
 def by_place(volume):
-    """Every measured voxel by its place in LPS, rounded to a hundredth of a mm."""
     at = np.argwhere(volume.values > UNMEASURED_HU)
     places = (at @ volume.T_ct_index[:3, :3].T + volume.T_ct_index[:3, 3]).round(2) + 0.0
     return {tuple(where): float(volume.values[tuple(index)]) for where, index in zip(places, at, strict=True)}
 
 
 def expected(T, hu=HU):
-    """The same from the affine that wrote the slices."""
     return {
         tuple(place(T, *index).round(2) + 0.0): float(hu[index]) for index in itertools.product(*map(range, hu.shape))
     }
 
 
 def with_simpleitk(folder):
-    """What SimpleITK's series reader makes of a folder: values by place."""
     reader = sitk.ImageSeriesReader()
     reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(folder)))
     image = reader.Execute()
@@ -120,7 +116,6 @@ def test_a_tilted_gantry_is_put_right_where_simpleitk_is_not(tmp_path, angle):
 
 
 def changed(at, **values):
-    """A series whose slice number ``at`` says something else."""
     slices = world.series()
     for keyword, value in values.items():
         if value is None:
@@ -131,12 +126,10 @@ def changed(at, **values):
 
 
 def moved(at, z, x=world.ORIGIN[0]):
-    """A series whose slice number ``at`` lies elsewhere."""
     return changed(at, ImagePositionPatient=world.ds([x, world.ORIGIN[1], z]))
 
 
 def shorter(slices):
-    """The last slice has lost a row of pixels."""
     slices[-1].PixelData = slices[-1].PixelData[:-14]
     return slices
 
@@ -147,9 +140,12 @@ REFUSED = {
         lambda: world.series(world.phantom((7, 5, 6)))[:3] + world.series(world.phantom((7, 5, 6)))[4:],
         "uneven_slices 2.5",
     ),
+    "twelve slices missing": (  # beside them each true step was less than a tenth of the largest one
+        lambda: world.series(world.phantom((7, 5, 24)))[:10] + world.series(world.phantom((7, 5, 24)))[22:],
+        "uneven_slices 12",
+    ),
     "uneven step": (lambda: moved(2, 812.25 + 5.9), "uneven_slices 3.4"),
     "two at one place": (lambda: moved(2, 812.25 + 2.5), "duplicate_place"),
-    "two time points": (lambda: world.series() + world.series(), "duplicate_place"),
     "one slice off the line": (lambda: changed(2, ImagePositionPatient=world.ds([-101.0, 33.0, 817.25])), "off_grid"),
     "another orientation": (
         lambda: changed(1, ImageOrientationPatient=["1", "0", "0", "0", "0.98", "0.199"]),
@@ -157,16 +153,12 @@ REFUSED = {
     ),
     "another pixel size": (lambda: changed(1, PixelSpacing=["0.9", "0.8"]), "mixed_geometry"),
     "no position": (lambda: changed(1, ImagePositionPatient=None), "missing_tag _1 ImagePositionPatient 0020 0032"),
-    "no orientation": (
-        lambda: changed(1, ImageOrientationPatient=None),
-        "missing_tag ImageOrientationPatient 0020 0037",
-    ),
     "no spacing": (lambda: changed(1, PixelSpacing=None), "missing_tag PixelSpacing 0028 0030"),
     "no slope": (lambda: changed(1, RescaleSlope=None), "no_rescale _1 0028 1053"),
+    "no intercept": (lambda: changed(1, RescaleIntercept=None), "no_rescale -1024"),
     "slope 0": (lambda: changed(1, RescaleSlope="0"), "out_of_range"),
     "no Hounsfield units": (lambda: changed(1, RescaleType="MGML"), "not_hounsfield MGML"),
     "a skewed plane": (lambda: changed(1, ImageOrientationPatient=list("100") + ["0.5", "1", "0"]), "axes_not_square"),
-    "axes of no length": (lambda: changed(1, ImageOrientationPatient=list("000000")), "axes_not_square"),
     "inverted": (lambda: changed(1, PhotometricInterpretation="MONOCHROME1"), "unsupported_feature MONOCHROME1"),
     "colours": (lambda: changed(1, SamplesPerPixel=3), "bad_tag SamplesPerPixel"),
     "another frame of reference": (lambda: changed(1, FrameOfReferenceUID=world.ROOT + "9"), "several_series"),
@@ -174,13 +166,11 @@ REFUSED = {
     "pixels cut short": (lambda: shorter(world.series()), "size_mismatch _3 56 70"),
     "no pixels": (lambda: changed(1, PixelData=None), "missing_tag"),
     "slices side by side": (lambda: world.series(T=world.affine(step=(5.0, 0, 2.5))), "gantry_tilt 63"),
-    "frames in a classic file": (lambda: changed(1, NumberOfFrames=2), "size_mismatch 70 140"),
 }
 
 
 @pytest.mark.parametrize("name", sorted(REFUSED))
 def test_a_series_that_is_no_regular_stack_is_refused_naming_the_slice(tmp_path, name):
-    """One line, with the file that is wrong."""
     make, message = REFUSED[name]
     folder = world.write_series(tmp_path, make(), [f"a{number:02d}_{number}" for number in range(20)])
     with refused(*message.split()):
@@ -188,20 +178,17 @@ def test_a_series_that_is_no_regular_stack_is_refused_naming_the_slice(tmp_path,
 
 
 def scout():
-    """A localizer: a CT image by its class, in the same folder."""
     data = world.ct_slice(world.phantom()[:, :, 0], world.affine(TURNS["coronal"]), series=world.ROOT + "50", number=77)
     data.ImageType = ["ORIGINAL", "PRIMARY", "LOCALIZER"]
     return data
 
 
 def capture():
-    """A dose page: a secondary capture, with the same series number."""
     data = world.base(world.CAPTURE_CLASS, world.ROOT + "60", series=world.ROOT + "51", description="dose")
     return world.image(data, world.phantom()[:, :, 0])
 
 
 def page():
-    """A page of text that is stored as a CT image without a place, in the series itself."""
     data = changed(0, ImagePositionPatient=None, ImageOrientationPatient=None)[0]
     data.ImageType = ["DERIVED", "SECONDARY", "OTHER"]
     return data
@@ -227,22 +214,20 @@ def test_two_series_are_refused_with_names_and_a_file_chooses_one(tmp_path):
     assert by_place(read_series(folder / "6.dcm")) == expected(world.affine(), HU + 5)
 
 
-@pytest.mark.parametrize("what", ["empty", "text", "folders", "capture alone"])
-def test_a_folder_without_a_series_says_what_it_holds(tmp_path, what):
-    """Nothing, no DICOM, only folders, or no CT."""
-    if what == "text":
-        (tmp_path / "a.txt").write_text("no")
-    elif what == "folders":
-        (tmp_path / "series 1").mkdir()
-    elif what == "capture alone":
-        world.write_series(tmp_path, [capture()])
-    told = {"folders": "series 1 (is a folder)", "capture alone": "1 Secondary Capture"}.get(what, "not a DICOM file")
-    with refused("no_ct", told):
+def test_a_folder_without_a_series_says_what_it_holds(tmp_path):
+    with refused("no_ct", "not a DICOM file"):
         read_series(tmp_path)
+    (tmp_path / "series 1").mkdir()
+    with refused("no_ct", "series 1 (is a folder)"):
+        read_series(tmp_path)
+    (tmp_path / "series 1" / "a.txt").write_text("no")
+    with refused("no_ct", "not a DICOM file"):
+        read_series(tmp_path / "series 1")
+    with refused("no_ct", "1 Secondary Capture"):
+        read_series(world.write_series(tmp_path / "captures", [capture()]))
 
 
 def test_rescaling_is_that_of_each_slice(tmp_path):
-    """Slope and intercept differ from slice to slice."""
     slices = world.series()
     slices[1].RescaleSlope, slices[1].RescaleIntercept = "0.5", "-1000.25"
     values = read_series(world.write_series(tmp_path, slices)).values
@@ -250,38 +235,38 @@ def test_rescaling_is_that_of_each_slice(tmp_path):
     assert np.array_equal(values[:, :, 2], HU[:, :, 2])
 
 
-@pytest.mark.parametrize(("bits", "signed"), [(16, True), (16, False), (12, True), (12, False)])
-def test_bits_above_the_stored_ones_do_not_count(tmp_path, bits, signed):
+def test_bits_above_the_stored_ones_do_not_count(tmp_path):
     """Two's complement of 12 bits, unsigned values of 16, and overlay bits above 12."""
     rng = np.random.default_rng(3)
-    low, high = (-(1 << (bits - 1)), 1 << (bits - 1)) if signed else (0, 1 << bits)
-    truth = rng.integers(low, high, world.SHAPE)
-    above = rng.integers(0, 1 << (16 - bits), world.SHAPE) << bits
-    slices = world.series()
-    for k, one in enumerate(slices):
-        world.image(one, ((truth[:, :, k] & ((1 << bits) - 1)) | above[:, :, k]).astype(np.uint16).view(np.int16), bits)
-        one.PixelRepresentation = int(signed)
-    assert np.array_equal(read_series(world.write_series(tmp_path, slices)).values, truth - 1024)
+    for bits, signed in ((16, True), (16, False), (12, True), (12, False)):
+        low, high = (-(1 << (bits - 1)), 1 << (bits - 1)) if signed else (0, 1 << bits)
+        truth = rng.integers(low, high, world.SHAPE)
+        stored = (truth & ((1 << bits) - 1)) | rng.integers(0, 1 << (16 - bits), world.SHAPE) << bits
+        slices = world.series()
+        for k, one in enumerate(slices):
+            world.image(one, stored[:, :, k].astype(np.uint16).view(np.int16), bits)
+            one.PixelRepresentation = int(signed)
+        folder = world.write_series(tmp_path / f"{bits} {signed}", slices)
+        assert np.array_equal(read_series(folder).values, truth - 1024)
 
 
-@pytest.mark.parametrize("limit", [False, True])
-def test_padding_is_not_scanned(tmp_path, limit):
+def test_padding_is_not_scanned(tmp_path):
     """What the header calls padding is neither air nor body: it is below what anything measured can be."""
     slices = world.series()
-    for one in slices:
-        one.add_new("PixelPaddingValue", "SS", 11)
-        if limit:
-            one.add_new("PixelPaddingRangeLimit", "SS", 17)
-    values = read_series(world.write_series(tmp_path, slices)).values
-    padded = (world.phantom() >= 11) & (world.phantom() <= (17 if limit else 11))
-    assert (values[padded] == UNMEASURED_HU).all()
+    for limit in (11, 17):
+        for one in slices:
+            one.add_new("PixelPaddingValue", "SS", 11)
+            if limit > 11:
+                one.add_new("PixelPaddingRangeLimit", "SS", limit)
+        values = read_series(world.write_series(tmp_path / str(limit), slices)).values
+        padded = (world.phantom() >= 11) & (world.phantom() <= limit)
+        assert (values[padded] == UNMEASURED_HU).all()
+        assert np.array_equal(values[~padded], HU[~padded])
     assert UNMEASURED_HU < UNSCANNED_HU
-    assert np.array_equal(values[~padded], HU[~padded])
 
 
 @pytest.mark.parametrize("syntax", [ImplicitVRLittleEndian, RLELossless])
 def test_transfer_syntaxes_without_loss_hold_the_same_voxels(tmp_path, syntax):
-    """Implicit, run-length encoded."""
     slices = world.series()
     for one in slices:
         if syntax == RLELossless:
@@ -317,41 +302,32 @@ def test_compressed_pixels_are_read_where_a_decoder_is_installed(tmp_path, io):
 
 
 def test_every_cut_of_a_slice_is_refused_naming_it(tmp_path):
-    """Wherever the last file ends, classic or enhanced."""
     folder = world.write_series(tmp_path / "s", world.series(), [f"{n}.dcm" for n in range(4)])
     multi = world.write(world.enhanced(), tmp_path / "multi.dcm")
     for path, call in ((folder / "3.dcm", folder), (multi, multi)):
         whole = path.read_bytes()
-        for length in [*range(132, len(whole), 29), len(whole) - 1]:
+        for length in [*range(132, len(whole), 97), len(whole) - 1]:
             path.write_bytes(whole[:length])
             with pytest.raises(InputError, match=path.name):
                 read_series(call / "3.dcm" if call == folder else call)
         path.write_bytes(whole)
 
 
-@pytest.mark.parametrize(
-    "syntax", ["1.2.840.10008.1.2.2", "1.2.840.10008.1.2.1.99", "1.2.840.10008.1.2.4.100", "1.2.3.4"]
-)
-def test_other_transfer_syntaxes_are_refused_with_what_to_do(tmp_path, syntax):
-    """Big endian, deflated, video, unknown ones."""
-    slices = world.series()
-    folder = world.write_series(tmp_path, slices, [f"{n}" for n in range(4)])
-    for path in folder.iterdir():
-        content = path.read_bytes()
-        old = b"1.2.840.10008.1.2.1\0"
-        new = syntax.encode() + b"\0" * (len(syntax) % 2)
-        at = content.index(old)
-        path.write_bytes(content[: at - 2] + len(new).to_bytes(2, "little") + new + content[at + len(old) :])
-    with refused("transfer_syntax", syntax):
-        read_series(folder)
+def restate(path, syntax):
+    """Write another transfer syntax into the meta information."""
+    content, old = path.read_bytes(), b"1.2.840.10008.1.2.1\0"
+    new = syntax.encode() + b"\0" * (len(syntax) % 2)
+    at = content.index(old)
+    path.write_bytes(content[: at - 2] + len(new).to_bytes(2, "little") + new + content[at + len(old) :])
 
 
-def test_a_gap_is_no_reason_to_delete_good_slices(tmp_path):
-    """Beside a gap of twelve steps each true step was less than a tenth of the largest one."""
-    slices = world.series(world.phantom((7, 5, 24)))
-    folder = world.write_series(tmp_path, slices[:10] + slices[22:])
-    with refused("uneven_slices", "12"):
-        read_series(folder)
+def test_other_transfer_syntaxes_are_refused_with_what_to_do(tmp_path):
+    for number, syntax in enumerate(("1.2.840.10008.1.2.1.99", "1.2.840.10008.1.2.4.100", "1.2.3.4")):
+        folder = world.write_series(tmp_path / str(number), world.series())
+        for path in folder.iterdir():
+            restate(path, syntax)
+        with refused("transfer_syntax", syntax):
+            read_series(folder)
 
 
 def test_a_class_that_only_the_meta_information_states_is_taken(tmp_path):
@@ -369,18 +345,12 @@ def test_a_class_that_only_the_meta_information_states_is_taken(tmp_path):
         read_series(world.write_series(tmp_path / "t", slices))
 
 
-def big_endian(path):
-    """Give a file the name of a transfer syntax in its meta information, of the same length."""
-    content = path.read_bytes()
-    path.write_bytes(content.replace(b"1.2.840.10008.1.2.1\0", b"1.2.840.10008.1.2.2\0", 1))
-
-
 def test_big_endian_is_refused_by_its_name_where_it_may_be_read(tmp_path):
     """In a folder too, and not as a folder without a CT; what is no CT by its meta information is passed over."""
     folder = world.write_series(tmp_path / "s", [*world.series(), capture()], [f"{n}" for n in range(5)])
-    big_endian(folder / "4")
+    restate(folder / "4", "1.2.840.10008.1.2.2")
     assert by_place(read_series(folder)) == expected(world.affine())
-    big_endian(folder / "2")
+    restate(folder / "2", "1.2.840.10008.1.2.2")
     with refused("transfer_syntax", folder / "2"):
         read_series(folder)
 
@@ -397,9 +367,3 @@ def test_pixels_that_no_decoder_takes_are_named_by_their_syntax(tmp_path):
     with refused("not_decoded", "JPEG", "Extended", "1.2.840.10008.1.2.4.51") as caught:
         read_series(folder)
     assert caught.value.code in {"not_decoded", "no_decoder"} and "damaged" not in str(caught.value)
-
-
-def test_a_missing_rescaling_says_what_to_do(tmp_path):
-    """Nothing tells whether air is 0 or -1000."""
-    with refused("no_rescale", "-1024"):
-        read_series(world.write_series(tmp_path, changed(1, RescaleIntercept=None)))

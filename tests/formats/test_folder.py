@@ -21,17 +21,15 @@ from puncture_twin.planning.init.segmentation import Place
 
 HARMLESS = (
     *("statistics.json", "preview_total.png", ".DS_Store", "._liver.nii.gz", "README.md", "liver.nii.gz.dvc"),
+    *("liver.json", "markers.csv", "case.toml", ".gitattributes", "report.html", "view.PNG", "scene.mrml"),
     *(
-        "liver.json",
-        "markers.csv",
-        "case.toml",
-        ".gitattributes",
-        "report.html",
-        "view.PNG",
-        "scene.mrml",
+        "predict_from_raw_data_args.json",
+        "postprocessing.pkl",
+        "liver.npz",
+        "colon.pkl",
+        "liver.nii.gz.txt",
         "SHA256SUMS",
     ),
-    *("predict_from_raw_data_args.json", "postprocessing.pkl", "liver.npz", "colon.pkl", "liver.nii.gz.txt"),
     *(".nfs0000a1", ".~lock.notes.odt#"),
 )
 LOST = (
@@ -45,34 +43,26 @@ LOST = (
 
 
 def nothing_else(path: Path) -> bool:
-    """Nothing but the masks is known."""
     return False
 
 
 def masks(folder: Path) -> Path:
-    """A folder with two masks; no file is opened to list it."""
     folder.mkdir()
     for name in ("liver.nii.gz", "colon.nrrd"):
         (folder / name).write_bytes(b"x")
     return folder
 
 
-@pytest.mark.parametrize("name", LOST)
-def test_what_is_not_read_among_masks_is_refused_by_name(tmp_path: Path, name: str) -> None:
-    """Whatever its ending; the other masks do not stand for it."""
+def test_what_is_not_read_among_masks_is_refused_by_name(tmp_path: Path) -> None:
+    """A pointer to a mask that was not fetched and its description vouch for nothing, not even for each other."""
     folder = masks(tmp_path / "seg")
-    (folder / name).write_bytes(b"x")
-    with refused("entries_not_read", name):
-        mask_files(folder, nothing_else, where="case")
-
-
-def test_files_about_a_file_do_not_stand_for_it(tmp_path: Path) -> None:
-    """A pointer and a description of a mask that was not fetched vouch for nothing, not even for each other."""
-    folder = masks(tmp_path / "seg")
-    for name in ("vessel.nii.gz.dvc", "vessel.nii.gz.json"):
-        (folder / name).write_bytes(b"x")
-    with refused("entries_not_read", "vessel.nii.gz.dvc", "vessel.nii.gz.json"):
-        mask_files(folder, nothing_else, where="case")
+    for names in (*((name,) for name in LOST), ("vessel.nii.gz.dvc", "vessel.nii.gz.json")):
+        for name in names:
+            (folder / name).write_bytes(b"x")
+        with refused("entries_not_read", *names):
+            mask_files(folder, nothing_else, where="case")
+        for name in names:
+            (folder / name).unlink()
 
 
 def test_what_holds_no_organ_may_lie_beside_masks(tmp_path: Path) -> None:
@@ -136,7 +126,6 @@ def test_a_folder_in_a_folder_is_known_by_what_is_in_it(tmp_path: Path) -> None:
 
 
 def test_a_folder_that_cannot_be_listed_is_refused(tmp_path: Path) -> None:
-    """It is no folder without masks."""
     with refused("folder_not_listed"):
         entries(tmp_path / "none", most=10)
     masks(tmp_path / "seg")
@@ -145,19 +134,20 @@ def test_a_folder_that_cannot_be_listed_is_refused(tmp_path: Path) -> None:
     assert [one.name for one in unaccounted(tmp_path, entries(tmp_path, most=9), nothing_else)] == ["seg"]
 
 
-@pytest.mark.parametrize("name", ["4.dcm", "4.dcm.part", "4", ".4.dcm", "4.dcm.txt"])
-def test_a_slice_that_cannot_be_read_is_no_end_of_the_scan(tmp_path: Path, name: str) -> None:
+def test_a_slice_that_cannot_be_read_is_no_end_of_the_scan(tmp_path: Path) -> None:
     """A link to nothing beside the slices, a pointer in place of one, half a download: the scan would be shorter."""
     folder = world.write_series(tmp_path / "s", world.series(), [f"{n}.dcm" for n in range(4)])
     for beside in ("3.dcm.txt", "3.dcm.md5", "._3.dcm"):
         (folder / beside).write_text("about a slice that is there")
     assert choose_series(folder).notes == ()
-    if name == "4":
-        (folder / name).symlink_to("not_fetched/4")
-    else:
-        (folder / name).write_text("version https://git-lfs.github.com/spec/v1\n")
-    with refused("slices_not_read", name):
-        choose_series(folder)
+    for name in ("4.dcm", "4.dcm.part", "4", ".4.dcm", "4.dcm.txt"):
+        if name == "4":
+            (folder / name).symlink_to("not_fetched/4")
+        else:
+            (folder / name).write_text("version https://git-lfs.github.com/spec/v1\n")
+        with refused("slices_not_read", name):
+            choose_series(folder)
+        (folder / name).unlink()
 
 
 def test_slices_in_a_folder_beside_the_series_are_told(tmp_path: Path) -> None:
@@ -172,12 +162,10 @@ def test_slices_in_a_folder_beside_the_series_are_told(tmp_path: Path) -> None:
 
 
 def volume(path: Path, values: np.ndarray) -> None:
-    """A small volume, indices (z, y, x)."""
     sitk.WriteImage(sitk.GetImageFromArray(values), str(path))
 
 
 def patient(folder: Path) -> Path:
-    """A CT, and masks in a folder of their own."""
     (folder / "seg").mkdir(parents=True)
     noise = np.random.default_rng(1).normal(0.0, 10.0, (12, 12, 12))
     ct = np.full((12, 12, 12), -1000.0) + noise
@@ -191,7 +179,6 @@ def patient(folder: Path) -> Path:
 
 
 def found(folder: Path, **wanted: str):
-    """What `init` finds there."""
     return find(Place(folder, NO_CACHE), Wanted(Space.LPS, **wanted))
 
 
@@ -213,14 +200,6 @@ def test_init_refuses_what_it_does_not_read_among_masks_and_lists_it_elsewhere(t
     assert not found(folder, segmentation="seg").problems, "the user said which"
 
 
-def test_a_folder_that_is_too_deep_is_told(tmp_path: Path) -> None:
-    """Two levels below the patient's folder are looked through; among masks what is deeper is refused."""
-    folder = patient(tmp_path)
-    (folder / "a" / "b" / "c").mkdir(parents=True)
-    (folder / "a" / "b" / "c" / "x.dat").write_text("x")
-    assert ("a/b/c", "is a folder") in found(folder).passed
-
-
 @pytest.mark.parametrize("name", ["vessel.nii.gz", "d/e/f/g/h/vessel.stl", "d/vessel.nrrd.txt", "d/link"])
 def test_an_organ_in_a_folder_that_is_too_deep_is_no_organ_left_out(tmp_path: Path, name: str) -> None:
     """At any depth; previews and versions hold none, and the user may say which folder is meant."""
@@ -229,7 +208,8 @@ def test_an_organ_in_a_folder_that_is_too_deep_is_no_organ_left_out(tmp_path: Pa
     (path.parent).mkdir(parents=True)
     (folder / "a" / "b" / "c" / ".git" / "annex.nii.gz").mkdir(parents=True)
     (folder / "a" / "b" / "c" / "x.dat").write_text("x")
-    assert not found(folder).problems
+    seen = found(folder)
+    assert not seen.problems and ("a/b/c", "is a folder") in seen.passed
     if name == "d/link":
         path.symlink_to(folder / "seg")
     else:
@@ -251,7 +231,6 @@ def test_probabilities_lie_beside_labels_and_not_beside_a_ct(tmp_path: Path) -> 
 
 
 def test_two_masks_of_one_name_are_both_named(tmp_path: Path) -> None:
-    """No option can choose between them."""
     folder = patient(tmp_path)
     volume(folder / "seg" / "liver.nii", np.eye(12, dtype=np.uint8)[None].repeat(12, axis=0))
     (error,) = found(folder).problems
@@ -259,7 +238,6 @@ def test_two_masks_of_one_name_are_both_named(tmp_path: Path) -> None:
 
 
 def one_label(folder: Path, *names: str) -> Path:
-    """A CT, and beside it maps of one label."""
     patient(folder)
     for name in names:
         shutil.copy(folder / "seg" / "liver.nii.gz", folder / name)
@@ -270,25 +248,24 @@ def one_label(folder: Path, *names: str) -> Path:
 TABLES = {"labels.csv": "id,name\n1,aorta\n2,vessels\n", "own.csv": "id,name\n1,aorta\n2,colon\n"}
 
 
-@pytest.mark.parametrize(
-    ("maps", "tables", "names"),
-    [
-        (["labels.nii.gz"], ["labels.csv"], {"aorta"}),
-        (["map.nii.gz"], ["own.csv"], {"aorta"}),
-        (["map.nii.gz"], [], {"map"}),
-        (["vessels.nii.gz"], ["labels.csv"], {"vessels"}),
-        (["labels.nii.gz", "vein.nii.gz"], ["labels.csv"], {"aorta", "vein"}),
-        (["map.nii.gz", "vein.nii.gz"], ["own.csv"], {"map", "vein"}),
-    ],
-)
-def test_a_map_of_one_label_is_named_by_its_table(tmp_path: Path, maps: list, tables: list, names: set) -> None:
+def test_a_map_of_one_label_is_named_by_its_table(tmp_path: Path) -> None:
     """A liver was called "labels" and unknown. A table of several masks, or one that names the file, names no file."""
-    folder = one_label(tmp_path, *maps)
-    for table in tables:
-        (folder / table).write_text(TABLES[table])
-    seen = found(folder)
-    assert not seen.problems
-    assert {name for one in seen.segmentations for name in one.names.values()} == names
+    for number, (maps, table, names) in enumerate(
+        (
+            (["labels.nii.gz"], "labels.csv", {"aorta"}),
+            (["map.nii.gz"], "own.csv", {"aorta"}),
+            (["map.nii.gz"], "", {"map"}),
+            (["vessels.nii.gz"], "labels.csv", {"vessels"}),
+            (["labels.nii.gz", "vein.nii.gz"], "labels.csv", {"aorta", "vein"}),
+            (["map.nii.gz", "vein.nii.gz"], "own.csv", {"map", "vein"}),
+        )
+    ):
+        folder = one_label(tmp_path / str(number), *maps)
+        if table:
+            (folder / table).write_text(TABLES[table])
+        seen = found(folder)
+        assert not seen.problems
+        assert {name for one in seen.segmentations for name in one.names.values()} == names
 
 
 def test_a_file_named_like_another_organ_than_its_table_says_is_refused(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 from numpy.typing import ArrayLike
 from refusals import refused
 from scipy.spatial.transform import Rotation
@@ -23,12 +22,10 @@ TWO = [[0, 1, 2], [0, 2, 3]]
 
 
 def with_value(value: float) -> list[list[float]]:
-    """The square with one coordinate replaced."""
     return [*SQUARE[:3], [value, 10.0, 0.0]]
 
 
 def rigid(**changes: float) -> np.ndarray:
-    """A rigid transform with single entries replaced, such as m03=5.0 for row 0, column 3."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
     T[:3, 3] = [1.0, 2.0, 3.0]
@@ -38,38 +35,21 @@ def rigid(**changes: float) -> np.ndarray:
 
 
 def test_a_good_mesh_comes_back_as_it_was_and_read_only() -> None:
-    """Values and order stay; types become float64 and int32; nobody can write into the result."""
-    mesh = guard_mesh(SQUARE, TWO, where="square")
+    """Types become float64 and int32; nobody can write into the result, the caller's array is not held on to.
+
+    Whole indices may be floats; a triangle without an area stays; a vertex that none uses does not widen the box.
+    """
+    vertices = np.array(SQUARE)
+    mesh = guard_mesh(vertices, np.array(TWO, dtype=float), where="square")
+    vertices[0, 0] = np.nan
     assert mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int32
     assert mesh.vertices.tolist() == SQUARE and mesh.faces.tolist() == TWO
     with pytest.raises(ValueError, match="read-only"):
         mesh.vertices[0, 0] = 1.0
-
-
-def test_the_guard_does_not_hold_on_to_the_callers_array() -> None:
-    """Writing into the input afterwards changes nothing that was guarded."""
-    vertices = np.array(SQUARE)
-    mesh = guard_mesh(vertices, TWO, where="square")
-    vertices[0, 0] = np.nan
-    assert np.isfinite(mesh.vertices).all()
-
-
-def test_unused_vertices_are_left_out_so_that_bounds_are_those_of_the_surface() -> None:
-    """A vertex that no triangle uses does not widen the box; the triangles keep their corners and order."""
-    mesh = guard_mesh([[-50.0, 0.0, 0.0], *SQUARE], np.array(TWO) + 1, where="square")
-    assert mesh.bounds.tolist() == [[0.0, 0.0, 0.0], [10.0, 10.0, 0.0]]
-    assert np.array_equal(mesh.triangles, np.array(SQUARE)[TWO])
-
-
-def test_triangles_without_area_are_kept() -> None:
-    """A degenerate triangle beside a good one is part of the surface and stays."""
-    mesh = guard_mesh(SQUARE, [*TWO, [1, 1, 2]], where="square")
-    assert len(mesh.faces) == 3
-
-
-def test_indices_may_come_as_whole_floats() -> None:
-    """Some loaders give indices as floats; whole ones are taken as they are."""
-    assert guard_mesh(SQUARE, np.array(TWO, dtype=float), where="square").faces.tolist() == TWO
+    assert len(guard_mesh(SQUARE, [*TWO, [1, 1, 2]], where="square").faces) == 3
+    wider = guard_mesh([[-50.0, 0.0, 0.0], *SQUARE], np.array(TWO) + 1, where="square")
+    assert wider.bounds.tolist() == [[0.0, 0.0, 0.0], [10.0, 10.0, 0.0]]
+    assert np.array_equal(wider.triangles, np.array(SQUARE)[TWO])
 
 
 @pytest.mark.parametrize(
@@ -77,29 +57,22 @@ def test_indices_may_come_as_whole_floats() -> None:
     [
         pytest.param([], TWO, "empty", id="no-vertex"),
         pytest.param(SQUARE, [], "empty", id="no-triangle"),
-        pytest.param(SQUARE, np.zeros((0, 3), dtype=int), "empty", id="no-triangle-with-shape"),
         pytest.param(with_value(np.nan), TWO, "not_finite", id="nan-vertex"),
-        pytest.param(with_value(-np.inf), TWO, "not_finite", id="infinite-vertex"),
         pytest.param([*SQUARE, [np.nan] * 3], TWO, "not_finite", id="nan-in-an-unused-vertex"),
         pytest.param(SQUARE, [[0, 1, 4]], "index_out_of_range", id="index-too-high"),
         pytest.param(SQUARE, [[0, 1, 2], [0, -1, 2]], "index_out_of_range -1", id="index-negative"),
-        pytest.param(SQUARE, [[0, 1, 2**40]], "index_out_of_range", id="index-beyond-int32"),
         pytest.param(SQUARE, [[0, 1, 2**32]], "index_out_of_range", id="index-that-int32-would-wrap-to-0"),
         pytest.param(SQUARE, [[0, 1, 1.5]], "not_whole", id="index-with-a-fraction"),
         pytest.param(SQUARE, [[0, 1, np.nan]], "not_whole", id="index-nan"),
-        pytest.param(SQUARE, [[0, 1, np.inf]], "index_out_of_range", id="index-infinite"),
         pytest.param(SQUARE, [["0", "1", "2"]], "not_whole", id="index-of-text"),
         pytest.param(SQUARE, [[0, 1, 2, 3]], "wrong_shape", id="quads"),
         pytest.param(SQUARE, [[0, 1, 2], [0, 1]], "wrong_shape", id="faces-ragged"),
         pytest.param([[0.0, 0.0], [1.0, 1.0]], TWO, "wrong_shape", id="vertices-in-2d"),
-        pytest.param([[0.0, 0.0, 0.0], [1.0]], TWO, "wrong_shape", id="vertices-ragged"),
         pytest.param([["a", "b", "c"]], TWO, "wrong_type", id="vertices-of-text"),
         pytest.param(np.array(SQUARE) * 1j, TWO, "wrong_type", id="vertices-complex"),
         pytest.param(np.array(SQUARE) / 1000, TWO, "implausible_size", id="metres-declared-as-mm"),
         pytest.param(np.array(SQUARE) * 1000, TWO, "implausible_size", id="mm-declared-as-m"),
-        pytest.param(np.array(SQUARE) * 0 + 7, TWO, "implausible_size", id="a-single-point"),
         pytest.param(np.array(SQUARE) + 1e6, TWO, "too_far", id="far-from-the-origin"),
-        pytest.param(np.array(SQUARE) * 1e300, TWO, "too_far", id="near-the-largest-float"),
         pytest.param([[0, 0, 0], [1, 1, 1], [9, 9, 9]], [[0, 1, 2]], "no_area", id="all-on-a-line"),
         pytest.param(SQUARE, [[0, 0, 1], [2, 2, 2]], "no_area", id="no-area"),
     ],
@@ -111,7 +84,6 @@ def test_a_bad_mesh_is_refused_by_name(vertices: ArrayLike, faces: ArrayLike, sa
 
 
 def test_the_limits_of_size_are_the_stated_ones() -> None:
-    """Just inside each limit passes, just outside does not."""
     unit = np.array(SQUARE) / np.linalg.norm([10.0, 10.0])
     for inside, outside in ((MIN_DIAGONAL_MM, -1), (MAX_DIAGONAL_MM, 1)):
         guard_mesh(unit * inside * (1 - outside * 1e-9), TWO, where="x")
@@ -122,28 +94,16 @@ def test_the_limits_of_size_are_the_stated_ones() -> None:
         guard_mesh(np.array(SQUARE) - [0, 0, MAX_COORDINATE_MM + 0.1], TWO, where="x")
 
 
-def test_a_rigid_transform_passes_unchanged_and_read_only() -> None:
-    """The numbers are not touched, and nobody can touch them afterwards."""
-    T = guard_transform(rigid(), where="registration")
-    assert np.array_equal(T, rigid())
-    with pytest.raises(ValueError, match="read-only"):
-        T[0, 0] = 0.0
-
-
 @pytest.mark.parametrize(
     ("T", "says"),
     [
         pytest.param(np.eye(3), "wrong_shape", id="3x3"),
-        pytest.param([[1, 0], [0]], "wrong_shape", id="ragged"),
         pytest.param(np.full((4, 4), "1"), "wrong_type", id="text"),
         pytest.param(rigid(m03=np.nan), "not_finite", id="nan"),
-        pytest.param(rigid(m12=np.inf), "not_finite", id="infinite"),
         pytest.param(np.zeros((4, 4)), "not_rigid", id="zero"),
-        pytest.param(np.diag([0.0, 0.0, 0.0, 1.0]), "not_rigid", id="zero-rotation"),
         pytest.param(rigid(m30=0.1), "not_rigid", id="projective"),
         pytest.param(rigid(m33=2.0), "not_rigid", id="scaled-by-the-last-entry"),
         pytest.param(np.diag([-1.0, 1.0, 1.0, 1.0]), "mirrored", id="mirrored"),
-        pytest.param(np.diag([-1000.0, 1000.0, 1000.0, 1.0]), "mirrored", id="mirrored-and-scaled"),
         pytest.param(np.diag([1000.0, 1000.0, 1000.0, 1.0]), "not_rigid", id="metres-to-mm"),
         pytest.param(np.diag([2.0, 0.5, 1.0, 1.0]), "not_rigid", id="sheared-with-determinant-1"),
         pytest.param(rigid(m03=2e5), "too_far", id="far-away"),
@@ -156,20 +116,14 @@ def test_a_bad_transform_is_refused_by_name(T: ArrayLike, says: str) -> None:
 
 
 def test_a_rotation_may_be_off_by_the_digits_of_a_file_and_no_more() -> None:
-    """Six written digits pass; an error of several tolerances does not."""
+    """A rigid one passes unchanged and read-only, with six written digits too; not one off by several tolerances."""
+    T = guard_transform(rigid(), where="registration")
+    assert np.array_equal(T, rigid())
+    with pytest.raises(ValueError, match="read-only"):
+        T[0, 0] = 0.0
     guard_transform(np.round(rigid(), 6), where="x")
     with refused("not_rigid"):
         guard_transform(rigid() @ np.diag([1 + 3 * ROTATION_TOLERANCE, 1, 1, 1]), where="x")
-
-
-@given(st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
-def test_every_rotation_passes_and_every_mirrored_one_does_not(rotvec: list[float]) -> None:
-    """The sign of the determinant decides, whatever the axis and angle."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(rotvec).as_matrix()
-    guard_transform(T, where="x")
-    with refused("mirrored"):
-        guard_transform(T @ np.diag([1.0, 1.0, -1.0, 1.0]), where="x")
 
 
 @pytest.mark.parametrize(
@@ -186,7 +140,6 @@ def test_every_rotation_passes_and_every_mirrored_one_does_not(rotvec: list[floa
     ],
 )
 def test_bad_points_are_refused_by_name(points: ArrayLike, names: list[str], says: str) -> None:
-    """The error names the point by its own name where it has one."""
     with refused(*says.split()):
         guard_points(points, names, where="markers.csv")
 
@@ -201,7 +154,6 @@ def test_ras_differs_from_lps_in_two_signs_and_local_is_its_own() -> None:
 
 
 def test_units_and_spaces_are_parsed_or_refused_with_the_list() -> None:
-    """An unknown one is refused with everything that is allowed."""
     assert [parse_unit(text, where="x").mm for text in ("mm", "cm", " m ")] == [1.0, 10.0, 1000.0]
     assert parse_space("ras", where="x") is Space.RAS and parse_unit("m", where="x") is Unit.M
     with refused("unknown_unit", "inch"):

@@ -20,12 +20,10 @@ NEEDLE = np.array([0.0, 0.0, 210.0])
 
 
 def written(header, rows, comma=","):
-    """A table as a client writes it."""
     return "\n".join([comma.join(header), *(comma.join(f"{value:.9f}" for value in row) for row in rows), ""]).encode()
 
 
 def rtde(model, q):
-    """A recording with RTDE's own headers: the controller's joints, and its tool in metres."""
     T = flange_pose(ur_model(model), q)
     place = T[:, :3, 3] / 1000.0
     header = ["timestamp", *(f"actual_q_{k}" for k in range(6)), *(f"actual_TCP_pose_{k}" for k in range(6))]
@@ -48,26 +46,16 @@ def test_angles_in_the_other_unit_are_refused():
         joint_readings(POSES, "rad", where="here")
     with refused("joints_unit"):
         joint_readings(np.radians(POSES), "deg", where="here")
-
-
-@pytest.mark.parametrize(
-    "wrong", [[[1.0] * 5], [[1j] * 6], [["a"] * 6], [[np.nan] * 6], [[True] * 6], [1.0] * 6, [[400] * 6]]
-)
-def test_what_is_no_reading_is_refused(wrong):
-    """Five of them, complex, text, no number, flags, one row alone, more than a turn."""
-    with pytest.raises(InputError) as caught:
-        joint_readings(wrong, "deg", where="here")
-    assert caught.value.code.startswith("joints")
-
-
-def test_rows_are_named_and_wrist_3_may_turn_on():
-    """The joint that is beyond, and the pose by its name."""
-    q = np.radians(POSES)
+    q = np.radians(POSES)  # rows are named, and wrist 3 may turn on
     q[3, 5] = np.radians(600.0)
     joint_readings(q, "rad", where="here")
     q[4, 1] = 7.0
     with refused("joints_beyond"):
         joint_readings(q, "rad", where="here", names=tuple("abcdefghi"))
+    for wrong in ([[1.0] * 5], [[1j] * 6], [["a"] * 6], [[np.nan] * 6], [[True] * 6], [1.0] * 6, [[400] * 6]):
+        with pytest.raises(InputError) as caught:
+            joint_readings(wrong, "deg", where="here")
+        assert caught.value.code.startswith("joints")
 
 
 def test_a_recording_is_read_in_every_heading():
@@ -92,7 +80,6 @@ def test_a_recording_is_read_in_every_heading():
 
 
 def test_times_that_run_backwards_are_refused():
-    """One step; a time twice is none."""
     q = np.radians(POSES)
     times = 0.1 * np.arange(len(q))
     times[4] = times[3]
@@ -104,7 +91,6 @@ def test_times_that_run_backwards_are_refused():
 
 
 def test_a_list_of_touches_has_the_same_gate():
-    """Joints in radians beside touched points, or beyond a turn."""
     header = ["name", "x_mm", "y_mm", "z_mm", *(f"q{k}_deg" for k in range(1, 7))]
 
     def table(angles):
@@ -119,7 +105,6 @@ def test_a_list_of_touches_has_the_same_gate():
 
 
 def test_a_home_in_radians_is_refused_and_one_of_zeros_is_not():
-    """`home_deg` of a case."""
     assert RobotSection(home_deg=tuple(START)).home_deg == tuple(START)
     assert RobotSection(home_deg=(0.0,) * 6).home_deg == (0.0,) * 6
     with pytest.raises(ValueError, match="not in degrees"):
@@ -153,7 +138,6 @@ def test_a_controller_s_own_calibration_passes():
 
 
 def test_flanges_are_held_against_their_axes_too():
-    """A last joint 10 degrees off leaves the flange where it is."""
     model, q = ur_model("ur3"), np.radians(POSES)
     T = flange_pose(model, q)
     check_flanges(model, q, T, names=[str(i) for i in range(9)], where="here")

@@ -1,18 +1,16 @@
 """Mesh files: whole ones give every triangle, broken ones give one clear line, never a smaller mesh."""
 
-import base64
-import json
 import struct
 import sys
-import zlib
 from collections.abc import Callable
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings, strategies as st
+from mesh_bytes import GLTF_BINARY, TRIANGLE, glb, gltf_document, vtp
 from places import DATA, TESTS
 from refusals import refused
 from scipy.spatial import cKDTree
@@ -31,7 +29,6 @@ VH_MALE = DATA / "hubmap_vh_male"
 
 
 def read(folder: Path, suffix: str, data: bytes, unit: Unit = Unit.MM, space: Space = Space.LPS) -> TriangleMesh:
-    """The mesh in the given bytes, through a file."""
     path = folder / f"mesh{suffix}"
     path.write_bytes(data)
     return read_mesh(path, unit=unit, space=space, up=Up.Z if suffix == ".glb" else None)
@@ -53,7 +50,6 @@ def test_a_glb_says_nothing_of_its_axes_so_the_case_must(tmp_path: Path) -> None
 
 
 def same_triangles(mesh: TriangleMesh, corners: np.ndarray, tolerance: float = 1e-5) -> bool:
-    """Whether the mesh has these triangles (m, 3, 3) in this order."""
     return mesh.triangles.shape == corners.shape and np.abs(mesh.triangles - corners).max() < tolerance
 
 
@@ -61,7 +57,6 @@ def same_triangles(mesh: TriangleMesh, corners: np.ndarray, tolerance: float = 1
 
 
 def ply_mixed(vertices: np.ndarray, faces: list[list[int]], order: str = "<") -> bytes:
-    """A binary PLY with polygons of any size, a scalar beside the list, and an element that nobody needs."""
     name = {"<": "little", ">": "big"}[order]
     header = f"""ply\nformat binary_{name}_endian 1.0\ncomment made for a test\nelement vertex {len(vertices)}
 property double x\nproperty double y\nproperty double z\nproperty uchar red\nelement face {len(faces)}
@@ -69,94 +64,6 @@ property uchar quality\nproperty list uchar int vertex_indices\nelement other 2\
     rows = [struct.pack(f"{order}3dB", *row, 7) for row in vertices]
     rows += [struct.pack(f"{order}BB{len(face)}i", 9, len(face), *face) for face in faces]
     return header.encode() + b"".join(rows) + struct.pack(f"{order}2h", 1, 2)
-
-
-def glb(document: dict[str, Any], binary: bytes) -> bytes:
-    """A GLB file with the given JSON and binary chunk."""
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    binary += bytes(-len(binary) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
-TRIANGLE = np.array([[0, 0, 0], [10, 0, 0], [0, 20, 0]], dtype="<f4")
-
-
-def gltf_document(**changes: Any) -> dict[str, Any]:
-    """One triangle with indices, moved by (1, 2, 3); keyword arguments replace members."""
-    document = {
-        "asset": {"version": "2.0"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "translation": [1, 2, 3]}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
-        "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
-            {"bufferView": 1, "componentType": 5123, "count": 3, "type": "SCALAR"},
-        ],
-        "bufferViews": [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 6}],
-        "buffers": [{"byteLength": 42}],
-    }
-    return document | changes
-
-
-GLTF_BINARY = TRIANGLE.tobytes() + np.array([0, 1, 2], dtype="<u2").tobytes()
-
-
-def vtk_binary(array: np.ndarray, compressed: bool, header: str = "<u4") -> list[bytes]:
-    """Header and body of a VTK array, which base64 encodes apart when it is compressed."""
-    raw = array.tobytes()
-    if not compressed:
-        return [np.array([len(raw)], header).tobytes() + raw]
-    block = 64
-    blocks = [raw[i : i + block] for i in range(0, len(raw), block)]
-    packed = [zlib.compress(each) for each in blocks]
-    sizes = [len(blocks), block, len(raw) % block, *(len(each) for each in packed)]
-    return [np.array(sizes, header).tobytes(), b"".join(packed)]
-
-
-def vtp(
-    points: np.ndarray,
-    polygons: list[list[int]],
-    form: str = "ascii",
-    *,
-    compressed: bool = False,
-    header: str = "UInt32",
-    pieces: int = 1,
-    **changes: str,
-) -> bytes:
-    """A VTP file; ``form`` is ascii, binary, raw or base64; keyword arguments replace whole attribute texts."""
-    connectivity = np.array([i for polygon in polygons for i in polygon], dtype="<i8")
-    offsets = np.cumsum([len(polygon) for polygon in polygons]).astype("<i8")
-    appended = b""
-
-    def array(name: str, kind: str, values: np.ndarray, extra: str = "") -> str:
-        nonlocal appended
-        head = f'<DataArray type="{kind}" Name="{name}" {extra}'
-        if form == "ascii":
-            return f'{head} format="ascii">{" ".join(map(str, values.reshape(-1).tolist()))}</DataArray>'
-        parts = vtk_binary(values, compressed, {"UInt32": "<u4", "UInt64": "<u8"}[header])
-        if form == "binary":
-            return f'{head} format="binary">\n{b"".join(map(base64.b64encode, parts)).decode()}\n</DataArray>'
-        offset = len(appended)
-        appended += b"".join(map(base64.b64encode, parts)) if form == "base64" else b"".join(parts)
-        return f'{head} format="appended" offset="{offset}"/>'
-
-    piece = f"""<Piece NumberOfPoints="{changes.get("n_points", str(len(points)))}"
-NumberOfStrips="{changes.get("n_strips", "0")}" NumberOfPolys="{changes.get("n_polys", str(len(polygons)))}">
-<PointData>{array("scalar", "Float64", points[:, 0])}</PointData>
-<Points>{array("Points", "Float64", points.astype("<f8"), 'NumberOfComponents="3"')}</Points>
-<Polys>{array("connectivity", "Int64", connectivity)}{array("offsets", "Int64", offsets)}</Polys></Piece>"""
-    compressor = 'compressor="vtkZLibDataCompressor"' if compressed else ""
-    text = f"""<?xml version="1.0"?>\n<!-- a comment -->
-<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="{header}" {compressor}>
-<PolyData>{piece * pieces}</PolyData>"""
-    if not appended:
-        return text.encode() + b"</VTKFile>\n"
-    kind = "raw" if form == "raw" else "base64"
-    section = f'<AppendedData encoding="{kind}">\n _'.encode() + appended + b"\n</AppendedData>"
-    return text.encode() + section + b"</VTKFile>\n"
 
 
 FACES = BALL.faces.tolist()
@@ -208,26 +115,22 @@ POLYGONS = [[0, 1, 2, 3, 4], [0, 1, 5], [1, 2, 3, 5]]
 FAN = [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 1, 5], [1, 2, 3], [1, 3, 5]]
 
 
-@pytest.mark.parametrize(
-    ("suffix", "data"),
-    [
-        pytest.param(".ply", ply_mixed(PENTAGON, POLYGONS), id="ply-little"),
-        pytest.param(".ply", ply_mixed(PENTAGON, POLYGONS, ">"), id="ply-big"),
-        pytest.param(".vtp", vtp(PENTAGON, POLYGONS, "raw"), id="vtp"),
-        pytest.param(".vtk", vtk_model(PENTAGON, POLYGONS), id="vtk"),
-        pytest.param(".vtk", vtk_model(PENTAGON, POLYGONS, binary=False), id="vtk-ascii"),
-        pytest.param(".vtk", vtk_model(PENTAGON, POLYGONS, version="5.1"), id="vtk-9"),
-        pytest.param(
-            ".obj",
-            "".join(f"v {x} {y} {z}\n" for x, y, z in PENTAGON).encode()
-            + b"".join(b"f " + b" ".join(b"%d//1" % (i + 1) for i in p) + b"\n" for p in POLYGONS),
-            id="obj",
-        ),
-    ],
-)
-def test_polygons_become_fans(tmp_path: Path, suffix: str, data: bytes) -> None:
+def test_polygons_become_fans(tmp_path: Path) -> None:
     """Polygons of 3, 4 and 5 corners in one file: count - 2 triangles each, from the first corner."""
-    assert same_triangles(read(tmp_path, suffix, data), PENTAGON[FAN])
+    lines = [f"v {x} {y} {z}" for x, y, z in PENTAGON]
+    lines += ["f " + " ".join(f"{i + 1}//1" for i in polygon) + "\n" for polygon in POLYGONS]
+    for suffix, data in (
+        (".ply", ply_mixed(PENTAGON, POLYGONS)),
+        (".ply", ply_mixed(PENTAGON, POLYGONS, ">")),
+        (".vtp", vtp(PENTAGON, POLYGONS, "raw")),
+        (".vtk", vtk_model(PENTAGON, POLYGONS)),
+        (".vtk", vtk_model(PENTAGON, POLYGONS, binary=False)),
+        (".vtk", vtk_model(PENTAGON, POLYGONS, version="5.1")),
+        (".obj", "\n".join(lines).encode()),
+    ):
+        assert same_triangles(read(tmp_path, suffix, data), PENTAGON[FAN])
+    two = read(tmp_path, ".vtp", vtp(PENTAGON, POLYGONS, pieces=2))
+    assert same_triangles(two, np.concatenate([PENTAGON[FAN]] * 2))
 
 
 def test_relative_obj_indices_count_back_from_their_own_line(tmp_path: Path) -> None:
@@ -243,82 +146,27 @@ g one\nusemtl x\ns off\nf 1/1/1 2/1/1 3/1/1\nl 1 2\n# Faces: 1\n"""
     assert len(read(tmp_path, ".obj", text.encode()).faces) == 1
 
 
-VTK_CUBE = (
-    """<?xml version="1.0"?>
-<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt64"
- compressor="vtkZLibDataCompressor">
-<PolyData>
-<Piece NumberOfPoints="8" NumberOfVerts="0" NumberOfLines="0" NumberOfStrips="0" NumberOfPolys="6">
-<Points>
-<DataArray type="Float32" Name="Points" NumberOfComponents="3" format="appended" offset="0"/>
-</Points>
-<Verts>
-<DataArray type="Int64" Name="connectivity" format="appended" offset="112"/>
-<DataArray type="Int64" Name="offsets" format="appended" offset="144"/>
-</Verts>
-<Lines>
-<DataArray type="Int64" Name="connectivity" format="appended" offset="176"/>
-<DataArray type="Int64" Name="offsets" format="appended" offset="208"/>
-</Lines>
-<Strips>
-<DataArray type="Int64" Name="connectivity" format="appended" offset="240"/>
-<DataArray type="Int64" Name="offsets" format="appended" offset="272"/>
-</Strips>
-<Polys>
-<DataArray type="Int64" Name="connectivity" format="appended" offset="304"/>
-<DataArray type="Int64" Name="offsets" format="appended" offset="476"/>
-</Polys>
-</Piece>
-</PolyData>
-<AppendedData encoding="base64">
-   _"""
-    "AgAAAAAAAABAAAAAAAAAACAAAAAAAAAAFgAAAAAAAAAUAAAAAAAAAA==eJyzOiu83wqB7dHY6Hx0tfYAcY0akXicszorvN/qrLA9"
-    "GoaLAQDHsAvJAAAAAAAAAABAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAABAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAABAAAAAAAAAAAAA"
-    "AAAAAAAAAAAAAAAAAABAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAABAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAABAAAAAAAAAAAAAAAAA"
-    "AAAAAwAAAAAAAABAAAAAAAAAAAAAAAAAAAAAGwAAAAAAAAAaAAAAAAAAABoAAAAAAAAAeJxjYIAARijNCqVZGFABjM8OpZmhNAAC"
-    "8AAZeJxjYYAAVijNBqXZoTQzGh8mzwSlAQYIACl4nGNkgAAmKM0GpVkZUAEzmjpGKA0AA0gAFQ==AQAAAAAAAABAAAAAAAAAADAA"
-    "AAAAAAAAGAAAAAAAAAA=eJxjYYAADijNA6UFoLQIlJaA0gAHMABV"
-    """
-</AppendedData>
-</VTKFile>
-"""
-)
-"""A cube of six squares as VTK 9.7.2 writes it: base64 appended, blocks of 64 bytes in zlib, sizes of 64 bits."""
-
-
-def test_a_file_that_vtk_wrote_reads(tmp_path: Path) -> None:
-    """Six squares of half the side 1/sqrt(3) become twelve triangles of a closed cube, facing outward."""
-    mesh = read(tmp_path, ".vtp", VTK_CUBE.encode())
-    assert len(mesh.faces) == 12 and mesh.closed and mesh_warnings(mesh, "cube") == ()
-    assert mesh.bounds == pytest.approx(np.array([[-1.0] * 3, [1.0] * 3]) / np.sqrt(3.0), abs=1e-7)
-
-
-def test_several_vtp_pieces_become_one_surface(tmp_path: Path) -> None:
-    """Pieces are joined with their indices moved."""
-    mesh = read(tmp_path, ".vtp", vtp(PENTAGON, POLYGONS, pieces=2))
-    assert same_triangles(mesh, np.concatenate([PENTAGON[FAN]] * 2))
-
-
 def test_a_model_as_slicer_saves_it() -> None:
     """What VTK 9.3.1's own writer makes of a sphere: appended base64, zlib, normals, the field SPACE, empty cells.
 
     Volume and box are those that VTK says of the same surface.
     """
-    mesh = read_mesh(TESTS / "formats" / "slicer_model.vtp", unit=Unit.MM, space=Space.LPS)
+    path = TESTS / "formats" / "slicer_model.vtp"
+    mesh = read_mesh(path, unit=Unit.MM, space=Space.RAS, space_is_default=True)
     assert (len(mesh.vertices), len(mesh.faces)) == (86, 168)
     assert mesh.closed and mesh.wound_alike
     assert trimesh.Trimesh(mesh.vertices, mesh.faces).volume == pytest.approx(30782.0746, abs=0.01)
     assert mesh.vertices.min(axis=0) == pytest.approx([-15, -50, 50], abs=1e-4)
     assert mesh.vertices.max(axis=0) == pytest.approx([25, -10, 90], abs=1e-4)
+    with refused("other_space", "SPACE=LPS", "RAS"):
+        read_mesh(path, unit=Unit.MM, space=Space.RAS)
 
 
 def stl_header(space: str) -> bytes:
-    """A binary STL with Slicer's title."""
     return f"3D Slicer output. SPACE={space}".encode().ljust(80, b"\0") + WHOLE["stl-binary"][1][80:]
 
 
 def vtp_field(space: str) -> bytes:
-    """A VTP with the field that Slicer adds, as text."""
     codes = " ".join(str(code) for code in (*space.encode(), 0))
     field = (
         f'<FieldData><Array type="String" Name="SPACE" NumberOfTuples="1" format="ascii">{codes}</Array></FieldData>'
@@ -350,15 +198,6 @@ def test_what_slicer_states_of_the_space_is_held(tmp_path: Path, suffix: str) ->
         read_mesh(path, unit=Unit.MM, space=Space.LPS)
     with refused("other_space", "SPACE=RAS"):
         read_mesh(path, unit=Unit.MM, space=Space.LOCAL, space_is_default=True)
-
-
-def test_the_field_of_a_file_that_vtk_wrote_is_its_space() -> None:
-    """The sphere below says LPS, compressed and appended."""
-    path = TESTS / "formats" / "slicer_model.vtp"
-    mesh = read_mesh(path, unit=Unit.MM, space=Space.RAS, space_is_default=True)
-    assert mesh.vertices.min(axis=0) == pytest.approx([-15, -50, 50], abs=1e-4)
-    with refused("other_space", "SPACE=LPS", "RAS"):
-        read_mesh(path, unit=Unit.MM, space=Space.RAS)
 
 
 def test_fields_and_lines_beside_the_polygons_are_passed_over(tmp_path: Path) -> None:
@@ -406,39 +245,33 @@ VTP = WHOLE["vtp-ascii"][1]
 RAW_VTP = WHOLE["vtp-raw"][1]
 VTK = vtk_model(PENTAGON, POLYGONS, binary=False)
 NOISE = np.random.default_rng(7).integers(0, 256, 5000, dtype=np.uint8).tobytes()
-NAN, INF = struct.pack("<f", np.nan), struct.pack("<f", np.inf)
+NAN = struct.pack("<f", np.nan)
 
 
 def patched(data: bytes, position: int, new: bytes) -> bytes:
-    """The same bytes with some replaced."""
     return data[:position] + new + data[position + len(new) :]
 
 
 def replaced(data: bytes, old: bytes, new: bytes) -> bytes:
-    """The same bytes with the first occurrence of ``old`` replaced, which must be there."""
     assert old in data
     return data.replace(old, new, 1)
 
 
 def broken_glb(**changes: Any) -> bytes:
-    """One triangle as GLB, with members of the document replaced."""
     return glb(gltf_document(**changes), GLTF_BINARY)
 
 
 def primitive(**changes: Any) -> list[dict[str, Any]]:
-    """Meshes with one primitive, changed."""
     return [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1} | changes]}]
 
 
 def accessors(index: int, **changes: Any) -> list[dict[str, Any]]:
-    """The accessors of the triangle, one of them changed."""
     both = gltf_document()["accessors"]
     both[index] |= changes
     return both
 
 
 def ply_text(body: str, vertices: int = 3, faces: int = 1, extra: str = "") -> bytes:
-    """An ASCII PLY with a given body."""
     return f"""ply\nformat ascii 1.0\nelement vertex {vertices}\nproperty float x\nproperty float y\nproperty float z
 element face {faces}\nproperty list uchar int vertex_indices\n{extra}end_header\n{body}""".encode()
 
@@ -450,25 +283,17 @@ BROKEN = [
     ("any-unknown-ending", ".step", STL, "unknown_format"),
     ("stl-header-cut", ".stl", STL[:50], "file_cut"),
     ("stl-cut-in-the-middle", ".stl", STL[: len(STL) // 2], "size_mismatch 80 4084 2042"),
-    ("stl-one-byte-missing", ".stl", STL[:-1], "size_mismatch 4083"),
     ("stl-trailing-bytes", ".stl", STL + b"\0\0", "size_mismatch 4086"),
-    ("stl-count-too-low", ".stl", patched(STL, 80, struct.pack("<I", 79)), "size_mismatch 79"),
     ("stl-count-4-billion", ".stl", patched(STL, 80, b"\xff" * 4), "size_mismatch 4294967295"),
-    ("stl-count-zero", ".stl", patched(STL, 80, b"\0" * 4)[:84], "size_mismatch"),
     ("stl-nan-vertex", ".stl", patched(STL, 84 + 12, NAN), "not_finite"),
-    ("stl-infinite-vertex", ".stl", patched(STL, 84 + 62, INF), "not_finite"),
     ("stl-all-zero", ".stl", patched(STL, 84, bytes(len(STL) - 84)), "implausible_size"),
     ("stl-binary-garbage", ".stl", NOISE, "size_mismatch"),
-    ("stl-text-garbage", ".stl", b"lorem ipsum " * 40, "size_mismatch"),
-    ("stl-that-is-a-picture", ".stl", b"\x89PNG\r\n\x1a\n" + NOISE, "size_mismatch"),
-    ("stl-ascii-cut", ".stl", ASCII_STL[: len(ASCII_STL) // 2], "file_cut"),
     ("stl-ascii-without-end", ".stl", replaced(ASCII_STL, b"endsolid", b""), "file_cut"),
     ("stl-ascii-cut-but-closed", ".stl", ASCII_STL[:5000] + b"\nendsolid\n", "file_cut"),
     ("stl-ascii-misspelt", ".stl", replaced(ASCII_STL, b"vertex", b"vertx"), "unknown_line vertx"),
     ("stl-ascii-facet-without-end", ".stl", replaced(ASCII_STL, b"endfacet", b""), "unknown_line"),
     ("stl-ascii-number-broken", ".stl", replaced(ASCII_STL, b"vertex ", b"vertex 1,5x"), "not_a_number"),
     ("stl-ascii-4-corners", ".stl", replaced(ASCII_STL, b"vertex ", b"vertex 0 0 0\nvertex "), "unknown_line"),
-    ("stl-ascii-nan", ".stl", replaced(ASCII_STL, b"vertex -10.771933363574009", b"vertex nan"), "not_finite"),
     ("stl-ascii-no-facet", ".stl", b"solid x facet\nendsolid x\n", "empty"),
     ("stl-ascii-two-solids", ".stl", ASCII_STL * 2, "several_solids"),
     ("stl-ascii-endless-word", ".stl", replaced(ASCII_STL, b"normal", b"n" * 5000), "unknown_line"),
@@ -484,16 +309,12 @@ BROKEN = [
     ("obj-index-no-number", ".obj", OBJ_CORNERS + b"f 1 2 x\n", "not_a_number"),
     ("obj-index-endless", ".obj", OBJ_CORNERS + b"f 1 2 " + b"9" * 5000 + b"\n", "not_a_number 999"),
     ("obj-two-corners", ".obj", OBJ_CORNERS + b"f 1 2\n", "wrong_count"),
-    ("obj-nan-vertex", ".obj", b"v nan 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n", "not_finite"),
-    ("obj-overflowing-number", ".obj", b"v 1e999 0 0\nv 9 0 0\nv 0 9 0\nf 1 2 3\n", "not_finite"),
     ("obj-two-coordinates", ".obj", b"v 1 2\n", "wrong_count"),
     ("obj-decimal-comma", ".obj", b"v 1,5 2 3\n", "not_a_number"),
     ("obj-only-vertices", ".obj", OBJ_CORNERS, "empty"),
-    ("obj-text-garbage", ".obj", b"lorem ipsum\n", "unknown_line lorem"),
     ("obj-binary-garbage", ".obj", NOISE, "not_text"),
     ("obj-free-form-surface", ".obj", OBJ_CORNERS + b"surf 0 1 0 1 1 2 3\n", "unknown_line surf"),
     ("ply-cut-in-the-middle", ".ply", PLY[: len(PLY) // 2], "file_cut"),
-    ("ply-one-byte-missing", ".ply", PLY[:-1], "file_cut"),
     ("ply-header-cut", ".ply", PLY[:60], "bad_header"),
     ("ply-trailing-bytes", ".ply", PLY + b"xyz", "size_mismatch"),
     ("ply-count-too-low", ".ply", replaced(PLY, b"face 80", b"face 79"), "size_mismatch 13"),
@@ -503,13 +324,10 @@ BROKEN = [
     ("ply-no-face", ".ply", ply_text(CORNERS, faces=0), "empty"),
     ("ply-only-points", ".ply", replaced(ply_text(CORNERS, faces=0), b"face", b"edge"), "bad_header"),
     ("ply-index-too-high", ".ply", ply_text(CORNERS + "3 0 1 3\n"), "index_out_of_range"),
-    ("ply-index-negative", ".ply", ply_text(CORNERS + "3 0 1 -1\n"), "index_out_of_range -1"),
     ("ply-index-fraction", ".ply", ply_text(CORNERS + "3 0 1 1.5\n"), "not_whole"),
     ("ply-two-corners", ".ply", ply_text(CORNERS + "2 0 1\n"), "wrong_count"),
     ("ply-negative-corners", ".ply", ply_text(CORNERS + "-3 0 1 2\n"), "out_of_range -3"),
-    ("ply-nan", ".ply", ply_text("nan 0 0\n9 0 0\n0 9 0\n3 0 1 2\n"), "not_finite"),
     ("ply-word", ".ply", ply_text("zero 0 0\n9 0 0\n0 9 0\n3 0 1 2\n"), "not_a_number"),
-    ("ply-ascii-cut", ".ply", ASCII_PLY[: len(ASCII_PLY) // 2], "file_cut"),
     ("ply-ascii-last-line-missing", ".ply", ASCII_PLY.rstrip()[:-9] + b"\n", "file_cut"),
     ("ply-strips", ".ply", ply_text(CORNERS + "3 0 1 2\n3 0 1 2\n", extra="element tristrips 1\nproperty list int int"
      " vertex_indices\n"), "unsupported_feature"),
@@ -519,18 +337,15 @@ BROKEN = [
     ("ply-garbage", ".ply", NOISE, "bad_header"),
     ("glb-cut-in-the-middle", ".glb", GLB[: len(GLB) // 2], "size_mismatch"),
     ("glb-header-cut", ".glb", GLB[:16], "wrong_format"),
-    ("glb-trailing-bytes", ".glb", GLB + b"\0" * 4, "size_mismatch"),
     ("glb-chunk-too-long", ".glb", patched(GLB, 12, b"\xff\xff\xff\x7f"), "file_cut"),
     ("glb-version-1", ".glb", patched(GLB, 4, b"\1"), "wrong_format"),
     ("glb-garbage", ".glb", NOISE, "wrong_format"),
     ("glb-json-broken", ".glb", patched(GLB, 20, b"x"), "not_json"),
     ("glb-json-nested-without-end", ".glb", glb({}, b"").replace(b"{}", b"[["), "not_json"),
     ("glb-json-of-another-kind", ".glb", glb({"a": 1}, b""), "bad_value asset missing"),
-    ("glb-no-mesh", ".glb", broken_glb(nodes=[{}], meshes=[]), "mesh_not_placed"),
     ("glb-mesh-without-node", ".glb", broken_glb(nodes=[{}]), "mesh_not_placed"),
     ("glb-mesh-outside-of-scene", ".glb", broken_glb(scenes=[{"nodes": []}]), "mesh_not_placed"),
     ("glb-node-cycle", ".glb", broken_glb(nodes=[{"mesh": 0, "children": [0]}]), "not_a_tree"),
-    ("glb-node-missing", ".glb", broken_glb(scenes=[{"nodes": [0, 5]}]), "not_a_tree"),
     ("glb-two-scenes", ".glb", broken_glb(scene=None, scenes=[{}, {}]), "several_scenes"),
     ("glb-zero-scale", ".glb", broken_glb(nodes=[{"mesh": 0, "scale": [1, 1, 0]}]), "not_invertible"),
     ("glb-nan-matrix", ".glb", broken_glb(nodes=[{"mesh": 0, "matrix": [float("nan")] * 16}]), "not_json"),
@@ -545,13 +360,11 @@ BROKEN = [
     ("glb-view-beyond-buffer", ".glb", broken_glb(buffers=[{"byteLength": 40}]), "size_mismatch 42"),
     ("glb-buffer-beyond-file", ".glb", broken_glb(buffers=[{"byteLength": 99}]), "size_mismatch 99"),
     ("glb-lines", ".glb", broken_glb(meshes=primitive(mode=1)), "unsupported_feature"),
-    ("glb-strip", ".glb", broken_glb(meshes=primitive(mode=5)), "unsupported_feature"),
     ("glb-without-position", ".glb", broken_glb(meshes=primitive(attributes={})), "unsupported_feature"),
     ("glb-morph-targets", ".glb", broken_glb(meshes=primitive(targets=[{"POSITION": 0}])), "unsupported_feature"),
     ("glb-skinned", ".glb", broken_glb(nodes=[{"mesh": 0, "skin": 0}]), "unsupported_feature"),
     ("glb-draco", ".glb", broken_glb(extensionsRequired=["KHR_draco_mesh_compression"]), "unsupported_feature"),
     ("glb-reads-other-files", ".glb", broken_glb(buffers=[{"byteLength": 42, "uri": "x.bin"}]), "data_elsewhere"),
-    ("vtp-cut-in-the-middle", ".vtp", VTP[: len(VTP) // 2], "xml_damaged"),
     ("vtp-raw-cut", ".vtp", RAW_VTP[: len(RAW_VTP) * 3 // 4], "file_cut"),
     ("vtp-raw-bytes-missing", ".vtp", RAW_VTP[:-300] + RAW_VTP[-40:], "file_cut"),
     ("vtp-garbage", ".vtp", NOISE, "xml_damaged"),
@@ -564,9 +377,7 @@ BROKEN = [
     ("vtp-polygons-too-many", ".vtp", vtp(PENTAGON, POLYGONS, "raw", n_polys="4"), "size_mismatch 24 32"),
     ("vtp-points-negative", ".vtp", vtp(PENTAGON, POLYGONS, n_points="-6"), "not_whole -6"),
     ("vtp-index-too-high", ".vtp", vtp(PENTAGON, [[0, 1, 6]]), "index_out_of_range"),
-    ("vtp-index-negative", ".vtp", vtp(PENTAGON, [[0, 1, -1]]), "index_out_of_range -1"),
     ("vtp-two-corners", ".vtp", vtp(PENTAGON, [[0, 1, 2], [0, 1]]), "bad_offsets"),
-    ("vtp-nan", ".vtp", vtp(PENTAGON * np.nan, POLYGONS), "not_finite"),
     ("vtp-word", ".vtp", replaced(vtp(PENTAGON, POLYGONS), b"15.0 10.0", b"wide 1"), "not_a_number float64"),
     ("vtp-two-components", ".vtp", replaced(VTP, b'Components="3"', b'Components="2"'), "wrong_shape"),
     ("vtp-float-indices", ".vtp", replaced(VTP, b'"Int64" Name="conn', b'"Float64" Name="conn'), "wrong_type float64"),
@@ -588,11 +399,8 @@ BROKEN = [
     ("vtk-huge", ".vtk", replaced(VTK, b"POINTS 6", b"POINTS 999999999999"), "out_of_range 999999999999"),
     ("vtk-points-of-int", ".vtk", replaced(VTK, b"6 float", b"6 int"), "unknown_type"),
     ("vtk-word", ".vtk", replaced(VTK, b"15 10", b"wide 1"), "not_a_number"),
-    ("vtk-nan", ".vtk", vtk_model(PENTAGON * np.nan, POLYGONS, binary=False), "not_finite"),
     ("vtk-index-too-high", ".vtk", vtk_model(PENTAGON, [[0, 1, 6]]), "index_out_of_range"),
-    ("vtk-index-negative", ".vtk", vtk_model(PENTAGON, [[0, 1, -1]]), "index_out_of_range -1"),
     ("vtk-two-corners", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [0, 1]]), "wrong_count"),
-    ("vtk-cells-too-many", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 4 15"), "file_cut"),
     ("vtk-cells-too-few", ".vtk", replaced(VTK, b"POLYGONS 3 15", b"POLYGONS 2 15"), "size_mismatch 10"),
     ("vtk-strips", ".vtk", replaced(VTK, b"POLYGONS", b"TRIANGLE_STRIPS"), "unsupported_feature"),
     ("vtk-9-offsets", ".vtk", vtk_model(PENTAGON, [[0, 1, 2], [], [3, 4, 5]], version="5.1"), "bad_offsets"),
@@ -603,31 +411,15 @@ BROKEN = [
 
 @pytest.mark.parametrize(("suffix", "data", "says"), [pytest.param(*case[1:], id=case[0]) for case in BROKEN])
 def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, suffix: str, data: bytes, says: str) -> None:
-    """One line that names the file, the place and what is allowed."""
     with refused(*says.split(), tmp_path / f"mesh{suffix}"):
         read(tmp_path, suffix, data)
 
 
 def test_a_missing_file_and_a_directory_are_refused(tmp_path: Path) -> None:
-    """What is not a file is named as such, by its path."""
-    with refused("no_such_file", "liver.stl"):
-        read_mesh(tmp_path / "liver.stl", unit=Unit.MM, space=Space.LPS)
     (tmp_path / "folder.stl").mkdir()
-    with refused("not_a_file"):
-        read_mesh(tmp_path / "folder.stl", unit=Unit.MM, space=Space.LPS)
-    with refused("no_such_file"):
-        read_mesh(tmp_path / "a\0b.stl", unit=Unit.MM, space=Space.LPS)
-
-
-@pytest.mark.parametrize(
-    "uri", ["beside.bin", "../secret.bin", "/etc/passwd", "file:///etc/passwd", "http://x/y.bin", "a\0", "data:,"]
-)
-def test_glb_buffers_in_other_places_are_refused(tmp_path: Path, uri: str) -> None:
-    """A surface that lies in a second file has no hash of its own: one line says to make it one file."""
-    (tmp_path / "beside.bin").write_bytes(GLTF_BINARY)
-    document = gltf_document(buffers=[{"byteLength": 42, "uri": uri}])
-    with refused("data_elsewhere"):
-        read(tmp_path, ".glb", glb(document, GLTF_BINARY))
+    for name, code in (("liver.stl", "no_such_file"), ("folder.stl", "not_a_file"), ("a\0b.stl", "no_such_file")):
+        with refused(code):
+            read_mesh(tmp_path / name, unit=Unit.MM, space=Space.LPS)
 
 
 def test_a_mesh_placed_too_often_is_refused_before_it_is_built(tmp_path: Path) -> None:
@@ -641,13 +433,8 @@ def test_a_mesh_placed_too_often_is_refused_before_it_is_built(tmp_path: Path) -
 
 # ---- any bytes -----------------------------------------------------------------------------------------------------
 
-ANY_BYTES = settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
-)
-
 
 def mesh_or_refusal(folder: Path, suffix: str, data: bytes) -> TriangleMesh | None:
-    """What reading gives: a mesh for which the guard holds, or None for a refusal; anything else fails the test."""
     try:
         mesh = read(folder, suffix, data)
     except InputError:
@@ -657,37 +444,23 @@ def mesh_or_refusal(folder: Path, suffix: str, data: bytes) -> TriangleMesh | No
 
 
 @pytest.mark.parametrize("kind", WHOLE)
-@ANY_BYTES
-@given(data=st.data())
-def test_a_cut_file_never_gives_fewer_triangles(tmp_path: Path, kind: str, data: st.DataObject) -> None:
-    """Cut anywhere: refused, or nothing was lost. An OBJ cut at a line end is the exception, tested below."""
+def test_cut_and_changed_bytes_give_a_refusal_or_a_guarded_mesh(tmp_path: Path, kind: str) -> None:
+    """Cut anywhere: refused, or nothing was lost. Up to four changed runs, or any bytes: no other exception."""
+    random = Random(kind)
     suffix, whole = WHOLE[kind]
-    cut = whole[: data.draw(st.integers(0, len(whole) - 1))]
-    if kind == "obj" and cut.endswith(b"\n"):
-        cut = cut[:-1]
-    mesh = mesh_or_refusal(tmp_path, suffix, cut)
-    assert mesh is None or same_triangles(mesh, BALL.triangles)
-
-
-@pytest.mark.parametrize("kind", WHOLE)
-@ANY_BYTES
-@given(data=st.data())
-def test_changed_bytes_give_a_refusal_or_a_guarded_mesh(tmp_path: Path, kind: str, data: st.DataObject) -> None:
-    """Up to four changed runs of bytes: no other exception, no mesh that the guard would refuse."""
-    suffix, whole = WHOLE[kind]
-    for _ in range(data.draw(st.integers(1, 4))):
-        position = data.draw(st.integers(0, min(len(whole), 2500)))
-        new = data.draw(st.binary(max_size=4) | st.sampled_from([b"-1", b"9" * 9, b"nan", b"1e9", b"\n", b"\xff" * 4]))
-        whole = whole[:position] + new + whole[position + data.draw(st.integers(0, 4)) :]
-    mesh_or_refusal(tmp_path, suffix, whole)
-
-
-@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply", ".glb", ".vtp", ".vtk"])
-@ANY_BYTES
-@given(data=st.binary(max_size=200))
-def test_random_bytes_are_refused(tmp_path: Path, suffix: str, data: bytes) -> None:
-    """Two hundred random bytes are no mesh of any kind."""
-    assert mesh_or_refusal(tmp_path, suffix, data) is None
+    for _ in range(15):
+        cut = whole[: random.randrange(len(whole))]
+        if kind == "obj" and cut.endswith(b"\n"):  # tested below
+            cut = cut[:-1]
+        mesh = mesh_or_refusal(tmp_path, suffix, cut)
+        assert mesh is None or same_triangles(mesh, BALL.triangles)
+        changed = whole
+        for _ in range(random.randint(1, 4)):
+            position = random.randint(0, min(len(whole), 2500))
+            words = [random.randbytes(random.randrange(5)), b"-1", b"9" * 9, b"nan", b"1e9", b"\n", b"\xff" * 4]
+            changed = changed[:position] + random.choice(words) + changed[position + random.randint(0, 4) :]
+        mesh_or_refusal(tmp_path, suffix, changed)
+        assert mesh_or_refusal(tmp_path, suffix, random.randbytes(random.randrange(200))) is None
 
 
 def test_an_obj_cut_at_a_line_end_is_open_where_it_is_not_refused(tmp_path: Path) -> None:
@@ -746,7 +519,6 @@ needs_vh_male = pytest.mark.skipif(not VH_MALE.is_dir(), reason="the hubmap_vh_m
 
 @needs_vh_male
 def test_the_visible_human_skin_is_whole_and_watertight() -> None:
-    """107,334 triangles, closed, 96.2 litres, facing outward."""
     mesh = read_mesh(VH_MALE / "VH_M_Skin.v1.1.glb", unit=Unit.M, space=Space.LOCAL, up=Up.Z)
     assert len(mesh.faces) == 107_334 and mesh.closed and mesh_warnings(mesh, "skin") == ()
     litres = np.linalg.det(mesh.triangles).sum() / 6.0 / 1e6

@@ -10,7 +10,7 @@ import pytest
 from places import REAL_CT
 from refusals import refused
 
-from puncture_twin.planning.formats.labels.labelmaps import LabelMap
+from puncture_twin.planning.formats.labels.labelmaps import LabelMap, parse_names
 from puncture_twin.planning.formats.labels.naming import V1, V2, LabelRule, RuleKind, names_for, select
 
 REAL = REAL_CT
@@ -18,19 +18,16 @@ NAMES = {1: "liver", 2: "rib_left_7", 3: "rib_left_8", 4: "lung_lower_lobe_left"
 
 
 def map_with(names: dict[int, str] | None) -> LabelMap:
-    """A label map of nothing but its names."""
     return LabelMap(np.ones((2, 2, 2), dtype=np.int32), np.eye(4), names, Path("a.seg.nrrd"))
 
 
 def chosen(present: tuple[int, ...] = (1, 2, 3, 4, 5), **rules: Any) -> dict[str, tuple[str, float]]:
-    """Name to kind and margin."""
     given = {"avoid": {"rib_*": 1.0, "aorta": 5.0}, "traverse": ["lung_*"], "target": ["liver"], **rules}
     selection = select(NAMES, present, where="case.toml", **given)
     return {rule.name: (str(rule.kind), rule.margin_mm) for rule in selection.rules}
 
 
 def test_tables_have_their_sizes_and_the_versions_differ() -> None:
-    """104 and 117 classes with distinct names; the aorta is 7 or 52."""
     assert (len(V1), len(V2)) == (104, 117)
     assert len(set(V1.values())) == 104
     assert len(set(V2.values())) == 117
@@ -42,18 +39,15 @@ def test_tables_have_their_sizes_and_the_versions_differ() -> None:
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"the real CT is not at {REAL}")
 @pytest.mark.parametrize(("table", "name"), [(V1, "labels_v1_normal.json"), (V2, "labels_v2_fast.json")])
 def test_tables_agree_with_the_real_label_maps(table: dict[int, str], name: str) -> None:
-    """Each name that comes with the data is the table's."""
     named = json.loads((REAL / name).read_text())
     assert {int(label): text for label, text in named.items()} == {int(label): table[int(label)] for label in named}
 
 
 def read_from(folder: Path) -> Callable[[str], bytes]:
-    """Gives the bytes of a file of this folder."""
     return lambda name: (folder / name).read_bytes()
 
 
 def test_namings_by_name_by_file_and_by_the_map_itself(tmp_path: Path) -> None:
-    """All four ways to name labels."""
     (tmp_path / "names.csv").write_text('id,name\n1,liver\n\n7,"vein, portal"\n', encoding="utf-8")
     assert names_for("totalsegmentator-v1", tmp_path, read_from(tmp_path), map_with(None))[7] == "aorta"
     assert names_for("totalsegmentator-v2", tmp_path, read_from(tmp_path), map_with(None))[52] == "aorta"
@@ -62,25 +56,18 @@ def test_namings_by_name_by_file_and_by_the_map_itself(tmp_path: Path) -> None:
     assert names_for("seg.nrrd", tmp_path, read_from(tmp_path), map_with({3: "x"})) == {3: "x"}
 
 
-@pytest.mark.parametrize(
-    ("content", "match"),
-    [
+def test_broken_name_tables_are_refused(tmp_path: Path) -> None:
+    for content, code in (
         (b"", "wrong_columns"),
         (b"id,name\n", "empty"),
-        (b"id,name\n0,a\n", "bad_label"),
-        (b"id,name\n-1,a\n", "bad_label"),
-        (b"id,name\n1.5,a\n", "bad_label"),
         (b"id,name\n1,a\n2,a\n", "duplicate_name"),
         (b"id,name\n1,\n", "bad_name"),
         (b"id,name\n1,\xff\n", "not_text"),
         (b'id,name\n1,"a\n', "not_csv"),
-    ],
-)
-def test_broken_name_tables_are_refused(tmp_path: Path, content: bytes, match: str) -> None:
-    """By line where there is one."""
-    (tmp_path / "names.csv").write_bytes(content)
-    with refused(*match.split()):
-        names_for("names.csv", tmp_path, read_from(tmp_path), map_with(None))
+    ):
+        (tmp_path / "names.csv").write_bytes(content)
+        with refused(code):
+            names_for("names.csv", tmp_path, read_from(tmp_path), map_with(None))
 
 
 def test_unknown_namings_are_refused_with_the_nearest(tmp_path: Path) -> None:
@@ -94,7 +81,6 @@ def test_unknown_namings_are_refused_with_the_nearest(tmp_path: Path) -> None:
 
 
 def test_patterns_give_every_label_its_rule() -> None:
-    """Kinds and margins come from the pattern that matches."""
     assert chosen() == {
         "liver": ("target", 0.0),
         "rib_left_7": ("avoid", 1.0),
@@ -107,16 +93,15 @@ def test_patterns_give_every_label_its_rule() -> None:
 
 
 def test_a_label_that_no_rule_names_is_an_error_that_lists_all_such() -> None:
-    """What is present and not spoken of is never silently free."""
     with refused("no_rule", "rib_left_8"):
         chosen(avoid={})
     with refused("labels_without_names"):
         chosen(present=(1, 9))
 
 
-@pytest.mark.parametrize(
-    ("avoid", "rules", "rib"),
-    [
+def test_the_most_specific_pattern_holds() -> None:
+    """Its own name, then the most characters that are no wildcards, whatever the order; the asterisk is the rest."""
+    for avoid, rules, rib in (
         ({"rib_*": 1.0, "*": 9.0}, {}, ("avoid", 1.0)),
         ({"*": 9.0, "rib_*": 1.0, "rib_left_*": 2.0}, {}, ("avoid", 2.0)),
         ({"rib_left_?": 2.0, "rib_*": 3.0, "*": 9.0}, {}, ("avoid", 2.0)),
@@ -125,14 +110,9 @@ def test_a_label_that_no_rule_names_is_an_error_that_lists_all_such() -> None:
         ({"rib_left_7": 0.5, "*": 9.0}, {"ignore": ["rib_left_*"]}, ("avoid", 0.5)),
         ({"*": 9.0}, {"traverse": ["lung_*", "rib_*"], "ignore": ["rib_left_[78]"]}, ("ignore", 0.0)),
         ({"aorta": 1.0}, {"traverse": ["*"]}, ("traverse", 0.0)),
-    ],
-)
-def test_the_most_specific_pattern_holds(
-    avoid: dict[str, float], rules: dict[str, list[str]], rib: tuple[str, float]
-) -> None:
-    """Its own name, then the most characters that are no wildcards, whatever the order; the asterisk is the rest."""
-    assert chosen(avoid=avoid, **rules)["rib_left_7"] == rib
-    assert chosen(avoid=dict(reversed(avoid.items())), **rules)["rib_left_7"] == rib
+    ):
+        assert chosen(avoid=avoid, **rules)["rib_left_7"] == rib
+        assert chosen(avoid=dict(reversed(avoid.items())), **rules)["rib_left_7"] == rib
 
 
 def test_what_nobody_knows_demands_a_margin_and_is_no_free_space() -> None:
@@ -145,11 +125,10 @@ def test_what_nobody_knows_demands_a_margin_and_is_no_free_space() -> None:
     assert "by unknown 'rib_*' = 2" in told[0]
 
 
-@pytest.mark.parametrize("rules", [{"ignore": ["rib_lef?_*"]}, {"traverse": ["lung_*", "aort?"]}, {"target": ["*"]}])
-def test_two_kinds_that_are_equally_specific_are_an_error(rules: dict[str, list[str]]) -> None:
-    """Nothing says which is meant; both are named."""
-    with refused("two_roles"):
-        chosen(avoid={"rib_?eft_*": 1.0, "a?rta": 5.0, "*": 2.0}, **rules)
+def test_two_kinds_that_are_equally_specific_are_an_error() -> None:
+    for rules in ({"ignore": ["rib_lef?_*"]}, {"traverse": ["lung_*", "aort?"]}, {"target": ["*"]}):
+        with refused("two_roles"):
+            chosen(avoid={"rib_?eft_*": 1.0, "a?rta": 5.0, "*": 2.0}, **rules)
     with refused("two_roles"):
         select(NAMES, [5], avoid={"aorta": 0.0}, ignore=["aorta"], where="case.toml")
 
@@ -168,7 +147,6 @@ def test_a_larger_margin_that_does_not_hold_is_told() -> None:
 
 
 def test_names_with_spaces_can_be_named() -> None:
-    """As Slicer writes them: in every kind, whole or by pattern."""
     names = {1: "right lung", 2: "left lung", 3: "liver lesion 1"}
     found = select(names, names, avoid={"left lung": 2.0}, traverse=["right *"], target=["liver lesion*"], where="c")
     assert [str(rule.kind) for rule in found.rules] == ["traverse", "avoid", "target"]
@@ -184,8 +162,65 @@ def test_a_pattern_that_names_nothing_is_an_error_or_a_warning() -> None:
     assert selection.warnings == ("case.toml: ignore pattern 'lung_*' matches no label present",)
 
 
-@pytest.mark.parametrize("margin", [-1.0, float("nan"), float("inf")])
-def test_margins_are_finite_and_not_negative(margin: float) -> None:
+def test_margins_are_finite_and_not_negative() -> None:
     """A margin below zero would let a needle in."""
-    with refused("out_of_range"):
-        chosen(avoid={"rib_*": margin, "aorta": 5.0})
+    for margin in (-1.0, float("nan"), float("inf")):
+        with refused("out_of_range"):
+            chosen(avoid={"rib_*": margin, "aorta": 5.0})
+
+
+READ = {1: "right lung", 7: "vein, portal"}
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("a.csv", 'id,name\n1,right lung\n\n7,"vein, portal"\n'),
+        ("a.csv", 'label,name\n0,background\n1,right lung\n7,"vein, portal"\n'),
+        ("a.csv", 'id,label\n1,right lung\n7,"vein, portal"\n'),
+        ("a.csv", 'Name,Label Value,Color\nright lung,1,red\n"vein, portal",7,blue\n'),
+        ("a.csv", 'LabelValue,Structure\n1,right lung\n7,"vein, portal"\n'),
+        ("a.csv", 'index,class_name,volume\n1,right lung,3.2\n7,"vein, portal",4\n'),
+        ("a.csv", "\ufeffvalue;name\r\n1;right lung\r\n7;vein, portal\r\n"),
+        ("a.tsv", "label_id\torgan\n1\tright lung\n7\tvein, portal\n"),
+        ("a.json", '{"1": "right lung", "7": "vein, portal"}'),
+        ("a.json", '{"right lung": 1, "vein, portal": 7}'),
+        ("a.json", '{"name": "x", "labels": {"background": 0, "right lung": 1, "vein, portal": 7}}'),
+        ("a.json", '{"labels": {"0": "background", "1": "right lung", "7": "vein, portal"}}'),
+        (
+            "a.txt",
+            '# ITK-SnAP Label Description File\n0 0 0 0 0 0 0 "Clear Label"\n1 255 0 0 1 1 1 "right lung"\n'
+            ' 7   0 9 0        0.5  1  1    "vein, portal"\n',
+        ),
+        ("a.ctbl", '# Color table\n0 Background 0 0 0 0\n1 "right lung" 1 2 3 255\n7 "vein, portal" 1 2 3 255\n'),
+    ],
+)
+def test_common_tables_are_read(file: str, text: str) -> None:
+    assert parse_names(text.encode(), Path(file)) == READ
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "match"),
+    [
+        ("a.csv", "1,liver\n", "wrong_columns"),
+        ("a.csv", "name,colour\nliver,red\n", "wrong_columns"),
+        ("a.csv", "name,name\nliver,1\n", "wrong_columns"),
+        ("a.csv", "label,name\n0,liver\n", "bad_label"),
+        ("a.csv", "label,name\n1,liver\n1,spleen\n", "duplicate_label"),
+        ("a.csv", "label,name\n1.0,liver\n", "bad_label 1.0"),
+        ("a.csv", "label,name\n99999,liver\n", "bad_label"),
+        ("a.csv", "label,name\n1,liver,red\n", "ragged_row"),
+        ("a.json", '{"1": "liver", "1": "spleen"}', "not_json"),
+        ("a.json", '{"liver": [1, 2]}', "labels_of_regions"),
+        ("a.json", '{"liver": {"a": 1}}', "wrong_format"),
+        ("a.json", '{"liver": true}', "wrong_format"),
+        ("a.json", '["liver"]', "wrong_format"),
+        ("a.json", "{}", "empty"),
+        ("a.txt", "1 liver\n", "unknown_line"),
+        ("a.txt", '1 255 0 0 1 1 1 "liver\n', "unknown_line"),
+        ("a.txt", "some notes about the patient and more\n", "unknown_line"),
+    ],
+)
+def test_what_is_no_table_is_refused(file: str, text: str, match: str) -> None:
+    with refused(*match.split()):
+        parse_names(text.encode(), Path(file))

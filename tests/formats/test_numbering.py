@@ -18,7 +18,6 @@ PLACES = {
 
 
 def map_of(table, places):
-    """A label map of voxels of 10 mm: one voxel an organ."""
     labels = np.zeros((24, 24, 24), np.uint8)
     T = np.diag([10.0, 10.0, 10.0, 1.0])
     T[:3, 3] = -120.0
@@ -30,7 +29,6 @@ def map_of(table, places):
 
 @pytest.mark.parametrize(("table", "name"), [(V1, "totalsegmentator-v1"), (V2, "totalsegmentator-v2")])
 def test_the_version_under_which_organs_lie_right_is_told(table, name):
-    """Under the other one vertebrae and sides are in no order."""
     assert likely_numbering(map_of(table, PLACES)) == name
 
 

@@ -2,11 +2,11 @@
 
 import json
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings, strategies as st
 from places import DATA
 from refusals import refused
 
@@ -27,7 +27,6 @@ POINTS = [[10.0, 20.0, 147.0], [110.0, 120.5, -100.0]]
 
 
 def markups(*, points: list[dict[str, Any]] | None = None, **changes: Any) -> str:
-    """A Slicer markups file of A and B; keyword arguments replace members, None removes them."""
     both = [
         {"id": str(i), "label": label, "position": position, "positionStatus": "defined", "orientation": [1.0] * 9}
         for i, (label, position) in enumerate(zip("AB", POINTS, strict=True))
@@ -39,7 +38,6 @@ def markups(*, points: list[dict[str, Any]] | None = None, **changes: Any) -> st
 
 
 def read(folder: Path, ending: str, data: str | bytes, **options: Any) -> NamedPoints:
-    """The points in the given text, through a file."""
     path = folder / f"markers{ending}"
     path.write_bytes(data.encode() if isinstance(data, str) else data)
     return read_points(path, **options)
@@ -64,7 +62,6 @@ def read(folder: Path, ending: str, data: str | bytes, **options: Any) -> NamedP
     ],
 )
 def test_every_form_gives_the_same_points_in_lps(tmp_path: Path, ending: str, text: str) -> None:
-    """Names in the file's order, coordinates in mm, read-only, in LPS."""
     found = read(tmp_path, ending, text, default_space=Space.LPS)
     assert found.names == ("A", "B") and found.space is Space.LPS and found.kinds is None
     assert found.points == pytest.approx(np.array(POINTS), abs=1e-12)
@@ -96,23 +93,20 @@ def test_a_slicer_file_speaks_for_itself(tmp_path: Path) -> None:
     assert found.points == pytest.approx(np.array(POINTS) * [-10, -10, 10], abs=1e-12)
 
 
-@pytest.mark.parametrize("space", [None, Space.LOCAL])
-def test_points_of_no_patient_keep_their_coordinates(tmp_path: Path, space: Space | None) -> None:
-    """A robot's base has no patient space, and a local frame is its own."""
-    found = read(tmp_path, ".csv", CSV, default_space=space)
-    assert found.space is space and found.points.tolist() == POINTS
+def test_what_the_file_does_not_state_is_declared(tmp_path: Path) -> None:
+    """A robot's base has no patient space, and a local frame is its own; markups without a unit are in mm.
 
-
-def test_a_missing_unit_may_be_declared(tmp_path: Path) -> None:
-    """A plain x,y,z header has no unit; the caller may then say it."""
+    Version 1.0.0 of their schema knows no unit: Slicer works in mm, and the later versions' default is mm.
+    """
+    for space in (None, Space.LOCAL):
+        found = read(tmp_path, ".csv", CSV, default_space=space)
+        assert found.space is space and found.points.tolist() == POINTS
     found = read(tmp_path, ".csv", CSV.replace("_mm", ""), default_unit=Unit.CM)
     assert found.points == pytest.approx(np.array(POINTS) * 10, abs=1e-12)
-
-
-def test_markups_without_a_unit_are_in_mm_whatever_the_caller_says(tmp_path: Path) -> None:
-    """Version 1.0.0 of the schema knows no unit: Slicer works in mm, and the later versions' default is mm."""
     found = read(tmp_path, ".mrk.json", markups(coordinateUnits=None), default_unit=Unit.CM)
     assert found.points.tolist() == POINTS
+    found = read(tmp_path, ".csv", "name,kind,x_mm,y_mm,z_mm\nA,marker,1,2,3\nL,lesion,4,5,6\n")
+    assert found.kinds == ("marker", "lesion")
 
 
 def test_a_line_names_its_two_ends(tmp_path: Path) -> None:
@@ -129,15 +123,8 @@ def test_a_line_names_its_two_ends(tmp_path: Path) -> None:
     assert found.points.tolist() == [[1.0, 2.0, 3.0], [-4.0, -5.0, 6.0]]
 
 
-def test_kinds_are_kept(tmp_path: Path) -> None:
-    """A column kind tells markers from lesions."""
-    found = read(tmp_path, ".csv", "name,kind,x_mm,y_mm,z_mm\nA,marker,1,2,3\nL,lesion,4,5,6\n")
-    assert found.kinds == ("marker", "lesion")
-
-
 @pytest.mark.skipif(not CHEN_2019.is_dir(), reason="the chen2019 set is not on this machine")
 def test_the_papers_markers_and_lesions_read() -> None:
-    """Table 1 of Chen 2019: five markers, three lesions."""
     found = read_points(CHEN_2019 / "markers_ct.csv", default_space=Space.LOCAL)
     assert "".join(found.names) == "ABCDELMH" and found.kinds is not None and found.kinds.count("lesion") == 3
     assert found.points[6].tolist() == [50.0, 130.0, 63.0]
@@ -147,7 +134,6 @@ def test_the_papers_markers_and_lesions_read() -> None:
 
 
 def one_point(**changes: Any) -> str:
-    """A markups file of one point; keyword arguments replace its members, None removes them."""
     point = {"label": "A", "position": [1.0, 2.0, 3.0], "positionStatus": "defined"} | changes
     return markups(points=[{key: value for key, value in point.items() if value is not None}])
 
@@ -157,65 +143,43 @@ BROKEN: list[tuple[str, str, str | bytes, str]] = [
     ("any-empty", ".csv", "", "file_size"),
     ("any-unknown-ending", ".json", markups(), "unknown_format markers.json mrk.json"),
     ("csv-only-white-space", ".csv", " \n\n", "empty"),
-    ("csv-only-header", ".csv", HEADER, "empty"),
     ("csv-no-header", ".csv", "A,1,2,3\n", "unknown_column"),
     ("csv-no-unit", ".csv", CSV.replace("_mm", ""), "unit_not_stated"),
     ("csv-unknown-unit", ".csv", CSV.replace("_mm", "_inch"), "unknown_unit inch"),
     ("csv-mixed-units", ".csv", CSV.replace("x_mm", "x_m"), "mixed_units"),
     ("csv-unknown-column", ".csv", "name,x_mm,y_mm,z_mm,weight\nA,1,2,3,4\n", "unknown_column weight"),
     ("csv-column-twice", ".csv", "name,x_mm,x_mm,z_mm\nA,1,2,3\n", "wrong_columns"),
-    ("csv-axis-in-two-units", ".csv", "name,x_mm,x_m,y_mm,z_mm\nA,1,1,2,3\n", "wrong_columns"),
-    ("csv-no-z", ".csv", "name,x_mm,y_mm\nA,1,2\n", "wrong_columns"),
     ("csv-no-name", ".csv", "x_mm,y_mm,z_mm\n1,2,3\n", "wrong_columns"),
-    ("csv-semicolons", ".csv", CSV.replace(",", ";"), "unknown_column"),
     ("csv-too-few-fields", ".csv", CSV + "C,1,2\n", "ragged_row"),
-    ("csv-too-many-fields", ".csv", HEADER + "A,1,2,3,4\n", "ragged_row"),
     ("csv-decimal-comma", ".csv", HEADER + "A,1,5,2,5,3,5\n", "ragged_row"),
-    ("csv-quoted-decimal-comma", ".csv", HEADER + 'A,"1,5",2,3\n', "not_a_number"),
     ("csv-word", ".csv", HEADER + "A,1,2,3\nB,1,two,3\n", "not_a_number"),
-    ("csv-no-number", ".csv", HEADER + "A,1,,3\n", "not_a_number"),
     ("csv-underscore", ".csv", HEADER + "A,1_0,2,3\n", "not_a_number 1_0"),
     ("csv-nan", ".csv", HEADER + "A,1,nan,3\n", "not_finite nan"),
-    ("csv-infinite", ".csv", HEADER + "A,1,2,-inf\n", "not_finite -inf"),
-    ("csv-overflow", ".csv", HEADER + "A,1,2,1e999\n", "not_finite 1e999"),
     ("csv-overflow-by-unit", ".csv", "name,x_m,y_m,z_m\nA,1e308,2,3\n", "not_finite"),
     ("csv-far-away", ".csv", HEADER + "A,1,2,1e6\n", "too_far"),
-    ("csv-mm-said-to-be-m", ".csv", CSV.replace("_mm", "_m"), "too_far [10000.0 100000"),
     ("csv-empty-name", ".csv", HEADER + " ,1,2,3\n", "bad_name"),
     ("csv-name-twice", ".csv", HEADER + "A,1,2,3\nA,4,5,6\n", "duplicate_name"),
     ("csv-open-quote", ".csv", HEADER + '"A,1,2,3\n', "not_csv"),
     ("csv-not-utf8", ".csv", HEADER.encode() + b"\xe4,1,2,3\n", "not_text 20"),
-    ("csv-of-an-image", ".csv", b"\x89PNG\r\n\x1a\n\0\0", "not_text"),
     ("csv-with-nul", ".csv", HEADER + "A\0,1,2,3\n", "bad_name A\\x00"),
     ("markups-cut", ".mrk.json", markups()[:200], "not_json"),
-    ("markups-nested-without-end", ".mrk.json", "[" * 100_000, "not_json"),
     ("markups-key-twice", ".mrk.json", markups().replace('"locked"', '"coordinateSystem"'), "not_json"),
     ("markups-of-another-kind", ".mrk.json", "[1, 2]", "wrong_count"),
-    ("markups-two-lists", ".mrk.json", '{"markups": [{}, {}]}', "wrong_count"),
     ("markups-curve", ".mrk.json", markups(type="Curve"), "unknown_type Curve"),
     ("markups-no-points", ".mrk.json", markups(points=[]), "empty"),
     ("markups-no-space", ".mrk.json", markups(coordinateSystem=None), "unknown_space"),
     ("markups-unknown-space", ".mrk.json", markups(coordinateSystem="IJK"), "unknown_space IJK"),
-    ("markups-space-2", ".mrk.json", markups(coordinateSystem=2), "unknown_space"),
     ("markups-space-true", ".mrk.json", markups(coordinateSystem=True), "unknown_space True"),
-    ("markups-in-um", ".mrk.json", markups(coordinateUnits="um"), "unknown_unit um"),
     ("markups-line-of-one", ".mrk.json", markups(type="Line", points=[{}]), "wrong_count"),
-    ("markups-line-of-three", ".mrk.json", markups(type="Line", points=[{}] * 3), "wrong_count"),
     ("markups-unknown-unit", ".mrk.json", markups(coordinateUnits=["[in_i]", "UCUM"]), "unknown_unit [in_i]"),
-    ("markups-unit-of-numbers", ".mrk.json", markups(coordinateUnits=3), "unknown_unit"),
     ("markups-no-label", ".mrk.json", one_point(label=None), "bad_name"),
-    ("markups-empty-label", ".mrk.json", one_point(label=" "), "bad_name"),
     ("markups-half-a-letter", ".mrk.json", one_point(label="\ud800"), "bad_name \\ud800"),
     ("markups-label-twice", ".mrk.json", markups().replace('"B"', '"A"'), "duplicate_name"),
     ("markups-undefined", ".mrk.json", one_point(positionStatus="undefined"), "point_undefined undefined"),
-    ("markups-preview", ".mrk.json", one_point(positionStatus="preview"), "point_undefined preview"),
     ("markups-no-position", ".mrk.json", one_point(position=None), "not_a_number"),
     ("markups-two-numbers", ".mrk.json", one_point(position=[1, 2]), "not_a_number [1 2]"),
-    ("markups-text-numbers", ".mrk.json", one_point(position=["1", 2, 3]), "not_a_number"),
-    ("markups-nan", ".mrk.json", one_point(position=[float("nan"), 2, 3]), "not_json"),
     ("markups-point-no-object", ".mrk.json", markups(points=[3]), "bad_name"),  # type: ignore[list-item]  # the fault
     ("fcsv-no-space", ".fcsv", FCSV.replace("# CoordinateSystem = LPS\n", ""), "unknown_space"),
-    ("fcsv-unknown-space", ".fcsv", FCSV.replace("LPS", "2"), "unknown_space"),
     ("fcsv-no-columns", ".fcsv", FCSV.replace("# columns", "# c"), "wrong_columns"),
     ("fcsv-no-point", ".fcsv", "\n".join(FCSV.splitlines()[:3]), "empty"),
     ("fcsv-line-cut", ".fcsv", FCSV[:-20], "ragged_row 14"),
@@ -233,14 +197,9 @@ def test_a_broken_file_is_refused_in_one_line(tmp_path: Path, ending: str, data:
     str(caught.value).encode("utf-8")  # can be printed
 
 
-def test_a_patient_space_contradicts_a_local_frame(tmp_path: Path) -> None:
-    """A Slicer file in LPS cannot give points of a carton's own frame."""
+def test_a_local_frame_a_missing_file_and_a_directory_are_refused(tmp_path: Path) -> None:
     with refused("local_space"):
         read(tmp_path, ".mrk.json", markups(), default_space=Space.LOCAL)
-
-
-def test_a_missing_file_and_a_directory_are_refused(tmp_path: Path) -> None:
-    """What is not a file is named as such, by its path."""
     with refused("no_such_file", "markers.csv"):
         read_points(tmp_path / "markers.csv")
     (tmp_path / "folder.csv").mkdir()
@@ -248,26 +207,17 @@ def test_a_missing_file_and_a_directory_are_refused(tmp_path: Path) -> None:
         read_points(tmp_path / "folder.csv")
 
 
-names = st.lists(
-    st.text(st.characters(categories=["L", "N", "P"]), min_size=1, max_size=8), min_size=1, max_size=6, unique=True
-)
-THROUGH_FILES = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True
-)
-
-
-@THROUGH_FILES
-@given(names=names, data=st.data())
-def test_written_points_read_back_exactly(tmp_path: Path, names: list[str], data: st.DataObject) -> None:
+def test_written_points_read_back_exactly(tmp_path: Path) -> None:
     """Any names (with commas and quotes), kinds and coordinates return bit for bit; nothing is left over."""
-    number = st.floats(-1e5, 1e5)
-    rows = data.draw(st.lists(st.tuples(number, number, number), min_size=len(names), max_size=len(names)))
-    kinds = tuple(names) if data.draw(st.booleans()) else None
-    points = NamedPoints(tuple(names), guard_points(rows, names, where="test"), Space.LOCAL, kinds)
-    write_points(tmp_path / "out.csv", points)
-    found = read_points(tmp_path / "out.csv", default_space=Space.LOCAL)
-    assert found.names == points.names and found.kinds == kinds
-    assert np.array_equal(found.points, points.points)
+    random = np.random.default_rng(2)
+    names = ("A", "é,1", 'say "x"', "\u4e09", "'", "a;b")
+    for kinds in (None, names):
+        rows = random.normal(size=(len(names), 3)) * 10.0 ** random.integers(-300, 5, (len(names), 3))
+        points = NamedPoints(names, guard_points(rows, names, where="test"), Space.LOCAL, kinds)
+        write_points(tmp_path / "out.csv", points)
+        found = read_points(tmp_path / "out.csv", default_space=Space.LOCAL)
+        assert found.names == points.names and found.kinds == kinds
+        assert np.array_equal(found.points, points.points)
     assert [path.name for path in tmp_path.iterdir()] == ["out.csv"]
 
 
@@ -281,22 +231,18 @@ def test_points_that_cannot_be_written_leave_nothing_behind(tmp_path: Path) -> N
     assert sorted(tmp_path.iterdir()) == before
 
 
-@pytest.mark.parametrize(
-    ("ending", "whole"), [(".csv", CSV), (".mrk.json", markups()), (".fcsv", FCSV)], ids=["csv", "markups", "fcsv"]
-)
-@THROUGH_FILES
-@given(data=st.data())
-def test_changed_bytes_give_a_refusal_or_guarded_points(
-    tmp_path: Path, ending: str, whole: str, data: st.DataObject
-) -> None:
+@pytest.mark.parametrize(("ending", "whole"), [(".csv", CSV), (".mrk.json", markups()), (".fcsv", FCSV)])
+def test_changed_bytes_give_a_refusal_or_guarded_points(tmp_path: Path, ending: str, whole: str) -> None:
     """Changed, cut or inserted bytes: an InputError or points for which the guard holds, nothing else."""
-    raw = whole.encode()
-    for _ in range(data.draw(st.integers(1, 4))):
-        position = data.draw(st.integers(0, len(raw)))
-        new = data.draw(st.binary(max_size=4) | st.sampled_from([b"nan", b"1e999", b"\n", b'"', b"null", b"[", b"\0"]))
-        raw = raw[:position] + new + raw[position + data.draw(st.integers(0, 9)) :]
-    try:
-        found = read(tmp_path, ending, raw)
-    except InputError:
-        return
-    guard_points(found.points, found.names, where="again")
+    random = Random(ending)
+    for _ in range(60):
+        raw = whole.encode()
+        for _ in range(random.randint(1, 4)):
+            position = random.randint(0, len(raw))
+            words = [random.randbytes(random.randrange(5)), b"nan", b"1e999", b"\n", b'"', b"null", b"[", b"\0"]
+            raw = raw[:position] + random.choice(words) + raw[position + random.randint(0, 9) :]
+        try:
+            found = read(tmp_path, ending, raw)
+        except InputError:
+            continue
+        guard_points(found.points, found.names, where="again")

@@ -18,14 +18,12 @@ AFFINE = np.array([[5.0, 0, 0, -60], [0, 0, 5.0, -40], [0, -5.0, 0, 50], [0, 0, 
 
 
 def segments():
-    """Three segments: the first two overlap, the third lies beside."""
     i, j, k = np.indices(SHAPE)
     lung = (i - 12) ** 2 + (j - 10) ** 2 + (k - 8) ** 2 < 36
     return {"right lung": lung, "lesion 1": (i > 10) & (i < 14) & (abs(j - 10) < 2) & (abs(k - 8) < 2), "rib": i == 20}
 
 
 def seg_nrrd(*changes, layers=2):
-    """A segmentation as Slicer 5 writes it; changes are (old, new) of its header."""
     lung, lesion, rib = segments().values()
     stack = np.zeros((layers, *SHAPE), np.uint8)
     stack[0][lung], stack[0][rib], stack[-1][lesion] = 1, 2, 1 if layers > 1 else 3
@@ -64,7 +62,6 @@ def seg_nrrd(*changes, layers=2):
 
 
 def read(folder, data):
-    """The segments of these bytes, through a file."""
     path = folder / "body.seg.nrrd"
     path.write_bytes(data)
     return parse_segments(path, path.name, lambda name: (folder / name).read_bytes())
@@ -84,7 +81,6 @@ def test_every_segment_is_where_it_was_drawn(tmp_path, layers):
 
 
 def test_layers_are_those_that_itk_reads(tmp_path):
-    """ITK takes the layers for the components of a vector."""
     found = read(tmp_path, seg_nrrd())
     image = SimpleITK.ReadImage(str(tmp_path / "body.seg.nrrd"))
     values = SimpleITK.GetArrayFromImage(image).transpose(2, 1, 0, 3)
@@ -135,17 +131,6 @@ def test_a_case_takes_segments_that_overlap_by_their_names(tmp_path):
     }  # fmt: skip
     middle = found["right lung"].mesh.vertices.mean(axis=0)
     assert middle == pytest.approx((AFFINE @ [12, 10, 8, 1])[:3], abs=0.5)
-
-
-def test_a_label_map_in_layers_says_how_it_is_read(tmp_path):
-    """As labelmap it is refused, and the line names the key that takes it."""
-    ball(tmp_path / "skin.stl", 150.0)
-    (tmp_path / "body.seg.nrrd").write_bytes(seg_nrrd())
-    rules = '[[structures]]\nlabelmap = "body.seg.nrrd"\nignore = ["*"]\n'
-    (tmp_path / "case.toml").write_text(case_text(structure("skin", "skin"), structure("organ", "target"), rules))
-    ball(tmp_path / "organ.stl", 10.0)
-    with refused("wrong_dimension"):
-        load_anatomy(load_case(tmp_path))
 
 
 @pytest.mark.parametrize("layers", [1, 2])

@@ -3,14 +3,13 @@
 import gzip
 import itertools
 import struct
-from collections.abc import Callable
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813 - the name that its whole documentation uses
-from hypothesis import HealthCheck, given, settings, strategies as st
 from refusals import refused
 
 from puncture_twin.planning.anatomy.scan import nearest
@@ -53,7 +52,6 @@ def nifti_bytes(
     order: str = "<",
     data: bytes | None = None,
 ) -> bytes:
-    """A single-file NIfTI-1; ``codes`` are those of qform and sform."""
     head = bytearray(352)
     struct.pack_into(order + "i", head, 0, 348)
     struct.pack_into(order + "8h", head, 40, *dim)
@@ -69,7 +67,6 @@ def nifti_bytes(
 
 
 def nrrd_bytes(*changes: tuple[str, str | None], data: bytes | None = None) -> bytes:
-    """A NRRD with lines replaced, added (unknown start) or dropped (None)."""
     lines = list(NRRD_LINES)
     for start, line in changes:
         found = next((i for i, old in enumerate(lines) if old.startswith(start)), len(lines))
@@ -78,14 +75,12 @@ def nrrd_bytes(*changes: tuple[str, str | None], data: bytes | None = None) -> b
 
 
 def write(folder: Path, name: str, content: bytes) -> Path:
-    """The path of a new file."""
     path = folder / name
     path.write_bytes(content)
     return path
 
 
 def place(T: np.ndarray, *index: float) -> list[float]:
-    """Where a voxel's centre lies."""
     return list((T @ [*index, 1.0])[:3])
 
 
@@ -107,12 +102,12 @@ def test_nifti_qform_with_a_quarter_turn_and_a_flip(tmp_path: Path) -> None:
     assert np.linalg.det(volume.T_ct_index) < 0
 
 
-@pytest.mark.parametrize(("units", "scale"), [(0, 1.0), (1, 0.001), (2, 1.0), (3, 1000.0)])
-def test_units_of_a_nifti_become_mm(tmp_path: Path, units: int, scale: float) -> None:
+def test_units_of_a_nifti_become_mm(tmp_path: Path) -> None:
     """Metre and micrometre are converted, an unknown unit is taken as mm."""
-    pixdim = (1, 2 * scale, 3 * scale, 4 * scale, 0, 0, 0, 0)
-    volume = read_volume(write(tmp_path, "a.nii", nifti_bytes(units=units, sform=SFORM * scale, pixdim=pixdim)))
-    assert np.allclose(place(volume.T_ct_index, 1, 2, 3), [-12, -26, 42], atol=1e-4)
+    for units, scale in ((0, 1.0), (1, 0.001), (2, 1.0), (3, 1000.0)):
+        pixdim = (1, 2 * scale, 3 * scale, 4 * scale, 0, 0, 0, 0)
+        volume = read_volume(write(tmp_path, "a.nii", nifti_bytes(units=units, sform=SFORM * scale, pixdim=pixdim)))
+        assert np.allclose(place(volume.T_ct_index, 1, 2, 3), [-12, -26, 42], atol=1e-4)
 
 
 def test_both_affines_may_be_given_if_they_agree(tmp_path: Path) -> None:
@@ -122,19 +117,16 @@ def test_both_affines_may_be_given_if_they_agree(tmp_path: Path) -> None:
         assert place(volume.T_ct_index, 1, 2, 3) == [-12.0, -26.0, 42.0]
 
 
-@pytest.mark.parametrize(
-    ("space", "expected"),
-    [
-        ("left-posterior-superior", [-8.0, -14.0, 42.0]),
-        ("right-anterior-superior", [8.0, 14.0, 42.0]),
-        ("left-anterior-superior", [-8.0, 14.0, 42.0]),
-    ],
-)
-def test_nrrd_says_its_space(tmp_path: Path, space: str, expected: list[float]) -> None:
+def test_nrrd_says_its_space(tmp_path: Path) -> None:
     """Voxel (1, 2, 3) of the same numbers in each of the patient spaces, in LPS."""
-    volume = read_volume(write(tmp_path, "a.nrrd", nrrd_bytes(("space:", f"space: {space}"))))
-    assert place(volume.T_ct_index, 1, 2, 3) == expected
-    assert np.array_equal(volume.values, VALUES)
+    for space, x, y in (
+        ("left-posterior-superior", -8.0, -14.0),
+        ("right-anterior-superior", 8.0, 14.0),
+        ("left-anterior-superior", -8.0, 14.0),
+    ):
+        volume = read_volume(write(tmp_path, "a.nrrd", nrrd_bytes(("space:", f"space: {space}"))))
+        assert place(volume.T_ct_index, 1, 2, 3) == [x, y, 42.0]
+        assert np.array_equal(volume.values, VALUES)
 
 
 def test_files_that_simpleitk_writes_come_back(tmp_path: Path) -> None:
@@ -155,7 +147,6 @@ def test_files_that_simpleitk_writes_come_back(tmp_path: Path) -> None:
 
 
 def with_simpleitk(path: Path) -> np.ndarray:
-    """The values that SimpleITK reads, axis i first."""
     reader = sitk.ImageFileReader()
     reader.SetImageIO("NrrdImageIO" if "nrrd" in path.name or path.suffix == ".nhdr" else "NiftiImageIO")
     reader.SetFileName(str(path))
@@ -163,7 +154,6 @@ def with_simpleitk(path: Path) -> np.ndarray:
 
 
 def stored_values(dtype: np.dtype[Any]) -> np.ndarray:
-    """120 values all over the range of a type, the ends included."""
     rng = np.random.default_rng(5)
     if dtype.kind == "f":
         return (1000.0 * rng.normal(size=120)).astype(dtype)
@@ -173,31 +163,29 @@ def stored_values(dtype: np.dtype[Any]) -> np.ndarray:
     return values.astype(dtype)
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
+SCALINGS = (0, 0), (1, 0), (1, -1024), (2.5, -1024), (0.1, 0.3), (-1, 0), (1 + 1e-7, 0), (1, 1e-20)
+"""Slope and intercept."""
+
+
 @pytest.mark.parametrize("code", sorted(TYPES))
-@pytest.mark.parametrize(
-    ("slope", "intercept"), [(0, 0), (1, 0), (1, -1024), (2.5, -1024), (0.1, 0.3), (-1, 0), (1 + 1e-7, 0), (1, 1e-20)]
-)
-def test_nifti_values_are_simpleitks_bit_for_bit(
-    tmp_path: Path, order: str, code: int, slope: float, intercept: float
-) -> None:
+def test_nifti_values_are_simpleitks_bit_for_bit(tmp_path: Path, code: int) -> None:
     """Every type in both byte orders, with slope and intercept, plain and compressed: the same values and type."""
-    dtype = np.dtype(order + TYPES[code])
-    data = stored_values(dtype).tobytes()
-    content = bytearray(nifti_bytes(order=order, datatype=(code, 8 * dtype.itemsize), data=data))
-    struct.pack_into(order + "2f", content, 112, slope, intercept)
-    plain, packed = write(tmp_path, "a.nii", content), write(tmp_path, "a.nii.gz", gzip.compress(content))
-    wanted = with_simpleitk(plain)
-    for path in (plain, packed):
-        values = read_volume(path).values
-        assert values.dtype == wanted.dtype
-        assert np.array_equal(values, wanted)
+    for order, scaling in itertools.product("<>", SCALINGS):
+        dtype = np.dtype(order + TYPES[code])
+        data = stored_values(dtype).tobytes()
+        content = bytearray(nifti_bytes(order=order, datatype=(code, 8 * dtype.itemsize), data=data))
+        struct.pack_into(order + "2f", content, 112, *scaling)
+        plain, packed = write(tmp_path, "a.nii", content), write(tmp_path, "a.nii.gz", gzip.compress(content))
+        wanted = with_simpleitk(plain)
+        for values in (read_volume(plain).values, read_volume(packed).values):
+            assert values.dtype == wanted.dtype
+            assert np.array_equal(values, wanted)
 
 
 @pytest.mark.parametrize("order", ["little", "big"])
-@pytest.mark.parametrize("name", sorted(NRRD_TYPES))
+@pytest.mark.parametrize("name", {dtype: name for name, dtype in sorted(NRRD_TYPES.items())}.values())
 def test_nrrd_values_are_simpleitks_bit_for_bit(tmp_path: Path, order: str, name: str) -> None:
-    """Every type by every name in both byte orders, raw and gzipped, attached and detached."""
+    """Every type in both byte orders, raw and gzipped, attached and detached."""
     dtype = np.dtype({"little": "<", "big": ">"}[order] + NRRD_TYPES[name])
     values = stored_values(dtype)
     raw = values.tobytes()
@@ -239,7 +227,7 @@ def test_canonical_order_is_right_handed_and_keeps_places() -> None:
         assert np.allclose(oriented.T_ct_index, T, atol=1e-12)
 
 
-@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 2, 0), (2, 1, 0)])
 def test_a_point_has_the_value_of_the_nearest_voxel(order: tuple[int, ...]) -> None:
     """However the voxels lie in memory; half way between two voxels it is the even one, outside there is none."""
     values = np.ascontiguousarray(VALUES.transpose(order), dtype=np.float32).transpose(np.argsort(order))
@@ -254,7 +242,6 @@ def test_a_point_has_the_value_of_the_nearest_voxel(order: tuple[int, ...]) -> N
 
 
 def restored(values: np.ndarray, T: np.ndarray, order: tuple[int, ...], flips: tuple[int, ...]) -> tuple[Any, Any]:
-    """The same volume, stored with its axes in another order and direction."""
     T_new = np.zeros((4, 4))
     T_new[3, 3] = 1
     for new, old in enumerate(order):
@@ -271,30 +258,18 @@ BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
     "empty": ("a.nii", b"", "file_size"),
     "cut in the header": ("a.nii", WHOLE[:200], "file_cut"),
     "cut in the data": ("a.nii", WHOLE[:-1], "size_mismatch"),
-    "data missing": ("a.nii", WHOLE[:352], "size_mismatch"),
     "too long": ("a.nii", WHOLE + b"\0", "size_mismatch"),
     "gz cut": ("a.nii.gz", PACKED[:-12], "file_damaged"),
-    "gz cut in the data only": ("a.nii.gz", gzip.compress(WHOLE[:-1]), "size_mismatch"),
     "gz with a wrong checksum": ("a.nii.gz", PACKED[:-8] + b"\1\2\3\4" + PACKED[-4:], "file_damaged"),
     "gz bomb": ("a.nii.gz", gzip.compress(WHOLE + bytes(50_000_000)), "size_mismatch"),
     "gz that is plain": ("a.nii.gz", WHOLE, "file_damaged"),
-    "plain that is gz": ("a.nii", PACKED, "file_cut"),
-    "garbage": ("a.nii", bytes(range(256)) * 4, "wrong_format"),
     "wrong magic": ("a.nii", nifti_bytes(magic=b"ni1\0"), "wrong_format"),
     "terabytes": ("a.nii", nifti_bytes(dim=(3, 32767, 32767, 32767, 1, 1, 1, 1), data=b""), "too_many"),
-    "gigabytes in a tiny gz": (
-        "a.nii.gz",
-        gzip.compress(nifti_bytes(dim=(3, 900, 900, 900, 1, 1, 1, 1))),
-        "size_mismatch",
-    ),
     "negative size": ("a.nii", nifti_bytes(dim=(3, -4, 5, 6, 1, 1, 1, 1)), "wrong_dimension"),
-    "zero size": ("a.nii", nifti_bytes(dim=(3, 0, 5, 6, 1, 1, 1, 1)), "wrong_dimension"),
     "4D": ("a.nii", nifti_bytes(dim=(4, 4, 5, 3, 2, 1, 1, 1)), "wrong_dimension"),
-    "8D": ("a.nii", nifti_bytes(dim=(8, 4, 5, 6, 1, 1, 1, 1)), "wrong_dimension"),
     "colour": ("a.nii", nifti_bytes(datatype=(128, 24)), "unknown_type 128"),
     "bits contradict the type": ("a.nii", nifti_bytes(datatype=(4, 32)), "unknown_type"),
     "NaN affine": ("a.nii", nifti_bytes(sform=SFORM * NAN), "not_finite"),
-    "infinite affine": ("a.nii", nifti_bytes(sform=np.full((3, 4), np.inf)), "not_finite"),
     "zero affine": ("a.nii", nifti_bytes(sform=SFORM * 0), "implausible_spacing"),
     "parallel axes": ("a.nii", nifti_bytes(sform=[[2, 3, 0, 0], [0, 0, 0, 0], [0, 0, 4, 0]]), "sheared"),
     "sheared affine": ("a.nii", nifti_bytes(sform=[[2, 0.03, 0, 0], [0, 3, 0, 0], [0, 0, 4, 0]]), "sheared"),
@@ -303,7 +278,6 @@ BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
     "affines disagree": ("a.nii", nifti_bytes(codes=(1, 1), qoffset=(10, 20, 31)), "geometry_contradicted"),
     "no affine": ("a.nii", nifti_bytes(codes=(0, 0)), "space_not_stated"),
     "quaternion too long": ("a.nii", nifti_bytes(codes=(1, 0), quaternion=(1, 1, 0)), "not_unit"),
-    "NaN quaternion": ("a.nii", nifti_bytes(codes=(1, 0), quaternion=(NAN, 0, 0)), "not_unit"),
     "negative pixdim": ("a.nii", nifti_bytes(pixdim=(1, -2, 3, 4, 0, 0, 0, 0), codes=(1, 0)), "not_positive"),
     "pixdim against sform": ("a.nii", nifti_bytes(pixdim=(1, 2, 3, 5, 0, 0, 0, 0)), "geometry_contradicted"),
     "metres called mm": (
@@ -313,7 +287,6 @@ BAD_NIFTI: dict[str, tuple[str, bytes, str]] = {
     ),
     "unknown unit": ("a.nii", nifti_bytes(units=5), "unknown_unit"),
     "offset inside the header": ("a.nii", nifti_bytes(vox_offset=0), "out_of_range"),
-    "NaN offset": ("a.nii", nifti_bytes(vox_offset=NAN), "out_of_range"),
     "offset past the end": ("a.nii", nifti_bytes(vox_offset=1e9), "size_mismatch"),
     "NaN slope": ("a.nii", nifti_bytes(slope=NAN), "not_finite"),
     "slope of zero": (
@@ -348,23 +321,20 @@ def test_axes_of_length_one_behind_the_three_of_space_are_none(tmp_path: Path) -
         np.testing.assert_allclose(np.abs(other.T_ct_index), np.abs(plain.T_ct_index))
 
 
-@pytest.mark.parametrize(("shift", "turned"), [(5.0, False), (0.0, False), (5.0, True)])
-def test_labels_that_lost_their_grid_are_refused(shift: float, turned: bool) -> None:
+def test_labels_that_lost_their_grid_are_refused() -> None:
     """They have the image's voxels and begin at 0; a grid that begins at 0 where the image lies is its own."""
-    T = np.diag([2.0, 3.0, 4.0, 1.0])
-    if turned:  # the same image, stored from its other end
-        T[:3, :3] *= -1
-        T[:3, 3] = (np.array(SHAPE) - 1) * [2.0, 3.0, 4.0]
-    T[:3, 3] += shift
-    image, start = VolumeGrid(SHAPE, T, {}), np.diag([2.0, 3.0, 4.0, 1.0])
-    if shift:
+    path, scale = Path("labels.nii"), [2.0, 3.0, 4.0]
+    start = np.diag([*scale, 1.0])
+    shifted, turned, beside = start.copy(), np.diag([-2.0, -3.0, -4.0, 1.0]), start.copy()
+    shifted[:3, 3] = 5.0
+    turned[:3, 3] = 5.0 + (np.array(SHAPE) - 1) * scale  # the same image, stored from its other end
+    beside[0, 3] = 0.5  # another place, and not lost
+    for T in (shifted, turned):
         with refused("grid_lost"):
-            refuse_lost_grid(VolumeGrid(SHAPE, start, {}), image, where=Path("labels.nii"))
-    else:
-        refuse_lost_grid(VolumeGrid(SHAPE, start, {}), image, where=Path("labels.nii"))
-    refuse_lost_grid(VolumeGrid((4, 5, 7), start, {}), image, where=Path("labels.nii"))
-    start[0, 3] = 0.5  # another place, and not lost
-    refuse_lost_grid(VolumeGrid(SHAPE, start, {}), image, where=Path("labels.nii"))
+            refuse_lost_grid(VolumeGrid(SHAPE, start, {}), VolumeGrid(SHAPE, T, {}), where=path)
+        refuse_lost_grid(VolumeGrid((4, 5, 7), start, {}), VolumeGrid(SHAPE, T, {}), where=path)
+        refuse_lost_grid(VolumeGrid(SHAPE, beside, {}), VolumeGrid(SHAPE, T, {}), where=path)
+    refuse_lost_grid(VolumeGrid(SHAPE, start, {}), VolumeGrid(SHAPE, start, {}), where=path)
 
 
 FOUR_D = (("dimension", "dimension: 4"), ("sizes", "sizes: 2 4 5 3"))
@@ -389,11 +359,8 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
         "size_mismatch",
     ),
     "points at another folder": ("a.nhdr", nrrd_bytes(("data", "data file: ../a.raw"), data=b""), "outside_folder"),
-    "points at the host": ("a.nhdr", nrrd_bytes(("data", "data file: /etc/passwd"), data=b""), "outside_folder"),
     "points nowhere": ("a.nhdr", nrrd_bytes(("data", "data file: b.raw"), data=b""), "no_such_file"),
     "points at itself": ("a.nhdr", nrrd_bytes(("data", "datafile: a.nhdr"), data=b""), "data_elsewhere"),
-    "a list of files": ("a.nhdr", nrrd_bytes(("data", "data file: LIST"), data=b"/etc/passwd\n"), "outside_folder"),
-    "a pattern of files": ("a.nhdr", nrrd_bytes(("data", "data file: a%d.raw 1 6 1"), data=b""), "outside_folder"),
     "an attached file that points": ("a.nrrd", nrrd_bytes(("data", "Data File: /etc/passwd")), "outside_folder"),
     "layers of segments": ("a.seg.nrrd", nrrd_bytes(*FOUR_D), "wrong_dimension"),
     "two spaces": ("a.nrrd", nrrd_bytes(("x", "space dimension: 3")), "stated_twice"),
@@ -428,62 +395,43 @@ BAD_NRRD: dict[str, tuple[str, bytes, str]] = {
 
 @pytest.mark.parametrize("case", [*BAD_NIFTI.values(), *BAD_NRRD.values()], ids=[*BAD_NIFTI, *BAD_NRRD])
 def test_damaged_and_hostile_files_are_refused_by_name(tmp_path: Path, case: tuple[str, bytes, str]) -> None:
-    """Each is an ``InputError`` that names the file and what is wrong."""
     name, content, match = case
     with refused(*match.split(), name):
         read_volume(write(tmp_path, name, content))
 
 
 def test_paths_that_are_no_volume_files(tmp_path: Path) -> None:
-    """A folder, nothing at all, and an unknown ending are refused."""
     (tmp_path / "folder.nii").mkdir()
-    with refused("no_such_file"):
-        read_volume(tmp_path / "folder.nii")
-    with refused("no_such_file"):
-        read_volume(tmp_path / "none.nii.gz")
-    with refused("unknown_format"):
-        read_volume(write(tmp_path, "a.img", WHOLE))
+    write(tmp_path, "a.img", WHOLE)
+    for name, code in (("folder.nii", "no_such_file"), ("b.nii.gz", "no_such_file"), ("a.img", "unknown_format")):
+        with refused(code):
+            read_volume(tmp_path / name)
 
 
 def test_a_link_beside_a_nrrd_may_not_lead_away(tmp_path: Path) -> None:
-    """A data file that is a link into another folder is refused."""
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.raw").symlink_to(write(tmp_path, "a.raw", VALUES.tobytes(order="F")))
     with refused("outside_folder"):
         read_volume(write(tmp_path / "in", "a.nhdr", nrrd_bytes(("data", "data file: a.raw"), data=b"")))
 
 
-def mutated(draw: Callable[[Any], Any], content: bytes, reach: int) -> bytes:
-    """The content with some of its first bytes replaced, and perhaps cut."""
-    changed = bytearray(content)
-    for position in draw(st.lists(st.integers(0, reach - 1), min_size=1, max_size=6)):
-        changed[position] = draw(st.integers(0, 255))
-    return bytes(changed[: draw(st.integers(0, len(changed)))]) if draw(st.booleans()) else bytes(changed)
-
-
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("a.nii", WHOLE),
-        ("a.nii.gz", PACKED),
-        ("a.nrrd", nrrd_bytes()),
-        ("b.nrrd", nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(VALUES.tobytes(order="F")))),
-    ],
-)
-@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_whatever_the_bytes_only_input_errors_come_out(
-    tmp_path: Path, name: str, content: bytes, data: st.DataObject
-) -> None:
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "a.nrrd", "b.nrrd"])
+def test_whatever_the_bytes_only_input_errors_come_out(tmp_path: Path, name: str) -> None:
     """A mutated file is refused or is a whole, finite volume of the size that its header says."""
-    changed = mutated(data.draw, content, min(len(content), 352))
-    try:
-        volume = read_volume(write(tmp_path, name, changed))
-    except InputError:
-        return
-    assert np.isfinite(volume.T_ct_index).all()
-    assert np.isfinite(volume.values).all()
-    assert min(volume.values.shape) >= 2
+    gzipped = nrrd_bytes(("encoding", "encoding: gzip"), data=gzip.compress(VALUES.tobytes(order="F")))
+    content = {"a.nii": WHOLE, "a.nii.gz": PACKED, "a.nrrd": nrrd_bytes(), "b.nrrd": gzipped}[name]
+    random = Random(name)
+    for _ in range(60):
+        changed = bytearray(content)
+        for _ in range(random.randint(1, 6)):
+            changed[random.randrange(min(len(content), 352))] = random.randrange(256)
+        end = random.choice((len(changed), random.randrange(len(changed))))
+        try:
+            volume = read_volume(write(tmp_path, name, changed[:end]))
+        except InputError:
+            continue
+        assert np.isfinite(volume.T_ct_index).all() and np.isfinite(volume.values).all()
+        assert min(volume.values.shape) >= 2
 
 
 def test_axes_without_a_named_space_are_lps_as_to_itk_and_that_is_told(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from fuzz.runner import Fuzzer
 
 
 def main():
-    """Run, print what failed and the counts; 1 if anything failed."""
     arguments = argparse.ArgumentParser()
     arguments.add_argument("--runs", type=int, default=100_000)
     arguments.add_argument("--first", type=int, default=0, help="Number of the first run.")

@@ -7,87 +7,23 @@ from fuzz.mutate import NUMBERS, pick
 
 COMMANDS = [
     *["search", "verify", "check", "compare", "plan", "rehearse", "place", "mirror", "live", "export", "register"],
-    *["touch", "pivot", "markers"],
-    *[
-        "calibrate",
-        "calibrate hand-eye",
-        "calibrate dynamics",
-        "batch",
-        "batch run",
-        "batch status",
-        "batch merge",
-        "batch compare",
-    ],
-    *[
-        "schema",
-        "init",
-        "selfcal",
-        "servo",
-        "reproduce",
-        "scan",
-        "confirm",
-        "",
-        "serch",
-        "x" * 3000,
-        "--help",
-        "-h",
-        "--version",
-    ],
+    *["touch", "pivot", "markers", "calibrate", "calibrate hand-eye", "calibrate dynamics", "batch", "batch run"],
+    *["batch status", "batch merge", "batch compare", "schema", "init", "selfcal", "servo", "reproduce", "scan"],
+    *["confirm", "", "serch", "x" * 3000, "--help", "-h", "--version"],
 ]
 """Not ``demo``, which needs nothing and takes a minute, nor ``batch plan``, which takes any folder."""
 
-OPTIONS = {
-    "--theta": "number",
-    "--beta": "number",
-    "--rank": "number",
-    "--window": "number",
-    "--entry": "word",
-    "--entries": "path",
-    "--targets": "path",
-    "--case": "path",
-    "--from": "path",
-    "--scan": "path",
-    "--learn": "path",
-    "--plan": "path",
-    "--recording": "path",
-    "--shots": "path",
-    "--noise": "word",
-    "--out": "out",
-    "--picture": "out",
-    "--jobs": "number",
-    "--seeds": "number",
-    "--seconds": "number",
-    "--rate": "number",
-    "--port": "number",
-    "--host": "word",
-    "--certify-size": "number",
-    "--target": "word",
-    "--target-label": "word",
-    "--hit-radius": "number",
-    "--space": "word",
-    "--trust-labels": None,
-    "--force": None,
-    "--cross-check": "number",
-    "--kind": "word",
-    "--diameter": "number",
-    "--count": "number",
-    "--layout": "path",
-    "--propose": "number",
-    "--engine": "word",
-    "--format": "word",
-    "--json": None,
-    "--arm": None,
-    "--no-arm": None,
-    "--no-pictures": None,
-    "--certify": None,
-    "--part": "word",
-    "--expect": "path",
-    "--memory-mb": "number",
-    "--timeout-s": "number",
-    "--nonsense": "word",
-    "-": None,
-    "--": None,
+KINDS = {
+    "number": (
+        "--theta --beta --rank --window --jobs --seeds --seconds --rate --port --certify-size --hit-radius "
+        "--cross-check --diameter --count --propose --memory-mb --timeout-s"
+    ),
+    "word": ("--entry --noise --host --target --target-label --space --kind --engine --format --part --nonsense"),
+    "path": ("--entries --targets --case --from --scan --learn --plan --recording --shots --layout --expect"),
+    "out": ("--out --picture"),
+    None: ("--trust-labels --force --json --arm --no-arm --no-pictures --certify - --"),
 }
+OPTIONS = {option: kind for kind, options in KINDS.items() for option in options.split()}
 WORDS = [
     *["", "fast", "fcl", "ros2", "csv", "urscript", "x" * 3000, "\0", "\u202e", "a b", "-1", "é", "liu1999"],
     *["\udcff"],
@@ -119,7 +55,6 @@ def command_line(rng, files):
 
 
 def run(main, words):
-    """Run a command line in this process; asserts what must hold of any."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main(words)

@@ -1,11 +1,8 @@
 """Small valid files of every kind that the program reads, made here: what the mutators start from."""
 
-import base64
 import gzip
 import hashlib
 import json
-import struct
-import zlib
 
 import dicom_world as world
 import h5py
@@ -13,7 +10,8 @@ import numpy as np
 import SimpleITK
 import trimesh
 from case_world import MARKERS, registration_section, whole
-from hostile.makers import CASE, MOUNT, RIB, certificate, glb, recording, sound_case
+from hostile.makers import CASE, MOUNT, RIB, certificate, recording, sound_case
+from mesh_bytes import glb, vtp
 from pydicom.uid import ImplicitVRLittleEndian, JPEGBaseline8Bit, RLELossless
 from slicer_files import vtk_model
 
@@ -59,7 +57,6 @@ STANDOFF_MM = 8.0
 
 
 def make_corpus(folder):
-    """Write every file into a folder."""
     make_meshes(folder)
     make_volumes(folder)
     make_dicom(folder)
@@ -83,7 +80,6 @@ def make_corpus(folder):
 
 
 def make_transforms(folder):
-    """A composite of a rigid part about a centre and an affine one, as HDF5 and as text."""
     euler = SimpleITK.Euler3DTransform([10.0, -20.0, 30.0], 0.1, 0.2, 0.3, [300.0, 0.0, -90.0])
     for name in ("transform.h5", "transform.tfm"):
         both = SimpleITK.CompositeTransform([euler, SimpleITK.AffineTransform(3)])
@@ -93,7 +89,6 @@ def make_transforms(folder):
 
 
 def output_set_manifest():
-    """The manifest of a set of two commands, one made from the other, in which a third was interrupted."""
     search = ManifestEntry(
         "1.0", (Input("case", "case.toml", "0" * 64),), (), {name: digest_of(name) for name in SET_FILES[:2]}
     )
@@ -102,12 +97,10 @@ def output_set_manifest():
 
 
 def digest_of(name):
-    """SHA-256 of what a file of the set holds, which is its name."""
     return hashlib.sha256(name.encode()).hexdigest()
 
 
 def make_meshes(folder):
-    """Two balls as one surface, in every format."""
     spheres = [trimesh.creation.icosphere(subdivisions=1, radius=radius) for radius in (20.0, 9.0)]
     spheres[1].apply_translation([60.0, 0.0, 0.0])
     mesh = trimesh.util.concatenate(spheres)
@@ -117,18 +110,14 @@ def make_meshes(folder):
     mesh.export(folder / "a.ply", encoding="binary", vertex_normal=False)
     mesh.export(folder / "ascii.ply", encoding="ascii", vertex_normal=False)
     vertices, faces = mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")
-    glb(folder, gltf(vertices, faces), vertices.tobytes() + faces.tobytes())
-    (folder / "rib.glb").rename(folder / "a.glb")
-    (folder / "ascii.vtp").write_text(
-        vtp(mesh, lambda array: ("ascii", " ".join(map(str, array.reshape(-1).tolist()))))
-    )
-    (folder / "base64.vtp").write_text(vtp(mesh, lambda array: ("binary", packed(array))))
+    (folder / "a.glb").write_bytes(glb(gltf(vertices, faces), vertices.tobytes() + faces.tobytes()))
+    (folder / "ascii.vtp").write_bytes(vtp(mesh.vertices, mesh.faces.tolist()))
+    (folder / "base64.vtp").write_bytes(vtp(mesh.vertices, mesh.faces.tolist(), "binary", compressed=True))
     (folder / "a.vtk").write_bytes(vtk_model(mesh.vertices, mesh.faces))
     (folder / "ascii.vtk").write_bytes(vtk_model(mesh.vertices, mesh.faces, binary=False))
 
 
 def gltf(vertices, faces):
-    """A glTF document of one mesh, placed twice."""
     return {
         "asset": {"version": "2.0"},
         "scene": 0,
@@ -150,37 +139,7 @@ def gltf(vertices, faces):
     }
 
 
-def vtp(mesh, encode):
-    """VTK PolyData; ``encode`` gives the format and the text of an array."""
-
-    def array(values, kind, name, extra=""):
-        how, text = encode(values)
-        return f'<DataArray type="{kind}" Name="{name}" format="{how}"{extra}>{text}</DataArray>\n'
-
-    faces = mesh.faces.astype("<i8")
-    offsets = np.arange(3, 3 * len(faces) + 1, 3, dtype="<i8")
-    return (
-        '<?xml version="1.0"?>\n<VTKFile type="PolyData" version="1.0" byte_order="LittleEndian" header_type="UInt32" '
-        'compressor="vtkZLibDataCompressor">\n<PolyData>\n'
-        f'<Piece NumberOfPoints="{len(mesh.vertices)}" NumberOfPolys="{len(faces)}">\n<Points>\n'
-        + array(mesh.vertices.astype("<f4"), "Float32", "Points", ' NumberOfComponents="3"')
-        + "</Points>\n<Polys>\n"
-        + array(faces, "Int64", "connectivity")
-        + array(offsets, "Int64", "offsets")
-        + "</Polys>\n</Piece>\n</PolyData>\n</VTKFile>\n"
-    )
-
-
-def packed(array):
-    """An array in one zlib block, with its header, in base64."""
-    raw = array.tobytes()
-    block = zlib.compress(raw)
-    header = struct.pack("<IIII", 1, len(raw), 0, len(block))
-    return base64.b64encode(header).decode() + base64.b64encode(block).decode()
-
-
 def make_volumes(folder):
-    """A label map and a CT, in every format and encoding."""
     labels = np.zeros((26, 12, 10), np.uint8)
     labels[15:20, 3:8, 3:8] = 1
     labels[21:24, 4:9, 4:8] = 2
@@ -202,7 +161,6 @@ def make_volumes(folder):
 
 
 def make_dicom(folder):
-    """Slices of a series in several encodings, an enhanced image, a segmentation and a structure set."""
     T, stored = world.affine(), world.phantom(DICOM_SHAPE)
     slices = world.series(stored, T)
     slices[1].compress(RLELossless)
@@ -228,7 +186,6 @@ def make_dicom(folder):
 
 
 def make_points(folder):
-    """Four markers in every format, and the names of labels."""
     for name in ("markers_ct.csv", "touch.csv"):
         (folder / name).write_text(MARKERS)
     (folder / "kinds.csv").write_text("name,kind,x_cm,y_cm,z_cm\nA,fid,0,0,8\nB,fid,5,0,7.5\nC,bone,0,6,7\n")
@@ -241,14 +198,12 @@ def make_points(folder):
 
 
 def evenly(times_s, q):
-    """The same motion with a row every ``SAMPLE_S``."""
     even = SAMPLE_S * np.arange(int(np.ceil(times_s[-1] / SAMPLE_S)) + 1)
     stretched = times_s * (even[-1] / times_s[-1])
     return Trajectory(even, np.stack([np.interp(even, stretched, joint) for joint in q.T], axis=1))
 
 
 def straight_plan():
-    """A plan of the embedded abdomen's arm: no approach, and a straight insertion that some roll can reach."""
     case = load_case(embedded() / "abdomen")
     T = load_placement(case).T_base_ct
     target = T[:3, :3] @ case.target_ct + T[:3, 3]

@@ -52,13 +52,11 @@ def rewritten_set(path):
 
 
 def contents(home):
-    """Every file under a folder and what it holds; what only a running command has there does not count."""
     files = [path for path in sorted(home.rglob("*")) if path.is_file() and not path.name.startswith(".puncture")]
     return {path.relative_to(home).as_posix(): path.read_bytes() for path in files if path.name != TIMINGS_NAME}
 
 
 def whole_set(one):
-    """The new entry is there, nothing got worse, and what was read is what is written again."""
     assert set(one.after) <= set(one.before), (one.before, one.after, one.text)
     assert set(one.read_again.entries["search"].files) == {"fresh.txt"} and one.read_again.unfinished == ()
     assert set(one.read_again.entries) - {"search"} <= set(one.read.entries)

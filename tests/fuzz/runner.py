@@ -50,13 +50,11 @@ class Fuzzer:
         self.refused = dict(self.accepted)
 
     def check_corpus(self):
-        """Every file of the corpus is read, and whole."""
         for target in TARGETS:
             for name in target.files:
                 target.check(target.read(self.corpus / name))
 
     def run(self, number):
-        """One run; returns what went wrong, in words, or None."""
         rng = np.random.default_rng([2026, number])
         start, peak = time.process_time(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         with warnings.catch_warnings():

@@ -33,25 +33,16 @@ from puncture_twin.twin.pictures import read_frames
 
 @dataclass(frozen=True)
 class Target:
-    """A reader and its files.
-
-    Attributes:
-        name: Unique.
-        files: File name in the corpus to the kind of its mutators.
-        read: Takes the path of a file.
-        check: Takes what was read; asserts what holds of it, whatever the file held.
-        heavy: Drawn less often: it reads other files too.
-    """
+    """A reader and its files."""
 
     name: str
-    files: dict[str, str]
-    read: object
-    check: object
-    heavy: bool = False
+    files: dict[str, str]  # file name in the corpus to the kind of its mutators
+    read: object  # takes the path of a file
+    check: object  # takes what was read; asserts what holds of it, whatever the file held
+    heavy: bool = False  # drawn less often: it reads other files too
 
 
 def whole_mesh(mesh):
-    """Finite, indices in range, at least a triangle; and what is open says so."""
     assert mesh.vertices.shape[1:] == (3,) and mesh.faces.shape[1:] == (3,) and len(mesh.faces) > 0
     assert np.isfinite(mesh.vertices).all() and np.abs(mesh.vertices).max() <= 1e6
     assert mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)
@@ -59,42 +50,35 @@ def whole_mesh(mesh):
 
 
 def whole_volume(volume):
-    """Finite values, and a regular place in the patient."""
     assert volume.values.ndim == 3 and min(volume.values.shape) >= 2 and np.isfinite(volume.values).all()
     assert volume.T_ct_index.shape == (4, 4) and np.isfinite(volume.T_ct_index).all()
     assert abs(np.linalg.det(volume.T_ct_index[:3, :3])) > 1e-6
 
 
 def whole_labelmap(labelmap):
-    """Whole labels from 0 on, one of them at least above."""
     assert labelmap.labels.dtype.kind in "iu" and labelmap.labels.min() >= 0 and labelmap.labels.max() > 0
 
 
 def whole_points(points):
-    """As many finite points as names, each name once and not empty."""
     assert points.points.shape == (len(points.names), 3) and np.isfinite(points.points).all()
     assert len(set(points.names)) == len(points.names) > 0 and all(points.names)
 
 
 def whole_transform(T):
-    """A rigid motion."""
     assert np.isfinite(T).all() and np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() < 1e-4
     assert np.linalg.det(T[:3, :3]) > 0
 
 
 def whole_names(names):
-    """Each label has a name of its own."""
     assert names and len(set(names.values())) == len(names) and all(0 < label <= 65535 for label in names)
 
 
 def whole_frames(read):
-    """Pictures with a pixel of some size."""
     assert read.grey.dtype == np.uint8 and read.grey.ndim == 3 and read.grey.size
     assert read.pixel_mm is None or np.isfinite(read.pixel_mm).all()
 
 
 def whole_recording(recording):
-    """Rigid motions and unit directions."""
     for T in (recording.A, recording.B):
         R = T[:, :3, :3]
         assert np.isfinite(T).all() and np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max() < 1e-5
@@ -103,12 +87,10 @@ def whole_recording(recording):
 
 
 def whole_states(states):
-    """Six finite angles at a finite time."""
     assert all(np.isfinite(state.time_s) and np.isfinite(state.q).all() and state.q.shape == (6,) for state in states)
 
 
 def whole_plan(plan):
-    """Finite numbers, a rigid pose, and joined phases."""
     assert np.isfinite([plan.theta, plan.beta, plan.roll, plan.standoff_mm, plan.needle_length_mm]).all()
     R = plan.T_base_ct[:3, :3]
     assert np.abs(R.T @ R - np.eye(3)).max() < 1e-5 and np.linalg.det(R) > 0
@@ -117,12 +99,10 @@ def whole_plan(plan):
 
 
 def whole_motion(motion):
-    """Times that rise."""
     assert all((np.diff(part.times_s) > 0).all() and np.isfinite(part.q).all() for part in motion)
 
 
 def whole_certificate(certificate):
-    """Leaves, verdicts and witnesses of one number."""
     count = len(certificate.leaves)
     assert all(len(part) == count for part in (certificate.verdict, certificate.reason, certificate.triangle))
     assert np.isfinite(certificate.size) and np.isfinite(certificate.question.length)
@@ -145,29 +125,24 @@ def whole_case(read):
 
 
 def whole_checks(checks):
-    """At least one expectation; of checks finite angles."""
     assert any(checks.tables().values()) and all(0 <= check.theta_deg <= 180 for check in checks.check)
 
 
 def whole_anything(value):
-    """Something was read."""
     assert value is not None
 
 
 def read_case(path):
-    """A case with its placement and its structures."""
     case = load_case(path)
     load_placement(case)
     return case, load_anatomy(case)
 
 
 def read_own_mesh(path):
-    """A mesh in mm, LPS."""
     return read_mesh(path, unit=Unit.MM, space=Space.LPS, up=Up.Z)
 
 
 def read_own_points(path):
-    """Points of a case in LPS."""
     return read_points(path, default_space=Space.LPS, default_unit=Unit.MM)
 
 
@@ -177,14 +152,12 @@ DICOM_MASKS = {"seg.dcm": "dicom", "rt.dcm": "dicom"}
 
 
 def dicom_series(path):
-    """The series of three slices beside a file, or the enhanced image; recognised, then with its voxels."""
     recognise(path)
     names = DICOM_SERIES if path.name in DICOM_SERIES else (path.name,)
     return parse_series(path, names, lambda name: (path.parent / name).read_bytes())
 
 
 def read_dicom_masks(path):
-    """The structures of a file on the series beside it, with their voxels."""
     recognise(path)
     ct = dicom_series(path.parent / DICOM_SERIES[0])
     parse = parse_segmentation if path.name == "seg.dcm" else parse_structure_set
@@ -193,7 +166,6 @@ def read_dicom_masks(path):
 
 
 def whole_masks(volumes):
-    """Each mask is of 0 and 1, on a regular grid."""
     assert volumes
     for volume in volumes:
         whole_volume(volume)
@@ -201,40 +173,22 @@ def whole_masks(volumes):
 
 
 def read_names(path):
-    """The names of a naming table; no label map is asked."""
     return names_for(path.name, path.parent, lambda name: (path.parent / name).read_bytes(), None)
 
 
 def read_times(path):
-    """The export's own table; it is read back as text."""
     return read_csv(path.read_bytes().decode("utf-8", "replace"), where=path)
 
 
 def read_transform(path):
-    """The motion of ITK's transforms."""
     return parse_transform(path.read_bytes(), path)
 
 
-MESHES = {
-    "a.stl": "stl",
-    "ascii.stl": "text",
-    "a.obj": "text",
-    "a.ply": "headed",
-    "ascii.ply": "text",
-    "a.glb": "glb",
-    "ascii.vtp": "text",
-    "base64.vtp": "text",
-    "a.vtk": "headed",
-    "ascii.vtk": "text",
-}
-LABELS = {
-    "labels.nii.gz": "gzip",
-    "labels.nii": "nifti",
-    "raw.nrrd": "headed",
-    "gzip.nrrd": "headed",
-    "labels.seg.nrrd": "headed",
-    "labels.nhdr": "text",
-}
+TEXTS = ("ascii.stl", "a.obj", "ascii.ply", "ascii.vtp", "base64.vtp", "ascii.vtk")
+MESHES = {"a.stl": "stl", "a.ply": "headed", "a.glb": "glb", "a.vtk": "headed", **dict.fromkeys(TEXTS, "text")}
+HEADED = ("raw.nrrd", "gzip.nrrd", "labels.seg.nrrd")
+LABELS = {"labels.nii.gz": "gzip", "labels.nii": "nifti", "labels.nhdr": "text", **dict.fromkeys(HEADED, "headed")}
+POINTS = {"a.mrk.json": "tree", **dict.fromkeys(("markers_ct.csv", "kinds.csv", "a.fcsv"), "table")}
 TRANSFORMS = {"transform.h5": "hdf5", "earliest.h5": "hdf5", "transform.tfm": "text"}
 CASES = ("full.toml", "case.toml", "mount.toml")
 TARGETS = [
@@ -243,12 +197,7 @@ TARGETS = [
     Target("series", DICOM, lambda path: dicom_series(path).volume(), whole_volume),
     Target("dicom masks", DICOM_MASKS, read_dicom_masks, whole_masks),
     Target("label map", LABELS, lambda path: labelmap_of(read_volume(path)), whole_labelmap),
-    Target(
-        "points",
-        {"markers_ct.csv": "table", "kinds.csv": "table", "a.mrk.json": "tree", "a.fcsv": "table"},
-        read_own_points,
-        whole_points,
-    ),
+    Target("points", POINTS, read_own_points, whole_points),
     Target("transform", TRANSFORMS, read_transform, whole_transform),
     Target("naming", {"names.csv": "table"}, read_names, whole_names),
     Target("case", dict.fromkeys(CASES, "text"), read_case, whole_case, heavy=True),

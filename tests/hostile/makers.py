@@ -1,10 +1,10 @@
 """Hostile inputs, by name: each function writes what a story of cases.toml is about into a folder."""
 
 import json
-import struct
 
 import numpy as np
 from case_world import case_text, structure, whole, write_balls
+from mesh_bytes import glb
 
 from puncture_twin.planning.certify.cells import Cells
 from puncture_twin.planning.certify.certificate import Certificate, write_certificate
@@ -24,13 +24,11 @@ STRUCTURE = RIB.replace('"rib"', '"s{0}"')
 
 
 def sound_case(folder, text=CASE + RIB):
-    """A case of three balls, in which everything is right."""
     write_balls(folder, ending="ply")
     (folder / "case.toml").write_text(whole(text))
 
 
 def case_with(before="", after="", old="", new=""):
-    """A maker of the sound case with text before, after or in place of other text."""
 
     def make(folder):
         text = CASE + RIB
@@ -41,7 +39,6 @@ def case_with(before="", after="", old="", new=""):
 
 
 def toml_file(name, text):
-    """A maker of one text file."""
 
     def make(folder):
         (folder / name).write_text(text)
@@ -49,18 +46,7 @@ def toml_file(name, text):
     return make
 
 
-def glb(folder, document, data):
-    """A GLB file from its JSON and its binary chunk."""
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    data += b"\0" * (-len(data) % 4)
-    parts = [(b"JSON", text), (b"BIN\0", data)]
-    body = b"".join(struct.pack("<I", len(content)) + kind + content for kind, content in parts)
-    (folder / "rib.glb").write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(body)) + body)
-
-
 def glb_document(vertices, primitives, nodes):
-    """Triangles without indices, in as many primitives and nodes as wished."""
     size = 12 * vertices
     return {
         "asset": {"version": "2.0"},
@@ -74,17 +60,15 @@ def glb_document(vertices, primitives, nodes):
 
 
 def glb_placed_often(folder):
-    """One triangle, placed by 200,000 nodes: a file of 4 MB."""
-    glb(folder, glb_document(3, 1, 200_000), np.eye(3, dtype="<f4").tobytes())
+    (folder / "rib.glb").write_bytes(glb(glb_document(3, 1, 200_000), np.eye(3, dtype="<f4").tobytes()))
 
 
 def glb_of_one_array(folder):
-    """6,000 vertices of 72 kB, named by 9,000 primitives: 54 million vertices."""
-    glb(folder, glb_document(6000, 9000, 1), np.random.default_rng(1).normal(size=(6000, 3)).astype("<f4").tobytes())
+    points = np.random.default_rng(1).normal(size=(6000, 3)).astype("<f4")
+    (folder / "rib.glb").write_bytes(glb(glb_document(6000, 9000, 1), points.tobytes()))
 
 
 def certificate(folder):
-    """A whole certificate of one cell, with its text."""
     question = Question(
         case_name="hostile",
         inputs={},
@@ -120,7 +104,6 @@ def certificate(folder):
 
 
 def certificate_with(old, new):
-    """A maker of a certificate with another number, beside its case."""
 
     def make(folder):
         sound_case(folder)
@@ -132,7 +115,6 @@ def certificate_with(old, new):
 
 
 def recording(change=lambda r: r, edit=lambda text: text):
-    """A maker of a recording of the self-calibration, whose poses or text are changed."""
 
     def make(folder):
         sound = simulate_recording(np.random.default_rng(1), 30)[0]
@@ -144,14 +126,12 @@ def recording(change=lambda r: r, edit=lambda text: text):
 
 
 def scaled(T, factor):
-    """Poses with other lengths."""
     T = np.array(T)
     T[:, :3, 3] *= factor
     return T
 
 
 def read_as(A=lambda r: r.A, B=lambda r: r.B, P=lambda r: r.P):
-    """A recording with other arrays."""
     return lambda r: Recording(A(r), B(r), P(r), r.v, r.names)
 
 
@@ -159,7 +139,6 @@ JOINTS = "time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n0,0,-1.5,0,-1.5,0,0\
 
 
 def joints(text):
-    """A maker of a recording of joints, beside a case that says where the arm stands."""
 
     def make(folder):
         sound_case(folder, CASE + RIB + MOUNT)
@@ -169,7 +148,6 @@ def joints(text):
 
 
 def plan_with(change):
-    """A maker of a straight plan whose document is changed."""
 
     def make(folder):
         from fuzz.corpus import straight_plan
@@ -183,17 +161,14 @@ def plan_with(change):
 
 
 def turn(document):
-    """A joint turns by 1,000 rad and back, on its way through one row."""
     document["insertion"]["q_rad"][1][0] = 1000.0
 
 
 def overflow(document):
-    """A joint at 1e308 rad."""
     document["insertion"]["q_rad"][1][0] = 1e308
 
 
 def vast_rotation(document):
-    """Columns of 1e200, whose products are infinite of both signs."""
     document["T_base_ct"] = [
         [1e200, 1e200, 1e200, 0],
         [1e200, -1e200, 1e200, 0],

@@ -35,7 +35,6 @@ WALL = 20
 
 
 def do(task):
-    """The exit code of what a task asks for."""
     if "argv" in task:
         return main(task["argv"])
     try:
@@ -47,7 +46,6 @@ def do(task):
 
 
 def child(task, out, err):
-    """Run a task, bounded; never returns."""
     code = 70
     try:
         os.dup2(out.fileno(), 1)
@@ -63,12 +61,10 @@ def child(task, out, err):
 
 
 def virtual_bytes():
-    """Address space that the process holds already."""
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
 
 
 def answer(task):
-    """Fork, wait, and say what happened."""
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         start = time.monotonic()
         pid = os.fork()

@@ -2,11 +2,8 @@
 
 The folder may be deleted at any time. An entry is used only if its digest covers its content and its key: the hashes
 of all inputs, the parameters, the source of the module that makes it with all that it imports, and the versions of the
-libraries. Anything else is made anew and replaced, and a `CacheWarning` says so.
-
-What one process keeps of values that cost time to make, from one case to the next.
-
-The folder is bounded in size: the least recently used goes first, and nothing of older versions stays.
+libraries. Anything else is made anew and replaced, and a `CacheWarning` says so. Folder and memory are bounded in size:
+the least recently used goes first, and nothing of older versions stays.
 """
 
 from __future__ import annotations
@@ -20,7 +17,8 @@ import shutil
 import time
 import warnings
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -47,16 +45,11 @@ DEAD_AFTER_S = 24 * 3600.0
 
 
 class StoredFile(NamedTuple):
-    """The name of an entry.
-
-    Attributes:
-        generation: 16 hexadecimal digits of its source and the libraries' versions.
-        key: 64 of all that decides its content.
-    """
+    """The name of an entry."""
 
     maker: str
-    generation: str
-    key: str
+    generation: str  # 16 hexadecimal digits of its source and the libraries' versions
+    key: str  # 64 of all that decides its content
 
     @property
     def file(self) -> str:
@@ -64,18 +57,8 @@ class StoredFile(NamedTuple):
         return f"{self.maker}.{self.generation}.{self.key}{SUFFIX}"
 
 
-class _Kept(NamedTuple):
-    used_ns: int
-    size: int
-    path: Path
-
-
 def store(folder: Path, entry: StoredFile, content: bytes, most_bytes: int) -> None:
-    """Write an entry, whole or not at all; then make the folder fit again.
-
-    Raises:
-        OSError, InputError: The folder cannot be written to.
-    """
+    """Write an entry, whole or not at all (OSError, InputError where it cannot be); then make the folder fit again."""
     if len(content) > most_bytes:
         return
     path = folder / entry.file
@@ -83,62 +66,37 @@ def store(folder: Path, entry: StoredFile, content: bytes, most_bytes: int) -> N
         shutil.rmtree(path, ignore_errors=True)
     with atomic(path) as temporary:
         temporary.write_bytes(content)
-    tidy(folder, entry, most_bytes)
+    _tidy(folder, entry, most_bytes)
 
 
-def touch(path: Path) -> None:
-    """Note that an entry was used."""
-    try:
-        os.utime(path)
-    except OSError:  # another process has removed it, or it is another user's
-        return
-
-
-def tidy(folder: Path, entry: StoredFile, most_bytes: int) -> None:
+def _tidy(folder: Path, entry: StoredFile, most_bytes: int) -> None:
     """Remove what this version of the maker cannot use, what the dead have left, and the oldest beyond the bound."""
-    kept = []
-    for one in _files(folder):
-        if _outlived(one, entry):
-            _remove(one.path)
-        elif ENTRY.fullmatch(one.path.name):
-            kept.append(one)
-    total = sum(one.size for one in kept)
-    for one in sorted(kept):
-        if total <= most_bytes:
-            break
-        _remove(one.path)
-        total -= one.size
-
-
-def _outlived(one: _Kept, entry: StoredFile) -> bool:
-    name = one.path.name
-    if TEMPORARY.fullmatch(name):
-        return time.time() - one.used_ns / 1e9 > DEAD_AFTER_S
-    found = ENTRY.fullmatch(name)
-    return found is not None and found["maker"] == entry.maker and found["generation"] != entry.generation
-
-
-def _files(folder: Path) -> Iterator[_Kept]:
-    """The plain files of the folder; one that another process removes meanwhile is passed over."""
+    kept: list[tuple[int, int, Path]] = []
     with os.scandir(folder) as found:
         for one in found:
-            try:
-                if one.is_file(follow_symlinks=False):
-                    seen = one.stat(follow_symlinks=False)
-                    yield _Kept(seen.st_mtime_ns, seen.st_size, Path(one.path))
-            except OSError:
-                continue
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:  # not ours to remove
-        return
+            with suppress(OSError):  # another process removes it meanwhile, or it is not ours
+                if not one.is_file(follow_symlinks=False):
+                    continue
+                seen, path = one.stat(follow_symlinks=False), Path(one.path)
+                named = ENTRY.fullmatch(one.name)
+                if named is None:
+                    outlived = bool(TEMPORARY.fullmatch(one.name)) and time.time() - seen.st_mtime > DEAD_AFTER_S
+                else:
+                    outlived = named["maker"] == entry.maker and named["generation"] != entry.generation
+                if outlived:
+                    path.unlink(missing_ok=True)
+                elif named is not None:
+                    kept.append((seen.st_mtime_ns, seen.st_size, path))
+    total = sum(size for _, size, _ in kept)
+    for _, size, path in sorted(kept):
+        if total <= most_bytes:
+            break
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        total -= size
 
 
 Value = TypeVar("Value")
-
 MEMORY_BYTES = 500_000_000
 """What is kept of patients, also beside a search: the meshes and trees of some ten whole bodies."""
 
@@ -169,18 +127,19 @@ class Memory:
         return self._held
 
     def get(self, key: tuple[Hashable, ...], make: Callable[[], Value], size: Callable[[Value], int]) -> Value:
-        """The value of a key, made where it is not there.
-
-        Args:
-            size: About how many bytes it holds.
-        """
+        """The value of a key, made where it is not there; ``size``: about how many bytes it holds."""
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
                 return self._kept[key][0]
         value = make()
         with self._lock:
-            self._keep(key, value, size(value))
+            if (bytes_of_it := size(value)) <= self._most and key not in self._kept:  # another thread has made it too
+                self._kept[key] = value, bytes_of_it
+                self._held += bytes_of_it
+            while self._held > self._most:
+                _, (_, gone) = self._kept.popitem(last=False)
+                self._held -= gone
         return value
 
     def holds(self, key: tuple[Hashable, ...]) -> bool:
@@ -192,29 +151,15 @@ class Memory:
         """Bytes that the values may hold."""
         return self._most
 
-    def _keep(self, key: tuple[Hashable, ...], value: Any, size: int) -> None:
-        if size > self._most or key in self._kept:  # another thread has made it too
-            return
-        self._kept[key] = value, size
-        self._held += size
-        while self._held > self._most:
-            _, (_, gone) = self._kept.popitem(last=False)
-            self._held -= gone
-
 
 NO_MEMORY = Memory()
 """Makes everything anew."""
-
-
 FOLDER_VARIABLE = "PUNCTURE_TWIN_CACHE"
 """Environment variable that names the folder; empty switches the cache off."""
-
 SIZE_VARIABLE = "PUNCTURE_TWIN_CACHE_MB"
 """Environment variable with the most megabytes (of 1,000,000 bytes) that the folder may hold."""
-
 MOST_BYTES = 2_000_000_000
 """Where it says nothing: the surfaces of some twenty whole bodies."""
-
 LIBRARIES = (
     *("puncture-twin", "numpy", "scipy", "scikit-image", "numba", "llvmlite", "python-fcl", "trimesh"),
     *("fast-simplification", "pillow", "pyarrow", "pydantic", "pydicom", "python-gdcm", "h5py"),
@@ -232,16 +177,11 @@ class _Read(Generic[Value]):
 
 @dataclass(frozen=True)
 class Cache:
-    """A folder of arrays, or no folder at all.
+    """A folder of arrays, or no folder at all."""
 
-    Attributes:
-        folder: Where; None makes everything anew each time.
-        memory: What this process keeps beside it.
-    """
-
-    folder: Path | None
+    folder: Path | None  # where; None makes everything anew each time
     most_bytes: int = MOST_BYTES
-    memory: Memory = field(default=NO_MEMORY, compare=False)
+    memory: Memory = field(default=NO_MEMORY, compare=False)  # what this process keeps beside it
 
     def arrays(
         self,
@@ -269,17 +209,17 @@ class Cache:
     def value(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
     ) -> Value:
-        """The value that ``read`` makes of `arrays`; reading is their check too, so a mesh is guarded once.
-
-        Args:
-            read: Raises ValueError, KeyError, TypeError or InputError for arrays that cannot be what ``make`` gives.
-        """
+        """The value that ``read`` makes of `arrays`; reading is their check too, so a mesh is guarded once."""
         if self.memory is NO_MEMORY:
             if self.folder is None:
                 return read(_frozen(make()))
             return self._from_folder(_entry(made_from, by), make, read).value
+
+        def size(found: _Read[Any]) -> int:
+            return sum(array.nbytes for array in found.arrays.values())
+
         entry = _entry(made_from, by)
-        return self.memory.get((__name__, entry), lambda: self._from_folder(entry, make, read), _size).value
+        return self.memory.get((__name__, entry), lambda: self._from_folder(entry, make, read), size).value
 
     def _from_folder(
         self, entry: StoredFile, make: Callable[[], Arrays], read: Callable[[Arrays], Value]
@@ -289,16 +229,9 @@ class Cache:
             made = _frozen(make())
             found = _Read(made, read(made))
             if self.folder is not None and module_unedited(entry.maker):  # else it may be of newer code than its stamp
-                self._store(entry, made)
+                with suppress(OSError, InputError):  # a folder that cannot be written to costs time, not the result
+                    store(self.folder, entry, packed(made, entry.key), self.most_bytes)
         return found
-
-    def _store(self, entry: StoredFile, arrays: Arrays) -> None:
-        """Store the arrays; a folder that cannot be written to costs time, not the result."""
-        assert self.folder is not None  # the caller has asked
-        try:
-            store(self.folder, entry, packed(arrays, entry.key), self.most_bytes)
-        except (OSError, InputError):
-            return
 
 
 NO_CACHE = Cache(None)
@@ -306,11 +239,7 @@ NO_CACHE = Cache(None)
 
 
 def user_cache() -> Cache:
-    """This user's cache: ``$PUNCTURE_TWIN_CACHE``, else ``puncture-twin`` under ``$XDG_CACHE_HOME`` or ``~/.cache``.
-
-    Raises:
-        InputError: ``$PUNCTURE_TWIN_CACHE_MB`` is no number.
-    """
+    """This user's: ``$PUNCTURE_TWIN_CACHE``, else ``puncture-twin`` in ``$XDG_CACHE_HOME`` or ``~/.cache``."""
     named = os.environ.get(FOLDER_VARIABLE)
     if named is not None:
         return Cache(Path(named) if named else None, _most_bytes())
@@ -332,11 +261,6 @@ def _frozen(arrays: Arrays) -> Arrays:
     for array in arrays.values():
         array.setflags(write=False)
     return arrays
-
-
-def _size(found: _Read[Any]) -> int:
-    """Of the arrays, which the value looks at."""
-    return sum(array.nbytes for array in found.arrays.values())
 
 
 def _entry(made_from: Mapping[str, Any], by: str) -> StoredFile:
@@ -364,5 +288,6 @@ def _kept(path: Path, key: str, read: Callable[[Arrays], Value]) -> _Read[Value]
         why = error if isinstance(error, DamagedError) else "does not have the expected content"
         warnings.warn(f"cache: a stored result {why}; it is computed again and replaced", CacheWarning, stacklevel=1)
         return None
-    touch(path)
+    with suppress(OSError):  # another process has removed it, or it is another user's
+        os.utime(path)  # it was used
     return found

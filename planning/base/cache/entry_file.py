@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.errors import InputError
 
 Arrays = dict[str, NDArray[Any]]
-
 MAGIC = b"puncture-twin arrays 3".ljust(31) + b"\n"
 """With the digest behind it 64 bytes: arrays lie in the file as in its body, and are read where they are."""
 DIGEST_BYTES = 32
@@ -44,17 +43,22 @@ def packed(arrays: Arrays, key: str) -> bytes:
 
 
 def unpacked(content: bytes, key: str) -> Arrays:
-    """The arrays of a file, read-only.
-
-    Raises:
-        DamagedError: It is not the file that was written for this key.
-    """
+    """The arrays of a file, read-only. Raises DamagedError: it is not the file that was written for this key."""
     start = len(MAGIC) + DIGEST_BYTES
     body = memoryview(content)[start:]
     if not content.startswith(MAGIC) or content[len(MAGIC) : start] != _digest(body, key):
         raise DamagedError("is truncated, damaged, or foreign")
     try:
-        return _arrays(content, start)
+        at = content.index(b"\n", start) + 1
+        arrays: Arrays = {}
+        for name, dtype, shape in json.loads(content[start:at]):
+            at += -at % ALIGNED
+            kind, count = np.dtype(dtype), int(np.prod(shape, dtype=np.int64))
+            if kind.hasobject:
+                raise ValueError("objects")
+            arrays[name] = np.frombuffer(content, kind, count, at).reshape(shape)
+            at += count * kind.itemsize
+        return arrays
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         raise DamagedError(f"cannot be read ({error})") from error
 
@@ -152,12 +156,7 @@ def _refusal(path: Path, what: str) -> InputError:
 
 
 def read_plain_file(path: Path) -> bytes:
-    """The content of a file that is really one; a pipe is not waited for.
-
-    Raises:
-        FileNotFoundError: It is not there.
-        DamagedError: It is something else than a file, or cannot be read.
-    """
+    """The content of a file that is really one, else DamagedError; a pipe is not waited for."""
     try:
         if not stat.S_ISREG(os.lstat(path).st_mode):
             raise DamagedError("is not a regular file")
@@ -172,16 +171,3 @@ def _digest(body: bytes | bytearray | memoryview, key: str) -> bytes:
     digest = hashlib.sha256(key.encode() + b"\n")
     digest.update(body)
     return digest.digest()
-
-
-def _arrays(content: bytes, start: int) -> Arrays:
-    at = content.index(b"\n", start) + 1
-    arrays: Arrays = {}
-    for name, dtype, shape in json.loads(content[start:at]):
-        at += -at % ALIGNED
-        kind, count = np.dtype(dtype), int(np.prod(shape, dtype=np.int64))
-        if kind.hasobject:
-            raise ValueError("objects")
-        arrays[name] = np.frombuffer(content, kind, count, at).reshape(shape)
-        at += count * kind.itemsize
-    return arrays

@@ -15,12 +15,9 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[3]
 """The folder of the parts: that of ``puncture_twin`` where it is installed, in a checkout the one around it."""
-
 PROJECT = str(PACKAGE)
 """Files are named by text here: a thousand names are asked for, and few are files."""
-
 PARTS = ("planning", "twin")
-
 IMPORTED = re.compile(
     rb"^[ \t]*(?:from|import)[ \t]+puncture_twin((?:\.\w+)*)(?:[ \t]+import[ \t]+(\([^)]*\)|[^\n#]*))?", re.M
 )

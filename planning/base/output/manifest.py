@@ -22,38 +22,27 @@ from puncture_twin.planning.base.strict_json import field, fitting, read_json, t
 MANIFEST_NAME = "manifest.json"
 TIMINGS_NAME = "timings.json"
 """Wall times and dates of the runs: the one file of a set whose bytes differ from run to run, listed without a hash."""
-
 FORMAT = "puncture-twin output set"
 """Tells this manifest from any other ``manifest.json``."""
-
 LAYOUT = 1
 """Version of the manifest's layout."""
-
 MAX_MANIFEST_BYTES = 50_000_000
 """A line for each of a hundred thousand files; a larger one is something else."""
-
 LONGEST_NAME = 1000
 """Bytes of a file's name with its sub-folders; we write some forty."""
-
 LONGEST_PART = 255
 """Bytes of one part of it, which is what file systems take."""
-
 ANOTHER_FOLDER = "another output folder, or remove that file"
 
 
 @dataclass(frozen=True)
 class ManifestEntry:
-    """What one command wrote.
-
-    Attributes:
-        depends_on: Entries of the same folder without which this one means nothing.
-        files: File name, relative to the folder with ``/``, to SHA-256.
-    """
+    """What one command wrote."""
 
     version: str
     inputs: tuple[Input, ...]
-    depends_on: tuple[str, ...]
-    files: Mapping[str, str]
+    depends_on: tuple[str, ...]  # entries of the same folder without which this one means nothing
+    files: Mapping[str, str]  # file name, relative to the folder with ``/``, to SHA-256
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -67,15 +56,10 @@ class ManifestEntry:
 
 @dataclass(frozen=True)
 class Manifest:
-    """The entries of a folder, and the names that an unfinished run may have left there.
+    """The entries of a folder, and the names that an unfinished run may have left there."""
 
-    Attributes:
-        entries: Name of the command to what it wrote.
-        unfinished: Files that belong to no entry any more, or not yet; the next run removes them.
-    """
-
-    entries: Mapping[str, ManifestEntry]
-    unfinished: tuple[str, ...] = ()
+    entries: Mapping[str, ManifestEntry]  # name of the command to what it wrote
+    unfinished: tuple[str, ...] = ()  # files that belong to no entry any more, or not yet; the next run removes them
 
     @property
     def files(self) -> dict[str, str]:
@@ -124,12 +108,7 @@ class Output(NamedTuple):
 
 
 def read_output(path: Path, *, max_bytes: int) -> Output:
-    """Read what an earlier command wrote, and refuse it where its folder's manifest tells otherwise.
-
-    Raises:
-        InputError: It cannot be read, is too large, or lies in a set that does not list these bytes: the set is
-            unfinished, or the file was edited.
-    """
+    """Read what an earlier command wrote, and refuse it where its folder's manifest tells otherwise."""
     data = read_input(path, max_bytes=max_bytes, where=str(path))
     digest = hashlib.sha256(data).hexdigest()
     home = path.resolve()
@@ -146,11 +125,7 @@ def read_output(path: Path, *, max_bytes: int) -> Output:
 
 
 def problems(folder: Path) -> tuple[str, ...]:
-    """Sentences on what keeps a folder from being one whole set; empty if nothing does.
-
-    Raises:
-        InputError: The manifest cannot be read, or is another program's.
-    """
+    """What keeps a folder from being one whole set, in sentences. Raises InputError: see `read_manifest`."""
     manifest = read_manifest(folder)
     if manifest is None:
         return (f"{MANIFEST_NAME} is missing",)
@@ -165,11 +140,7 @@ def problems(folder: Path) -> tuple[str, ...]:
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """A folder's manifest; None where there is none.
-
-    Raises:
-        InputError: It cannot be read, is damaged, or is another program's.
-    """
+    """A folder's manifest; None where there is none. Raises InputError: it is damaged, or another program's."""
     path = folder / MANIFEST_NAME
     if not path.exists():
         return None
@@ -177,7 +148,14 @@ def read_manifest(folder: Path) -> Manifest | None:
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         refuse("is not the manifest of an output folder", path, ANOTHER_FOLDER, "not_an_output_folder")
     with fitting(path, ANOTHER_FOLDER):
-        return _manifest(document)
+        if document["layout"] != LAYOUT:
+            raise ValueError(f"layout {document['layout']}")
+        entries = {name: _entry(entry) for name, entry in document["entries"].items()}
+        unfinished = tuple(map(_name, document["unfinished"]))
+        listed = Counter([*unfinished, *(name for entry in entries.values() for name in entry.files)])
+        if twice := {name for name, count in listed.items() if count > 1}:
+            raise ValueError(f"{min(twice)!r} is listed twice")
+        return Manifest(MappingProxyType(entries), unfinished)
 
 
 def file_digest(path: Path) -> str:
@@ -198,22 +176,6 @@ def _set_of(folder: Path) -> Manifest | None:
 
 def _document(path: Path) -> Any:
     return read_json(path, max_bytes=MAX_MANIFEST_BYTES, allowed=ANOTHER_FOLDER)
-
-
-def _manifest(document: dict[str, Any]) -> Manifest:
-    if document["layout"] != LAYOUT:
-        raise ValueError(f"layout {document['layout']}")
-    entries = {name: _entry(entry) for name, entry in document["entries"].items()}
-    unfinished = tuple(map(_name, document["unfinished"]))
-    _refuse_twice([name for entry in entries.values() for name in entry.files] + list(unfinished))
-    return Manifest(MappingProxyType(entries), unfinished)
-
-
-def _refuse_twice(names: list[str]) -> None:
-    """A file belongs to one entry, or to none."""
-    twice = {name for name, count in Counter(names).items() if count > 1}
-    if twice:
-        raise ValueError(f"{min(twice)!r} is listed twice")
 
 
 def _entry(document: dict[str, Any]) -> ManifestEntry:

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,14 +49,10 @@ class _Series:
 
 @dataclass(frozen=True, eq=False)
 class CtSeries:
-    """A CT series in one folder. Its headers are read once, its pixels at each call of `volume`.
-
-    Attributes:
-        files: Every file of the series, by its key in ``content``.
-    """
+    """A CT series in one folder. Its headers are read once, its pixels at each call of `volume`."""
 
     path: Path
-    files: tuple[str, ...]
+    files: tuple[str, ...]  # every file of the series, by its key in ``content``
     content: Content
     aside: tuple[str, ...] = ()
     part: tuple[str, ...] = ()
@@ -96,21 +91,13 @@ class CtSeries:
 
     @cached_property
     def grid(self) -> VolumeGrid:
-        """Grid of the voxels of `volume`, LPS mm.
-
-        Raises:
-            InputError: Headers that cannot be trusted, or that make no volume.
-        """
+        """Grid of `volume`'s voxels, LPS mm. Raises InputError: headers that make no volume, or no trusted one."""
         straight = self._series.grid
         shape = check_shape(straight.shape, where=self.path)
         return VolumeGrid(shape, check_affine(straight.T_ct_index, where=self.path), {})
 
     def volume(self) -> Volume:
-        """The voxels in Hounsfield units, single precision; ``UNMEASURED_HU`` where nothing was measured.
-
-        Raises:
-            InputError: Pixels that are damaged, or in a transfer syntax that is not read.
-        """
+        """The voxels in HU, single precision; ``UNMEASURED_HU`` where unmeasured. Raises InputError: damaged."""
         grid, series = self.grid, self._series
         values = np.empty(grid.shape, np.float32, order="F")
         places: dict[str, list[int]] = {}
@@ -121,13 +108,18 @@ class CtSeries:
             frames = stored_values(parse_dicom(self.content(file), Path(file)), layout, file)
             for number in numbers:
                 one = series.stack.slices[number]
-                image = _hounsfield(frames[one.frame], one, layout)
+                stored = frames[one.frame]
+                scaled = stored.astype(np.float64) * one.slope + one.intercept
+                if layout.padding is not None:
+                    low, high = layout.padding
+                    scaled[(stored >= low) & (stored <= high)] = np.nan
+                image = np.asarray(scaled.T, np.float32)
                 values[:, :, number] = _filled(moved(image, series.grid.shifts[number], grid.shape[:2]))
         return Volume(values, grid.T_ct_index, self.path)
 
     @cached_property
     def _series(self) -> _Series:
-        slices: list[Slice] = []
+        every: list[Slice] = []
         layouts: dict[str, PixelLayout] = {}
         stated = set()
         counts = Counter[str]()
@@ -139,36 +131,24 @@ class CtSeries:
             stated.add((header.series_uid, header.frame_of_reference))
             layouts[file] = pixel_layout(data, file)
             own = slices_of(data, file, layouts[file].frames)
-            slices += own
+            every += own
             counts[LOSSY] += text(data, "LossyImageCompression", where=file) == "01"
             counts[CLASS_IN_META] += not text(data, "SOPClassUID", where=file)
             counts[SCOUTS] += layouts[file].frames - len(own)
-        series_uid, frame_of_reference = _one(stated, self.path)
-        stack = stack_of(slices, self.path)
+        if len(stated) != 1:
+            series, frames = (len({one[at] for one in stated}) for at in (0, 1))
+            what = f"files of {series} series and {frames} frames of reference"
+            refuse(what, self.path, "one of each", "several_series")
+        ((series_uid, frame_of_reference),) = stated
+        stack = stack_of(every, self.path)
         rows, columns = _one_size(layouts, self.path)
         grid = straight_grid(stack, rows, columns, self.path)
         notes = tuple(f"{self.path.name}: {note.format(count)}" for note, count in counts.items() if count)
         return _Series(stack, grid, layouts, series_uid, frame_of_reference, notes)
 
 
-def _hounsfield(stored: NDArray[Any], one: Slice, layout: PixelLayout) -> NDArray[np.float32]:
-    """A slice in Hounsfield units, shape (columns, rows), NaN where it is padded."""
-    scaled = stored.astype(np.float64) * one.slope + one.intercept
-    if layout.padding is not None:
-        low, high = layout.padding
-        scaled[(stored >= low) & (stored <= high)] = np.nan
-    return np.asarray(scaled.T, np.float32)
-
-
 def _filled(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.where(np.isnan(image), np.float32(UNMEASURED_HU), image)
-
-
-def _one(stated: set[tuple[str, str]], path: Path) -> tuple[str, str]:
-    if len(stated) != 1:
-        series, frames = (len({one[at] for one in stated}) for at in (0, 1))
-        refuse(f"files of {series} series and {frames} frames of reference", path, "one of each", "several_series")
-    return next(iter(stated))
 
 
 def _one_size(layouts: dict[str, PixelLayout], path: Path) -> tuple[int, int]:
@@ -189,11 +169,7 @@ def parse_series(path: Path, files: Sequence[str], content: Content, aside: tupl
 
 
 def read_series(path: Path) -> Volume:
-    """The CT of a folder with one series, or of the series of a file in it.
-
-    Raises:
-        InputError: Anything wrong with a file, or slices that make no volume.
-    """
+    """The CT of a folder with one series, or of a file's series in it. Raises InputError: anything wrong with it."""
     chosen = choose_series(path)
 
     def content(name: str) -> bytes:

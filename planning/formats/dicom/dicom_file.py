@@ -32,11 +32,7 @@ ALLOWED = "a complete DICOM file"
 
 @contextmanager
 def refused_if_damaged(where: str | Path) -> Iterator[None]:
-    """Turn whatever the library raises for damaged values into one error, and keep its warnings off the terminal.
-
-    Raises:
-        InputError: The library could not read the file.
-    """
+    """One InputError for whatever the library raises for damaged values, and none of its warnings on the terminal."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -51,11 +47,7 @@ def refused_if_damaged(where: str | Path) -> Iterator[None]:
 
 
 def parse_dicom(content: bytes, path: Path) -> Dataset:
-    """The data set of a file that has been read, with its ``file_meta``.
-
-    Raises:
-        InputError: No DICOM, damaged, cut short, deflated or big endian.
-    """
+    """A read file's data set with ``file_meta``. Raises InputError: no DICOM, damaged, cut, deflated or big endian."""
     if not is_dicom(content[:META_START]):
         refuse("not a DICOM file: no DICM at byte 128", path, ALLOWED, "wrong_format")
     with refused_if_damaged(path):
@@ -82,14 +74,12 @@ def read_meta(stream: BinaryIO) -> FileMetaDataset:
     return meta
 
 
-def refuse_syntax(syntax: UID, path: Path) -> NoReturn:
+HOW_TO_CONVERT = "Explicit VR Little Endian; convert it with 'gdcmconv --raw IN OUT' or 'dcmdjpeg IN OUT'"
+
+
+def refuse_syntax(syntax: UID, where: str | Path) -> NoReturn:
     """Raise the error of a file in a transfer syntax that is not read."""
-    refuse(f"transfer syntax {syntax.name} ({syntax})", path, how_to_convert(), "transfer_syntax")
-
-
-def how_to_convert() -> str:
-    """Advice on converting a file in a transfer syntax that is not read."""
-    return "Explicit VR Little Endian; convert it with 'gdcmconv --raw IN OUT' or 'dcmdjpeg IN OUT'"
+    refuse(f"transfer syntax {syntax.name} ({syntax})", where, HOW_TO_CONVERT, "transfer_syntax")
 
 
 MAX_TEXT = 200
@@ -109,11 +99,7 @@ def has(data: Dataset, keyword: str) -> bool:
 
 
 def numbers(data: Dataset, keyword: str, count: int, *, where: str) -> tuple[float, ...]:
-    """The value of an element as so many finite numbers.
-
-    Raises:
-        InputError: Missing, of another count, or not finite.
-    """
+    """An element's value as so many finite numbers. Raises InputError: missing, of another count, or not finite."""
     found = value(data, keyword, where=where)
     listed = list(found) if isinstance(found, MultiValue | list | tuple) else [] if found is None else [found]
     with refused_if_damaged(f"{where}: {keyword}"):
@@ -130,11 +116,7 @@ def number(data: Dataset, keyword: str, *, where: str) -> float:
 
 
 def whole(data: Dataset, keyword: str, *, low: int, high: int, where: str) -> int:
-    """The value of an element as one whole number between two others.
-
-    Raises:
-        InputError: Missing, not whole or out of range.
-    """
+    """An element's value as one whole number between two others. Raises InputError: missing, not whole or outside."""
     found = number(data, keyword, where=where)
     if found != int(found) or not low <= found <= high:
         refuse(f"{name(keyword)} is {found:g}", where, f"a whole number from {low} to {high}", "bad_tag")
@@ -162,11 +144,7 @@ def sop_class_of(data: Dataset, *, where: str) -> str:
 
 
 def items(data: Dataset, keyword: str, *, where: str) -> list[Dataset]:
-    """The items of a sequence, none where it is absent.
-
-    Raises:
-        InputError: It is no sequence.
-    """
+    """The items of a sequence, none where it is absent. Raises InputError: it is no sequence."""
     found = value(data, keyword, where=where)
     if found is None:
         return []
@@ -196,12 +174,7 @@ MAX_ELEMENTS = 3_000_000
 
 
 def whole_length(data: memoryview, *, implicit: bool, where: Path) -> int:
-    """Bytes of a data set without the zeros that some programs write behind it.
-
-    Args:
-        data: The data set, behind its file's meta information, little endian.
-        implicit: Whether value representations are left out.
-    """
+    """Bytes of a data set, behind the meta information, without the zeros that some programs write behind it."""
     return _Walk(data, where).data_set(0, len(data), implicit=implicit, depth=0, closed=False)
 
 
@@ -214,13 +187,7 @@ class _Walk:
         self._count = 0
 
     def data_set(self, at: int, end: int, *, implicit: bool, depth: int, closed: bool) -> int:
-        """Offset at which a data set ends that begins at an offset.
-
-        Args:
-            end: The first byte behind it, or behind all that may hold it.
-            implicit: Whether value representations are left out.
-            closed: Whether a delimiter ends it, and not its length.
-        """
+        """Offset at which a data set ends: at ``end``, at the latest, or where ``closed``, at its delimiter."""
         if depth > MAX_DEPTH:
             self._refuse(f"sequences in sequences, {depth} deep", at)
         last = -1

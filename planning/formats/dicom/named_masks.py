@@ -22,17 +22,13 @@ Mask = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class MaskVolume:
-    """One structure as a volume of 0 and 1, whose voxels are made at each call.
-
-    Attributes:
-        files: Every file that decides it, by its key in ``content``: also the CT's, where it lies on its grid.
-        grid: Where the voxels lie, LPS mm; sheared where the CT's gantry was tilted.
-    """
+    """One structure as a volume of 0 and 1, whose voxels are made at each call."""
 
     path: Path
+    # every file that decides it, by its key in ``content``: also the CT's, where it lies on its grid
     files: tuple[str, ...]
     part: tuple[str, ...]
-    grid: VolumeGrid
+    grid: VolumeGrid  # where the voxels lie, LPS mm; sheared where the CT's gantry was tilted
     make: Callable[[], Mask]
     notes: tuple[str, ...] = ()
 
@@ -50,11 +46,7 @@ class NamedMasks:
 
 
 def unique_names(names: Sequence[str], where: Path) -> None:
-    """Whether each structure has a name of its own.
-
-    Raises:
-        InputError: One has none, or two share one.
-    """
+    """Whether each structure has a name of its own. Raises InputError: one has none, or two share one."""
     if not names:
         refuse("has no structure", where, "a file with structures", "no_structure")
     for name in names:
@@ -64,11 +56,7 @@ def unique_names(names: Sequence[str], where: Path) -> None:
 
 
 def check_frame_of_reference(stated: str, ct: CtSeries, where: Path) -> None:
-    """Whether structures and CT lie in the same coordinates.
-
-    Raises:
-        InputError: They state two, or one states none.
-    """
+    """Whether structures and CT lie in the same coordinates. Raises InputError: they state two, or one states none."""
     if stated != ct.frame_of_reference or not stated:
         what = f"lies in the frame of reference {stated or 'not stated'}, the CT {ct.path.name} in "
         allowed = "structures drawn on this CT, or on one registered to it"

@@ -14,10 +14,10 @@ from pydicom.uid import UID
 
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.formats.dicom.dicom_file import (
-    has,
-    how_to_convert,
+    HOW_TO_CONVERT,
     name,
     number,
+    refuse_syntax,
     refused_if_damaged,
     text,
     value,
@@ -33,31 +33,20 @@ MAX_FRAMES = 20_000
 
 @dataclass(frozen=True)
 class PixelLayout:
-    """Storage of an image's values.
+    """Storage of an image's values."""
 
-    Attributes:
-        frames: Images in the file.
-        allocated: Bits of a cell.
-        stored: Of them, the bits of a value: the lowest.
-        signed: Whether values are two's complements.
-        padding: Stored values, lowest and highest, that were not measured; None where the header names none.
-    """
-
-    frames: int
+    frames: int  # images in the file
     rows: int
     columns: int
-    allocated: int
-    stored: int
-    signed: bool
+    allocated: int  # bits of a cell
+    stored: int  # of them, the bits of a value: the lowest
+    signed: bool  # whether values are two's complements
+    # stored values, lowest and highest, that were not measured; None where the header names none
     padding: tuple[int, int] | None
 
 
 def pixel_layout(data: Dataset, where: str) -> PixelLayout:
-    """Storage of an image's values; plain pixels must have the length that follows from it.
-
-    Raises:
-        InputError: A colour image, an unusual layout, no pixels, or pixels of another length.
-    """
+    """Storage of an image's values. Raises InputError: colours, an unusual layout, no pixels, or too few or many."""
     if (meaning := text(data, "PhotometricInterpretation", where=where)) != "MONOCHROME2":
         what = f"{name('PhotometricInterpretation')} is {meaning or 'missing'}"
         refuse(what, where, "MONOCHROME2", "unsupported_feature")
@@ -75,22 +64,14 @@ def pixel_layout(data: Dataset, where: str) -> PixelLayout:
 
 
 def sizes(data: Dataset, where: str) -> tuple[int, int, int]:
-    """Rows, columns and frames of an image.
-
-    Raises:
-        InputError: Missing or implausible.
-    """
+    """Rows, columns and frames of an image. Raises InputError: missing or implausible."""
     rows, columns = (whole(data, keyword, low=1, high=MAX_SIDE, where=where) for keyword in ("Rows", "Columns"))
-    several = has(data, "NumberOfFrames")
-    return rows, columns, whole(data, "NumberOfFrames", low=1, high=MAX_FRAMES, where=where) if several else 1
+    several = "NumberOfFrames" in data
+    return (rows, columns, whole(data, "NumberOfFrames", low=1, high=MAX_FRAMES, where=where) if several else 1)
 
 
 def check_length(data: Dataset, promised: int, where: str) -> None:
-    """Whether plain pixels have the length that their header promises, and one byte more where that is odd.
-
-    Raises:
-        InputError: They have not, or there are none.
-    """
+    """Refuse plain pixels of another length than their header promises, but for one byte where that is odd."""
     pixels = value(data, "PixelData", where=where)
     if not isinstance(pixels, bytes):
         refuse(f"{name('PixelData')} is missing", where, "an image with pixels", "missing_tag")
@@ -100,11 +81,7 @@ def check_length(data: Dataset, promised: int, where: str) -> None:
 
 
 def stored_values(data: Dataset, layout: PixelLayout, where: str) -> NDArray[Any]:
-    """The stored values of every frame, shape (frames, rows, columns), without the bits above them.
-
-    Raises:
-        InputError: A transfer syntax that no installed decoder reads, or pixels that are damaged.
-    """
+    """Stored values (frames, rows, columns), without bits above them. Raises InputError: no decoder, or damaged."""
     shape = (layout.frames, layout.rows, layout.columns)
     if data.file_meta.TransferSyntaxUID in PLAIN:
         cells = np.frombuffer(data.PixelData, f"<u{layout.allocated // 8}", int(np.prod(shape)))
@@ -125,9 +102,6 @@ def decoded_frames(data: Dataset, where: str, *, raw: bool) -> Iterator[NDArray[
         data: An image whose sizes have been checked.
         where: The file.
         raw: Stored values as they are; else luminance and chrominance become RGB.
-
-    Raises:
-        InputError: A transfer syntax that no installed decoder reads, or pixels that are damaged.
     """
     syntax = data.file_meta.TransferSyntaxUID
     decoder = _decoder(syntax, where)
@@ -143,8 +117,8 @@ def decoded_frames(data: Dataset, where: str, *, raw: bool) -> Iterator[NDArray[
             try:
                 frame = next(frames, None)
             except Exception as error:  # the decoders promise no kind of error
-                what = f"{_named(syntax)}: its pixels cannot be decoded ({str(error)[:150]})"
-                raise InputError(what, where=where, allowed=how_to_convert(), code="not_decoded") from error
+                what = f"transfer syntax {syntax.name} ({syntax}): its pixels cannot be decoded ({str(error)[:150]})"
+                raise InputError(what, where=where, allowed=HOW_TO_CONVERT, code="not_decoded") from error
         if frame is None:
             return
         yield np.ascontiguousarray(frame[0])
@@ -154,33 +128,25 @@ def _decoder(syntax: UID, where: str) -> Decoder:
     """The decoder of a transfer syntax, one that is installed."""
     with refused_if_damaged(where):
         if not syntax.is_transfer_syntax or not (syntax.is_compressed or syntax in PLAIN):
-            refuse(_named(syntax), where, how_to_convert(), "transfer_syntax")
+            refuse_syntax(syntax, where)
         try:
             decoder = get_decoder(syntax)
         except NotImplementedError:
-            raise InputError(_named(syntax), where=where, allowed=how_to_convert(), code="transfer_syntax") from None
+            refuse_syntax(syntax, where)
         if not decoder.is_available:
-            what = f"{_named(syntax)} needs a decoder that is not installed"
-            refuse(what, where, f"{how_to_convert()}; or pip install python-gdcm", "no_decoder")
+            what = f"transfer syntax {syntax.name} ({syntax}) needs a decoder that is not installed"
+            refuse(what, where, f"{HOW_TO_CONVERT}; or pip install python-gdcm", "no_decoder")
         return decoder
-
-
-def _named(syntax: UID) -> str:
-    return f"transfer syntax {syntax.name} ({syntax})"
 
 
 def _padding(data: Dataset, stored: int, signed: bool, where: str) -> tuple[int, int] | None:
     """The range of stored values that mean "not measured"."""
     if value(data, "PixelPaddingValue", where=where) is None:
         return None
-    ends = [number(data, "PixelPaddingValue", where=where)]
-    if value(data, "PixelPaddingRangeLimit", where=where) is not None:
-        ends.append(number(data, "PixelPaddingRangeLimit", where=where))
-    plain = [_as_stored(int(end), stored, signed) for end in ends]
+    stated = [
+        one for one in ("PixelPaddingValue", "PixelPaddingRangeLimit") if value(data, one, where=where) is not None
+    ]
+    # As so many bits hold them: writers state a padding with the sign of another type.
+    ends = [int(number(data, keyword, where=where)) % (1 << stored) for keyword in stated]
+    plain = [end - (1 << stored) if signed and end >= 1 << (stored - 1) else end for end in ends]
     return min(plain), max(plain)
-
-
-def _as_stored(number: int, stored: int, signed: bool) -> int:
-    """A number as so many bits hold it: writers state a padding with the sign of another type."""
-    number %= 1 << stored
-    return number - (1 << stored) if signed and number >= 1 << (stored - 1) else number

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import BinaryIO
 
 from pydicom.datadict import tag_for_keyword
-from pydicom.dataset import Dataset, FileMetaDataset
+from pydicom.dataset import Dataset
 from pydicom.filereader import read_dataset
 from pydicom.uid import UID
 
@@ -32,38 +32,26 @@ _TAGS = [
     )
 ]
 _LAST_TAG = max(_TAGS)
-
+_META_CLASS = "MediaStorageSOPClassUID"
 DATE_DIGITS = 8
 
 
 @dataclass(frozen=True)
 class DicomFile:
-    """A DICOM file by its header.
-
-    Attributes:
-        sop_class: What the standard calls this class.
-        series: Its number and description, as a person knows it.
-        frame_of_reference: The coordinates in which it lies, or the empty string.
-        is_slice: Whether it is a CT image, and no scout or page of text.
-        date: When it was taken, as ``2019-11-04``; the empty string where the file does not say.
-    """
+    """A DICOM file by its header."""
 
     name: str
     kind: storage.Kind
-    sop_class: str
+    sop_class: str  # what the standard calls this class
     series_uid: str
-    series: str
-    frame_of_reference: str
-    is_slice: bool
-    date: str
+    series: str  # its number and description, as a person knows it
+    frame_of_reference: str  # the coordinates in which it lies, or the empty string
+    is_slice: bool  # whether it is a CT image, and no scout or page of text
+    date: str  # when it was taken, as ``2019-11-04``; the empty string where the file does not say
 
 
 def recognise(path: Path) -> DicomFile | None:
-    """The kind of a file by its header; None if it is no DICOM file.
-
-    Raises:
-        InputError: It begins as DICOM, and its header is damaged.
-    """
+    """The kind of a file by its header; None for no DICOM file. Raises InputError: its header is damaged."""
     try:
         with path.open("rb") as stream:
             if not storage.is_dicom(stream.read(storage.META_START)):
@@ -71,8 +59,15 @@ def recognise(path: Path) -> DicomFile | None:
             with dicom_file.refused_if_damaged(path):
                 meta = dicom_file.read_meta(stream)
                 if meta.TransferSyntaxUID in storage.NOT_READ:
-                    return _not_read(meta, path)
-                header = _header(stream, implicit=meta.TransferSyntaxUID == storage.IMPLICIT)
+                    syntax, sop_class = UID(meta.TransferSyntaxUID), dicom_file.text(meta, _META_CLASS, where=str(path))
+                    if not sop_class or storage.kind_of(sop_class) is not storage.Kind.OTHER:
+                        dicom_file.refuse_syntax(syntax, path)
+                    other, called = storage.Kind.OTHER, UID(sop_class).name
+                    return DicomFile(path.name, other, called, "", syntax.name, "", is_slice=False, date="")
+                implicit = meta.TransferSyntaxUID == storage.IMPLICIT
+                header = read_dataset(
+                    stream, implicit, True, stop_when=lambda tag, *_: tag > _LAST_TAG, specific_tags=list(_TAGS)
+                )
                 header.file_meta = meta
     except OSError as error:
         what = f"cannot be read ({error.strerror})"
@@ -80,59 +75,32 @@ def recognise(path: Path) -> DicomFile | None:
     return described(header, path)
 
 
-def _not_read(meta: FileMetaDataset, path: Path) -> DicomFile:
-    """Description, by its meta information, of a file whose transfer syntax is not read; refused if it is of use."""
-    sop_class, syntax = dicom_file.text(meta, "MediaStorageSOPClassUID", where=str(path)), UID(meta.TransferSyntaxUID)
-    if not sop_class or storage.kind_of(sop_class) is not storage.Kind.OTHER:
-        dicom_file.refuse_syntax(syntax, path)
-    return DicomFile(path.name, storage.Kind.OTHER, UID(sop_class).name, "", syntax.name, "", is_slice=False, date="")
-
-
 def described(data: Dataset, path: Path) -> DicomFile:
-    """Description of a data set by its own header.
-
-    Raises:
-        InputError: Its header is damaged.
-    """
+    """Description of a data set by its own header. Raises InputError: its header is damaged."""
     where = str(path)
     sop_class = dicom_file.sop_class_of(data, where=where)
     kind = storage.kind_of(sop_class)
     with dicom_file.refused_if_damaged(path):
         called = UID(sop_class).name if sop_class else "no SOP class"
-    number, description = (
-        dicom_file.text(data, keyword, where=where) for keyword in ("SeriesNumber", "SeriesDescription")
-    )
+    text = partial(dicom_file.text, data, where=where)
     types = {part.upper() for part in dicom_file.texts(data, "ImageType", where=where)}
-    placed = (
-        dicom_file.has(data, "ImagePositionPatient")
-        or dicom_file.has(data, "ImageOrientationPatient")
-        or "SECONDARY" not in types
-    )
+    placed = "ImagePositionPatient" in data or "ImageOrientationPatient" in data or "SECONDARY" not in types
+    dates = [text(keyword) for keyword in ("AcquisitionDate", "SeriesDate", "StudyDate")]
+    date = next((one for one in dates if len(one) == DATE_DIGITS and one.isascii() and one.isdigit()), "")
     return DicomFile(
         name=path.name,
         kind=kind,
         sop_class=called,
-        series_uid=dicom_file.text(data, "SeriesInstanceUID", where=where),
-        series=f"{number or '?'} {description or 'without description'}",
-        frame_of_reference=dicom_file.text(data, "FrameOfReferenceUID", where=where),
+        series_uid=text("SeriesInstanceUID"),
+        series=f"{text('SeriesNumber') or '?'} {text('SeriesDescription') or 'without description'}",
+        frame_of_reference=text("FrameOfReferenceUID"),
         is_slice=kind is storage.Kind.CT and placed and not types & NO_SLICES,
-        date=_date(data, where),
+        date=date and f"{date[:4]}-{date[4:6]}-{date[6:]}",
     )
 
 
-def _date(data: Dataset, where: str) -> str:
-    """Date of the acquisition, else of its series or study: eight digits, or none."""
-    stated = (dicom_file.text(data, keyword, where=where) for keyword in ("AcquisitionDate", "SeriesDate", "StudyDate"))
-    plain = next((one for one in stated if len(one) == DATE_DIGITS and one.isascii() and one.isdigit()), "")
-    return plain and f"{plain[:4]}-{plain[4:6]}-{plain[6:]}"
-
-
 def list_folder(folder: Path) -> tuple[tuple[DicomFile, ...], tuple[Entry, ...]]:
-    """Every DICOM file of a folder, by name, and every other entry; folders in it are not entered.
-
-    Raises:
-        InputError: Too many files, one that begins as DICOM and is damaged, or one whose name cannot be printed.
-    """
+    """Every DICOM file of a folder by name, and every other entry. Raises InputError: too many, or a damaged one."""
     listed = entries(folder, most=MAX_FILES)
     found = {one: recognise(folder / one.name) for one in listed if one.what == FILE}
     for one in found.values():
@@ -142,34 +110,22 @@ def list_folder(folder: Path) -> tuple[tuple[DicomFile, ...], tuple[Entry, ...]]
     return files, tuple(one for one in listed if found.get(one) is None)
 
 
-def _header(stream: BinaryIO, *, implicit: bool) -> Dataset:
-    return read_dataset(stream, implicit, True, stop_when=lambda tag, *_: tag > _LAST_TAG, specific_tags=list(_TAGS))
-
-
 SHOWN, LOOKED_AT = 6, 100
 """Series that a message lists, and files of a folder next to the slices that are opened."""
 
 
 @dataclass(frozen=True)
 class SeriesFiles:
-    """The files of one CT series.
-
-    Attributes:
-        notes: What else lies in the folder and was left out, one sentence.
-    """
+    """The files of one CT series."""
 
     folder: Path
     names: tuple[str, ...]
     series_uid: str
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what else lies in the folder and was left out, one sentence
 
 
 def choose_series(path: Path) -> SeriesFiles:
-    """The files of the CT series that a path means.
-
-    Raises:
-        InputError: No CT series there, several, or a file that is no slice of one.
-    """
+    """The files of the CT series that a path means. Raises InputError: none there, several, or a file of no series."""
     folder = path if is_folder(path) else path.parent
     found, others = list_folder(folder)
     slices = [one for one in found if one.is_slice]
@@ -189,7 +145,12 @@ def choose_series(path: Path) -> SeriesFiles:
         refuse(what, path, allowed, "slices_not_read")
     aside = [one for one in found if one.name not in set(names)]
     below = [one for one in others if one.what == FOLDER and _holds_dicom(folder / one.name)]
-    return SeriesFiles(folder, names, slices[0].series_uid, _notes(aside, below, path))
+    kinds = Counter(
+        f"{one.sop_class} '{one.series}'" if one.kind is storage.Kind.CT else one.sop_class for one in aside
+    )
+    shown = [*(f"{count} {name}" for name, count in kinds.most_common()), *(f"DICOM in {one.name}" for one in below)]
+    note = f"{path.name}: other files next to the CT series were left out: {first_few(shown)}"
+    return SeriesFiles(folder, names, slices[0].series_uid, (note,) if shown else ())
 
 
 def _may_be_slice(one: Entry, names: Sequence[str]) -> bool:
@@ -223,14 +184,6 @@ def _check_one_series(
         more = f"; and {len(series) - SHOWN} more" if len(series) > SHOWN else ""
         allowed = "one series: give one of its files instead of the folder"
         refuse(f"{len(series)} CT series: {'; '.join(listed)}{more}", path, allowed, "several_series")
-
-
-def _notes(aside: Sequence[DicomFile], below: Sequence[Entry], path: Path) -> tuple[str, ...]:
-    kinds = Counter(
-        f"{one.sop_class} '{one.series}'" if one.kind is storage.Kind.CT else one.sop_class for one in aside
-    )
-    shown = [*(f"{count} {name}" for name, count in kinds.most_common()), *(f"DICOM in {one.name}" for one in below)]
-    return (f"{path.name}: other files next to the CT series were left out: {first_few(shown)}",) if shown else ()
 
 
 def _count(files: Sequence[DicomFile]) -> str:

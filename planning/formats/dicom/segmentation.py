@@ -38,17 +38,11 @@ HALF = 0.5
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """The frames of a segmentation.
+    """The frames of a segmentation."""
 
-    Attributes:
-        segments: Shape (n,), the segment of each frame.
-        slices: Shape (n,), where it lies, in steps from the first.
-        T_ct_index: Shape (4, 4), maps (column, row, slice) to LPS mm.
-    """
-
-    segments: NDArray[np.int64]
-    slices: NDArray[np.int64]
-    T_ct_index: Floats
+    segments: NDArray[np.int64]  # shape (n,), the segment of each frame
+    slices: NDArray[np.int64]  # shape (n,), where it lies, in steps from the first
+    T_ct_index: Floats  # shape (4, 4), maps (column, row, slice) to LPS mm
     rows: int
     columns: int
 
@@ -67,9 +61,6 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
     Args:
         file: The file's key in ``content``.
         ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
-
-    Raises:
-        InputError: No segmentation, one that cannot be trusted, or one of another frame of reference.
     """
     data = dicom_file.parse_dicom(content(file), path)
     where = path.name
@@ -78,7 +69,12 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
     kind = _checked_kind(data, path)
     if ct is not None:
         named_masks.check_frame_of_reference(dicom_file.text(data, "FrameOfReferenceUID", where=where), ct, path)
-    names = _names(data, where)
+    names: dict[int, str] = {}
+    for item in dicom_file.items(data, "SegmentSequence", where=where):
+        segment = dicom_file.whole(item, "SegmentNumber", low=1, high=65535, where=where)
+        if segment in names:
+            refuse(f"two segments have the number {segment}", where, "each number once", "duplicate_number")
+        names[segment] = dicom_file.text(item, "SegmentLabel", where=where)
     named_masks.unique_names(list(names.values()), path)
     frames = _frames(data, names, ct, path)
     placed = _placed(frames, ct, path)
@@ -106,23 +102,12 @@ def _checked_kind(data: Dataset, path: Path) -> str:
             "unsupported_feature",
         )
     if data.file_meta.TransferSyntaxUID not in PLAIN:
-        syntax = data.file_meta.TransferSyntaxUID
-        refuse(f"transfer syntax {syntax.name} ({syntax})", path, dicom_file.how_to_convert(), "transfer_syntax")
+        dicom_file.refuse_syntax(data.file_meta.TransferSyntaxUID, path)
     bits = 1 if kind == "BINARY" else 8
     dicom_file.whole(data, "BitsAllocated", low=bits, high=bits, where=where)
     rows, columns, count = sizes(data, where)
     check_length(data, (rows * columns * count * bits + 7) // 8, where)
     return kind
-
-
-def _names(data: Dataset, where: str) -> dict[int, str]:
-    found: dict[int, str] = {}
-    for item in dicom_file.items(data, "SegmentSequence", where=where):
-        segment = dicom_file.whole(item, "SegmentNumber", low=1, high=65535, where=where)
-        if segment in found:
-            refuse(f"two segments have the number {segment}", where, "each number once", "duplicate_number")
-        found[segment] = dicom_file.text(item, "SegmentLabel", where=where)
-    return found
 
 
 def _frames(data: Dataset, names: dict[int, str], ct: CtSeries | None, path: Path) -> _Frames:
@@ -200,16 +185,12 @@ def _least_step(gaps: Floats, stated_mm: float | None, path: Path) -> float:
             refuse("one slice of unknown thickness", path, "SliceThickness", "missing_tag")
         return stated_mm
     least = float(real.min())
-    if not _keep_to(real, least) and stated_mm is not None and stated_mm <= least * (1 + PLACE_TOLERANCE):
+    uneven = (np.abs(real - np.round(real / least) * least) > PLACE_TOLERANCE * least).any()
+    if uneven and stated_mm is not None and stated_mm <= least * (1 + PLACE_TOLERANCE):
         times = round(least / stated_mm)
         if abs(least - times * stated_mm) <= PLACE_TOLERANCE * stated_mm:
             return least / times
     return least
-
-
-def _keep_to(gaps: Floats, step: float) -> bool:
-    """Whether distances are whole numbers of steps."""
-    return bool((np.abs(gaps - np.round(gaps / step) * step) <= PLACE_TOLERANCE * step).all())
 
 
 def _placed(frames: _Frames, ct: CtSeries | None, path: Path) -> _Placed:

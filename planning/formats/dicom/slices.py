@@ -36,17 +36,11 @@ WITH_RESCALE = (
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """Position and orientation of an image.
+    """Position and orientation of an image."""
 
-    Attributes:
-        origin_ct: Shape (3,), the centre of its first pixel, LPS mm.
-        axes_ct: Shape (3, 2), unit vectors: along a row (with rising column), and along a column.
-        spacing_mm: Distance of neighbouring pixels along a row, and along a column.
-    """
-
-    origin_ct: Floats
-    axes_ct: Floats
-    spacing_mm: tuple[float, float]
+    origin_ct: Floats  # shape (3,), the centre of its first pixel, LPS mm
+    axes_ct: Floats  # shape (3, 2), unit vectors: along a row (with rising column), and along a column
+    spacing_mm: tuple[float, float]  # distance of neighbouring pixels along a row, and along a column
 
     @property
     def normal_ct(self) -> Floats:
@@ -56,21 +50,14 @@ class Plane:
 
 @dataclass(frozen=True, eq=False)
 class Slice:
-    """One slice of a CT.
+    """One slice of a CT."""
 
-    Attributes:
-        file: The file's key in ``content``.
-        frame: Its number in the file, from 0.
-        slope: What a stored value is multiplied with.
-        intercept: What is added then; the sum is in Hounsfield units.
-    """
-
-    file: str
-    frame: int
+    file: str  # the file's key in ``content``
+    frame: int  # its number in the file, from 0
     label: str
     plane: Plane
-    slope: float
-    intercept: float
+    slope: float  # what a stored value is multiplied with
+    intercept: float  # what is added then; the sum is in Hounsfield units
 
 
 def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
@@ -78,9 +65,6 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
 
     Args:
         frames: How many images it holds.
-
-    Raises:
-        InputError: A position, an axis, a spacing or a rescaling is missing, contradictory or not in Hounsfield units.
     """
     if sop_class_of(data, where=file) == CLASSIC_CT:
         if frames != 1:
@@ -90,7 +74,11 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
     found = []
     for frame, groups in enumerate(frame_groups(data, frames, where=file)):
         label = f"{file}, frame {frame + 1}"
-        kinds = [part.upper() for one in groups.find("CTImageFrameTypeSequence", label) for part in _types(one, label)]
+        kinds = [
+            part.upper()
+            for one in groups.find("CTImageFrameTypeSequence", label)
+            for part in texts(one, "FrameType", where=label)
+        ]
         if not set(kinds) & NO_SLICES:
             found.append(_slice(file, frame, label, groups))
     return found
@@ -108,11 +96,7 @@ class Groups:
         return items(self.own, keyword, where=label) or items(self.shared, keyword, where=label)
 
     def holder(self, keyword: str, label: str) -> Dataset:
-        """The one item of a group; of a classic image, which has no groups, the image itself.
-
-        Raises:
-            InputError: The group is missing.
-        """
+        """The one item of a group, or a classic image, which has no groups, itself. Raises InputError: no group."""
         if self.own is self.shared:
             return self.own
         found = self.find(keyword, label)
@@ -122,11 +106,7 @@ class Groups:
 
 
 def frame_groups(data: Dataset, frames: int, *, where: str) -> list[Groups]:
-    """The functional groups of each frame of a multi-frame image.
-
-    Raises:
-        InputError: There are more or fewer of them than frames.
-    """
+    """The functional groups of each frame. Raises InputError: there are more or fewer of them than frames."""
     own = items(data, "PerFrameFunctionalGroupsSequence", where=where)
     if len(own) != frames:
         what = f"{name('PerFrameFunctionalGroupsSequence')} has {len(own)} items for {frames} frames"
@@ -136,11 +116,7 @@ def frame_groups(data: Dataset, frames: int, *, where: str) -> list[Groups]:
 
 
 def plane_of(groups: Groups, label: str) -> Plane:
-    """Position and orientation of a frame.
-
-    Raises:
-        InputError: Position, orientation or spacing is missing or wrong.
-    """
+    """Position and orientation of a frame. Raises InputError: position, orientation or spacing is missing or wrong."""
     origin = numbers(groups.holder("PlanePositionSequence", label), "ImagePositionPatient", 3, where=label)
     cosines = numbers(groups.holder("PlaneOrientationSequence", label), "ImageOrientationPatient", 6, where=label)
     between_rows, between_columns = numbers(
@@ -180,10 +156,6 @@ def _slice(file: str, frame: int, label: str, groups: Groups) -> Slice:
     return Slice(file, frame, label, plane_of(groups, label), slope, intercept)
 
 
-def _types(item: Dataset, label: str) -> tuple[str, ...]:
-    return texts(item, "FrameType", where=label)
-
-
 AXES_TOLERANCE = 1e-3
 """Tolerance between the axes of two slices: 0.25 mm at the corner of a slice, below a pixel; cosines are rounded."""
 PLACE_TOLERANCE_MM = 0.1
@@ -200,17 +172,11 @@ SHOWN = 4
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Slices at even steps.
+    """Slices at even steps."""
 
-    Attributes:
-        slices: In the order in which they lie along the normal.
-        plane: The first one's.
-        step_ct: Shape (3,), from each slice to the next, LPS mm.
-    """
-
-    slices: tuple[Slice, ...]
-    plane: Plane
-    step_ct: Floats
+    slices: tuple[Slice, ...]  # in the order in which they lie along the normal
+    plane: Plane  # the first one's
+    step_ct: Floats  # shape (3,), from each slice to the next, LPS mm
 
     @property
     def T_ct_index(self) -> Floats:  # noqa: N802  a frame's name
@@ -223,24 +189,37 @@ class Stack:
 
 
 def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
-    """The stack that slices make.
-
-    Raises:
-        InputError: Fewer than two, other orientations or pixel sizes, several at one place, a step that is missing,
-            or uneven steps; the slices are named.
-    """
+    """The stack that slices make."""
     if len(slices) < 2:
         refuse(f"{len(slices)} slice", where, "a series of at least 2 slices", "too_few_slices")
     first = slices[0]
     for other in slices[1:]:
-        _check_alike(first, other, where)
+        difference = float(np.abs(first.plane.axes_ct - other.plane.axes_ct).max())
+        if difference > AXES_TOLERANCE:
+            angle = np.degrees(np.arccos(np.clip(first.plane.normal_ct @ other.plane.normal_ct, -1.0, 1.0)))
+            what = f"{first.label} and {other.label} have different orientations (normals {angle:.1f} degrees apart)"
+            refuse(what, where, "slices of the same orientation", "mixed_geometry")
+        ratios = np.array(first.plane.spacing_mm) / other.plane.spacing_mm
+        if np.abs(ratios - 1.0).max() > SPACING_TOLERANCE:
+            what = f"{first.label} and {other.label} have different pixel sizes"
+            refuse(f"{what}: {first.plane.spacing_mm} and {other.plane.spacing_mm} mm", where, "one", "mixed_geometry")
     normal = first.plane.normal_ct
     ordered = sorted(slices, key=lambda one: float(one.plane.origin_ct @ normal))
     origins = np.array([one.plane.origin_ct for one in ordered])
     steps = np.diff(origins @ normal)
     _check_one_place(ordered, steps, where)
     step = float(np.median(steps))
-    _check_steps(ordered, steps, step, where)
+    wrong = np.flatnonzero(np.abs(steps - step) > _tolerance(step))
+    if len(wrong):
+        at = int(wrong[0])
+        between, times = f"between {ordered[at].label} and {ordered[at + 1].label}", steps[at] / step
+        what = f"uneven steps: {steps[at]:.4g} mm {between}"
+        if round(times) >= 2 and abs(times - round(times)) * step <= _tolerance(step):
+            missing = round(times) - 1
+            what = f"{missing} slice{' is' if missing == 1 else 's are'} missing {between}: {steps[at]:.4g} mm apart"
+        more = f", and at {len(wrong) - 1} more places" if len(wrong) > 1 else ""
+        allowed = f"even steps; here mostly {step:.4g} mm (resample the series, or export it again)"
+        refuse(f"{what}{more}", where, allowed, "uneven_slices")
     step_ct = (origins[-1] - origins[0]) / (len(ordered) - 1)
     off = np.linalg.norm(origins - origins[0] - np.arange(len(ordered))[:, None] * step_ct, axis=1)
     worst = int(np.argmax(off))
@@ -248,18 +227,6 @@ def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
         what = f"{ordered[worst].label} lies {off[worst]:.2f} mm off the line of the others"
         refuse(what, where, f"slices along one straight line, to {_tolerance(step):.2g} mm", "off_grid")
     return Stack(tuple(ordered), ordered[0].plane, step_ct)
-
-
-def _check_alike(first: Slice, other: Slice, where: Path) -> None:
-    difference = float(np.abs(first.plane.axes_ct - other.plane.axes_ct).max())
-    if difference > AXES_TOLERANCE:
-        angle = np.degrees(np.arccos(np.clip(first.plane.normal_ct @ other.plane.normal_ct, -1.0, 1.0)))
-        what = f"{first.label} and {other.label} have different orientations (normals {angle:.1f} degrees apart)"
-        refuse(what, where, "slices of the same orientation", "mixed_geometry")
-    ratios = np.array(first.plane.spacing_mm) / other.plane.spacing_mm
-    if np.abs(ratios - 1.0).max() > SPACING_TOLERANCE:
-        what = f"{first.label} and {other.label} have different pixel sizes"
-        refuse(f"{what}: {first.plane.spacing_mm} and {other.plane.spacing_mm} mm", where, "one", "mixed_geometry")
 
 
 def _check_one_place(ordered: Sequence[Slice], steps: Floats, where: Path) -> None:
@@ -272,23 +239,6 @@ def _check_one_place(ordered: Sequence[Slice], steps: Floats, where: Path) -> No
     more = f" and {len(named) - SHOWN} more pairs" if len(named) > SHOWN else ""
     allowed = "one slice at each position (one time point, no copies)"
     refuse(f"several slices at one position: {'; '.join(named[:SHOWN])}{more}", where, allowed, "duplicate_place")
-
-
-def _check_steps(ordered: Sequence[Slice], steps: Floats, step: float, where: Path) -> None:
-    wrong = np.flatnonzero(np.abs(steps - step) > _tolerance(step))
-    if not len(wrong):
-        return
-    at = int(wrong[0])
-    between = f"between {ordered[at].label} and {ordered[at + 1].label}"
-    times = steps[at] / step
-    if round(times) >= 2 and abs(times - round(times)) * step <= _tolerance(step):
-        missing = round(times) - 1
-        what = f"{missing} slice{' is' if missing == 1 else 's are'} missing {between}: {steps[at]:.4g} mm apart"
-    else:
-        what = f"uneven steps: {steps[at]:.4g} mm {between}"
-    more = f", and at {len(wrong) - 1} more places" if len(wrong) > 1 else ""
-    allowed = f"even steps; here mostly {step:.4g} mm (resample the series, or export it again)"
-    refuse(f"{what}{more}", where, allowed, "uneven_slices")
 
 
 def _tolerance(step: float) -> float:
@@ -305,27 +255,16 @@ WHOLE_PIXEL = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class StraightGrid:
-    """The grid with right angles that holds every slice of a stack.
+    """The grid with right angles that holds every slice of a stack."""
 
-    Attributes:
-        shape: Voxels along columns, rows and slices.
-        T_ct_index: Shape (4, 4), maps them to LPS mm.
-        shifts: Shape (n, 2), where pixel (0, 0) of each slice lies in the grid, along columns and rows, in pixels.
-        tilt_deg: Between the slices' normal and the direction from one to the next.
-    """
-
-    shape: tuple[int, int, int]
-    T_ct_index: Floats
-    shifts: Floats
-    tilt_deg: float
+    shape: tuple[int, int, int]  # voxels along columns, rows and slices
+    T_ct_index: Floats  # shape (4, 4), maps them to LPS mm
+    shifts: Floats  # shape (n, 2), where pixel (0, 0) of each slice lies in the grid, along columns and rows, in pixels
+    tilt_deg: float  # between the slices' normal and the direction from one to the next
 
 
 def straight_grid(stack: Stack, rows: int, columns: int, where: Path) -> StraightGrid:
-    """The grid of a stack; its own one where it was not tilted.
-
-    Raises:
-        InputError: The slices lie side by side rather than one behind the other.
-    """
+    """The grid of a stack; its own where it was not tilted. Raises InputError: slices that lie side by side."""
     plane, count = stack.plane, len(stack.slices)
     along = float(stack.step_ct @ plane.normal_ct)
     sideways_mm = plane.axes_ct.T @ stack.step_ct  # how far each slice is shifted in its own plane
@@ -354,22 +293,17 @@ def moved(image: NDArray[np.float32], shift: Floats, shape: tuple[int, int]) -> 
         shape: Of the larger one.
     """
     for axis in (0, 1):
-        image = _moved(image, float(shift[axis]), shape[axis], axis)
+        near = int(np.floor(shift[axis] + WHOLE_PIXEL))
+        part = float(shift[axis]) - near
+        placed = _placed(image, near, shape[axis], axis)
+        if part > WHOLE_PIXEL:
+            beyond = _placed(image, near + 1, shape[axis], axis)
+            placed = np.float32(1.0 - part) * placed + np.float32(part) * beyond
+        image = placed
     return image
 
 
-def _moved(image: NDArray[np.float32], shift: float, size: int, axis: int) -> NDArray[np.float32]:
-    near = int(np.floor(shift + WHOLE_PIXEL))
-    part = shift - near
-    if part <= WHOLE_PIXEL:
-        return _placed(image, near, size, axis)
-    return np.float32(1.0 - part) * _placed(image, near, size, axis) + np.float32(part) * _placed(
-        image, near + 1, size, axis
-    )
-
-
 def _placed(image: NDArray[np.float32], at: int, size: int, axis: int) -> NDArray[np.float32]:
-    after = size - at - image.shape[axis]
     pads = [(0, 0), (0, 0)]
-    pads[axis] = (at, after)
+    pads[axis] = (at, size - at - image.shape[axis])
     return np.pad(image, pads, constant_values=np.nan)

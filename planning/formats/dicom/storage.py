@@ -29,14 +29,12 @@ ENHANCED_CT = ("1.2.840.10008.5.1.4.1.1.2.1", "1.2.840.10008.5.1.4.1.1.2.2")
 """Enhanced CT Image Storage, and Legacy Converted Enhanced CT Image Storage."""
 SEGMENTATION = "1.2.840.10008.5.1.4.1.1.66.4"
 STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
-
 _KINDS = {
     CLASSIC_CT: Kind.CT,
     **dict.fromkeys(ENHANCED_CT, Kind.CT),
     SEGMENTATION: Kind.SEGMENTATION,
     STRUCTURE_SET: Kind.STRUCTURE_SET,
 }
-
 IMPLICIT = "1.2.840.10008.1.2"
 EXPLICIT = "1.2.840.10008.1.2.1"
 DEFLATED = "1.2.840.10008.1.2.1.99"

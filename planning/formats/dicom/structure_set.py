@@ -35,15 +35,10 @@ MAX_LENGTH = 5_000_000
 
 @dataclass(frozen=True, eq=False)
 class Contour:
-    """A closed contour in a slice.
+    """A closed contour in a slice."""
 
-    Attributes:
-        slice: Its number in the CT.
-        points: Shape (n, 2), columns and rows, in pixels.
-    """
-
-    slice: int
-    points: Floats
+    slice: int  # its number in the CT
+    points: Floats  # shape (n, 2), columns and rows, in pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,10 +58,6 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
 
     Args:
         file: The file's key in ``content``.
-
-    Raises:
-        InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that
-            lie off the CT's slices.
     """
     data = dicom_file.parse_dicom(content(file), path)
     where = path.name
@@ -74,7 +65,7 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
         refuse(f"SOP class {sop_class or 'missing'}", path, "a DICOM RTSTRUCT", "wrong_format")
     names = _names(data, ct, path)
     named_masks.unique_names(list(names.values()), path)
-    grid = _slices_grid(ct)
+    grid = VolumeGrid(check_shape((*ct.slice_shape, len(ct.stack.slices)), where=ct.path), ct.stack.T_ct_index, {})
     regions = _regions(data, names, grid, path)
     files = (file, *ct.files)
     masks = {
@@ -84,11 +75,6 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
     return named_masks.NamedMasks(
         masks, tuple(_notes({names[roi]: region for roi, region in regions.items()}, grid, where))
     )
-
-
-def _slices_grid(ct: CtSeries) -> VolumeGrid:
-    """The CT's slices as they were scanned, sheared where the gantry was tilted: contours lie in them."""
-    return VolumeGrid(check_shape((*ct.slice_shape, len(ct.stack.slices)), where=ct.path), ct.stack.T_ct_index, {})
 
 
 def _names(data: Dataset, ct: CtSeries, path: Path) -> dict[int, str]:
@@ -125,7 +111,18 @@ def _regions(data: Dataset, names: dict[int, str], grid: VolumeGrid, path: Path)
 
 
 def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) -> Contour:
-    points_ct = _points(item, label)
+    with dicom_file.refused_if_damaged(f"{label}: {dicom_file.name('ContourData')}"):
+        raw = item.get_item("ContourData")
+        stored = raw.value if isinstance(raw, RawDataElement) else None
+        parts = bytes(stored or b"").rstrip(b" \0").split(b"\\")
+        flat = np.array(parts, dtype=np.float64) if parts != [b""] else np.zeros(0)
+    count = len(flat) // 3
+    if len(flat) != 3 * count or not 3 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
+        allowed = "three finite numbers for each of at least three points"
+        refuse(f"{dicom_file.name('ContourData')} has {len(flat)} numbers", label, allowed, "wrong_count")
+    if dicom_file.has(item, "NumberOfContourPoints"):
+        dicom_file.whole(item, "NumberOfContourPoints", low=count, high=count, where=label)
+    points_ct = flat.reshape(-1, 3)
     index = apply(T_index_ct, points_ct)
     slices = np.unique(np.round(index[:, 2]))
     at = points_ct[0].round(2).tolist()
@@ -139,22 +136,6 @@ def _contour(item: Dataset, T_index_ct: Floats, grid: VolumeGrid, label: str) ->
     if length > MAX_LENGTH:
         refuse(f"the contour through {at} is {length:.3g} pixels long", label, f"{MAX_LENGTH}", "too_long")
     return Contour(int(slices[0]), index[:, :2])
-
-
-def _points(item: Dataset, label: str) -> Floats:
-    """The points of a contour, shape (n, 3), LPS mm; split here, as the library takes microseconds a number."""
-    with dicom_file.refused_if_damaged(f"{label}: {dicom_file.name('ContourData')}"):
-        raw = item.get_item("ContourData")
-        stored = raw.value if isinstance(raw, RawDataElement) else None
-        parts = bytes(stored or b"").rstrip(b" \0").split(b"\\")
-        flat = np.array(parts, dtype=np.float64) if parts != [b""] else np.zeros(0)
-    count = len(flat) // 3
-    if len(flat) != 3 * count or not 3 <= count <= MAX_CONTOUR_POINTS or not (np.abs(flat) <= MAX_ORIGIN_MM).all():
-        allowed = "three finite numbers for each of at least three points"
-        refuse(f"{dicom_file.name('ContourData')} has {len(flat)} numbers", label, allowed, "wrong_count")
-    if dicom_file.has(item, "NumberOfContourPoints"):
-        dicom_file.whole(item, "NumberOfContourPoints", low=count, high=count, where=label)
-    return flat.reshape(-1, 3)
 
 
 def _mask(contours: tuple[Contour, ...], shape: tuple[int, int, int]) -> named_masks.Mask:
@@ -174,15 +155,11 @@ def _between(below: Bools, above: Bools, contours: tuple[Contour, ...]) -> Bools
     """
     if (below & above).any():
         return below | above
-    if _is_every_so_many(contours):
+    # Whether at least three slices have contours, all at one distance of several slices
+    steps = {above - below for below, above in itertools.pairwise(_slices(contours))}
+    if len(_slices(contours)) > 2 and len(steps) == 1 and steps != {1}:
         return np.asarray(convex_hull_image(below | above))
     return np.zeros_like(below)
-
-
-def _is_every_so_many(contours: tuple[Contour, ...]) -> bool:
-    """Whether at least three slices have contours, all at one distance of several slices."""
-    steps = {above - below for below, above in itertools.pairwise(_slices(contours))}
-    return len(_slices(contours)) > 2 and len(steps) == 1 and steps != {1}
 
 
 def _slice_mask(contours: list[Contour], shape: tuple[int, int]) -> Bools:

@@ -52,15 +52,13 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
     Args:
         known: Whether a path in it is something else that the case names.
         where: The file and key that name the folder, for errors.
-
-    Raises:
-        InputError: No folder, no mask in it, too many, two of one structure, or entries that would be passed over.
     """
     allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one per structure"
     if not is_folder(folder):
         refuse(f"'{folder.name[:200]}' is not a folder", where, allowed, "not_a_folder")
     found = entries(folder, most=MAX_ENTRIES, allowed=allowed)
-    files = [one.name for one in found if is_mask(one) and not known(folder / one.name)]
+    masks = [one.name for one in found if one.what == FILE and one.name.lower().endswith(MASK_ENDINGS)]
+    files = [name for name in masks if not known(folder / name)]
     left = unaccounted(folder, found, lambda path: path.name in files or known(path))
     if left:
         raise not_read(left, "masks", where)
@@ -71,21 +69,12 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
 
 
 def refuse_one_name(files: Sequence[str], where: str | Path) -> None:
-    """Whether each mask of a folder is of another structure: ``liver.nii`` next to ``liver.nii.gz`` is not.
-
-    Raises:
-        InputError: Two are of one; names both.
-    """
+    """Refuse two masks of a folder that are of one structure, such as ``liver.nii`` next to ``liver.nii.gz``."""
     names: dict[str, str] = {}
     for file in files:
         if (other := names.setdefault(structure_name(file), file)) is not file:
             allowed = "one mask per structure: move one of the two out of the folder"
             refuse(f"'{other}' and '{file}' are masks with the same name", where, allowed, "masks_of_one_name")
-
-
-def is_mask(entry: Entry) -> bool:
-    """Whether an entry is read as a mask."""
-    return entry.what == FILE and entry.name.lower().endswith(MASK_ENDINGS)
 
 
 def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError:
@@ -99,11 +88,7 @@ def not_read(left: Sequence[Entry], among: str, where: str | Path) -> InputError
 
 
 def refuse_label_map(mask: LabelMap) -> None:
-    """Whether a mask's voxels have one value besides 0, often 1 or 255, or none.
-
-    Raises:
-        InputError: Several values: a label map, not the mask of one structure.
-    """
+    """Refuse a mask whose voxels have several values besides 0: a label map. One, often 1 or 255, or none is right."""
     present = mask.labels_present()
     if len(present) > 1:
         what = f"is not a mask: its voxels have the labels {first_few(list(map(str, present)))}"
@@ -112,11 +97,7 @@ def refuse_label_map(mask: LabelMap) -> None:
 
 
 def check_one_grid(headers: Mapping[str, VolumeGrid], *, where: str | Path) -> None:
-    """Whether all masks of a folder lie on one grid: what lies beyond a smaller one would count as free.
-
-    Raises:
-        InputError: Two differ in shape or place; names both.
-    """
+    """Refuse masks of a folder on two grids: what lies beyond the smaller one would count as free."""
     (first, grid), *others = headers.items()
     for name, other in others:
         sizes = [" x ".join(map(str, one.shape)) for one in (grid, other)]
@@ -135,11 +116,7 @@ SEGMENT_ENDING = ".nrrd"
 
 
 def parse_segments(path: Path, file: str, content: Content) -> NamedMasks:
-    """The segments of a Slicer segmentation, each by its name.
-
-    Raises:
-        InputError: No such file, no segment, or segments that share a name or a label.
-    """
+    """The segments of a Slicer segmentation by name. Raises InputError: none, or two of one name or label."""
     header = parse_layered_header(content(file), path)
     if header.data_path != path:
         refuse(f"its voxels are in {header.data_path.name}", path, "header and voxels in one file", "data_elsewhere")

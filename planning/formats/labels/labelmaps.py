@@ -46,34 +46,24 @@ from puncture_twin.planning.geometry.rigid import apply
 
 MAX_LABEL = 65_535
 """Label maps are 8 or 16 bit; a larger value means that an image was given instead."""
-
 ALLOWED = f"whole numbers from 0 (background) to {MAX_LABEL}"
-
 ROUNDED_BY = 0.02
 """So far a value may lie off a whole number: of labels stored in 8 bits with a slope some are off by half a step."""
-
 LEAST_WHOLE = 0.15
 """Fraction of voxels besides the background: a blended map is whole inside its labels, an image in 4 % by chance."""
-
 Box = tuple[slice, slice, slice]
 
 
 @dataclass(frozen=True, eq=False)
 class LabelMap:
-    """Labels in patient space.
+    """Labels in patient space."""
 
-    Attributes:
-        labels: Shape (ni, nj, nk), of the file's own type where that is whole numbers, read-only; 0 is background.
-        T_ct_index: Shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm.
-        names: Label to name, as a .seg.nrrd states it, or None.
-        rounded_by: How far the file's values are off whole numbers, at most.
-    """
-
+    # shape (ni, nj, nk), of the file's own type where that is whole numbers, read-only; 0 is background
     labels: NDArray[np.integer]
-    T_ct_index: NDArray[np.float64]
-    names: dict[int, str] | None
+    T_ct_index: NDArray[np.float64]  # shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm
+    names: dict[int, str] | None  # label to name, as a .seg.nrrd states it, or None
     path: Path
-    rounded_by: float = 0.0
+    rounded_by: float = 0.0  # how far the file's values are off whole numbers, at most
 
     def __post_init__(self) -> None:
         labels = np.asarray(self.labels).view()
@@ -92,15 +82,7 @@ class LabelMap:
 
 
 def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
-    """The label map that a volume is, in LPS mm.
-
-    Args:
-        may_be_empty: Whether a map with background only is one: the mask of an organ that is not there.
-
-    Raises:
-        InputError: Values that are negative, not whole or above ``MAX_LABEL``; a map with background only; segment
-            names that contradict each other.
-    """
+    """The label map that a volume is, in LPS mm; one with background only may be the mask of an organ not there."""
     names = segment_names(volume.fields, volume.path)
     labels, rounded_by = whole_labels(volume.values, volume.path)
     if not may_be_empty and not labels.any():
@@ -109,12 +91,7 @@ def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
 
 
 def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer], float]:
-    """Voxels as whole numbers, and how far they were off, at most.
-
-    Raises:
-        InputError: Values that are negative, too large, or farther from whole numbers than `ROUNDED_BY`; those of a
-            map that was blended by an interpolation have a code of their own.
-    """
+    """Voxels as whole numbers, and how far they were off, at most: `ROUNDED_BY`; a blended map has its own code."""
     low, high = values.min(), values.max()
     if low < -ROUNDED_BY or high > MAX_LABEL:
         refuse(f"values from {low} to {high} are not labels", path, ALLOWED, "no_labels")
@@ -137,13 +114,9 @@ ALLOWED_SEGMENTS = "a .seg.nrrd as Slicer saves it, with names, label values and
 
 
 class Segment(NamedTuple):
-    """Layer and label of a segment.
+    """Layer and label of a segment."""
 
-    Attributes:
-        layer: From 0.
-    """
-
-    layer: int
+    layer: int  # from 0
     label: int
 
 
@@ -173,19 +146,17 @@ def listed_segments(remarks: Mapping[str, str], layers: int, path: Path) -> dict
 
 
 def _segment(remarks: Mapping[str, str], number: int, layers: int, path: Path) -> Segment:
-    label = _number(remarks, f"Segment{number}_LabelValue", None, path)
-    layer = _number(remarks, f"Segment{number}_Layer", "0" if layers == 1 else None, path)
+    found = []
+    for key in (f"Segment{number}_LabelValue", f"Segment{number}_Layer"):
+        text = remarks.get(key, "0" if layers == 1 and key.endswith("Layer") else None)
+        if text is None or not (text.isascii() and text.isdigit() and len(text) < 10):
+            refuse(f"{key} is {'missing' if text is None else repr(text[:20])}", path, ALLOWED_SEGMENTS, "bad_value")
+        found.append(int(text))
+    label, layer = found
     if not (1 <= label <= MAX_LABEL and layer < layers):
         allowed = f"labels from 1 to {MAX_LABEL}, layers from 0 to {layers - 1}"
         refuse(f"segment {number} has label {label} in layer {layer}", path, allowed, "out_of_range")
     return Segment(layer, label)
-
-
-def _number(remarks: Mapping[str, str], key: str, default: str | None, path: Path) -> int:
-    text = remarks.get(key, default)
-    if text is None or not (text.isascii() and text.isdigit() and len(text) < 10):
-        refuse(f"{key} is {'missing' if text is None else repr(text[:20])}", path, ALLOWED_SEGMENTS, "bad_value")
-    return int(text)
 
 
 def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> TriangleMesh:
@@ -193,9 +164,6 @@ def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> Triangle
 
     A label that touches the border of the volume is closed there, on the outer face of its border voxels. The
     result does not depend on the axis order or the flips in which the map is stored.
-
-    Raises:
-        InputError: If no voxel has this label.
     """
     box = labelmap.boxes.get(label)
     if box is None:
@@ -272,7 +240,6 @@ NUMBER_COLUMNS = (
 """Headers of a column of numbers, the surest first."""
 BACKGROUND = frozenset({"", "background", "clearlabel", "clear", "none", "unlabelled", "unlabeled", "air"})
 """Names of the background."""
-
 ALLOWED_CSV = "a CSV with a header such as id,name or label,name, and one label per line"
 ALLOWED_JSON = 'JSON such as {"1": "liver"}, {"liver": 1} or {"labels": {...}}'
 ALLOWED_LIST = 'lines of ITK-SNAP (1 255 0 0 1 1 1 "liver") or of a colour table (1 liver 255 0 0 255)'
@@ -285,35 +252,23 @@ class _Entry(NamedTuple):
 
 
 def parse_names(data: bytes, path: Path) -> dict[int, str]:
-    """The names of a table, by label.
-
-    Raises:
-        InputError: Not such a table, a label that stands twice, or none at all; names the line where there is one.
-    """
+    """The names of a table, by label. Raises InputError: no such table, a label that stands twice, or none at all."""
     reader, allowed = _READERS[path.suffix.lower()]
     names: dict[int, str] = {}
     for entry in reader(data, path):
-        label = _label(entry, allowed)
-        if label is None:
-            continue
+        text = entry.number.strip()
+        if not (text.isascii() and text.isdigit() and len(text) < 7 and int(text) <= MAX_LABEL):
+            refuse(f"label {text[:40]!r} of {entry.name[:60]!r}", entry.where, allowed, "bad_label")
+        label = int(text)
         if label in names:
             refuse(f"id {label} appears twice", entry.where, "each id once", "duplicate_label")
-        names[label] = entry.name.strip()
+        if label:
+            names[label] = entry.name.strip()
+        elif _plain(entry.name) not in BACKGROUND:
+            refuse(f"label 0 is {entry.name[:60]!r}", entry.where, "0 for the background only", "bad_label")
     if not names:
         refuse("the naming has no label", path, allowed, "empty")
     return names
-
-
-def _label(entry: _Entry, allowed: str) -> int | None:
-    """The number of an entry; None for the background."""
-    text = entry.number.strip()
-    if not (text.isascii() and text.isdigit() and len(text) < 7 and int(text) <= MAX_LABEL):
-        refuse(f"label {text[:40]!r} of {entry.name[:60]!r}", entry.where, allowed, "bad_label")
-    if int(text) == 0:
-        if _plain(entry.name) not in BACKGROUND:
-            refuse(f"label 0 is {entry.name[:60]!r}", entry.where, "0 for the background only", "bad_label")
-        return None
-    return int(text)
 
 
 def _plain(text: str) -> str:
@@ -321,36 +276,27 @@ def _plain(text: str) -> str:
 
 
 def _csv_entries(data: bytes, path: Path) -> Iterator[_Entry]:
-    rows = _rows(data, path)
-    number, name = _columns(rows[0] if rows else [], path)
-    for line, row in enumerate(rows[1:], start=2):
-        if not row:
-            continue
-        where = f"{path}, line {line}"
-        if len(row) != len(rows[0]):
-            refuse(f"{len(row)} fields, not {len(rows[0])}: {row}", where, ALLOWED_CSV, "ragged_row")
-        yield _Entry(row[number], row[name], where)
-
-
-def _rows(data: bytes, path: Path) -> list[list[str]]:
     text = decode_text(data, str(path))
     try:
         first = text.partition("\n")[0]
         separator = max((",", ";", "\t"), key=first.count)
-        return list(csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator))
+        rows = list(csv.reader(io.StringIO(text, newline=""), strict=True, delimiter=separator))
     except csv.Error as error:
         raise InputError(f"is not a CSV file ({error})", where=path, allowed=ALLOWED_CSV, code="not_csv") from error
-
-
-def _columns(header: Sequence[str], path: Path) -> tuple[int, int]:
-    """Columns of numbers and names: ``label`` is a name next to an id, and a number next to a name."""
-    plain = [_plain(cell) for cell in header]
+    header = rows[0] if rows else []
+    plain = [_plain(cell) for cell in header]  # ``label`` is a name next to an id, and a number next to a name
     name = next((plain.index(one) for one in NAME_COLUMNS if one in plain), None)
     number = next((plain.index(one) for one in NUMBER_COLUMNS if one in plain and plain.index(one) != name), None)
     if name is None or number is None:
         shown = ",".join(header)[:100] or "missing"
         refuse(f"header {shown!r} has no column of labels and names", path, ALLOWED_CSV, "wrong_columns")
-    return number, name
+    for line, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        where = f"{path}, line {line}"
+        if len(row) != len(header):
+            refuse(f"{len(row)} fields, not {len(header)}: {row}", where, ALLOWED_CSV, "ragged_row")
+        yield _Entry(row[number], row[name], where)
 
 
 def _json_entries(data: bytes, path: Path) -> Iterator[_Entry]:
@@ -370,28 +316,20 @@ def _json_entries(data: bytes, path: Path) -> Iterator[_Entry]:
 
 def _list_entries(data: bytes, path: Path) -> Iterator[_Entry]:
     for line, text in enumerate(decode_text(data, str(path)).splitlines(), start=1):
-        if text.strip() and not text.lstrip().startswith("#"):
-            yield _list_entry(text, f"{path}, line {line}")
-
-
-def _list_entry(text: str, where: str) -> _Entry:
-    try:
-        fields = shlex.split(text)
-    except ValueError as error:
-        raise InputError(f"{text[:60]!r} ({error})", where=where, allowed=ALLOWED_LIST, code="unknown_line") from error
-    if len(fields) == 8 and all(_is_number(one) for one in fields[:7]):
-        return _Entry(fields[0], fields[7], where)
-    if len(fields) == 6 and all(_is_number(one) for one in fields[2:]):
-        return _Entry(fields[0], fields[1], where)
-    raise InputError(f"{text[:60]!r}", where=where, allowed=ALLOWED_LIST, code="unknown_line")
-
-
-def _is_number(text: str) -> bool:
-    return re.fullmatch(r"\d+(\.\d*)?|\.\d+", text) is not None
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        where, fields, said = f"{path}, line {line}", [], ""
+        try:
+            fields = shlex.split(text)
+        except ValueError as error:
+            said = f" ({error})"
+        numbers = [re.fullmatch(r"\d+(\.\d*)?|\.\d+", one) is not None for one in fields]
+        if not {8: all(numbers[:7]), 6: all(numbers[2:])}.get(len(fields), False):
+            refuse(f"{text[:60]!r}{said}", where, ALLOWED_LIST, "unknown_line")
+        yield _Entry(fields[0], fields[7] if len(fields) == 8 else fields[1], where)
 
 
 _Reader = Callable[[bytes, Path], Iterator[_Entry]]
-
 _READERS: Mapping[str, tuple[_Reader, str]] = MappingProxyType(
     {
         ".csv": (_csv_entries, ALLOWED_CSV),

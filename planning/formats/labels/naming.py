@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from fnmatch import fnmatchcase
@@ -55,7 +55,6 @@ V1: Mapping[int, str] = _numbered(
     "urinary_bladder",
 )
 """Version 1."""
-
 V2: Mapping[int, str] = _numbered(
     _ABDOMEN,
     "pancreas adrenal_gland_right adrenal_gland_left",
@@ -77,8 +76,6 @@ V2: Mapping[int, str] = _numbered(
     "sternum costal_cartilages",
 )
 """Version 2, task ``total``."""
-
-
 BUILT_IN: Mapping[str, Mapping[int, str]] = {"totalsegmentator-v1": V1, "totalsegmentator-v2": V2}
 OWN_NAMES = "seg.nrrd"
 """The naming that takes the names inside a .seg.nrrd."""
@@ -106,30 +103,21 @@ DEMANDING = frozenset((RuleKind.AVOID, RuleKind.UNKNOWN))
 
 @dataclass(frozen=True)
 class LabelRule:
-    """Rule of one label that is present.
-
-    Attributes:
-        margin_mm: The clearance that an avoided or unknown structure demands; 0 for the other kinds.
-    """
+    """Rule of one label that is present."""
 
     label: int
     name: str
     kind: RuleKind
-    margin_mm: float
+    margin_mm: float  # the clearance that an avoided or unknown structure demands; 0 for the other kinds
     pattern: str
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Rules of a case's patterns for the labels of a map.
+    """Rules of a case's patterns for the labels of a map."""
 
-    Attributes:
-        rules: One per label present, by rising label, those to ignore included.
-        warnings: Patterns that match no label of this map.
-    """
-
-    rules: tuple[LabelRule, ...]
-    warnings: tuple[str, ...]
+    rules: tuple[LabelRule, ...]  # one per label present, by rising label, those to ignore included
+    warnings: tuple[str, ...]  # patterns that match no label of this map
 
 
 class OwnNames(Protocol):
@@ -156,9 +144,6 @@ def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes],
         naming: ``"totalsegmentator-v1"``, ``"totalsegmentator-v2"``, the path of a table of names (CSV,
             JSON, ITK-SNAP's or Slicer's list), or None or ``"seg.nrrd"`` for the names that a .seg.nrrd holds.
         content: Gives the bytes of a table by its path.
-
-    Raises:
-        InputError: An unknown naming, a map without names of its own, or a table that cannot be used.
     """
     allowed = f"{', '.join(BUILT_IN)}, a table of names ({', '.join(NAME_ENDINGS)}), or a .seg.nrrd with names"
     if naming is None or naming == OWN_NAMES:
@@ -196,47 +181,37 @@ def select(
         avoid: Pattern to margin in mm.
         unknown: Patterns of structures of which it is unknown whether a path may cross them.
         all_named: Whether ``names`` holds every name that can occur, so that a pattern of none is a slip.
-
-    Raises:
-        InputError: A label present that has no name or that no pattern names, one that two equally specific patterns
-            of different kinds name, a pattern that matches no name although all are known, or a margin that is
-            negative or not finite.
     """
-    patterns = [LabelRule(0, "", RuleKind.AVOID, float(margin), pattern) for pattern, margin in avoid.items()]
-    patterns += [LabelRule(0, "", RuleKind.UNKNOWN, float(margin), pattern) for pattern, margin in unknown.items()]
-    for kind, listed in ((RuleKind.TRAVERSE, traverse), (RuleKind.TARGET, target), (RuleKind.IGNORE, ignore)):
-        patterns += [LabelRule(0, "", kind, 0.0, pattern) for pattern in listed]
-    _check_margins(patterns, where)
-    if all_named:
-        _refuse_unknown(patterns, names, where)
+    free = (dict.fromkeys(listed, 0.0) for listed in (traverse, target, ignore))
+    tables = zip(RuleKind, (avoid, unknown, *free), strict=True)
+    patterns = [LabelRule(0, "", kind, float(mm), one) for kind, table in tables for one, mm in table.items()]
+    for rule in patterns:
+        if not (math.isfinite(rule.margin_mm) and rule.margin_mm >= 0):
+            refuse(f"margin {rule.margin_mm} of pattern {rule.pattern!r}", where, "mm, 0 or more", "out_of_range")
+        if all_named and rule.pattern != REST and not any(fnmatchcase(name, rule.pattern) for name in names.values()):
+            near = difflib.get_close_matches(rule.pattern.strip("*?"), names.values(), n=3, cutoff=0.4)
+            allowed = f"names like {', '.join(near)}" if near else f"one of {_listed(sorted(names.values()))}"
+            refuse(f"{rule.kind} pattern {rule.pattern!r} matches no name in the naming", where, allowed, "no_match")
     nameless = [label for label in sorted(present) if label not in names]
     if nameless:
         refuse(f"labels without a name: {_listed(nameless)}", where, "labels of the naming", "labels_without_names")
     rules = [_rule(label, names[label], patterns, where) for label in sorted(present)]
-    missing = [names[label] for label, rule in zip(sorted(present), rules, strict=True) if rule is None]
-    if missing:
+    taken = tuple(rule for rule in rules if rule is not None)
+    if missing := [names[label] for label, rule in zip(sorted(present), rules, strict=True) if rule is None]:
         allowed = "a pattern in avoid, unknown, traverse, target or ignore for each"
         refuse(f"no rule covers these labels, which are present: {_listed(missing)}", where, allowed, "no_rule")
-    here = [names[label] for label in present]
-    unused = [p for p in patterns if not any(fnmatchcase(name, p.pattern) for name in here)]
-    absent = [f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused]
-    taken = tuple(rule for rule in rules if rule is not None)
-    weaker = [warning for rule in taken for warning in _weaker_warnings(rule, patterns, where)]
-    return Selection(taken, (*absent, *weaker))
-
-
-def _check_margins(patterns: Sequence[LabelRule], where: str | Path) -> None:
-    for rule in patterns:
-        if not (math.isfinite(rule.margin_mm) and rule.margin_mm >= 0):
-            refuse(f"margin {rule.margin_mm} of pattern {rule.pattern!r}", where, "mm, 0 or more", "out_of_range")
-
-
-def _refuse_unknown(patterns: Sequence[LabelRule], names: Mapping[int, str], where: str | Path) -> None:
-    for rule in patterns:
-        if rule.pattern != REST and not any(fnmatchcase(name, rule.pattern) for name in names.values()):
-            near = difflib.get_close_matches(rule.pattern.strip("*?"), names.values(), n=3, cutoff=0.4)
-            allowed = f"names like {', '.join(near)}" if near else f"one of {_listed(sorted(names.values()))}"
-            refuse(f"{rule.kind} pattern {rule.pattern!r} matches no name in the naming", where, allowed, "no_match")
+    unused = [p for p in patterns if not any(fnmatchcase(names[label], p.pattern) for label in present)]
+    warnings = [f"{where}: {p.kind} pattern {p.pattern!r} matches no label present" for p in unused]
+    for rule in taken:
+        for other in patterns if rule.pattern != rule.name else ():  # else somebody wrote the label's own name
+            overruled = other.kind in DEMANDING and other.pattern != REST and fnmatchcase(rule.name, other.pattern)
+            if overruled and (rule.kind not in DEMANDING or other.margin_mm > rule.margin_mm):
+                applies = f"{rule.kind} {rule.pattern!r}"
+                warnings.append(
+                    f"{where}: {rule.name!r} is matched by {applies} and by {other.kind} {other.pattern!r} = "
+                    f"{other.margin_mm:g}; the more specific applies: {applies}, {rule.margin_mm:g} mm"
+                )
+    return Selection(taken, tuple(warnings))
 
 
 def specificity(pattern: str, name: str) -> float:
@@ -262,20 +237,6 @@ def _rule(label: int, name: str, patterns: Sequence[LabelRule], where: str | Pat
     return LabelRule(label, name, first.kind, first.margin_mm, first.pattern)
 
 
-def _weaker_warnings(rule: LabelRule, patterns: Sequence[LabelRule], where: str | Path) -> Iterator[str]:
-    """Patterns that would demand more of a label than the one that holds, where nobody wrote the label's own name."""
-    if rule.pattern == rule.name:
-        return
-    for other in patterns:
-        overruled = other.kind in DEMANDING and other.pattern != REST and fnmatchcase(rule.name, other.pattern)
-        if overruled and (rule.kind not in DEMANDING or other.margin_mm > rule.margin_mm):
-            applies = f"{rule.kind} {rule.pattern!r}"
-            yield (
-                f"{where}: {rule.name!r} is matched by {applies} and by {other.kind} {other.pattern!r} = "
-                f"{other.margin_mm:g}; the more specific applies: {applies}, {rule.margin_mm:g} mm"
-            )
-
-
 def _listed(items: Sequence[object]) -> str:
     return ", ".join(str(item) for item in items)
 
@@ -297,13 +258,9 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ByName(Generic[T]):
-    """Values by patterns of names.
+    """Values by patterns of names."""
 
-    Attributes:
-        of_pattern: Shell patterns; the most specific that matches a name holds.
-    """
-
-    of_pattern: Mapping[str, T]
+    of_pattern: Mapping[str, T]  # shell patterns; the most specific that matches a name holds
 
     def of(self, name: str) -> T | None:
         """The value of one name; None where no pattern matches it.
@@ -331,14 +288,9 @@ class ByName(Generic[T]):
                 near = did_you_mean(pattern.strip("*?"), known)
                 refuse(f"{key}: pattern '{pattern}' matches no structure{near}", where, first_few(known), "no_match")
         for name in names:
-            _refuse_contradiction(self.of_pattern, name, key, where)
-
-
-def _refuse_contradiction(of_pattern: Mapping[str, T], name: str, key: str, where: str | Path) -> None:
-    """Refuse two equally specific patterns that give one name two meanings."""
-    matching = [pattern for pattern in of_pattern if fnmatchcase(name, pattern)]
-    best = max((specificity(pattern, name) for pattern in matching), default=0.0)
-    equal = [pattern for pattern in matching if specificity(pattern, name) == best]
-    if any(of_pattern[pattern] != of_pattern[equal[0]] for pattern in equal):
-        message = f"{key}: {' and '.join(map(repr, equal))} both match '{name}', with different values"
-        refuse(message, where, "one pattern that is more specific than the others", "ambiguous_patterns")
+            matching = [pattern for pattern in self.of_pattern if fnmatchcase(name, pattern)]
+            best = max((specificity(pattern, name) for pattern in matching), default=0.0)
+            equal = [pattern for pattern in matching if specificity(pattern, name) == best]
+            if any(self.of_pattern[pattern] != self.of_pattern[equal[0]] for pattern in equal):
+                message = f"{key}: {' and '.join(map(repr, equal))} both match '{name}', with different values"
+                refuse(message, where, "one pattern that is more specific than the others", "ambiguous_patterns")

@@ -8,7 +8,7 @@ Source: Khronos glTF 2.0 specification, sections 3.5 (nodes), 3.6 (binary data) 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import scipy
@@ -26,14 +26,11 @@ _DOCUMENT_ALLOWED = "a glTF 2.0 document in JSON"
 _JSON_CHUNK, _BIN_CHUNK = b"JSON", b"BIN\0"
 TRIANGLES = 4
 """Mode of a primitive: separate triangles."""
-
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "KHR_lights_", "EXT_texture_")
 """Required extensions with these beginnings change colours only, not the surface."""
 _INSTANCING = "EXT_mesh_gpu_instancing"
-
 MAX_NODES = 10_000
 """Nodes, accessors or views of a file; a scene of anatomy has some hundred, and each one costs its own time."""
-
 Index = Annotated[int, Field(ge=0, le=2**53)]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -124,26 +121,6 @@ class Document(_Properties):
     extensions_required: list[str] = []
 
 
-class GlbFile(NamedTuple):
-    """A checked document, and the bytes of its one buffer."""
-
-    document: Document
-    binary: bytes
-
-
-def read_document(data: bytes, where: str) -> GlbFile:
-    """The document of a GLB file, its chunks, buffer and views checked to reach as far as they say.
-
-    Raises:
-        InputError: If it is cut, contradicts itself, or uses what would change the surface and is not supported.
-    """
-    written, binary = _chunks(data, where)
-    document = _parse(written, where)
-    _check_supported(document, where)
-    _check_sizes(document, len(binary), where)
-    return GlbFile(document, binary)
-
-
 def _chunks(data: bytes, where: str) -> tuple[bytes, bytes]:
     """The JSON chunk and the BIN chunk, which may be empty."""
     if len(data) < 20 or data[:4] != b"glTF" or int.from_bytes(data[4:8], "little") != 2:
@@ -176,20 +153,6 @@ def _parse(text: bytes, where: str) -> Document:
         raise InputError(what, where=where, allowed=_DOCUMENT_ALLOWED, code="bad_value") from error
 
 
-def _check_supported(document: Document, where: str) -> None:
-    """Refuse what would change the surface in a way that this reader does not know."""
-    if not document.asset.version.startswith("2."):
-        refuse(f"glTF version {document.asset.version[:20]!r}", where, "version 2", "unknown_version")
-    for name in document.extensions_required:
-        if not name.startswith(_HARMLESS):
-            what = f"needs the extension {name[:60]!r}"
-            refuse(what, where, "glTF without compression or other extensions", "unsupported_feature")
-    for index, node in enumerate(document.nodes):
-        if node.skin is not None or _INSTANCING in node.extensions:
-            what = f"node {index} is bent by a skin or instanced"
-            refuse(what, where, "rigid meshes, one per node", "unsupported_feature")
-
-
 def _check_sizes(document: Document, size: int, where: str) -> None:
     """Hold the buffer against the BIN chunk, and the views against the buffer."""
     for buffer in document.buffers:
@@ -211,30 +174,31 @@ _FLOAT = 5126
 _INDEX_TYPES: dict[int, np.dtype[Any]] = {5121: np.dtype("<u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4")}
 MAX_PARTS = 10_000
 """Primitives in all places: each one is built by itself."""
-
 MAX_REPEATED_VERTICES = 3_000_000
 """Beyond what the file's own data hold: what it may place again. They take 70 MB."""
-
 _VERTEX_BYTES, _TRIANGLE_BYTES = 12, 3
 """Least size of a vertex, and of a triangle by indices of one byte."""
 
 
 def read_glb(data: bytes, where: str) -> RawMesh:
-    """The triangles of a GLB file's scene, in the unit of the file and its axes, y up by the standard (section 3.4).
-
-    Raises:
-        InputError: If it is cut, contradicts itself, or uses what is not supported.
-    """
-    glb = _Glb(*read_document(data, where), where)
+    """The triangles of a GLB file's scene, in the unit of the file and its axes, y up by the standard (section 3.4)."""
+    written, binary = _chunks(data, where)
+    document = _parse(written, where)
+    if not document.asset.version.startswith("2."):
+        refuse(f"glTF version {document.asset.version[:20]!r}", where, "version 2", "unknown_version")
+    for name in document.extensions_required:
+        if not name.startswith(_HARMLESS):
+            what = f"needs the extension {name[:60]!r}"
+            refuse(what, where, "glTF without compression or other extensions", "unsupported_feature")
+    for index, node in enumerate(document.nodes):
+        if node.skin is not None or _INSTANCING in node.extensions:
+            what = f"node {index} is bent by a skin or instanced"
+            refuse(what, where, "rigid meshes, one per node", "unsupported_feature")
+    _check_sizes(document, len(binary), where)
+    glb = _Glb(document, binary, where)
     placed = glb.placed()
-    glb.check_total(placed)
+    glb.check_total([mesh for mesh, _ in placed])
     return join([part for mesh, T_scene_mesh in placed for part in glb.parts(mesh, T_scene_mesh)])
-
-
-class _Size(NamedTuple):
-    parts: int
-    vertices: int
-    triangles: int
 
 
 @dataclass(frozen=True)
@@ -279,35 +243,44 @@ class _Glb:
             index, T_scene_parent = waiting.pop()
             if index >= len(nodes) or index in found:
                 refuse(f"node {index} is missing or used twice", self.where, _TREE_ALLOWED, "not_a_tree")
-            found[index] = T_scene_parent @ _local(nodes[index], f"{self.where}, node {index}")
-            waiting.extend((child, found[index]) for child in nodes[index].children)
+            node, where = nodes[index], f"{self.where}, node {index}"
+            allowed = "an invertible affine transform with last row 0 0 0 1"
+            if node.matrix is not None:
+                T = np.array(node.matrix, dtype=np.float64).reshape(4, 4).T
+            else:
+                if np.linalg.norm(node.rotation) == 0.0:
+                    refuse("rotation quaternion of length 0", where, allowed, "not_invertible")
+                T = np.eye(4)
+                T[:3, :3] = scipy.spatial.transform.Rotation.from_quat(node.rotation).as_matrix() * np.array(node.scale)
+                T[:3, 3] = node.translation
+            determinant = np.linalg.det(T[:3, :3])
+            if not np.isfinite(determinant) or determinant == 0.0 or T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+                what = f"transform with determinant {determinant:.4g}, last row {T[3].tolist()}"
+                refuse(what, where, allowed, "not_invertible")
+            found[index] = T_scene_parent @ T
+            waiting.extend((child, found[index]) for child in node.children)
         return found
 
-    def check_total(self, placed: list[tuple[int, Floats]]) -> None:
+    def check_total(self, placed: list[int]) -> None:
         """Count before building: a small file may place one large mesh many times, or name one array in many parts."""
-        sizes = [self._size(mesh) for mesh in self.document.meshes]
-        total = _Size(*(sum(sizes[mesh][kind] for mesh, _ in placed) for kind in range(3)))
-        if total.parts > MAX_PARTS:
-            refuse(f"{total.parts} parts in all instances", self.where, f"at most {MAX_PARTS}", "too_many")
-        size = len(self.binary)
-        vertices = min(MAX_VERTICES, size // _VERTEX_BYTES + MAX_REPEATED_VERTICES)
-        triangles = min(MAX_TRIANGLES, size // _TRIANGLE_BYTES + MAX_REPEATED_VERTICES // 3)
-        if total.triangles > triangles or total.vertices > vertices:
-            what = f"{total.triangles} triangles and {total.vertices} vertices in all instances"
-            refuse(what, self.where, f"at most {triangles} and {vertices} from {size} bytes of data", "too_many")
 
-    def _size(self, mesh: Mesh) -> _Size:
-        corners = [self._count(primitive.attributes.get("POSITION")) for primitive in mesh.primitives]
-        indices = [
-            None if primitive.indices is None else self._count(primitive.indices) for primitive in mesh.primitives
-        ]
-        used = (own if own is not None else other for own, other in zip(indices, corners, strict=True))
-        return _Size(len(corners), sum(corners), sum(count // 3 for count in used))
+        def count(accessor: int | None) -> int:  # the reader refuses one that is not there by its name
+            found = self.document.accessors[accessor : accessor + 1] if accessor is not None else []
+            return found[0].count if found else 0
 
-    def _count(self, accessor: int | None) -> int:
-        if accessor is None or accessor >= len(self.document.accessors):
-            return 0  # the reader refuses it by name
-        return self.document.accessors[accessor].count
+        count_of_parts = sum(len(self.document.meshes[mesh].primitives) for mesh in placed)
+        if count_of_parts > MAX_PARTS:
+            refuse(f"{count_of_parts} parts in all instances", self.where, f"at most {MAX_PARTS}", "too_many")
+        parts = [one for mesh in placed for one in self.document.meshes[mesh].primitives]
+        corners = [count(one.attributes.get("POSITION")) for one in parts]
+        used = [own if one.indices is None else count(one.indices) for one, own in zip(parts, corners, strict=True)]
+        vertices, triangles, size = sum(corners), sum(number // 3 for number in used), len(self.binary)
+        most_vertices = min(MAX_VERTICES, size // _VERTEX_BYTES + MAX_REPEATED_VERTICES)
+        most_triangles = min(MAX_TRIANGLES, size // _TRIANGLE_BYTES + MAX_REPEATED_VERTICES // 3)
+        if triangles > most_triangles or vertices > most_vertices:
+            what = f"{triangles} triangles and {vertices} vertices in all instances"
+            allowed = f"at most {most_triangles} and {most_vertices} from {size} bytes of data"
+            refuse(what, self.where, allowed, "too_many")
 
     def parts(self, mesh: int, T_scene_mesh: Floats) -> list[RawMesh]:
         """The primitives of a mesh at one place."""
@@ -368,21 +341,3 @@ class _Glb:
             refuse(what, where, "accessors inside their view", "size_mismatch")
         start, strides = view.byte_offset + accessor.byte_offset, (stride, dtype.itemsize)
         return np.ndarray((accessor.count, width), dtype, self.binary, offset=start, strides=strides)
-
-
-def _local(node: Node, where: str) -> Floats:
-    """T_parent_node, from its matrix (by columns) or as translation times rotation times scale."""
-    allowed = "an invertible affine transform with last row 0 0 0 1"
-    if node.matrix is not None:
-        T = np.array(node.matrix, dtype=np.float64).reshape(4, 4).T
-    else:
-        if np.linalg.norm(node.rotation) == 0.0:
-            refuse("rotation quaternion of length 0", where, allowed, "not_invertible")
-        T = np.eye(4)
-        T[:3, :3] = scipy.spatial.transform.Rotation.from_quat(node.rotation).as_matrix() * np.array(node.scale)
-        T[:3, 3] = node.translation
-    determinant = np.linalg.det(T[:3, :3])
-    if not np.isfinite(determinant) or determinant == 0.0 or T[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-        what = f"transform with determinant {determinant:.4g}, last row {T[3].tolist()}"
-        refuse(what, where, allowed, "not_invertible")
-    return T

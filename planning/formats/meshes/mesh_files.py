@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -43,40 +42,37 @@ _ALLOWED = "lines v, f, and " + ", ".join(sorted(_IGNORED))
 _STATED_COUNT = re.compile(r"#\s*faces\s*:\s*(\d+)|#\s*(\d+)\s+(?:faces|triangles)\b", re.IGNORECASE)
 
 
-@dataclass
-class _Content:
-    vertices: list[tuple[float, float, float]] = field(default_factory=list)
-    corners: list[int] = field(default_factory=list)
-    counts: list[int] = field(default_factory=list)
-
-
 def read_obj(data: bytes, where: str) -> RawMesh:
     """The faces of an OBJ file, of all its objects and groups; polygons are cut into fans."""
     text = decode_text(data, where)
     if not text.endswith("\n"):
-        refuse(
-            "the last line has no line end: the file may be truncated", where, "a line end after every line", "file_cut"
-        )
-    content = _Content()
+        what = "the last line has no line end: the file may be truncated"
+        refuse(what, where, "a line end after every line", "file_cut")
     text = text.replace("\\\r\n", " ").replace("\\\n", " ")
+    vertices: list[tuple[float, float, float]] = []
+    corners: list[int] = []
+    counts: list[int] = []
     for number, line in enumerate(text.split("\n"), start=1):
-        _read_line(line, content, f"{where}, line {number}")
-    faces = triangulate(np.array(content.corners, dtype=np.int64), np.array(content.counts, np.int64), where)
-    _check_complete(content, text, where)
-    return RawMesh(np.array(content.vertices, dtype=np.float64), faces)
-
-
-def _read_line(line: str, content: _Content, where: str) -> None:
-    tokens = line.split("#", 1)[0].split()
-    if not tokens or tokens[0] in _IGNORED:
-        return
-    if tokens[0] == "v":
-        content.vertices.append(_vertex(tokens[1:], where))
-    elif tokens[0] == "f":
-        content.corners.extend(_corner(token, len(content.vertices), where) for token in tokens[1:])
-        content.counts.append(len(tokens) - 1)
-    else:
-        refuse(f"line starts with {tokens[0][:20]!r}", where, _ALLOWED, "unknown_line")
+        tokens, place = line.split("#", 1)[0].split(), f"{where}, line {number}"
+        if not tokens or tokens[0] in _IGNORED:
+            continue
+        if tokens[0] == "v":
+            vertices.append(_vertex(tokens[1:], place))
+        elif tokens[0] == "f":
+            corners.extend(_corner(token, len(vertices), place) for token in tokens[1:])
+            counts.append(len(tokens) - 1)
+        else:
+            refuse(f"line starts with {tokens[0][:20]!r}", place, _ALLOWED, "unknown_line")
+    faces = triangulate(np.array(corners, dtype=np.int64), np.array(counts, np.int64), where)
+    if unused := len(vertices) - len(set(corners)):
+        what = f"{unused} vertices are not used by any face: the face list may be truncated"
+        allowed = "an OBJ whose faces use every vertex, or a format that states its counts"
+        refuse(what, where, allowed, "unused_vertices")
+    stated = sum(int(first or second) for first, second in _STATED_COUNT.findall(text))
+    if stated > len(counts):
+        what = f"comments state {stated} faces, but there are {len(counts)}"
+        refuse(what, where, "as many as stated", "size_mismatch")
+    return RawMesh(np.array(vertices, dtype=np.float64), faces)
 
 
 def _vertex(tokens: list[str], where: str) -> tuple[float, float, float]:
@@ -101,18 +97,6 @@ def _corner(token: str, n_vertices: int, where: str) -> int:
     return index - 1 if index > 0 else n_vertices + index
 
 
-def _check_complete(content: _Content, text: str, where: str) -> None:
-    unused = len(content.vertices) - len(set(content.corners))
-    if unused:
-        what = f"{unused} vertices are not used by any face: the face list may be truncated"
-        allowed = "an OBJ whose faces use every vertex, or a format that states its counts"
-        refuse(what, where, allowed, "unused_vertices")
-    stated = sum(int(first or second) for first, second in _STATED_COUNT.findall(text))
-    if stated > len(content.counts):
-        what = f"comments state {stated} faces, but there are {len(content.counts)}"
-        refuse(what, where, "as many as stated", "size_mismatch")
-
-
 _HEADER_BYTES = 84
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _BINARY_ALLOWED = "a binary STL of 84 + 50 n bytes, n as its header states it, at least 1"
@@ -127,27 +111,15 @@ _COORDINATE_TOKENS = [8, 9, 10, 12, 13, 14, 16, 17, 18]
 
 def read_stl(data: bytes, where: str) -> RawMesh:
     """The triangles of an STL file, three vertices of their own each."""
+    stated = int.from_bytes(data[80:84], "little")
+    needed = _HEADER_BYTES + 50 * stated
     looks_ascii = data[:512].lstrip().lower().startswith(b"solid") and b"facet" in data[:2048].lower()
-    if looks_ascii and not _binary_size_fits(data):
+    if looks_ascii and (len(data) < _HEADER_BYTES or len(data) != needed):
         return _read_ascii(data, where)
-    return _read_binary(data, where)
-
-
-def _binary_size_fits(data: bytes) -> bool:
-    return len(data) >= _HEADER_BYTES and len(data) == _HEADER_BYTES + 50 * _stated_count(data)
-
-
-def _stated_count(data: bytes) -> int:
-    return int.from_bytes(data[80:84], "little")
-
-
-def _read_binary(data: bytes, where: str) -> RawMesh:
     if len(data) < _HEADER_BYTES:
         refuse(f"STL of {len(data)} bytes is shorter than its header", where, _BINARY_ALLOWED, "file_cut")
-    count = _stated_count(data)
-    if not _binary_size_fits(data) or count == 0:
-        needed = _HEADER_BYTES + 50 * count
-        what = f"header states {count} triangles, which take {needed} bytes, but the file has {len(data)}"
+    if len(data) != needed or stated == 0:
+        what = f"header states {stated} triangles, which take {needed} bytes, but the file has {len(data)}"
         refuse(what, where, _BINARY_ALLOWED, "size_mismatch")
     facets = np.frombuffer(data, dtype=_FACET, offset=_HEADER_BYTES)
     return _from_corners(facets["corners"].astype(np.float64))
@@ -162,20 +134,6 @@ def _read_ascii(data: bytes, where: str) -> RawMesh:
         refuse("several solids: a truncated file could lose some", where, _ASCII_ALLOWED, "several_solids")
     if len(tokens) == 0:
         refuse("the solid has no facet", where, _ASCII_ALLOWED, "empty")
-    _check_keywords(tokens, where)
-    if len(tokens) % _TOKENS_PER_FACET:
-        refuse(f"facet {len(tokens) // _TOKENS_PER_FACET} is not complete", where, _ASCII_ALLOWED, "file_cut")
-    columns = [tokens[column::_TOKENS_PER_FACET] for column in _COORDINATE_TOKENS]
-    try:
-        corners = np.array([[float(token) for token in column] for column in columns])
-    except ValueError as error:
-        what = f"a coordinate is not a number ({error})"
-        raise InputError(what, where=where, allowed=_ASCII_ALLOWED, code="not_a_number") from error
-    return _from_corners(corners.T.reshape(-1, 3, 3))
-
-
-def _check_keywords(tokens: list[str], where: str) -> None:
-    """Every facet has the same words at the same places; the first that has not is named."""
     wrong = [
         (facet, place, found, keyword)
         for place, keyword in _KEYWORDS.items()
@@ -185,6 +143,15 @@ def _check_keywords(tokens: list[str], where: str) -> None:
     if wrong:
         facet, _, found, keyword = min(wrong)
         refuse(f"facet {facet}: {found[:20]!r} instead of {keyword!r}", where, _ASCII_ALLOWED, "unknown_line")
+    if len(tokens) % _TOKENS_PER_FACET:
+        refuse(f"facet {len(tokens) // _TOKENS_PER_FACET} is not complete", where, _ASCII_ALLOWED, "file_cut")
+    columns = [tokens[column::_TOKENS_PER_FACET] for column in _COORDINATE_TOKENS]
+    try:
+        corners = np.array([[float(token) for token in column] for column in columns])
+    except ValueError as error:
+        what = f"a coordinate is not a number ({error})"
+        raise InputError(what, where=where, allowed=_ASCII_ALLOWED, code="not_a_number") from error
+    return _from_corners(corners.T.reshape(-1, 3, 3))
 
 
 def _from_corners(corners: NDArray[np.float64]) -> RawMesh:
@@ -204,14 +171,10 @@ def _read_glb(data: bytes, where: str) -> RawMesh:
 _READERS: Mapping[str, Callable[[bytes, str], RawMesh]] = MappingProxyType(
     {".stl": read_stl, ".obj": read_obj, ".ply": read_ply, ".glb": _read_glb, ".vtp": read_vtp, ".vtk": read_vtk}
 )
-
 UP_NOT_STATED = "the glTF standard says y is up, some programs write z up, and the file does not state it"
-
 _STATEMENT = re.compile(rb"\bSPACE=(LPS|RAS)\b")
-
 _STATEMENT_BYTES = 1000
 """Slicer writes what space a mesh is in into its header or first comment; a VTP has a field for it."""
-
 MESH_SUFFIXES: tuple[str, ...] = tuple(_READERS)
 """The file name endings that ``read_mesh`` takes, in lower case; upper case is the same."""
 
@@ -230,9 +193,6 @@ def read_mesh(
         unit: The unit of its coordinates.
         space_is_default: Whether a patient space that the file states holds instead of ``space``.
         up: Its axis that is up in the file; without it, z of all but GLB.
-
-    Raises:
-        InputError: If it is missing, cut, contradicts itself or the caller, is empty, or fails the guard.
     """
     _reader(path)  # an unknown ending is refused before anything is read
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
@@ -254,9 +214,6 @@ def parse_mesh(
     Args:
         unit: The unit of its coordinates.
         stretch: Shape (3,): factors of the file's axes on top of its unit, as a URDF states them.
-
-    Raises:
-        InputError: As `read_mesh`, but for reading.
     """
     name = str(path)
     reader = _reader(path)
@@ -264,17 +221,19 @@ def parse_mesh(
         in_text = _stated_space(data)
         raw = reader(data, name)
         stated = raw.space or in_text
-        actual = space if stated is None else _actual_space(stated, space, default=space_is_default, where=name)
-        vertices = to_lps(_z_up(raw.vertices, up, path), actual) * (unit.mm if stretch is None else unit.mm * stretch)
+        actual = space
+        if stated is not None and space_is_default and space is not Space.LOCAL:
+            actual = stated
+        elif stated not in (None, space) and (space is not Space.LOCAL or space_is_default):  # local is of its own
+            allowed = 'space = "local" if intended' if space is Space.LOCAL else f'space = "{stated}"'
+            refuse(f"the file states SPACE={stated}, the case {space}", name, allowed, "other_space")
+        # Points (n, 3) of a file, rotated by a quarter about x where its y is up
+        if up is None and path.suffix.lower() == ".glb":
+            allowed = 'up = "y" (rotated to z up) or up = "z" (kept as it is), or another format'
+            refuse(UP_NOT_STATED, path, allowed, "up_not_stated")
+        z_up = raw.vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0] if up is Up.Y else raw.vertices
+        vertices = to_lps(z_up, actual) * (unit.mm if stretch is None else unit.mm * stretch)
     return guard_mesh(vertices, raw.faces, where=name)
-
-
-def _z_up(vertices: NDArray[np.float64], up: Up | None, path: Path) -> NDArray[np.float64]:
-    """Points (n, 3) of a file, rotated by a quarter about x where its y is up."""
-    if up is None and path.suffix.lower() == ".glb":
-        allowed = 'up = "y" (rotated to z up) or up = "z" (kept as it is), or another format'
-        refuse(UP_NOT_STATED, path, allowed, "up_not_stated")
-    return vertices if up is not Up.Y else vertices[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
 
 
 def _stated_space(data: bytes) -> Space | None:
@@ -282,35 +241,15 @@ def _stated_space(data: bytes) -> Space | None:
     return None if found is None else Space(found[1].decode())
 
 
-def _actual_space(stated: Space, space: Space, *, default: bool, where: str) -> Space:
-    """The space of a file that states one; that of a frame of its own may be declared local."""
-    if stated is space or (space is Space.LOCAL and not default):
-        return space
-    if default and space is not Space.LOCAL:
-        return stated
-    allowed = 'space = "local" if intended' if space is Space.LOCAL else f'space = "{stated}"'
-    what = f"the file states SPACE={stated}, the case {space}"
-    raise InputError(what, where=where, allowed=allowed, code="other_space")
-
-
 class MeshExtent(NamedTuple):
-    """Box and space of a mesh file before its unit is known.
+    """Box and space of a mesh file before its unit is known."""
 
-    Attributes:
-        box: Its lowest and highest corner in its own unit, whatever that is, shape (2, 3).
-        space: What it states of its axes, or None.
-    """
-
-    box: NDArray[np.float64]
-    space: Space | None
+    box: NDArray[np.float64]  # its lowest and highest corner in its own unit, whatever that is, shape (2, 3)
+    space: Space | None  # what it states of its axes, or None
 
 
 def mesh_extent(path: Path) -> MeshExtent:
-    """The box of a mesh file in its own unit, and the space that it states.
-
-    Raises:
-        InputError: As `read_mesh`, but for the guard.
-    """
+    """The box of a mesh file in its own unit, and the space that it states; refused as by `read_mesh`."""
     reader = _reader(path)
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
     raw = reader(data, str(path))
@@ -329,11 +268,7 @@ def _reader(path: Path) -> Callable[[bytes, str], RawMesh]:
 
 
 def mesh_warnings(mesh: TriangleMesh, name: str) -> tuple[str, ...]:
-    """Warnings about a structure's mesh, one sentence each.
-
-    Args:
-        mesh: The structure's surface, mm.
-    """
+    """Warnings about a structure's mesh, mm, one sentence each."""
     warnings = []
     flat = np.count_nonzero(mesh.areas == 0.0)
     if flat:

@@ -46,45 +46,43 @@ class _Element(NamedTuple):
     properties: list[_Property]
 
 
-class _Header(NamedTuple):
-    is_ascii: bool
-    elements: list[_Element]
-    body_start: int
-
-
 class _Lists(NamedTuple):
     counts: NDArray[np.int64]
     values: NDArray[np.float64]
 
 
-def read_ply(data: bytes, where: str) -> RawMesh:
-    """The faces of a PLY file; polygons are cut into fans, other elements are passed over.
+_Columns = dict[str, NDArray[Any] | _Lists]
+"""Of an element, by property name."""
 
-    Raises:
-        InputError: If header and data do not fit each other, or there are no faces.
-    """
-    header = _header(data, where)
-    body = data[header.body_start :]
-    cursor = _Cursor(_ascii_as_doubles(body, where) if header.is_ascii else body, where)
+
+def read_ply(data: bytes, where: str) -> RawMesh:
+    """The faces of a PLY file; polygons are cut into fans, other elements are passed over."""
+    elements, body = _split(data, where)
+    cursor = _Cursor(body, where)
     vertices: NDArray[np.float64] | None = None
     faces: _Lists | None = None
-    for element in header.elements:
+    for element in elements:
         columns = cursor.take(element)
         if element.name == "vertex":
-            vertices = _vertices(columns, where)
+            axes = [columns.get(axis) for axis in "xyz"]
+            if any(axis is None or isinstance(axis, _Lists) for axis in axes):
+                refuse("vertices without x, y and z", where, _ALLOWED, "bad_header")
+            vertices = np.stack([np.asarray(axis, dtype=np.float64) for axis in axes], axis=1)
         elif element.name == "face":
             if element.rows == 0:
                 refuse("no face", where, "at least one face", "empty")
             faces = _faces(columns, where)
         elif element.name == "tristrips" and element.rows:
             refuse("triangle strips", where, "an element face with lists of vertex indices", "unsupported_feature")
-    cursor.check_end()
+    if rest := body[cursor.position :].strip():
+        refuse(f"{len(rest)} bytes after the stated data", where, _ALLOWED, "size_mismatch")
     if vertices is None or faces is None:
         refuse("no element vertex, or no element face", where, _ALLOWED, "bad_header")
     return RawMesh(vertices, triangulate(faces.values.astype(np.int64), faces.counts, where))
 
 
-def _header(data: bytes, where: str) -> _Header:
+def _split(data: bytes, where: str) -> tuple[list[_Element], bytes]:
+    """The elements that the header states, and their data, in binary."""
     end = data.find(b"end_header", 0, _MAX_HEADER_BYTES)
     line_end = data.find(b"\n", end)
     if not data.startswith(b"ply") or end < 0 or line_end < 0:
@@ -94,21 +92,27 @@ def _header(data: bytes, where: str) -> _Header:
     formats = [line[1] for line in lines if line[0] == "format" and len(line) == 3]
     if lines[0] != ["ply"] or len(formats) != 1 or formats[0] not in _FORMATS:
         refuse(f"format {formats}", where, "one of " + ", ".join(_FORMATS), "unsupported_feature")
-    elements = _elements(lines, _FORMATS[formats[0]], is_ascii=formats[0] == "ascii", where=where)
-    return _Header(formats[0] == "ascii", elements, line_end + 1)
+    is_ascii, body = formats[0] == "ascii", data[line_end + 1 :]
+    elements = _elements(lines, _FORMATS[formats[0]], is_ascii=is_ascii, where=where)
+    return elements, _ascii_as_doubles(body, where) if is_ascii else body
 
 
 def _elements(lines: list[list[str]], order: str, *, is_ascii: bool, where: str) -> list[_Element]:
+    def dtype(kind: str) -> np.dtype[Any]:
+        if kind not in _TYPES:
+            refuse(f"property type {kind[:20]!r}", where, ", ".join(_TYPES), "unknown_type")
+        return np.dtype("<f8" if is_ascii else order + _TYPES[kind])
+
     elements: list[_Element] = []
     for line in lines:
         match line:
             case ["element", name, rows] if rows.isascii() and rows.isdigit() and len(rows) <= 13:
                 elements.append(_Element(name, min(int(rows), _MAX_ROWS), []))
             case ["property", "list", count_type, kind, name] if elements:
-                count_dtype = _dtype(count_type, order, is_ascii, where)
-                elements[-1].properties.append(_Property(name, _dtype(kind, order, is_ascii, where), count_dtype))
+                count_dtype = dtype(count_type)
+                elements[-1].properties.append(_Property(name, dtype(kind), count_dtype))
             case ["property", kind, name] if elements:
-                elements[-1].properties.append(_Property(name, _dtype(kind, order, is_ascii, where), None))
+                elements[-1].properties.append(_Property(name, dtype(kind), None))
             case ["ply"] | ["format", _, _]:
                 pass
             case _:
@@ -120,17 +124,10 @@ def _elements(lines: list[list[str]], order: str, *, is_ascii: bool, where: str)
     return elements
 
 
-def _dtype(kind: str, order: str, is_ascii: bool, where: str) -> np.dtype[Any]:
-    if kind not in _TYPES:
-        refuse(f"property type {kind[:20]!r}", where, ", ".join(_TYPES), "unknown_type")
-    return np.dtype("<f8" if is_ascii else order + _TYPES[kind])
-
-
 def _ascii_as_doubles(body: bytes, where: str) -> bytes:
     if not body.endswith(b"\n"):
-        refuse(
-            "the last line has no line end: the file may be truncated", where, "a line end after every line", "file_cut"
-        )
+        what = "the last line has no line end: the file may be truncated"
+        refuse(what, where, "a line end after every line", "file_cut")
     tokens = token_array(decode_text(body, where).split(), where)
     try:
         return tokens.astype("<f8").tobytes()
@@ -147,7 +144,7 @@ class _Cursor:
     where: str
     position: int = 0
 
-    def take(self, element: _Element) -> dict[str, NDArray[Any] | _Lists]:
+    def take(self, element: _Element) -> _Columns:
         """The columns of an element, by property name."""
         smallest = sum((p.count_dtype or p.dtype).itemsize for p in element.properties)
         left = len(self.body) - self.position
@@ -156,30 +153,13 @@ class _Cursor:
             refuse(what, self.where, _ALLOWED, "file_cut")
         if element.rows == 0:
             return {}
-        lengths = self._first_row(element)
-        even = self._take_even(element, lengths)
-        return even if even is not None else self._take_row_by_row(element)
-
-    def check_end(self) -> None:
-        """Refuse anything but white space behind the last element."""
-        rest = self.body[self.position :].strip()
-        if rest:
-            refuse(f"{len(rest)} bytes after the stated data", self.where, _ALLOWED, "size_mismatch")
-
-    def _first_row(self, element: _Element) -> list[int]:
-        position, lengths = self.position, []
-        for prop in element.properties:
-            length, position = self._length(prop, position)
-            lengths.append(length)
-            position += length * prop.dtype.itemsize
-        return lengths
+        return self._take_even(element) or self._take_row_by_row(element)
 
     def _length(self, prop: _Property, position: int) -> tuple[int, int]:
         """How many numbers a property has at a position, and where they start."""
-        if prop.count_dtype is None:
-            start, length = position, 1
-        else:
-            start = position + prop.count_dtype.itemsize
+        start, length = position, 1
+        if prop.count_dtype is not None:
+            start += prop.count_dtype.itemsize
             if start > len(self.body):
                 refuse(f"data ends inside {prop.name}", self.where, _ALLOWED, "file_cut")
             stated = np.frombuffer(self.body, prop.count_dtype, 1, position)[0]
@@ -191,38 +171,42 @@ class _Cursor:
             refuse(f"data ends inside {prop.name}", self.where, _ALLOWED, "file_cut")
         return length, start
 
-    def _take_even(self, element: _Element, lengths: list[int]) -> dict[str, NDArray[Any] | _Lists] | None:
+    def _take_even(self, element: _Element) -> _Columns | None:
         """Read all rows at once, if each has lists as long as the first row's; None otherwise."""
-        fields: list[tuple[str, Any]] = []
-        for number, (prop, length) in enumerate(zip(element.properties, lengths, strict=True)):
-            if prop.count_dtype is None:
-                fields.append((f"v{number}", prop.dtype))
-            else:
-                fields += [(f"n{number}", prop.count_dtype), (f"v{number}", prop.dtype, (length,))]  # type: ignore[list-item]  # numpy takes both forms
+        fields: list[Any] = []
+        lengths, position = [], self.position
+        for number, prop in enumerate(element.properties):
+            length, start = self._length(prop, position)
+            position = start + length * prop.dtype.itemsize
+            lengths.append(length)
+            if prop.count_dtype is not None:
+                fields.append((f"n{number}", prop.count_dtype))
+            fields.append((f"v{number}", prop.dtype, () if prop.count_dtype is None else (length,)))
         row = np.dtype(fields)
         if row.itemsize * element.rows > len(self.body) - self.position:
             return None
         table = np.frombuffer(self.body, row, element.rows, self.position)
-        columns: dict[str, NDArray[Any] | _Lists] = {}
+        columns: _Columns = {}
         for number, (prop, length) in enumerate(zip(element.properties, lengths, strict=True)):
+            values = table[f"v{number}"]
             if prop.count_dtype is None:
-                columns[prop.name] = table[f"v{number}"]
+                columns[prop.name] = values
             elif (table[f"n{number}"] != length).any():
                 return None
             else:
                 counts = np.full(element.rows, length, dtype=np.int64)
-                columns[prop.name] = _Lists(counts, table[f"v{number}"].astype(np.float64).reshape(-1))
+                columns[prop.name] = _Lists(counts, values.astype(np.float64).reshape(-1))
         self.position += row.itemsize * element.rows
         return columns
 
-    def _take_row_by_row(self, element: _Element) -> dict[str, NDArray[Any] | _Lists]:
+    def _take_row_by_row(self, element: _Element) -> _Columns:
         chunks: list[list[NDArray[Any]]] = [[] for _ in element.properties]
         for _ in range(element.rows):
             for prop, column in zip(element.properties, chunks, strict=True):
                 length, start = self._length(prop, self.position)
                 column.append(np.frombuffer(self.body, prop.dtype, length, start))
                 self.position = start + length * prop.dtype.itemsize
-        columns: dict[str, NDArray[Any] | _Lists] = {}
+        columns: _Columns = {}
         for prop, column in zip(element.properties, chunks, strict=True):
             values = np.concatenate(column).astype(np.float64)
             counts = np.array([len(each) for each in column], dtype=np.int64)
@@ -230,14 +214,7 @@ class _Cursor:
         return columns
 
 
-def _vertices(columns: dict[str, NDArray[Any] | _Lists], where: str) -> NDArray[np.float64]:
-    axes = [columns.get(axis) for axis in "xyz"]
-    if any(axis is None or isinstance(axis, _Lists) for axis in axes):
-        refuse("vertices without x, y and z", where, _ALLOWED, "bad_header")
-    return np.stack([np.asarray(axis, dtype=np.float64) for axis in axes], axis=1)
-
-
-def _faces(columns: dict[str, NDArray[Any] | _Lists], where: str) -> _Lists:
+def _faces(columns: _Columns, where: str) -> _Lists:
     lists = [columns[name] for name in _INDEX_NAMES if name in columns]
     if len(lists) != 1 or not isinstance(lists[0], _Lists):
         refuse("faces without one list of vertex indices", where, " or ".join(_INDEX_NAMES), "bad_header")

@@ -18,19 +18,10 @@ from puncture_twin.planning.formats.guard import MAX_TOKEN_LENGTH, MAX_TRIANGLES
 _ALLOWED = "a legacy VTK file, ASCII or BINARY, of DATASET POLYDATA whose points and polygons are as many as it states"
 _VERSION = re.compile(rb"# vtk DataFile Version ([1-5])\.\d\s*")
 _TYPES = {
-    "unsigned_char": ">u1",
-    "char": ">i1",
-    "unsigned_short": ">u2",
-    "short": ">i2",
-    "unsigned_int": ">u4",
-    "int": ">i4",
-    "unsigned_long": ">u8",
-    "long": ">i8",
-    "vtkidtype": ">i8",
-    "vtktypeint64": ">i8",
-    "float": ">f4",
-    "double": ">f8",
-}
+    "unsigned_char": ">u1", "char": ">i1", "unsigned_short": ">u2", "short": ">i2", "unsigned_int": ">u4",
+    "int": ">i4", "unsigned_long": ">u8", "long": ">i8", "vtkidtype": ">i8", "vtktypeint64": ">i8",
+    "float": ">f4", "double": ">f8",
+}  # fmt: skip
 """By their names in lower case, as stored in a binary file."""
 _CELLS = ("VERTICES", "LINES", "POLYGONS", "TRIANGLE_STRIPS")
 _OFFSETS_SINCE = 5
@@ -47,11 +38,7 @@ class _Polygons(NamedTuple):
 
 
 def read_vtk(data: bytes, where: str) -> RawMesh:
-    """The polygons of a legacy VTK file; polygons are cut into fans; lines and lone points carry no surface.
-
-    Raises:
-        InputError: If it is cut, of another kind, has fewer numbers than it states, or holds triangle strips.
-    """
+    """The polygons of a legacy VTK file; polygons are cut into fans; lines and lone points carry no surface."""
     cursor = _Cursor(data, where)
     version = _VERSION.fullmatch(cursor.line())
     cursor.line()  # the title, which anything may be
@@ -61,8 +48,30 @@ def read_vtk(data: bytes, where: str) -> RawMesh:
     cursor.is_ascii = form == b"ASCII"
     if cursor.words() != ["DATASET", "POLYDATA"]:
         refuse("the data set is not POLYDATA", where, _ALLOWED, "wrong_format")
-    points, polygons = _sections(cursor, offsets=int(version[1]) >= _OFFSETS_SINCE, where=where)
-    if points is None or polygons is None:
+    offsets = int(version[1]) >= _OFFSETS_SINCE
+    points: NDArray[np.float64] | None = None
+    polygons: _Polygons | None = None
+    while (words := cursor.words()) and words[0].upper() not in _DATA:
+        key = words[0].upper()
+        if key == "POINTS" and points is None:
+            count, kind = _count(words, 1, MAX_VERTICES, where), words[2].lower() if len(words) == 3 else ""
+            if kind not in ("float", "double"):
+                refuse(f"points of type {kind[:20]!r}", where, "float, double", "unknown_type")
+            points = cursor.numbers(3 * count, kind).astype(np.float64).reshape(-1, 3)
+        elif key in _CELLS:
+            cells = _cells(cursor, words, offsets=offsets, where=where)
+            if key == "TRIANGLE_STRIPS" and len(cells.counts):
+                refuse("triangle strips", where, "polygons", "unsupported_feature")
+            if key == "POLYGONS" and polygons is None:
+                polygons = cells
+        elif key == "METADATA":  # information about arrays, which ends with an empty line
+            while cursor.line().strip():
+                pass
+        elif key == "FIELD":
+            _pass_over(cursor, words, where)
+        else:
+            refuse(f"unknown line {' '.join(words)[:60]!r}", where, _ALLOWED, "unknown_line")
+    if points is None or polygons is None or not len(polygons.counts):
         refuse("no points or no polygons: the file is truncated, or has no surface", where, _ALLOWED, "empty")
     if polygons.corners.min() < 0 or polygons.corners.max() >= len(points):
         what = f"vertex indices {polygons.corners.min()} to {polygons.corners.max()}"
@@ -70,44 +79,29 @@ def read_vtk(data: bytes, where: str) -> RawMesh:
     return RawMesh(points, triangulate(polygons.corners, polygons.counts, where))
 
 
-def _sections(cursor: _Cursor, *, offsets: bool, where: str) -> tuple[NDArray[np.float64] | None, _Polygons | None]:
-    """The points and the polygons, whatever is between; what comes after the surface is left."""
-    points: NDArray[np.float64] | None = None
-    polygons: _Polygons | None = None
-    while (words := cursor.words()) and words[0].upper() not in _DATA:
-        key = words[0].upper()
-        if key == "POINTS" and points is None:
-            points = _points(cursor, words, where)
-        elif key in _CELLS:
-            cells = _cells(cursor, words, offsets=offsets, where=where)
-            if key == "TRIANGLE_STRIPS" and len(cells.counts):
-                refuse("triangle strips", where, "polygons", "unsupported_feature")
-            if key == "POLYGONS" and polygons is None:
-                polygons = cells
-        elif key in ("METADATA", "FIELD"):
-            _pass_over(cursor, words, where)
-        else:
-            refuse(f"unknown line {' '.join(words)[:60]!r}", where, _ALLOWED, "unknown_line")
-    return points, polygons if polygons is not None and len(polygons.counts) else None
-
-
-def _points(cursor: _Cursor, words: list[str], where: str) -> NDArray[np.float64]:
-    count, kind = _count(words, 1, MAX_VERTICES, where), words[2].lower() if len(words) == 3 else ""
-    if kind not in ("float", "double"):
-        refuse(f"points of type {kind[:20]!r}", where, "float, double", "unknown_type")
-    return cursor.numbers(3 * count, kind).astype(np.float64).reshape(-1, 3)
-
-
 def _cells(cursor: _Cursor, words: list[str], *, offsets: bool, where: str) -> _Polygons:
     first, size = _count(words, 1, MAX_TRIANGLES, where), _count(words, 2, 4 * MAX_TRIANGLES, where)
     if offsets:
-        return _offset_cells(cursor, first, size, where)
+        ends = cursor.named_numbers("OFFSETS", first).astype(np.int64)
+        corners = cursor.named_numbers("CONNECTIVITY", size).astype(np.int64)
+        if first == 0:
+            return _Polygons(corners[:0], corners[:0])
+        if ends[0] != 0 or ends[-1] != size or (np.diff(ends) < 1).any():
+            refuse("offsets do not rise from 0 to the number of corners", where, _ALLOWED, "bad_offsets")
+        return _Polygons(corners, np.diff(ends))
     table = cursor.numbers(size, "int").astype(np.int64)
     starts = np.empty(first, np.int64)
     if size == 4 * first and (table[::4] == 3).all():
         starts[:] = 4 * np.arange(first)
     else:
-        _find_starts(table, starts, where)
+        at = 0
+        for cell in range(len(starts)):
+            if not 0 <= at < len(table) or table[at] < 1:
+                refuse(f"cell {cell} is cut, or has no corner", where, _ALLOWED, "file_cut")
+            starts[cell] = at
+            at += int(table[at]) + 1
+        if at != len(table):
+            refuse(f"cells of {at} numbers instead of {len(table)}", where, _ALLOWED, "size_mismatch")
     counts = table[starts]
     if int(counts.sum()) + first != size:
         refuse(f"{first} cells that do not match their {size} numbers", where, _ALLOWED, "size_mismatch")
@@ -116,35 +110,8 @@ def _cells(cursor: _Cursor, words: list[str], *, offsets: bool, where: str) -> _
     return _Polygons(table[keep], counts)
 
 
-def _find_starts(table: NDArray[np.int64], starts: NDArray[np.int64], where: str) -> None:
-    """Start of each cell: at the count of its corners, which gives the next start."""
-    at = 0
-    for cell in range(len(starts)):
-        if not 0 <= at < len(table) or table[at] < 1:
-            refuse(f"cell {cell} is cut, or has no corner", where, _ALLOWED, "file_cut")
-        starts[cell] = at
-        at += int(table[at]) + 1
-    if at != len(table):
-        refuse(f"cells of {at} numbers instead of {len(table)}", where, _ALLOWED, "size_mismatch")
-
-
-def _offset_cells(cursor: _Cursor, first: int, size: int, where: str) -> _Polygons:
-    """Cells since version 5: one offset more than there are cells, then the corners of all."""
-    ends = cursor.named_numbers("OFFSETS", first).astype(np.int64)
-    corners = cursor.named_numbers("CONNECTIVITY", size).astype(np.int64)
-    if first == 0:
-        return _Polygons(corners[:0], corners[:0])
-    if ends[0] != 0 or ends[-1] != size or (np.diff(ends) < 1).any():
-        refuse("offsets do not rise from 0 to the number of corners", where, _ALLOWED, "bad_offsets")
-    return _Polygons(corners, np.diff(ends))
-
-
 def _pass_over(cursor: _Cursor, words: list[str], where: str) -> None:
-    """Information about arrays, which ends with an empty line, or a field of arrays."""
-    if words[0].upper() == "METADATA":
-        while cursor.line().strip():
-            pass
-        return
+    """A field of arrays."""
     for _ in range(_count(words, 2, 1000, where)):
         array = cursor.words()
         if len(array) != 4:
@@ -194,7 +161,13 @@ class _Cursor:
         dtype = np.dtype(_TYPES[kind.lower()])
         if self.is_ascii:
             return self._from_text(count, np.dtype(np.float64 if dtype.kind == "f" else np.int64))
-        return self._from_bytes(count, dtype)
+        size = count * dtype.itemsize
+        if self._at + size > len(self._data):
+            what = f"{count} numbers of {size} bytes do not fit into the file: it is truncated"
+            refuse(what, self._where, _ALLOWED, "file_cut")
+        values = np.frombuffer(self._data, dtype, count, self._at)
+        self._at += size
+        return values
 
     def named_numbers(self, key: str, count: int) -> NDArray[Any]:
         """The numbers of an array with a line of its own: its name and type."""
@@ -204,15 +177,6 @@ class _Cursor:
         if words[1].lower() in ("float", "double"):
             refuse(f"{key} of type {words[1]}", self._where, "whole numbers", "wrong_type")
         return self.numbers(count, words[1])
-
-    def _from_bytes(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-        size = count * dtype.itemsize
-        if self._at + size > len(self._data):
-            what = f"{count} numbers of {size} bytes do not fit into the file: it is truncated"
-            refuse(what, self._where, _ALLOWED, "file_cut")
-        values = np.frombuffer(self._data, dtype, count, self._at)
-        self._at += size
-        return values
 
     def _from_text(self, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
         words: list[bytes] = []

@@ -29,27 +29,28 @@ _SPACES = {b"LPS\0": Space.LPS, b"RAS\0": Space.RAS}
 _HEADER_TYPES = {"UInt32": "u4", "UInt64": "u8"}
 
 
-class _Split(NamedTuple):
-    text: bytes
-    appended: bytes
-
-
 def read_vtp(data: bytes, where: str) -> RawMesh:
-    """The polygons of a VTP file; polygons are cut into fans; points and lines in it carry no surface.
-
-    Raises:
-        InputError: If it is cut, an array is shorter or longer than stated, or it holds triangle strips.
-    """
-    split = _split_appended(data, where)
-    if b"<!" in split.text.replace(b"<!--", b""):
+    """The polygons of a VTP file; polygons are cut into fans; points and lines in it carry no surface."""
+    written, appended = _split_appended(data, where)
+    if b"<!" in written.replace(b"<!--", b""):
         refuse("a document type or CDATA section", where, "VTK's own XML, without either", "xml_doctype")
     try:
-        root = ElementTree.fromstring(split.text)
+        root = ElementTree.fromstring(written)
     except (ElementTree.ParseError, ValueError, LookupError) as error:  # no XML, or an unknown text encoding
         raise InputError(f"XML cannot be read ({error})", where=where, allowed=_ALLOWED, code="xml_damaged") from error
     if root.tag != "VTKFile" or root.get("type") != "PolyData":
         refuse(f"{root.tag} of type {root.get('type')}", where, _ALLOWED, "wrong_format")
-    encoding = _encoding(root, split.appended, where)
+    section = root.find("AppendedData")
+    appended_form = "raw" if section is None else section.get("encoding", "")
+    order, header = root.get("byte_order", ""), root.get("header_type", "UInt32")
+    compressor = root.get("compressor")
+    if order not in _BYTE_ORDERS or header not in _HEADER_TYPES or appended_form not in ("raw", "base64"):
+        what = f"byte_order {order!r}, header_type {header!r}, appended {appended_form!r}"
+        refuse(what, where, "LittleEndian or BigEndian, UInt32 or UInt64, raw or base64", "unsupported_feature")
+    if compressor not in _COMPRESSORS:
+        refuse(f"compressor {compressor!r}", where, "none or vtkZLibDataCompressor", "unsupported_feature")
+    header_type, compressed = np.dtype(_BYTE_ORDERS[order] + _HEADER_TYPES[header]), _COMPRESSORS[compressor]
+    encoding = Encoding(_BYTE_ORDERS[order], header_type, compressed, appended, appended_form == "base64")
     pieces = root.findall("PolyData/Piece")
     parts = [_piece(piece, encoding, f"{where}, piece {i}") for i, piece in enumerate(pieces)]
     filled = [part for part in parts if part is not None]
@@ -71,35 +72,16 @@ def _space(root: ElementTree.Element, encoding: Encoding, where: str) -> Space |
     return _SPACES[text]
 
 
-def _split_appended(data: bytes, where: str) -> _Split:
+def _split_appended(data: bytes, where: str) -> tuple[bytes, bytes]:
     """The XML without its appended data, which may be raw bytes, and those data from after the underscore."""
     start = _APPENDED.search(data)
     if start is None:
-        return _Split(data, b"")
+        return data, b""
     end = data.rfind(_APPENDED_END)
     mark = data.find(b"_", start.end())
     if end < 0 or not start.end() <= mark < end or data[start.end() : mark].strip():
         refuse("AppendedData without its mark or end: the file is cut", where, _ALLOWED, "file_cut")
-    return _Split(data[: start.end()] + data[end:], data[mark + 1 : end])
-
-
-def _encoding(root: ElementTree.Element, appended: bytes, where: str) -> Encoding:
-    section = root.find("AppendedData")
-    appended_form = "raw" if section is None else section.get("encoding", "")
-    order, header = root.get("byte_order", ""), root.get("header_type", "UInt32")
-    compressor = root.get("compressor")
-    if order not in _BYTE_ORDERS or header not in _HEADER_TYPES or appended_form not in ("raw", "base64"):
-        what = f"byte_order {order!r}, header_type {header!r}, appended {appended_form!r}"
-        refuse(what, where, "LittleEndian or BigEndian, UInt32 or UInt64, raw or base64", "unsupported_feature")
-    if compressor not in _COMPRESSORS:
-        refuse(f"compressor {compressor!r}", where, "none or vtkZLibDataCompressor", "unsupported_feature")
-    return Encoding(
-        byte_order=_BYTE_ORDERS[order],
-        header_type=np.dtype(_BYTE_ORDERS[order] + _HEADER_TYPES[header]),
-        compressed=_COMPRESSORS[compressor],
-        appended=appended,
-        appended_base64=appended_form == "base64",
-    )
+    return data[: start.end()] + data[end:], data[mark + 1 : end]
 
 
 def _piece(piece: ElementTree.Element, encoding: Encoding, where: str) -> RawMesh | None:
@@ -162,28 +144,17 @@ _ALLOWED_ARRAYS = "an array as long as the file states, complete, in ascii, bina
 
 
 class Encoding(NamedTuple):
-    """Encoding of a file's arrays.
-
-    Attributes:
-        header_type: The type of the sizes before each array.
-        compressed: Whether binary arrays are blocks of zlib.
-        appended: The bytes after the underscore of the appended section.
-        appended_base64: Whether those are base64.
-    """
+    """Encoding of a file's arrays."""
 
     byte_order: str
-    header_type: np.dtype[Any]
-    compressed: bool
-    appended: bytes
-    appended_base64: bool
+    header_type: np.dtype[Any]  # the type of the sizes before each array
+    compressed: bool  # whether binary arrays are blocks of zlib
+    appended: bytes  # the bytes after the underscore of the appended section
+    appended_base64: bool  # whether those are base64
 
 
 def array_values(element: ElementTree.Element, count: int, encoding: Encoding, where: str) -> NDArray[Any]:
-    """The numbers of an array.
-
-    Returns:
-        Shape (count,), of the array's own type.
-    """
+    """The numbers of an array, shape (count,), of its own type."""
     kind = element.get("type", "")
     if kind not in _TYPES:
         refuse(f"type {kind[:20]!r}", where, ", ".join(_TYPES), "unknown_type")

@@ -7,8 +7,8 @@ A NIfTI affine maps to RAS; everything here leaves in LPS.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +35,11 @@ LPS_FROM_RAS = np.array([[-1.0], [-1.0], [1.0], [1.0]])
 PLAIN = "a single-file NIfTI-1 (.nii, .nii.gz) with 3 axes"
 
 
-@dataclass(frozen=True)
-class _Fields:
+LAYOUT = "40x8h14x2h2x8f3f3xB128x2h6f12f20x"
+"""The fields of `_Fields` among those that do not matter, by `struct`."""
+
+
+class _Fields(NamedTuple):
     """The header's fields that matter, as stored; ``order`` is the byte order, "<" or ">"."""
 
     order: str
@@ -59,23 +62,28 @@ def parse_nifti_header(content: bytes, path: Path) -> volume_header.VolumeHeader
 
     Where sform and qform are both given they must agree, so that it does not matter which one a program takes
     (SimpleITK takes the sform if its code is 1, else the qform).
-
-    Raises:
-        InputError: Whatever is wrong with the header.
     """
     compressed = path.name.lower().endswith(".gz")
-    start = memoryview(content)
-    head = (
-        volume_header.first_bytes(start, HEADER_BYTES, where=path, allowed=PLAIN)
-        if compressed
-        else content[:HEADER_BYTES]
-    )
+    head = content[:HEADER_BYTES]
+    if compressed:
+        head = volume_header.first_bytes(memoryview(content), HEADER_BYTES, where=path, allowed=PLAIN)
     fields = _parse(head, path)
-    shape = _shape(fields, path)
+    count = fields.dim[0]
+    if not 3 <= count <= 7 or set(fields.dim[4 : count + 1]) - {1}:
+        allowed = "one volume with 3 dimensions (further ones of length 1), no time series, no components"
+        refuse(f"{count} dimensions, sizes {fields.dim[1 : max(count, 3) + 1]}", path, allowed, "wrong_dimension")
+    shape = volume_header.check_shape(fields.dim[1:4], where=path)
     if BITS_OF_DATATYPE.get(fields.datatype) != fields.bitpix:
         what = f"datatype {fields.datatype} with {fields.bitpix} bits"
         refuse(what, path, f"(datatype: bits) {BITS_OF_DATATYPE}", "unknown_type")
-    slope, intercept = _scaling(fields, path)
+    slope, intercept = fields.scaling
+    if not np.isfinite(fields.scaling).all():
+        refuse("scl_slope or scl_inter is not finite", path, "finite numbers", "not_finite")
+    if slope == 0.0 and intercept == 0.0:  # none are stated
+        slope = 1.0
+    elif abs(slope) <= LEAST_SLOPE:
+        what = f"scl_slope {slope:g} with scl_inter {intercept:g}: some programs apply the slope, others do not"
+        refuse(what, path, "both 0, or a slope other than 0", "scaling_ambiguous")
     T_ct_index = volume_header.check_affine(_affine(fields, shape, path), where=path)
     offset = fields.vox_offset
     if not (np.isfinite(offset) and offset >= FIRST_VOXEL_BYTE and offset == int(offset)):
@@ -86,52 +94,15 @@ def parse_nifti_header(content: bytes, path: Path) -> volume_header.VolumeHeader
     return volume_header.VolumeHeader(shape, T_ct_index, {}, cells, path)
 
 
-def _scaling(fields: _Fields, path: Path) -> tuple[float, float]:
-    """Slope and intercept of stored values; 1 and 0 where the header states none."""
-    slope, intercept = fields.scaling
-    if not np.isfinite(fields.scaling).all():
-        refuse("scl_slope or scl_inter is not finite", path, "finite numbers", "not_finite")
-    if slope == 0.0 and intercept == 0.0:
-        return 1.0, 0.0
-    if abs(slope) <= LEAST_SLOPE:
-        what = f"scl_slope {slope:g} with scl_inter {intercept:g}: some programs apply the slope, others do not"
-        refuse(what, path, "both 0, or a slope other than 0", "scaling_ambiguous")
-    return slope, intercept
-
-
 def _parse(data: bytes, path: Path) -> _Fields:
     if len(data) < HEADER_BYTES:
         refuse(f"the file ends inside the header ({len(data)} bytes)", path, PLAIN, "file_cut")
     order = {348: "<", 1543569408: ">"}.get(struct.unpack_from("<i", data, 0)[0])
     if order is None or data[344:348] != b"n+1\0":
         refuse("not a NIfTI-1 header (header size and magic 'n+1')", path, PLAIN, "wrong_format")
-
-    def get(layout: str, offset: int) -> tuple[float, ...]:
-        return struct.unpack_from(order + layout, data, offset)
-
-    return _Fields(
-        order=order,
-        dim=struct.unpack_from(order + "8h", data, 40),
-        datatype=struct.unpack_from(order + "h", data, 70)[0],
-        bitpix=struct.unpack_from(order + "h", data, 72)[0],
-        pixdim=get("8f", 76),
-        vox_offset=get("f", 108)[0],
-        scaling=(get("f", 112)[0], get("f", 116)[0]),
-        units=data[123] & 7,
-        qform_code=struct.unpack_from(order + "h", data, 252)[0],
-        sform_code=struct.unpack_from(order + "h", data, 254)[0],
-        quaternion=get("3f", 256),
-        qoffset=get("3f", 268),
-        srow=get("12f", 280),
-    )
-
-
-def _shape(fields: _Fields, path: Path) -> tuple[int, int, int]:
-    count = fields.dim[0]
-    if not 3 <= count <= 7 or set(fields.dim[4 : count + 1]) - {1}:
-        allowed = "one volume with 3 dimensions (further ones of length 1), no time series, no components"
-        refuse(f"{count} dimensions, sizes {fields.dim[1 : max(count, 3) + 1]}", path, allowed, "wrong_dimension")
-    return volume_header.check_shape(fields.dim[1:4], where=path)
+    v = struct.unpack(order + LAYOUT, data)
+    geometry = v[22], v[23], v[24:27], v[27:30], v[30:]
+    return _Fields(order, v[:8], v[8], v[9], v[10:18], v[18], v[19:21], v[21] & 7, *geometry)
 
 
 def _affine(fields: _Fields, shape: tuple[int, int, int], path: Path) -> NDArray[np.float64]:
@@ -145,55 +116,41 @@ def _affine(fields: _Fields, shape: tuple[int, int, int], path: Path) -> NDArray
     if fields.sform_code <= 0 and fields.qform_code <= 0:
         what = "neither sform nor qform is set (both codes 0): the file does not state its space"
         refuse(what, path, "sform_code or qform_code > 0", "space_not_stated")
+
+    def to_lps_mm(T_ras_index: NDArray[np.float64]) -> NDArray[np.float64]:
+        return T_ras_index * LPS_FROM_RAS * [[scale], [scale], [scale], [1.0]]
+
     candidates = []
     if fields.sform_code > 0:
-        candidates.append(_to_lps_mm(_sform(fields), scale))
-        _check_pixdim(candidates[0], np.array(fields.pixdim[1:4]) * scale, path)
+        candidates.append(to_lps_mm(np.vstack([np.reshape(fields.srow, (3, 4)), [0.0, 0.0, 0.0, 1.0]])))
+        pixdim_mm = np.array(fields.pixdim[1:4]) * scale
+        with np.errstate(over="ignore", invalid="ignore"):  # a hostile affine is refused by name just after
+            spacing = np.linalg.norm(candidates[0][:3, :3], axis=0)
+        plausible = np.isfinite(spacing).all() and spacing.min() > 0
+        if plausible and np.abs(spacing / pixdim_mm - 1).max() > PIXDIM_TOLERANCE:
+            what = f"pixdim states voxels of {pixdim_mm.round(4)} mm, the sform {spacing.round(4)} mm"
+            refuse(what, path, f"both agree within {PIXDIM_TOLERANCE:.1%}", "geometry_contradicted")
     if fields.qform_code > 0:
-        candidates.append(_to_lps_mm(_qform(fields, path), scale))
+        b, c, d = fields.quaternion
+        square = b * b + c * c + d * d
+        if not square <= 1 + 1e-6:  # float32 rounding of a unit quaternion; NaN lands here too
+            refuse(f"quaternion {(b, c, d)} of the qform", path, "b^2 + c^2 + d^2 <= 1", "not_unit")
+        a = max(0.0, 1.0 - square) ** 0.5
+        R = np.array(
+            [
+                [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
+                [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
+                [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
+            ]
+        )
+        qfac = -1.0 if fields.pixdim[0] < 0 else 1.0
+        T = np.eye(4)
+        T[:3, :3] = R * np.array(fields.pixdim[1:4]) * [1.0, 1.0, qfac]
+        T[:3, 3] = fields.qoffset
+        candidates.append(to_lps_mm(T))
     checked = [volume_header.check_affine(T, where=path) for T in candidates]
     apart = volume_header.corner_deviation_mm(checked[0], checked[-1], shape)
     if apart > QFORM_TOLERANCE_MM:
         what = f"sform and qform place a corner of the volume {apart:.3g} mm apart"
         refuse(what, path, f"both agree within {QFORM_TOLERANCE_MM} mm, or one is unset", "geometry_contradicted")
     return checked[0]
-
-
-def _check_pixdim(T_ct_index: NDArray[np.float64], pixdim_mm: NDArray[np.float64], path: Path) -> None:
-    with np.errstate(over="ignore", invalid="ignore"):  # a hostile affine is refused by name just after
-        spacing = np.linalg.norm(T_ct_index[:3, :3], axis=0)
-    plausible = np.isfinite(spacing).all() and spacing.min() > 0
-    if plausible and np.abs(spacing / pixdim_mm - 1).max() > PIXDIM_TOLERANCE:
-        what = f"pixdim states voxels of {pixdim_mm.round(4)} mm, the sform {spacing.round(4)} mm"
-        refuse(what, path, f"both agree within {PIXDIM_TOLERANCE:.1%}", "geometry_contradicted")
-
-
-def _to_lps_mm(T_ras_index: NDArray[np.float64], scale: float) -> NDArray[np.float64]:
-    T = LPS_FROM_RAS * T_ras_index
-    T[:3] *= scale
-    return T
-
-
-def _sform(fields: _Fields) -> NDArray[np.float64]:
-    return np.vstack([np.reshape(fields.srow, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
-
-
-def _qform(fields: _Fields, path: Path) -> NDArray[np.float64]:
-    """Quaternion (a, b, c, d) with a >= 0, column 3 times qfac (NIfTI-1 standard, method 2)."""
-    b, c, d = fields.quaternion
-    square = b * b + c * c + d * d
-    if not square <= 1 + 1e-6:  # float32 rounding of a unit quaternion; NaN lands here too
-        refuse(f"quaternion {(b, c, d)} of the qform", path, "b^2 + c^2 + d^2 <= 1", "not_unit")
-    a = max(0.0, 1.0 - square) ** 0.5
-    R = np.array(
-        [
-            [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
-            [2 * (b * c + a * d), a * a + c * c - b * b - d * d, 2 * (c * d - a * b)],
-            [2 * (b * d - a * c), 2 * (c * d + a * b), a * a + d * d - b * b - c * c],
-        ]
-    )
-    qfac = -1.0 if fields.pixdim[0] < 0 else 1.0
-    T = np.eye(4)
-    T[:3, :3] = R * np.array(fields.pixdim[1:4]) * [1.0, 1.0, qfac]
-    T[:3, 3] = fields.qoffset
-    return T

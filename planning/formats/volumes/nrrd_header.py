@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,35 +20,10 @@ MAX_HEADER_BYTES = 4_000_000
 """A .seg.nrrd with a thousand segments stays below 1 MB."""
 KNOWN_FIELDS = frozenset(
     (
-        "type",
-        "dimension",
-        "space",
-        "spacedimension",
-        "sizes",
-        "spacedirections",
-        "spaceorigin",
-        "spaceunits",
-        "kinds",
-        "endian",
-        "encoding",
-        "datafile",
-        "centers",
-        "centerings",
-        "content",
-        "measurementframe",
-        "byteskip",
-        "lineskip",
-        "thicknesses",
-        "units",
-        "labels",
-        "min",
-        "max",
-        "oldmin",
-        "oldmax",
-        "number",
-        "axismins",
-        "axismaxs",
-        "sampleunits",
+        *("type", "dimension", "space", "spacedimension", "sizes", "spacedirections", "spaceorigin", "spaceunits"),
+        *("kinds", "endian", "encoding", "datafile", "centers", "centerings", "content", "measurementframe"),
+        *("byteskip", "lineskip", "thicknesses", "units", "labels", "min", "max", "oldmin", "oldmax", "number"),
+        *("axismins", "axismaxs", "sampleunits"),
     )
 )
 
@@ -76,15 +50,6 @@ def split_header(content: bytes, path: Path) -> NrrdText:
         lines = head[: end.start() if end else None].decode("utf-8").split("\n")[1:]
     except UnicodeDecodeError as error:
         raise InputError(f"the header is not text ({error})", where=path, allowed="UTF-8", code="not_text") from error
-    fields, remarks = _lines(lines, path)
-    if "datafile" in fields:
-        return NrrdText(fields, remarks, _beside(fields["datafile"], path), 0)
-    if end is None:
-        refuse("the file ends inside the header", path, "a complete file", "file_cut")
-    return NrrdText(fields, remarks, path, end.end())
-
-
-def _lines(lines: list[str], path: Path) -> tuple[dict[str, str], dict[str, str]]:
     fields: dict[str, str] = {}
     remarks: dict[str, str] = {}
     for number, line in enumerate((text.rstrip("\r") for text in lines), start=2):
@@ -101,7 +66,22 @@ def _lines(lines: list[str], path: Path) -> tuple[dict[str, str], dict[str, str]
         if key in fields:
             refuse(f"the field {field!r} appears twice", where, "each field once", "duplicate_key")
         fields[key] = value.strip()
-    return fields, remarks
+    if "datafile" in fields:
+        name = fields["datafile"]
+        allowed = "the name of one file in the same folder"
+        if not name or re.search(r"[/\\%\s\0]", name) or name in (".", "..") or name.upper().startswith("LIST"):
+            refuse(f"data file {name[:80]!r}", path, allowed, "outside_folder")
+        data_path = path.parent / name
+        if not is_plain_file(data_path):
+            refuse(f"data file {name!r} {absence(data_path)}", path, allowed, "no_such_file")
+        if data_path.resolve().parent != path.parent.resolve():
+            refuse(f"data file {name!r} is a link to another folder", path, allowed, "outside_folder")
+        if data_path.resolve() == path.resolve():
+            refuse("the data file is the header itself", path, allowed, "data_elsewhere")
+        return NrrdText(fields, remarks, data_path, 0)
+    if end is None:
+        refuse("the file ends inside the header", path, "a complete file", "file_cut")
+    return NrrdText(fields, remarks, path, end.end())
 
 
 def stated_field(fields: dict[str, str], key: str, path: Path) -> str:
@@ -118,28 +98,10 @@ def whole_number(text: str, path: Path) -> int:
     return int(text)
 
 
-def _beside(name: str, path: Path) -> Path:
-    """The data file of a detached header: a plain name in the same folder, or nothing."""
-    allowed = "the name of one file in the same folder"
-    if not name or re.search(r"[/\\%\s\0]", name) or name in (".", "..") or name.upper().startswith("LIST"):
-        refuse(f"data file {name[:80]!r}", path, allowed, "outside_folder")
-    data_path = path.parent / name
-    if not is_plain_file(data_path):
-        refuse(f"data file {name!r} {absence(data_path)}", path, allowed, "no_such_file")
-    if data_path.resolve().parent != path.parent.resolve():
-        refuse(f"data file {name!r} is a link to another folder", path, allowed, "outside_folder")
-    if data_path.resolve() == path.resolve():
-        refuse("the data file is the header itself", path, allowed, "data_elsewhere")
-    return data_path
-
-
 LPS_SIGNS = {
-    "left-posterior-superior": (1.0, 1.0, 1.0),
-    "lps": (1.0, 1.0, 1.0),
-    "right-anterior-superior": (-1.0, -1.0, 1.0),
-    "ras": (-1.0, -1.0, 1.0),
-    "left-anterior-superior": (1.0, -1.0, 1.0),
-    "las": (1.0, -1.0, 1.0),
+    **dict.fromkeys(("left-posterior-superior", "lps"), (1.0, 1.0, 1.0)),
+    **dict.fromkeys(("right-anterior-superior", "ras"), (-1.0, -1.0, 1.0)),
+    **dict.fromkeys(("left-anterior-superior", "las"), (1.0, -1.0, 1.0)),
 }
 TYPES = {
     **dict.fromkeys(("signed char", "int8", "int8_t"), "i1"),
@@ -157,8 +119,6 @@ GZIP = frozenset(("gzip", "gz"))
 AXIS_KINDS = frozenset(("domain", "space", "time", "none", "???"))
 """What an axis may be that runs through space; others (vector, list, color) hold several values per voxel."""
 VECTOR = re.compile(r"\(([^()]*)\)")
-
-
 LAYER_KINDS = frozenset(("list", "vector"))
 """What Slicer calls the axis of its layers: "list"; older versions "vector"."""
 MAX_LAYERS = 1000
@@ -167,36 +127,36 @@ UNNAMED_SPACE = "its header states no patient space; read as LPS, as in ITK and 
 
 
 def parse_nrrd_header(content: bytes, path: Path) -> VolumeHeader:
-    """Parse the header of a volume in three dimensions.
-
-    Raises:
-        InputError: A damaged header, an unknown field, a space that is not patient space, or data elsewhere than in
-            the file or beside it.
-    """
-    raw = _without_last(split_header(content, path))
-    if raw.fields.get("dimension") != "3":
-        raise _wrong_dimension(raw.fields, path)
-    return _header(raw, path)
+    """The header of a volume in three dimensions. Raises InputError: damaged, no patient space, or data elsewhere."""
+    return _header(_without_last(split_header(content, path)), path)
 
 
 def parse_layered_header(content: bytes, path: Path) -> VolumeHeader:
     """What the header of a segmentation says whose segments may overlap: one volume, or several as layers.
 
     Layers are the first axis, which runs fastest in the file (Slicer, "Segmentations", file format).
-
-    Raises:
-        InputError: As `parse_nrrd_header`; a first axis of four that is none of layers.
     """
     raw = _without_last(split_header(content, path))
-    return _header(_without_layers(raw, path), path, _layers(raw, path))
+    if raw.fields.get("dimension") != "4":
+        return _header(raw, path)
+    fields = dict(raw.fields)
+    for key in ("sizes", "spacedirections", "kinds"):
+        fields[key] = stated_field(fields, key, path).partition(" ")[2].strip()
+    for key in ("spaceunits", "units"):
+        fields[key] = fields.get(key, "").replace('""', "").replace("???", "").strip()
+    one_layer = {key: value for key, value in fields.items() if value} | {"dimension": "3"}
+    sizes, kinds = raw.fields["sizes"].split(), raw.fields["kinds"].lower().split()
+    if not (kinds and kinds[0] in LAYER_KINDS and sizes and raw.fields["spacedirections"].startswith("none")):
+        allowed = "kinds: list domain domain domain, space directions: none (...)"
+        refuse("dimension 4, but the first axis is not one of layers", path, allowed, "wrong_dimension")
+    layers = whole_number(sizes[0], path)
+    if not 1 <= layers <= MAX_LAYERS:
+        refuse(f"{layers} layers", path, f"1 to {MAX_LAYERS}", "out_of_range")
+    return _header(replace(raw, fields=one_layer), path, layers)
 
 
 def is_layered(content: bytes, path: Path) -> bool:
-    """Whether a file has a fourth axis, of layers: one of Slicer's segmentations whose segments overlap.
-
-    Raises:
-        InputError: No NRRD header.
-    """
+    """Whether a file has a fourth axis, of layers: one of Slicer's segmentations whose segments overlap."""
     return _without_last(split_header(content, path)).fields.get("dimension") == "4"
 
 
@@ -212,73 +172,44 @@ def _without_last(raw: NrrdText) -> NrrdText:
     return replace(raw, fields={**fields, "dimension": "3"})
 
 
-def _wrong_dimension(fields: dict[str, str], path: Path) -> InputError:
-    stated = fields.get("dimension")
-    if stated == "4":
-        what = 'dimension 4: overlapping segments are in layers; give such a file in [[structures]] seg = "FILE"'
-        return InputError(what, where=path, allowed="dimension: 3, or a .seg.nrrd as seg", code="wrong_dimension")
-    return InputError(f"dimension {stated}", where=path, allowed="dimension: 3", code="wrong_dimension")
-
-
 def _header(raw: NrrdText, path: Path, layers: int = 1) -> VolumeHeader:
     fields = raw.fields
-    shape = check_shape(
-        tuple(whole_number(text, path) for text in stated_field(fields, "sizes", path).split()), where=path
-    )
-    _check_units(fields, path)
-    _check_axes(fields, path)
-    T_ct_index = check_affine(_affine(fields, path), where=path)
-    notes = () if "space" in fields else (f"{path.name}: {UNNAMED_SPACE}",)
-    return VolumeHeader(shape, T_ct_index, raw.remarks, _cells(raw, path), raw.data_path, layers, notes)
-
-
-def _layers(raw: NrrdText, path: Path) -> int:
-    if raw.fields.get("dimension") != "4":
-        return 1
-    sizes, kinds = raw.fields.get("sizes", "").split(), raw.fields.get("kinds", "").lower().split()
-    directions = raw.fields.get("spacedirections", "")
-    if not (kinds and kinds[0] in LAYER_KINDS and sizes and directions.startswith("none")):
-        allowed = "kinds: list domain domain domain, space directions: none (...)"
-        refuse("dimension 4, but the first axis is not one of layers", path, allowed, "wrong_dimension")
-    layers = whole_number(sizes[0], path)
-    if not 1 <= layers <= MAX_LAYERS:
-        refuse(f"{layers} layers", path, f"1 to {MAX_LAYERS}", "out_of_range")
-    return layers
-
-
-def _without_layers(raw: NrrdText, path: Path) -> NrrdText:
-    """The header of one layer: its axes are the last three."""
-    if raw.fields.get("dimension") != "4":
-        if raw.fields.get("dimension") != "3":
-            raise _wrong_dimension(raw.fields, path)
-        return raw
-    fields = dict(raw.fields)
-    for key in ("sizes", "spacedirections", "kinds"):
-        fields[key] = stated_field(fields, key, path).partition(" ")[2].strip()
-    for key in ("spaceunits", "units"):
-        fields[key] = fields.get(key, "").replace('""', "").replace("???", "").strip()
-    return replace(raw, fields={key: value for key, value in fields.items() if value})
-
-
-def data_file(content: bytes, path: Path) -> str | None:
-    """The name of the file beside a detached header that holds its data; None where header and data are one file.
-
-    Raises:
-        InputError: A damaged header, or data elsewhere than in the file or beside it.
-    """
-    raw = split_header(content, path)
-    return None if raw.data_path == path else raw.data_path.name
-
-
-def _check_units(fields: dict[str, str], path: Path) -> None:
+    if (stated := fields.get("dimension")) == "4":
+        what = 'dimension 4: overlapping segments are in layers; give such a file in [[structures]] seg = "FILE"'
+        refuse(what, path, "dimension: 3, or a .seg.nrrd as seg", "wrong_dimension")
+    if stated != "3":
+        refuse(f"dimension {stated}", path, "dimension: 3", "wrong_dimension")
+    sizes = [whole_number(text, path) for text in stated_field(fields, "sizes", path).split()]
+    shape = check_shape(tuple(sizes), where=path)
     for key in ("spaceunits", "units"):
         named = set(re.findall(r'"([^"]*)"', fields.get(key, ""))) - {""}
         if (fields.get(key) and not named and key == "spaceunits") or named - {"mm"}:
             refuse(f"{key} {fields[key]!r}", path, '"mm" "mm" "mm"', "unknown_unit")
+    kinds = fields.get("kinds", "domain domain domain").lower().split()
+    if len(kinds) != 3 or not AXIS_KINDS.issuperset(kinds):
+        refuse(f"kinds {fields['kinds'][:80]!r}", path, "domain domain domain", "unsupported_feature")
+    for key in ("axismins", "axismaxs"):
+        if set(fields.get(key, "nan").lower().split()) != {"nan"}:
+            refuse(f"{key} together with a space", path, "only space origin and space directions", "stated_twice")
+    notes = () if "space" in fields else (f"{path.name}: {UNNAMED_SPACE}",)
+    T_ct_index = check_affine(_affine(dict(fields), path), where=path)
+    return VolumeHeader(shape, T_ct_index, raw.remarks, _cells(raw, path), raw.data_path, layers, notes)
+
+
+def data_file(content: bytes, path: Path) -> str | None:
+    """The name of the file beside a detached header that holds its data; None where header and data are one file."""
+    raw = split_header(content, path)
+    return None if raw.data_path == path else raw.data_path.name
 
 
 def _affine(fields: dict[str, str], path: Path) -> NDArray[np.float64]:
-    space = _space(fields, path)
+    if "spacedimension" in fields:
+        if "space" in fields:
+            refuse("both space and space dimension", path, "one of the two", "stated_twice")
+        if fields["spacedimension"] != "3":
+            refuse(f"space dimension {fields['spacedimension'][:20]!r}", path, "3", "wrong_dimension")
+        fields["space"] = "lps"  # a header that counts its axes instead is LPS, as to ITK
+    space = stated_field(fields, "space", path).lower()
     if space not in LPS_SIGNS:
         allowed = "left-posterior-superior, right-anterior-superior, left-anterior-superior"
         refuse(f"space {space!r} is not a patient space", path, allowed, "unknown_space")
@@ -289,17 +220,6 @@ def _affine(fields: dict[str, str], path: Path) -> NDArray[np.float64]:
     T[:3, 3] = origin[0]
     T[:3] *= np.array(LPS_SIGNS[space])[:, None]
     return T
-
-
-def _space(fields: dict[str, str], path: Path) -> str:
-    """The space that is stated; a header that counts its axes instead (``space dimension``) is LPS, as to ITK."""
-    if "spacedimension" not in fields:
-        return stated_field(fields, "space", path).lower()
-    if "space" in fields:
-        refuse("both space and space dimension", path, "one of the two", "stated_twice")
-    if fields["spacedimension"] != "3":
-        refuse(f"space dimension {fields['spacedimension'][:20]!r}", path, "3", "wrong_dimension")
-    return "lps"
 
 
 def _vectors(text: str, count: int, path: Path) -> NDArray[np.float64]:
@@ -316,35 +236,19 @@ def _vectors(text: str, count: int, path: Path) -> NDArray[np.float64]:
     return vectors
 
 
-def _check_axes(fields: dict[str, str], path: Path) -> None:
-    """Refuse axes that hold several values per voxel, or that are placed in two ways."""
-    kinds = fields.get("kinds", "domain domain domain").lower().split()
-    if len(kinds) != 3 or not AXIS_KINDS.issuperset(kinds):
-        refuse(f"kinds {fields['kinds'][:80]!r}", path, "domain domain domain", "unsupported_feature")
-    for key in ("axismins", "axismaxs"):
-        if set(fields.get(key, "nan").lower().split()) != {"nan"}:
-            refuse(f"{key} together with a space", path, "only space origin and space directions", "stated_twice")
-
-
 def _cells(raw: NrrdText, path: Path) -> VoxelLayout:
+    fields = raw.fields
     for key in ("byteskip", "lineskip"):
-        if raw.fields.get(key, "0") != "0":
-            refuse(f"{key} {raw.fields[key]!r}", path, "0", "unsupported_feature")
-    stated = stated_field(raw.fields, "encoding", path).lower()
+        if fields.get(key, "0") != "0":
+            refuse(f"{key} {fields[key]!r}", path, "0", "unsupported_feature")
+    stated = stated_field(fields, "encoding", path).lower()
     encoding = "gzip" if stated in GZIP else stated
     if encoding not in {"raw", "gzip"}:
         refuse(f"encoding {stated!r}", path, "raw, gzip", "unsupported_feature")
-    return VoxelLayout(_dtype(raw.fields, path), encoding, start=raw.data_offset)
-
-
-def _dtype(fields: dict[str, str], path: Path) -> np.dtype[Any]:
     name = TYPES.get(stated_field(fields, "type", path).lower())
     if name is None:
         refuse(f"type {fields['type']!r}", path, "an integer type, float or double", "unknown_type")
-    dtype = np.dtype(name)
-    if dtype.itemsize == 1:
-        return dtype
-    order = {"little": "<", "big": ">"}.get(fields.get("endian", "").lower())
-    if order is None:
+    order = {"little": "<", "big": ">"}.get(fields.get("endian", "").lower(), "")
+    if not order and np.dtype(name).itemsize > 1:
         refuse("the byte order is not stated", path, "endian: little or big", "missing_key")
-    return np.dtype(order + name)
+    return VoxelLayout(np.dtype(order + name), encoding, start=raw.data_offset)

@@ -63,11 +63,7 @@ class Volume(Shown):
 
 
 def data_file(content: bytes, path: Path) -> str | None:
-    """The name of the file beside this one that holds its voxels; None for a volume in one file.
-
-    Raises:
-        InputError: A header that is damaged, or names data elsewhere.
-    """
+    """The name of the file beside this one that holds its voxels; None for a volume in one file."""
     return nrrd_header.data_file(content, path) if path.name.lower().endswith(NRRD_ENDINGS) else None
 
 
@@ -80,9 +76,6 @@ def read_volume(path: Path) -> Volume:
     """A volume from .nii, .nii.gz, .nrrd, .nhdr (data beside it) or .seg.nrrd, in LPS mm.
 
     NIfTI is RAS and turned here; NRRD says its space. Units of metre and micrometre in NIfTI become mm.
-
-    Raises:
-        InputError: Anything wrong with the file; nothing else comes out, whatever its bytes.
     """
     if not is_plain_file(path):
         refuse(f"the file {absence(path)}", path, "a volume file", "no_such_file")
@@ -96,11 +89,7 @@ def read_volume(path: Path) -> Volume:
 
 
 def parse_volume(content: bytes, path: Path, data: bytes | None = None) -> Volume:
-    """Parse a volume file that has been read; it is not opened again.
-
-    Args:
-        data: The file that `data_file` names, where it names one.
-    """
+    """Parse a volume file that was read, and ``data``, the file that `data_file` names where it names one."""
     header = parse_header(content, path)
     stored = content if data is None else data
     try:
@@ -165,14 +154,10 @@ class VolumeSource(Protocol):
 
 @dataclass(frozen=True)
 class VolumeFile:
-    """A volume in one file, or in a header and a file of voxels beside it.
-
-    Attributes:
-        files: That file, and the one beside it.
-    """
+    """A volume in one file, or in a header and a file of voxels beside it."""
 
     path: Path
-    files: tuple[str, ...]
+    files: tuple[str, ...]  # that file, and the one beside it
     content: Content
     part: tuple[str, ...] = ()
 
@@ -194,15 +179,10 @@ class VolumeFile:
 
 @dataclass(frozen=True, eq=False)
 class Oriented:
-    """An array in canonical order.
+    """An array in canonical order."""
 
-    Attributes:
-        values: Shape (nx, ny, nz), a view of what was given.
-        T_ct_index: Shape (4, 4), maps an index of ``values`` to LPS mm; its determinant is positive.
-    """
-
-    values: NDArray[Any]
-    T_ct_index: NDArray[np.float64]
+    values: NDArray[Any]  # shape (nx, ny, nz), a view of what was given
+    T_ct_index: NDArray[np.float64]  # shape (4, 4), maps an index of ``values`` to LPS mm; its determinant is positive
 
     @property
     def spacing_mm(self) -> NDArray[np.float64]:
@@ -215,11 +195,7 @@ TILE = (32, 64)
 
 
 def in_order(values: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
-    """A copy that lies in memory in the order of its axes, the last one fastest, as every mask does that is made of it.
-
-    Args:
-        values: Shape (nx, ny, nz), in any order, such as a view of a file that runs the other way.
-    """
+    """A copy of values (nx, ny, nz), in any order, that lies in memory in that of its axes, the last one fastest."""
     found = np.empty(values.shape, dtype)
     for k in range(0, values.shape[2], TILE[0]):
         for j in range(0, values.shape[1], TILE[1]):

@@ -32,37 +32,23 @@ MAX_ORIGIN_MM = 100_000.0
 
 @dataclass(frozen=True)
 class VoxelLayout:
-    """How a file stores its voxels, axis i first.
+    """How a file stores its voxels, axis i first."""
 
-    Attributes:
-        dtype: Of one voxel, with the file's byte order.
-        encoding: ``raw`` or ``gzip``: of all that the file holds from byte ``start`` on.
-        start: Bytes of the file before the encoded data.
-        offset: Bytes of the decoded data before the first voxel.
-        slope: What a stored value is multiplied with; 1 and an intercept of 0 leave it as it is.
-    """
-
-    dtype: np.dtype[Any]
-    encoding: str
-    start: int = 0
-    offset: int = 0
-    slope: float = 1.0
+    dtype: np.dtype[Any]  # of one voxel, with the file's byte order
+    encoding: str  # ``raw`` or ``gzip``: of all that the file holds from byte ``start`` on
+    start: int = 0  # bytes of the file before the encoded data
+    offset: int = 0  # bytes of the decoded data before the first voxel
+    slope: float = 1.0  # what a stored value is multiplied with; 1 and an intercept of 0 leave it as it is
     intercept: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class VolumeGrid:
-    """Where the voxels of a volume lie; what they hold has not been looked at.
+    """Where the voxels of a volume lie; what they hold has not been looked at."""
 
-    Attributes:
-        shape: Voxels along i, j, k.
-        T_ct_index: Shape (4, 4), maps voxel index (i, j, k) to LPS mm.
-        fields: The file's own key/value remarks (NRRD ``key:=value``), empty for the other formats.
-    """
-
-    shape: tuple[int, int, int]
-    T_ct_index: NDArray[np.float64]
-    fields: dict[str, str]
+    shape: tuple[int, int, int]  # voxels along i, j, k
+    T_ct_index: NDArray[np.float64]  # shape (4, 4), maps voxel index (i, j, k) to LPS mm
+    fields: dict[str, str]  # the file's own key/value remarks (NRRD ``key:=value``), empty for the other formats
 
     @property
     def count(self) -> int:
@@ -82,25 +68,16 @@ class VolumeGrid:
 
 @dataclass(frozen=True, eq=False)
 class VolumeHeader(VolumeGrid):
-    """One volume in one or two files as its header describes it.
-
-    Attributes:
-        data_path: The file that holds them: the header's own, or one beside it.
-        layers: How many values each voxel has, one for each layer of segments that overlap.
-    """
+    """One volume in one or two files as its header describes it."""
 
     cells: VoxelLayout
-    data_path: Path
-    layers: int = 1
+    data_path: Path  # the file that holds them: the header's own, or one beside it
+    layers: int = 1  # how many values each voxel has, one for each layer of segments that overlap
     notes: tuple[str, ...] = ()
 
 
 def check_shape(shape: tuple[int, ...], *, where: Path) -> tuple[int, int, int]:
-    """The shape, if it is that of a volume in three dimensions that fits a machine.
-
-    Raises:
-        InputError: An axis with fewer than two voxels, or more than ``MAX_VOXELS`` in all.
-    """
+    """The shape of a volume. Raises InputError: no three axes of two voxels or more, or above ``MAX_VOXELS`` in all."""
     if len(shape) != 3 or min(shape) < 2:
         refuse(f"a volume of size {shape}", where, "3 axes with at least 2 voxels each", "wrong_dimension")
     count = shape[0] * shape[1] * shape[2]
@@ -114,9 +91,6 @@ def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.
 
     Args:
         T_ct_index: Shape (4, 4), maps voxel index to mm.
-
-    Raises:
-        InputError: Named: not finite, zero or singular, implausible spacing, sheared, implausible origin.
     """
     T = np.array(T_ct_index, dtype=np.float64)
     if not np.isfinite(T).all():
@@ -152,11 +126,7 @@ def _corners(shape: tuple[int, int, int]) -> NDArray[np.float64]:
 
 
 def refuse_lost_grid(labels: VolumeGrid, image: VolumeGrid, *, where: Path) -> None:
-    """Labels with an image's voxels that begin at 0, elsewhere: a program kept the voxels, and not where they lie.
-
-    Raises:
-        InputError: They are such.
-    """
+    """Refuse labels with an image's voxels that begin at 0, elsewhere: a program kept them, and not where they lie."""
     boxes = np.array([apply(one.T_ct_index, _corners(one.shape)) for one in (labels, image)])
     apart = max(float(np.abs(np.subtract(*ends)).max()) for ends in (boxes.min(axis=1), boxes.max(axis=1)))
     if sorted(labels.shape) == sorted(image.shape) and not labels.T_ct_index[:3, 3].any() and apart > ONE_PLACE_MM:
@@ -194,9 +164,6 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
 
     Returns:
         Shape (promised,).
-
-    Raises:
-        InputError: Damaged, truncated, or of another length.
     """
     if promised > len(content) * DEFLATE_RATIO:
         what = f"{len(content)} compressed bytes cannot hold the {promised} bytes that the header states"
@@ -216,11 +183,7 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
 
 
 def first_bytes(content: memoryview, count: int, *, where: Path, allowed: str) -> bytes:
-    """The first bytes that gzip data inflate to; fewer where there are no more.
-
-    Raises:
-        InputError: No gzip data, or damaged at the beginning.
-    """
+    """The first bytes that gzip data inflate to; fewer where there are no more. Raises InputError: damaged there."""
     try:
         return b"".join(_parts(content, count))
     except (EOFError, zlib.error) as error:
@@ -253,9 +216,6 @@ def decoded(content: memoryview, header: VolumeHeader) -> NDArray[Any]:
 
     Returns:
         Shape (ni, nj, nk), axis i running fastest in memory; (layers, ni, nj, nk) where there are several layers.
-
-    Raises:
-        InputError: The data are damaged, or shorter or longer than the header says.
     """
     cells, where = header.cells, header.data_path
     data, count = content[cells.start :], header.count * header.layers

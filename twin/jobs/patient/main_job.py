@@ -18,8 +18,7 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse, require_extra
 from puncture_twin.planning.base.output.manifest import read_output
-from puncture_twin.planning.base.output.output_set import withdraw, writing
-from puncture_twin.planning.base.output.publish import Draft
+from puncture_twin.planning.base.output.output_set import Draft, withdraw, writing
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.budget.guidance import check_ways, with_ways
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked

@@ -14,8 +14,7 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import refuse, require_extra
 from puncture_twin.planning.base.output.manifest import read_output
-from puncture_twin.planning.base.output.output_set import writing
-from puncture_twin.planning.base.output.publish import Draft
+from puncture_twin.planning.base.output.output_set import Draft, writing
 from puncture_twin.planning.base.provenance import Input, InputFiles, inputs_document, read_inputs
 from puncture_twin.planning.base.strict_json import array, fitting, number, parse_json
 from puncture_twin.planning.base.text import Shown

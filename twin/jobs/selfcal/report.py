@@ -14,8 +14,7 @@ from matplotlib.figure import Figure
 
 from puncture_twin.planning.base.errors import PlanningError, refuse
 from puncture_twin.planning.base.files import new_folder
-from puncture_twin.planning.base.output.output_set import withdraw, writing
-from puncture_twin.planning.base.output.publish import Draft
+from puncture_twin.planning.base.output.output_set import Draft, withdraw, writing
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.twin.guidance.ultrasound.acquisition import keep_pictures
