@@ -858,13 +858,13 @@ def batch(
     """
     from puncture_twin.planning.base.files import check_writable
     from puncture_twin.planning.base.progress import Silent
-    from puncture_twin.planning.batch.run import Request, run_cohort
+    from puncture_twin.planning.batch.run import run_cohort
     from puncture_twin.planning.batch.run_case import run_here
     from puncture_twin.twin.jobs.batch.jobs import merge_cohort, plan_cohort
 
     out, watcher = check_writable(folder), Silent()
     plan_cohort(Path(cohort), out, arm=arm, dry=False, watcher=watcher)
-    run_cohort(out, Request(jobs=jobs), watcher, run_here if jobs == 1 else None)
+    run_cohort(out, watcher, jobs=jobs, elsewhere=run_here if jobs == 1 else None)
     return merge_cohort(out, None if expect is None else Path(expect), tolerance_mm, watcher)
 
 

@@ -19,7 +19,7 @@ from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.anatomy.unseen import beyond_images, beyond_labels
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
-from puncture_twin.planning.base.errors import Finding, InputError, Severity, refuse
+from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.base.progress import Names, unnamed
 from puncture_twin.planning.base.text import did_you_mean
 from puncture_twin.planning.case.case import Case
@@ -33,21 +33,15 @@ from puncture_twin.planning.geometry.triangle_distance import squared_distance
 OUTSIDE_BODY, ATTACHED_LIMB = "outside_body", "attached_limb"
 UNNAMED_DENSE, UNNAMED_GAS = "unnamed_dense", "unnamed_gas"
 """Names of the structures that the CT adds."""
-
 OUTSIDE_NOT_KNOWN = (
     "outside the body: not known (no CT; [ct] file can state one), so table, clothes and arms count as air"
 )
-
 LIMB_ATTACHED = "a limb seems to be pressed against the trunk"
 NO_ARMS = '[ct] arms = "none"'
-"""The line that overrules the rule."""
-
+"""The second overrules the rule."""
 UNNAMED_FREE = '[ct] unnamed = "free": what the CT shows inside the body outside the structures is not checked'
-
-CELLS = 24
-"""Along the ball's diameter."""
-OWN_TARGET = "target.hit_radius_mm"
-"""Where the ball comes from."""
+CELLS, OWN_TARGET = 24, "target.hit_radius_mm"
+"""Cells along the diameter of the target's own ball, and where that comes from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +51,6 @@ class Anatomy:
     Attributes:
         structures: All structures of the body but the skin; the CT's unnamed dense components and gas among them.
         surroundings: Solids outside of the body: what the CT shows there, obstacles, the gantry.
-        scan: The CT of the case, or None.
         findings: The warnings again, and what is said besides, with code and numbers.
         ignored: Names of labels that the case leaves out on purpose.
         couch: What lies beyond what the body lies on in the CT, or None where no CT shows it.
@@ -78,17 +71,12 @@ class Anatomy:
         return self.structures + self.surroundings
 
     def structure(self, name: str) -> Structure:
-        """The structure of this name.
-
-        Raises:
-            InputError: There is none.
-        """
-        for structure in self.structures:
-            if structure.name == name:
-                return structure
-        names = ", ".join(s.name for s in self.structures)
-        near = did_you_mean(name, (structure.name for structure in self.structures))
-        raise InputError(f"no structure '{name}'{near}", where="anatomy", allowed=names, code="unknown_structure")
+        """The structure of this name; none is an error."""
+        names = [structure.name for structure in self.structures]
+        if name not in names:
+            what = f"no structure '{name}'{did_you_mean(name, names)}"
+            refuse(what, "anatomy", ", ".join(names), "unknown_structure")
+        return self.structures[names.index(name)]
 
 
 def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE) -> Anatomy:
@@ -100,15 +88,18 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
     loader = StructureSources(case, progress, cache)
     reads = [partial(loader.one, section) for section in case.structure if section.role != "skin"]
     reads += [one for section in case.structures for one in loader.many(section)]
-    _check_count(case, len(reads) + 1)
+    if wrong := count_difference(case.stated_structures, len(reads) + 1):  # before surfaces are made
+        refuse(wrong, case.path, "the number of structures that are read", "structures_miscounted")
     structures = [read() for read in reads]
     skin = loader.skin(case.skin_section, structures)
-    _check_demands(case, structures)
+    if case.region != "phantom" and not any(structure.demands_margin for structure in structures):
+        what = 'no structure has role "avoid" or "unknown", so no verdict would say anything about safety'
+        refuse(what, case.path, 'a structure of role "avoid" or "unknown", or region = "phantom"', "nothing_to_avoid")
     structures.extend(own_target(case))
     outside: tuple[Structure, ...] = ()
     guesses: list[Finding] = []
     couch: TriangleMesh | None = None
-    scan, left_out = loader.scan(case.skin_section, skin, structures), loader.unnamed_warnings()
+    scan, left_out = loader.scan(case.skin_section, skin, structures), tuple(loader.unnamed_warnings())
     if scan is None:
         loader.warnings.append(OUTSIDE_NOT_KNOWN)
     else:
@@ -122,23 +113,19 @@ def load_anatomy(case: Case, progress: Names = unnamed, cache: Cache = NO_CACHE)
         progress("unnamed tissue in the body")
         structures.extend(_unnamed(case, scan, structures))
     unseen = beyond_images(case, skin, scan, cache.memory)
-    beyond = beyond_labels(case, skin, structures, cache.memory)
+    beyond, ending = beyond_labels(case, skin, structures, cache.memory)
     outside = (*outside, *unseen.structures)
-    structures.extend(beyond.structures)
+    structures.extend(beyond)
     _check_names(case, [*structures, *outside])
     read = {one.name: one.mesh for one in structures if one.source != OWN_TARGET}  # the ball is ours
     of_meshes = cached_mesh_warnings(read, cache)
-    warnings = (*loader.warnings, *beyond.warnings, *left_out, *skin.warnings, *of_meshes)
+    warnings = (*loader.warnings, *ending, *left_out, *skin.warnings, *of_meshes)
     found = (*guesses, *unseen.findings)
     return Anatomy(tuple(structures), skin, warnings, outside, scan, tuple(loader.ignored), couch, found)
 
 
 def guessed(code: str, what: str, volume: float, side: str, overrule: str) -> Finding:
-    """Sentence on what a rule guessed of an image: how much, where, which picture shows it, what overrules it.
-
-    Args:
-        code: Of the finding; the structure that paths would pass through, where there is one.
-    """
+    """Sentence on what a rule guessed of an image: how much, where, which picture shows it, what overrules it."""
     said = (
         f"{what}: {volume / 1000:.1f} l at its {side} side (see slices.png); paths through it are unknown_region "
         f"({code}); if that is wrong: {overrule}"
@@ -162,7 +149,7 @@ def _outside(
 ) -> tuple[Structure, ...]:
     """Surfaces of what the CT shows outside of the body that is not air, and of limbs pressed against it."""
     if case.ct.table != "none":
-        warnings.extend(support_warnings(outside.supported, outside.open_faces))
+        warnings.extend(support_warnings(outside.couch is not None, outside.open_faces))
     voxel_ct = scan.source.surfaces.voxel_ct
     bones = [Named(one.name, one.mesh) for one in structures if one.source != OWN_TARGET]
     found = ((OUTSIDE_BODY, outside.mesh), (ATTACHED_LIMB, scan.attached_limbs(case.target_ct, bones)))
@@ -189,28 +176,14 @@ def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterato
 
 
 def load_skin(case: Case, cache: Cache = NO_CACHE) -> Skin:
-    """The skin of a case alone.
-
-    Raises:
-        InputError: A file that cannot be trusted.
-    """
+    """The skin of a case alone."""
     return StructureSources(case, lambda _: None, cache).skin(case.skin_section)
 
 
 def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh | None:
-    """Load the surfaces beyond what the body lies on in the case's CT, as `Anatomy.couch`.
-
-    Raises:
-        InputError: A CT that cannot be trusted, or does not show the target.
-    """
+    """Load the surfaces beyond what the body lies on in the case's CT, as `Anatomy.couch`."""
     scan = StructureSources(case, lambda _: None, cache).scan(case.skin_section, skin)
     return None if scan is None else scan.outside(case.ct.air_hu).couch
-
-
-def _check_count(case: Case, count: int) -> None:
-    """Compare the number of structures with what the case states, before surfaces are made and the CT adds others."""
-    if wrong := count_difference(case.stated_structures, count):
-        refuse(wrong, case.path, "the number of structures that are read", "structures_miscounted")
 
 
 def _check_names(case: Case, structures: list[Structure]) -> None:
@@ -226,13 +199,6 @@ def _check_names(case: Case, structures: list[Structure]) -> None:
         refuse(what, case.path, ", ".join(names), "unknown_structure")
 
 
-def _check_demands(case: Case, structures: list[Structure]) -> None:
-    """Refuse a patient without margins: every path would be "safe". A phantom may hold nothing but its target."""
-    if case.region != "phantom" and not any(structure.demands_margin for structure in structures):
-        what = 'no structure has role "avoid" or "unknown", so no verdict would say anything about safety'
-        refuse(what, case.path, 'a structure of role "avoid" or "unknown", or region = "phantom"', "nothing_to_avoid")
-
-
 def surface_distance(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
     """Distance of a point (3,) from a surface, on either side, mm."""
     return float(np.sqrt(squared_distance(point, mesh.triangles).min()))
@@ -246,14 +212,9 @@ def own_target(case: Case) -> Iterator[Structure]:
 
 
 def ball(middle_ct: Floats, radius_mm: float) -> TriangleMesh:
-    """The surface of a ball, to a hundredth of its radius.
-
-    Args:
-        middle_ct: Shape (3,), mm.
-    """
+    """The surface of a ball about a point (3,), mm, to a hundredth of its radius."""
     cell = 2.0 * radius_mm / CELLS
-    count = CELLS + 3
-    offset = (np.arange(count) - (count - 1) / 2) * cell
+    offset = (np.arange(CELLS + 3) - (CELLS + 2) / 2) * cell
     x, y, z = np.meshgrid(offset, offset, offset, indexing="ij")
     field = radius_mm - np.sqrt(x**2 + y**2 + z**2)
     field[field == 0.0] = -np.finfo(np.float32).eps

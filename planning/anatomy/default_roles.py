@@ -29,13 +29,9 @@ KINDS: Mapping[str, Kind] = MappingProxyType({kind: kind for kind in get_args(Ki
 
 
 class DefaultRole(NamedTuple):
-    """One line of the table.
+    """One line of the table, for shell patterns of names in lower case with underscores.
 
-    Attributes:
-        patterns: Shell patterns of names in lower case with underscores.
-        kind: What it means to a needle: ``ignore`` for outlines of the body, which the skin is; ``unknown`` for what
-            nobody looked at.
-        margin_mm: The clearance that it demands; 0 where it demands none.
+    ``ignore`` is for outlines of the body, which the skin is; ``unknown`` for what nobody looked at.
     """
 
     group: str
@@ -210,11 +206,7 @@ def default_role(name: str, region: str) -> DefaultRole | None:
 
 
 def never_crossed(name: str) -> DefaultRole | None:
-    """The line of a structure that is no usual target and that no path crosses, such as a large vessel; None of others.
-
-    Args:
-        name: A structure's, in any spelling; in any region.
-    """
+    """The line, in any region, of what no path crosses and is no usual target, such as a large vessel; else None."""
     lines = [default_role(name, region) for region in ("other", *BY_REGION)]
     if not VESSEL_WORDS.isdisjoint(plain_name(name).split("_")):  # of a lesion, or of anything else
         lines += [line for line in GENERAL if line.group == OTHER_VESSELS]
@@ -241,7 +233,6 @@ def _matches(plain: str, pattern: str) -> bool:
 
 
 def _matching(plain: str, lines: tuple[DefaultRole, ...]) -> Iterator[tuple[float, DefaultRole]]:
-    """How closely each line names a name, for those that do."""
     for line in lines:
         close = [specificity(pattern, plain) for pattern in line.patterns if _matches(plain, pattern)]
         if close:
@@ -328,9 +319,14 @@ def named_as_crossed(name: str) -> bool:
     """
     spoken = _words(name)
     nouns = [word for word in spoken if word not in QUALIFIERS and not LEVEL.fullmatch(word)]
-    lesion = any(_is_lesion(word) for word in nouns)
-    known = all(word in ORGANS | BONES | SOFT_TISSUES or _is_lesion(word) for word in nouns)
-    return bool(nouns) and known and (lesion or not _may_lack_its_noun(spoken))
+    if not nouns or not all(word in ORGANS | BONES | SOFT_TISSUES or _is_lesion(word) for word in nouns):
+        return False
+    # Known words may still be said of a vessel or a nerve, of one beside a bone, of the cord or of a muscle of the eye.
+    of_organ = bool(spoken & POSITIONS and spoken & ORGANS and not spoken & PARTS)
+    of_bone = bool(spoken & WALLS and spoken & BONES)
+    of_cord = "matter" in spoken and any(word in POSITIONS or LEVEL.fullmatch(word) for word in spoken)
+    of_eye = any(noun in spoken and not spoken & NEEDS[noun] for noun in NEEDS)
+    return any(_is_lesion(word) for word in nouns) or not (of_organ or of_bone or of_cord or of_eye)
 
 
 def named_as_lesion(name: str) -> bool:
@@ -345,12 +341,3 @@ def _words(name: str) -> frozenset[str]:
 
 def _is_lesion(word: str) -> bool:
     return word.rstrip(DIGITS) in LESIONS
-
-
-def _may_lack_its_noun(spoken: frozenset[str]) -> bool:
-    """Whether known words may be said of a vessel, a nerve, the cord or a muscle of the eye."""
-    placed = spoken & POSITIONS
-    of_organ = bool(placed and spoken & ORGANS and not spoken & PARTS)
-    of_bone = bool(spoken & WALLS and spoken & BONES)
-    of_cord = "matter" in spoken and any(word in POSITIONS or LEVEL.fullmatch(word) for word in spoken)
-    return of_organ or of_bone or of_cord or any(noun in spoken and not spoken & NEEDS[noun] for noun in NEEDS)

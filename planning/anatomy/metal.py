@@ -17,14 +17,9 @@ from puncture_twin.planning.geometry.rigid import apply
 
 METAL_HU = 1500.0
 """Cortical bone and teeth end about here; half a voxel of steel has more."""
-AROUND_MM = 3.0
-"""So far about metal its surroundings are looked at."""
-BLUR_MM = 1.5
-"""So far from its voxels a piece of metal still blurs into others; beyond, they show what it lies in."""
-
-EDGE_MM = 1.5
-"""mm by which the edges of wide metal protrude from the balls that fit into it."""
-
+AROUND_MM, BLUR_MM, EDGE_MM = 3.0, 1.5, 1.5
+"""So far about metal its surroundings are looked at; so far from its voxels a piece of it still blurs into others (what
+is beyond shows what it lies in); so far the edges of wide metal protrude from the balls that fit into it."""
 SOLID_HU = 8000.0
 """Assumed of a voxel that is wholly metal, whose value the range of the image clips. It only decides at which part of
 metal a voxel in air and one in tissue count as full: alike, so that a marker on the skin is not drawn to one side."""
@@ -35,13 +30,9 @@ Box = tuple[slice, slice, slice]
 
 
 class Metal(NamedTuple):
-    """One connected piece of metal.
+    """One connected piece of metal: its voxels in their box with `AROUND_MM` about it, and their middle (3,), LPS mm.
 
-    Attributes:
-        box: Its voxels' box with `AROUND_MM` about it.
-        voxels: Of the box: which belong to the piece.
-        middle_ct: Shape (3,), of its voxels, LPS mm.
-        size_mm: The longest side of its box.
+    ``size_mm`` is the longest side of the voxels' box.
     """
 
     box: Box
@@ -124,16 +115,14 @@ def metal_parts(
     reach_mm: Floats | float = BLUR_MM,
     least: float = LEAST_PART,
 ) -> Floats:
-    """Part of each voxel of a piece's box that is metal, 0 to 1, as far as a clipped range allows.
+    """Part of each voxel of a piece's box that is metal, 0 to 1; none below ``least``.
 
     What a voxel would show without metal is what the nearest voxel shows that is too far away to be blurred by it:
     air on one side of a marker and skin on the other. Without that, air would hide the outer edge of a marker.
 
     Args:
-        level_hu: From where on other voxels of the box are metal too.
-        solid_hu: Of a voxel that is wholly metal.
+        level_hu: From where on other voxels of the box are metal too; ``solid_hu`` is that of wholly metal.
         reach_mm: So far from its voxels metal blurs into others, or fills them in part; one number, or one an axis.
-        least: A smaller part is taken for none.
     """
     values = volume.values[metal.box].astype(np.float64)
     every, outside = _sides(values, volume, metal, level_hu, reach_mm)
@@ -141,7 +130,9 @@ def metal_parts(
         return np.asarray(metal.voxels, dtype=np.float64)
     spacing = spacing_mm(volume)
     nearest = ndimage.distance_transform_edt(~outside, spacing, return_distances=False, return_indices=True)
-    background = _smooth(values, outside)[tuple(nearest)]
+    near = ndimage.gaussian_filter(outside.astype(np.float64), 1.0)  # the mean about each voxel of those outside
+    smooth = ndimage.gaussian_filter(np.where(outside, values, 0.0), 1.0) / np.maximum(near, 1e-3)
+    background = smooth[tuple(nearest)]
     parts = (values - background) / (solid_hu - background)  # linear partial volume
     others = every & ~metal.voxels
     mine = ndimage.distance_transform_edt(~metal.voxels, spacing)
@@ -173,19 +164,8 @@ def metal_weights(volume: Volume, metal: Metal) -> Floats:
     return np.asarray(np.minimum(metal_parts(volume, metal), full) / full)
 
 
-def _smooth(values: Floats, some: Bools) -> Floats:
-    """The mean about each voxel of those that count."""
-    near = ndimage.gaussian_filter(some.astype(np.float64), 1.0)
-    return np.asarray(ndimage.gaussian_filter(np.where(some, values, 0.0), 1.0) / np.maximum(near, 1e-3))
-
-
 def centroid(weights: Floats, box: Box, T_ct_index: Floats) -> Floats:
     """The weights' middle, shape (3,), LPS mm."""
-    starts = [axis.start for axis in box]
-    index = [np.tensordot(np.arange(n), weights.sum(axis=_others(axis)), 1) for axis, n in enumerate(weights.shape)]
-    return apply(T_ct_index, np.array(index) / weights.sum() + starts)
-
-
-def _others(axis: int) -> tuple[int, int]:
-    a, b = itertools.compress(range(3), [one != axis for one in range(3)])
-    return a, b
+    sums = (weights.sum(axis=others) for others in ((1, 2), (0, 2), (0, 1)))
+    index = [np.tensordot(np.arange(len(one)), one, 1) for one in sums]
+    return apply(T_ct_index, np.array(index) / weights.sum() + [axis.start for axis in box])

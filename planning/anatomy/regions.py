@@ -13,12 +13,9 @@ from typing import NamedTuple
 
 
 class Organ(NamedTuple):
-    """One usual organ.
+    """One usual organ, and words of which a name holds one, in lower case without spaces and signs.
 
-    Attributes:
-        words: What a structure's name may hold, in lower case without spaces and signs; one is enough.
-        paired: Whether there is one on each side.
-        conduit: Whether it is itself a vessel or a nerve.
+    ``paired``: there is one on each side; ``conduit``: it is itself a vessel or a nerve.
     """
 
     name: str
@@ -122,13 +119,16 @@ _SIDES: Mapping[str, frozenset[str]] = MappingProxyType(
 
 
 def absent_organs(region: str, names: Iterable[str]) -> list[str]:
-    """The usual organs of a region that no name is like, in the order of its list.
-
-    Args:
-        names: Of the case's structures, also of those that it ignores on purpose.
-    """
-    known = [_Name.of(name) for name in names]
-    return [absent for organ in USUAL[region] for absent in _absent(organ, known)]
+    """The usual organs of a region that no name of a case's structures (ignored ones too) is like, in their order."""
+    known, absent = [_Name.of(name) for name in names], list[str]()
+    for organ in USUAL[region]:
+        alike = [name for name in known if name.is_like(organ)]
+        sides = frozenset[str]().union(*(name.sides for name in alike))
+        if not alike:
+            absent.append(organ.name)
+        elif organ.paired:
+            absent += [f"{organ.name} ({side})" for side in _SIDES if side not in sides]
+    return absent
 
 
 class _Name(NamedTuple):
@@ -145,23 +145,14 @@ class _Name(NamedTuple):
         sides = frozenset(side for side, said in _SIDES.items() if said & set(words))
         return cls("".join(words), words, sides or frozenset(_SIDES))
 
-    @property
-    def is_of_an_organ(self) -> bool:
-        """Whether it says of itself that it is a vessel, a nerve, a duct or a lesion."""
-        return any(NOT_THE_ORGAN.fullmatch(word) for word in self.words)
+    def is_like(self, organ: Organ) -> bool:
+        """Whether it may be an organ's, and not that of its vessels, nerves, ducts or lesions.
 
-    def is_like(self, word: str) -> bool:
-        """Long words may stand anywhere in the name; short ones begin one of its words, so that `ren` is no adrenal."""
-        if len(word) > 5:
-            return word in self.text
-        return any(own.startswith(word) for own in self.words)
-
-
-def _absent(organ: Organ, names: list[_Name]) -> Iterator[str]:
-    own = names if organ.conduit else [name for name in names if not name.is_of_an_organ]
-    alike = [name for name in own if any(name.is_like(word) for word in organ.words)]
-    if not alike:
-        yield organ.name
-    elif organ.paired:
-        sides = frozenset[str]().union(*(name.sides for name in alike))
-        yield from (f"{organ.name} ({side})" for side in _SIDES if side not in sides)
+        Long words may stand anywhere in the name; short ones begin one of its words, so that `ren` is no adrenal.
+        """
+        if not organ.conduit and any(NOT_THE_ORGAN.fullmatch(word) for word in self.words):
+            return False
+        return any(
+            word in self.text if len(word) > 5 else any(own.startswith(word) for own in self.words)
+            for word in organ.words
+        )

@@ -52,19 +52,10 @@ class Outside(NamedTuple):
     couch: TriangleMesh | None
     open_faces: tuple[Face, ...]
 
-    @property
-    def supported(self) -> bool:
-        """Whether the image shows what the body lies on."""
-        return self.couch is not None
-
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A CT beside the skin of its case. Its voxels are decoded only if something is not in the cache.
-
-    Attributes:
-        skin: The skin, where it does not come from this CT.
-    """
+    """A CT beside the skin of its case, if that is from elsewhere. Voxels are decoded if the cache lacks something."""
 
     name: str
     source: Imaged
@@ -127,9 +118,7 @@ class Scan:
     def attached_limbs(self, target_ct: NDArray[np.float64], structures: Sequence[Named] = ()) -> TriangleMesh | None:
         """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None.
 
-        Args:
-            target_ct: Shape (3,), LPS mm.
-            structures: Of the case: bones that they name are no evidence of a limb.
+        Bones that the case's structures name are no evidence of a limb.
         """
         if not self.source.shown.limbs:
             return None
@@ -156,19 +145,14 @@ class Scan:
         return self._kept({**made_from, "chosen": chosen}, make)[0] if any(chosen[1:]) else None
 
     def unnamed(self, structures: Sequence[Named], dense_hu: float) -> Unnamed:
-        """Surfaces of what is dense, or gas, inside the body and in no structure.
+        """Surfaces of what is dense, from an HU on, or gas, inside the body and in no structure."""
 
-        Args:
-            dense_hu: From here on a voxel is dense.
-        """
-
-        def make() -> Unnamed:
-            ct = self._ct
+        def make() -> list[TriangleMesh | None]:
             slack_mm = 0.0 if self.skin is None else 2.0 * self._tolerance_mm
-            return unnamed_surfaces(ct, self._body, structures, dense_hu=dense_hu, slack_mm=slack_mm)
+            return [*unnamed_surfaces(self._ct, self._body, structures, dense_hu=dense_hu, slack_mm=slack_mm)]
 
         named = {"structures": [f"{one.name} {one.mesh.digest}" for one in structures]}
-        return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, lambda: list(make())))
+        return Unnamed(*self._kept({"what": "unnamed", "dense_hu": dense_hu, **named}, make))
 
     def may_hold(self, unnamed: Unnamed, mesh: TriangleMesh) -> bool:
         """Whether something of what no structure names may lie in a surface, or beside it."""
@@ -179,13 +163,8 @@ class Scan:
         return within or any(one is not None and contains(one, (low + high) / 2.0) for one in unnamed)
 
     def hu_at(self, points_ct: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Hounsfield units of the nearest voxel, NaN outside of the image.
-
-        Args:
-            points_ct: Shape (n, 3), LPS mm.
-        """
-        T_index_ct = np.asarray(np.linalg.inv(self._ct.T_ct_index), dtype=np.float64)
-        return nearest(self._ct.hu, T_index_ct, points_ct)
+        """Hounsfield units of the voxels nearest to points (n, 3), LPS mm; NaN outside of the image."""
+        return nearest(self._ct.hu, np.asarray(np.linalg.inv(self._ct.T_ct_index), np.float64), points_ct)
 
     @property
     def voxels(self) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
@@ -222,7 +201,6 @@ class Scan:
 
     @property
     def _tolerance_mm(self) -> float:
-        """How far a skin from elsewhere may be off."""
         return max(SKIN_TOLERANCE_MM, 1.5 * float(self._ct.spacing_mm.max()))
 
     def _kept(
@@ -232,7 +210,6 @@ class Scan:
         return self.source.kept(self._of(made_from), lambda: _of_meshes(make()), _to_meshes, by=__name__)
 
     def _kept_arrays(self, made_from: dict[str, Any], make: Callable[[], Arrays]) -> Arrays:
-        """What is made of this CT and the skin, from the cache."""
         return self.source.kept(self._of(made_from), make, dict, by=__name__)
 
     def _of(self, made_from: dict[str, Any]) -> dict[str, Any]:
@@ -252,13 +229,7 @@ def _to_meshes(stored: Arrays) -> list[TriangleMesh | None]:
 
 
 def nearest(values: NDArray[np.float32], T_index_ct: Floats, points_ct: Floats) -> Floats:
-    """Values of the nearest voxels, NaN outside of the image; half way between two it is the one of even index.
-
-    Args:
-        values: Shape (nx, ny, nz).
-        T_index_ct: Shape (4, 4), maps LPS mm to an index of ``values``.
-        points_ct: Shape (n, 3), LPS mm.
-    """
+    """Values of the nearest voxels, NaN outside of the image; half way between two it is the one of even index."""
     order = np.argsort(values.strides)[::-1]  # as it lies in memory: the kernel is compiled for one order alone
     plain = np.ascontiguousarray(values.transpose(order))
     return np.asarray(_nearest(plain, T_index_ct[order], np.ascontiguousarray(points_ct)))

@@ -22,28 +22,22 @@ from puncture_twin.planning.geometry.containment import settled_crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, smooth_normals, split_at_creases
 from puncture_twin.planning.geometry.rigid import pose
 
-HU_RANGE = 500.0
-"""Values further from the threshold say no more about where the surface is: bone under the skin is as inside
-as water."""
-HU_LEAST = 50.0
-"""Keeps every vertex at least 1/11 of a voxel away from voxel centres, so that no triangle is a sliver."""
-CUT_PLANE_MM = 0.5
-"""A triangle this close to the plane of a cut belongs to it: half a voxel of a fine scan."""
-FLAT_END_MM2 = 3000.0
-"""No skin is flat and square to the scanner over such an area; even a belly pressed on a table is rounder."""
-FLAT_STEP = 1.0 - 1e-9
-"""Cosine to its side's axis of a triangle that is a face of voxels."""
+HU_RANGE, HU_LEAST = 500.0, 50.0
+"""Values further from the threshold say no more about where the surface is: bone under the skin is as inside as water.
+The least keeps every vertex at least 1/11 of a voxel away from voxel centres, so that no triangle is a sliver."""
+CUT_PLANE_MM, FLAT_END_MM2, FLAT_STEP = 0.5, 3000.0, 1.0 - 1e-9
+"""A triangle this close to the plane of a cut belongs to it: half a voxel of a fine scan. No skin is flat and square to
+the scanner over such an area; even a belly pressed on a table is rounder. The last is the cosine to its side's axis of
+a triangle that is a face of voxels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """The closed surface of the body, and which of its triangles are skin.
+    """The closed surface of the body, LPS mm, normals outward, and which of its triangles are skin.
 
     Attributes:
-        mesh: In LPS mm, normals outward.
         cut_faces: Shape (m,), triangles that are not skin: there the field of view ends, and the body goes on.
         field_of_view: What was imaged, or None for a mesh that says nothing of that.
-        warnings: What cannot be known, or was assumed, one sentence each.
     """
 
     mesh: TriangleMesh
@@ -82,14 +76,7 @@ def skin_of_image(image: CtImage) -> Skin:
 
 
 def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> Skin:
-    """The outer surface of one label, holes filled in each axial slice (a label may be a shell of skin only).
-
-    Args:
-        box: The part of it without what was laid around it.
-
-    Raises:
-        InputError: If no voxel has this label, or every voxel is inside.
-    """
+    """The outer surface of one label in a box, holes filled in each axial slice (it may be a shell of skin only)."""
     where = f"{labelmap.path}, label {label}"
     if label not in labelmap.boxes:
         allowed = f"labels present: {', '.join(map(str, labelmap.labels_present()))}"
@@ -104,15 +91,7 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
 
 
 def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
-    """The skin of a mesh: of a whole body, or of one that was cut at some sides.
-
-    Args:
-        mesh: In LPS mm (or the local frame, without cuts).
-        cut: Sides at which the body was cut flat, as `SIDES` names them: there the mesh ends, and the body goes on.
-
-    Raises:
-        InputError: If no triangle lies in the plane where a side was cut.
-    """
+    """The skin of a mesh (LPS mm): of a whole body, or of one that was cut flat at some sides, named as in `SIDES`."""
     mesh = split_at_creases(mesh)
     warnings = () if mesh.closed else ("the skin mesh is open: its inside, and where skin is missing, are not known",)
     if not cut:
@@ -135,9 +114,6 @@ def flat_ends(mesh: TriangleMesh) -> tuple[str, ...]:
 
     A round body of straight voxel steps ends so too, but half as wide again one step before; across the bed, where
     bodies end seldom and are cut mostly, that is not asked.
-
-    Args:
-        mesh: In LPS mm.
     """
     corners = mesh.triangles
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
@@ -155,10 +131,16 @@ def flat_ends(mesh: TriangleMesh) -> tuple[str, ...]:
 
 
 def _skin(mesh: TriangleMesh, found: BodyMask, T_ct_index: Floats) -> Skin:
-    view = field_of_view(found.body, T_ct_index)
-    centres = mesh.triangles.mean(axis=1)
-    cut_faces = _on_cut_border(view, spacing_of(T_ct_index), centres) | _at_unscanned(found, T_ct_index, centres)
-    return Skin(mesh, cut_faces, view, found.warnings)
+    view, centres = field_of_view(found.body, T_ct_index), mesh.triangles.mean(axis=1)
+    low = view.to_box(centres)
+    from_faces = np.stack([low, view.size_mm - low], axis=2)  # the cap and its chamfer lie within half a voxel
+    cut = np.any((from_faces < 0.5 * spacing_of(T_ct_index)[:, None]) & view.cut, axis=(1, 2))
+    if found.unscanned.any():  # and triangles in whose cell of eight voxels one was not scanned
+        index = np.floor(np.linalg.solve(T_ct_index[:3, :3], (centres - T_ct_index[:3, 3]).T).T).astype(int)
+        for step in itertools.product((0, 1), repeat=3):
+            cell = tuple(np.clip(index + step, 0, np.array(found.body.shape) - 1).T)
+            cut |= found.unscanned[cell] & ~found.body[cell]
+    return Skin(mesh, cut, view, found.warnings)
 
 
 def field_of_view(body: NDArray[np.bool_], T_ct_index: Floats) -> FieldOfView:
@@ -170,39 +152,15 @@ def field_of_view(body: NDArray[np.bool_], T_ct_index: Floats) -> FieldOfView:
     return FieldOfView(T_ct_image, spacing * body.shape, np.array(cut))
 
 
-def _on_cut_border(
-    view: FieldOfView, spacing_mm: NDArray[np.float64], centres_ct: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Triangles whose centre is within half a voxel of a face that cuts the body: the cap and its chamfer."""
-    low = view.to_box(centres_ct)
-    from_faces = np.stack([low, view.size_mm - low], axis=2)
-    return np.asarray(np.any((from_faces < 0.5 * spacing_mm[:, None]) & view.cut, axis=(1, 2)))
-
-
-def _at_unscanned(found: BodyMask, T: Floats, centres_ct: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Triangles in whose cell of eight voxels one was not scanned."""
-    near = np.zeros(len(centres_ct), dtype=np.bool_)
-    if not found.unscanned.any():
-        return near
-    index = np.linalg.solve(T[:3, :3], (centres_ct - T[:3, 3]).T).T
-    low = np.floor(index).astype(int)
-    for step in itertools.product((0, 1), repeat=3):
-        cell = np.clip(low + step, 0, np.array(found.body.shape) - 1)
-        near |= found.unscanned[tuple(cell.T)] & ~found.body[tuple(cell.T)]
-    return near
-
-
 @dataclass(frozen=True, eq=False)
 class SkinPaths:
     """The skin along n paths; mm, radians, NaN where there is none.
 
     Attributes:
         entry_ct: Shape (n, 3), where the path from outside first meets the skin for good, seen from the target.
-        path_length: Shape (n,), target to entry.
-        skin_angle: Shape (n,), between the path and the skin's inward normal.
-        reentry_depth: Shape (n,), where the needle would meet skin again, before where its flange waits.
-        unknown_depth: Shape (n,), where the path leaves the body through a cut, or 0 where the skin's crossings do not
-            add up.
+        path_length, skin_angle: Target to entry, and between the path and the skin's inward normal.
+        reentry_depth: Where the needle would meet skin again, before where its flange waits.
+        unknown_depth: Where the path leaves the body through a cut, or 0 where the skin's crossings do not add up.
     """
 
     entry_ct: Floats
@@ -213,13 +171,7 @@ class SkinPaths:
 
 
 def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, farthest: float) -> SkinPaths:
-    """Follow every path from the target outward.
-
-    Args:
-        target_ct: Shape (3,).
-        outward_ct: Shape (n, 3), unit vectors.
-        farthest: How far skin matters, mm: to where the flange can be while the tip waits.
-    """
+    """Follow every path from the target (3,) outward along unit vectors (n, 3), as far as the flange can be, mm."""
     found, settled = settled_crossings(skin.mesh, target_ct, outward_ct)
     has = found.count > 0
     first = found.first[has]

@@ -61,7 +61,7 @@ class StructureSources:
         name = section.source
         volume = self._labels(name)
         names = names_for(section.naming, self._case.folder, self._case.files.content, volume)
-        rules = self._kept_rules(section, names, volume.labels_present())
+        rules = self._kept_rules(section, names, volume.present().labels)
         return [partial(self._ruled, rule, volume, name, rule.label) for rule in rules]
 
     def _ruled(self, rule: LabelRule, volume: VolumeSurfaces | None, file: str, label: int) -> Structure:
@@ -108,42 +108,31 @@ class StructureSources:
         self.ignored.extend(rule.name for rule in selection.rules if rule.kind is RuleKind.IGNORE)
         yield from (rule for rule in selection.rules if rule.kind is not RuleKind.IGNORE)
 
-    def unnamed_warnings(self) -> list[str]:
+    def unnamed_warnings(self) -> Iterator[str]:
         """Maps from which the case takes single labels, and which hold others that nobody names."""
-        named: dict[str, set[int]] = {}
-        for section in self._case.structure:
-            if section.labelmap is not None and section.label is not None:
-                named.setdefault(section.labelmap, set()).add(section.label)
         whole = {section.source for section in self._case.structures}
-        return [w for name, labels in sorted(named.items()) if name not in whole for w in self._unnamed(name, labels)]
-
-    def _unnamed(self, name: str, labels: set[int]) -> list[str]:
-        volume = self._labels(name)
-        others = [label for label in volume.labels_present() if label not in labels]
-        if not others:
-            return []
-        names = (volume.names or {}) if name.lower().endswith(NRRD_ENDINGS) else {}
-        shown = first_few([f"{label} {names[label]}" if label in names else str(label) for label in others])
-        return [f"{name} has labels that the case does not list; they count as free: {shown}"]
+        listed = {(section.labelmap or "", section.label) for section in self._case.structure}
+        for name in sorted({name for name, _ in listed} - whole - {""}):
+            volume = self._labels(name)
+            others = [label for label in volume.present().labels if (name, label) not in listed]
+            names = (volume.names or {}) if name.lower().endswith(NRRD_ENDINGS) else {}
+            if others:
+                shown = first_few([f"{label} {names[label]}" if label in names else str(label) for label in others])
+                yield f"{name} has labels that the case does not list; they count as free: {shown}"
 
     def skin(self, section: StructureSection, structures: Sequence[Structure] = ()) -> Skin:
-        """The body's surface, from whatever the case names.
-
-        Args:
-            structures: What lies in the body, as far as it was read: where it is cut, the body is too.
-        """
+        """The body's surface, from whatever the case names; where structures within it are cut, the body is too."""
         self._progress(section.name)
         if volume := section.ct or section.labelmap:
             return self._seen(volume, section.label, structures, section.cut).skin()
         mesh, kept = self._mesh(section), self._cache.memory
         local = self._case.space is Space.LOCAL or section.cut is not None
-        ends = () if local else kept.get((flat_ends.__name__, mesh.digest), partial(flat_ends, mesh), _no_bytes)
+        ends = () if local else kept.get((flat_ends.__name__, mesh.digest), partial(flat_ends, mesh), len)
         if ends:
             what = f"skin mesh {section.mesh} has a flat end at side {', '.join(ends)}: was the body cut there?"
             allowed = f"cut = {json.dumps(ends)} where there is no skin, or cut = [] if all of it is skin"
             refuse(what, self._case.path, allowed, "skin_cut_unstated")
-        cut = section.cut or ()
-        return cached_skin(mesh, cut, self._cache)
+        return cached_skin(mesh, section.cut or (), self._cache)
 
     def _seen(
         self, name: str, label: int | None, structures: Sequence[Structure], stated: Sequence[str] | None
@@ -207,7 +196,6 @@ class StructureSources:
         return volume
 
     def _check_grid(self, grid: VolumeGrid, name: str) -> None:
-        """Whether labels kept where their voxels lie."""
         ct = self._case.skin_section.ct or self._case.ct.file
         if ct is not None:
             refuse_lost_grid(grid, self._case.volumes.source(ct).grid, where=self._file(name))
@@ -230,8 +218,3 @@ class StructureSources:
 
     def _file(self, name: str) -> Path:
         return self._case.folder / name
-
-
-def _no_bytes(ends: tuple[str, ...]) -> int:
-    """Of a few names."""
-    return 100 * len(ends)

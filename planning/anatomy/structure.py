@@ -5,7 +5,7 @@ The grids on which a case's labels lie: of each label map, and one of each folde
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -61,11 +61,7 @@ class Structure:
 
 @dataclass(frozen=True, eq=False)
 class LabelGrid:
-    """The voxels of a label map, or of all masks of a folder.
-
-    Attributes:
-        name: The file or folder, as the case writes it.
-    """
+    """The voxels of a label map, or of all masks of a folder, by its name as the case writes it."""
 
     name: str
     files: frozenset[str]
@@ -82,13 +78,10 @@ def label_grids(case: Case) -> tuple[LabelGrid, ...]:
     Raises:
         InputError: A header that cannot be trusted.
     """
-    return tuple(sorted(_grids(case), key=lambda grid: grid.name))
-
-
-def _grids(case: Case) -> Iterator[LabelGrid]:
     maps = {one.labelmap for one in case.structure} | {many.labelmap for many in case.structures}
     sources = {name: [name] for name in maps if name is not None}
     sets = [one.mask_set for one in case.structures if one.mask_set is not None]
     sources |= {one: list(case.masks(one).values()) for one in sets}
-    for name, files in sources.items():
-        yield LabelGrid(name, frozenset(files), case.volumes.source(files[0]).grid)
+    return tuple(
+        LabelGrid(name, frozenset(files), case.volumes.source(files[0]).grid) for name, files in sorted(sources.items())
+    )

@@ -4,22 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from puncture_twin.planning.anatomy.body import cut_ends
 from puncture_twin.planning.anatomy.body.body_mask import CtImage, ct_image
-from puncture_twin.planning.anatomy.body.cut_ends import (
-    Box,
-    Content,
-    FieldOfView,
-    content_of,
-    cut_ends,
-    end_warnings,
-    stated_ends,
-)
+from puncture_twin.planning.anatomy.body.cut_ends import Box, Content, FieldOfView
 from puncture_twin.planning.anatomy.body.tables import PATIENT, Shown
 from puncture_twin.planning.anatomy.skin import Skin, skin_from_label, skin_from_mesh, skin_of_image
 from puncture_twin.planning.base.arrays import Bools, Floats
@@ -34,24 +27,19 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 Value = TypeVar("Value")
 
+ENDS = ("last", "area_mm2", "thick", "wide")
+"""Of `Content`, by axis and end."""
 READERS = "puncture_twin.planning.case.named_files"
 """The module that knows every reader of volumes. A surface is made from what they read, and is made anew where one of
 them has changed; nothing here imports them, so that a case without DICOM does not load its library."""
 
-LARGEST = 4
-"""Voxels are held in memory where they take one of so many parts of it at most."""
-
-MASK_BYTES = 3
-"""Of a voxel, for what is found in a CT: the body, and what was not measured."""
+LARGEST, MASK_BYTES = 4, 3
+"""Voxels are held in memory where they take one of so many parts of it at most; and bytes of a voxel for what is found
+in a CT: the body, and what was not measured."""
 
 
 class Present(NamedTuple):
-    """The labels that a map or mask holds.
-
-    Attributes:
-        labels: Those that have a voxel, rising.
-        rounded_by: How far its values are off whole numbers.
-    """
+    """The labels of a map or mask that have a voxel, ascending, and how far its values are off whole numbers."""
 
     labels: tuple[int, ...]
     rounded_by: float
@@ -95,13 +83,9 @@ class VolumeSurfaces:
         """The names that the file holds for its labels."""
         return segment_names(self.source.grid.fields, self.path)
 
-    def labels_present(self) -> tuple[int, ...]:
-        """The labels that have a voxel, ascending."""
-        return self.present().labels
-
     def present(self) -> Present:
         """The labels that have a voxel, at least one."""
-        return self._kept("labels present", lambda: _of_present(self.labelmap), _to_labels)
+        return self._kept("labels present", lambda: _of_present(self.labelmap), _to_present)
 
     def mask(self) -> Present:
         """The voxels' value in a file that is one structure's mask; none where it is empty."""
@@ -111,7 +95,7 @@ class VolumeSurfaces:
             refuse_label_map(labels)
             return _of_present(labels)
 
-        return self._kept("mask label", make, _to_mask)
+        return self._kept("mask label", make, partial(_to_present, fewest=0, most=1))
 
     def label(self, label: int) -> TriangleMesh:
         """The surface of one label, LPS mm."""
@@ -143,25 +127,23 @@ class VolumeSurfaces:
             shown: What a person says of the image; for a phantom see `cut_ends`.
             stated: The sides at which the body was cut, where a person says so.
         """
-        content = self._kept(f"content {label}", lambda: self._content(label), _to_content)
-        cut = self._cut_ends(label, content, tuple(organs), shown) if stated is None else stated_ends(stated)
-        notes = end_warnings(content, cut, shown.phantom and stated is None)
-        return Imaged(self, content.box(cut), label, notes, replace(shown, whole=bool(content.inside)))
 
-    def _cut_ends(
-        self, label: int | None, content: Content, organs: Sequence[tuple[TriangleMesh, float]], shown: Shown
-    ) -> Bools:
+        def measured() -> Arrays:
+            if label is None:
+                return _of_content(self.ct_image.content)
+            labels = canonical(self.labelmap.labels, self.labelmap.T_ct_index)
+            return _of_content(cut_ends.content_of(labels.values == label, labels.T_ct_index))
+
+        content, organs = self._kept(f"content {label}", measured, _to_content), tuple(organs)
+
+        def found() -> Bools:
+            return cut_ends.cut_ends(content, organs, whole=shown.phantom)
+
         by = ((mesh.digest, voxel_mm) for mesh, voxel_mm in organs)
         key = (*self._key(f"ends {label}"), shown.phantom, *by)
-        return self.cache.memory.get(
-            key, lambda: cut_ends(content, organs, whole=shown.phantom), lambda ends: ends.nbytes
-        )
-
-    def _content(self, label: int | None) -> Arrays:
-        if label is None:
-            return _of_content(self.ct_image.content)
-        labels = canonical(self.labelmap.labels, self.labelmap.T_ct_index)
-        return _of_content(content_of(labels.values == label, labels.T_ct_index))
+        cut = self.cache.memory.get(key, found, _nbytes) if stated is None else cut_ends.stated_ends(stated)
+        notes = cut_ends.end_warnings(content, cut, shown.phantom and stated is None)
+        return Imaged(self, content.box(cut), label, notes, replace(shown, whole=bool(content.inside)))
 
     def held(self, what: str, make: Callable[[], Value], size: Callable[[Value], int]) -> Value:
         """Value made from this file, cached in memory alone, where that does not displace everything else."""
@@ -222,13 +204,14 @@ class Imaged:
 
     def skin(self) -> Skin:
         """The body's skin."""
-        kept = self.kept({"what": "skin", "label": self.label}, lambda: _of_skin(self._skin()), _to_skin, by=__name__)
-        return replace(kept, warnings=(*self.notes, *kept.warnings))
 
-    def _skin(self) -> Skin:
-        if self.label is None:
-            return skin_of_image(self.image)
-        return skin_from_label(self.surfaces.labelmap, self.label, self.box)
+        def make() -> Arrays:
+            if self.label is None:
+                return _of_skin(skin_of_image(self.image))
+            return _of_skin(skin_from_label(self.surfaces.labelmap, self.label, self.box))
+
+        kept = self.kept({"what": "skin", "label": self.label}, make, _to_skin, by=__name__)
+        return replace(kept, warnings=(*self.notes, *kept.warnings))
 
     def kept(
         self, made_from: Mapping[str, Any], make: Callable[[], Arrays], read: Callable[[Arrays], Value], *, by: str
@@ -289,35 +272,24 @@ def _of_present(labels: LabelMap) -> Arrays:
     return {"labels": np.array(labels.labels_present(), np.int64), "rounded_by": np.array(labels.rounded_by)}
 
 
+def _to_present(stored: Arrays, fewest: int = 1, most: float = np.inf) -> Present:
+    labels, rounded_by = stored["labels"], float(stored["rounded_by"])
+    whole = labels.ndim == 1 and labels.dtype == np.int64 and fewest <= len(labels) <= most
+    if not whole or not 0.0 <= rounded_by <= ROUNDED_BY:
+        raise ValueError("no list of labels")
+    return Present(tuple(labels.tolist()), rounded_by)
+
+
 def _of_content(content: Content) -> Arrays:
-    ends = {"last": content.last, "area_mm2": content.area_mm2, "thick": content.thick, "wide": content.wide}
-    return {"shape": np.array(content.shape), "T_ct_index": content.T_ct_index, **ends}
+    return {name: np.array(getattr(content, name)) for name in ("shape", "T_ct_index", *ENDS)}
 
 
 def _to_content(stored: Arrays) -> Content:
-    ends = [stored[name] for name in ("last", "area_mm2", "thick", "wide")]
-    shape, T_ct_index = stored["shape"], stored["T_ct_index"]
+    ends, shape, T_ct_index = [stored[name] for name in ENDS], stored["shape"], stored["T_ct_index"]
     if any(array.shape != (3, 2) for array in ends) or (shape.shape, T_ct_index.shape) != ((3,), (4, 4)):
         raise ValueError("three axes with two ends")
     return Content(tuple(shape.tolist()), T_ct_index, *ends)
 
 
-def _to_labels(stored: Arrays) -> Present:
-    found = _to_present(stored)
-    if not found.labels:
-        raise ValueError("no label")
-    return found
-
-
-def _to_mask(stored: Arrays) -> Present:
-    found = _to_present(stored)
-    if len(found.labels) > 1:
-        raise ValueError("at most one label")
-    return found
-
-
-def _to_present(stored: Arrays) -> Present:
-    labels, rounded_by = stored["labels"], float(stored["rounded_by"])
-    if labels.ndim != 1 or labels.dtype != np.int64 or not 0.0 <= rounded_by <= ROUNDED_BY:
-        raise ValueError("no list of labels")
-    return Present(tuple(labels.tolist()), rounded_by)
+def _nbytes(array: Bools) -> int:
+    return array.nbytes

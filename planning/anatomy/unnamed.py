@@ -57,39 +57,25 @@ class Unnamed(NamedTuple):
 def unnamed_surfaces(
     ct: CtImage, body: Bools, structures: Sequence[Named], *, dense_hu: float, slack_mm: float = 0.0
 ) -> Unnamed:
-    """Find dense components and gas inside the body outside of all structures grown by one voxel.
+    """Find dense components, from an HU on, and gas inside a CT's body outside of all structures grown by one voxel.
 
-    Args:
-        body: The CT's body, shape (nx, ny, nz).
-        dense_hu: From here on a voxel is dense.
-        slack_mm: So deep below the body's surface there may still be the ambient air, because the surface is from
-            elsewhere and was widened.
+    So deep below the body's surface as ``slack_mm`` there may still be the ambient air, where that is from elsewhere.
     """
-    holders = _marked(np.zeros(body.shape, bool), [one for one in structures if one.may_contain_gas], ct)
-    gas = ct.hu < GAS_HU
+    gas, named = ct.hu < GAS_HU, np.zeros(body.shape, bool)
     if gas.any():
-        gas &= _deep(body, ct, slack_mm) & ~grown(holders)
-    named = _marked(holders, [one for one in structures if not one.may_contain_gas], ct)
+        gas &= ~widened(~body, (SKIN_VOXELS,) * 3)  # beyond the border the body goes on
+        if slack_mm > 0.0 and not body.all():
+            gas &= scipy.ndimage.distance_transform_edt(body, sampling=ct.spacing_mm) > slack_mm
+    for holders in (True, False):
+        for one in structures:
+            if one.may_contain_gas == holders:
+                mark_inside(one.mesh, ct.T_ct_index, named)
+        if holders and gas.any():
+            gas &= ~grown(named)
     return Unnamed(_surface(body & (ct.hu >= dense_hu) & ~grown(named), ct), _surface(gas, ct))
 
 
-def _deep(body: Bools, ct: CtImage, slack_mm: float) -> Bools:
-    """Voxels so deep in the body that air in them is not the room's; beyond the border the body goes on."""
-    deep = ~widened(~body, (SKIN_VOXELS,) * 3)
-    if slack_mm > 0.0 and not body.all():
-        deep &= scipy.ndimage.distance_transform_edt(body, sampling=ct.spacing_mm) > slack_mm
-    return deep
-
-
-def _marked(mask: Bools, structures: Sequence[Named], ct: CtImage) -> Bools:
-    """The mask with the voxels of structures."""
-    for structure in structures:
-        mark_inside(structure.mesh, ct.T_ct_index, mask)
-    return mask
-
-
 def _surface(mask: Bools, ct: CtImage) -> TriangleMesh | None:
-    """The surface of the components that are large enough."""
     if not mask.any():
         return None
     box = box_in(mask)

@@ -11,9 +11,7 @@ the map becomes a closed surface of role ``unknown``; the air beyond it, outside
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -29,26 +27,32 @@ from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.labels.labelmaps import mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical
-from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
+from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
 from puncture_twin.planning.geometry.parts import voxels_inside
-from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rigid import apply, pose
 
 BEYOND_IMAGE = "beyond_image"
-"""Its name among the structures."""
-REACH_MM = 2000.0
-"""So far the body goes on along the bed, and half spaces to their sides: farther than a needle and its arm reach."""
-ASIDE_MM = 400.0
-"""So far it goes on beyond a face that cuts its side: no trunk is wider than 800 mm."""
+BEYOND_LABELS = "beyond_labels"
+"""Their names among the structures."""
+REACH_MM, ASIDE_MM = 2000.0, 400.0
+"""So far the body goes on along the bed, and half spaces to their sides: farther than a needle and its arm reach. And
+beyond a face that cuts its side: no trunk is wider than 800 mm."""
 USUAL_MM = 150.0
 """By so much a body without arms is wider than where an image cuts it: hips below a waist, shoulders above a chest."""
 ARM_MM3 = 1.5e5
 """An adult's arm has this in 40 mm of its length, a child's in 100; no bottle or cushion lies at both sides."""
-OUTLINE_MM = 10.0
-"""So near to a face points belong to its outline: half of the thickest slice."""
-SAME_MM = 0.01
-"""Corners of an outline that are no farther apart are one."""
+OUTLINE_MM, SAME_MM = 10.0, 0.01
+"""So near to a face points belong to its outline (half of the thickest slice); corners of it no farther apart are one.
+"""
 TANGENTS = 32
 """Sides of the polygon about an outline: about a circle of 200 mm it is 1 mm too wide at most."""
+VOXELS_OF_SLACK, CELL_MM = 1.0, 2.0
+"""A map may end so many voxels inside the skin's box: the skin itself is found to that. And the least edge of the cells
+by which the body beyond a map is found; it is widened by one cell to all sides."""
+ENDS = (
+    "label map {name} ends {voxels:.0f} voxels inside the body, within the needle's reach: the space beyond is unknown"
+)
 
 
 class Assumed(NamedTuple):
@@ -68,8 +72,7 @@ class Beyond(NamedTuple):
 def beyond_images(case: Case, skin: Skin, scan: Scan | None, memory: Memory = NO_MEMORY) -> Beyond:
     """Solids assumed beyond the image of a case's skin, and beyond a CT that is smaller than a skin from elsewhere.
 
-    Args:
-        memory: Holds each solid: of one patient it is the same for every target.
+    Of one patient they are the same for every target.
     """
     at_ends = skin.mesh.vertices[np.unique(skin.mesh.faces[skin.cut_faces])]  # their outlines, and nothing before them
     ends = [] if skin.field_of_view is None else [(skin.field_of_view, at_ends)]
@@ -128,7 +131,6 @@ def beyond_image(view: FieldOfView, points_ct: Floats, wider_mm: float, moved_ct
     """The solid beyond a box that cuts the body at one face at least, closed, LPS mm.
 
     Args:
-        view: The box and its faces that cut the body.
         points_ct: Shape (n, 3), of the body's surface, those of its outlines at the faces among them.
         wider_mm: To the sides; infinite for all beyond the faces' planes.
         moved_ct: Shape (3,), how far what lies there may come toward the image as the body breathes, mm.
@@ -198,146 +200,69 @@ def _finding(view: FieldOfView, what: Assumed, own: str) -> Finding:
     return Finding(BEYOND_IMAGE, Severity.WARNING, f"{said} ({BEYOND_IMAGE}; {what.because}{way_out}{own})", numbers)
 
 
-BEYOND_LABELS = "beyond_labels"
-"""Its name among the structures."""
-
-VOXELS_OF_SLACK = 1.0
-"""A map may end so many voxels inside the skin's box: the skin itself is found to that."""
-
-CELL_MM = 2.0
-"""Least edge of the cells by which the body beyond a map is found; it is widened by one cell to all sides."""
-
-ENDS = (
-    "label map {name} ends {voxels:.0f} voxels inside the body, within the needle's reach: the space beyond is unknown"
-)
-
-
-class BeyondLabels(NamedTuple):
-    """The body beyond all maps of a case.
-
-    Attributes:
-        mesh: Closed, LPS mm; None where every map holds the body within the needle's reach.
-        margin_mm: What an organ that is not seen there may demand, and half a voxel.
-    """
-
-    mesh: TriangleMesh | None
-    margin_mm: float
-    warnings: tuple[str, ...]
-
-    @property
-    def structures(self) -> tuple[Structure, ...]:
-        """The one of role ``unknown`` that it is, or none."""
-        if self.mesh is None:
-            return ()
-        at_map = np.zeros((3, 3))  # where the map ends is known; the margin has half a voxel
-        return (Structure(BEYOND_LABELS, Role.UNKNOWN, self.margin_mm, self.mesh, BEYOND_LABELS, voxel_ct=at_map),)
-
-
-@dataclass(frozen=True, eq=False)
-class _Extent:
-    """A map against the body, both in the map's voxels, which may be oblique to the patient.
-
-    Attributes:
-        low, high: Shape (3,), of the body within the needle's reach.
-    """
-
-    grid: LabelGrid
-    low: Floats
-    high: Floats
-
-    @property
-    def box(self) -> tuple[Floats, Floats]:
-        """The map's outer faces."""
-        return np.full(3, -0.5), np.array(self.grid.voxels.shape) - 0.5
-
-    @property
-    def gaps(self) -> Floats:
-        """Number of voxels by which the body goes on beyond each low and high face, shape (2, 3)."""
-        low, high = self.box
-        return np.stack([low - self.low, self.high - high])
-
-
-def beyond_labels(case: Case, skin: Skin, structures: Sequence[Structure], memory: Memory = NO_MEMORY) -> BeyondLabels:
-    """Find where label maps end inside the body.
+def beyond_labels(
+    case: Case, skin: Skin, structures: Sequence[Structure], memory: Memory = NO_MEMORY
+) -> tuple[tuple[Structure, ...], tuple[str, ...]]:
+    """The body beyond the label maps that end in it, as one structure or none, and a warning for each such map.
 
     An organ that the map would have shown demands its margin of the needle's surface. So the margin of what is beyond
     is the largest that the case demands of any label of the map, and half a voxel more: a label that ends at the map's
     face has its edges cut off by so much there.
 
-    Args:
-        skin: The case's skin; where it is open, a map that ends is refused.
-
     Raises:
         InputError: A map that does not hold the target, or one that ends in a body whose skin is open.
     """
-    meshes, margins, warnings = [], [0.0], []
+    meshes, margins, warnings = list[TriangleMesh](), [0.0], []
     for grid in label_grids(case):
-        margin = _largest_margin(case, grid, structures) + float(grid.voxels.spacing_mm.max()) / 2
-        extent = _extent(case, skin.mesh, grid, margin, memory)
-        if not grid.voxels.holds(case.target_ct):
+        voxels = grid.voxels
+        if not voxels.holds(case.target_ct):
             what = f"label map {grid.name} does not contain the target, so its surroundings are unknown"
             refuse(what, case.path, "label maps that contain the target", "labels_end")
-        if extent.gaps.max() <= VOXELS_OF_SLACK:
+        sections = [one for one in case.structures if one.source == grid.name]
+        named = [margin for one in sections for margin in (*one.avoid.values(), *one.unknown.values())]
+        margin = max([case.ct.margin_mm, *named, *(one.margin_mm for one in grid.own(structures))])
+        margin += float(voxels.spacing_mm.max()) / 2
+        body, faces = _near_body(case, skin.mesh, voxels, margin, memory), np.full((2, 3), -0.5)  # low and high
+        faces[1] += voxels.shape
+        gaps = (faces - body) * [[1.0], [-1.0]]  # voxels by which the body goes on beyond each face of the map
+        if gaps.max() <= VOXELS_OF_SLACK:
             continue
-        said = ENDS.format(name=grid.name, voxels=extent.gaps.max())
+        said = ENDS.format(name=grid.name, voxels=gaps.max())
         if not skin.mesh.closed:
             allowed = "a label map of the whole body about the target, or a closed skin"
             refuse(f"{said} (the skin is open)", case.path, allowed, "labels_end")
         warnings.append(f"{said} ({BEYOND_LABELS})")
         margins.append(margin)
-        meshes += list(_slabs(extent, skin.mesh))
-    return BeyondLabels(joined(meshes) if meshes else None, max(margins), tuple(warnings))
+        for end, axis in np.argwhere(gaps > 0.0).tolist():
+            beyond = body.copy()
+            beyond[1 - end, axis] = faces[end, axis]
+            meshes += _body_between(grid, skin.mesh, beyond, axis, end)
+    if not meshes:
+        return (), tuple(warnings)
+    at_map = np.zeros((3, 3))  # where the map ends is known; the margin has half a voxel
+    solid = Structure(BEYOND_LABELS, Role.UNKNOWN, max(margins), joined(meshes), BEYOND_LABELS, voxel_ct=at_map)
+    return (solid,), tuple(warnings)
 
 
-def _largest_margin(case: Case, grid: LabelGrid, structures: Sequence[Structure]) -> float:
-    """Largest margin, mm, of structures that may lie beyond an image: those that patterns name, and unnamed ones."""
-    sections = [one for one in case.structures if one.source == grid.name]
-    named = [margin for one in sections for margin in (*one.avoid.values(), *one.unknown.values())]
-    return max([case.ct.margin_mm, *named, *(one.margin_mm for one in grid.own(structures))])
-
-
-def _extent(case: Case, skin: TriangleMesh, grid: LabelGrid, margin_mm: float, memory: Memory) -> _Extent:
-    T_index_ct = np.linalg.inv(grid.voxels.T_ct_index)
-
-    def box() -> Floats:
-        body = apply(T_index_ct, skin.vertices)
-        return np.stack([body.min(axis=0), body.max(axis=0)])
-
-    low, high = memory.get((__name__, skin.digest, T_index_ct.tobytes()), box, lambda ends: ends.nbytes)
+def _near_body(case: Case, skin: TriangleMesh, voxels: VolumeGrid, margin_mm: float, memory: Memory) -> Floats:
+    """Low and high corner of the body within the needle's reach, in a map's voxels, which may be oblique: (2, 3)."""
+    T_index_ct = np.linalg.inv(voxels.T_ct_index)
+    key = (__name__, skin.digest, T_index_ct.tobytes())
+    low, high = memory.get(key, lambda: box_of(apply(T_index_ct, skin.vertices)), lambda ends: ends.nbytes)
     target = apply(T_index_ct, case.target_ct[None])[0]
     # |row| is how many voxels an axis advances for a step of 1 mm along its normal
     reach = (case.needle.length_mm + margin_mm) * np.linalg.norm(T_index_ct[:3, :3], axis=1)
-    return _Extent(grid, np.maximum(low, target - reach), np.minimum(high, target + reach))
+    return np.stack([np.maximum(low, target - reach), np.minimum(high, target + reach)])
 
 
-def _slabs(extent: _Extent, skin: TriangleMesh) -> Iterator[TriangleMesh]:
-    """The body beyond each face of the map, which it exceeds, as closed surfaces."""
-    for end, axis in itertools.product(range(2), range(3)):
-        if extent.gaps[end, axis] <= 0:
-            continue
-        low, high = extent.low.copy(), extent.high.copy()
-        (high if end == 0 else low)[axis] = extent.box[end][axis]
-        mesh = _body_between(extent.grid, skin, low, high, axis, end)
-        if mesh is not None:
-            yield mesh
-
-
-def _body_between(
-    grid: LabelGrid, skin: TriangleMesh, low: Floats, high: Floats, axis: int, end: int
-) -> TriangleMesh | None:
-    """The body between two corners, voxels, in cells of which one layer ends in the map's face."""
-    step = np.maximum(1.0, CELL_MM / grid.voxels.spacing_mm)
+def _body_between(grid: LabelGrid, skin: TriangleMesh, corners: Floats, axis: int, end: int) -> Iterator[TriangleMesh]:
+    """The body between two corners, voxels, where there is any, in cells of which one layer ends in the map's face."""
+    (low, high), step = corners, np.maximum(1.0, CELL_MM / grid.voxels.spacing_mm)
     count = np.ceil((high - low) / step).astype(int) + 2
     first = low - step / 2
-    if end == 0:
-        first[axis] = high[axis] - (count[axis] - 0.5) * step[axis]
-    else:
-        first[axis] = low[axis] + step[axis] / 2
-    T_index_cell = np.eye(4)
-    T_index_cell[:3, :3], T_index_cell[:3, 3] = np.diag(step), first
-    T_ct_cell = grid.voxels.T_ct_index @ T_index_cell
+    first[axis] = low[axis] + step[axis] / 2 if end else high[axis] - (count[axis] - 0.5) * step[axis]
+    T_ct_cell = grid.voxels.T_ct_index @ pose(np.diag(step), first)
     inside = widened(voxels_inside(skin, T_ct_cell, tuple(count)), (1, 1, 1))
-    if not inside.any():
-        return None
-    oriented = canonical(inside, T_ct_cell)
-    return mask_surface(oriented.values, oriented.T_ct_index, where=grid.name)
+    if inside.any():
+        oriented = canonical(inside, T_ct_cell)
+        yield mask_surface(oriented.values, oriented.T_ct_index, where=grid.name)

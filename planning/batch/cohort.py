@@ -9,7 +9,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -23,25 +23,20 @@ from puncture_twin.planning.base.provenance import Input, content_input
 from puncture_twin.planning.base.text import unprintable_texts
 from puncture_twin.planning.base.toml_file import SchemaOne, parse_toml
 from puncture_twin.planning.case.options import NO_OPTIONS, SECTIONS, CaseOptions, case_options
-from puncture_twin.planning.case.toml_types import Section, Text
+from puncture_twin.planning.case.tables import Section, Text
 
 CASE_FILE = "case.toml"
 
 ALLOWED = f"a folder with {CASE_FILE} files, a CSV with the header 'case', or a cohort.toml"
 
 MAX_FILE_BYTES = 200_000_000
-"""A million lines of two hundred characters."""
+MOST_CASES = 1_000_000
+"""A million lines of two hundred characters. More cases of one cohort are a slip in a grid of options."""
 
 
 @dataclass(frozen=True)
 class CohortCase:
-    """One case with its options.
-
-    Attributes:
-        path: The case file, or the folder that holds ``case.toml``.
-        name: What people call it; "" leaves it to the case.
-        options: What is stated in place of what the case states.
-    """
+    """One case with its options: its file, or the folder that holds ``case.toml``; "" leaves the name to the case."""
 
     stated: str
     path: Path
@@ -49,54 +44,39 @@ class CohortCase:
     options: CaseOptions = NO_OPTIONS
 
 
-MOST_CASES = 1_000_000
-"""Cases of one cohort: more is a slip in a grid of options."""
-
-
 def read_cohort(cohort: Path) -> tuple[tuple[CohortCase, ...], tuple[Input, ...]]:
     """The cases of a cohort, in its order, and the file that lists them, if one does.
 
-    Args:
-        cohort: A folder: every ``case.toml`` below it. A ``.csv`` or ``.toml`` file: what it lists.
+    Of a folder every ``case.toml`` below it; of a ``.csv`` or ``.toml`` file what it lists.
 
     Raises:
         InputError: Something else, a file that cannot be read whole, or no case at all.
     """
-    inputs: tuple[Input, ...] = ()
+    inputs, readers = tuple[Input, ...](), {".csv": csv_cases, ".toml": toml_cases}
     if is_folder(cohort):
         cases = _folder_cases(cohort)
+    elif cohort.suffix.lower() in readers:
+        content = read_input(cohort, max_bytes=MAX_FILE_BYTES, where=str(cohort))
+        cases = readers[cohort.suffix.lower()](content, cohort)
+        inputs = (content_input("cohort", cohort.name, content),)
     else:
-        cases, inputs = _listed_cases(cohort)
+        refuse("is not a cohort", cohort, ALLOWED, "not_a_cohort")
     if not 0 < len(cases) <= MOST_CASES:
         what = f"has {len(cases)} cases" if cases else "has no case"
         refuse(what, cohort, f"1 to {MOST_CASES} cases: {ALLOWED}", "cohort_size")
-    for one in cases:
-        _check_path(one, cohort)
+    for one in cases:  # no table can hold another path: a case that cannot be named would be lost
+        try:
+            str(one.path.absolute()).encode("utf-8")
+        except UnicodeEncodeError as error:
+            what = f"the path '{one_line(one.stated, 100)}' is not UTF-8"
+            raise InputError(what, where=cohort, allowed="cases with UTF-8 paths", code="not_text") from error
     return tuple(cases), inputs
 
 
-def _check_path(case: CohortCase, cohort: Path) -> None:
-    """Refuse a path that no table can hold: a case that cannot be named would be lost."""
-    try:
-        str(case.path.absolute()).encode("utf-8")
-    except UnicodeEncodeError as error:
-        what = f"the path '{one_line(case.stated, 100)}' is not UTF-8"
-        raise InputError(what, where=cohort, allowed="cases with UTF-8 paths", code="not_text") from error
-
-
-def _listed_cases(path: Path) -> tuple[list[CohortCase], tuple[Input, ...]]:
-    readers = {".csv": csv_cases, ".toml": toml_cases}
-    if path.suffix.lower() not in readers:
-        refuse("is not a cohort", path, ALLOWED, "not_a_cohort")
-    content = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
-    return readers[path.suffix.lower()](content, path), (content_input("cohort", path.name, content),)
-
-
 def _folder_cases(cohort: Path) -> list[CohortCase]:
-    """Every case file below a folder, also behind links to folders, each folder once; none that cannot be looked into.
+    """Every case file below a folder, also behind links to folders, each folder once.
 
-    Raises:
-        InputError: A folder that cannot be read, or a link to nothing next to folders: a patient would be lost.
+    What cannot be read, or a link to nothing next to folders, is refused: a patient would be lost.
     """
     found, seen = [], set[str]()
     for folder, below, files in os.walk(cohort, followlinks=True, onerror=_refuse_unreadable):
@@ -130,11 +110,7 @@ LONGEST_CELL = 20_000
 
 
 def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
-    """The cases that a CSV lists.
-
-    Raises:
-        InputError: No column ``case``, an unknown column, or a line that cannot be used; names the line.
-    """
+    """The cases that a CSV lists; what cannot be used is refused with its line."""
     rows = _rows(content, path)
     header = _header(next(rows, []), path)
     cases = []
@@ -149,7 +125,6 @@ def csv_cases(content: bytes, path: Path) -> list[CohortCase]:
 
 
 def _rows(content: bytes, path: Path) -> Any:
-    """Lines of a CSV as a reader that counts them."""
     text = decode_text(content, str(path))
     if "\0" in text or max(map(len, text.splitlines()), default=0) > LONGEST_CELL:
         refuse("is not a CSV file", path, f"text, lines of at most {LONGEST_CELL} characters", "not_csv")
@@ -173,10 +148,6 @@ def _case(cells: dict[str, str], path: Path, where: str) -> CohortCase:
     stated = cells[CASE]
     if not stated.strip() or any(unprintable_texts(cells)):
         refuse("the case is empty or not printable", where, "the path of a case", "bad_name")
-    return CohortCase(stated, path.parent / stated.strip(), cells.get(NAME, "").strip(), _options(cells, where))
-
-
-def _options(cells: dict[str, str], where: str) -> CaseOptions:
     sections: dict[str, dict[str, Any]] = {}
     if cells.get(TARGET, "").strip():
         sections["target"] = target_option(cells[TARGET].strip())
@@ -184,7 +155,8 @@ def _options(cells: dict[str, str], where: str) -> CaseOptions:
         kind, _, key = name.partition(".")
         if key and cell.strip():
             sections.setdefault(kind, {})[key] = _value(cell.strip())
-    return case_options(sections, where=where)
+    options = case_options(sections, where=where)
+    return CohortCase(stated, path.parent / stated.strip(), cells.get(NAME, "").strip(), options)
 
 
 def target_option(text: str) -> dict[str, Any]:
@@ -245,18 +217,18 @@ class _Choice(NamedTuple):
 
 
 def toml_cases(content: bytes, path: Path) -> list[CohortCase]:
-    """The cases that a cohort file describes: every match of its patterns with every combination of its options.
-
-    Raises:
-        InputError: Not of this schema, a pattern that matches nothing, or too many combinations.
-    """
+    """The cases that a cohort file describes: every match of its patterns with every combination of its options."""
     stated = parse_toml(content, path, CohortFile, allowed=ALLOWED_TOML, keys=KEYS)
     found = _matches(stated.cases, path)
     axes = [axis for name, kind in AXES.items() if (axis := _axis(getattr(stated, name), name, kind, path))]
     count = len(found) * math.prod(len(axis) for axis in axes)
     if count > MOST_CASES:
         refuse(f"gives {count} cases", path, f"at most {MOST_CASES}", "cohort_size")
-    combinations = [_combined(choices, path) for choices in product(*axes)]
+    combinations = []
+    for choices in product(*axes):
+        name = ", ".join(f"{one.kind} {one.name}" for one in choices)
+        options = case_options({one.kind: dict(one.values) for one in choices}, where=str(path))
+        combinations.append((name, options))
     return [CohortCase(one, path.parent / one, name, options) for one in found for name, options in combinations]
 
 
@@ -289,13 +261,3 @@ def _table(values: Any, kind: str, where: str) -> Mapping[str, Any]:
         return {"model": values}
     what = f"option '{kind}' is not a table"
     raise InputError(what, where=where, allowed="keys and values, as in the case", code="not_a_table")
-
-
-def _combined(choices: Sequence[_Choice], path: Path) -> tuple[str, CaseOptions]:
-    name = ", ".join(_labels(choices))
-    return name, case_options({one.kind: dict(one.values) for one in choices}, where=str(path))
-
-
-def _labels(choices: Sequence[_Choice]) -> Iterator[str]:
-    for one in choices:
-        yield f"{one.kind} {one.name}"

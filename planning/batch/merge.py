@@ -33,15 +33,13 @@ NOT_RUN = "not run"
 
 def merged_rows(cases: Sequence[PlannedCase], out: Path) -> list[dict[str, Any]]:
     """A row for each case of the plan, in its order; one that has none yet says so."""
-    return [_row(one, out) for one in cases]
-
-
-def _row(planned: PlannedCase, out: Path) -> dict[str, Any]:
-    found = read_row(out, planned.id)
-    if found is None:
-        return blank_row(planned, None, NOT_RUN) | {"directions": None, "safe": None}
-    stated = {name: getattr(planned, name) for name in ("case", "name")}
-    return {name: found.get(name) for name in SCHEMA.names} | stated
+    rows = []
+    for one in cases:
+        found = read_row(out, one.id)
+        blank = blank_row(one, None, NOT_RUN) | {"directions": None, "safe": None}
+        known = found and {name: found.get(name) for name in SCHEMA.names} | {"case": one.case, "name": one.name}
+        rows.append(known or blank)
+    return rows
 
 
 def write_cases(rows: Sequence[dict[str, Any]], path: Path) -> None:
@@ -54,9 +52,6 @@ def write_dataset(rows: Sequence[dict[str, Any]], out: Path, folder: Path, progr
 
     Every part has the union of all columns: readers take the first part's for the whole, and drop an organ that only
     later cases have, or stop.
-
-    Raises:
-        InputError: Two cases give a column of one name two types.
     """
     ids = list(dict.fromkeys(row["id"] for row in rows if (out / row["id"] / TABLE_NAME).is_file()))
     schema = union_schema([pq.read_schema(out / one / TABLE_NAME) for one in ids], out)
@@ -68,11 +63,7 @@ def write_dataset(rows: Sequence[dict[str, Any]], out: Path, folder: Path, progr
 
 
 def union_schema(schemas: Sequence[pa.Schema], where: Path) -> pa.Schema:
-    """Every column of any, in the order of their first tables.
-
-    Raises:
-        InputError: A column of two types.
-    """
+    """Every column of any, in the order of their first tables; one of two types is refused."""
     fields: dict[str, pa.Field] = {}
     for schema in schemas:
         for one in schema:
@@ -90,34 +81,23 @@ def widened(table: pa.Table, schema: pa.Schema) -> pa.Table:
 
 
 NO_SAFE = "no safe direction"
+ENTRY = ("best_entry_x_mm", "best_entry_y_mm", "best_entry_z_mm")
 
 SCHEMA = pa.schema(
     [
-        ("case", pa.string()),
-        ("id", pa.string()),
-        ("name", pa.string()),
+        *((name, pa.string()) for name in ("case", "id", "name")),
         ("exit_code", pa.int64()),
         ("reason", pa.string()),
-        ("directions", pa.int64()),
-        ("safe", pa.int64()),
-        ("best_theta_deg", pa.float64()),
-        ("best_beta_deg", pa.float64()),
-        ("best_clearance_mm", pa.float64()),
-        ("best_path_length_mm", pa.float64()),
-        ("best_skin_angle_deg", pa.float64()),
-        ("best_entry_x_mm", pa.float64()),
-        ("best_entry_y_mm", pa.float64()),
-        ("best_entry_z_mm", pa.float64()),
-        ("best_p_hit", pa.float64()),
-        ("best_p_touch_any", pa.float64()),
+        *((name, pa.int64()) for name in ("directions", "safe")),
+        *((f"best_{name}_deg", pa.float64()) for name in ("theta", "beta")),
+        *((f"best_{name}", pa.float64()) for name in ("clearance_mm", "path_length_mm", "skin_angle_deg")),
+        *((name, pa.float64()) for name in ENTRY),
+        *((f"best_p_{name}", pa.float64()) for name in ("hit", "touch_any")),
         ("windows", pa.int64()),
-        ("safe_square_deg", pa.float64()),
-        ("safe_entry_cm2", pa.float64()),
-        ("reach_fraction", pa.float64()),
+        *((name, pa.float64()) for name in ("safe_square_deg", "safe_entry_cm2", "reach_fraction")),
         ("arm", pa.string()),
         ("page", pa.bool_()),
-        ("options", pa.string()),
-        ("inputs", pa.string()),
+        *((name, pa.string()) for name in ("options", "inputs")),
     ]
 )
 """Columns of ``cases.parquet``: ``case`` as the cohort writes it; ``reason`` is null where ``exit_code`` is 0;
@@ -133,19 +113,14 @@ def blank_row(planned: PlannedCase, exit_code: int | None, reason: str | None) -
 
 def searched_row(planned: PlannedCase, context: CaseContext, candidates: Candidates) -> dict[str, Any]:
     """The row of a case that was searched."""
-    safe = int(candidates.safe.sum())
-    row = blank_row(planned, 0 if safe else 1, None if safe else no_safe_reason(candidates))
+    safe, counts = int(candidates.safe.sum()), candidates.counts()
+    most = f" (most: {next(iter(counts))})" if counts else ""  # the reason of most directions, where none is safe
+    row = blank_row(planned, 0 if safe else 1, None if safe else f"{NO_SAFE}{most}")
     row |= {"directions": len(candidates), "safe": safe, "arm": context.arm, "reach_fraction": _reach(candidates)}
     windows = candidates.windows
     row |= {"windows": len(windows), "safe_square_deg": sum(one.square_deg for one in windows)}
     row |= {"safe_entry_cm2": sum(one.entry_cm2 for one in windows)}
     return row | _best(candidates) if safe else row
-
-
-def no_safe_reason(candidates: Candidates) -> str:
-    """The reason of most directions, where none is safe."""
-    counts = candidates.counts()
-    return f"{NO_SAFE} (most: {next(iter(counts))})" if counts else NO_SAFE
 
 
 def _best(candidates: Candidates) -> dict[str, Any]:
@@ -172,19 +147,13 @@ def _reach(candidates: Candidates) -> float | None:
 MAX_TABLE_BYTES = 2_000_000_000
 ALLOWED = f"a cohort's folder after `batch merge`, or its {CASES_NAME}"
 NEEDED = ("case", "options", "exit_code", "reason", "safe", "best_clearance_mm", "best_theta_deg", "best_beta_deg")
-ENTRY = ("best_entry_x_mm", "best_entry_y_mm", "best_entry_z_mm")
 
 CaseKey = tuple[str, str, int]
 """Case as written, options, and which of several with both alike: what stays when inputs or versions change."""
 
 
 class CaseChange(NamedTuple):
-    """One case in two cohorts.
-
-    Attributes:
-        before: The case's row in the first; None where it is not there.
-        after: The second cohort's row of the case.
-    """
+    """One case in two cohorts: its row in the first and in the second; None where it is not there."""
 
     case: str
     options: str
@@ -205,7 +174,10 @@ class CaseChange(NamedTuple):
     @property
     def moved_mm(self) -> float | None:
         """Distance between the best entries on the skin, mm; None without two."""
-        return _distance(_vector(self.before), _vector(self.after))
+        entries = [row and [row[name] for name in ENTRY] for row in (self.before, self.after)]
+        if any(entry is None or None in entry for entry in entries):
+            return None
+        return float(np.linalg.norm(np.diff(np.array(entries, np.float64), axis=0)))
 
     @property
     def clearance_mm(self) -> float | None:
@@ -216,11 +188,7 @@ class CaseChange(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two cohorts compared, case by case.
-
-    Attributes:
-        changes: In the order of the second, then what only the first has.
-    """
+    """Two cohorts compared, case by case, in the order of the second, then what only the first has."""
 
     changes: tuple[CaseChange, ...]
 
@@ -236,7 +204,13 @@ class Comparison:
 
     def beyond(self, tolerance_mm: float) -> list[CaseChange]:
         """The cases whose verdict changed, or whose best clearance did by more than so much."""
-        return [one for one in self.changes if one.kind != "same" or not _unchanged(one, tolerance_mm)]
+        found = []
+        for one in self.changes:
+            clearances = [row["best_clearance_mm"] for row in (one.before, one.after) if row is not None]
+            alike = one.clearance_mm is None or abs(one.clearance_mm) <= tolerance_mm
+            if one.kind != "same" or clearances.count(None) == 1 or not alike:
+                found.append(one)
+        return found
 
 
 def compare(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, Any]]) -> Comparison:
@@ -247,14 +221,7 @@ def compare(before: Sequence[Mapping[str, Any]], after: Sequence[Mapping[str, An
 
 
 def read_cases(place: Path) -> list[dict[str, Any]]:
-    """The rows of a merged cohort.
-
-    Args:
-        place: Its folder, or its ``cases.parquet``.
-
-    Raises:
-        InputError: There is none, or it is something else.
-    """
+    """The rows of a merged cohort, by its folder or its ``cases.parquet``; anything else is refused."""
     path = place / CASES_NAME if is_folder(place) else place
     data = read_input(path, max_bytes=MAX_TABLE_BYTES, where=str(path))
     try:
@@ -282,20 +249,3 @@ def _keyed(rows: Iterable[Mapping[str, Any]]) -> dict[CaseKey, Mapping[str, Any]
         found[(*key, seen[key])] = row
         seen[key] += 1
     return found
-
-
-def _unchanged(change: CaseChange, tolerance_mm: float) -> bool:
-    """Whether the best clearance is unchanged; one that only one of them has is not."""
-    one, other = change.before, change.after
-    if one is None or other is None or (one["best_clearance_mm"] is None) != (other["best_clearance_mm"] is None):
-        return False
-    return change.clearance_mm is None or abs(change.clearance_mm) <= tolerance_mm
-
-
-def _vector(row: Mapping[str, Any] | None) -> list[float] | None:
-    values = [None if row is None else row[name] for name in ENTRY]
-    return None if None in values else [float(value) for value in values if value is not None]
-
-
-def _distance(one: list[float] | None, other: list[float] | None) -> float | None:
-    return None if one is None or other is None else float(np.linalg.norm(np.subtract(one, other)))

@@ -14,7 +14,8 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -41,9 +42,7 @@ from puncture_twin.planning.batch.cohort import CohortCase
 from puncture_twin.planning.case.case import ALLOWED_CASE, load_case
 from puncture_twin.planning.case.options import case_options
 
-PLAN_NAME = "plan.parquet"
-MAX_PLAN_BYTES = 2_000_000_000
-ID_DIGITS = 32
+PLAN_NAME, MAX_PLAN_BYTES, ID_DIGITS = "plan.parquet", 2_000_000_000, 32
 """Hexadecimal digits of an id: 128 bits, and too many digits for a number in any reader of partitions."""
 
 OWN_FOLDER = "the case's folder"
@@ -71,27 +70,12 @@ class PlannedCase:
     refusal: str
 
 
-SCHEMA = pa.schema(
-    [
-        ("case", pa.string()),
-        ("id", pa.string()),
-        ("name", pa.string()),
-        ("path", pa.string()),
-        ("options", pa.string()),
-        ("arm", pa.bool_()),
-        ("inputs", pa.string()),
-        ("refusal", pa.string()),
-    ]
-)
+SCHEMA = pa.schema([(one.name, pa.bool_() if one.name == "arm" else pa.string()) for one in fields(PlannedCase)])
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A cohort's plan.
-
-    Attributes:
-        version: Of this package, when it was made.
-    """
+    """A cohort's plan, and the version of this package that made it."""
 
     cases: tuple[PlannedCase, ...]
     sha256: str
@@ -99,11 +83,7 @@ class Plan:
 
 
 def case_id(options: str, arm: bool | None, inputs: Sequence[Input], refusal: str) -> str:
-    """The id of a case: the same bytes, options and version give the same id, wherever the files lie.
-
-    Args:
-        refusal: Why it cannot be read, or "".
-    """
+    """The id of a case: the same bytes, options and version give the same id, wherever the files lie."""
     stated = [(one.role, "" if one.role == CASE_ROLE else one.path, one.sha256) for one in inputs]
     decides = {"version": version("puncture-twin"), "options": options, "arm": arm, "refusal": refusal}
     text = json.dumps({**decides, "inputs": sorted(stated)}, sort_keys=True)
@@ -124,19 +104,13 @@ def identified(row: PlannedCase) -> PlannedCase:
         inputs, refusal, name = case.inputs, "", case.name
         called = f"{name}: {row.name}" if row.name and row.options != "{}" else row.name or name
     except PlanningError as error:
-        inputs, refusal, called = _readable(row), relative_text(str(error), row), row.name
+        refusal, called, inputs = relative_text(str(error), row), row.name, ()
+        with suppress(InputError):  # the case file, where it can be read
+            path = find_toml(row.path, "case.toml")
+            inputs = (content_input(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE)),)
     stated = json.dumps(inputs_document(inputs))
     found = replace(row, id=case_id(row.options, row.arm, inputs, refusal), inputs=stated, refusal=refusal)
     return found if row.id else replace(found, name=called)
-
-
-def _readable(row: PlannedCase) -> tuple[Input, ...]:
-    """The case file of a refused case, where it can be read."""
-    try:
-        path = find_toml(row.path, "case.toml")
-        return (content_input(CASE_ROLE, path.name, read_toml_bytes(path, ALLOWED_CASE)),)
-    except InputError:
-        return ()
 
 
 def relative_text(text: str, row: PlannedCase) -> str:
@@ -155,11 +129,7 @@ def write_plan_table(rows: Sequence[PlannedCase], path: Path) -> None:
 
 
 def read_plan_table(out: Path) -> Plan:
-    """The plan of a folder.
-
-    Raises:
-        InputError: There is none, or it is not the one that was written.
-    """
+    """The plan of a folder; none, or one that is not as it was written, is refused."""
     path = out / PLAN_NAME
     if not path.is_file():
         refuse("has no plan", out, NO_PLAN, "no_batch_plan")
@@ -199,7 +169,6 @@ def commit(draft: Path, out: Path, case_id: str, inputs: Sequence[Input], timing
     """Put a draft in its place, with its manifest, by one rename; the second of two is discarded.
 
     Args:
-        draft: Of `new_draft`, on the file system of ``out``, with all its files.
         timings: What differs from run to run: seconds, attempts.
 
     Returns:

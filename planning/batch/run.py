@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -31,15 +32,7 @@ from puncture_twin.planning.base.errors import InputError, one_line, refuse, req
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.processes import worker_count
 from puncture_twin.planning.base.progress import Count, Watcher
-from puncture_twin.planning.batch.plan import (
-    WORK_PREFIX,
-    PlannedCase,
-    discard,
-    identified,
-    is_final,
-    read_plan_table,
-    read_row,
-)
+from puncture_twin.planning.batch import plan as plans
 from puncture_twin.planning.batch.run_case import (
     NO_LIMITS,
     WORKER_DIED,
@@ -80,11 +73,7 @@ WHOLE = Part(1, 1)
 
 
 def parse_part(text: str) -> Part:
-    """A part as it is typed.
-
-    Raises:
-        InputError: Something else.
-    """
+    """A part as it is typed; anything else is refused."""
     found = re.fullmatch(r"([0-9]{1,7})/([0-9]{1,7})", text)
     if found is None or not 1 <= int(found[1]) <= int(found[2]):
         refuse(f"'{text[:40]}' is not a part", "--part", ALLOWED_PARTS, "bad_part")
@@ -92,11 +81,7 @@ def parse_part(text: str) -> Part:
 
 
 def slurm_part(environment: Mapping[str, str]) -> Part | None:
-    """The part of this task of a SLURM array; None outside of one.
-
-    Raises:
-        InputError: An array from whose numbers the part cannot be inferred.
-    """
+    """The part of this task of a SLURM array; None outside of one. One from which it cannot be inferred is refused."""
     if TASK not in environment:
         return None
     stated = {name: environment.get(name, "1" if name == STEP else "") for name in (TASK, COUNT, FIRST, STEP)}
@@ -117,29 +102,13 @@ LOCK_NAME = ".puncture-twin-run-lock"
 ALLOWED_AT_ONCE = "one run at a time, parallel parts (--part i/n), or another folder"
 
 
-@dataclass(frozen=True)
-class Request:
-    """Cases to be run, and how.
-
-    Attributes:
-        jobs: Processes of this machine, at most one a core.
-        write_page: Writes a page for each case that is searched, or None.
-    """
-
-    part: Part = WHOLE
-    jobs: int = 1
-    limits: Limits = NO_LIMITS
-    write_page: WritePage | None = None
-
-
 @dataclass
 class RunCounts:
     """Counts of one run.
 
     Attributes:
         same: Planned cases that are others to the byte: they are run once.
-        before: Others that had their rows.
-        refused_before: Of these, cases whose inputs were refused.
+        before: Others that had their rows, of which ``refused_before`` were refused.
         ended: Exit code of a row to how many rows.
         reasons: Of rows whose exit code is above 1.
         stale: Cases whose files are not those of the plan; they have no row.
@@ -173,30 +142,44 @@ class RunCounts:
             self.reasons[end.reason or ""] += 1
 
 
-def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTasks | None = None) -> RunCounts:
+def run_cohort(
+    out: Path,
+    watcher: Watcher,
+    *,
+    part: Part = WHOLE,
+    jobs: int = 1,
+    limits: Limits = NO_LIMITS,
+    write_page: WritePage | None = None,
+    elsewhere: RunTasks | None = None,
+) -> RunCounts:
     """Run what has no final row yet.
 
     Args:
+        jobs: Processes of this machine, at most one a core.
+        write_page: Writes a page for each case that is searched, or None.
         elsewhere: Runs the cases; None runs them in processes of this machine.
 
     Raises:
         InputError: No plan, one of another version, another run in the folder, or a disk that takes no more.
     """
-    plan = read_plan_table(out)
+    plan = plans.read_plan_table(out)
     if plan.version != version("puncture-twin"):
         what = f"the plan is of version {plan.version}, this program is {version('puncture-twin')}"
         refuse(what, out, "repeat batch plan: unchanged results are kept", "unknown_version")
-    with running(out, request.part) as work:
-        rows = request.part.of(plan.cases)
+    with running(out, part) as work:
+        rows = part.of(plan.cases)
         cases = distinct(rows)
-        cached = [_stored_row(one, out, work) for one in cases]
-        tasks = [
-            CaseTask(one, out, work, request.write_page) for one, row in zip(cases, cached, strict=True) if not row
-        ]
-        refused = sum(row["exit_code"] > 1 for row in cached if row)
+        cached = [plans.read_row(out, one.id) for one in cases]
+        tasks = []
+        for one, row in zip(cases, cached, strict=True):
+            if not plans.is_final(row):
+                plans.discard(out, one.id, work)  # a failure of the program, or half a result
+                tasks.append(CaseTask(one, out, work, write_page))
+        refused = sum(row["exit_code"] > 1 for row in cached if row is not None and plans.is_final(row))
         counts = RunCounts(len(rows), len(rows) - len(cases), len(cases) - len(tasks), refused)
         watcher.count("cases", 0, len(tasks))
-        with closing(_ends(tasks, request, elsewhere)) as ends:
+        run = elsewhere or partial(run_tasks, worker_count(jobs, len(tasks)))
+        with closing(run(tasks, limits)) as ends:
             for done, end in enumerate(ends, start=1):
                 if end.full:
                     what = f"cannot be written ({end.full}); finished cases are kept"
@@ -206,43 +189,25 @@ def run_cohort(out: Path, request: Request, watcher: Watcher, elsewhere: RunTask
     return counts
 
 
-def distinct(cases: Iterable[PlannedCase]) -> list[PlannedCase]:
+def distinct(cases: Iterable[plans.PlannedCase]) -> list[plans.PlannedCase]:
     """The first case of each id: the same bytes, options and version have one answer."""
     return list({one.id: one for one in reversed(list(cases))}.values())[::-1]
 
 
-def _ends(tasks: Sequence[CaseTask], request: Request, elsewhere: RunTasks | None) -> Generator[CaseEnd, None, None]:
-    if elsewhere is not None:
-        return elsewhere(tasks, request.limits)
-    return run_tasks(tasks, worker_count(request.jobs, len(tasks)), request.limits)
-
-
-def _stored_row(planned: PlannedCase, out: Path, work: Path) -> dict[str, Any] | None:
-    """The stored row of a case; a failure of the program or half a result is removed."""
-    row = read_row(out, planned.id)
-    if is_final(row):
-        return row
-    discard(out, planned.id, work)
-    return None
-
-
 @contextmanager
 def running(out: Path, part: Part) -> Iterator[Path]:
-    """Lock a part of a cohort; yields a folder for drafts, which is removed in the end.
+    """Lock a part of a cohort, or refuse; yields a folder for drafts, which is removed in the end.
 
     The system frees the locks of a process that dies, and its folder is removed by the next run of the same part, or of
     the whole.
-
-    Raises:
-        InputError: Another process runs it, or the folder cannot be written to.
     """
-    work = out / f"{WORK_PREFIX}{part.number}-of-{part.parts}"
+    work = out / f"{plans.WORK_PREFIX}{part.number}-of-{part.parts}"
     with ExitStack() as stack:
         try:
             stack.enter_context(_locked(out, LOCK_NAME, fcntl.LOCK_EX if part == WHOLE else fcntl.LOCK_SH))
             if part != WHOLE:
                 stack.enter_context(_locked(out, f"{LOCK_NAME}-{part.number}-of-{part.parts}", fcntl.LOCK_EX))
-            for left in out.glob(f"{WORK_PREFIX}*") if part == WHOLE else [work]:
+            for left in out.glob(f"{plans.WORK_PREFIX}*") if part == WHOLE else [work]:
                 shutil.rmtree(left, ignore_errors=True)
             work.mkdir(exist_ok=True)
         except OSError as error:
@@ -275,14 +240,9 @@ COPIES = 2
 
 @dataclass(frozen=True)
 class Estimate:
-    """Estimated time, memory and disk of a cohort.
+    """Estimated time (a case, in a warm worker), disk (of all, run and merged) and memory (of a worker) of a cohort.
 
-    Attributes:
-        refused: That cannot be read.
-        sample: The case that was measured, as the cohort writes it; None where none can be read.
-        seconds: A case, in a worker that is warm.
-        disk_bytes: Of all cases, run and merged.
-        memory_bytes: Of one worker, at its most.
+    By the case that was measured, as the cohort writes it; None where none can be read.
     """
 
     cases: int
@@ -293,7 +253,7 @@ class Estimate:
     memory_bytes: int = 0
 
 
-def estimate(cases: Sequence[PlannedCase]) -> Estimate:
+def estimate(cases: Sequence[plans.PlannedCase]) -> Estimate:
     """Estimate a cohort from its first case that can be read, run twice, the second time warm."""
     readable = [one for one in cases if not one.refusal]
     refused = len(cases) - len(readable)
@@ -311,12 +271,9 @@ def estimate(cases: Sequence[PlannedCase]) -> Estimate:
 
 @dataclass
 class CohortState:
-    """State of a cohort's cases, each counted once: done, failed, missing or stale.
+    """State of a cohort's cases, each counted once: done, failed (by reason), missing or stale.
 
-    Attributes:
-        safe: Done, with a safe direction.
-        reasons: Failed, by reason: refused inputs, and failures of the program.
-        stale: Cases whose inputs have changed since the plan: `batch plan` again.
+    Stale are those whose inputs have changed since the plan: `batch plan` again.
     """
 
     planned: int = 0
@@ -343,23 +300,16 @@ class CohortState:
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
-        return {
-            "cases": self.planned,
-            "done": self.done,
-            "safe": self.safe,
-            "no_safe": self.no_safe,
-            "failed": self.failed,
-            "reasons": [{"reason": reason, "count": count} for reason, count in self.reasons.most_common()],
-            "missing": self.missing,
-            "stale": self.stale,
-            "stale_cases": self.stale_cases,
-        }
+        reasons = [{"reason": reason, "count": count} for reason, count in self.reasons.most_common()]
+        done = {"cases": self.planned, "done": self.done, "safe": self.safe, "no_safe": self.no_safe}
+        rest = {"missing": self.missing, "stale": self.stale, "stale_cases": self.stale_cases}
+        return {**done, "failed": self.failed, "reasons": reasons, **rest}
 
-    def add(self, planned: PlannedCase, out: Path) -> None:
+    def add(self, planned: plans.PlannedCase, out: Path) -> None:
         """Count one more; its files are read and hashed."""
         self.planned += 1
-        row = read_row(out, planned.id)
-        if identified(planned).id != planned.id:
+        row = plans.read_row(out, planned.id)
+        if plans.identified(planned).id != planned.id:
             self.stale_cases.append(planned.case)
         elif row is None:
             self.missing += 1
@@ -372,42 +322,20 @@ class CohortState:
 
 
 def cohort_state(out: Path, progress: Count) -> CohortState:
-    """The state of every case of a plan.
-
-    Raises:
-        InputError: The folder has no plan.
-    """
-    plan, state = read_plan_table(out), CohortState()
+    """The state of every case of a folder's plan."""
+    plan, state = plans.read_plan_table(out), CohortState()
     for number, one in enumerate(plan.cases, start=1):
         state.add(one, out)
         progress(number, len(plan.cases))
     return state
 
 
-CONNECT_S = 20.0
-"""So long a scheduler may take to answer."""
-
-WORKER_CACHE = "puncture_twin_kept"
-"""Attribute of Dask's worker object: what this process keeps, and who is at it."""
-
-
-class _WorkerCache:
-    """Cache of one worker process. Its threads run one case at a time: FCL's objects are moved for each query."""
-
-    def __init__(self) -> None:
-        self.memory = Memory(MEMORY_BYTES)
-        self.turn = threading.Lock()
+CONNECT_S, WORKER_CACHE = 20.0, "puncture_twin_kept"
+"""So long a scheduler may take to answer. Attribute of Dask's worker object: what this process keeps, and a lock."""
 
 
 def on_scheduler(address: str) -> RunTasks:
-    """Make a function that runs cases on a scheduler's workers.
-
-    Args:
-        address: Such as ``tcp://10.0.0.1:8786``.
-
-    Raises:
-        InputError: The extra ``dask`` is not installed.
-    """
+    """Make a function that runs cases on the workers of a scheduler, such as at ``tcp://10.0.0.1:8786``."""
     require_extra("dask", "--scheduler")
     import distributed
 
@@ -452,9 +380,10 @@ def _dask_ends(distributed: Any, client: Any, tasks: Sequence[CaseTask]) -> Gene
 
 
 def run_on_worker(task: CaseTask) -> CaseEnd:
-    """Run a case in a worker's process, one at a time."""
+    """Run a case in a worker's process, one at a time: FCL's objects are moved for each query."""
     from distributed import get_worker
 
-    cached: _WorkerCache = vars(get_worker()).setdefault(WORKER_CACHE, _WorkerCache())
-    with cached.turn:
-        return run_case(task, cached.memory)
+    fresh = Memory(MEMORY_BYTES), threading.Lock()
+    memory, turn = vars(get_worker()).setdefault(WORKER_CACHE, fresh)
+    with turn:
+        return run_case(task, memory)

@@ -18,7 +18,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
@@ -30,20 +30,8 @@ from puncture_twin.planning.base.errors import InputError, one_line, refuse
 from puncture_twin.planning.base.output.output_set import disk_is_full
 from puncture_twin.planning.base.progress import Stages
 from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
+from puncture_twin.planning.batch import plan as plans
 from puncture_twin.planning.batch.merge import blank_row, searched_row
-from puncture_twin.planning.batch.plan import (
-    PAGE_NAME,
-    PROGRAM_FAILED,
-    TABLE_NAME,
-    PlannedCase,
-    case_id,
-    commit,
-    identified,
-    new_draft,
-    read_row,
-    relative_text,
-    write_row,
-)
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.options import case_options
 from puncture_twin.planning.search.candidates import Candidates
@@ -61,15 +49,9 @@ READY = "ready"
 
 @dataclass(frozen=True)
 class CaseTask:
-    """One case to be run, with all that a worker needs.
+    """One case to be run; drafts are written to ``work``, on the file system of ``out``; attempt 2 is after a death."""
 
-    Attributes:
-        work: For what is being written, on the same file system.
-        write_page: Writes the case's page too, or None.
-        attempt: 1, or 2 after a worker has died of it.
-    """
-
-    planned: PlannedCase
+    planned: plans.PlannedCase
     out: Path
     work: Path
     write_page: WritePage | None = None
@@ -80,8 +62,7 @@ class CaseEnd(NamedTuple):
     """How a case ended.
 
     Attributes:
-        exit_code: Of the case's row; None where there is no row.
-        reason: Of its row; or why there is none: its files are not those of the plan.
+        exit_code: Of the case's row; None where there is no row, and ``reason`` says why.
         full: What the system said of a disk that takes no more, or "".
     """
 
@@ -95,15 +76,11 @@ STALE = "its files differ from those of the plan"
 
 
 def run_case(task: CaseTask, memory: Memory = NO_MEMORY) -> CaseEnd:
-    """Search a case and commit its result; nothing is done where there is a final one.
-
-    Args:
-        memory: What this process keeps from one case to the next.
-    """
+    """Search a case and commit its result; nothing is done where there is a final one."""
     known = ended(task)
-    if known is not None and known.exit_code != PROGRAM_FAILED:
+    if known is not None and known.exit_code != plans.PROGRAM_FAILED:
         return known
-    draft = new_draft(task.work, task.planned.id)
+    draft = plans.new_draft(task.work, task.planned.id)
     try:
         return _run(task, memory, draft)
     except OSError as error:
@@ -116,7 +93,7 @@ def run_case(task: CaseTask, memory: Memory = NO_MEMORY) -> CaseEnd:
 
 def ended(task: CaseTask) -> CaseEnd | None:
     """The end of a case that has a row already; None without one."""
-    row = read_row(task.out, task.planned.id)
+    row = plans.read_row(task.out, task.planned.id)
     return None if row is None else CaseEnd(task.planned.id, row["exit_code"], row["reason"])
 
 
@@ -125,9 +102,9 @@ def failed(task: CaseTask, reason: str) -> CaseEnd:
     end = ended(task)
     if end is not None:
         return end
-    draft = new_draft(task.work, task.planned.id)
+    draft = plans.new_draft(task.work, task.planned.id)
     inputs = read_inputs(json.loads(task.planned.inputs))
-    return _committed(task, draft, blank_row(task.planned, PROGRAM_FAILED, reason), inputs, {})
+    return _committed(task, draft, blank_row(task.planned, plans.PROGRAM_FAILED, reason), inputs, {})
 
 
 def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
@@ -137,32 +114,32 @@ def _run(task: CaseTask, memory: Memory, draft: Path) -> CaseEnd:
         context = prepare(load_case(planned.path, options), arm=planned.arm, memory=memory)
         stages = context.stages
         inputs = context.case.inputs
-        if case_id(planned.options, planned.arm, inputs, "") != planned.id:
+        if plans.case_id(planned.options, planned.arm, inputs, "") != planned.id:
             return CaseEnd(planned.id, None, STALE)
         row = _searched(task, context, draft)
     except InputError as error:
-        return _refused(task, draft, relative_text(str(error), planned))
+        return _refused(task, draft, plans.relative_text(str(error), planned))
     except Exception as error:  # whatever breaks becomes this case's row: the others go on
         if isinstance(error, OSError) and disk_is_full(error, task.out):
             raise
-        message = relative_text(f"{type(error).__name__}: {error}", planned)
-        row, inputs = blank_row(planned, PROGRAM_FAILED, message), read_inputs(json.loads(planned.inputs))
+        message = plans.relative_text(f"{type(error).__name__}: {error}", planned)
+        row, inputs = blank_row(planned, plans.PROGRAM_FAILED, message), read_inputs(json.loads(planned.inputs))
     return _committed(task, draft, row, inputs, stages.seconds)
 
 
 def _searched(task: CaseTask, context: CaseContext, draft: Path) -> dict[str, Any]:
     candidates = context.search()
-    write_table(candidates, draft / TABLE_NAME)
+    write_table(candidates, draft / plans.TABLE_NAME)
     row = searched_row(task.planned, context, candidates)
     if task.write_page is not None:
         task.write_page(context, candidates, draft)
-        row["page"] = (draft / PAGE_NAME).is_file()
+        row["page"] = (draft / plans.PAGE_NAME).is_file()
     return row
 
 
 def _refused(task: CaseTask, draft: Path, reason: str) -> CaseEnd:
     """A refusal at reading is the plan's own, or the files have changed; a later one is of the plan's files."""
-    now = identified(task.planned)
+    now = plans.identified(task.planned)
     if now.id != task.planned.id:
         return CaseEnd(task.planned.id, None, STALE)
     inputs = read_inputs(json.loads(now.inputs))
@@ -173,27 +150,21 @@ def _committed(
     task: CaseTask, draft: Path, row: dict[str, Any], inputs: tuple[Input, ...], seconds: dict[str, float]
 ) -> CaseEnd:
     row["inputs"] = json.dumps(inputs_document(inputs))
-    write_row(row, draft)
+    plans.write_row(row, draft)
     timings = {"seconds": {name: round(spent, 3) for name, spent in seconds.items()}, "attempt": task.attempt}
-    commit(draft, task.out, task.planned.id, inputs, timings)
+    plans.commit(draft, task.out, task.planned.id, inputs, timings)
     return CaseEnd(task.planned.id, row["exit_code"], row["reason"])
 
 
-def run_here(tasks: Sequence[CaseTask], limits: object) -> Generator[CaseEnd, None, None]:
+def run_here(tasks: Sequence[CaseTask], _limits: object) -> Generator[CaseEnd, None, None]:
     """Run cases in this process, which no limit holds for; yields how each ended."""
-    del limits
     memory = Memory(MEMORY_BYTES)
     for task in tasks:
         yield run_case(task, memory)
 
 
 def work(connection: Connection, memory_bytes: int) -> None:
-    """Run tasks from the queue until none is left.
-
-    Args:
-        connection: Gives `CaseTask`, takes `READY` and then a `CaseEnd` for each.
-        memory_bytes: What is kept from one case to the next.
-    """
+    """Run tasks from a connection, which takes `READY` and then a `CaseEnd` for each, until none is left."""
     threading.Thread(target=_leave_with_parent, daemon=True).start()
     memory = Memory(memory_bytes)
     connection.send(READY)
@@ -216,23 +187,15 @@ def _leave_with_parent() -> None:
 WORKER_DIED, TIMED_OUT, OUT_OF_MEMORY = "worker_died", "timed_out", "out_of_memory"
 """Reasons of the rows that no worker could write."""
 
-TRIES = 2
-"""Tries of a case whose worker dies."""
-
-LOOK_EVERY_S = 0.2
-"""Seconds between two checks of memory and time."""
+TRIES, LOOK_EVERY_S = 2, 0.2
+"""Tries of a case whose worker dies; and seconds between two checks of memory and time."""
 
 STATM = "/proc/{}/statm"
 SPAWN = multiprocessing.get_context("spawn")
 
 
 class Limits(NamedTuple):
-    """Time and memory limits of one case.
-
-    Attributes:
-        memory_mb: Resident set of its worker, 10^6 bytes; None sets no limit.
-        timeout_s: From when a warm worker begins; None sets no limit.
-    """
+    """Limits of one case, None for none: its worker's resident set, 10^6 bytes; time from when a warm worker begins."""
 
     memory_mb: int | None = None
     timeout_s: float | None = None
@@ -265,11 +228,7 @@ class _Worker:
 
 
 class TaskQueue:
-    """Cases in groups: a worker that has a group's patient in memory gets the next case of that group.
-
-    Args:
-        tasks: What is to be done; neighbours of one folder are one group.
-    """
+    """Cases in groups, by folder: a worker that has a group's patient in memory gets the next case of that group."""
 
     def __init__(self, tasks: Iterable[CaseTask]) -> None:
         self._groups: dict[str, deque[CaseTask]] = {}
@@ -301,21 +260,23 @@ def group_of(task: CaseTask) -> str:
     return str(Path(task.planned.path).parent)
 
 
-def run_tasks(tasks: Iterable[CaseTask], jobs: int, limits: Limits) -> Generator[CaseEnd, None, None]:
-    """Run cases in workers; yields how each ended, as they end.
-
-    Raises:
-        InputError: Memory cannot be watched on this system.
-    """
+def run_tasks(jobs: int, tasks: Iterable[CaseTask], limits: Limits) -> Generator[CaseEnd, None, None]:
+    """Run cases in workers; yields how each ended, as they end."""
     if limits.memory_mb is not None and not Path(STATM.format(os.getpid())).exists():
         refuse("memory cannot be monitored on this system", "--memory-mb", "a system with /proc", "memory_not_watched")
     queue, workers = TaskQueue(tasks), list[_Worker]()
     try:
         while queue or workers:
             while queue and len(workers) < jobs:
-                with _without_interrupt():  # until the worker is listed: one that is not would be left alone
+                # Ctrl-C waits until the worker is listed (one that is not would be left alone), which never sees it.
+                before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+                try:
                     workers.append(_started(queue.next(None), limits))
-            for worker in _spoken(workers):
+                finally:
+                    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            handles = [handle for one in workers for handle in (one.connection, one.process.sentinel)]
+            heard = wait(handles, timeout=LOOK_EVERY_S)  # that have sent something, or have died
+            for worker in [one for one in workers if one.connection in heard or one.process.sentinel in heard]:
                 yield from _heard(worker, workers, queue)
             for worker in list(workers):
                 reason = _beyond(worker, limits)
@@ -338,25 +299,7 @@ def _started(task: CaseTask, limits: Limits) -> _Worker:
     return _Worker(process, ours, task)
 
 
-@contextmanager
-def _without_interrupt() -> Iterator[None]:
-    """Put Ctrl-C off; a process that is started within never sees it, and the main process ends it."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _spoken(workers: list[_Worker]) -> list[_Worker]:
-    """Workers that have sent something, or have died."""
-    handles = [handle for one in workers for handle in (one.connection, one.process.sentinel)]
-    found = wait(handles, timeout=LOOK_EVERY_S)
-    return [one for one in workers if one.connection in found or one.process.sentinel in found]
-
-
 def _heard(worker: _Worker, workers: list[_Worker], queue: TaskQueue) -> Iterator[CaseEnd]:
-    """Handle a worker's message and its next case; or its death."""
     try:
         message = worker.connection.recv() if worker.connection.poll() else None
     except (EOFError, OSError):
@@ -374,32 +317,20 @@ def _heard(worker: _Worker, workers: list[_Worker], queue: TaskQueue) -> Iterato
     elif not worker.process.is_alive():
         workers.remove(worker)
         worker.end()
-        yield from _died(worker.task, queue)
-
-
-def _died(task: CaseTask, queue: TaskQueue) -> Iterator[CaseEnd]:
-    """Requeue the case of a dead worker, or write its row; a result from before the death counts."""
-    if task.attempt < TRIES and ended(task) is None:
-        queue.again(replace(task, attempt=task.attempt + 1))
-    else:
-        yield failed(task, WORKER_DIED)
+        if worker.task.attempt < TRIES and ended(worker.task) is None:  # a result from before the death counts
+            queue.again(replace(worker.task, attempt=worker.task.attempt + 1))
+        else:
+            yield failed(worker.task, WORKER_DIED)
 
 
 def _beyond(worker: _Worker, limits: Limits) -> str:
-    """The limit that a worker's case has passed; "" where none."""
     if not worker.ready:
         return ""
     if limits.timeout_s is not None and time.monotonic() - worker.since > limits.timeout_s:
         return TIMED_OUT
-    if limits.memory_mb is not None and resident_bytes(worker.process.pid or 0) > limits.memory_mb * 1_000_000:
-        return OUT_OF_MEMORY
+    if limits.memory_mb is not None:
+        with suppress(OSError, IndexError):  # it may be gone
+            pages = Path(STATM.format(worker.process.pid)).read_text(encoding="ascii").split()[1]
+            if int(pages) * os.sysconf("SC_PAGE_SIZE") > limits.memory_mb * 1_000_000:
+                return OUT_OF_MEMORY
     return ""
-
-
-def resident_bytes(process: int) -> int:
-    """Memory of a process; 0 where it is gone."""
-    try:
-        pages = Path(STATM.format(process)).read_text(encoding="ascii").split()[1]
-    except (OSError, IndexError):
-        return 0
-    return int(pages) * os.sysconf("SC_PAGE_SIZE")

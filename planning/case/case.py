@@ -1,8 +1,6 @@
 """A case: a case file and all that it names, read once and validated; in LPS (or local) mm and radians.
 
 The bed frame: which way is up and which way lies the bed, as a case states it or as a patient usually lies.
-
-How a case shows itself in a notebook.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from puncture_twin.planning.base.toml_file import find_toml, parse_toml, read_to
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case import named_files, settings, tables
 from puncture_twin.planning.case.case_file import CaseFile
-from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, entry_frame, grid
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS, Directions, direction, entry_frame, grid, lps_axis
 from puncture_twin.planning.case.errors import ErrorModel, errors_of
 from puncture_twin.planning.case.options import NO_OPTIONS, OPTIONS_ROLE, CaseOptions, case_options
 from puncture_twin.planning.formats.guard import guard_points
@@ -45,20 +43,14 @@ class Case(Shown):
     Attributes:
         target_ct: Shape (3,), the point to reach.
         T_ct_entry: Shape (4, 4), the entry frame, its origin on the target.
-        volumes: Those of them that are volumes: the CT and the label maps.
+        volumes: Those of the files that are volumes: the CT and the label maps.
         stated_structures: How many structures the case says that it has, the skin among them.
         hit_radius_mm: Within which of the target the tip hits; None counts the target's own mesh.
-        errors: What is declared to err, or None.
+        errors: What is declared to err; None, as of all that follows, where the case does not say.
         truth_errors: From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`.
-        breathing: How the body moves with the breath, or None where the case does not say.
-        stereo: The two cameras in the room, or None.
-        ultrasound: The probe on an arm of its own, or None.
-        control_scan: What is known of CTs with the needle in, or None.
-        motion: How the target has moved since the scan, or None where the case does not say.
-        bending: How the needle bends, and in what, or None where the case does not say.
         own_target: Whether the target lies in no structure: its own is then the ball of the hit radius about it, which
             has its name.
-        tool: What the flange carries beside needle and holder, or None.
+        tool: What the flange carries beside needle and holder.
         options: What is stated in place of what the case file states.
     """
 
@@ -107,7 +99,29 @@ class Case(Shown):
         return f"Case {self.name}"
 
     def _facts(self) -> Facts:
-        return _facts(self)
+        """Target, needle, structures, grid, robot, and what the case leaves open."""
+        x, y, z = self.target_ct
+        axes = "the local frame" if str(self.space) == "local" else "LPS"
+        yield "target", f"{self.target_name} in {self.target_structure}: ({x:.1f}, {y:.1f}, {z:.1f}) mm in {axes}"
+        one = self.needle
+        yield "needle", f"⌀ {one.diameter_mm:g} mm, shaft {one.shaft_mm:g} mm, tip to flange {one.length_mm:g} mm"
+        if self.tool is not None:
+            size = " × ".join(f"{edge:.0f}" for edge in np.ptp(self.tool.mesh.bounds, axis=0))
+            yield "tool", f"{self.tool.file.name}, {size} mm along the flange's axes"
+        stated = [one.name for one in self.structure] + [f"as in {one.source}" for one in self.structures]
+        yield "structures", ", ".join(stated) or "none"
+        (low, high), (first, last) = np.degrees(self.search.theta), np.degrees(self.search.beta)
+        step = np.degrees(self.search.step)
+        yield "search", f"θ {low:g}° to {high:g}°, β {first:g}° to {last:g}°, every {step:g}°"
+        yield "robot", self.robot.model.name
+        base = "not stated" if self.robot.T_base_ct_mount is None else "by a stated mount"
+        if self.robot.transform is not None:
+            base = f"by the stated transform {self.robot.transform}: no residuals"
+        if self.registration is not None:
+            base = f"by registration of markers ({self.registration.method})"
+        yield "its base", base
+        yield "inputs", f"{len(self.inputs)} files, {self.path}"
+        yield from (("warning", warning) for warning in self.warnings)
 
     def replace(self, *, target_ct: ArrayLike | None = None, **options: Mapping[str, Any]) -> Case:
         """What the case would be if its file had these values; the file stays as it is.
@@ -126,12 +140,8 @@ class Case(Shown):
         """
         for kind, values in options.items():
             if isinstance(values, Mapping) and not values:
-                refuse(
-                    f"option '{kind}' has no keys, and changes nothing",
-                    "replace",
-                    "keys and values, as in the case",
-                    "empty",
-                )
+                what = f"option '{kind}' has no keys, and changes nothing"
+                refuse(what, "replace", "keys and values, as in the case", "empty")
         known = self if target_ct is not None and not options else None  # a target alone changes no other file
         if target_ct is not None:
             point = guard_points([target_ct], (self.target_name,), where="replace: target_ct")
@@ -213,7 +223,9 @@ def case_of(
     target = _target_of(content, path, space, files)
     robot = settings.robot_of(content, space, path, files)
     tool = tables.tool_of(content.tool, files, path)
-    searched, placed = content.search, content.registration
+    searched, placed, motion = content.search, content.registration, None
+    if content.motion is not None:  # a diagonal covariance: LPS and RAS are the same
+        motion = settings.Motion(read_only(np.diag(np.square(content.motion.target_sd_mm))))
     return Case(
         path=path,
         name=content.name,
@@ -248,7 +260,7 @@ def case_of(
         stereo=settings.stereo_of(content.stereo, space, path),
         ultrasound=settings.ultrasound_of(content.ultrasound, space, path),
         control_scan=content.control_scan,
-        motion=settings.motion_of(content.motion),
+        motion=motion,
         bending=settings.bending_of(content.needle, content.tissue, path),
     )
 
@@ -307,37 +319,5 @@ def along_axis(case: Case) -> Vector:
 
 def _stated(axis: settings.Axis | None, space: Space, otherwise: Floats) -> Vector:
     """An axis that the case states, or the default, in LPS (or the local frame)."""
-    if isinstance(axis, str):
-        return ANATOMICAL_LPS[axis]
-    vector = otherwise if axis is None else to_lps(np.array([axis]), space)[0]
-    return float(vector[0]), float(vector[1]), float(vector[2])
-
-
-def _facts(case: Case) -> Facts:
-    """Target, needle, structures, grid, robot, and what the case leaves open."""
-    x, y, z = case.target_ct
-    axes = "the local frame" if str(case.space) == "local" else "LPS"
-    yield "target", f"{case.target_name} in {case.target_structure}: ({x:.1f}, {y:.1f}, {z:.1f}) mm in {axes}"
-    needle = case.needle
-    yield "needle", f"⌀ {needle.diameter_mm:g} mm, shaft {needle.shaft_mm:g} mm, tip to flange {needle.length_mm:g} mm"
-    if case.tool is not None:
-        size = " × ".join(f"{edge:.0f}" for edge in np.ptp(case.tool.mesh.bounds, axis=0))
-        yield "tool", f"{case.tool.file.name}, {size} mm along the flange's axes"
-    stated = [one.name for one in case.structure] + [f"as in {one.source}" for one in case.structures]
-    yield "structures", ", ".join(stated) or "none"
-    (low, high), (first, last) = np.degrees(case.search.theta), np.degrees(case.search.beta)
-    step = np.degrees(case.search.step)
-    yield "search", f"θ {low:g}° to {high:g}°, β {first:g}° to {last:g}°, every {step:g}°"
-    yield "robot", case.robot.model.name
-    yield "its base", _base(case)
-    yield "inputs", f"{len(case.inputs)} files, {case.path}"
-    for warning in case.warnings:
-        yield "warning", warning
-
-
-def _base(case: Case) -> str:
-    if case.registration is not None:
-        return f"by registration of markers ({case.registration.method})"
-    if case.robot.transform is not None:
-        return f"by the stated transform {case.robot.transform}: no residuals"
-    return "not stated" if case.robot.T_base_ct_mount is None else "by a stated mount"
+    x, y, z = (otherwise if axis is None else lps_axis(axis, space)).tolist()
+    return x, y, z

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, Strict, model_validator
 from puncture_twin.planning.base.errors import SchemaError
 from puncture_twin.planning.base.text import unprintable_texts
 from puncture_twin.planning.case import tables
-from puncture_twin.planning.case.toml_types import CaseName, Section, Text
+from puncture_twin.planning.case.tables import CaseName, Section, Text
 
 COUNT_KEY = "structures = N"
 """The name under which the count at the top reaches the model: TOML knows ``structures`` as an array of tables too."""
@@ -36,16 +36,6 @@ def _stated_region(value: object) -> object:
     if value is None:
         raise SchemaError(f"schema = 2 needs region, one of {', '.join(get_args(Region))}", "missing_key")
     return value
-
-
-def _statements(data: Any) -> Any:
-    """The file's content with a count at the top under `COUNT_KEY`, and None for what is not stated and must be."""
-    if not isinstance(data, dict):
-        return data
-    count = data.get("structures")
-    if isinstance(count, int) and not isinstance(count, bool):
-        data = {**{key: value for key, value in data.items() if key != "structures"}, COUNT_KEY: count}
-    return {"schema": None, "region": None, **data}
 
 
 def count_difference(stated: int, found: int) -> str:
@@ -118,26 +108,23 @@ class CaseFile(Section):
     @model_validator(mode="before")
     @classmethod
     def _as_stated(cls, data: Any) -> Any:
-        return _statements(data)
+        """A count at the top comes under `COUNT_KEY`, and None for what is not stated and must be."""
+        for text in unprintable_texts(data):
+            what = f"{text[:60]!a} has a control or format character; names and paths are plain text"
+            raise SchemaError(what, "bad_name")
+        if not isinstance(data, dict):
+            return data
+        count = data.get("structures")
+        if isinstance(count, int) and not isinstance(count, bool):
+            data = {**{key: value for key, value in data.items() if key != "structures"}, COUNT_KEY: count}
+        return {"schema": None, "region": None, **data}
 
     @model_validator(mode="after")
-    def _is_whole(self) -> Self:
+    def _no_contradiction(self) -> Self:
         stated = self.stated_structures
         wrong = "" if self.structures else count_difference(stated, len(self.structure))
         if wrong:
             raise SchemaError(wrong, "structures_miscounted")
-        return self
-
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_unprintable(cls, data: Any) -> Any:
-        for text in unprintable_texts(data):
-            what = f"{text[:60]!a} has a control or format character; names and paths are plain text"
-            raise SchemaError(what, "bad_name")
-        return data
-
-    @model_validator(mode="after")
-    def _no_contradiction(self) -> Self:
         if self.registration is not None and self.robot.mount is not None:
             raise SchemaError("[registration] and [robot.mount] both place the base; keep one", "stated_twice")
         if self.errors is None and self.rehearsal.errors is not None:
@@ -169,10 +156,6 @@ class CaseFile(Section):
         skins = [s.name for s in self.structure if s.role == "skin"]
         if len(skins) != 1:
             raise SchemaError(f'exactly one structure must have role "skin"; here {skins or "none"}', "not_one_skin")
-        return self
-
-    @model_validator(mode="after")
-    def _local_has_no_head(self) -> Self:
         if self.space != "local":
             return self
         gantry = self.gantry

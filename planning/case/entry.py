@@ -11,7 +11,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Floats, Ints, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.tables import EntryAxes
 from puncture_twin.planning.geometry.rigid import frame_of_axes
@@ -32,8 +32,8 @@ ANATOMICAL_LPS = MappingProxyType(
 AXES_PARALLEL = 0.999
 """|cos| above which two axes do not span a frame (2.6 degrees)."""
 
-GRID_SLACK = 1e-9
-"""Fraction of a step by which rounding may miss the end of a range."""
+GRID_SLACK, SAME_ANGLE = 1e-9, 1e-9
+"""Fraction of a step by which rounding may miss the end of a range; and radians within which θ is at a pole."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +41,7 @@ class Directions:
     """A set of entry directions.
 
     Attributes:
-        theta: Shape (n,), puncture angle from the entry frame's +z, rad.
-        beta: Shape (n,), azimuth from +x in its xy plane, rad.
+        theta, beta: Shape (n,), rad: puncture angle from the entry frame's +z, azimuth from +x in its xy plane.
         outward_ct: Shape (n, 3), unit vectors in the CT frame, from the target outward.
         grid: The regular grid that they are, row by row; None for any others.
     """
@@ -65,15 +64,11 @@ class NeedlePose:
 
 
 def entry_frame(frame: str | EntryAxes | None, space: Space, *, where: str | Path = "search.frame") -> Floats:
-    """Rotation R_ct_entry of the entry frame.
+    """Rotation R_ct_entry of the entry frame: columns x, y = z × x and z in LPS (or the local frame), shape (3, 3).
 
     Args:
-        frame: ``"ct"`` (axes of the case's space), ``"bed"`` (x to the head, z to the front), explicit axes, or
-            None for the space's default: ``"ct"`` for a local space, ``"bed"`` for a patient.
-        space: The case's space; explicit vectors are given in it.
-
-    Returns:
-        Shape (3, 3), columns x, y = z × x and z in LPS (or the local frame).
+        frame: ``"ct"`` (axes of the case's space), ``"bed"`` (x to the head, z to the front), explicit axes in that
+            space, or None for its default: ``"ct"`` for a local space, ``"bed"`` for a patient.
 
     Raises:
         InputError: The axes do not span a frame.
@@ -85,14 +80,15 @@ def entry_frame(frame: str | EntryAxes | None, space: Space, *, where: str | Pat
     axes = EntryAxes(z="anterior", x="head") if frame == "bed" else frame
     if not isinstance(axes, EntryAxes):
         refuse(f"frame '{frame}' is not known", where, "ct, bed, or z and x axes", "unknown_frame")
-    z, x = (_axis(axis, space) for axis in (axes.z, axes.x))
+    z, x = (lps_axis(axis, space) for axis in (axes.z, axes.x))
     lengths = np.linalg.norm(z), np.linalg.norm(x)
     if min(lengths) == 0 or abs(z @ x) > AXES_PARALLEL * lengths[0] * lengths[1]:
         refuse("search.frame: its axes are parallel or zero", where, "two axes", "axes_parallel")
     return frame_of_axes(z, x)
 
 
-def _axis(axis: str | tuple[float, float, float], space: Space) -> Floats:
+def lps_axis(axis: str | tuple[float, float, float], space: Space) -> Floats:
+    """An axis of a space, of any length, or a direction of the body by its name, in LPS (or the local frame): (3,)."""
     if isinstance(axis, str):
         return np.array(ANATOMICAL_LPS[axis])
     return to_lps(np.array([axis]), space)[0]
@@ -118,13 +114,9 @@ def angles(outward_entry: Floats) -> tuple[Floats, Floats]:
 
 
 def needle_pose(target_ct: Floats, outward_ct: Floats, *, standoff: Floats | float, length: float) -> NeedlePose:
-    """Tip f + r u and top f + (r + l) u of a needle that points at f (Chen 2019, Eq. 12-15).
+    """Tip f + r u and top f + (r + l) u of a needle of length l that points at f (Chen 2019, Eq. 12-15).
 
-    Args:
-        target_ct: Shape (3,), f, mm.
-        outward_ct: Shape (..., 3), u, unit.
-        standoff: r, mm, a number or shape (...,).
-        length: l, tip to flange, mm.
+    Of a target f (3,), directions u (..., 3), and standoffs r, a number or (...,); mm.
     """
     r = np.asarray(standoff, dtype=float)[..., None]
     return NeedlePose(target_ct + r * outward_ct, target_ct + (r + length) * outward_ct)
@@ -137,13 +129,9 @@ def direction(theta: Floats | float, beta: Floats | float, R_ct_entry: Floats) -
 
 
 def grid(theta: tuple[float, float], beta: tuple[float, float], step: float, R_ct_entry: Floats) -> Directions:
-    """Every (θ, β) of a regular grid, θ outermost; β = 360° is left out where the range is the full circle.
+    """Every (θ, β) of a regular grid, rad, θ outermost; the highest belong to it where the step meets them.
 
-    Args:
-        theta: Lowest and highest puncture angle, rad; both belong to the grid where the step meets them.
-        beta: Lowest and highest azimuth, rad.
-        step: Grid step of both angles, rad.
-        R_ct_entry: Rotation of the entry frame, shape (3, 3).
+    β = 360° is left out where the range is the full circle.
     """
     azimuths = _steps(beta, step)
     full_circle = bool(len(azimuths) > 1 and azimuths[-1] - azimuths[0] >= 2 * np.pi - GRID_SLACK)
@@ -160,24 +148,14 @@ def _steps(limits: tuple[float, float], step: float) -> Floats:
 
 
 def _directions(theta: Floats, beta: Floats, R_ct_entry: Floats) -> Directions:
-    columns = (theta, beta, outward(theta, beta) @ R_ct_entry.T)
-    for column in columns:
-        column.setflags(write=False)
-    return Directions(*columns)
-
-
-SAME_ANGLE = 1e-9
-"""Radians within which θ is at a pole: rounding of degrees."""
+    return Directions(read_only(theta), read_only(beta), read_only(outward(theta, beta) @ R_ct_entry.T))
 
 
 @dataclass(frozen=True, eq=False)
 class AngleGrid:
-    """m puncture angles by k azimuths, row by row with θ outermost; rad.
+    """Puncture angles (m,) by azimuths (k,), ascending, row by row with θ outermost; rad.
 
-    Attributes:
-        theta: Shape (m,), ascending.
-        beta: Shape (k,), ascending.
-        full_circle: The last azimuth's next neighbour is the first.
+    ``full_circle``: the last azimuth's next neighbour is the first.
     """
 
     theta: Floats
@@ -203,28 +181,20 @@ class AngleGrid:
     def neighbours(self) -> Ints:
         """Pairs of rows one step apart, shape (e, 2); all rows at a pole are one direction, and so neighbours."""
         rows = np.arange(len(self)).reshape(len(self.theta), len(self.beta))
-        pairs = [(rows[:-1], rows[1:]), (rows[:, :-1], rows[:, 1:])]
+        at_pole = rows[(self.theta < SAME_ANGLE) | (self.theta > np.pi - SAME_ANGLE)]
+        pairs = [(rows[:-1], rows[1:]), (rows[:, :-1], rows[:, 1:]), (at_pole[:, :-1], at_pole[:, 1:])]
         if self.full_circle:
-            pairs.append((rows[:, -1:], rows[:, :1]))
-        at_pole = rows[self._at_pole()]
-        pairs.append((at_pole[:, :-1], at_pole[:, 1:]))
+            pairs.insert(2, (rows[:, -1:], rows[:, :1]))
         return np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in pairs])
 
     def beyond(self) -> tuple[Floats, Floats]:
         """Directions (θ, β) one step outside of the grid, which nobody has asked about, shape (b,) each."""
-        outside = []
-        if self.theta[0] > SAME_ANGLE:
-            outside.append(_product(self.theta[:1] - self.step, self.beta))
-        if self.theta[-1] < np.pi - SAME_ANGLE:
-            outside.append(_product(self.theta[-1:] + self.step, self.beta))
-        if not self.full_circle:
-            ends = np.array([self.beta[0] - self.step, self.beta[-1] + self.step])
-            outside.append(_product(self.theta, ends))
-        theta, beta = np.concatenate([np.zeros((2, 0)), *outside], axis=1)
+        none, polar = np.empty(0), [self.theta[0] - self.step, self.theta[-1] + self.step]
+        beyond = [self.theta[0] > SAME_ANGLE, self.theta[-1] < np.pi - SAME_ANGLE]
+        beside = none if self.full_circle else np.array([self.beta[0] - self.step, self.beta[-1] + self.step])
+        rows = (np.array(polar)[beyond], self.beta), (self.theta, beside)
+        theta, beta = np.concatenate([_product(one, other) for one, other in rows], axis=1)
         return np.clip(theta, 0.0, np.pi), beta
-
-    def _at_pole(self) -> Ints:
-        return np.flatnonzero((self.theta < SAME_ANGLE) | (self.theta > np.pi - SAME_ANGLE))
 
 
 def _product(theta: Floats, beta: Floats) -> Floats:

@@ -18,30 +18,22 @@ from pydantic import Field
 from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case_file import CaseFile
-from puncture_twin.planning.case.entry import ANATOMICAL_LPS
+from puncture_twin.planning.case.entry import lps_axis
 from puncture_twin.planning.case.named_files import CaseVolumes
-from puncture_twin.planning.case.tables import ErrorsSection
-from puncture_twin.planning.case.toml_types import Number, Section
-from puncture_twin.planning.geometry.spaces import Space, to_lps
+from puncture_twin.planning.case.tables import ErrorsSection, Number, Section
+from puncture_twin.planning.geometry.spaces import Space
 
-DEFAULT_READING_MM = 0.5
-"""Of a marker in a CT whose pixel and slice spacing nobody stated."""
-
-DEFAULT_TOUCH_MM = 0.35
-"""What the touches of Chen 2019 show without any CT: distances between its markers, measured twice."""
-
-DEFAULT_DRIFT_DEG = 0.02
-"""Of every joint between touch and insertion."""
+DEFAULT_READING_MM, DEFAULT_TOUCH_MM, DEFAULT_DRIFT_DEG = 0.5, 0.35, 0.02
+"""Of a marker in a CT whose pixel and slice spacing nobody stated; what the touches of Chen 2019 show without any CT
+(distances between its markers, measured twice); of every joint between touch and insertion."""
 
 UNIFORM = 1.0 / np.sqrt(12.0)
 """Standard deviation of an error that is uniform over one cell, over the cell."""
 
-THICK_MM = 3.0
-"""Slices up to this let a contour err by its own cell alone, in every direction."""
-
-SIDEWAYS = 0.5
-"""Of what slices exceed that by: between them a contour that leans is a stair, which errs sideways too. Balls of 8 mm
-and more, averaged over slices of up to 10 mm, err by that at most (docs/concepts/uncertainty.md)."""
+THICK_MM, SIDEWAYS = 3.0, 0.5
+"""Slices up to this let a contour err by its own cell alone, in every direction. Of what slices exceed that by: between
+them a contour that leans is a stair, which errs sideways too. Balls of 8 mm and more, averaged over slices of up to
+10 mm, err by that at most (docs/concepts/uncertainty.md)."""
 
 
 class ArmKind(NamedTuple):
@@ -104,8 +96,7 @@ class ArmUncertainty:
 
     Attributes:
         link_mm: Of every Denavit-Hartenberg length a_i and d_i.
-        twist: Of every twist alpha_i.
-        joint: Of every joint's zero.
+        twist, joint: Of every twist alpha_i, and of every joint's zero.
         repeatability: Of every joint, anew at each arrival.
         drift: Of every joint, since the markers were touched.
         jitter: Of every joint about where it arrived, at any one moment; a touch reads its mean.
@@ -137,9 +128,8 @@ class ErrorModel:
     """All declared errors of a case.
 
     Attributes:
-        marker_cov_ct: Shape (3, 3), mm^2: of one marker read in the CT.
+        marker_cov_ct, target_cov_ct: Shape (3, 3), mm^2: of one marker, and of the target, read in the CT.
         touch_mm: Of one touch, per axis of the base frame, besides the arm.
-        target_cov_ct: Shape (3, 3), mm^2: of the target read in the CT.
         surface_mm: By which a whole structure's surface may lie off, along its normal; None where every structure's own
             voxels say it.
         found: Whether the markers' residuals give the size of all errors, and the declaration their shape.
@@ -179,9 +169,7 @@ class ErrorModel:
     def surface_cov_ct(self, voxel_ct: Floats | None) -> Floats:
         """S, shape (3, 3), mm^2: a surface of unit normal n may lie off by sqrt(n' S n), a structure's as a whole.
 
-        Args:
-            voxel_ct: Edges of the structure's voxels as columns, shape (3, 3), mm; None for a mesh, of which nobody
-                knows it: 0, and `not_modelled` says so.
+        By its voxels' edges as columns, shape (3, 3), mm; None for a mesh, of which nobody knows it: 0.
         """
         if self.surface_mm is not None:
             return np.asarray(self.surface_mm**2 * np.eye(3))
@@ -210,7 +198,6 @@ def error_model(
     """The declaration in mm and radians, with the defaults filled in.
 
     Args:
-        space: Of the case, in which ``bed_axis`` is meant.
         cells: Of the case's own CT, which give pixel, spacing and bed axis where the section does not.
         fle_mm: ``registration.fle_mm``, the short form: rms length of a marker's whole error, touch included.
 
@@ -256,10 +243,8 @@ def _reading_cov(section: ErrorsSection, space: Space, cells: Cells | None, wher
 
 
 def _deviation(stated: float | None, cell: float | None, of_ct: float | None) -> float:
-    if stated is not None:
-        return stated
     cell = of_ct if cell is None else cell
-    return DEFAULT_READING_MM if cell is None else float(cell * UNIFORM)
+    return _or(stated, DEFAULT_READING_MM if cell is None else float(cell * UNIFORM))
 
 
 def _bed_axis(section: ErrorsSection, space: Space, cells: Cells | None, where: str | Path) -> Floats:
@@ -272,9 +257,7 @@ def _bed_axis(section: ErrorsSection, space: Space, cells: Cells | None, where: 
         refuse('bed_axis: space "local" has no head', where, "bed_axis = [x, y, z]", "local_space")
     if axis is None:
         return np.array([0.0, 0.0, 1.0]) if cells is None else np.asarray(cells.normal_ct)
-    vector = (
-        np.array(ANATOMICAL_LPS[axis]) if isinstance(axis, str) else to_lps(np.array([axis], dtype=float), space)[0]
-    )
+    vector = lps_axis(axis, space)
     length = float(np.linalg.norm(vector))
     if length == 0:
         refuse("bed_axis is zero", where, "a direction", "zero_direction")
@@ -291,20 +274,11 @@ def errors_of(
     """The declared errors, or the truth's own, which know no short form."""
     if section is None:
         return None
-    return error_model(
-        section,
-        space=Space(content.space),
-        cells=_ct_cells(content, case_volumes),
-        fle_mm=None if truth or content.registration is None else content.registration.fle_mm,
-        where=f"{path}: {'rehearsal.errors' if truth else 'errors'}",
-    )
-
-
-def _ct_cells(content: CaseFile, case_volumes: CaseVolumes) -> Cells | None:
-    """Pixel, slice spacing and slice normal of the case's CT; None without one."""
-    name = content.ct_name
-    if name is None:
-        return None
-    grid = case_volumes.source(name).grid
-    spacing = grid.spacing_mm
-    return Cells(float(spacing[:2].max()), float(spacing[2]), grid.T_ct_index[:3, 2] / spacing[2])
+    cells = None
+    if content.ct_name is not None:
+        grid = case_volumes.source(content.ct_name).grid
+        x_mm, y_mm, slices_mm = grid.spacing_mm.tolist()
+        cells = Cells(max(x_mm, y_mm), slices_mm, grid.T_ct_index[:3, 2] / slices_mm)
+    fle_mm = None if truth or content.registration is None else content.registration.fle_mm
+    where = f"{path}: {'rehearsal.errors' if truth else 'errors'}"
+    return error_model(section, space=Space(content.space), cells=cells, fle_mm=fle_mm, where=where)

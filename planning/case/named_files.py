@@ -76,40 +76,26 @@ def read_named_files(content: CaseFile, path: Path, files: InputFiles, case_volu
 
 def named_files(content: CaseFile) -> Iterator[NamedFile]:
     """Every file that a case names, and folders with a CT, in the order of its sections; of folders of masks none."""
-    if content.target.points is not None:
-        yield NamedFile("target", content.target.points, "target.points", points.MAX_FILE_BYTES)
+    most = volumes.MAX_FILE_BYTES
+    rows: list[tuple[str, str | None, str, int]] = [
+        ("target", content.target.points, "target.points", points.MAX_FILE_BYTES)
+    ]
     for one in content.structure:
         key = f"structure '{one.name}'"
-        if one.mesh is not None:
-            yield NamedFile(f"mesh {one.name}", one.mesh, key, meshes.MAX_FILE_BYTES)
-        if one.labelmap is not None:
-            yield NamedFile("labelmap", one.labelmap, key, volumes.MAX_FILE_BYTES)
-        if one.ct is not None:
-            yield NamedFile("ct", one.ct, key, volumes.MAX_FILE_BYTES)
+        rows.append((f"mesh {one.name}", one.mesh, key, meshes.MAX_FILE_BYTES))
+        rows += [("labelmap", one.labelmap, key, most), ("ct", one.ct, key, most)]
     for number, many in enumerate(content.structures, start=1):
-        yield from _many_files(many, f"structures number {number}")
+        key = f"structures number {number}"
+        rows += [(role, getattr(many, role), f"{key}.{role}", most) for role in ("labelmap", "seg", "rtstruct", "ct")]
         if many.naming is not None and naming.is_naming_file(many.naming):
-            yield NamedFile("naming", many.naming, f"structures number {number}.naming", naming.MAX_CSV_BYTES)
-    if content.ct.file is not None:
-        yield NamedFile("ct", content.ct.file, "ct.file", volumes.MAX_FILE_BYTES)
+            rows.append(("naming", many.naming, f"{key}.naming", naming.MAX_CSV_BYTES))
+    rows.append(("ct", content.ct.file, "ct.file", most))
     for side in ("markers_ct", "markers_base", "transform"):
-        file = getattr(content.registration, side, None)
-        if file is not None:
-            most = itk_transform.most_bytes(file) if side == "transform" else points.MAX_FILE_BYTES
-            yield NamedFile(side, file, f"registration.{side}", most)
-    if content.rehearsal.truth_base is not None:
-        yield NamedFile("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES)
-
-
-def _many_files(many: StructuresSection, key: str) -> Iterator[NamedFile]:
-    """A label map, or the file that holds masks."""
-    if many.labelmap is not None:
-        yield NamedFile("labelmap", many.labelmap, f"{key}.labelmap", volumes.MAX_FILE_BYTES)
-    for role in ("seg", "rtstruct"):
-        if (file := getattr(many, role)) is not None:
-            yield NamedFile(role, file, f"{key}.{role}", volumes.MAX_FILE_BYTES)
-    if many.ct is not None:
-        yield NamedFile("ct", many.ct, f"{key}.ct", volumes.MAX_FILE_BYTES)
+        file: str | None = getattr(content.registration, side, None)
+        largest = itk_transform.most_bytes(file) if file and side == "transform" else points.MAX_FILE_BYTES
+        rows.append((side, file, f"registration.{side}", largest))
+    rows.append(("truth_base", content.rehearsal.truth_base, "rehearsal.truth_base", points.MAX_FILE_BYTES))
+    yield from (NamedFile(role, name, key, most) for role, name, key, most in rows if name is not None)
 
 
 def _masks(content: CaseFile, path: Path, single: Sequence[NamedFile]) -> Iterator[NamedFile]:
@@ -141,11 +127,7 @@ VOLUME_ROLES = ("labelmap", "ct")
 
 
 class CaseVolumes:
-    """The CT and the label maps of a case.
-
-    Args:
-        path: The case file, to whose folder names are relative.
-    """
+    """The CT and the label maps of a case, by names relative to the folder of its file."""
 
     def __init__(self, files: InputFiles, path: Path) -> None:
         self._files = files
@@ -156,9 +138,6 @@ class CaseVolumes:
 
     def read(self, role: str, name: str, *, key: str) -> None:
         """Read every file of a volume; those that hold its voxels decide as much as its header.
-
-        Args:
-            role: One of ``VOLUME_ROLES``.
 
         Raises:
             InputError: A file that is missing, too large or not readable, or a header that is damaged.
@@ -183,13 +162,9 @@ class CaseVolumes:
         return self._series.get(name or "")
 
     def read_masks(self, section: StructuresSection, case_ct: str | None) -> None:
-        """The structures of a SEG (DICOM, or Slicer's .seg.nrrd) or RTSTRUCT whose file has been read, and its CT.
+        """The structures of a SEG (DICOM, or Slicer's .seg.nrrd) or RTSTRUCT whose file has been read; else none.
 
-        Other sections have none.
-
-        Args:
-            section: Names the file, and the CT series on which it was drawn where that is not the case's.
-            case_ct: The CT of the case, or None.
+        They were drawn on the CT series that the section names, or on the case's.
 
         Raises:
             InputError: Structures that cannot be trusted, or that were drawn in other coordinates.
@@ -243,7 +218,6 @@ class CaseVolumes:
 
 
 def _key(file: str, called: str) -> str:
-    """The name of one structure's volume."""
     return f"{file}#{called}"
 
 
@@ -262,7 +236,6 @@ ROBOT_NOWHERE = (
 _HEADER = re.compile(r"^[ \t]*\[{1,2}[ \t]*([^\[\]\n]+?)[ \t]*\]{1,2}[ \t]*(?:#.*)?$", re.MULTILINE)
 """The header of a table, on a line of its own."""
 
-
 LINE_FILES = (".csv", ".fcsv")
 """Endings of lists that are read line by line: one that was cut within a number is another number, and looks whole."""
 
@@ -278,13 +251,8 @@ def wholeness_warnings(content: CaseFile, files: InputFiles, path: Path) -> tupl
             refuse(said, path, "files in which every line ends with a line break", "file_cut")
     if content.end is None:
         return (TOP_COUNT_NOTE,)
-    return () if ends_with_end(files.content(path.name).decode("utf-8")) else (NOT_LAST_NOTE,)
-
-
-def ends_with_end(text: str) -> bool:
-    """Whether the last table of a file is ``[end]``."""
-    headers = _HEADER.findall(text)
-    return bool(headers) and headers[-1] == "end"
+    headers = _HEADER.findall(files.content(path.name).decode("utf-8"))
+    return () if headers and headers[-1] == "end" else (NOT_LAST_NOTE,)
 
 
 def robot_warnings(content: CaseFile, robot: RobotSettings) -> tuple[str, ...]:

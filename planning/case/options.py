@@ -21,44 +21,32 @@ from puncture_twin.planning.base.errors import InputError, refuse
 
 OPTIONS_ROLE = "options"
 """Of the input that options are."""
-
 TABLES = {"target": "target", "needle": "needle", "arm": "robot", "errors": "errors", "search": "search"}
 """Options that are laid over a table of the case, key by key, and that table."""
-
 MOUNT, MARGINS, ADDED = "mount", "margins", "add_mm"
 """Options that are more than that, and the key of `margins` that adds to all."""
-
 SECTIONS = (*TABLES, MARGINS, MOUNT)
 """Every kind of option."""
-
 ALTERNATIVES = (
     *(("position_mm", "points"), ("points", "position_mm")),
     *(("model", "urdf"), ("model", "flange"), ("model", "limits"), ("urdf", "model"), ("urdf", "limits")),
 )
 """Keys of a table of which the first takes the place of the second: a target's, and an arm's."""
 
-WITH_MARGIN = ("avoid", "unknown")
-"""Roles that demand a margin."""
-
 
 @dataclass(frozen=True)
 class CaseOptions:
-    """Options of one case.
-
-    Attributes:
-        sections: Kind of option (`SECTIONS`) to its keys and values, as TOML gives them; mm and degrees.
-    """
+    """Options of one case: kind (`SECTIONS`) to its keys and values, as TOML gives them; mm and degrees."""
 
     sections: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
     def text(self) -> str:
         """The options as JSON: the same options give the same text; of margins the order counts, so it is kept."""
-        tables = (
-            f"{json.dumps(kind)}: "
-            + json.dumps(dict(values), sort_keys=kind != MARGINS, allow_nan=False, default=_plain)
-            for kind, values in sorted(self.sections.items())
-        )
+        tables = []
+        for kind, values in sorted(self.sections.items()):
+            text = json.dumps(dict(values), sort_keys=kind != MARGINS, allow_nan=False, default=_plain)
+            tables.append(f"{json.dumps(kind)}: {text}")
         return f"{{{', '.join(tables)}}}"
 
     def applied(self, data: dict[str, Any], *, where: Path | str) -> dict[str, Any]:
@@ -103,10 +91,7 @@ NO_OPTIONS = CaseOptions()
 
 
 def case_options(sections: Mapping[str, Any], *, where: str) -> CaseOptions:
-    """Options from plain values.
-
-    Args:
-        sections: Kind of option to a table of keys and values.
+    """Options from plain values: kind of option to a table of keys and values.
 
     Raises:
         InputError: An unknown kind, something that is no table, or a value that is no number, text or list of them.
@@ -161,7 +146,7 @@ def _set_margins(data: dict[str, Any], values: Mapping[str, Any], where: Path | 
 def _margins(data: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
     """Every margin of a case: the name or pattern that it is stated for, its table and its key there."""
     for one in _tables(data.get("structure")):
-        if one.get("role") in WITH_MARGIN:
+        if one.get("role") in ("avoid", "unknown"):
             yield str(one.get("name")), one, "margin_mm"
     for many in _tables(data.get("structures")):
         avoid = many.get("avoid")

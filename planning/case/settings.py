@@ -1,11 +1,6 @@
-"""What a validated case holds beside its structures: needle, search, CT, obstacles, gantry and arm; mm and radians.
+"""What a validated case holds beside its structures, in mm and radians and in the CT's frame.
 
-The devices that see needle and target in the room, and how the target moves.
-
-Frames that a case states by two axes: where the arm's base stands, and which way a gantry or a bed looks.
-
-The robot that a case states (an arm of the table or of the user's own URDF, and where it is located), its needle that
-bends, and its breathing, in mm and in the CT's frame.
+Needle and its bending, search, CT, obstacles, gantry, arm, devices that see needle and target, motion and breathing.
 """
 
 from __future__ import annotations
@@ -29,8 +24,8 @@ from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case import tables
 from puncture_twin.planning.case.case_file import CaseFile
-from puncture_twin.planning.case.entry import ANATOMICAL_LPS, entry_frame
-from puncture_twin.planning.case.toml_types import Anatomical, Vector
+from puncture_twin.planning.case.entry import AXES_PARALLEL, entry_frame, lps_axis
+from puncture_twin.planning.case.tables import Anatomical
 from puncture_twin.planning.formats import itk_transform
 from puncture_twin.planning.formats.labels.naming import REST, ByName
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
@@ -66,19 +61,15 @@ class Needle:
 
         The shaft must reach; and with a fixed standoff the tip must still lie ``skin_gap_mm`` outside, along it.
         """
-        if self.standoff_mm is None:
-            return self.shaft_mm
-        return min(self.shaft_mm, self.standoff_mm - self.skin_gap_mm)
+        outside = np.inf if self.standoff_mm is None else self.standoff_mm - self.skin_gap_mm
+        return min(self.shaft_mm, outside)
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """The grid of directions, the limit at the skin and those of the chances; radians.
+    """The grid of directions, the limit at the skin and those of the chances (None sets no limit); radians.
 
-    Attributes:
-        min_hit: Least chance to hit the target; None sets no limit.
-        max_touch: Greatest chance to touch any one structure; None sets no limit.
-        max_touch_of: Limits of single structures, by name, in place of ``max_touch``.
+    ``max_touch`` is of any one structure, ``max_touch_of`` of single ones, by name, in its place.
     """
 
     theta: tuple[float, float]
@@ -97,12 +88,10 @@ class CtSettings:
     Attributes:
         file: Where the skin does not come from a CT, the CT's file, or None.
         air_hu: Outside of the body, what is denser is not air.
-        dense_hu: Inside the body, what is at least so dense must belong to a structure.
-        margin_mm: Clearance that these structures demand.
-        unnamed: What it shows inside the body and no structure names: ``unknown``, or ``free``.
+        dense_hu: Inside the body, what is at least so dense must belong to a structure, or to one that demands
+            ``margin_mm`` and is ``unknown``, or ``free``, as ``unnamed`` says.
         trust_labels: Whether a person has seen that the structures lie right: no check of that refuses them.
-        arms: Whether the image shows arms or other limbs beside the trunk, where a person states it.
-        table: Whether it shows what the body lies on, where a person states it.
+        arms, table: Whether the image shows limbs beside the trunk, and what the body lies on, if a person states it.
         beyond_mm: How much wider than where the image cuts it the body may be beyond, where a person states it;
             infinite for all that lies beyond the plane of the cut.
     """
@@ -120,11 +109,8 @@ class CtSettings:
     @property
     def declared(self) -> tuple[str, ...]:
         """Sentences on what a person states of the image."""
-        said = []
-        if self.arms is not None:
-            said.append("declared: " + ("no arms in the image" if self.arms == "none" else "arms in the image"))
-        if self.table is not None:
-            said.append("declared: " + ("no table in the image" if self.table == "none" else "a table in the image"))
+        stated = ((self.arms, "no arms", "arms"), (self.table, "no table", "a table"))
+        said = [f"declared: {no if one == 'none' else yes} in the image" for one, no, yes in stated if one is not None]
         if self.beyond_mm is not None:
             wider = "fills all" if np.isinf(self.beyond_mm) else f"is at most {self.beyond_mm:g} mm wider"
             said.append(f"declared: beyond the image the body {wider}")
@@ -143,12 +129,7 @@ class Obstacle:
 
 @dataclass(frozen=True, eq=False)
 class Gantry:
-    """A wall with a round bore.
-
-    Attributes:
-        T_ct_gantry: Shape (4, 4), mm: the bore's centre; its axis is z, its top x.
-        wall_mm: How far the wall reaches outward from the bore.
-    """
+    """A wall that reaches so far outward from a round bore, whose axis is z of its frame, its top x; mm."""
 
     T_ct_gantry: Floats
     bore_diameter_mm: float
@@ -158,12 +139,11 @@ class Gantry:
 
 @dataclass(frozen=True, eq=False)
 class RobotSettings:
-    """The arm.
+    """The arm, its home (6,), rad, or None for the model's own, and where its base is.
 
     Attributes:
-        home: Shape (6,), rad, or None for the model's own.
-        T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated, or None.
-        stated: The section that states a transform, or None.
+        T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated.
+        stated: The section that states a transform.
     """
 
     model: UrModel
@@ -180,12 +160,9 @@ class RobotSettings:
 
 @dataclass(frozen=True, eq=False)
 class Stereo:
-    """Two cameras and the balls on the needle that they see.
+    """Two cameras (2, 3), mm, None where they are to be proposed, and the balls on the needle that they see.
 
-    Attributes:
-        cameras_ct: Shape (2, 3), mm: where the cameras are, or None where they are to be proposed.
-        balls_mm: Distances of the balls behind the needle's tip, ascending.
-        sd_mm: Standard deviation of a point that both see, per axis.
+    The balls by their distance behind the needle's tip, ascending; ``sd_mm`` is of a point that both see, per axis.
     """
 
     cameras_ct: Floats | None
@@ -195,15 +172,12 @@ class Stereo:
 
 @dataclass(frozen=True, eq=False)
 class Ultrasound:
-    """A probe on an arm of its own.
+    """A probe on an arm of its own, whose base is at T_base_ct_mount (4, 4), mm; None where that is to be proposed.
 
     Attributes:
-        T_base_ct_mount: Shape (4, 4), mm, of that arm's base, or None where it is to be proposed.
-        target_sd_mm: Standard deviation of the target's reading per axis of the image plane, and across it.
-        tip_sd_mm: The same of the needle's tip.
+        target_sd_mm, tip_sd_mm: Of a reading in the image plane, per axis, and across it.
         calibration_sd_mm: Of the image's place on its arm, per axis.
-        depth_mm: How deep the probe sees.
-        width_mm: Of its footprint.
+        depth_mm, width_mm: How deep the probe sees, and its footprint.
     """
 
     model: UrModel
@@ -223,11 +197,7 @@ class Motion:
 
 
 def stereo_of(section: tables.StereoSection | None, space: Space, path: Path) -> Stereo | None:
-    """The cameras; None where the case declares none.
-
-    Raises:
-        InputError: A position that looks like metres.
-    """
+    """The cameras; None where the case declares none. A position that looks like metres is refused."""
     if section is None:
         return None
     cameras = None
@@ -241,21 +211,12 @@ def stereo_of(section: tables.StereoSection | None, space: Space, path: Path) ->
 
 
 def ultrasound_of(section: tables.UltrasoundSection | None, space: Space, path: Path) -> Ultrasound | None:
-    """The probe and its arm; None where the case declares none.
-
-    Raises:
-        InputError: An unknown arm, or a mount that cannot be used.
-    """
+    """The probe and its arm; None where the case declares none. A mount that cannot be used is refused."""
     if section is None:
         return None
     mount = None if section.mount is None else mount_pose(section.mount, space, path, key="ultrasound.mount")
     stated = section.model_dump(exclude={"model", "mount"})
     return Ultrasound(model=ur_model(section.model), T_base_ct_mount=mount, **stated)
-
-
-def motion_of(section: tables.MotionSection | None) -> Motion | None:
-    """How the target moves; its covariance is diagonal, so LPS and RAS are the same. None where none is declared."""
-    return None if section is None else Motion(read_only(np.diag(np.square(section.target_sd_mm))))
 
 
 def ct_of(section: tables.CtSection, *, trust_labels: bool) -> CtSettings:
@@ -266,15 +227,11 @@ def ct_of(section: tables.CtSection, *, trust_labels: bool) -> CtSettings:
 
 def search_of(section: tables.SearchSection) -> SearchSettings:
     """The grid and the limits in radians."""
-    return SearchSettings(
-        theta=(np.radians(section.theta_deg[0]), np.radians(section.theta_deg[1])),
-        beta=(np.radians(section.beta_deg[0]), np.radians(section.beta_deg[1])),
-        step=np.radians(section.step_deg),
-        max_skin_angle=np.radians(section.max_skin_angle_deg),
-        min_hit=section.min_hit,
-        max_touch=section.max_touch,
-        max_touch_of=MappingProxyType(dict(section.max_touch_of)),
-    )
+    (low, high), (first, last) = section.theta_deg, section.beta_deg
+    ranges = (np.radians(low), np.radians(high)), (np.radians(first), np.radians(last))
+    steps = np.radians(section.step_deg), np.radians(section.max_skin_angle_deg)
+    touch_of = MappingProxyType(dict(section.max_touch_of))
+    return SearchSettings(*ranges, *steps, section.min_hit, section.max_touch, touch_of)
 
 
 def obstacle_of(section: tables.ObstacleSection, space: Space) -> Obstacle:
@@ -292,9 +249,6 @@ def gantry_of(gantry: tables.GantrySection, space: Space, path: Path) -> Gantry:
     tilt = pose([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]], np.zeros(3))
     return Gantry(read_only(T @ tilt), gantry.bore_diameter_mm, gantry.wall_mm, gantry.thickness_mm)
 
-
-AXES_PARALLEL = 0.999
-"""|cos| above which a mount's x and z axes do not span a frame (2.6 degrees)."""
 
 LIKE_METRES = 5.0
 """A base that stands nearer to the CT's origin than this, and not on it, is one in metres: no arm reaches farther."""
@@ -329,11 +283,7 @@ def mount_pose(mount: tables.MountSection, space: Space, path: Path, *, key: str
 
 
 def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Floats:
-    """R_ct_frame, shape (3, 3), of a frame whose z axis is given and whose x axis is what of ``x`` is square to it.
-
-    Raises:
-        InputError: The two are parallel or zero; names ``key``.
-    """
+    """R_ct_frame, shape (3, 3), of a frame whose z axis is given and whose x axis is what of ``x`` is square to it."""
     try:
         return entry_frame(tables.EntryAxes(z=z, x=x), space, where=path)
     except InputError as error:
@@ -347,8 +297,7 @@ URDF_ROLE, MESH_ROLE = "urdf", "urdf mesh"
 def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> RobotSettings:
     """The arm with its home, its speeds, and where it is located, as far as mount or transform say so.
 
-    Args:
-        files: What it names; each file that decides the arm is added.
+    Each file that decides the arm becomes an input of the case.
 
     Raises:
         InputError: An arm, a mount or a transform that cannot be used.
@@ -357,11 +306,10 @@ def robot_of(content: CaseFile, space: Space, path: Path, files: InputFiles) -> 
     home = None if robot.home_deg is None else read_only(np.radians(np.asarray(robot.home_deg)))
     mount = None if robot.mount is None else mount_pose(robot.mount, space, path)
     speeds = SpeedLimits(*(getattr(robot, name) for name in SpeedLimits._fields))
-    if stated is not None and stated.transform is not None:
-        T_file = itk_transform.parse_transform(files.content(stated.transform), path.parent / stated.transform)
-        mount = read_only(tables.stated_base_ct(stated, T_file))
-        return RobotSettings(model, home, mount, stated, speeds)
-    return RobotSettings(model, home, mount, speeds=speeds)
+    if stated is None or stated.transform is None:
+        return RobotSettings(model, home, mount, speeds=speeds)
+    T_file = itk_transform.parse_transform(files.content(stated.transform), path.parent / stated.transform)
+    return RobotSettings(model, home, read_only(tables.stated_base_ct(stated, T_file)), stated, speeds)
 
 
 def arm_of(section: tables.RobotSection, files: InputFiles, path: Path) -> UrModel:
@@ -381,7 +329,6 @@ def arm_of(section: tables.RobotSection, files: InputFiles, path: Path) -> UrMod
 
 
 def _mesh(address: str, *, urdf: str, files: InputFiles, path: Path) -> bytes:
-    """The bytes of a mesh that a URDF names."""
     if "://" in address or PurePosixPath(address).is_absolute():
         allowed = "paths relative to the URDF's folder, such as meshes/base.stl"
         refuse(f"robot.urdf: mesh '{address}' is not a path next to the URDF", path, allowed, "outside_folder")
@@ -393,11 +340,9 @@ def stated_limits(section: tables.LimitsSection | None) -> StatedLimits:
     """The limits in radians; nothing where the case states none."""
     if section is None:
         return NOTHING_STATED
-    angles = (
-        None
-        if section.lowest_deg is None
-        else np.radians(np.stack([section.lowest_deg, section.highest_deg or ()], axis=1))
-    )
+    angles = None
+    if section.lowest_deg is not None:
+        angles = np.radians(np.stack([section.lowest_deg, section.highest_deg or ()], axis=1))
     return StatedLimits(angles, None if section.max_speed_deg_s is None else np.radians(section.max_speed_deg_s))
 
 
@@ -447,34 +392,17 @@ def _shaft(needle: tables.NeedleSection, where: str | Path) -> Shaft:
 def breathing_of(section: tables.BreathingSection | None, space: Space, where: str | Path) -> Breathing | None:
     """The breathing of a case; None where it declares none.
 
-    Args:
-        space: Of the case, in which a direction is meant.
-
     Raises:
         InputError: A direction without length, or an anatomical one in a space that knows no patient.
     """
     if section is None:
         return None
-    return Breathing(
-        amplitude_mm=section.amplitude_mm,
-        direction_ct=_unit(section.direction, space, where),
-        weights=ByName(section.weights),
-        phases=section.phases,
-        exponent=section.exponent,
-        scanned_at=section.scanned_at,
-        gate=section.gate,
-    )
-
-
-def _unit(direction: str | Vector, space: Space, where: str | Path) -> Floats:
-    """Shape (3,), unit, LPS (or the case's local frame)."""
-    if isinstance(direction, str):
-        if space is Space.LOCAL:
-            message = f'breathing.direction: space "local" has no {direction}'
-            refuse(message, where, "direction = [x, y, z]", "local_space")
-        return np.array(ANATOMICAL_LPS[direction], dtype=np.float64)
-    vector = to_lps(np.array([direction], dtype=np.float64), space)[0]
+    if isinstance(section.direction, str) and space is Space.LOCAL:
+        message = f'breathing.direction: space "local" has no {section.direction}'
+        refuse(message, where, "direction = [x, y, z]", "local_space")
+    vector = lps_axis(section.direction, space)
     length = float(np.linalg.norm(vector))
     if length == 0:
         refuse("breathing.direction is zero", where, "a direction of any length", "zero_direction")
-    return np.asarray(vector / length)
+    stated = section.model_dump(exclude={"direction", "weights"})
+    return Breathing(direction_ct=vector / length, weights=ByName(section.weights), **stated)

@@ -1,85 +1,112 @@
-"""``[[structure]]``, ``[[structures]]``, ``[ct]``: one structure, many by name patterns, and the CT beside them.
+"""The tables of a case file: numbers with bounds, names, and a section for each table; mm and degrees.
 
-``[search]`` and ``[ranking]``: which directions are searched, their limits, and what a good one is.
-
-``[needle]`` and ``[tissue.NAME]``: the needle, and what it bends in.
-
-``[robot]``: the arm, its speeds, and where its base is located.
-
-``[place]``: where ``place`` may stand the arm.
-
-Where the patient lies for the robot, as a case states it: by markers, or by a transform that somebody else found.
-
-``[errors]`` and ``[rehearsal]``: what is declared to err, and the truth that a rehearsal draws instead.
-
-The table ``[breathing]`` of a case. See docs/concepts/breathing.md.
-
-``[stereo]``, ``[ultrasound]``, ``[control_scan]`` and ``[motion]``: what sees needle and target, and what moves.
-
-``[[obstacle]]`` and ``[gantry]``: what is located around the patient.
-
-The body of the user's own that the flange carries beside the needle and its holder.
+See docs/reference/case.md for the keys.
 """
 
 from __future__ import annotations
 
+import difflib
+import re
+import unicodedata
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import scipy
-from pydantic import Field, Strict, model_validator
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    BaseModel,
+    ConfigDict,
+    Field,
+    Strict,
+    StringConstraints,
+    model_validator,
+)
 
-from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS, HIGHEST
+from puncture_twin.planning.arm.kinematics import DEFAULT_SPEEDS as USUAL, HIGHEST
 from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import SchemaError
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.toml_types import (
-    Anatomical,
-    Coordinate,
-    Degrees180,
-    Degrees360,
-    Label,
-    Length,
-    Margin,
-    Name,
-    NotNegative,
-    Number,
-    Positive,
-    Section,
-    Sextuple,
-    StructureName,
-    Text,
-    Vector,
-    Weight,
-    Yes,
-)
+from puncture_twin.planning.base.text import MAX_NAME
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
+from puncture_twin.planning.formats.points import plainly_radians
 from puncture_twin.planning.geometry.rigid import inverse, pose
 from puncture_twin.planning.geometry.spaces import Space, Up, parse_unit
 
-MAX_STRUCTURES = 1000
-"""Structures, or obstacles, of a case: TotalSegmentator knows 117 classes, and each structure costs a tree."""
+
+def _plain_name(value: str) -> str:
+    if not re.fullmatch(r"[^\W_]([\w .\-]*[\w.\-])?", unicodedata.normalize("NFC", value)):
+        raise SchemaError("must be letters, digits, spaces and . _ -, a letter or digit first", "bad_name")
+    return value
+
+
+def _degrees(value: tuple[float, ...]) -> tuple[float, ...]:
+    if plainly_radians(value):
+        raise SchemaError(f"all six are within {max(map(abs, value)):g} of zero: not in degrees?", "wrong_unit")
+    return value
+
+
+Number = Annotated[float, Strict(), AllowInfNan(False)]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Coordinate = Annotated[Number, Field(ge=-100_000, le=100_000)]
+Length = Annotated[Number, Field(gt=0, le=100_000)]
+Margin = Annotated[Number, Field(ge=0, le=1000)]
+Weight = Annotated[Number, Field(ge=0, le=1000)]
+JointDegrees = Annotated[Number, Field(ge=-360, le=360)]
+Vector = tuple[Coordinate, Coordinate, Coordinate]
+Sextuple = Annotated[
+    tuple[JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees, JointDegrees], AfterValidator(_degrees)
+]
+Text = Annotated[str, StringConstraints(min_length=1, max_length=MAX_NAME)]
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$", max_length=80)]
+CaseName = Annotated[str, StringConstraints(max_length=80), AfterValidator(_plain_name)]
+"""Of any alphabet: a patient may be called Müller. What must be ASCII (exports to robots) writes it plainly."""
+StructureName = Annotated[str, StringConstraints(pattern=r"^\S(.*\S)?$", max_length=MAX_NAME)]
+"""As other programs name structures, such as "right lung"; that it is printable is checked for the whole file."""
+Degrees360 = Annotated[Number, Field(ge=0, le=360)]
+Degrees180 = Annotated[Number, Field(ge=0, le=180)]
+Yes = Annotated[bool, Strict()]
+Label = Annotated[int, Strict(), Field(ge=1, le=65535)]
+Anatomical = Literal["left", "right", "anterior", "posterior", "head", "feet"]
+
+
+class Section(BaseModel):
+    """A table of the file: frozen, and an unknown key is an error that names the nearest valid one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_unknown_keys(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            known = [field.alias or name for name, field in cls.model_fields.items()]
+            for key in data:
+                if key not in known:
+                    near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+                    hint = f"did you mean '{near[0]}'? " if near else ""
+                    raise SchemaError(f"unknown key '{key}'; {hint}keys here: {', '.join(known)}", "unknown_key")
+        return data
+
+
+MAX_STRUCTURES, MAX_LABEL_MAPS = 1000, 100
+"""Structures, or obstacles, of a case: TotalSegmentator knows 117 classes, and each structure costs a tree. And tables
+``[[structures]]``, each with a label map of its own."""
 
 Stated = Literal["none", "present"]
 """What a person says of arms, or of a table, in an image."""
-
 Role = Literal["avoid", "traverse", "target", "skin", "unknown"]
 
-MAX_LABEL_MAPS = 100
-"""Tables ``[[structures]]``, each with a label map of its own."""
-
 Patterns = Annotated[tuple[Text, ...], Field(max_length=MAX_STRUCTURES)]
-
-AIR_HU = -900.0
+Margins = Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)]
+AIR_HU, DENSE_HU = -900.0, 250.0
 """Air is -1000; its noise in a mean over 3 mm is some 15, so that 100 is more than six times that. Foam of a mattress
-has -970 to -900: what is less dense than this is not told from air."""
-
-DENSE_HU = 250.0
-"""Cancellous bone starts at about 200; soft tissue with contrast in the venous phase ends at about 200."""
+has -970 to -900: what is less dense than this is not told from air. Cancellous bone starts at about 200; soft tissue
+with contrast in the venous phase ends at about 200."""
 
 
 class StructureSection(Section):
@@ -132,8 +159,8 @@ class StructuresSection(Section):
     ct: str | None = None
     naming: str | None = None
     target: Patterns = ()
-    avoid: Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
-    unknown: Annotated[dict[Text, Margin], Field(max_length=MAX_STRUCTURES)] = Field(default_factory=dict)
+    avoid: Margins = Field(default_factory=dict)
+    unknown: Margins = Field(default_factory=dict)
     traverse: Patterns = ()
     ignore: Patterns = ()
 
@@ -179,6 +206,7 @@ class CtSection(Section):
 
 
 Chance = Annotated[Number, Field(ge=0, le=1)]
+"""Or another fraction."""
 
 MAX_DIRECTIONS = 1_000_000
 """Rows of a search: a hemisphere at 0.2 degrees; 2 GB of table with 60 structures."""
@@ -206,16 +234,10 @@ class SearchSection(Section):
 
     @model_validator(mode="after")
     def _grid_fits(self) -> Self:
-        rows = 1.0
-        for low, high in (self.theta_deg, self.beta_deg):
-            rows *= (high - low) / self.step_deg + 1
+        rows = float(np.prod([(high - low) / self.step_deg + 1 for low, high in (self.theta_deg, self.beta_deg)]))
         if rows > MAX_DIRECTIONS:
             what = f"step_deg {self.step_deg:g} makes {rows:,.0f} directions; {MAX_DIRECTIONS:,} at most"
             raise SchemaError(what, "too_many")
-        return self
-
-    @model_validator(mode="after")
-    def _ranges_ascend(self) -> Self:
         for key in ("theta_deg", "beta_deg"):
             low, high = getattr(self, key)
             if low > high:
@@ -244,8 +266,6 @@ class RankingSection(Section):
 
 
 Force = Annotated[Number, Field(ge=0, le=50)]
-Stiffness = Annotated[Number, Field(ge=0, le=100)]
-"""Soft tissue has 0.01 to 1, rubber some 10."""
 
 
 class NeedleSection(Section):
@@ -279,7 +299,7 @@ class NeedleSection(Section):
 class TissueSection(Section):
     """One tissue."""
 
-    stiffness_n_mm2: Stiffness
+    stiffness_n_mm2: Annotated[Number, Field(ge=0, le=100)]  # soft tissue has 0.01 to 1, rubber some 10
     cutting_n: Force = 0.0
     friction_n_mm: Annotated[Number, Field(ge=0, le=1)] = 0.0
     capsule_n: Force = 0.0
@@ -354,12 +374,10 @@ class RobotSection(Section):
     limits: LimitsSection | None = None
     home_deg: Sextuple | None = None
     mount: MountSection | None = None
-    tip_speed_mm_s: Annotated[Number, Field(ge=1, le=HIGHEST.tip_speed_mm_s)] = DEFAULT_SPEEDS.tip_speed_mm_s
-    insertion_speed_mm_s: Annotated[Number, Field(ge=0.1, le=HIGHEST.insertion_speed_mm_s)] = (
-        DEFAULT_SPEEDS.insertion_speed_mm_s
-    )
-    joint_speed_fraction: Annotated[Number, Field(ge=0.01, le=1)] = DEFAULT_SPEEDS.joint_speed_fraction
-    joint_acceleration_fraction: Annotated[Number, Field(ge=0.01, le=1)] = DEFAULT_SPEEDS.joint_acceleration_fraction
+    tip_speed_mm_s: Annotated[Number, Field(ge=1, le=HIGHEST.tip_speed_mm_s)] = USUAL.tip_speed_mm_s
+    insertion_speed_mm_s: Annotated[Number, Field(ge=0.1, le=HIGHEST.insertion_speed_mm_s)] = USUAL.insertion_speed_mm_s
+    joint_speed_fraction: Annotated[Number, Field(ge=0.01, le=1)] = USUAL.joint_speed_fraction
+    joint_acceleration_fraction: Annotated[Number, Field(ge=0.01, le=1)] = USUAL.joint_acceleration_fraction
 
     @model_validator(mode="after")
     def _one_arm(self) -> Self:
@@ -367,10 +385,6 @@ class RobotSection(Section):
             raise SchemaError("model and urdf both state the arm; keep one", "stated_twice")
         if self.urdf is None and "flange" in self.model_fields_set:
             raise SchemaError("flange names a link of urdf, and urdf is missing", "key_not_of_it")
-        return self
-
-    @model_validator(mode="after")
-    def _insertion_is_the_slower(self) -> Self:
         if self.insertion_speed_mm_s > self.tip_speed_mm_s:
             what = f"insertion_speed_mm_s {self.insertion_speed_mm_s:g} is above tip_speed_mm_s {self.tip_speed_mm_s:g}"
             raise SchemaError(what, "out_of_range")
@@ -378,7 +392,6 @@ class RobotSection(Section):
 
 
 Range = tuple[Coordinate, Coordinate]
-
 MountName = Literal["floor", "rail", "ceiling", "side"]
 
 
@@ -425,7 +438,6 @@ class PlaceSection(Section):
 RAS_OF_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Its own inverse."""
 NO_RESIDUALS = "stated transform {file}: no residuals, expected error unknown"
-
 _OF_MARKERS = ("method", "correct", "correct_joints_deg")
 _OF_COMPARISON = ("use", "fle_mm", "accept_residuals", "accept_symmetry")
 
@@ -450,16 +462,12 @@ class RegistrationSection(Section):
     base_axes: Literal["LPS", "RAS"] | None = None
 
     @model_validator(mode="after")
-    def _corrected(self) -> Self:
+    def _one_source(self) -> Self:
         if self.correct_joints_deg is not None and not self.correct:
             raise SchemaError("correct_joints_deg needs correct = true, the correction for it", "keys_together")
         if self.correct and self.method not in {None, "weighted"}:
             what = f'correct = true has its own fit; method "{self.method}" has another'
             raise SchemaError(what, "conflicting_keys")
-        return self
-
-    @model_validator(mode="after")
-    def _one_source(self) -> Self:
         markers = [key for key in ("markers_ct", "markers_base") if getattr(self, key) is None]
         if self.transform is None:
             if markers:
@@ -499,23 +507,14 @@ class MarkerSection(RegistrationSection):
 
 
 def stated_base_ct(section: RegistrationSection, T_file: Floats) -> Floats:
-    """T_base_ct, shape (4, 4), mm, of a stated transform.
-
-    Args:
-        section: Says which way it goes, and what its coordinates on the robot's side are.
-        T_file: Shape (4, 4), what the file does to a point; rigid to the digits of its file.
-    """
+    """T_base_ct (4, 4), mm, of what a stated transform's file does to a point (4, 4), rigid to the file's digits."""
     U, _, Vt = np.linalg.svd(T_file[:3, :3])
     T = pose(U @ Vt, T_file[:3, 3])
     return _read_as(T, inverted=section.transform_maps == "base_to_ct", turned=section.base_axes == "RAS")
 
 
 def other_readings(section: RegistrationSection, T_base_ct: Floats) -> dict[str, Floats]:
-    """T_base_ct under other values of ``transform_maps`` and ``base_axes``, by these keys as text.
-
-    Args:
-        T_base_ct: Shape (4, 4), mm, by its own keys.
-    """
+    """T_base_ct (4, 4), mm, under other values of ``transform_maps`` and ``base_axes``, by these keys as text."""
     T = RAS_OF_LPS @ T_base_ct if section.base_axes == "RAS" else T_base_ct
     maps = "ct_to_base" if section.transform_maps == "base_to_ct" else "base_to_ct"
     axes = "LPS" if section.base_axes == "RAS" else "RAS"
@@ -579,11 +578,8 @@ class RehearsalSection(Section):
     errors: ErrorsSection | None = None
 
 
-Position = Annotated[Number, Field(ge=0, le=1)]
 PatternWeight = Annotated[Number, Field(ge=0, le=2)]
 """Of what moves more than the target, such as the dome of a liver over a lesion deep in it, a weight is above 1."""
-
-MOST_PATTERNS = 1000
 
 
 class BreathingSection(Section):
@@ -591,11 +587,11 @@ class BreathingSection(Section):
 
     amplitude_mm: Annotated[Number, Field(ge=0, le=100)]
     direction: Anatomical | Vector = "feet"
-    weights: Annotated[dict[Text, PatternWeight], Field(max_length=MOST_PATTERNS)]
+    weights: Annotated[dict[Text, PatternWeight], Field(max_length=MAX_STRUCTURES)]
     phases: Annotated[int, Strict(), Field(ge=1, le=64)] = 8
     exponent: Annotated[int, Strict(), Field(ge=1, le=6)] = 2
-    scanned_at: Position = 0.0
-    gate: Position | None = None
+    scanned_at: Chance = 0.0
+    gate: Chance | None = None
 
     @model_validator(mode="after")
     def _full_inhale_is_a_phase(self) -> Self:
@@ -607,7 +603,6 @@ class BreathingSection(Section):
 
 Deviation = Annotated[Number, Field(gt=0, le=10)]
 """Standard deviation of a device's reading, mm; no device reads without error."""
-
 Along = Annotated[Number, Field(gt=0, le=1000)]
 """Along the needle, from its tip."""
 
@@ -697,10 +692,7 @@ class ToolSection(Section):
 
 
 def tool_of(section: ToolSection | None, files: InputFiles, path: Path) -> ToolBody | None:
-    """The tool's body; its file becomes an input of the case. None where the case names none.
-
-    Args:
-        section: As the case states it. It is turned about the flange's x, y and z, in this order, then moved.
+    """The tool's body, turned about the flange's x, y and z, in this order, then moved; its file becomes an input.
 
     Raises:
         InputError: A file that cannot be used, or a unit that is not known.

@@ -16,27 +16,24 @@ from pydantic import Field, StringConstraints, ValidationError, model_validator
 from puncture_twin.planning.base.errors import InputError, SchemaError, refuse
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.toml_file import parse_toml, read_toml_bytes
-from puncture_twin.planning.case import toml_types
+from puncture_twin.planning.case.tables import Degrees180, Degrees360, NotNegative, Number, Positive, Section, Text, Yes
 
 ALLOWED = "[[check]], [[window]] or [[plan]] tables"
 KEYS = "docs/how-to/collision-cases.md"
-DEFAULT_TOLERANCE_MM = 0.01
-"""A tenth of the 0.1 mm to which a robot repeats itself."""
-
-MOST_TOLERANCE_MM = 10.0
-"""A clearance that may be off by more is not checked at all."""
+DEFAULT_TOLERANCE_MM, MOST_TOLERANCE_MM = 0.01, 10.0
+"""A tenth of the 0.1 mm to which a robot repeats itself; a clearance that may be off by more is not checked at all."""
 
 TestName = Annotated[str, StringConstraints(pattern=r"^[^\s:\[\]/\\]([^:\[\]/\\]*[^\s:\[\]/\\])?$", max_length=80)]
 """What pytest can select a test by: without the signs of its own names."""
 
 Mark = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=80)]
-Chance = Annotated[toml_types.Number, Field(ge=0, le=1)]
+Chance = Annotated[Number, Field(ge=0, le=1)]
 
 
-class Expectation(toml_types.Section):
+class Expectation(Section):
     """Keys of every table: the case, and the test's name."""
 
-    case: toml_types.Text | None = None
+    case: Text | None = None
     name: TestName | None = None
     why: str = ""
     marks: tuple[Mark, ...] = ()
@@ -50,16 +47,16 @@ class Expectation(toml_types.Section):
 class CheckSection(Expectation):
     """Expectation of one direction."""
 
-    theta_deg: toml_types.Degrees180
-    beta_deg: toml_types.Degrees360
+    theta_deg: Degrees180
+    beta_deg: Degrees360
     verdict: str = Field(pattern="^(safe|rejected)$")
     reason: Reason | None = None
     structure: str | None = None
-    clearance_mm: dict[str, toml_types.Number] = Field(default_factory=dict)
-    tolerance_mm: Annotated[toml_types.NotNegative, Field(le=MOST_TOLERANCE_MM)] = DEFAULT_TOLERANCE_MM
-    min_clearance_mm: toml_types.Number | None = None
+    clearance_mm: dict[str, Number] = Field(default_factory=dict)
+    tolerance_mm: Annotated[NotNegative, Field(le=MOST_TOLERANCE_MM)] = DEFAULT_TOLERANCE_MM
+    min_clearance_mm: Number | None = None
     max_touch: Chance | None = None
-    arm: toml_types.Yes = False
+    arm: Yes = False
 
     @property
     def usual_name(self) -> str:
@@ -70,10 +67,10 @@ class CheckSection(Expectation):
 class WindowSection(Expectation):
     """Expectation of the window that contains one direction."""
 
-    theta_deg: toml_types.Degrees180
-    beta_deg: toml_types.Degrees360
-    min_square_deg: toml_types.Positive
-    arm: toml_types.Yes = False
+    theta_deg: Degrees180
+    beta_deg: Degrees360
+    min_square_deg: Positive
+    arm: Yes = False
 
     @property
     def usual_name(self) -> str:
@@ -84,7 +81,7 @@ class WindowSection(Expectation):
 class PlanSection(Expectation):
     """Expectation of a plan that must still be valid."""
 
-    file: toml_types.Text
+    file: Text
 
     @property
     def usual_name(self) -> str:
@@ -92,10 +89,10 @@ class PlanSection(Expectation):
         return "plan-" + "-".join(Path(self.file).parts[-2:])
 
 
-class ChecksFile(toml_types.Section):
+class ChecksFile(Section):
     """Schema of a whole file of expectations."""
 
-    case: toml_types.Text | None = None
+    case: Text | None = None
     check: tuple[CheckSection, ...] = ()
     window: tuple[WindowSection, ...] = ()
     plan: tuple[PlanSection, ...] = ()
@@ -119,16 +116,8 @@ class CheckedFile(NamedTuple):
 
 
 def read_checks(path: Path) -> CheckedFile:
-    """Read and validate a file of expectations.
-
-    Raises:
-        InputError: Unreadable, not TOML, not this schema, or a table without a case; names the line.
-    """
+    """Read and validate a file of expectations; the line of what is refused is named."""
     data = read_toml_bytes(path, ALLOWED)
-    return CheckedFile(_parse(data, path), data)
-
-
-def _parse(data: bytes, path: Path) -> ChecksFile:
     try:
         content = parse_toml(data, path, ChecksFile, allowed=ALLOWED, keys=KEYS)
     except InputError as error:
@@ -136,12 +125,12 @@ def _parse(data: bytes, path: Path) -> ChecksFile:
             raise
         place = error.__cause__.errors(include_url=False)[0]["loc"]
         raise error.at(_where(data, path, place)) from error
-    for kind, tables in content.tables().items():
-        for at, table in enumerate(tables):
+    for kind, expectations in content.tables().items():
+        for at, table in enumerate(expectations):
             if (table.case or content.case) is None:
                 allowed = "case = FILE, in the file or in the table"
                 refuse("no case", _where(data, path, (kind, at)), allowed, "missing_case")
-    return content
+    return CheckedFile(content, data)
 
 
 def _where(data: bytes, path: Path, place: tuple[Any, ...]) -> str:
@@ -162,10 +151,9 @@ TOKENS = re.compile(
 
 
 def line_of(text: str, place: Sequence[str | int]) -> int | None:
-    """The line of a place such as ("check", 2, "verdict"), counted from 1; that of its table where it has no own.
+    """The line of a place such as ("check", 2, "verdict"), from 1 on; that of its table where it has no own.
 
-    Args:
-        place: The array's name, the number of the table from 0 on, and keys; or keys of the file.
+    The array's name, the number of the table from 0 on, and keys; or keys of the file.
     """
     heads = [match for match in TOKENS.finditer(text) if match["kind"]]
     if len(place) < 2:

@@ -30,13 +30,14 @@ from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, reason_text
-from puncture_twin.planning.search.windows import Windows, nearest_row
+from puncture_twin.planning.search.windows import nearest_row
 
-DIGIT = 0.1
-"""Fraction of a tolerance: a rewritten number keeps the rest of it."""
+DIGIT, LEAST_DIGIT_MM, CHANCE_DIGIT, DIGIT_SQUARE_DEG = 0.1, 0.01, 0.01, 1.0
+"""Steps of rewritten numbers: a fraction of a tolerance, which keeps the rest; of a least clearance, mm; of a chance
+(relative); and of an area."""
 
-LEAST_DIGIT_MM, CHANCE_DIGIT = 0.01, 0.01
-"""Steps of a rewritten least clearance (mm) and of a rewritten chance (relative)."""
+MOST_SHOWN = 6
+"""Windows."""
 
 
 def direction_finding(check: checks_file.CheckSection, found: Explanation) -> Finding:
@@ -96,50 +97,33 @@ def _touch(check: checks_file.CheckSection, found: Explanation) -> Iterator[Diff
 
 
 def _number(new: NewNumber) -> NewNumber | None:
-    """A new expected number; None where its value is not finite."""
     return new if np.isfinite(new.value) else None
-
-
-DIGIT_SQUARE_DEG = 1.0
-"""Step of a rewritten area."""
-
-MOST_SHOWN = 6
-"""Windows."""
 
 
 def window_finding(window: checks_file.WindowSection, direction: Candidates, search: Candidates) -> Finding:
     """Differences of one window from what is expected."""
-    windows = search.windows
-    differences = tuple(_differences(window, direction, search, windows))
-    return Finding(differences, tuple(_listed(search, windows))) if differences else Finding()
+    differs, windows = _window_difference(window, direction, search), search.windows.windows
+    listed = [f"windows: {len(windows)}"]
+    for one in windows[:MOST_SHOWN]:
+        listed.append(f"  {one.number}: {one.square_deg:.1f} square degrees, best at {_angles(search, one.best)}")
+    return Finding() if differs is None else Finding((differs,), tuple(listed))
 
 
-def _differences(
-    window: checks_file.WindowSection, direction: Candidates, search: Candidates, windows: Windows
-) -> Iterator[Difference]:
+def _window_difference(
+    window: checks_file.WindowSection, direction: Candidates, search: Candidates
+) -> Difference | None:
     if not direction.safe[0]:
-        yield Difference(f"the direction is rejected: {reason_text(direction, 0)}")
-        return
+        return Difference(f"the direction is rejected: {reason_text(direction, 0)}")
     row = nearest_row(search, direction.outward_ct[0])
     if row is None:
-        yield Difference("the direction is safe but outside the grid of the case")
-    elif not search.safe[row]:
-        yield Difference(f"the nearest direction of the grid, {_angles(search, row)}: {reason_text(search, row)}")
-    else:
-        yield from _too_small(window, windows, int(windows.of_row[row]))
-
-
-def _too_small(window: checks_file.WindowSection, windows: Windows, number: int) -> Iterator[Difference]:
-    want, got = window.min_square_deg, windows.windows[number - 1].square_deg
-    if not got >= want:
-        line = f"its window {number}: expected at least {want:g} square degrees, found {got:.1f}"
-        yield Difference(line, NewNumber(("min_square_deg",), got, DIGIT_SQUARE_DEG, ROUND_FLOOR))
-
-
-def _listed(search: Candidates, windows: Windows) -> Iterator[str]:
-    yield f"windows: {len(windows.windows)}"
-    for one in windows.windows[:MOST_SHOWN]:
-        yield f"  {one.number}: {one.square_deg:.1f} square degrees, best at {_angles(search, one.best)}"
+        return Difference("the direction is safe but outside the grid of the case")
+    if not search.safe[row]:
+        return Difference(f"the nearest direction of the grid, {_angles(search, row)}: {reason_text(search, row)}")
+    number = int(search.windows.of_row[row])
+    want, got = window.min_square_deg, search.windows.windows[number - 1].square_deg
+    line = f"its window {number}: expected at least {want:g} square degrees, found {got:.1f}"
+    number_of = NewNumber(("min_square_deg",), got, DIGIT_SQUARE_DEG, ROUND_FLOOR)
+    return None if got >= want else Difference(line, number_of)
 
 
 def _angles(candidates: Candidates, row: int) -> str:
@@ -156,13 +140,7 @@ class CollisionMismatchError(AssertionError):
 
 @dataclass(frozen=True)
 class Table:
-    """One table of expectations, as a test needs it.
-
-    Attributes:
-        kind: ``check``, ``window`` or ``plan``.
-        at: Its number among those, from 0 on.
-        line: Where it begins, from 1 on; None where nothing tells.
-    """
+    """One table of expectations: its kind, number among those (from 0 on) and line (from 1 on), where that is known."""
 
     kind: str
     at: int
@@ -184,15 +162,12 @@ class CollisionFile(pytest.File):
         names = unique_names(table.expected.name or table.expected.usual_name for table in tables)
         for name, table in zip(names, tables, strict=True):
             item = CollisionItem.from_parent(self, name=name, table=table)
-            self._mark(item, table)
-            yield item
-
-    def _mark(self, item: pytest.Item, table: Table) -> None:
-        for mark in table.expected.marks:
             try:
-                item.add_marker(mark)
+                for mark in table.expected.marks:
+                    item.add_marker(mark)
             except pytest.fail.Exception as error:  # --strict-markers
                 raise self.CollectError(f"{self.path}:{table.line or 1}: marks: {error}") from error
+            yield item
 
 
 def _tables(content: checks_file.ChecksFile, data: bytes, folder: Path) -> Iterator[Table]:
@@ -214,19 +189,14 @@ class CollisionItem(pytest.Item):
         """Check, and fail with what differs, or keep the numbers that are to be rewritten."""
         session, table = session_of(self.config), self._table
         if table.kind != "plan":
-            self.user_properties += arm_properties(session, table)
+            context = session.context(table.case, arm=bool(getattr(table.expected, "arm", False)))
+            self.user_properties += [("case", str(table.case)), (ARM_PROPERTY, context.arm)]
         found = FINDERS[table.kind](session, table, self.path.parent)
-        if found.differences and not (updating(self.config) and self._queued_for_rewrite(session, found)):
-            raise CollisionMismatchError(found.text(table.expected.why))
-
-    def _queued_for_rewrite(self, session: Session, found: Finding) -> bool:
-        """Keep what differs for the rewriting at the end, if all of it is numbers."""
         numbers = [one.number for one in found.differences if one.number is not None]
-        if len(numbers) < len(found.differences):
-            return False
+        if len(numbers) < len(found.differences) or (numbers and not updating(self.config)):
+            raise CollisionMismatchError(found.text(table.expected.why))
         for number in numbers:
-            session.change(self.path, self._table.data, Change(self._table.kind, self._table.at, self.name, number))
-        return True
+            session.change(self.path, table.data, Change(table.kind, table.at, self.name, number))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """The differences, in a few lines."""
@@ -242,18 +212,8 @@ class CollisionItem(pytest.Item):
         return self.path, None if line is None else line - 1, f"{self.path.name}: {self.name}"
 
 
-def arm_properties(session: Session, table: Table) -> list[tuple[str, object]]:
-    """Properties of a test's report about the arm."""
-    context = session.context(table.case, arm=bool(getattr(table.expected, "arm", False)))
-    return [("case", str(table.case)), (ARM_PROPERTY, context.arm)]
-
-
 def check_in_python(config: pytest.Config, case: Path, keys: Mapping[str, Any]) -> Explanation:
-    """Check a direction by the keys of a ``[[check]]`` table.
-
-    Raises:
-        CollisionMismatchError: Something is not as expected.
-    """
+    """Check a direction by the keys of a ``[[check]]`` table; what differs is raised."""
     check = checks_file.CheckSection(**keys)
     found = _explained(session_of(config), case, check)
     finding = direction_finding(check, found)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from puncture_twin.planning.collision_cases.session import add_flag, arm_notes, updating
+from puncture_twin.planning.collision_cases.session import UPDATE, arm_notes, session_of, updating, write_changes
 
 if TYPE_CHECKING:
     from puncture_twin.planning.search.explain import Explanation
@@ -22,7 +22,8 @@ SUFFIX = ".collision.toml"
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """The flag that rewrites expected numbers."""
-    add_flag(parser)
+    text = "rewrite the numbers expected in *.collision.toml files; never a verdict"
+    parser.getgroup("collision").addoption(UPDATE, action="store_true", help=text)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -41,11 +42,8 @@ def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Col
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Rewrite the numbers that changed, each file at once."""
-    if updating(session.config):
-        from puncture_twin.planning.collision_cases.session import write_changes
-
-        if not write_changes(session.config):
-            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+    if updating(session.config) and not write_changes(session.config):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
@@ -56,8 +54,6 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
         for line in notes:
             terminalreporter.line(line)
     if updating(config):
-        from puncture_twin.planning.collision_cases.session import session_of
-
         terminalreporter.section("collision files")
         for line in session_of(config).lines or ["no number was rewritten"]:
             terminalreporter.line(line)

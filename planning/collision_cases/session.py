@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 class Session:
     """Cases and searches of one run, read once: meshes and trees cost more than any check.
 
-    Attributes:
-        changes: File to what it held when it was read, and the numbers that changed.
+    ``changes`` has each file, what it held when it was read, and the numbers that changed.
     """
 
     changes: dict[Path, tuple[bytes, list[Change]]] = field(default_factory=dict)
@@ -40,11 +39,7 @@ class Session:
     _searches: dict[tuple[Path, bool], Candidates] = field(default_factory=dict)
 
     def context(self, path: Path, *, arm: bool) -> CaseContext:
-        """The prepared context of a case.
-
-        Raises:
-            InputError: It cannot be read, or the arm is to be checked in a case that does not say where its base is.
-        """
+        """The prepared context of a case."""
         from puncture_twin.planning.search.context import prepare  # here: every run of pytest loads this module
 
         key = (path.resolve(), arm)
@@ -94,11 +89,7 @@ SEVERAL = f"{UPDATE} rewrites files: run it in one process, without -n"
 
 
 def arm_notes(reports: Iterable[object]) -> list[str]:
-    """A line for each case and reason for which an arm was not checked; none where it always was.
-
-    Args:
-        reports: Of pytest; only what it calls the call of a test is counted.
-    """
+    """A line for each case and reason for which an arm was not checked in a test's call; none where it always was."""
     notes: Counter[str] = Counter()
     for report in reports:
         if getattr(report, "when", "") == "call":
@@ -108,18 +99,8 @@ def arm_notes(reports: Iterable[object]) -> list[str]:
     return [f"{line} ({plural(count, 'test')})" for line, count in notes.items()]
 
 
-def add_flag(parser: pytest.Parser) -> None:
-    """Register the flag with pytest."""
-    text = "rewrite the numbers expected in *.collision.toml files; never a verdict"
-    parser.getgroup("collision").addoption(UPDATE, action="store_true", help=text)
-
-
 def updating(config: pytest.Config) -> bool:
-    """Whether numbers are to be rewritten.
-
-    Raises:
-        UsageError: By several processes at once.
-    """
+    """Whether numbers are to be rewritten; several processes at once may not."""
     wanted = bool(config.getoption(UPDATE))
     if wanted and config.getoption("numprocesses", None):
         raise pytest.UsageError(SEVERAL)
@@ -128,13 +109,7 @@ def updating(config: pytest.Config) -> bool:
 
 @dataclass(frozen=True)
 class Change:
-    """A number of one table to be rewritten.
-
-    Attributes:
-        kind: The array of the table, such as ``check``.
-        at: Its number in the array, from 0 on.
-        number: What is to be written.
-    """
+    """A number to be rewritten, of a table by its array, such as ``check``, and its place there, from 0 on."""
 
     kind: str
     at: int
@@ -143,10 +118,7 @@ class Change:
 
 
 def rewrite(path: Path, data: bytes, changes: Sequence[Change]) -> list[str]:
-    """Rewrite a file, whole or not at all.
-
-    Returns:
-        One line a number: where, old and new.
+    """Rewrite a file, whole or not at all; one line a number: where, old and new.
 
     Raises:
         InputError: The file is another one by now, or cannot be written.
@@ -194,11 +166,9 @@ MOST_LINES, MOST_DIFFERENCES, MOST_CHARACTERS = 15, 6, 300
 
 @dataclass(frozen=True)
 class NewNumber:
-    """The found number of a key that expects another.
+    """The found number of a key that expects another, and by how much the written one may differ.
 
-    Attributes:
-        within: By how much the written number may differ.
-        rounding: `ROUND_FLOOR` for a least value, `ROUND_CEILING` for a largest one: what is written must be satisfied.
+    It is rounded so that what is written is satisfied: `ROUND_FLOOR` for a least value, `ROUND_CEILING` for a largest.
     """
 
     keys: tuple[str, ...]
@@ -223,11 +193,7 @@ class NewNumber:
 
 @dataclass(frozen=True)
 class Difference:
-    """One difference from an expectation.
-
-    Attributes:
-        number: What the file would have to expect; None where only a person may change it.
-    """
+    """One difference, and what the file would have to expect; None where only a person may change it."""
 
     line: str
     number: NewNumber | None = None
@@ -235,13 +201,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one test: its differences.
-
-    Attributes:
-        differences: None where everything is as expected.
-        detail: Lines for a person, the most telling first.
-        last: How to see all of it; "" where nothing shows more.
-    """
+    """Result of one test: its differences, lines for a person, the most telling first, and how to see all of it."""
 
     differences: tuple[Difference, ...] = ()
     detail: tuple[str, ...] = ()

@@ -18,16 +18,10 @@ from puncture_twin.planning.base.errors import Finding, InputError, InputListErr
 from puncture_twin.planning.base.text import first_few
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM
+from puncture_twin.planning.evidence import target
 from puncture_twin.planning.evidence.inside_skin import odd_units, outside_skin, overlaps
 from puncture_twin.planning.evidence.label_placement import label_placement
 from puncture_twin.planning.evidence.named_places import densities, order_of_organs
-from puncture_twin.planning.evidence.target import (
-    needle_too_short,
-    open_around_target,
-    target_in_other_space,
-    target_in_vessel,
-    target_place,
-)
 from puncture_twin.planning.registration.checks.checked_placement import placement_findings, weak_points
 from puncture_twin.planning.registration.checks.markers import Surroundings
 from puncture_twin.planning.registration.placement import Placement
@@ -37,13 +31,7 @@ STEP_SLACK = 1e-9
 
 
 def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache = NO_CACHE) -> tuple[Finding, ...]:
-    """Hold the inputs of a case against each other.
-
-    Args:
-        placement: Where the patient lies for the robot, or None.
-
-    Returns:
-        Warnings and notes, in the order in which they are shown.
+    """Hold the inputs of a case against each other, and warnings and notes in the order in which they are shown.
 
     Raises:
         InputError: Everything that is refused, in one line; its code and numbers are those of the first.
@@ -52,9 +40,9 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
     on_edges = {one.code for one in places} - {"outline_unconfirmed"} == {"labels_on_edges"}
     placed = (
         *places,
-        *target_place(case, anatomy),
-        *target_in_vessel(case),
-        *target_in_other_space(case, anatomy),
+        *target.target_place(case, anatomy),
+        *target.target_in_vessel(case),
+        *target.target_in_other_space(case, anatomy),
         *order_of_organs(case, anatomy),
         *densities(case, anatomy, on_edges=on_edges),
         *overlaps(case, anatomy, cache),
@@ -66,9 +54,9 @@ def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: C
     rest = (
         *declared(case),
         *outside_skin(case, anatomy, cache),
-        *open_around_target(case, anatomy),
+        *target.open_around_target(case, anatomy),
         *markers(case, anatomy, placement, cache),
-        *needle_too_short(case, anatomy),
+        *target.needle_too_short(case, anatomy),
         *thick_slices(case, anatomy),
         *short_grid(case),
         *ignored_organs(case, anatomy),
@@ -85,7 +73,6 @@ def declared(case: Case) -> Iterator[Finding]:
 
 
 def _refuse(case: Case, found: Sequence[Finding]) -> None:
-    """One line for all refusals; nothing where there are none."""
     refused = [one for one in found if one.severity is Severity.REFUSAL]
     if not refused:
         return
@@ -100,11 +87,7 @@ def _refuse(case: Case, found: Sequence[Finding]) -> None:
 
 
 def markers(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache) -> Iterator[Finding]:
-    """What weakens the markers, or the stated transform, and what they leave open.
-
-    Raises:
-        InputError: Names or axes that have likely slipped, or a transform that cannot be; see `placement_findings`.
-    """
+    """What weakens the markers, or the stated transform, and what they leave open; see `placement_findings`."""
     if placement is None:
         return
     if placement.registration is not None:

@@ -36,21 +36,16 @@ HU_RANGE = (-200.0, 400.0)
 COPY_MM = 2.0
 """The CT is averaged to voxels of at most so much: fine enough for edges, and filtered in no time."""
 
-POINTS = 15_000
-LEAST_POINTS = 200
-"""On all surfaces together, by area; and on each of them, unless they are very many."""
+POINTS, LEAST_POINTS, REFINING_POINTS = 15_000, 200, 4_000
+"""On all surfaces together, by area; on each of them, unless they are very many; and where a place is refined."""
 
 PATCH_MM = 20.0
 
-LEAST_SHIFT_MM = 6.0
-LEAST_SHIFT_VOXELS = 1.5
-MOST_SHIFT_MM = 50.0
+LEAST_SHIFT_MM, LEAST_SHIFT_VOXELS, MOST_SHIFT_MM = 6.0, 1.5, 50.0
 """Shifts that are tried: from the larger of the first two, doubled up to the last."""
 
-SCALES = (0.9, 0.95, 1.05, 1.1)
-
-TURNS = np.radians([-24.0, -12.0, -6.0, 6.0, 12.0, 24.0])
-"""About each axis: what was resampled in another pose lies turned on the CT's own grid."""
+SCALES, TURNS = (0.9, 0.95, 1.05, 1.1), np.radians([-24.0, -12.0, -6.0, 6.0, 12.0, 24.0])
+"""The second about each axis: what was resampled in another pose lies turned on the CT's own grid."""
 
 LEAST_SEEN = 0.5
 """A placement that leaves less than this in the image, of the points that are in it as they are, says nothing."""
@@ -61,16 +56,9 @@ OFFSETS = (-1.0, -0.5, 0.5, 1.0)
 LEAST_SUM = 1e-12
 """Below every sum of edge strengths, so that nothing is divided by 0."""
 
-REFINING_POINTS = 4_000
-
 
 class Placement(NamedTuple):
-    """Another place of the surfaces.
-
-    Attributes:
-        kind: ``shift``, ``turn``, ``scale``, ``axes``, ``grid`` or ``unit``.
-        T: Shape (4, 4), maps the surfaces as they are to where they would lie, LPS mm.
-    """
+    """Another place of the surfaces: shift, turn, scale, axes, grid or unit, and the map (4, 4) there, LPS mm."""
 
     kind: str
     T: Floats
@@ -79,9 +67,7 @@ class Placement(NamedTuple):
 class Fit(NamedTuple):
     """How a placement compares with the surfaces as they are.
 
-    Attributes:
-        z: Of the paired differences; above 0 where the other place lies better on the edges.
-        ratio: A(T) / A(1) on the points that both have in the image.
+    z is above 0 where it lies better on the edges; the ratio is A(T) / A(1) on the points that both have in the image.
     """
 
     placement: Placement
@@ -91,12 +77,7 @@ class Fit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EdgeImage:
-    """A CT on voxels of at most `COPY_MM`, clipped and smoothed by one voxel.
-
-    Attributes:
-        values: Shape (nx, ny, nz).
-        T_ct_index: Shape (4, 4), voxel index to LPS mm.
-    """
+    """A CT on voxels of at most `COPY_MM`, clipped and smoothed by one voxel."""
 
     values: NDArray[np.float32]
     T_ct_index: Floats
@@ -119,7 +100,6 @@ class EdgeImage:
 
 @nb.njit(cache=True, error_model="numpy")
 def _strength(values, T, points, normals, strength):  # type: ignore[no-untyped-def]  # numba infers
-    """As `EdgeImage.strength`; ``T`` maps LPS mm to an index."""
     ni, nj, nk = values.shape
     for n in range(len(points)):
         p, d = points[n], normals[n]
@@ -139,7 +119,6 @@ def _strength(values, T, points, normals, strength):  # type: ignore[no-untyped-
 
 @nb.njit(cache=True, error_model="numpy")
 def _between(values, x, y, z):  # type: ignore[no-untyped-def]
-    """Trilinear between the voxels about an index."""
     i, j, k = min(int(x), values.shape[0] - 2), min(int(y), values.shape[1] - 2), min(int(z), values.shape[2] - 2)
     x, y, z = x - i, y - j, z - k
     total = 0.0
@@ -151,12 +130,7 @@ def _between(values, x, y, z):  # type: ignore[no-untyped-def]
 
 
 def edge_image(hu: NDArray[np.generic], T_ct_index: Floats) -> EdgeImage:
-    """The CT as the edge test sees it.
-
-    Args:
-        hu: Shape (nx, ny, nz), Hounsfield units, of any type that holds `HU_RANGE`.
-        T_ct_index: Shape (4, 4), voxel index to LPS mm.
-    """
+    """The CT (nx, ny, nz), HU of any type that holds `HU_RANGE`, as the edge test sees it."""
     spacing = np.linalg.norm(T_ct_index[:3, :3], axis=0)
     factor = np.maximum(1, np.floor(COPY_MM / spacing + 1e-6)).astype(int)
     count = np.array(hu.shape) // factor
@@ -172,14 +146,7 @@ def edge_image(hu: NDArray[np.generic], T_ct_index: Floats) -> EdgeImage:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Points on several surfaces.
-
-    Attributes:
-        points_ct: Shape (n, 3), LPS mm.
-        normals_ct: Shape (n, 3), unit; their sign does not matter.
-        structure: Shape (n,), which surface each lies on.
-        patch: Shape (n,), which patch of it.
-    """
+    """Points (n, 3) on several surfaces, unit normals of any sign, and by point the surface and the patch of it."""
 
     points_ct: Floats
     normals_ct: Floats
@@ -201,8 +168,7 @@ class Sample:
 
     def moved(self, T: Floats) -> Sample:
         """The same surfaces elsewhere, by a map (4, 4)."""
-        points, normals = self.placed(T)
-        return Sample(points, normals, self.structure, self.patch)
+        return Sample(*self.placed(T), self.structure, self.patch)
 
     def placed(self, T: Floats) -> tuple[Floats, Floats]:
         """Its points and normals by a placement (4, 4)."""
@@ -215,23 +181,18 @@ def sample_surfaces(meshes: Sequence[TriangleMesh], count: int = POINTS) -> Samp
     areas = np.array([mesh.areas.sum() for mesh in meshes])
     least = min(LEAST_POINTS, count // len(meshes))
     counts = np.maximum(np.round(count * areas / areas.sum()), least).astype(int)
-    points, normals = [], []
-    for mesh, number in zip(meshes, counts, strict=True):
-        spread = spread_on(mesh, number)
-        points.append(spread.points)
-        normals.append(spread.normals)
+    spread = [spread_on(mesh, number) for mesh, number in zip(meshes, counts, strict=True)]
+    where, normals = (np.concatenate(some) for some in zip(*spread, strict=True))
     structure = np.repeat(np.arange(len(meshes)), counts)
-    where = np.concatenate(points)
     cube = np.floor((where - where.min(axis=0)) / PATCH_MM).astype(np.intp)
     patch = np.unique(np.column_stack([structure, cube]), axis=0, return_inverse=True)[1].ravel()
-    return Sample(where, np.concatenate(normals), structure, patch)
+    return Sample(where, normals, structure, patch)
 
 
 def shifts(axes: Floats, voxel_mm: Floats, most_mm: Floats | float = MOST_SHIFT_MM) -> Iterator[Placement]:
-    """Moved along each axis, doubling from the least shift that counts.
+    """Moved along each axis (unit columns (3, 3)), doubling from the least shift that counts.
 
     Args:
-        axes: Shape (3, 3), unit columns.
         voxel_mm: Shape (3,), of the coarser of image and labels along these axes.
         most_mm: The largest shift, of all axes or of each (3,); the least is tried whatever it is.
     """
@@ -264,16 +225,12 @@ def turns(about: Floats, axes: Floats) -> Iterator[Placement]:
 
 
 def axis_slips(about: Sequence[Floats], axes: Floats) -> Iterator[Placement]:
-    """Every other way to name and to direct three axes: mirror images, half and quarter turns, arrays reversed.
+    """Every other way to name and to direct three axes (unit columns), about points (3,) that stay in place.
 
-    Args:
-        about: Points (3,) that stay in place.
-        axes: Shape (3, 3), unit columns: of the patient, or of a grid.
+    Mirror images, half and quarter turns, arrays reversed.
     """
-    ways = [
-        (order, signs) for order in itertools.permutations(range(3)) for signs in itertools.product((1, -1), repeat=3)
-    ]
-    for point, (order, signs) in itertools.product(about, ways):
+    orders, signs_of = itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
+    for point, order, signs in itertools.product(about, orders, signs_of):
         slip = np.eye(3)[:, list(order)] * np.array(signs)
         if not np.array_equal(slip, np.eye(3)):
             yield Placement("axes", _about(point, axes @ slip @ axes.T))
@@ -297,11 +254,9 @@ def _about(point: Floats, linear: Floats) -> Floats:
 
 
 class Compared(NamedTuple):
-    """All placements that were tried, and how each structure by itself takes them.
+    """All placements that were tried, with z and A(T) / A(1) of each structure by itself: (placements, structures).
 
-    Attributes:
-        own_z: Shape (placements, structures), z over the patches of one structure; -inf where it is not seen.
-        own_ratio: The same shape, its A(T) / A(1).
+    z is -inf where a structure is not seen.
     """
 
     fits: tuple[Fit, ...]
@@ -341,7 +296,6 @@ def fit_of(placement: Placement, sample: Sample, here: Floats, there: Floats) ->
 
 
 def _seen(here: Floats, there: Floats) -> tuple[Floats, Floats]:
-    """Both strengths where both are in the image, and 0 elsewhere."""
     both = np.isfinite(here) & np.isfinite(there)
     return np.where(both, here, 0.0), np.where(both, there, 0.0)
 
@@ -368,17 +322,14 @@ def _sums(values: Floats, group: NDArray[np.intp]) -> Floats:
 
 
 def _z(total: Any, square: Any) -> Floats:
-    """Z = total / sqrt(square); -inf where nothing was summed."""
     return np.where(square > 0.0, total / np.sqrt(np.maximum(square, LEAST_SUM)), -np.inf)
 
 
 def refined(image: EdgeImage, sample: Sample, start: Placement, most_mm: float = np.inf) -> Placement:
     """The placement near another one at which the surfaces lie best: shifted, turned and scaled further.
 
-    Nelder-Mead over shift (mm), turn and scale, about the middle of the surfaces.
-
-    Args:
-        most_mm: No point of the surfaces moves farther from there, to first order.
+    Nelder-Mead over shift (mm), turn and scale, about the middle of the surfaces, of which no point moves farther than
+    ``most_mm``, to first order.
     """
     some = sample.thinned(REFINING_POINTS)
     middle = apply(start.T, sample.middle_ct[None])[0]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -30,12 +29,10 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, spread_on
 from puncture_twin.planning.geometry.parts import voxels_inside
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
-CELL_MM = 2.0
-MOST_CELLS = 30e6
+CELL_MM, MOST_CELLS = 2.0, 30e6
 """Cells in which volumes are counted, wider where there would be more."""
 
-LEAST_SHARED = 0.05
-LEAST_CELLS = 20
+LEAST_SHARED, LEAST_CELLS = 0.05, 20
 """Of the smaller one's volume, and of cells: less is what smoothing and partial volume move."""
 
 NESTED = 0.95
@@ -71,12 +68,7 @@ TRIANGLES = 2_000
 
 
 class Shared(NamedTuple):
-    """Two structures that lie in one place.
-
-    Attributes:
-        one, other: Rows of the structures; the first is the smaller.
-        fraction: Of the smaller one's volume.
-    """
+    """Two structures, by their rows, that lie in one place; the fraction is of the first one's volume, the smaller."""
 
     one: int
     other: int
@@ -189,14 +181,8 @@ ALLOWED_INSIDE = (
 CAUSES = "a part of the body outside the skin (such as an arm), or the wrong space (LPS/RAS) or unit?"
 
 
-@dataclass(frozen=True)
-class Inside:
-    """Where the samples of one surface lie.
-
-    Attributes:
-        inside: Inside the skin, or within the tolerance of it.
-        beyond: Past a side at which the skin was cut: the body goes on there, so they say nothing.
-    """
+class Inside(NamedTuple):
+    """Where the samples of one surface lie; what is beyond a side at which the skin was cut says nothing."""
 
     inside: int
     outside: int
@@ -212,12 +198,8 @@ def inside_skin(meshes: Sequence[TriangleMesh], skin: Skin, tolerance_mm: Floats
     """Count which part of each surface lies inside a closed skin.
 
     A ray from a point inside the body leaves it an odd number of times. A sample lies inside if an even number of these
-    crossings comes before it. The point is the skin's own, so that the answer is the same for every target.
-
-    Args:
-        meshes: The k structures, mm.
-        skin: Closed; an open one has no inside.
-        tolerance_mm: Shape (k,); a sample of a structure this near to the skin counts as inside.
+    crossings comes before it. The point is the skin's own, so that the answer is the same for every target. A sample of
+    a structure that is as near to the skin as its tolerance (k,) counts as inside.
     """
     points = np.concatenate([spread_on(mesh, SAMPLES).points for mesh in meshes] or [np.empty((0, 3))])
     reach = np.repeat(np.asarray(tolerance_mm, dtype=np.float64), SAMPLES)
@@ -227,24 +209,6 @@ def inside_skin(meshes: Sequence[TriangleMesh], skin: Skin, tolerance_mm: Floats
     lost = np.bincount(outside[~beyond] // SAMPLES, minlength=len(meshes))
     cut = np.bincount(outside[beyond] // SAMPLES, minlength=len(meshes))
     return [Inside(SAMPLES - int(o) - int(c), int(o), int(c)) for o, c in zip(lost, cut, strict=True)]
-
-
-def kept_inside_skin(meshes: Sequence[TriangleMesh], skin: Skin, tolerance_mm: Floats, cache: Cache) -> list[Inside]:
-    """`inside_skin`, from the cache where it is there."""
-    view = skin.field_of_view
-    seen = None if view is None else [view.T_ct_box.tolist(), view.size_mm.tolist(), view.cut.tolist()]
-    made_from = {
-        "what": "inside the skin",
-        "skin": [skin.mesh.digest, seen],
-        "meshes": [mesh.digest for mesh in meshes],
-        "at": np.asarray(tolerance_mm).tolist(),
-    }
-
-    def make() -> Arrays:
-        found = inside_skin(meshes, skin, tolerance_mm)
-        return {"counts": np.array([(one.inside, one.outside, one.beyond) for one in found], np.int64).reshape(-1, 3)}
-
-    return [Inside(*counts) for counts in cache.arrays(made_from, make, by=__name__)["counts"].tolist()]
 
 
 def near_surface(points: Floats, mesh: TriangleMesh, distance_mm: Floats) -> Bools:
@@ -319,9 +283,21 @@ def outside_skin(case: Case, anatomy: Anatomy, cache: Cache) -> Iterator[Finding
         said = "the skin mesh is open: the part of each structure inside the body is not known"
         yield Finding("skin_open", Severity.WARNING, said)
         return
-    tolerances = np.array([_surface_tolerance_mm(case, structure) for structure in placed])
+    volume, view = case.skin_section.ct or case.skin_section.labelmap, anatomy.skin.field_of_view
+    skin_mm = 0.0 if volume is None else float(case.volumes.source(volume).grid.spacing_mm.max())
+    # Surface and skin may be off by half a voxel each, and no less than a mesh may.
+    tolerances = [max(LEAST_TOLERANCE_MM, (skin_mm + structure.voxel_mm) / 2) for structure in placed]
     meshes = [structure.mesh for structure in placed]
-    for structure, part in zip(placed, kept_inside_skin(meshes, anatomy.skin, tolerances, cache), strict=True):
+    seen = None if view is None else [view.T_ct_box.tolist(), view.size_mm.tolist(), view.cut.tolist()]
+    made_from = {"what": "inside the skin", "skin": [anatomy.skin.mesh.digest, seen], "at": tolerances}
+    made_from |= {"meshes": [mesh.digest for mesh in meshes]}
+
+    def make() -> Arrays:
+        found = inside_skin(meshes, anatomy.skin, np.array(tolerances))
+        return {"counts": np.array(found, np.int64).reshape(-1, 3)}
+
+    counts = cache.arrays(made_from, make, by=__name__)["counts"].tolist()
+    for structure, part in zip(placed, (Inside(*one) for one in counts), strict=True):
         if part.inside + part.outside == 0:
             said = f"structure '{structure.name}' is completely beyond a side at which the skin was cut"
             yield Finding("beyond_skin", Severity.WARNING, said)
@@ -338,10 +314,3 @@ def _wholly_outside(skin: Skin, structure: Structure) -> bool:
     if _beyond_cut(structure.mesh.bounds, skin.field_of_view, np.zeros(2)).all():
         return False
     return bool(np.any(below > high) or np.any(above < low))
-
-
-def _surface_tolerance_mm(case: Case, structure: Structure) -> float:
-    """How far a structure's surface and the skin may be off: half a voxel each, and no less than a mesh may."""
-    skin = case.skin_section.ct or case.skin_section.labelmap
-    skin_mm = 0.0 if skin is None else float(case.volumes.source(skin).grid.spacing_mm.max())
-    return max(LEAST_TOLERANCE_MM, (skin_mm + structure.voxel_mm) / 2)

@@ -19,9 +19,9 @@ A refused case may state ``[search] trust_labels = true``: its owner has looked,
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,8 +40,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
 from puncture_twin.planning.geometry.spaces import Space
 
-REFUSING_Z = 6.0
-WARNING_Z = 3.0
+REFUSING_Z, WARNING_Z = 6.0, 3.0
 """z of true placements stays below the first, also of one structure alone, and of six and more below the second: the
 table of `python -m benchmarks.placements`."""
 
@@ -63,14 +62,10 @@ UNCONFIRMED = ((0.5, 0.0, 1.3), (1.4, 0.0, 3.5))
 """Of a structure that does so by no more than this (either) the CT does not confirm where it lies: 95 of 100 that are
 15 mm off, and 1 in 5 of true ones."""
 
-INSIDE_MM = 3.0
-"""So deep below a surface lies what must be even within it."""
+INSIDE_MM, LEAST_HU = 3.0, 3.0
+"""So deep below a surface lies what must be even within it; what deviates less than noise alone is even."""
 
-LEAST_HU = 3.0
-"""Mean deviation that noise alone leaves: what is less uneven is even."""
-
-UNITS = (0.001, 0.1, 10.0, 1000.0)
-LEAST_EXTENT_MM = 50.0
+UNITS, LEAST_EXTENT_MM = (0.001, 0.1, 10.0, 1000.0), 50.0
 """Meshes in m or cm taken for mm, and the other way round; what becomes smaller than this lies on any one edge."""
 
 LEAST_SCALE, LEAST_TURN = 0.015, np.radians(1.5)
@@ -101,13 +96,10 @@ class Source:
     """Structures that were written together, and lie right or wrong together.
 
     Attributes:
-        name: The file or folder, or "the meshes".
         axes: Shape (3, 3), unit columns: of its grid, or of the patient.
-        middles: Places (3,) about which it may be mirrored or turned: the middle of its grid, or of the image, and the
-            origin.
+        middles: Places (3,) about which it may be mirrored or turned: of its grid or the image the middle; the origin.
         first: Shape (3,), the first voxel of its grid, about which it may be scaled too.
         voxel_mm: Shape (3,), of the coarser of its voxels and the image's along each of its axes.
-        in_units: Whether it may be in another unit.
         grid_slip: Where the CT has its matrix on another grid: the map (4, 4) to that; else None.
     """
 
@@ -123,8 +115,7 @@ class Source:
     def placements(self) -> list[edges.Placement]:
         """Every other place that is tried."""
         middles = self.middles[: 1 if np.allclose(*self.middles, atol=edges.LEAST_SHIFT_MM) else 2]
-        corners = np.concatenate([mesh.bounds for mesh in self.meshes.values()])
-        low, high = box_of(corners)
+        low, high = box_of(np.concatenate([mesh.bounds for mesh in self.meshes.values()]))
         across = np.abs(self.axes.T) @ (high - low)
         found = [
             *edges.shifts(self.axes, self.voxel_mm, across / 3.0),
@@ -133,11 +124,8 @@ class Source:
             *edges.axis_slips(middles, self.axes),
         ]
         if self.in_units:
-            found += [
-                one
-                for one in edges.scalings([np.zeros(3)], UNITS, "unit")
-                if one.T[0, 0] * across.max() > LEAST_EXTENT_MM
-            ]
+            units = edges.scalings([np.zeros(3)], UNITS, "unit")
+            found += [one for one in units if one.T[0, 0] * across.max() > LEAST_EXTENT_MM]
         if self.grid_slip is not None:
             found.append(edges.Placement("grid", self.grid_slip))
         return found
@@ -153,9 +141,8 @@ class Assessed(NamedTuple):
         T: Shape (4, 4), LPS mm: the refined place where one is named, else None.
         middle_ct: Shape (3,), of the surfaces as they are.
         open: The kinds of placements that are not excluded.
-        odd: Structures that lie better shifted by themselves.
+        odd, unconfirmed: Structures that lie, or may lie, better shifted by themselves.
         agreeing: Structures of which two or more lie better at one place, whatever it is.
-        unconfirmed: Structures that may lie better shifted by themselves.
         unseen: Structures of which the image shows less than half.
         uneven: Of the best placement to as it is, over all structures: what is above 1 is no place of organs.
     """
@@ -197,8 +184,12 @@ def assess(image: edges.EdgeImage, source: Source) -> Assessed:
     ahead = compared.best
     if ahead.z > -WARNING_Z:  # a row of single steps may leave out what lies between them
         ahead = _ahead(image, sample, source, compared.best)
-    named = ahead.z >= WARNING_Z and (ahead.placement.kind == "grid" or _is_peak(image, sample, ahead, source))
-    inner = sample.points_ct - INSIDE_MM * sample.normals_ct * _outward(source)[sample.structure, None]
+    named = ahead.z >= WARNING_Z and ahead.placement.kind == "grid"
+    if not named and ahead.z >= REFUSING_Z:  # a place can be named where it is a peak: every shift from there is worse
+        shifts = list(edges.shifts(source.axes, source.voxel_mm))
+        named = edges.compare(image, sample.moved(ahead.placement.T), shifts).best.z <= -WARNING_Z
+    outward = np.copysign(1.0, [mesh.volume for mesh in source.meshes.values()])
+    inner = sample.points_ct - INSIDE_MM * sample.normals_ct * outward[sample.structure, None]
     here = _unevenness(image, inner, sample.structure, np.eye(4))
     alone = Alone(tuple(source.meshes), compared, _alone(image, inner, sample.structure, compared.fits, here))
     seen = np.bincount(sample.structure, np.isfinite(image.hu_at(sample.points_ct))) / np.bincount(sample.structure)
@@ -237,14 +228,6 @@ def _ahead(image: edges.EdgeImage, sample: edges.Sample, source: Source, best: e
     return max(found, key=lambda fit: fit.z)
 
 
-def _is_peak(image: edges.EdgeImage, sample: edges.Sample, ahead: edges.Fit, source: Source) -> bool:
-    """Whether a place can be named: it is better beyond doubt, and every shift from there is worse."""
-    around = edges.compare(
-        image, sample.moved(ahead.placement.T), list(edges.shifts(source.axes, source.voxel_mm))
-    ).best
-    return ahead.z >= REFUSING_Z and around.z <= -WARNING_Z
-
-
 def _slip(sample: edges.Sample, T: Floats, source: Source) -> float:
     """How far a map (4, 4) moves the surfaces, rms, each axis in its least shift that counts."""
     moved = (apply(T, sample.points_ct) - sample.points_ct) @ source.axes / edges.least_shift_mm(source.voxel_mm)
@@ -259,8 +242,7 @@ def _excluded(fit: edges.Fit) -> bool:
 class Alone(NamedTuple):
     """How each structure by itself takes other places.
 
-    Attributes:
-        uneven: Shape (placements, structures), unevenness there to that as it is; NaN where nobody asks, or sees it.
+    ``uneven`` there to that as it is: shape (placements, structures), NaN where nobody asks, or sees it.
     """
 
     names: tuple[str, ...]
@@ -296,28 +278,20 @@ def _alone(
     Only shifted or in the other space: of all mirror images and turns some has stronger edges than an organ that is as
     dense as what is around it, or than a lung that is full.
     """
-    nowhere = np.full(len(here), np.nan)
-    asked = [fit.placement.kind == "shift" or (fit.placement.T == OTHER_SPACE).all() for fit in fits]
-    there = [
-        _unevenness(image, inner_ct, structure, fit.placement.T) if one else nowhere
-        for fit, one in zip(fits, asked, strict=True)
-    ]
-    return np.asarray(np.array(there) / here)
-
-
-def _outward(source: Source) -> Floats:
-    """1 for structures whose normals point outward, -1 for the others."""
-    return np.array([np.copysign(1.0, mesh.volume) for mesh in source.meshes.values()])
+    there = np.full((len(fits), len(here)), np.nan)
+    for row, (kind, T) in enumerate(fit.placement for fit in fits):
+        if kind == "shift" or (T == OTHER_SPACE).all():
+            there[row] = _unevenness(image, inner_ct, structure, T)
+    return there / here
 
 
 def _unevenness(image: edges.EdgeImage, inner_ct: Floats, structure: NDArray[np.intp], T: Floats) -> Floats:
     """Of each structure, placed by T (4, 4): the mean deviation of HU at its inner points (n, 3); NaN where unseen."""
-    hu = np.split(image.hu_at(apply(T, inner_ct)), np.flatnonzero(np.diff(structure)) + 1)
-    return np.maximum([_deviation(one[np.isfinite(one)], edges.LEAST_SEEN * len(one)) for one in hu], LEAST_HU)
-
-
-def _deviation(hu: Floats, least: float) -> float:
-    return float(np.abs(hu - np.median(hu)).mean()) if len(hu) > least else np.nan
+    found = []
+    for one in np.split(image.hu_at(apply(T, inner_ct)), np.flatnonzero(np.diff(structure)) + 1):
+        hu = one[np.isfinite(one)]
+        found.append(np.abs(hu - np.median(hu)).mean() if len(hu) > edges.LEAST_SEEN * len(one) else np.nan)
+    return np.maximum(found, LEAST_HU)
 
 
 def label_placement(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
@@ -333,20 +307,22 @@ def label_placement(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
             "meshes": [f"{name} {mesh.digest}" for name, mesh in source.meshes.items()],
             "placed_by": [np.asarray(one).tolist() for one in given],
         }
-        found = scan.source.kept(made_from, partial(_assessed, image, source), _read, by=__name__)
-        yield from _findings(case, scan, source, found)
 
+        def make(source: Source = source) -> Arrays:
+            found = assess(image(), source)
+            T, middle = None if found.T is None else found.T.tolist(), found.middle_ct.tolist()
+            return {"json": np.array(json.dumps(found._asdict() | {"T": T, "middle_ct": middle}))}
 
-def _assessed(image: Callable[[], edges.EdgeImage], source: Source) -> Arrays:
-    return _stored(assess(image(), source))
+        yield from _findings(case, scan, source, scan.source.kept(made_from, make, _read, by=__name__))
 
 
 def sources(case: Case, anatomy: Anatomy, scan: Scan) -> Iterator[Source]:
     """The structures of a case by what they were written in; none that the CT itself or the case adds."""
     ct = scan.source.surfaces.source.grid
     middle, origin = apply(ct.T_ct_index, (np.array(ct.shape)[None] - 1) / 2)[0], np.zeros(3)
-    skin = [] if scan.skin is None else [("skin", scan.skin.mesh, _skin_source(case))]
-    rest = [(one.name, one.mesh, one.source.rpartition(":")[0] or one.source) for one in anatomy.structures] + skin
+    rest = [(one.name, one.mesh, one.source.rpartition(":")[0] or one.source) for one in anatomy.structures]
+    if scan.skin is not None:
+        rest.append(("skin", scan.skin.mesh, str(case.skin_section.mesh or case.skin_section.labelmap)))
     for grid in label_grids(case):
         own = {name: mesh for name, mesh, file in rest if file in grid.files}
         if not own:
@@ -363,11 +339,6 @@ def sources(case: Case, anatomy: Anatomy, scan: Scan) -> Iterator[Source]:
     if meshes:
         voxel = _along(np.eye(3), ct.T_ct_index)
         yield Source("the meshes", meshes, np.eye(3), (middle, origin), origin, voxel, in_units=True)
-
-
-def _skin_source(case: Case) -> str:
-    section = case.skin_section
-    return str(section.mesh or section.labelmap)
 
 
 def _along(axes: Floats, T_ct_index: Floats) -> Floats:
@@ -396,8 +367,13 @@ def _findings(case: Case, scan: Scan, source: Source, found: Assessed) -> Iterat
         said = f"{source.name}: {names} would fit the edges of {scan.name} better {alike}: are they in the right place?"
         severity = Severity.REFUSAL if found.agreeing and not case.ct.trust_labels else Severity.WARNING
         yield Finding("structure_beside_image", severity, said, numbers | {"names": names}, ALLOWED)
-    if count > 1 and not found.refuses:
-        yield from _unconfirmed(scan, source, found, numbers)
+    faint = [name for name in found.unconfirmed if name not in {*found.odd, *found.agreeing, *found.unseen}]
+    unsure = [*faint, *found.unseen]
+    if count > 1 and not found.refuses and unsure:  # of which the image does not show where they lie
+        parts = {"no clear edge": faint, "not in the image": [*found.unseen]}
+        why = "".join(f"; {what}: {first_few(some)}" for what, some in parts.items() if some)
+        said = f"{source.name}: {scan.name} does not confirm the outline of {len(unsure)} of {count} structures"
+        yield Finding("outline_unconfirmed", Severity.NOTE, said + why, numbers | {"names": ", ".join(unsure)})
     if found.doubtful:
         return
     if found.open:
@@ -412,26 +388,11 @@ def _findings(case: Case, scan: Scan, source: Source, found: Assessed) -> Iterat
         yield Finding("labels_on_edges", Severity.NOTE, said, numbers)
 
 
-def _unconfirmed(scan: Scan, source: Source, found: Assessed, numbers: dict[str, Any]) -> Iterator[Finding]:
-    """The structures of which the image does not show where they lie, whatever it shows of the whole."""
-    faint = [name for name in found.unconfirmed if name not in {*found.odd, *found.agreeing, *found.unseen}]
-    parts = {"no clear edge": faint, "not in the image": [*found.unseen]}
-    names = [name for some in parts.values() for name in some]
-    if names:
-        why = "".join(f"; {what}: {first_few(some)}" for what, some in parts.items() if some)
-        count = f"{len(names)} of {len(source.meshes)}"
-        said = f"{source.name}: {scan.name} does not confirm the outline of {count} structures"
-        yield Finding("outline_unconfirmed", Severity.NOTE, said + why, numbers | {"names": ", ".join(names)})
-
-
 class Slip(NamedTuple):
     """A placement in words and numbers.
 
-    Attributes:
-        shift_mm: Shape (3,), LPS: of the middle of the surfaces.
-        scale: 1 for none.
-        axes: How axes are exchanged or negated, in words; empty for not at all.
-        turn: By how much it is turned besides, rad.
+    The shift (3,) of the surfaces' middle, LPS, the scale, axes that are exchanged or negated, in words, and by how
+    much it is turned besides, rad.
     """
 
     shift_mm: Floats
@@ -455,22 +416,13 @@ class Slip(NamedTuple):
 
 def slip_of(T: Floats, middle_ct: Floats) -> Slip:
     """What a placement (4, 4) does to surfaces about a point (3,), LPS mm."""
-    linear = T[:3, :3]
+    linear, exchanged = T[:3, :3], np.zeros((3, 3))
     scale = float(np.cbrt(abs(np.linalg.det(linear))))
     order = np.abs(linear).argmax(axis=0)
-    signs = np.sign(linear[order, range(3)])
-    exchanged = np.zeros((3, 3))
-    exchanged[order, range(3)] = signs
-    rest = linear / scale @ exchanged.T
-    shift = apply(T, middle_ct[None])[0] - middle_ct
-    return Slip(
-        shift, scale, edges.axes_text(order.tolist(), signs.tolist()), float(np.linalg.norm(log_rotation(rest)))
-    )
-
-
-def _stored(found: Assessed) -> Arrays:
-    T = None if found.T is None else found.T.tolist()
-    return {"json": np.array(json.dumps(found._asdict() | {"T": T, "middle_ct": found.middle_ct.tolist()}))}
+    exchanged[order, range(3)] = signs = np.sign(linear[order, range(3)])
+    axes = edges.axes_text(order.tolist(), signs.tolist())
+    turn = float(np.linalg.norm(log_rotation(linear / scale @ exchanged.T)))
+    return Slip(apply(T, middle_ct[None])[0] - middle_ct, scale, axes, turn)
 
 
 TUPLES = ("open", "odd", "agreeing", "unconfirmed", "unseen")

@@ -59,12 +59,9 @@ SAMPLES = 200
 
 
 class Tissue(NamedTuple):
-    """Organs whose Hounsfield units are known: measured .83 to .95 of bones, .97 of lungs where labels lie right.
+    """Organs, by words of their names, whose HU are known: .83 to .95 of bones, .97 of lungs where labels lie right.
 
-    Attributes:
-        words: Of which one is in an organ's name.
-        low, high: HU.
-        least: Of the points within them; a smaller fraction is a warning.
+    A smaller fraction than ``least`` of their points is a warning.
     """
 
     name: str
@@ -106,7 +103,8 @@ def order_of_organs(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
             (a, b)
             for a, b in _pairs(middles, axis)
             if abs(middles[b][axis] - middles[a][axis]) >= CLEARLY_MM
-            and (axis == 2 or _at_one_level(boxes[a], boxes[b]))
+            # Boxes share a height along the bed: a neck tells nothing of a belly's spine.
+            and (axis == 2 or (boxes[a][0, 2] <= boxes[b][1, 2] and boxes[b][0, 2] <= boxes[a][1, 2]))
         ]
         wrong = [(a, b) for a, b in pairs if middles[a][axis] > middles[b][axis]]
         if not wrong:
@@ -139,13 +137,7 @@ def _kind(name: str) -> str:
     return next((organ for organ in SEVERAL if _is(name, organ)), SIDES.sub("", name))
 
 
-def _at_one_level(box: Floats, other: Floats) -> bool:
-    """Whether two boxes (2, 3) share a height along the bed: a neck tells nothing of a belly's spine."""
-    return bool(box[0, 2] <= other[1, 2] and other[0, 2] <= box[1, 2])
-
-
 def _pairs(middles: dict[str, Floats], axis: int) -> Iterator[tuple[str, str]]:
-    """Names of which the first's middle comes first along an axis."""
     if axis == 0:
         for name in middles:
             side = SIDES.search(name)
@@ -195,6 +187,5 @@ def densities(case: Case, anatomy: Anatomy, *, on_edges: bool) -> Iterator[Findi
 
 
 def _below(mesh: TriangleMesh) -> Floats:
-    """Points (n, 3) just below a surface, mm."""
     spread = spread_on(mesh, SAMPLES)
     return np.asarray(spread.points - np.copysign(INWARD_MM, mesh.volume) * spread.normals)

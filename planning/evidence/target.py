@@ -26,8 +26,6 @@ from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 MOST_AROUND = 0.5
 """An open mesh may go so far around the target: of the rays that cross it oddly, and of its winding number."""
-
-
 ON_SURFACE_MM = 1e-3
 """A target this close to its structure's surface lies on it: meshes in single precision round to 1e-5 mm."""
 
@@ -48,16 +46,17 @@ class Likely(IntEnum):
 
 def likely_target(names: Iterable[str]) -> Likely:
     """Of the structures that hold a point, the likeliest target: it tells the wrong one of two readings of a point."""
-    return max((_likely(name) for name in names), default=Likely.NOTHING)
-
-
-def _likely(name: str) -> Likely:
-    line = default_role(name, "other")
-    if line == LESION:
-        return Likely.LESION if never_crossed(name) is None else Likely.DANGER
-    if line is None or line.kind != "avoid":
-        return Likely.OTHER
-    return Likely.DANGER if line.group in NEVER_CROSSED else Likely.ORGAN
+    likeliest = Likely.NOTHING
+    for name in names:
+        line = default_role(name, "other")
+        if line == LESION:
+            likely = Likely.LESION if never_crossed(name) is None else Likely.DANGER
+        elif line is None or line.kind != "avoid":
+            likely = Likely.OTHER
+        else:
+            likely = Likely.DANGER if line.group in NEVER_CROSSED else Likely.ORGAN
+        likeliest = max(likeliest, likely)
+    return likeliest
 
 
 def target_place(case: Case, anatomy: Anatomy) -> Iterator[Finding]:
@@ -94,18 +93,12 @@ def _misplaced(case: Case, lies: str, allowed: str) -> Finding:
 def readings_inside(
     point_ct: Floats, space: Space, inside: Callable[[Floats], bool], place: str = "in the body"
 ) -> str:
-    """The readings of a point under which it would lie where it belongs, as a hint in brackets; empty for none.
-
-    Args:
-        point_ct: Shape (3,), LPS (or local) mm, as it was read.
-        inside: Whether a point (3,) lies there.
-    """
+    """The readings of a point (3,), mm, under which it would lie where it belongs, in brackets; else empty."""
     found = [text for text, point in _readings(point_ct, space) if inside(point)]
     return f" (read {' or '.join(found)} it lies {place})" if found else ""
 
 
 def _readings(point_ct: Floats, space: Space) -> Iterator[tuple[str, Floats]]:
-    """Each other reading, with the point (3,), mm."""
     for unit in Unit:
         if unit is not Unit.MM:
             yield f"in {unit}", unit.mm * point_ct

@@ -41,10 +41,6 @@ def side_of(mesh: TriangleMesh, point: NDArray[np.float64]) -> Side:
 
     Where triangles are given twice or wound against their neighbours, the winding number means nothing: it may be 0
     deep inside. Then a point is inside if rays from it cross the surface an odd number of times.
-
-    Args:
-        mesh: The surface, mm.
-        point: Shape (3,), mm, in the mesh's frame.
     """
     if not mesh.closed:
         return Side.UNKNOWN
@@ -105,10 +101,6 @@ def winding_number(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
     30(2), 1983, Eq. 8):
 
         tan(angle / 2) = a.(b x c) / (|a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b|)
-
-    Args:
-        mesh: The surface, mm.
-        point: Shape (3,), mm, in the mesh's frame.
     """
     return float(winding_numbers(mesh, point[None])[0])
 
@@ -144,10 +136,6 @@ def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
     """Fraction of all directions from a point in which a ray crosses the surface an odd number of times.
 
     0 outside of a closed surface, 1 inside, in between for an open one; a triangle that is given twice counts once.
-
-    Args:
-        mesh: The surface, mm.
-        point: Shape (3,), mm, in the mesh's frame.
     """
     surface = TriangleMesh(mesh.vertices, mesh.faces[mesh.distinct])
     return float(np.mean(crossings(surface, point, even_directions(SUM_RAYS)).count % 2))
@@ -157,31 +145,21 @@ def hit_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
     """Fraction of all directions from a point in which a ray hits the surface.
 
     1 inside a closed surface, and also in a hollow of it, of which `winding_number` is 0.
-
-    Args:
-        mesh: The surface, mm.
-        point: Shape (3,), mm, in the mesh's frame.
     """
     return float(np.mean(crossings(mesh, point, even_directions(SUM_RAYS)).count > 0))
 
 
-MOST_POLAR_BINS = 120
-"""Bins over the polar angle (1.5 degrees each) for many rays; twice as many over the azimuth."""
+MOST_POLAR_BINS, LEAST_POLAR_BINS = 120, 2
+"""Bins over the polar angle (1.5 degrees each) for many rays; twice as many over the azimuth. For few rays: of fewer
+bins a cone's window would hold some twice."""
 
-LEAST_POLAR_BINS = 2
-"""For few rays: of fewer bins a cone's window would hold some twice."""
+SAME_CROSSING_MM, USUAL_CROSSINGS = 1e-6, 4
+"""Crossings of one ray closer than this are one: the ray runs through an edge or a corner. Space is made for so many of
+a ray before they are counted; for more, they are computed once again."""
 
-SAME_CROSSING_MM = 1e-6
-"""Crossings of one ray closer than this are one: the ray runs through an edge or a corner."""
-
-USUAL_CROSSINGS = 4
-"""Crossings of a ray that space is made for before they are counted; for more, they are computed once again."""
-
-CONE_SLACK = 1e-9
-"""Radians by which a bounding cone is widened against rounding."""
-
-OUTSIDE = 1e-12
-"""By so much less than a cone's is the cosine of a ray that is outside of it whatever rounding did."""
+CONE_SLACK, OUTSIDE = 1e-9, 1e-12
+"""Radians by which a bounding cone is widened against rounding; and by so much less than the cone's is the cosine of a
+ray that is outside of it whatever rounding did."""
 
 DOUBTFUL = 1e-12
 """A triangle seen so nearly edge-on that the part of its area across the ray is rounding: where on it the ray is
@@ -193,15 +171,12 @@ NUDGE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Every crossing, sorted by ray and then by depth.
+    """Every crossing, sorted by ray and then by depth, mm from the origin; the first four of shape (c,).
 
     Attributes:
-        ray: Shape (c,), row of the ray.
-        depth: Shape (c,), mm from the origin.
-        face: Shape (c,), triangle that is crossed.
-        sense: Shape (c,), 1 where the ray comes out through the triangle's front (its corners run counterclockwise seen
-            from there), -1 where it goes in, 0 where it does both at once (two surfaces touch there, or one is folded)
-            or the triangle is seen edge-on.
+        sense: 1 where the ray comes out through the triangle's front (its corners run counterclockwise seen from
+            there), -1 where it goes in, 0 where it does both at once (two surfaces touch there, or one is folded) or
+            the triangle is seen edge-on.
         count: Shape (n,), crossings of each ray.
         first: Shape (n,), row in ``depth`` of each ray's first crossing (meaningless where count is 0).
     """
@@ -215,13 +190,7 @@ class Crossings:
 
 
 def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: float = np.inf) -> Crossings:
-    """All crossings of rays with a surface.
-
-    Args:
-        origin: Shape (3,), where every ray starts, mm.
-        directions: Shape (n, 3), unit vectors.
-        length: Crossings beyond are left out, mm.
-    """
+    """All crossings of rays from one origin (3,), mm, along unit vectors (n, 3), with a surface, as far as a length."""
     order, starts, bins = _binned(directions)
     rays = np.take(directions, order, axis=0)
     lengths = np.sqrt(np.einsum("ij,ij->i", rays, rays))
@@ -316,7 +285,6 @@ def _visit(vertices, faces, origin, binned, length, ray, depth, face, sense):  #
 
 @allocation_free()
 def _seen(vertices, row, origin):  # type: ignore[no-untyped-def]  # numba infers
-    """A vertex, seen from where the rays start."""
     return vertices[row, 0] - origin[0], vertices[row, 1] - origin[1], vertices[row, 2] - origin[2]
 
 
@@ -430,7 +398,6 @@ def _cross(a, b, c, u):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free()
 def _largest(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
-    """The largest coordinate of three points."""
     return max(abs(a[0]), abs(a[1]), abs(a[2]), abs(b[0]), abs(b[1]), abs(b[2]), abs(c[0]), abs(c[1]), abs(c[2]))
 
 
@@ -469,7 +436,6 @@ def _edge_function(p, q):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free()
 def _along(p, u):  # type: ignore[no-untyped-def]  # numba infers
-    """Distance of a point along a ray."""
     return p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
 
 

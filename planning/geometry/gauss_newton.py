@@ -17,23 +17,17 @@ from typing import Generic, NamedTuple, TypeVar
 import numpy as np
 from scipy.special import fdtrc
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 
 X = TypeVar("X")
 """Type of the estimate."""
-
 NO_PIVOT = 1e-15
 """An eigenvalue of the normal equations below this fraction of the largest is rounding: no step is made along it."""
-
-SMALL_GAIN = 1e-10
-"""A step that would lower the cost by a smaller fraction is not made: the fit has settled."""
-
-NOT_HIGHER = 1 + 1e-12
-"""A cost that rises by no more than rounding has not risen."""
-
+SMALL_GAIN, NOT_HIGHER = 1e-10, 1 + 1e-12
+"""A step that would lower the cost by a smaller fraction is not made: the fit has settled. And a cost that rises by no
+more than rounding has not risen."""
 MOST_DAMPINGS = 30
 """Dampings of one step; from 1e-6 by tens, far beyond any step that moves the estimate."""
-
 UNSEEN = 1e-6
 """Relative length of a column outside of the model's own below which the data cannot show it."""
 
@@ -58,18 +52,20 @@ class System(NamedTuple, Generic[X]):
 
 
 class Fit(NamedTuple, Generic[X]):
-    """Result of Gauss-Newton."""
+    """Result of Gauss-Newton.
+
+    Attributes:
+        system: Linearised where the last step (p,), in the unknowns' units, began; 0 where none was left to make.
+        settled: Whether it arrived within the steps it was given.
+        determined: Whether no unknown was left alone by the last step.
+    """
 
     estimate: X
     system: System[X]
-    """Linearised where the last step began."""
     step: Floats
-    """Shape (p,): the last step, in the unknowns' units; 0 where none was left to make."""
     iterations: int
     settled: bool
-    """Whether it arrived within the steps it was given."""
     determined: bool
-    """Whether no unknown was left alone by the last step."""
 
 
 def gauss_newton(
@@ -104,7 +100,7 @@ class _Normal(NamedTuple):
     values: Floats
     axes: Floats
     pull: Floats
-    known: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    known: Bools
 
     @classmethod
     def of(cls, system: System[X]) -> _Normal:
@@ -119,10 +115,6 @@ class _Normal(NamedTuple):
         damped = np.where(self.known, self.values + damping * self.values[-1], 1.0)  # 1 only avoids a division by 0
         return np.asarray(-self.axes @ (np.where(self.known, 1.0 / damped, 0.0) * self.pull))
 
-    def gain(self) -> float:
-        """Decrease of the cost by the undamped step, were the problem linear."""
-        return float(np.sum(self.pull[self.known] ** 2 / self.values[self.known]))
-
 
 def _descend(
     normal: _Normal, system: System[X], estimate: X, moved: Callable[[X, Floats], X], damping: float
@@ -132,7 +124,8 @@ def _descend(
         step = normal.step(damping)
         return step, moved(estimate, step), damping
     before = float(system.residuals @ system.residuals)
-    if normal.gain() > SMALL_GAIN * before:
+    gain = np.sum(normal.pull[normal.known] ** 2 / normal.values[normal.known])  # of the undamped step, if linear
+    if gain > SMALL_GAIN * before:
         for _ in range(MOST_DAMPINGS):
             step = normal.step(damping)
             after = moved(estimate, step)
@@ -143,20 +136,21 @@ def _descend(
 
 
 class Lacking(NamedTuple):
-    """Explanation of a linear model's residuals by k unknowns that it lacks."""
+    """Explanation of a linear model's residuals by k unknowns that it lacks.
+
+    Attributes:
+        found, sd: Shape (k,): their values, and standard deviations by the residuals that they leave.
+        probability: Chance of residuals that they explain so well, where all are zero: F(k, freedom).
+        freedom: Residuals less p and k.
+        variance, variance_without: Of one residual, with them and in the model without them.
+    """
 
     found: Floats
-    """Shape (k,): their values."""
     sd: Floats
-    """Shape (k,): their standard deviations, by the residuals that they leave."""
     probability: float
-    """Chance of residuals that they explain so well, where all are zero: F(k, freedom)."""
     freedom: int
-    """Residuals less p and k."""
     variance: float
-    """Variance of one residual, with them."""
     variance_without: float
-    """Variance of one residual, in the model without them."""
 
 
 def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> Lacking | None:

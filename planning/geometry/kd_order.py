@@ -40,7 +40,6 @@ def kd_order(points: NDArray[np.float64], leaf: int) -> NDArray[np.int64]:
 
 @nb.njit(cache=True, nogil=True)
 def _sort(records, rows, leaf):  # type: ignore[no-untyped-def]  # numba infers
-    """Split range after range, each at its left-balanced middle."""
     stack, sample = np.empty((STACK, 2), np.int64), np.empty(MOST_SAMPLED, np.float32)
     stack[0, 0], stack[0, 1] = 0, len(records)
     waiting = 1
@@ -61,7 +60,6 @@ def _sort(records, rows, leaf):  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, nogil=True)
 def _longest_side(records, low, high):  # type: ignore[no-untyped-def]  # numba infers
-    """Axis along which a range of points extends most."""
     x0 = x1 = records[low, 0]
     y0 = y1 = records[low, 1]
     z0 = z1 = records[low, 2]

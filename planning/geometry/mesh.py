@@ -19,16 +19,14 @@ from puncture_twin.planning.geometry.rigid import apply
 
 Faces = NDArray[np.int32]
 
-
 MIXED = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 """Odd numbers without a pattern: weights of a place's coordinates, as bits, in a sum that tells nearly all apart."""
 
 BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-"""Corners of the unit cube about the origin, shape (8, 3)."""
 BOX_SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-"""Its sides: corners in order, seen from outside to the left."""
 BOX_FACES = np.array([triangle for a, b, c, d in BOX_SIDES for triangle in ((a, b, c), (a, c, d))])
-"""Its sides as triangles, shape (12, 3)."""
+"""Corners (8, 3) of the unit cube about the origin; its sides, corners in order, seen from outside to the left; and
+these as triangles, (12, 3)."""
 
 MOST_IN_ONE = 2_000_000
 """So many places give triples that fit in 63 bits."""
@@ -36,12 +34,7 @@ MOST_IN_ONE = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh(Shown):
-    """Vertices and triangles of one surface. Any instance may be trusted: the guard has passed it.
-
-    Attributes:
-        vertices: Shape (n, 3), float64, mm.
-        faces: Shape (m, 3), int32, indices into ``vertices``.
-    """
+    """Vertices (n, 3), mm, and triangles (m, 3) of a surface. Any instance may be trusted: the guard has passed it."""
 
     vertices: Floats
     faces: Faces
@@ -142,11 +135,7 @@ class TriangleMesh(Shown):
         return float(_volume(self.vertices, self.faces, self.bounds.mean(axis=0)))
 
     def transformed(self, T_b_a: NDArray[np.float64]) -> TriangleMesh:
-        """The surface in frame b.
-
-        Args:
-            T_b_a: Shape (4, 4), maps coordinates of this mesh's frame a to frame b, mm.
-        """
+        """The surface in frame b, of this mesh in frame a."""
         return TriangleMesh(apply(T_b_a, self.vertices), self.faces)
 
 
@@ -286,8 +275,7 @@ def split_at_creases(mesh: TriangleMesh) -> TriangleMesh:
     """
     keys = (mesh.vertices + 0.0).view(np.dtype((np.void, 24))).reshape(-1)
     _, welded = np.unique(keys, return_inverse=True)
-    corner_vertex = welded[mesh.faces]
-    pairs = _smooth_pairs(mesh, corner_vertex.astype(np.int64))
+    pairs = _smooth_pairs(mesh, welded[mesh.faces].astype(np.int64))
     count = 3 * len(mesh.faces)
     graph = scipy.sparse.coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     fans, fan = scipy.sparse.csgraph.connected_components(graph, directed=False)
@@ -311,9 +299,7 @@ def _smooth_pairs(mesh: TriangleMesh, corner_vertex: NDArray[np.int64]) -> NDArr
     along = np.where(swap[a] == swap[b], -1.0, 1.0)  # of neighbours wound alike one runs the edge back
     smooth = along * np.einsum("ij,ij->i", normals[faces[a]], normals[faces[b]]) >= np.cos(CREASE)
     a, b = a[smooth], b[smooth]
-    return np.concatenate(
-        [np.stack([low_corner[a], low_corner[b]], axis=1), np.stack([high_corner[a], high_corner[b]], axis=1)]
-    )
+    return np.concatenate([np.stack([corner[a], corner[b]], axis=1) for corner in (low_corner, high_corner)])
 
 
 def _normals(mesh: TriangleMesh) -> NDArray[np.float64]:
@@ -344,21 +330,16 @@ def smooth_normals(mesh: TriangleMesh, face: NDArray[np.int64], points: Floats) 
         at_vertex[:, axis] = about_vertices(part)
     kept, whole = np.linalg.norm(at_vertex, axis=1), about_vertices(np.linalg.norm(areas, axis=1))
     crossed = TriangleMesh(mesh.vertices, mesh.faces[face])
-    weights, own = _corner_weights(crossed.triangles, points), _normals(crossed)
+    a, b, c = np.moveaxis(crossed.triangles, 1, 0)
+    own, across = _normals(crossed), np.cross(b - a, c - a)
+    parts = [np.cross(c - b, points - b), np.cross(a - c, points - c), np.cross(b - a, points - a)]
+    weights = np.stack([np.einsum("ij,ij->i", part, across) for part in parts], axis=1)  # as the areas opposite
     corner = number[mesh.faces[face]]
     normals = _unit(at_vertex)[corner]
     signs = np.where(np.einsum("ijk,ik->ij", normals, own) < 0.0, -1.0, 1.0)
     blended = _unit(np.einsum("ij,ij,ijk->ik", weights, signs, normals))
     coherent = (kept >= COHERENT * whole)[corner].all(axis=1)
     return np.where(coherent[:, None], blended, own)
-
-
-def _corner_weights(triangles: Floats, points: Floats) -> Floats:
-    """How much corners count (n, 3) at points of triangles (n, 3, 3): as the areas opposite, in one measure per row."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    normal = np.cross(b - a, c - a)
-    parts = [np.cross(c - b, points - b), np.cross(a - c, points - c), np.cross(b - a, points - a)]
-    return np.stack([np.einsum("ij,ij->i", part, normal) for part in parts], axis=1)
 
 
 def _unit(vectors: Floats) -> Floats:

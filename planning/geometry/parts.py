@@ -26,15 +26,7 @@ of a surface that was made on the same grid. A line that does all the same flips
 
 
 def voxels_inside(mesh: TriangleMesh, T_ct_index: Floats, shape: tuple[int, ...]) -> Bools:
-    """Voxels whose centres lie inside a surface, or through which it passes where it is open.
-
-    Args:
-        mesh: LPS mm. Of an open surface the inside is not known; its own voxels are returned.
-        T_ct_index: Shape (4, 4), voxel index to LPS mm.
-
-    Returns:
-        Shape ``shape``.
-    """
+    """Voxels of a grid whose centres lie inside a surface, or through which it passes where it is open."""
     mask = np.zeros(shape, bool)
     mark_inside(mesh, T_ct_index, mask)
     return mask
@@ -97,9 +89,7 @@ def _voxels_on(corners: Floats, shape: tuple[int, ...]) -> Bools:
 class Parts:
     """The parts of a mask, numbered from 0, as they are met.
 
-    Attributes:
-        runs: Shape (n, 4), of each run the line's two indices, its first voxel and the one after its last.
-        part: Shape (n,), its number.
+    By run the line's two indices, its first voxel and the one after its last, (n, 4), and its part, (n,).
     """
 
     shape: tuple[int, ...]
@@ -118,11 +108,7 @@ class Parts:
         return np.bincount(self.part, held, len(self.sizes)).astype(np.int64)
 
     def painted(self, values: NDArray[Any]) -> NDArray[Any]:
-        """A grid with a value of its own in each part, and zero outside of all.
-
-        Args:
-            values: Shape (parts,), whole numbers or flags.
-        """
+        """A grid with a value (parts,), a whole number or flag, of its own in each part, and zero outside of all."""
         grid = np.zeros(self.shape, values.dtype)
         _paint(self.runs, values[self.part], grid)
         return grid
@@ -153,12 +139,7 @@ def middle_of(mask: Bools) -> Floats:
 
 
 def ends_of(mask: Bools) -> tuple[Ints32, Ints32, Ints32, Ints32]:
-    """First and last voxel of a mask along each line of axes 0 and 1.
-
-    Returns:
-        The first along axis 0, shape (ny, nz), the last, and both along axis 1, shape (nx, nz); -1 of a line that does
-        not meet it.
-    """
+    """First and last voxel of a mask along axis 0, shape (ny, nz), and along axis 1, (nx, nz); -1 of a line without."""
     nx, ny, nz = mask.shape
     ends = [np.full(shape, -1, np.int32) for shape in ((ny, nz), (ny, nz), (nx, nz), (nx, nz))]
     _find_ends(_plain(mask), *ends)
@@ -173,7 +154,6 @@ def in_blocks(mask: Bools, edge: NDArray[np.int_]) -> Ints32:
 
 
 def _plain(mask: Bools) -> Bools:
-    """The array as kernels take it: contiguous and writable."""
     return np.require(mask, requirements=["C", "W"])
 
 

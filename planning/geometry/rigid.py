@@ -54,21 +54,16 @@ def apply(T_b_a: NDArray[np.floating[Any]], points_a: NDArray[np.floating[Any]])
 def rotated_about(T: Floats, center: Floats, change: Floats) -> Floats:
     """A pose (4, 4) rotated about a point (3,) of the frame that it leads to, then shifted.
 
-    Args:
-        T: Shape (4, 4), mm.
-        center: Shape (3,), mm.
-        change: Shape (6,): rotation vector (rad), then shift (mm).
+    By a change (6,): rotation vector (rad), then shift (mm).
     """
     # p -> Exp(ω) (p - c) + c + s
     R = exp_rotation(change[:3])
     return pose(R @ T[:3, :3], R @ (T[:3, 3] - center) + center + change[3:])
 
 
-SMALL_ANGLE = 1e-6
-"""rad: below it the left Jacobian's terms of second order (φ²/6 < 2e-13) are left out."""
-
-SERIES_BELOW = 1e-3
-"""rad: up to it sin(φ/2) / φ is its series, off by less than 1e-21."""
+SMALL_ANGLE, SERIES_BELOW = 1e-6, 1e-3
+"""rad: below the first the left Jacobian's terms of second order (φ²/6 < 2e-13) are left out; up to the second
+sin(φ/2) / φ is its series, off by less than 1e-21."""
 
 
 def skew(v: Floats) -> Floats:

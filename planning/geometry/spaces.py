@@ -11,7 +11,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from puncture_twin.planning.base.errors import InputError
+from puncture_twin.planning.base.errors import refuse
 
 if TYPE_CHECKING:
     from puncture_twin.planning.base.arrays import Floats
@@ -33,17 +33,11 @@ class Up(StrEnum):
 
 
 def to_lps(points: Floats, space: Space) -> Floats:
-    """Coordinates in LPS; those of a local frame stay as they are, since such a frame is its own.
+    """Coordinates (n, 3) of any unit in LPS; those of a local frame stay as they are, since such a frame is its own.
 
-    Args:
-        points: Shape (n, 3), any unit, in ``space``.
-
-    Returns:
-        Shape (n, 3), same unit. RAS has x and y negated, which is its own inverse.
+    RAS has x and y negated, which is its own inverse.
     """
-    if space is Space.RAS:
-        return points.astype(float) * (-1.0, -1.0, 1.0)
-    return points.astype(float)
+    return points.astype(float) * ((-1.0, -1.0, 1.0) if space is Space.RAS else (1.0, 1.0, 1.0))
 
 
 def point_text(point_ct: Floats, space: Space) -> str:
@@ -57,10 +51,8 @@ def parse_space(text: str, *, where: str) -> Space:
     Raises:
         InputError: If it names none.
     """
-    for space in Space:
-        if text.strip().lower() == space.lower():
-            return space
-    raise InputError(f"unknown space {text!r}", where=where, allowed=", ".join(Space), code="unknown_space")
+    found = {space.lower(): space for space in Space}.get(text.strip().lower())
+    return found or refuse(f"unknown space {text!r}", where, ", ".join(Space), "unknown_space")
 
 
 class Unit(StrEnum):
@@ -82,6 +74,6 @@ def parse_unit(text: str, *, where: str) -> Unit:
     Raises:
         InputError: If it names none.
     """
-    if text.strip() in tuple(Unit):
-        return Unit(text.strip())
-    raise InputError(f"unknown unit of length {text!r}", where=where, allowed=", ".join(Unit), code="unknown_unit")
+    if text.strip() not in tuple(Unit):
+        refuse(f"unknown unit of length {text!r}", where, ", ".join(Unit), "unknown_unit")
+    return Unit(text.strip())

@@ -20,10 +20,9 @@ ROUNDS_TO_ZERO = 1e-30
 def squared_distance(points: NDArray[np.float64], triangles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Squared distance, mm^2, from points (..., 3) to triangles (..., 3, 3), broadcast against each other."""
     shape = np.broadcast_shapes(points.shape[:-1], triangles.shape[:-2])
-    pairs = int(np.prod(shape))
-    flat_points = np.broadcast_to(points, (*shape, 3)).reshape(pairs, 3)
-    flat_triangles = np.broadcast_to(triangles, (*shape, 3, 3)).reshape(pairs, 3, 3)
-    squares = np.empty(pairs)
+    flat_points = np.broadcast_to(points, (*shape, 3)).reshape(-1, 3)
+    flat_triangles = np.broadcast_to(triangles, (*shape, 3, 3)).reshape(-1, 3, 3)
+    squares = np.empty(len(flat_points))
     _each(np.ascontiguousarray(flat_triangles), np.ascontiguousarray(flat_points), squares)
     return squares.reshape(shape)
 
@@ -64,7 +63,6 @@ def to_triangle(t, x, y, z):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free()
 def _to_segment(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]  # numba infers
-    """Squared distance of the origin to the segment a b."""
     ux, uy, uz = bx - ax, by - ay, bz - az
     squared = ux * ux + uy * uy + uz * uz
     fraction = 0.0

@@ -106,7 +106,7 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
     Args:
         naming: As the user states it, or None.
     """
-    present = surfaces.labels_present()
+    present = surfaces.present().labels
     if naming is None and surfaces.names is None:
         naming, notes = _found_naming(place, source, surfaces.labelmap, present)
     else:

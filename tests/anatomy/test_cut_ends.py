@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
-from case_world import skin_from_ct
+from case_world import case_text, skin_from_ct, structure
 
 from puncture_twin.planning.anatomy.body.body_mask import ct_image
 from puncture_twin.planning.anatomy.body.cut_ends import SIDES, content_of, cut_ends, end_warnings, stated_ends
@@ -36,7 +36,6 @@ def cut_at(array, axis, end):
 
 
 def filled_up(array, axis, end, voxels, value=0.0):
-    """So many voxels laid behind one side."""
     width = [(0, 0)] * 3
     width[axis] = (voxels, 0) if end == 0 else (0, voxels)
     return np.pad(array, width, constant_values=value)
@@ -49,18 +48,15 @@ def surface_of(labels):
 
 
 def hu_of(body, seed=0):
-    """Noisy tissue in noisy air."""
     noise = np.random.default_rng(seed).normal(0.0, 12.0, body.shape)
     return np.where(body, 40.0, -1000.0) + noise
 
 
-@pytest.mark.parametrize("voxels", [1, 2, 9])
+@pytest.mark.parametrize("voxels", [1, 9])
 @pytest.mark.parametrize("side", ALL_SIDES)
 def test_what_lies_behind_a_face_that_cuts_an_organ_is_left_out(side, voxels):
     """At each of the six sides, however wide the border is, the image is what it was before it was filled up."""
-    axis, end = side
-    organ = lumps(RADII_MM - 16.0)
-    whole = lumps()
+    (axis, end), organ, whole = side, lumps(RADII_MM - 16.0), lumps()
     margins = [(n - m) // 2 for n, m in zip(whole.shape, organ.shape, strict=True)]
     organ = np.pad(organ, [(k, k) for k in margins])
     body, organ = cut_at(whole, axis, end), filled_up(cut_at(organ, axis, end), axis, end, voxels)
@@ -83,9 +79,9 @@ def test_across_the_bed_a_patient_does_not_end_flat(end):
 
 
 def test_no_round_end_is_taken_for_a_cut():
-    """120 heads and stumps of any size, on voxels of .7 to 10 mm, wherever they lie on them."""
+    """60 heads and stumps of any size, on voxels of .7 to 10 mm, wherever they lie on them."""
     rng = np.random.default_rng(7)
-    for _ in range(120):
+    for _ in range(60):
         spacing = rng.uniform([2.0, 2.0, 0.7], [4.0, 4.0, 10.0])
         radii = rng.uniform(20.0, 90.0, 3)
         radii[2] = max(radii[2], radii[0] * radii[1] / 130.0)
@@ -120,8 +116,7 @@ def test_a_side_with_the_same_border_as_a_cut_one_is_cut_too():
 
 
 @pytest.mark.parametrize("fill", ["noise", -1000.0, -3024.0, 0.0])
-@pytest.mark.parametrize("voxels", [1, 6])
-@pytest.mark.parametrize("end", [0, 1])
+@pytest.mark.parametrize(("end", "voxels"), [(0, 1), (1, 6)])
 def test_no_path_enters_through_a_cut_that_was_filled_up(end, voxels, fill):
     """The skin is that of the image as it was cut: the same surface, the same marks, and no entry there."""
     body = cut_at(lumps(), 2, end)
@@ -161,49 +156,16 @@ def test_what_the_case_states_is_so():
         assert np.argwhere(skin.field_of_view.cut).tolist() == cut
 
 
-CASE = """schema = 2
-name = "box"
-region = "phantom"
-space = "LPS"
-
-[[structure]]
-name = "skin"
-ct = "ct.nii.gz"
-role = "skin"
-{cut}
-
-[[structure]]
-name = "lesion"
-labelmap = "labels.nii.gz"
-label = 1
-role = "target"
-
-[[structure]]
-name = "rod"
-labelmap = "labels.nii.gz"
-label = 2
-role = "avoid"
-margin_mm = 2.0
-
-[target]
-name = "target"
-position_mm = [80.0, 80.0, 80.0]
-structure = "lesion"
-
-[needle]
-length_mm = 170.0
-shaft_mm = 120.0
-diameter_mm = 1.2
-
-[search]
-theta_deg = [0, 80]
-step_deg = 10.0
-max_skin_angle_deg = 85
-frame = "bed"
-
-[end]
-structures = 3
-"""
+def case_of(cut):
+    return case_text(
+        structure("skin", "skin", {"ct": "ct.nii.gz"}) + cut,
+        structure("lesion", "target", {"labelmap": "labels.nii.gz", "label": 1}),
+        structure("rod", "avoid", {"labelmap": "labels.nii.gz", "label": 2}, margin_mm=2.0),
+        region="phantom",
+        target='position_mm = [80.0, 80.0, 80.0]\nstructure = "lesion"',
+        needle="length_mm = 170.0\nshaft_mm = 120.0\ndiameter_mm = 1.2",
+        search='theta_deg = [0, 80]\nstep_deg = 10.0\nmax_skin_angle_deg = 85\nframe = "bed"',
+    )
 
 
 def unknown_of(folder, rod, cut=""):
@@ -216,22 +178,20 @@ def unknown_of(folder, rod, cut=""):
         image = sitk.GetImageFromArray(array.T)
         image.SetSpacing([STEP_MM] * 3)
         sitk.WriteImage(image, str(folder / f"{name}.nii.gz"))
-    (folder / "case.toml").write_text(CASE.format(cut=cut))
+    (folder / "case.toml").write_text(case_of(cut))
     context = prepare(folder / "case.toml", arm=False)
     counts = context.search().counts()
     return counts.get("unknown_region", 0), context.anatomy.skin.field_of_view.cut
 
 
-def test_a_phantom_in_air_lies_on_nothing(tmp_path):
-    """Its four flat sides are skin, and so are its ends, though a rod runs through it from one to the other."""
-    unknown, cut = unknown_of(tmp_path, lambda z: z < 99)
-    assert unknown == 0
-    assert not cut.any()
-
-
 def test_a_phantom_that_cuts_an_insert_was_cut_unless_its_case_says_that_it_is_whole(tmp_path):
-    """A rod that ends within: no path leaves at the end where it is cut, until ``cut = []`` stands in the case."""
+    """A rod that ends within: no path leaves at the end where it is cut, until ``cut = []`` stands in the case.
+
+    Where it runs through from end to end, the four flat sides are skin, and so are the ends: in air it lies on nothing.
+    """
+    unknown, cut = unknown_of(tmp_path, lambda z: z < 99)
+    assert unknown == 0 and not cut.any()
     unknown, cut = unknown_of(tmp_path, lambda z: z > -4)
     assert unknown > 0
     assert np.argwhere(cut).tolist() == [[2, 1]]
-    assert unknown_of(tmp_path, lambda z: z > -4, "cut = []")[0] == 0
+    assert unknown_of(tmp_path, lambda z: z > -4, "cut = []\n")[0] == 0

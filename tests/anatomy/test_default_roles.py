@@ -30,18 +30,10 @@ def test_every_class_of_totalsegmentator_is_known(region):
 
 def test_the_cases_written_by_hand_are_met():
     """Whatever the case of the real CT avoids, the table avoids by as much; what it crosses is crossed."""
-    case = parse_toml(
-        (ROOT / "tests" / "real" / "case_v2.toml").read_bytes(),
-        ROOT / "tests" / "real" / "case_v2.toml",
-        CaseFile,
-        allowed="",
-        keys="",
-    )
-    (section,) = case.structures
-    rules = select(
-        V2, V2, avoid={**section.avoid, "*": 0.0}, traverse=section.traverse, target=section.target, where="case"
-    ).rules
-    for rule in rules:
+    path = ROOT / "tests" / "real" / "case_v2.toml"
+    (section,) = parse_toml(path.read_bytes(), path, CaseFile, allowed="", keys="").structures
+    rest = {"traverse": section.traverse, "target": section.target, "where": "case"}
+    for rule in select(V2, V2, avoid={**section.avoid, "*": 0.0}, **rest).rules:
         line = default_role(rule.name, "abdomen")
         if rule.kind is RuleKind.TRAVERSE:
             assert line.kind == "traverse", rule.name
@@ -74,6 +66,9 @@ def test_spellings_of_other_programs_are_known(names, group):
     assert {default_role(name, "abdomen").group for name in names} == {group}
 
 
+LINES = [*GENERAL, *(line for region in BY_REGION.values() for line in region)]
+
+
 @pytest.mark.parametrize(
     ("names", "region"),
     [
@@ -90,11 +85,9 @@ def test_what_may_be_hurt_is_not_crossed_for_its_place(names, region):
 
 def test_what_no_line_knows_is_not_guessed():
     """It is avoided by the largest margin of the table."""
-    assert default_role("Segment_1", "abdomen") is None
-    assert default_role("qwerty", "brain") is None
-    lines = [*GENERAL, *(line for region in BY_REGION.values() for line in region)]
-    assert (UNKNOWN_NAME.kind, UNKNOWN_NAME.margin_mm) == ("avoid", max(line.margin_mm for line in lines))
-    assert all((line.margin_mm > 0) == (line.kind in ("avoid", "unknown")) for line in lines)
+    assert default_role("Segment_1", "abdomen") is default_role("qwerty", "brain") is None
+    assert (UNKNOWN_NAME.kind, UNKNOWN_NAME.margin_mm) == ("avoid", max(line.margin_mm for line in LINES))
+    assert all((line.margin_mm > 0) == (line.kind in ("avoid", "unknown")) for line in LINES)
 
 
 def test_a_region_has_its_own_lines():
@@ -104,12 +97,8 @@ def test_a_region_has_its_own_lines():
     assert default_role("Left lateral ventricle", "brain").group == "ventricles of the brain"
     assert default_role("brainstem", "brain").margin_mm == 5.0
 
-
-@pytest.mark.parametrize("name", ["Midbrain", "Pons", "Medulla oblongata", "mesencephalon"])
-def test_parts_of_the_brainstem_are_brainstem(name):
-    """The midbrain was brain by its ending, which paths to a target in the brain cross freely."""
-    assert default_role(name, "brain").group == "brainstem"
-    assert never_crossed(name).group == "brainstem"
+    for name in ("Midbrain", "Pons", "Medulla oblongata", "mesencephalon"):  # brain by its ending, it was crossed
+        assert default_role(name, "brain").group == never_crossed(name).group == "brainstem"
 
 
 def test_a_lesion_named_after_a_vessel_stays_a_lesion():
@@ -121,7 +110,7 @@ def test_a_lesion_named_after_a_vessel_stays_a_lesion():
 def test_the_page_shows_the_table():
     """Every line with its role, margin and reason, as docs/default_roles.py writes it."""
     page = (ROOT / "docs" / "reference" / "default-roles.md").read_text(encoding="utf-8")
-    for line in (UNKNOWN_NAME, *GENERAL, *(line for region in BY_REGION.values() for line in region)):
+    for line in (UNKNOWN_NAME, *LINES):
         margin = f"{line.margin_mm:g}" if line.margin_mm else ""
         assert f"| {line.kind} | {margin} | {line.reason} |" in page, line.group
         assert all(f"`{pattern}`" in page for pattern in line.patterns), line.group

@@ -11,7 +11,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 import trimesh
-from case_world import whole
+from case_world import case_text, structure
 from refusals import refused
 
 from puncture_twin.planning.base.reasons import Reason
@@ -27,43 +27,8 @@ LENGTH = 210.0
 CAP = {"theta": (4 * DEG, 40 * DEG), "beta": (-30 * DEG, 30 * DEG)}
 """Toward the head; angles from 0 to 25 degrees are imaged, waited for beyond the image, or inserted beyond it."""
 
-CASE = """
-schema = 2
-region = "other"
-name = "cut"
-space = "LPS"
-[target]
-position_mm = [0.0, 0.0, 60.0]
-structure = "lesion"
-[needle]
-length_mm = 210.0
-shaft_mm = 150.0
-diameter_mm = 1.2
-{standoff}
-[search]
-step_deg = 2.0
-max_skin_angle_deg = 60
-[[structure]]
-name = "skin"
-role = "skin"
-mesh = "skin.ply"
-unit = "mm"
-cut = ["head"]
-[[structure]]
-name = "lesion"
-role = "target"
-mesh = "lesion.ply"
-unit = "mm"
-[[structure]]
-name = "spine"
-role = "avoid"
-margin_mm = 2.0
-mesh = "spine.ply"
-unit = "mm"
-"""
 
-
-def cut_case(folder, standoff=""):
+def cut_case(folder, standoff="", more=""):
     """The trunk with its image's end, prepared without an arm."""
     for name, size, middle in (
         ("skin", (400, 160, 240), (0, 0, 0)),
@@ -72,10 +37,17 @@ def cut_case(folder, standoff=""):
     ):
         mesh = trimesh.creation.box(extents=size)
         mesh.apply_translation(middle)
-        mesh.export(folder / f"{name}.ply")
-    path = folder / "case.toml"
-    path.write_text(whole(CASE.format(standoff=standoff)))
-    return prepare(path, arm=False)
+        mesh.export(folder / f"{name}.stl")
+    text = case_text(
+        structure("skin", "skin", cut=["head"]),
+        structure("lesion", "target"),
+        structure("spine", "avoid", margin_mm=2.0) + more,
+        target='position_mm = [0.0, 0.0, 60.0]\nstructure = "lesion"',
+        needle=f"length_mm = 210.0\nshaft_mm = 150.0\ndiameter_mm = 1.2\n{standoff}",
+        search="step_deg = 2.0\nmax_skin_angle_deg = 60",
+    )
+    (folder / "case.toml").write_text(text)
+    return prepare(folder / "case.toml", arm=False)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +58,6 @@ def cut(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def certified(cut):
-    """Its certificate toward the head."""
     return certify(cut.case, cut.anatomy, size=0.5 * DEG, **CAP)
 
 
@@ -105,7 +76,6 @@ def leaves_while_waiting(tilt):
 
 
 def rated(context, theta, beta):
-    """The search's verdicts on directions, rad."""
     theta, beta = np.atleast_1d(theta), np.broadcast_to(beta, np.shape(np.atleast_1d(theta)))
     directions = Directions(theta, beta, outward(theta, beta) @ context.case.T_ct_entry[:3, :3].T)
     return organ_candidates(context.case, context.anatomy, context.engine, directions)
@@ -145,12 +115,12 @@ def test_a_path_without_a_standoff_keeps_its_reason(cut):
 
 def test_the_certificate_agrees_with_the_search(cut, certified, rng):
     """Random directions of the cap: none of a safe cell is refused, none of a rejected one safe; few are undecided."""
-    theta, beta = rng.uniform(*CAP["theta"], 4000), rng.uniform(*CAP["beta"], 4000)
+    theta, beta = rng.uniform(*CAP["theta"], 2000), rng.uniform(*CAP["beta"], 2000)
     found = rated(cut, theta, beta)
     letters = certified.at(theta, beta)
     assert found.safe[letters == "S"].all()
     assert not found.safe[letters == "R"].any()
-    assert min((letters == "S").sum(), (letters == "R").sum()) > 300
+    assert min((letters == "S").sum(), (letters == "R").sum()) > 150
     assert certified.fraction("U") < 0.05
     verify(certified, cut.case, cut.anatomy)
 
@@ -165,21 +135,25 @@ def beyond_image(case, certificate):
 
 def forged(certificate, rows, tmp_path):
     """The certificate as a file in which cells are claimed safe, whole and agreeing with itself."""
-    verdict, reason, structure = certificate.verdict.copy(), certificate.reason.copy(), certificate.structure.copy()
-    verdict[rows], reason[rows], structure[rows] = "S", "", ""
+    write_certificate(claiming(certificate, rows, "S", ""), tmp_path / "c.json")
+    return read_certificate(tmp_path / "c.json")
+
+
+def claiming(certificate, rows, letter, why):
+    """The certificate with another verdict and reason of cells."""
+    verdict, reason, beside = certificate.verdict.copy(), certificate.reason.copy(), certificate.structure.copy()
+    verdict[rows], reason[rows] = letter, why
+    beside[rows] = "" if letter == "S" else beside[rows]
     letters = iter(verdict)
     tree = tuple("".join(x if x.islower() else str(next(letters)) for x in level) for level in certificate.tree)
-    write_certificate(
-        replace(certificate, tree=tree, verdict=verdict, reason=reason, structure=structure), tmp_path / "c.json"
-    )
-    return read_certificate(tmp_path / "c.json")
+    return replace(certificate, tree=tree, verdict=verdict, reason=reason, structure=beside)
 
 
 def test_a_cell_forged_safe_whose_waiting_flange_leaves_the_image_is_refused(cut, certified, tmp_path):
     """Several such cells, each by itself, and all at once: the checker names the cell."""
     rows = np.flatnonzero(beyond_image(cut.case, certified))
     assert len(rows) > 20
-    for forgery in (*rows[:: len(rows) // 5, None], rows):
+    for forgery in (*rows[:: len(rows) // 3, None], rows):
         with refused("cell_not_proven", forgery[0]):
             verify(forged(certified, forgery, tmp_path), cut.case, cut.anatomy)
 
@@ -198,12 +172,8 @@ def test_a_certificate_for_inserted_needles_alone_is_refused(cut, certified, mon
 def test_a_cell_forged_out_of_the_image_is_refused(cut, certified, tmp_path):
     """A safe cell beside the border, claimed to leave the image: not proven either."""
     row = int(np.flatnonzero(certified.verdict == "S")[-1])
-    verdict, reason = certified.verdict.copy(), certified.reason.copy()
-    verdict[row], reason[row] = "R", Reason.UNKNOWN_REGION.value
-    letters = iter(verdict)
-    tree = tuple("".join(x if x.islower() else str(next(letters)) for x in level) for level in certified.tree)
     with refused("cell_not_proven", row):
-        verify(replace(certified, tree=tree, verdict=verdict, reason=reason), cut.case, cut.anatomy)
+        verify(claiming(certified, row, "R", Reason.UNKNOWN_REGION.value), cut.case, cut.anatomy)
 
 
 def test_another_gap_is_another_question(cut, certified):
@@ -219,7 +189,7 @@ LAMP = '[[obstacle]]\nname = "lamp"\nframe = "ct"\ncenter_mm = [0.0, {y}, 60.0]\
 @pytest.mark.parametrize(("before", "safe"), [(40.0, True), (0.7, True), (0.5, False), (-4.0, False)])
 def test_an_obstacle_counts_up_to_the_flange_of_its_direction(tmp_path, before, safe):
     """The flange waits at 300 mm straight in (a path of 150 mm would need 370): a lamp behind it is as far as it is."""
-    context = cut_case(tmp_path, LAMP.format(y=-(300.0 + before + 5.0)))
+    context = cut_case(tmp_path, more=LAMP.format(y=-(300.0 + before + 5.0)))
     found = context.check(0.0, 0.0)
     column = found.clearance.structures.index("lamp")
     assert found.safe[0] == safe
@@ -230,7 +200,7 @@ def test_an_obstacle_counts_up_to_the_flange_of_its_direction(tmp_path, before, 
 
 def test_no_reported_depth_exceeds_the_flange(tmp_path):
     """A lamp across many directions, some of whose flanges wait before it: each depth lies before its own flange."""
-    context = cut_case(tmp_path, LAMP.format(y=-300.0).replace("40.0, 10.0, 40.0", "400.0, 10.0, 400.0"))
+    context = cut_case(tmp_path, more=LAMP.format(y=-300.0).replace("40.0, 10.0, 40.0", "400.0, 10.0, 400.0"))
     tilt = np.linspace(0.0, 30.0, 301) * DEG
     found = rated(context, tilt, np.pi)
     flange = LENGTH + found.path.length + gap(found.path.skin_angle)

@@ -18,23 +18,19 @@ def test_a_guess_says_how_much_where_and_what_overrules_it():
     assert found.sentence.endswith('[ct] arms = "none"')
 
 
-def test_a_volume_is_what_a_surface_encloses():
-    """A ball of 50 mm, wherever it lies, to what its surface is off."""
-    for middle in (np.zeros(3), np.array([300.0, -900.0, 1500.0])):
-        assert ball(middle, 50.0).volume / 1e3 == pytest.approx(4.0 / 3.0 * np.pi * 125.0, rel=0.01)
-
-
 @pytest.mark.parametrize(
-    ("place", "side"),
-    [((120, 10, 400), "left"), ((-120, 0, 0), "right"), ((30, 90, 0), "back"), ((-30, -90, 0), "front")],
+    ("places", "side"),
+    [
+        ([((120, 10, 400), 10)], "left"),
+        ([((-120, 0, 0), 10)], "right"),
+        ([((30, 90, 0), 10)], "back"),
+        ([((-30, -90, 0), 10)], "front"),
+        ([((100, 0, 0), 30), ((60, 400, 0), 1)], "left"),
+    ],
 )
-def test_a_side_is_that_of_the_body(place, side):
-    """Of LPS, measured in the body's own width and depth."""
-    skin = skin_from_mesh(ball(np.zeros(3), 100.0))
-    assert body_side(ball(np.array(place, float), 10.0), skin) == side
-
-
-def test_a_side_is_that_of_most_of_it():
-    """A large ball at the left and a speck far back are at the left, though the middle of their box is not."""
-    both = joined([ball(np.array([100.0, 0.0, 0.0]), 30.0), ball(np.array([60.0, 400.0, 0.0]), 1.0)])
-    assert body_side(both, skin_from_mesh(ball(np.zeros(3), 100.0))) == "left"
+def test_a_side_is_that_of_most_of_it_in_the_bodys_width_and_depth(places, side):
+    """Also where a speck lies far back. A volume is what a surface encloses, wherever it lies."""
+    balls = [ball(np.array(middle, float), radius) for middle, radius in places]
+    assert body_side(joined(balls), skin_from_mesh(ball(np.zeros(3), 100.0))) == side
+    volume = sum(4.0 / 3.0 * np.pi * radius**3 for _, radius in places)
+    assert joined(balls).volume == pytest.approx(volume, rel=0.01)

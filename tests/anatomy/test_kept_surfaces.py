@@ -30,28 +30,23 @@ def case_folder(folder: Path, low: int = 28) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The case."""
     return case_folder(tmp_path / "case")
 
 
 @pytest.fixture
 def cache(tmp_path: Path) -> Cache:
-    """An empty folder."""
     return Cache(tmp_path / "cache")
 
 
 def anatomy(folder: Path, cache: Cache) -> Anatomy:
-    """The case, read anew."""
     return load_anatomy(load_case(folder), cache=cache)
 
 
 def meshes(found: Anatomy) -> list[TriangleMesh]:
-    """All its surfaces."""
     return [found.skin.mesh, *(one.mesh for one in found.structures)]
 
 
 def facts(found: Anatomy) -> list[tuple[str, bool, bool]]:
-    """What is known of each surface."""
     return [(mesh.digest, mesh.closed, mesh.wound_alike) for mesh in meshes(found)]
 
 
@@ -67,7 +62,6 @@ def entry(cache: Cache, what: str) -> Path:
 
 
 def as_if_found(mesh: TriangleMesh) -> tuple[bool, bool]:
-    """What the mesh's triangles themselves say."""
     again = TriangleMesh(mesh.vertices, mesh.faces)
     return again.closed, again.wound_alike
 
@@ -118,7 +112,6 @@ WRONG = {
 @pytest.mark.parametrize("what", ["skin", "vessel", "all"])
 @pytest.mark.parametrize("wrong", WRONG)
 def test_an_entry_without_what_it_should_say_is_made_anew(folder: Path, cache: Cache, what: str, wrong: str) -> None:
-    """Under a forged digest too."""
     expected = facts(anatomy(folder, cache))
     path = entry(cache, what)
     key, whole = path.name.split(".")[-2], path.read_bytes()

@@ -12,6 +12,7 @@ from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, CtImage, ct_i
 from puncture_twin.planning.anatomy.body.limbs import limb_search
 from puncture_twin.planning.anatomy.unnamed import Named
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
+from puncture_twin.planning.geometry.rigid import pose
 
 CT = REAL_CT / "ct.nii.gz"
 CHEST = DATA / "slicer_chest_ct4" / "CTChest4.nrrd"
@@ -26,14 +27,12 @@ ALONG = ((120.0, 65.0, 10.0), (170.0, 60.0, 170.0))
 
 
 def about(start, end):
-    """Distance of every voxel from a line."""
     a, b = np.array(start), np.array(end)
     t = np.clip((POINTS - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
     return np.linalg.norm(POINTS - a - t[..., None] * (b - a), axis=-1)
 
 
 def image(*lines, radius=28.0, bone=8.0, trunk=TRUNK):
-    """A trunk with a spine, and limbs along lines."""
     body, bones = trunk.copy(), SPINE & trunk
     for start, end in lines:
         off = about(start, end)
@@ -51,7 +50,6 @@ def search(hu, body, structures=()):
 
 
 def limbs_of(hu, body, target=TARGET, structures=()):
-    """Limbs of an image from its first voxel on."""
     found = search(hu, body, structures)
     return found.limbs(found.chosen(target))
 
@@ -79,60 +77,40 @@ def test_the_bone_of_an_arm_beside_the_trunk_is_found(slope):
 @pytest.mark.parametrize("line", [ACROSS, ((36.0, 165.0, 0.0), (36.0, 165.0, 180.0))])
 def test_a_bone_that_a_structure_names_is_no_evidence(line):
     """Unless its name is an arm's; and a label of all that is soft explains no bone in it."""
-    hu, body = image(line)
-    middle = (np.array(line[0]) + line[1]) / 2.0
-    long_bone = ball(np.zeros(3), 1.0)
-    axis = np.subtract(*line[::-1])
+    (hu, body), axis = image(line), np.subtract(*line[::-1])
     along = np.outer(axis, axis) / (axis @ axis)
     stretch = 12.0 * (np.eye(3) - along) + 0.6 * np.linalg.norm(axis) * along
-    vertices = long_bone.vertices @ stretch + middle
-    bone = type(long_bone)(vertices, long_bone.faces)
-    whole = ball(TARGET, 400.0)
+    bone = ball(np.zeros(3), 1.0).transformed(pose(stretch, np.mean(line, axis=0)))
     assert not limbs_of(hu, body, structures=[Named("rib_left_7", bone)]).any()
-    assert limbs_of(hu, body, structures=[Named("humerus_left", bone)]).any()
-    assert limbs_of(hu, body, structures=[Named("tissue", whole)]).any()
-    for name in ("bone", "Skeleton", "Segment_1", "LeftArmBones", "Elle"):  # may be, or hold, an arm's
+    assert limbs_of(hu, body, structures=[Named("tissue", ball(TARGET, 400.0))]).any()
+    for name in ("humerus_left", "bone", "Skeleton", "Segment_1", "LeftArmBones", "Elle"):  # may be, or hold, an arm's
         assert limbs_of(hu, body, structures=[Named(name, bone)]).any(), name
 
 
 def test_a_thigh_pressed_against_the_one_that_holds_the_target_is_found_though_its_bone_is_named():
     """Two thighs of 75 mm side by side: beyond a neck no bone is asked for."""
-    x = POINTS[..., 0] - 160.0, POINTS[..., 1] - 140.0
-    left, right = (np.hypot(x[0] - side * 73.0, x[1]) < 75.0 for side in (1, -1))
-    line = (160.0 - 73.0, 140.0, 0.0), (160.0 - 73.0, 140.0, 180.0)
+    right, left = (np.hypot(POINTS[..., 0] - x, POINTS[..., 1] - 140.0) < 75.0 for x in (87.0, 233.0))
     hu, body = image(trunk=left | right)
-    hu[body & (hu > 200.0)], hu[about(*line) < 14.0] = 30.0, 600.0
-    vertices = ball(np.zeros(3), 1.0).vertices * [14.0, 14.0, 120.0] + line[0] + [0.0, 0.0, 90.0]
-    femur = Named("femur_right", type(ball(np.zeros(3), 1.0))(vertices, ball(np.zeros(3), 1.0).faces))
-    found = limbs_of(hu, body, np.array([200.0, 140.0, 90.0]), [femur])
+    hu[body & (hu > 200.0)], hu[about((87.0, 140.0, 0.0), (87.0, 140.0, 180.0)) < 14.0] = 30.0, 600.0
+    femur = ball(np.zeros(3), 1.0).transformed(pose(np.diag([14.0, 14.0, 120.0]), [87.0, 140.0, 90.0]))
+    found = limbs_of(hu, body, np.array([200.0, 140.0, 90.0]), [Named("femur_right", femur)])
     assert found[right & ~left].mean() > 0.98
 
 
-def test_an_arm_that_holds_the_target_is_not_forbidden():
-    """It is then the arm that is to be punctured."""
-    hu, body = image(ACROSS)
-    middle = (np.array(ACROSS[0]) + ACROSS[1]) / 2.0
-    assert not limbs_of(hu, body, middle).any()
-
-
-def test_nothing_about_the_target_is_a_limb():
-    """A target in the trunk near an arm upon it: only what is nearer to the bone than the air is the arm's."""
-    hu, body = image(ACROSS)
-    target = np.array([160.0, 108.0, 90.0])
-    limbs = limbs_of(hu, body, target)
-    assert limbs.any()
-    assert not limbs[tuple(np.rint(target / SPACING).astype(int))]
-
-
 def test_one_search_serves_every_target_as_one_of_its_own_does():
-    """Targets in the trunk, near the arm, in it, in a piece that lies apart and in the air, in either order."""
+    """Targets in the trunk, near the arm, in it, in a piece that lies apart and in the air, in either order.
+
+    Of a target near the arm only what is nearer to the bone than the air is the arm's; an arm that holds the target is
+    the one that is to be punctured.
+    """
     hu, body = image(ACROSS)
     apart = np.hypot(POINTS[..., 0] - 12.0, POINTS[..., 2] - 20.0) < 12.0
     hu[apart], body = 30.0, body | apart
-    middle = (np.array(ACROSS[0]) + ACROSS[1]) / 2.0
-    targets = [TARGET, [160.0, 108.0, 90.0], middle, [12.0, 100.0, 20.0], [310.0, 10.0, 90.0]]
+    targets = [TARGET, [160.0, 108.0, 90.0], np.mean(ACROSS, axis=0), [12.0, 100.0, 20.0], [310.0, 10.0, 90.0]]
     shared, alone = search(hu, body), [limbs_of(hu, body, np.array(target)) for target in targets]
     assert alone[0].sum() > alone[1].sum() > 0
+    assert not alone[1][tuple(np.rint(targets[1] / SPACING).astype(int))]
+    assert not alone[2].any()
     for target, expected in [*zip(targets, alone, strict=True)][::-1] * 2:
         np.testing.assert_array_equal(shared.limbs(shared.chosen(np.array(target))), expected)
 

@@ -11,7 +11,6 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
 
 RULES = '{source}\ntarget = ["organ"]\n[structures.avoid]\n"vessel *" = 3.0\n'
-END = "[end]\nstructures = {}\n"
 
 
 def labels():
@@ -24,7 +23,6 @@ def labels():
 
 
 def write_mask(path, mask, value=1, spacing=(2.0, 2.0, 2.0), dtype=np.uint8):
-    """One mask."""
     path.parent.mkdir(exist_ok=True)
     sitk.WriteImage(image_of((value * mask).astype(dtype), spacing), str(path))
 
@@ -37,6 +35,13 @@ def write_masks(folder):
     (folder / "statistics.json").write_text("{}")
 
 
+def write_both(folder):
+    """The masks, and the label map that they were taken from."""
+    write_masks(folder / "seg")
+    sitk.WriteImage(image_of(labels()), str(folder / "labels.nrrd"))
+    (folder / "names.csv").write_text("id,name\n1,organ\n3,vessel left\n")
+
+
 def case_of(folder, source):
     """A case of the usual skin and a source of structures."""
     write_balls(folder, "skin")
@@ -47,9 +52,7 @@ def case_of(folder, source):
 
 def test_a_folder_of_masks_is_searched_as_its_label_map_is(tmp_path):
     """Same surfaces, same verdicts; an empty mask is no structure, and a note says so."""
-    write_masks(tmp_path / "seg")
-    sitk.WriteImage(image_of(labels()), str(tmp_path / "labels.nrrd"))
-    (tmp_path / "names.csv").write_text("id,name\n1,organ\n3,vessel left\n")
+    write_both(tmp_path)
     by_masks = prepare(case_of(tmp_path, 'masks = "seg"'), arm=False)
     by_map = prepare(case_of(tmp_path, 'labelmap = "labels.nrrd"\nnaming = "names.csv"'), arm=False)
     for one, other in zip(by_masks.anatomy.structures, by_map.anatomy.structures, strict=True):
@@ -62,26 +65,16 @@ def test_a_folder_of_masks_is_searched_as_its_label_map_is(tmp_path):
     assert by_masks.anatomy.structure("vessel left").source == "seg/vessel left.nii.gz:255"
 
 
-def test_every_mask_is_an_input(tmp_path):
-    """The empty one decided that there is nothing; what is no volume decided nothing."""
+def test_every_mask_is_an_input_and_has_its_rule(tmp_path):
+    """The empty one decided that there is nothing, and need not be named; what is no volume decided nothing."""
     write_masks(tmp_path / "seg")
-    case = load_case(case_of(tmp_path, 'masks = "seg"'))
-    files = {one.role: one.path for one in case.inputs}
-    assert files == {
-        "case": "case.toml",
-        "mesh skin": "skin.stl",
-        "mask gallbladder": "seg/gallbladder.nii.gz",
-        "mask organ": "seg/organ.nii.gz",
-        "mask vessel left": "seg/vessel left.nii.gz",
-    }
-
-
-def test_patterns_hold_for_masks(tmp_path):
-    """A mask that nobody names is an error; one that is empty need not be named."""
-    write_masks(tmp_path / "seg")
+    path = case_of(tmp_path, 'masks = "seg"')
+    masks = {f"mask {name}": f"seg/{name}.nii.gz" for name in ("gallbladder", "organ", "vessel left")}
+    files = {one.role: one.path for one in load_case(path).inputs}
+    assert files == {"case": "case.toml", "mesh skin": "skin.stl", **masks}
     write_mask(tmp_path / "seg" / "rib.nii.gz", labels() == 3)
     with refused("no_rule"):
-        prepare(case_of(tmp_path, 'masks = "seg"'), arm=False)
+        prepare(path, arm=False)
 
 
 def test_a_mask_on_another_grid_is_refused(tmp_path):
@@ -136,9 +129,8 @@ def test_a_name_belongs_to_one_structure(tmp_path):
     write_masks(tmp_path / "seg")
     path = case_of(tmp_path, 'masks = "seg"')
     write_balls(tmp_path, "organ")
-    path.write_text(
-        path.read_text().replace("structures = 3", "structures = 4").replace(SKIN, SKIN + structure("organ", "target"))
-    )
+    text = path.read_text().replace("structures = 3", "structures = 4")
+    path.write_text(text.replace(SKIN, SKIN + structure("organ", "target")))
     with refused("duplicate_name", "organ"):
         prepare(path, arm=False)
 
@@ -146,11 +138,9 @@ def test_a_name_belongs_to_one_structure(tmp_path):
 @pytest.mark.parametrize("source", ['masks = "seg"', 'labelmap = "labels.nrrd"\nnaming = "names.csv"'])
 def test_a_wrong_count_is_refused_before_a_surface_is_made(tmp_path, monkeypatch, source):
     """What the headers and the values that are there tell needs no surface of hundreds of organs, nor the body's."""
-    write_masks(tmp_path / "seg")
-    sitk.WriteImage(image_of(labels()), str(tmp_path / "labels.nrrd"))
-    (tmp_path / "names.csv").write_text("id,name\n1,organ\n3,vessel left\n")
+    write_both(tmp_path)
     path = case_of(tmp_path, source)
-    path.write_text(path.read_text().replace(END.format(3), END.format(4)))
+    path.write_text(path.read_text().replace("[end]\nstructures = 3", "[end]\nstructures = 4"))
     made = []
     monkeypatch.setattr(VolumeSurfaces, "label", lambda _, label: made.append(label))
     with refused("structures_miscounted"):

@@ -1,7 +1,6 @@
 """The skin from a CT, a label and a mesh; where the field of view cuts the body."""
 
 import itertools
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +9,11 @@ from case_world import skin_from_ct
 from places import REAL_CT
 from refusals import refused
 
-from puncture_twin.planning.anatomy.skin import Skin, flat_ends, skin_from_label, skin_from_mesh
+from puncture_twin.planning.anatomy.skin import flat_ends, skin_from_label, skin_from_mesh
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap
 from puncture_twin.planning.formats.volumes.volume_files import Volume, read_volume
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
-REAL = REAL_CT
 SHAPE = (60, 56, 30)
 SPACING = np.array([3.0, 3.0, 5.0])
 RADIUS = 55.0
@@ -24,7 +22,7 @@ T_CT_INDEX = np.diag([*SPACING, 1.0])
 T_CT_INDEX.setflags(write=False)
 
 
-def cylinder_ct(radius: float = RADIUS, centre: np.ndarray = CENTRE) -> np.ndarray:
+def cylinder_ct(radius=RADIUS, centre=CENTRE):
     """HU of a body along z that both ends cut, with a lung cut by the top, gas, a table and a sheet.
 
     At the edge a voxel's value is the mixture of air and tissue that its share of the body gives.
@@ -39,38 +37,33 @@ def cylinder_ct(radius: float = RADIUS, centre: np.ndarray = CENTRE) -> np.ndarr
     return hu
 
 
-def ct_of(hu: np.ndarray, T: np.ndarray = T_CT_INDEX) -> Volume:
-    """A CT without a file."""
+def ct_of(hu, T=T_CT_INDEX):
     return Volume(hu.astype(np.int16), T, Path("made.nii"))
 
 
 @pytest.fixture(scope="module")
-def skin() -> Skin:
-    """The skin of the cylinder."""
+def skin():
     return skin_from_ct(ct_of(cylinder_ct()))
 
 
-def corners_at_z(skin: Skin, low: float, high: float) -> np.ndarray:
-    """Vertices between two heights."""
+def corners_at_z(skin, low, high):
     z = skin.mesh.vertices[:, 2]
     return skin.mesh.vertices[(z > low) & (z < high)]
 
 
-def test_skin_of_a_cylinder_is_the_cylinder_alone(skin: Skin) -> None:
+def test_skin_of_a_cylinder_is_the_cylinder_alone(skin):
     """Closed; every vertex between the ends within 0.5 mm of the true radius: no table, sheet, lung or gas."""
     sides = corners_at_z(skin, 0.0, 145.0)
     radii = np.hypot(*(sides[:, :2] - CENTRE).T)
     assert skin.mesh.closed
     assert len(sides) > 1000
     assert np.abs(radii - RADIUS).max() < 0.5
-    a, b, c = skin.mesh.triangles.swapaxes(0, 1)
-    assert np.einsum("ij,ij->", a, np.cross(b, c)) / 6 == pytest.approx(np.pi * RADIUS**2 * 150.0, rel=0.02)
+    assert skin.mesh.volume == pytest.approx(np.pi * RADIUS**2 * 150.0, rel=0.02)
 
 
-def test_ends_that_the_field_of_view_cuts_are_not_skin(skin: Skin) -> None:
+def test_ends_that_the_field_of_view_cuts_are_not_skin(skin):
     """The caps lie on the box and are marked, the sides are not; both z faces and no other count as cut."""
     view = skin.field_of_view
-    assert view is not None
     assert view.cut.tolist() == [[False, False], [False, False], [True, True]]
     assert view.size_mm[2] == pytest.approx(SPACING[2] * SHAPE[2])
     assert view.T_ct_box[2, 3] == pytest.approx(-SPACING[2] / 2)
@@ -79,10 +72,10 @@ def test_ends_that_the_field_of_view_cuts_are_not_skin(skin: Skin) -> None:
     assert skin.mesh.bounds[:, 2].tolist() == pytest.approx([-2.5, 147.5])
 
 
-def test_skin_does_not_depend_on_how_the_ct_is_stored(skin: Skin) -> None:
+def test_skin_does_not_depend_on_how_the_ct_is_stored(skin):
     """Axis orders and flips leave the surface, the marks and the box in place."""
     hu = cylinder_ct()
-    for order, flips in (((2, 0, 1), (1, -1, 1)), ((1, 0, 2), (-1, -1, -1)), ((0, 1, 2), (-1, 1, 1))):
+    for order, flips in (((2, 0, 1), (1, -1, 1)), ((1, 0, 2), (-1, -1, -1))):
         T_index = np.zeros((4, 4))
         T_index[3, 3] = 1
         for new, old in enumerate(order):
@@ -95,17 +88,7 @@ def test_skin_does_not_depend_on_how_the_ct_is_stored(skin: Skin) -> None:
         assert np.array_equal(other.cut_faces, skin.cut_faces)
 
 
-def test_a_body_cut_at_its_side_is_marked_there() -> None:
-    """Moved out of the image to the right, the body reaches the low x face."""
-    skin = skin_from_ct(ct_of(cylinder_ct(centre=np.array([30.0, 70.0]))))
-    view = skin.field_of_view
-    assert view is not None
-    assert view.cut.tolist() == [[True, False], [False, False], [True, True]]
-    centres = skin.mesh.triangles[skin.cut_faces].mean(axis=1)
-    assert np.count_nonzero(np.abs(centres[:, 0] + 1.5) < 1e-6) > 100
-
-
-def test_a_lung_that_a_side_face_cuts_stays_inside_the_body() -> None:
+def test_a_lung_that_a_side_face_cuts_stays_inside_the_body():
     """Air with the density of lung at the border is filled, so that its wall is no skin, and a warning says so."""
     hu = cylinder_ct(centre=np.array([30.0, 70.0]))
     x, y, z = (np.indices(SHAPE).T * SPACING).T
@@ -115,9 +98,12 @@ def test_a_lung_that_a_side_face_cuts_stays_inside_the_body() -> None:
     inner = corners_at_z(skin, 25.0, 125.0)
     assert np.all((np.abs(np.hypot(*(inner[:, :2] - [30.0, 70.0]).T) - RADIUS) < 0.6) | (inner[:, 0] < 0.0))
     assert any("lung or gas" in warning for warning in skin.warnings)
+    assert skin.field_of_view.cut.tolist() == [[True, False], [False, False], [True, True]]
+    centres = skin.mesh.triangles[skin.cut_faces].mean(axis=1)
+    assert np.count_nonzero(np.abs(centres[:, 0] + 1.5) < 1e-6) > 100
 
 
-def test_where_the_scanner_did_not_look_there_is_no_skin() -> None:
+def test_where_the_scanner_did_not_look_there_is_no_skin():
     """Voxels of -2000 HU beside the body: the surface there is the rim of what was measured, not skin."""
     hu = cylinder_ct()
     hu[:20] = -2000.0
@@ -133,13 +119,13 @@ def test_where_the_scanner_did_not_look_there_is_no_skin() -> None:
     ("hu", "match"),
     [(np.full(SHAPE, -1000), "no_body"), (np.full(SHAPE, 40), "no_air"), (cylinder_ct(radius=10.0), "no_body")],
 )
-def test_a_ct_without_a_plausible_body_is_refused(hu: np.ndarray, match: str) -> None:
+def test_a_ct_without_a_plausible_body_is_refused(hu, match):
     """Air alone, tissue alone, and something far smaller than a patient."""
     with refused(match):
         skin_from_ct(ct_of(hu))
 
 
-def test_skin_from_a_label_that_is_only_a_shell_is_solid() -> None:
+def test_skin_from_a_label_that_is_only_a_shell_is_solid():
     """A ring of skin voxels becomes the outer surface alone; cut ends are marked."""
     x, y, _ = (np.indices(SHAPE).T * SPACING).T
     distance = np.hypot(x - CENTRE[0], y - CENTRE[1])
@@ -150,13 +136,12 @@ def test_skin_from_a_label_that_is_only_a_shell_is_solid() -> None:
     assert skin.mesh.closed
     assert np.hypot(*(sides[:, :2] - CENTRE).T).min() > RADIUS - 4.5
     assert skin.cut_faces.any()
-    assert skin.field_of_view is not None
     assert skin.field_of_view.cut.tolist() == [[False, False], [False, False], [True, True]]
     with refused("label_absent"):
         skin_from_label(labelmap, 5)
 
 
-def test_skin_from_a_mesh_warns_when_it_is_open(ball: Callable[..., TriangleMesh]) -> None:
+def test_skin_from_a_mesh_warns_when_it_is_open(ball):
     """A closed mesh is taken whole; of an open one the inside is not known."""
     whole = skin_from_mesh(ball(100.0))
     assert whole.warnings == ()
@@ -166,16 +151,14 @@ def test_skin_from_a_mesh_warns_when_it_is_open(ball: Callable[..., TriangleMesh
     assert "open" in opened.warnings[0]
 
 
-@pytest.mark.skipif(not REAL.is_dir(), reason=f"the real CT is not at {REAL}")
-def test_skin_of_the_real_patient_is_closed_and_knows_its_four_cut_faces() -> None:
+@pytest.mark.skipif(not REAL_CT.is_dir(), reason=f"the real CT is not at {REAL_CT}")
+def test_skin_of_the_real_patient_is_closed_and_knows_its_four_cut_faces():
     """Left, right, top and bottom are cut, front and back are not; the body holds a plausible 20 to 28 litres."""
-    skin = skin_from_ct(read_volume(REAL / "ct.nii.gz"))
+    skin = skin_from_ct(read_volume(REAL_CT / "ct.nii.gz"))
     assert skin.mesh.closed
-    assert skin.field_of_view is not None
     assert skin.field_of_view.cut.tolist() == [[True, True], [False, False], [True, True]]
     assert 0.1 < skin.cut_faces.mean() < 0.4
-    a, b, c = skin.mesh.triangles.swapaxes(0, 1)
-    assert 20e6 < np.einsum("ij,ij->", a, np.cross(b, c)) / 6 < 28e6
+    assert 20e6 < skin.mesh.volume < 28e6
 
 
 def stepped(field):

@@ -7,19 +7,9 @@ import pytest
 import trimesh
 
 from puncture_twin.planning.anatomy.skin import Skin, skin_from_mesh, skin_paths
-from puncture_twin.planning.geometry.containment import NUDGE, Crossings
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 
 UP = np.array([[0.0, 0.0, 1.0]])
-
-
-def joined(*meshes):
-    """One surface of several."""
-    offsets = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
-    return TriangleMesh(
-        np.concatenate([m.vertices for m in meshes]),
-        np.concatenate([m.faces + o for m, o in zip(meshes, offsets, strict=True)]),
-    )
 
 
 def pyramid():
@@ -37,7 +27,7 @@ def touched_by_an_edge():
     box = trimesh.creation.box([40, 40, 40])
     wedge = np.array([[-10.0, 0, 80], [10, 0, 80], [-10, 10, 90], [10, 10, 90], [-10, 10, 80], [10, 10, 80]])
     faces = np.array([[0, 1, 2], [1, 3, 2], [0, 4, 1], [1, 4, 5], [2, 3, 4], [3, 5, 4], [0, 2, 4], [1, 5, 3]])
-    return joined(TriangleMesh(box.vertices, box.faces), TriangleMesh(wedge, faces))
+    return joined([TriangleMesh(box.vertices, box.faces), TriangleMesh(wedge, faces)])
 
 
 def test_a_path_that_only_touches_an_edge_is_looked_at_again():
@@ -47,32 +37,6 @@ def test_a_path_that_only_touches_an_edge_is_looked_at_again():
     paths = skin_paths(skin_from_mesh(mesh), np.zeros(3), UP, 200.0)
     assert paths.path_length[0] == pytest.approx(20.0, abs=1e-5)
     assert np.isnan(paths.unknown_depth[0])
-
-
-def test_the_second_look_is_a_nudge_aside_and_only_for_rays_that_need_it(monkeypatch):
-    """Rays whose crossings add up are asked once more unturned; the others are turned by 1e-7 rad, and stay unit."""
-    asked = []
-
-    def crossings(mesh, origin, directions, length=np.inf):
-        asked.append(directions.copy())
-        count = np.array([1, 2, 3, 0]) if len(asked) == 1 else np.array([1, 1, 3, 2])
-        ray, first = np.repeat(np.arange(4), count), np.concatenate([[0], np.cumsum(count)[:-1]])
-        way = (-1) ** (np.arange(len(ray)) - first[ray])
-        return Crossings(ray, 10.0 + np.arange(len(ray)), 0 * ray, way, count, first)
-
-    monkeypatch.setattr("puncture_twin.planning.geometry.containment.crossings", crossings)
-    box = trimesh.creation.box([100, 100, 100])
-    skin = skin_from_mesh(TriangleMesh(box.vertices, box.faces))
-    directions = np.array([[0.0, 0, 1], [0.6, 0.8, 0.0], [1, 0, 0], np.array([-1, 1, 1]) / np.sqrt(3)])
-    paths = skin_paths(skin, np.zeros(3), directions, 200.0)
-    assert len(asked) == 2
-    np.testing.assert_array_equal(asked[0], directions)
-    np.testing.assert_array_equal(asked[1][[0, 2]], directions[[0, 2]])
-    turned = asked[1][[1, 3]]
-    np.testing.assert_allclose(np.linalg.norm(turned, axis=1), 1.0, atol=1e-15)
-    np.testing.assert_allclose(np.linalg.norm(turned - directions[[1, 3]], axis=1), NUDGE, rtol=1e-6)
-    assert np.isnan(paths.unknown_depth[:3]).all()
-    assert paths.unknown_depth[3] == 0.0  # also the second look does not add up
 
 
 def test_crossings_that_add_up_are_not_asked_again(monkeypatch, box):
@@ -106,9 +70,8 @@ def test_through_a_corner_the_entry_is_the_corner():
 
 def three_boxes(box, top):
     """The body, and two plates above it: the first from z = 80 to 85, the second from ``top`` on."""
-    return skin_from_mesh(
-        joined(box([100, 100, 100]), box([30, 30, 5], (0, 0, 82.5)), box([30, 30, 5], (0, 0, top + 2.5)))
-    )
+    plates = [box([30, 30, 5], (0, 0, z + 2.5)) for z in (80.0, top)]
+    return skin_from_mesh(joined([box([100, 100, 100]), *plates]))
 
 
 def test_reentry_is_the_second_crossing_and_counts_up_to_the_needles_top(box):
@@ -137,58 +100,39 @@ def test_a_cut_face_is_no_entry_and_the_unknown_begins_there(box):
 
 def tent(left, right):
     """An open roof with its ridge at z = 50 along y, 40 mm long, of two unlike slopes of these widths."""
-    vertices = np.array(
-        [
-            [0.0, -20, 50],
-            [0, 20, 50],
-            [-left, -20, 20],
-            [-left, 20, 20],
-            [right, -20, 50 - 0.2 * right],
-            [right, 20, 50 - 0.2 * right],
-        ]
-    )
+    sides = [(0.0, 50), (-left, 20), (right, 50 - 0.2 * right)]
+    vertices = np.array([[x, y, z] for x, z in sides for y in (-20, 20)])
     return TriangleMesh(vertices, np.array([[0, 1, 3], [0, 3, 2], [0, 4, 5], [0, 5, 1]]))
 
 
-def test_the_normal_at_a_point_is_blended_from_the_corners_by_their_nearness():
+def sheet_of(mesh):
+    """An open skin."""
+    return Skin(mesh, np.zeros(len(mesh.faces), bool), None, ())
+
+
+@pytest.mark.parametrize(("left", "right"), [(40.0, 40.0), (10.0, 90.0)])
+def test_the_normal_at_a_point_is_blended_from_the_corners_by_their_nearness(left, right):
     """Across a smooth pair of slopes the angle follows the corners' normals, weighted by area and by where one is."""
-    mesh = tent(40.0, 40.0)
-    skin = Skin(mesh, np.zeros(4, bool), None, ())
+    mesh = tent(left, right)
     a, b, c = mesh.triangles.swapaxes(0, 1)
     areas = np.cross(b - a, c - a)
     corner = np.zeros((6, 3))
     for face, area in zip(mesh.faces, areas, strict=True):
         corner[face] += area
     corner /= np.linalg.norm(corner, axis=1, keepdims=True)
-    target = np.array([-3.0, 4.0, 0.0])
-    point = np.array([-10.0, 5.0, 50.0 - 10.0 * 30 / 40])
-    toward = (point - target) / np.linalg.norm(point - target)
-    face = mesh.faces[0]
-    weights = np.linalg.solve(np.column_stack([mesh.vertices[i] for i in face]), point)
-    normal = weights @ corner[face]
+    target, point = np.array([-3.0, 4.0, 0.0]), np.array([-left / 4, 5.0, 50.0 - 30 / 4])
+    toward, face = (point - target) / np.linalg.norm(point - target), mesh.faces[0]
+    normal = np.linalg.solve(mesh.vertices[face].T, point) @ corner[face]
     cosine = abs(normal @ toward) / np.linalg.norm(normal)
-    found = skin_paths(skin, target, toward[None], 200.0)
+    found = skin_paths(sheet_of(mesh), target, toward[None], 200.0)
     np.testing.assert_allclose(found.entry_ct[0], point, atol=1e-9)
     assert found.skin_angle[0] == pytest.approx(np.arccos(cosine), abs=1e-9)
-
-
-def test_the_larger_face_has_the_larger_say_in_a_corners_normal():
-    """At the ridge of a roof with unequal slopes the normal leans as the areas do, not as the faces count."""
-    mesh = tent(10.0, 90.0)
-    a, b, c = mesh.triangles.swapaxes(0, 1)
-    areas = np.cross(b - a, c - a)
-    at_start = areas[[0, 1, 2, 3]].sum(axis=0)
-    at_end = areas[[0, 3]].sum(axis=0)
-    normal = 0.5 * at_start / np.linalg.norm(at_start) + 0.5 * at_end / np.linalg.norm(at_end)
-    found = skin_paths(Skin(mesh, np.zeros(4, bool), None, ()), np.zeros(3), UP, 200.0)
-    expected = np.arccos(abs(normal[2]) / np.linalg.norm(normal))
-    assert found.skin_angle[0] == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_second_sheet_is_a_reentry_also_where_crossings_are_even():
     """Of an open skin nothing must add up: the second of two sheets over the target is met again."""
     upper = TriangleMesh(tent(40.0, 40.0).vertices + [0, 0, 25.0], tent(40.0, 40.0).faces)
-    found = skin_paths(Skin(joined(tent(40.0, 40.0), upper), np.zeros(8, bool), None, ()), np.zeros(3), UP, 200.0)
+    found = skin_paths(sheet_of(joined([tent(40.0, 40.0), upper])), np.zeros(3), UP, 200.0)
     assert (found.path_length[0], found.reentry_depth[0]) == (50, 75)
 
 
@@ -196,7 +140,7 @@ def test_a_corner_whose_faces_cancel_has_no_say():
     """Where faces of opposite winding meet and their areas cancel, the other corners' normals decide."""
     flat = np.array([[0.0, 0, 50], [30, 0, 50], [0, 30, 50], [-30, 0, 50], [0, -30, 50]])
     sheet = TriangleMesh(flat, np.array([[0, 1, 2], [0, 4, 3]]))
-    found = skin_paths(Skin(sheet, np.zeros(2, bool), None, ()), np.zeros(3), np.array([[0.1, 0.1, 0.99]]), 200.0)
+    found = skin_paths(sheet_of(sheet), np.zeros(3), np.array([[0.1, 0.1, 0.99]]), 200.0)
     assert found.skin_angle[0] == pytest.approx(np.arccos(0.99), abs=1e-9)
 
 
@@ -205,7 +149,7 @@ def test_the_angle_does_not_depend_on_how_fine_the_skin_is():
     angles = []
     for scale in (1.0, 0.01):
         mesh = TriangleMesh(scale * tent(10.0, 90.0).vertices, tent(10.0, 90.0).faces)
-        angles.append(skin_paths(Skin(mesh, np.zeros(4, bool), None, ()), np.zeros(3), UP, 200.0).skin_angle[0])
+        angles.append(skin_paths(sheet_of(mesh), np.zeros(3), UP, 200.0).skin_angle[0])
     assert angles[0] > 0.1
     assert angles[1] == pytest.approx(angles[0], abs=1e-9)
 
@@ -215,6 +159,6 @@ def test_straight_in_is_an_angle_of_zero_at_any_tilt(rng):
     for _ in range(60):
         R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         corners = np.array([[-9.0, -9, 30], [9, -9, 30], [0, 9, 30]]) @ R.T
-        sheet = Skin(TriangleMesh(corners, np.array([[0, 1, 2]])), np.zeros(1, bool), None, ())
+        sheet = sheet_of(TriangleMesh(corners, np.array([[0, 1, 2]])))
         found = skin_paths(sheet, np.zeros(3), R[:, 2][None], 200.0)
         assert found.skin_angle[0] == pytest.approx(0, abs=1e-6)

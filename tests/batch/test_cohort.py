@@ -10,7 +10,6 @@ from puncture_twin.planning.batch.cohort import read_cohort
 
 
 def stated(cohort):
-    """The cases as written."""
     return [one.stated for one in read_cohort(cohort)[0]]
 
 
@@ -138,7 +137,6 @@ def test_a_cohort_file_is_a_grid(tmp_path):
     ],
 )
 def test_a_cohort_file_that_cannot_be_used_is_refused(tmp_path, text, message):
-    """With its key."""
     write_patient(tmp_path / "p0")
     (tmp_path / "cohort.toml").write_text(text or "# nothing\n")
     with refused(*message.split()):

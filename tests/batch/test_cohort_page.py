@@ -16,7 +16,6 @@ HITS = [0.5, 1.0, None, 1e-9, 0.93]
 
 
 def row(at, hit):
-    """One case of the table."""
     values = dict.fromkeys([*SCHEMA.names, "page"])
     safe = 0 if hit is None else 12
     known = {"case": f"p{at}/case.toml", "name": f"p{at}", "id": f"{at:032x}", "safe": safe, "arm": "checked"}
@@ -25,7 +24,6 @@ def row(at, hit):
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory):
-    """The page's; one case was refused."""
     path = tmp_path_factory.mktemp("cohort") / "cohort.html"
     rows = [row(at, hit) for at, hit in enumerate(HITS)]
     rows.append({**row(9, None), "exit_code": 2, "reason": "case.toml: no such structure", "safe": None})
@@ -35,7 +33,6 @@ def address(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    """One browser for both widths."""
     with chromium() as browser:
         yield browser
 

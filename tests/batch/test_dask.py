@@ -1,5 +1,6 @@
 """A real scheduler with two worker processes on the loopback, one of which is killed in mid-work."""
 
+import json
 import os
 import subprocess
 import sys
@@ -14,18 +15,17 @@ from refusals import refused
 
 from puncture_twin.planning.base.progress import Silent
 from puncture_twin.planning.batch.plan import read_plan_table
-from puncture_twin.planning.batch.run import Request, on_scheduler, run_cohort
+from puncture_twin.planning.batch.run import on_scheduler, run_cohort
 from puncture_twin.planning.batch.run_case import Limits
 from puncture_twin.run_twin import main
 
 TIME_LIMIT_S = 300.0
 """Of the whole: a try without an end is a failure, not a wait."""
 
-CASES = 8
+CASES = 5
 
 
 def start(module, *words):
-    """One of Dask's programs."""
     path = os.pathsep.join([str(ROOT), str(TESTS), os.environ.get("PYTHONPATH", "")])
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     program = [sys.executable, "-m", f"distributed.cli.{module}", *map(str, words), "--no-dashboard"]
@@ -35,8 +35,6 @@ def start(module, *words):
 @pytest.fixture
 def scheduler(tmp_path):
     """Address of a scheduler, and its two workers; of two threads one, which must not meet in one of FCL's objects."""
-    import json
-
     file = tmp_path / "scheduler.json"
     words = ("--host", "127.0.0.1", "--port", "0", "--scheduler-file", file)
     running = [start("dask_scheduler", *words)]
@@ -53,11 +51,6 @@ def scheduler(tmp_path):
         one.wait()
 
 
-def results(out, ids):
-    """Those that are there."""
-    return [one for one in ids if (out / one).exists()]
-
-
 def test_a_killed_worker_costs_no_case_and_none_is_committed_twice(scheduler, tmp_path):
     """Every case is run once at least and committed once; the merged table is that of an undisturbed cohort."""
     address, workers = scheduler
@@ -66,12 +59,14 @@ def test_a_killed_worker_costs_no_case_and_none_is_committed_twice(scheduler, tm
     out = tmp_path / "out"
     assert main(["batch", "plan", str(tmp_path / "c"), "--out", str(out), "--no-arm"]) == 0
     ids, found = [one.id for one in read_plan_table(out).cases], []
-    request = Request(write_page=cohort_world.slow_token)
-    work = threading.Thread(target=lambda: found.append(run_cohort(out, request, Silent(), on_scheduler(address))))
-    work.daemon = True
+
+    def run():
+        found.append(run_cohort(out, Silent(), write_page=cohort_world.slow_token, elsewhere=on_scheduler(address)))
+
+    work = threading.Thread(target=run, daemon=True)
     work.start()
     deadline = time.monotonic() + TIME_LIMIT_S
-    while len(results(out, ids)) < 2 and work.is_alive() and time.monotonic() < deadline:
+    while sum((out / one).exists() for one in ids) < 2 and work.is_alive() and time.monotonic() < deadline:
         time.sleep(0.02)
     workers[0].kill()
     work.join(deadline - time.monotonic())
@@ -96,6 +91,6 @@ def test_no_scheduler_is_one_line(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr("puncture_twin.planning.batch.run.CONNECT_S", 0.5)
     for address in ("tcp://127.0.0.1:1", "nonsense://x"):
         with refused("no_scheduler"):
-            run_cohort(out, Request(), Silent(), on_scheduler(address))
+            run_cohort(out, Silent(), elsewhere=on_scheduler(address))
     with refused("dask_limits"):
-        run_cohort(out, Request(limits=Limits(1000, None)), Silent(), on_scheduler("tcp://127.0.0.1:1"))
+        run_cohort(out, Silent(), limits=Limits(1000, None), elsewhere=on_scheduler("tcp://127.0.0.1:1"))

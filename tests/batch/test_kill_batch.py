@@ -1,6 +1,6 @@
 """SIGKILL of workers and of the main process at random: after an undisturbed run nothing was lost.
 
-Five kills here; ``make kill-batch`` makes two hundred.
+Three kills here; ``make kill-batch`` makes two hundred.
 """
 
 import os
@@ -17,8 +17,8 @@ from kill_world import start
 from puncture_twin.planning.batch.plan import WORK_PREFIX, read_plan_table, read_row
 from puncture_twin.run_twin import main
 
-KILLS = int(os.environ.get("BATCH_KILLS", "5"))
-CASES = int(os.environ.get("BATCH_CASES", "12"))
+KILLS = int(os.environ.get("BATCH_KILLS", "3"))
+CASES = int(os.environ.get("BATCH_CASES", "6"))
 STARTED_S = 60.0
 """So long a run may take to come to its work, on a busy machine."""
 
@@ -43,7 +43,6 @@ def files(out):
 
 
 def workers_of(process):
-    """The workers that are alive."""
     try:
         found = psutil.Process(process.pid).children(recursive=True)
         return [one for one in found if "resource_tracker" not in " ".join(one.cmdline())]
@@ -51,15 +50,10 @@ def workers_of(process):
         return []
 
 
-def at_work(out):
-    """Whether a case is being written."""
-    return any(out.glob(f"{WORK_PREFIX}*/*"))
-
-
 def kill_one(process, out, rng):
     """Kill a worker, or the main process, some time after the work began; which of them, or None where it was over."""
     deadline = time.monotonic() + STARTED_S
-    while process.poll() is None and not at_work(out) and time.monotonic() < deadline:
+    while process.poll() is None and not any(out.glob(f"{WORK_PREFIX}*/*")) and time.monotonic() < deadline:
         time.sleep(0.002)
     time.sleep(rng.uniform(0.0, 0.4))
     workers = workers_of(process)

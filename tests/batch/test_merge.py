@@ -4,6 +4,7 @@ import duckdb
 import numpy as np
 import pandas
 import polars
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from cohort_world import merged, plan_of, run_here, tiny_text, write_cohort, write_patient
@@ -35,36 +36,21 @@ def test_a_row_a_case(cohort):
     assert [row["reason"] is None for row in rows.values()] == [True, True, False, True]
     assert rows["p2/case.toml"]["safe"] == 0 and rows["p0/case.toml"]["safe"] > 0
     assert len({row["id"] for row in rows.values()}) == 4
-    types = dict(
-        zip(
-            pq.read_schema(cohort / "out" / "cases.parquet").names,
-            pq.read_schema(cohort / "out" / "cases.parquet").types,
-            strict=True,
-        )
-    )
-    assert [str(types[name]) for name in ("case", "id", "safe", "exit_code", "reason", "best_theta_deg")] == [
-        *("string", "string", "int64", "int64", "string", "double")
-    ]
-
-
-def read_pandas(folder):
-    """One line."""
-    return pandas.read_parquet(folder)
+    schema, names = pq.read_schema(cohort / "out" / "cases.parquet"), ("case", "id", "safe", "exit_code", "reason")
+    assert [str(schema.field(name).type) for name in names] == ["string", "string", "int64", "int64", "string"]
+    assert str(schema.field("best_theta_deg").type) == "double"
 
 
 def read_duckdb(folder):
-    """One line."""
     return duckdb.sql(f"FROM read_parquet('{folder}/**/*.parquet', hive_partitioning = true)").df()
 
 
 def read_polars(folder):
-    """One line."""
-    return polars.read_parquet(f"{folder}/**/*.parquet", hive_partitioning=True).to_pandas(
-        use_pyarrow_extension_array=False
-    )
+    table = polars.read_parquet(f"{folder}/**/*.parquet", hive_partitioning=True)
+    return table.to_pandas(use_pyarrow_extension_array=False)
 
 
-@pytest.mark.parametrize("read", [read_pandas, read_duckdb, read_polars])
+@pytest.mark.parametrize("read", [pandas.read_parquet, read_duckdb, read_polars])
 def test_no_reader_drops_an_organ(cohort, read):
     """The one that only the last case has is a column of all, null for the others; the rows are those of the cases."""
     table, rows = read(cohort / "out" / "candidates"), merged(cohort / "out")
@@ -78,8 +64,6 @@ def test_no_reader_drops_an_organ(cohort, read):
 
 def test_a_column_of_two_types_is_refused(tmp_path):
     """Results of two versions are not mixed."""
-    import pyarrow as pa
-
     with refused("tables_differ", "int64"):
         union_schema([pa.schema([("a", pa.int64())]), pa.schema([("a", pa.string())])], tmp_path)
 
@@ -92,7 +76,6 @@ def test_the_page_names_failures_first_and_links_no_page_that_is_not_there(cohor
 
 
 def test_merging_again_gives_the_same_bytes(cohort):
-    """Whoever ran what in which order."""
     before = {name: (cohort / "out" / name).read_bytes() for name in ("cases.parquet", "cohort.html")}
     assert main(["batch", "merge", "--out", str(cohort / "out")]) == 0
     assert {name: (cohort / "out" / name).read_bytes() for name in before} == before
@@ -104,15 +87,13 @@ def test_a_case_that_was_not_run_says_so(tmp_path, capfd):
     assert main(["batch", "plan", str(tmp_path / "c"), "--out", str(tmp_path / "out"), "--no-arm"]) == 0
     assert main(["batch", "merge", "--out", str(tmp_path / "out")]) == 1
     assert "2 not run" in capfd.readouterr().out
-    assert [(row["exit_code"], row["reason"], row["safe"]) for row in merged(tmp_path / "out").values()] == [
-        (None, "not run", None)
-    ] * 2
+    found = [(row["exit_code"], row["reason"], row["safe"]) for row in merged(tmp_path / "out").values()]
+    assert found == [(None, "not run", None)] * 2
 
 
 def test_what_is_expected_is_held(cohort, tmp_path, capfd):
     """The same verdicts: 0. One that changed, or a clearance beyond the tolerance: 1, with its line."""
-    expected = tmp_path / "expected.parquet"
-    table = pq.read_table(cohort / "out" / "cases.parquet")
+    expected, table = tmp_path / "expected.parquet", pq.read_table(cohort / "out" / "cases.parquet")
     pq.write_table(table, expected)
     command = ["batch", "merge", "--out", str(cohort / "out"), "--expect", str(expected)]
     assert main(command) == 0
@@ -130,53 +111,31 @@ def test_what_is_expected_is_held(cohort, tmp_path, capfd):
 
 
 def row(case, safe, clearance=None, entry=None, reason=None, code=0):
-    """Of a merged table."""
     values = dict(zip("xyz", entry or (None, None, None), strict=True))
-    best = {f"best_entry_{axis}_mm": value for axis, value in values.items()}
-    return {
-        "case": case,
-        "options": "{}",
-        "safe": safe,
-        "best_clearance_mm": clearance,
-        "exit_code": code,
-        "reason": reason,
-        **best,
-    }
+    best = {f"best_entry_{axis}_mm": value for axis, value in values.items()} | {"best_clearance_mm": clearance}
+    return {"case": case, "options": "{}", "safe": safe, "exit_code": code, "reason": reason, **best}
 
 
 def test_two_cohorts_are_compared_case_by_case():
     """What became safe, what was lost, what came and went, how far the best entry moved."""
-    no = {"reason": "no safe direction", "code": 1}
+    no, at = {"reason": "no safe direction", "code": 1}, (0, 0, 0)
     before = [
-        row("a", 5, 2.0, (0, 0, 0)),
+        row("a", 5, 2.0, at),
         row("b", 0, **no),
-        row("c", 3, 1.0, (0, 0, 0)),
-        row("gone", 1, 1.0, (0, 0, 0)),
+        row("c", 3, 1.0, at),
+        row("gone", 1, 1.0, at),
         row("same", 0, **no),
     ]
-    after = [
-        row("a", 5, 2.5, (3, 4, 0)),
-        row("b", 2, 1.0, (0, 0, 0)),
-        row("c", 0, reason="x", code=2),
-        row("same", 0, **no),
-        row("new", 0, **no),
-    ]
-    found = compare(before, after)
-    assert {one.case: one.kind for one in found.changes} == {
-        "a": "same",
-        "b": "became safe",
-        "c": "lost",
-        "same": "same",
-        "new": "new",
-        "gone": "gone",
-    }
+    after = [row("a", 5, 2.5, (3, 4, 0)), row("b", 2, 1.0, at), row("c", 0, reason="x", code=2), row("same", 0, **no)]
+    found = compare(before, [*after, row("new", 0, **no)])
+    kinds = {"a": "same", "b": "became safe", "c": "lost", "same": "same", "new": "new", "gone": "gone"}
+    assert {one.case: one.kind for one in found.changes} == kinds
     assert (found.changes[0].moved_mm, found.changes[0].clearance_mm) == (5.0, 0.5)
     assert [one.case for one in found.beyond(0.1)] == ["a", "b", "c", "new", "gone"]
     assert [one.case for one in found.beyond(0.6)] == ["b", "c", "new", "gone"]
 
 
 def test_compare_prints_what_changed(cohort, tmp_path, capfd):
-    """From folders or tables."""
     assert main(["batch", "compare", str(cohort / "out"), str(cohort / "out" / "cases.parquet")]) == 0
     assert "4 cases: 4 same" in capfd.readouterr().out
     with refused("no_such_file"):

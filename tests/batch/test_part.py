@@ -3,6 +3,7 @@
 import re
 import shlex
 import subprocess
+from itertools import product
 
 import pytest
 import typer
@@ -13,47 +14,30 @@ from puncture_twin.planning.batch.run import Part, parse_part, slurm_part
 from puncture_twin.run_twin import app
 
 
-@pytest.mark.parametrize("count", [0, 1, 7, 100])
-@pytest.mark.parametrize("parts", [1, 2, 3, 7, 13])
-def test_the_parts_are_the_whole(count, parts):
+def test_the_parts_are_the_whole():
     """In order, each case once, sizes within one of each other."""
-    items = list(range(count))
-    found = [list(Part(number, parts).of(items)) for number in range(1, parts + 1)]
-    assert [one for some in found for one in some] == items
-    assert max(map(len, found)) - min(map(len, found)) <= 1
+    for count, parts in product([0, 1, 7, 100], [1, 2, 3, 7, 13]):
+        items = list(range(count))
+        found = [list(Part(number, parts).of(items)) for number in range(1, parts + 1)]
+        assert [one for some in found for one in some] == items
+        assert max(map(len, found)) - min(map(len, found)) <= 1
 
 
 def array(task, count, first="0", **more):
-    """What SLURM sets for one task of an array."""
     return {f"SLURM_ARRAY_TASK_{name}": value for name, value in dict(ID=task, COUNT=count, MIN=first, **more).items()}
 
 
-@pytest.mark.parametrize(
-    ("environment", "part"),
-    [
-        (array("0", "8"), Part(1, 8)),
-        (array("8", "8", "1"), Part(8, 8)),
-        (array("15", "4", "5", STEP="5"), Part(3, 4)),
-        ({}, None),
-    ],
-)
-def test_slurms_array_is_a_part(environment, part):
-    """From 0, from 1, in steps; nothing outside of an array."""
-    assert slurm_part(environment) == part
-
-
-@pytest.mark.parametrize(
-    "environment", [array("9", "8", "1"), array("6", "4", "5", STEP="5"), array("1", ""), array("a", "3")]
-)
-def test_an_array_with_gaps_is_refused(environment):
-    """``--array=1,5,9`` does not say which part a task is: none is left out silently."""
-    with refused("bad_part"):
-        slurm_part(environment)
+def test_slurms_array_is_a_part():
+    """From 0, from 1, in steps; nothing outside of an array. Of one with gaps it is not known which part a task is."""
+    assert slurm_part(array("0", "8")) == Part(1, 8) and slurm_part(array("8", "8", "1")) == Part(8, 8)
+    assert slurm_part(array("15", "4", "5", STEP="5")) == Part(3, 4) and slurm_part({}) is None
+    for environment in (array("9", "8", "1"), array("6", "4", "5", STEP="5"), array("1", ""), array("a", "3")):
+        with refused("bad_part"):
+            slurm_part(environment)
 
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "1/0", "1", "a/b", "-1/3", "1/3/5", "", "1/ 3"])
 def test_what_is_no_part_is_refused(text):
-    """One line."""
     with refused("bad_part"):
         parse_part(text)
 
@@ -73,11 +57,7 @@ def test_the_array_of_the_page_is_a_script_that_runs_its_part():
     assert words[:3] == ["run-twin", "batch", "run"]
     command = typer.main.get_command(app).commands["batch"].commands["run"]
     parsed = command.make_context("run", words[3:], resilient_parsing=True).params
-    assert (parsed["jobs"], parsed["memory_mb"], parsed["part"], str(parsed["out_dir"])) == (
-        4,
-        3500,
-        None,
-        "/shared/cohort",
-    )
+    taken = (parsed["jobs"], parsed["memory_mb"], parsed["part"], str(parsed["out_dir"]))
+    assert taken == (4, 3500, None, "/shared/cohort")
     memory_mb = int(directives["mem"].removesuffix("G")) * 1000
     assert parsed["jobs"] * parsed["memory_mb"] < memory_mb

@@ -14,12 +14,10 @@ from puncture_twin.planning.search.context import prepare
 
 @pytest.fixture
 def path(tmp_path):
-    """A case."""
     return write_patient(tmp_path / "a")
 
 
 def run(row, out, **keys):
-    """Run one case; nothing of its draft is left."""
     task = task_of(row, out, **keys)
     end = run_case(task)
     assert list(task.work.iterdir()) == []

@@ -1,11 +1,12 @@
 """What a worker keeps from one case to the next never changes an answer: attacks on the sharing of meshes and trees."""
 
 import io
+import os
 import shutil
 
 import pyarrow.parquet as pq
 import pytest
-from case_world import ball, registration_section, write_markers
+from case_world import ball, registration_section, structure, write_markers
 from cohort_world import plan_of, table_bytes, task_of, tiny_text, write_patient
 
 from puncture_twin.planning.base.cache.array_cache import MEMORY_BYTES, Memory
@@ -14,7 +15,6 @@ from puncture_twin.planning.batch.run_case import STALE, run_case
 
 @pytest.fixture
 def memory():
-    """A worker's."""
     return Memory(MEMORY_BYTES)
 
 
@@ -48,8 +48,6 @@ def test_two_patients_with_the_same_file_names(tmp_path, memory):
 
 def test_a_mesh_that_is_edited_between_two_cases(tmp_path, memory):
     """In place, of the same size and with the old date: the new bytes count, and the old plan has no such case."""
-    import os
-
     path = write_patient(tmp_path / "a")
     rib, (planned,) = path.parent / "rib.stl", plan_of(path)
     before = held(path, tmp_path, memory, 0)
@@ -65,36 +63,20 @@ def test_a_mesh_that_is_edited_between_two_cases(tmp_path, memory):
 
 def test_the_same_bytes_in_another_unit_space_role_or_margin(tmp_path, memory):
     """All that decides a surface or a verdict beside the bytes is part of what is kept, or is not kept."""
-    text = tiny_text()
-    rib = 'role = "avoid"\nmargin_mm = 3.0'
-    found, number = set(), 0
-    for new in (
-        rib,
-        'role = "avoid"\nmargin_mm = 30.0',
-        'role = "traverse"',
-        f'{rib}\nspace = "RAS"',
-        f'{rib}\nspace = "LPS"',
-    ):
-        path = write_patient(tmp_path / f"p{number}", text=text.replace(rib, new) + extra(new))
+    rib, second = 'role = "avoid"\nmargin_mm = 3.0', structure("second", "unknown", {"mesh": "rib.stl", "unit": "mm"})
+    wide, crossed = rib.replace("3.0", "30.0"), f'role = "traverse"\n{second}margin_mm = 1.0'
+    found = set()
+    for number, new in enumerate((rib, wide, crossed, f'{rib}\nspace = "RAS"', f'{rib}\nspace = "LPS"')):
+        path = write_patient(tmp_path / f"p{number}", text=tiny_text().replace(rib, new))
         found.add(held(path, tmp_path, memory, number))
-        number += 1
-    assert len(found) == number
-
-
-def extra(section):
-    """What keeps a case without a rib to be avoided a case."""
-    again = '[[structure]]\nname = "second"\nmesh = "rib.stl"\nunit = "mm"\nrole = "unknown"\nmargin_mm = 1.0\n'
-    return again if "traverse" in section else ""
+    assert len(found) == 5
 
 
 def test_the_unit_is_part_of_a_mesh(tmp_path, memory):
     """A rib in centimetres, ten times as far away and as large, is not the rib in millimetres."""
-    mm = write_patient(tmp_path / "mm")
-    cm = write_patient(tmp_path / "cm")
+    mm, cm = (write_patient(tmp_path / unit) for unit in ("mm", "cm"))
     ball(cm.parent / "rib.stl", 0.5, (4, 0, 4))
-    text = cm.read_text()
-    head, tail = text.rsplit('unit = "mm"', 1)
-    cm.write_text(head + 'unit = "cm"' + tail)
+    cm.write_text('unit = "cm"'.join(cm.read_text().rsplit('unit = "mm"', 1)))
     shutil.copy(cm.parent / "rib.stl", mm.parent / "rib.stl")
     assert held(mm, tmp_path, memory, 0) != held(cm, tmp_path, memory, 1)
 
@@ -104,14 +86,9 @@ MOUNT = {"position_mm": [350.0, -150.0, -300.0], "x_axis": [1.0, 0.0, 0.0], "z_a
 
 def test_the_arm_and_its_workcell(tmp_path, memory):
     """Another mount, needle, model or table is another workcell; the same is the same to the byte."""
-    table = (
-        '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 150.0, 0.0]\nsize_mm = [400.0, 40.0, 800.0]\n'
-    )
-    plain, moved = (
-        write_patient(tmp_path / name, text=tiny_text(search="theta_deg = [0, 30]\nstep_deg = 30.0") + table)
-        for name in ("a", "b")
-    )
-    moved.write_text(moved.read_text().replace("[0.0, 150.0, 0.0]", "[0.0, 130.0, 0.0]"))
+    table = '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0, {}, 0]\nsize_mm = [400, 40, 800]\n'
+    text = tiny_text(search="theta_deg = [0, 30]\nstep_deg = 30.0")
+    plain, moved = (write_patient(tmp_path / f"{y}", text=text + table.format(y)) for y in (150, 130))
     far = {**MOUNT, "position_mm": [800.0, 0.0, 0.0]}
     options = [
         (plain, {"mount": MOUNT}),

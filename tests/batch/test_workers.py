@@ -7,8 +7,8 @@ from refusals import refused
 
 from puncture_twin.planning.base.progress import Silent
 from puncture_twin.planning.batch.plan import read_plan_table
-from puncture_twin.planning.batch.run import Part, Request, run_cohort, running
-from puncture_twin.planning.batch.run_case import NO_LIMITS, Limits
+from puncture_twin.planning.batch.run import Part, run_cohort, running
+from puncture_twin.planning.batch.run_case import Limits, run_here
 from puncture_twin.run_twin import main
 
 
@@ -19,8 +19,8 @@ def planned(tmp_path):
     out = tmp_path / "out"
     assert main(["batch", "plan", str(tmp_path / "c"), "--out", str(out), "--no-arm"]) == 0
 
-    def run(write_page=None, limits=NO_LIMITS, **keys):
-        counts = run_cohort(out, Request(write_page=write_page, limits=limits, **keys), Silent())
+    def run(**keys):
+        counts = run_cohort(out, Silent(), **keys)
         assert not list(out.glob(".puncture-twin-cases-*"))
         return counts
 
@@ -33,36 +33,28 @@ def rows(out):
     return [(row["exit_code"], row["reason"]) for row in merged(out).values()]
 
 
-def test_a_worker_that_dies_twice_costs_its_case_one_row(planned):
-    """The case before and the case after have their verdicts; the next run tries it again."""
+def test_a_worker_that_dies_costs_nothing_but_time_and_twice_its_case_one_row(planned):
+    """The case before and the case after have their verdicts; the next run tries it again.
+
+    The second try of another one is committed; that there were two is in the timings alone.
+    """
     out, run = planned
-    assert run(cohort_world.die_at_one).reasons["worker_died"] == 1
-    found = rows(out)
-    assert [code for code, _ in found] == [0, 3, 2] and found[1] == (3, "worker_died")
-    counts = run()
+    counts = run(write_page=cohort_world.die)
+    assert counts.reasons["worker_died"] == 1 and counts.ended == {0: 1, 2: 1, 3: 1}
+    first, second, _ = rows(out)
+    assert (first[0], second) == (0, (3, "worker_died"))
+    ids = [one.id for one in read_plan_table(out).cases]
+    assert [timings(out / one)["attempt"] for one in ids] == [2, 2, 1]
+    counts = run(elsewhere=run_here)
     assert (counts.before, counts.ended[0], counts.failed) == (2, 1, 0)
     assert [code for code, _ in rows(out)] == [0, 0, 2]
 
 
-def test_a_worker_that_dies_once_costs_nothing_but_time(planned):
-    """The second try is committed; that there were two is in the timings alone."""
-    out, run = planned
-    assert run(cohort_world.die_once).ended == {0: 2, 2: 1}
-    ids = [one.id for one in read_plan_table(out).cases]
-    assert [timings(out / one)["attempt"] for one in ids] == [2, 2, 1]
-
-
-@pytest.mark.parametrize(
-    ("page", "limits", "reason"),
-    [
-        (cohort_world.sleep, Limits(timeout_s=4.0), "timed_out"),
-        (cohort_world.eat, Limits(memory_mb=1500), "out_of_memory"),
-    ],
-)
-def test_a_case_beyond_a_limit_is_stopped(planned, page, limits, reason):
+def test_a_case_beyond_a_limit_is_stopped(planned):
     """With its reason, and the refused one is reached."""
     out, run = planned
-    assert run(page, limits).reasons[reason] == 2
+    reasons = run(write_page=cohort_world.sleep_or_eat, limits=Limits(1500, 6.0)).reasons
+    assert (reasons["timed_out"], reasons["out_of_memory"]) == (1, 1)
     assert [code for code, _ in rows(out)] == [3, 3, 2]
 
 
@@ -70,7 +62,7 @@ def test_a_full_disk_stops_the_run_with_one_line(planned):
     """No row says that a case failed, which only the disk did."""
     out, run = planned
     with refused("unwritable"):
-        run(cohort_world.full)
+        run(write_page=cohort_world.full, elsewhere=run_here)
     assert rows(out) == [(None, "not run")] * 3
 
 

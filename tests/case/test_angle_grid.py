@@ -7,7 +7,6 @@ from puncture_twin.planning.case.entry import grid, outward
 
 
 def angle_grid(theta_deg, beta_deg, step_deg):
-    """The grid of ranges in degrees."""
     return grid(tuple(np.radians(theta_deg)), tuple(np.radians(beta_deg)), np.radians(step_deg), np.eye(3)).grid
 
 

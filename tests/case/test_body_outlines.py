@@ -9,7 +9,7 @@ from puncture_twin.planning.anatomy.skin import skin_from_mesh
 from puncture_twin.planning.init.segmentation import MOST_OF_SKIN, PART_OF_SKIN, agreement
 from puncture_twin.planning.search.context import prepare
 
-TARGET = (-40.0, 0.0, 10.0)
+TARGET = np.array([-40.0, 0.0, 10.0])
 BODY_MM = 90.0
 NAMES = ["External", "patient", "body envelope"]
 
@@ -24,55 +24,54 @@ def write_case(folder, **masks):
 
 
 def init(capfd, folder, *words):
-    """Run it; returns exit code and stderr's lines."""
     return run_init(capfd, folder, *(words or ("--target", ",".join(map(str, TARGET)))))[::2]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_ball_that_is_named_like_the_body_is_an_obstacle(tmp_path, capfd, name):
+def test_a_ball_that_is_named_like_the_body_is_an_obstacle(tmp_path, capfd):
     """It was left out (ignore), and paths through a carotid that somebody called External were safe."""
-    write_case(tmp_path, **{name: inside((-40.0, -40.0, 10.0), 10.0)})
+    ways = dict(zip(NAMES, np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]), strict=True))
+    write_case(tmp_path, **{name: inside(TARGET + 40.0 * way, 10.0) for name, way in ways.items()})
     code, said = init(capfd, tmp_path)
     assert code == 0, said
-    assert roles(tmp_path)[name] == ("avoid", 5.0)
-    (line,) = [one for one in said if "named like the outline of the body" in one]
-    assert f"'{name}'" in line and "of the skin" in line and "ignore" in line
-    context = prepare(tmp_path, arm=False)
-    found = context.search()
-    through = found.outward_ct @ [0.0, -1.0, 0.0] > np.cos(np.arctan2(10.0, 40.0))
-    assert through.any() and not found.safe[through].any()
+    lines = [one for one in said if "named like the outline of the body" in one]
+    found = prepare(tmp_path, arm=False).search()
+    for name, way in ways.items():
+        assert roles(tmp_path)[name] == ("avoid", 5.0)
+        assert any(f"'{name}'" in line and "of the skin" in line and "ignore" in line for line in lines)
+        through = found.outward_ct @ way > np.cos(np.arctan2(10.0, 40.0))
+        assert through.any() and not found.safe[through].any()
 
 
-@pytest.mark.parametrize("name", NAMES[:2])
-def test_around_the_lesion_it_is_unknown(tmp_path, capfd, name):
+def test_around_the_lesion_it_is_unknown(tmp_path, capfd):
     """Nobody knows whether a path may cross it; and it is not taken for the target."""
-    write_case(tmp_path, **{name: inside(TARGET, 16.0)})
-    code, said = init(capfd, tmp_path)
-    assert code == 0, said
-    assert roles(tmp_path)[name] == ("unknown", 5.0) and roles(tmp_path)["tumor"][0] == "target"
-    assert not prepare(tmp_path, arm=False).search().safe.any()
-    assert init(capfd, tmp_path, "--target", "-40,12,10", "--force")[0] == 0
-    assert roles(tmp_path)[name] == ("unknown", 5.0) and roles(tmp_path)["target"][0] == "target"
+    write_case(tmp_path, **{name: inside(TARGET, 16.0 + number) for number, name in enumerate(NAMES[:2])})
+    for words, target in (((), "tumor"), (("--target", "-40,12,10", "--force"), "target")):
+        code, said = init(capfd, tmp_path, *words)
+        assert code == 0, said
+        assert {roles(tmp_path)[name] for name in NAMES[:2]} == {("unknown", 5.0)}
+        assert roles(tmp_path)[target][0] == "target"
+        assert words or not prepare(tmp_path, arm=False).search().safe.any()
 
 
 OUTLINES = {
-    "whole": BODY,
-    "5 mm less": inside((0.0, 0.0, 0.0), BODY_MM - 5.0),
-    "a shell": BODY & ~inside((0.0, 0.0, 0.0), BODY_MM - 10.0),
-    "with holes": BODY & ~inside((40.0, 0.0, 0.0), 35.0) & ~inside((-40.0, 0.0, -20.0), 25.0),
-    "without its head": BODY & (Z < 60.0),
-    "the half with the target": BODY & (X < 0.0),
+    "skin": BODY,
+    "External": inside((0.0, 0.0, 0.0), BODY_MM - 5.0),
+    "patient": BODY & ~inside((0.0, 0.0, 0.0), BODY_MM - 10.0),
+    "body_envelope": BODY & ~inside((40.0, 0.0, 0.0), 35.0) & ~inside((-40.0, 0.0, -20.0), 25.0),
+    "body_trunc": BODY & (Z < 60.0),
+    "outline": BODY & (X < 0.0),
 }
+"""Whole, 5 mm less, a shell, with holes, without its head, the half with the target."""
 
 
-@pytest.mark.parametrize(("name", "kind"), [("skin", "whole"), *(("External", kind) for kind in sorted(OUTLINES))])
-def test_the_outline_itself_is_left_out(tmp_path, capfd, name, kind):
+def test_the_outline_itself_is_left_out(tmp_path, capfd):
     """Whole, as a shell, with holes for the lungs, cropped: paths cross it as they did."""
-    write_case(tmp_path, **{name: OUTLINES[kind]})
+    write_case(tmp_path, **OUTLINES)
     code, said = init(capfd, tmp_path)
     assert code == 0, said
-    assert name not in roles(tmp_path) and prepare(tmp_path, arm=False).search().safe.any()
-    assert any(f"treated as the outline of the body, so not checked (ignore): {name}" in line for line in said)
+    assert not OUTLINES.keys() & roles(tmp_path).keys() and prepare(tmp_path, arm=False).search().safe.any()
+    (line,) = [one for one in said if "treated as the outline of the body, so not checked (ignore)" in one]
+    assert all(name in line for name in OUTLINES)
 
 
 def test_a_limb_beside_the_target_is_no_outline(tmp_path, capfd):
@@ -84,7 +83,6 @@ def test_a_limb_beside_the_target_is_no_outline(tmp_path, capfd):
 
 
 def meshes(folder, **balls):
-    """A folder of balls: name to radius and middle."""
     (folder / "meshes").mkdir()
     for name, (radius, middle) in balls.items():
         ball(folder / "meshes" / f"{name}.stl", radius, np.array(middle))

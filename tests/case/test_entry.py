@@ -63,20 +63,14 @@ def test_oblique_axes_give_an_orthonormal_frame(rng, space):
         assert R[:, 1] @ x == pytest.approx(0, abs=1e-12)
 
 
-@pytest.mark.parametrize("x", [(0, 0, -3), (0, 0, 0), (np.sin(np.radians(2)), 0, np.cos(np.radians(2)))])
-def test_parallel_axes_are_refused(x):
-    """Axes that do not span a frame are named: opposite, zero, or 2 degrees apart, of any length."""
-    for length in (0.01, 1.0, 70.0):
-        with refused("axes_parallel"):
-            entry_frame(EntryAxes(z=(0, 0, length), x=x), Space.LPS)
-    with refused("axes_parallel"):
-        entry_frame(EntryAxes(z=(0, 0, 0), x=(1, 0, 0)), Space.LPS)
-
-
 @pytest.mark.parametrize("length", [0.01, 1.0, 70.0])
-def test_axes_three_degrees_apart_span_a_frame(length):
-    z = (0.0, 0.0, length)
-    R = entry_frame(EntryAxes(z=z, x=(-np.sin(np.radians(3)), 0, np.cos(np.radians(3)))), Space.LPS)
+def test_parallel_axes_are_refused(length):
+    """Opposite, zero, or 2 degrees apart, of any length; axes 3 degrees apart span a frame."""
+    two, three = np.radians([2, 3])
+    for z, x in ((1, (0, 0, -3)), (1, (0, 0, 0)), (1, (np.sin(two), 0, np.cos(two))), (0, (1, 0, 0))):
+        with refused("axes_parallel"):
+            entry_frame(EntryAxes(z=(0, 0, z * length), x=x), Space.LPS)
+    R = entry_frame(EntryAxes(z=(0.0, 0.0, length), x=(-np.sin(three), 0, np.cos(three))), Space.LPS)
     np.testing.assert_allclose(R.T, [[-1, 0, 0], [0, -1, 0], [0, 0, 1]], atol=1e-12)
 
 
@@ -151,18 +145,11 @@ def test_rounding_of_a_billionth_of_a_step_loses_no_end(short, count):
     assert len(grid((0, 10 - short), (0, 0), 1.0, np.eye(3))) == count
 
 
-def test_each_needle_has_its_own_standoff():
-    """Standoffs by row go with directions by row; the top is one length beyond the tip."""
-    u = direction(0.4, 1.1, np.eye(3)).outward_ct.repeat(3, axis=0)
-    pose = needle_pose(np.zeros(3), u, standoff=np.array([10.0, 20.0, 30.0]), length=100.0)
-    np.testing.assert_allclose(np.linalg.norm(pose.tip_ct, axis=1), [10, 20, 30])
-    np.testing.assert_allclose(np.linalg.norm(pose.top_ct, axis=1), [110, 120, 130])
-
-
 def test_needle_points_at_the_target():
-    """Tip and top lie on the ray from the target: at r and at r + l (Chen 2019, Eq. 12-15)."""
-    target = np.array([1.0, 2.0, 3.0])
-    u = direction(0.4, 1.1, np.eye(3)).outward_ct[0]
-    pose = needle_pose(target, u, standoff=150.0, length=401.0)
-    np.testing.assert_allclose(pose.tip_ct, target + 150 * u)
-    np.testing.assert_allclose(pose.top_ct, target + 551 * u)
+    """Tip and top lie on the ray from the target: at r and at r + l (Chen 2019, Eq. 12-15); r by row goes with u."""
+    target, u = np.array([1.0, 2.0, 3.0]), direction(0.4, 1.1, np.eye(3)).outward_ct
+    for standoff in (150.0, np.array([10.0, 20.0, 30.0])):
+        rows = u if np.ndim(standoff) == 0 else u.repeat(3, axis=0)
+        pose, r = needle_pose(target, rows, standoff=standoff, length=401.0), np.reshape(standoff, (-1, 1))
+        np.testing.assert_allclose(pose.tip_ct, target + r * rows)
+        np.testing.assert_allclose(pose.top_ct, target + (r + 401.0) * rows)

@@ -33,7 +33,6 @@ def write_masks(folder):
 
 
 def init(capfd, folder, *words):
-    """Run it; returns exit code and stderr."""
     code = main(["init", str(folder), *(() if any("--target" in word for word in words) else TARGET), *words])
     return code, capfd.readouterr().err
 
@@ -128,10 +127,14 @@ def test_a_file_that_is_not_read_can_be_left_out(tmp_path, capfd):
     assert "portal_vein.mgz" in (tmp_path / "case.toml").read_text()
 
 
-@pytest.mark.parametrize("name", ["skin", "body", "rest"])
-def test_a_label_map_alone_starts(tmp_path, capfd, name):
-    """With the label that is named like the skin, or the one that is stated; its skin is the drawn body's."""
-    write_labels(tmp_path, (*BALLS, name))
+@pytest.mark.parametrize("name", ["skin", "masks", "rest"])
+def test_labels_alone_start(tmp_path, capfd, name):
+    """With the label or mask that is named like the skin, or the one that is stated; its skin is the drawn body's."""
+    if name == "masks":
+        write_masks(tmp_path / "seg")
+        write_mask(tmp_path / "seg" / "body.nii.gz", BODY)
+    else:
+        write_labels(tmp_path, (*BALLS, name))
     if name == "rest":
         code, said = init(capfd, tmp_path)
         assert code == 2 and "--skin NAME" in said and "rest" in said
@@ -140,13 +143,6 @@ def test_a_label_map_alone_starts(tmp_path, capfd, name):
     assert np.ptp(context.anatomy.skin.mesh.bounds, axis=0) == pytest.approx([180.0] * 3, abs=4.0)
     assert {one.name for one in context.anatomy.structures} == set(BALLS)
     assert context.search().safe.any()
-
-
-def test_a_folder_of_masks_alone_starts(tmp_path, capfd):
-    write_masks(tmp_path / "seg")
-    write_mask(tmp_path / "seg" / "body.nii.gz", BODY)
-    assert init(capfd, tmp_path)[0] == 0
-    assert set(roles(tmp_path)) == set(BALLS)
 
 
 def test_meshes_alone_start_with_the_skin_that_is_stated(tmp_path, capfd):

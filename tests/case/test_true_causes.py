@@ -19,7 +19,6 @@ from puncture_twin.planning.init.start import Request, start_case
 
 
 def labels():
-    """Three balls: 1, 2 and 3."""
     voxels = np.zeros(X.shape, np.uint8)
     for number, middle in enumerate(((0, 0, 0), (36, 10, 0), (0, -40, 20)), start=1):
         voxels[inside(middle, 10.0)] = number

@@ -38,11 +38,6 @@ def run(pytester, text):
     return pytester.runpytest_inprocess("-p", "no:cacheprovider", "-p", "no:xdist")
 
 
-def test_a_check_that_holds_passes(pytester):
-    """One [[check]], one test."""
-    run(pytester, GOOD).assert_outcomes(passed=1)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -57,14 +52,8 @@ def test_a_failing_check_prints_the_nearest_structures(pytester, old, new, messa
     """What differs comes first, then verdict and structures, then the command that shows all."""
     result = run(pytester, GOOD.replace(old, new))
     result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(
-        [
-            message,
-            "*theta 0 deg, beta 0 deg: safe*",
-            "*bolt_h*avoid*",
-            "full explanation: run-twin check *case_m.toml*--all",
-        ]
-    )
+    explained = ["*theta 0 deg, beta 0 deg: safe*", "*bolt_h*avoid*"]
+    result.stdout.fnmatch_lines([message, *explained, "full explanation: run-twin check *case_m.toml*--all"])
 
 
 @pytest.mark.parametrize(
@@ -90,12 +79,11 @@ def test_a_broken_file_says_what_is_allowed(pytester, text, message):
 @pytest.fixture
 def carton_without_base(tmp_path):
     """The carton, in a case that does not say where the robot's base is."""
-    folder_ = tmp_path / "carton"
-    shutil.copytree(CARTON.parent, folder_)
-    text = (folder_ / "case_m.toml").read_text()
-    start, end = text.index("[registration]"), text.index("[robot]")
-    (folder_ / "case_m.toml").write_text(text[:start] + text[end:])
-    return folder_ / "case_m.toml"
+    shutil.copytree(CARTON.parent, tmp_path / "carton")
+    case = tmp_path / "carton" / "case_m.toml"
+    text = case.read_text()
+    case.write_text(text[: text.index("[registration]")] + text[text.index("[robot]") :])
+    return case
 
 
 def test_a_check_of_the_arm_fails_where_the_case_does_not_say_where_it_is(pytester, carton_without_base):
@@ -109,17 +97,13 @@ def test_a_check_of_the_arm_fails_where_the_case_does_not_say_where_it_is(pytest
 
 def test_a_run_without_an_arm_says_so_though_it_is_green(pytester, carton_without_base):
     """Once for each case, with the reason; a case whose arm was checked is not mentioned."""
-    other = GOOD.replace(str(CARTON), str(carton_without_base))
-    result = run(
-        pytester, GOOD + GOOD[GOOD.index("[[") :] + other[other.index("[[") :] + f'case = "{carton_without_base}"'
-    )
+    check = GOOD[GOOD.index("[[") :]
+    result = run(pytester, f'{GOOD}{check}{check}case = "{carton_without_base}"')
     result.assert_outcomes(passed=3)
-    result.stdout.fnmatch_lines(
-        [
-            f"*{CARTON}: arm not checked: switched off (--no-arm) (2 tests)",
-            f"*{carton_without_base}: arm not checked: the case does not state where the robot's base is (1 test)",
-        ]
-    )
+    because = "the case does not state where the robot's base is"
+    told = [f"{CARTON}: arm not checked: switched off (--no-arm) (2 tests)"]
+    told.append(f"{carton_without_base}: arm not checked: {because} (1 test)")
+    result.stdout.fnmatch_lines([f"*{line}" for line in told])
 
 
 def test_the_fixture_judges_in_python(collision_check):
@@ -161,7 +145,6 @@ def test_names_marks_and_reasons(pytester):
 
 
 def test_a_mark_that_nobody_registered_is_an_error_where_marks_are_strict(pytester):
-    """With file and line."""
     pytester.makeini("[pytest]\naddopts = --strict-markers")
     result = run(pytester, WINDOW.replace("thorough", "nightly"))
     result.assert_outcomes(errors=1)

@@ -43,5 +43,4 @@ def test_only_heads_of_tables_count():
     ],
 )
 def test_a_place_has_the_line_of_its_key_or_of_its_table(place, line):
-    """None where no line tells."""
     assert line_of(TEXT, place) == line

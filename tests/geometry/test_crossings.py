@@ -1,11 +1,10 @@
-"""Every crossing of every ray: against brute force, analytic spheres, and rays through edges and corners."""
+"""Every crossing of every ray: against brute force, and rays through edges and corners."""
 
 import numpy as np
 import pytest
 import trimesh
 from oracles import ray_crossings
 
-from puncture_twin.planning.case.entry import grid
 from puncture_twin.planning.geometry.containment import (
     Side,
     contains,
@@ -16,8 +15,6 @@ from puncture_twin.planning.geometry.containment import (
     winding_number,
 )
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-
-FULL = grid((0, np.pi), (0, 2 * np.pi), np.radians(7.3), np.eye(3)).outward_ct
 
 
 def by_ray(found, count):
@@ -63,28 +60,6 @@ def test_a_ray_crosses_the_same_among_few_and_among_many(rng, spread, size):
 def test_no_ray_has_no_crossings(ball):
     found = crossings(ball(10.0), np.zeros(3), np.zeros((0, 3)))
     assert [len(one) for one in (found.ray, found.depth, found.face, found.count, found.first)] == [0] * 5
-
-
-def test_from_inside_a_ball_every_ray_leaves_once(ball):
-    """From any point inside, each ray crosses the closed surface once, near the analytic sphere."""
-    mesh = ball(50, subdivisions=4)
-    for origin in ([0, 0, 0], [20, -10, 30], [0, 0, 49.0]):
-        found = crossings(mesh, np.array(origin, float), FULL)
-        assert (found.count == 1).all()
-        reached = np.linalg.norm(np.array(origin) + found.depth[:, None] * FULL[found.ray], axis=1)
-        assert (reached <= 50 + 1e-9).all()
-        assert (reached > 49.7).all()
-
-
-def test_rays_through_corners_and_edges_are_not_missed(box):
-    """From the centre of a box, rays through its corners, edge middles and face diagonals cross exactly once."""
-    corners = np.array(
-        [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) != (0, 0, 0)]
-    )
-    directions = corners / np.linalg.norm(corners, axis=1, keepdims=True)
-    found = crossings(box([2, 2, 2]), np.zeros(3), directions)
-    assert (found.count == 1).all()
-    np.testing.assert_allclose(found.depth, np.linalg.norm(corners, axis=1), atol=1e-12)
 
 
 @pytest.mark.parametrize(("spread", "size"), [(60, 10), (60, 100), (3, 3), (40, 4), (100, 2000)])
@@ -198,7 +173,6 @@ def test_a_ray_through_corners_and_edges_leaves_every_shell_once(rng, form, off,
 
 
 def box_between(low, high):
-    """A closed box wound outward, shape (12, 3, 3)."""
     box = trimesh.creation.box(np.subtract(high, low))
     return (box.vertices + np.add(low, high) / 2)[box.faces]
 

@@ -41,12 +41,6 @@ def test_every_split_is_in_order(cloud, count, leaf, rng):
     refuse_unsplit(points[order], leaf)
 
 
-def test_runs_are_compact(rng):
-    points = rng.uniform(0, 1, (5000, 3))
-    runs = points[kd_order(points, 16)][:4992].reshape(-1, 16, 3)
-    assert np.median(np.ptp(runs, axis=1)) < 0.2
-
-
 def test_what_is_no_number_ends_too(rng):
     """Callers refuse it; who did not would get some order, and not wait for ever."""
     points = rng.uniform(0, 1, (3000, 3))

@@ -20,7 +20,6 @@ def rotation_vectors(angle):
 
 
 def poses(n=20):
-    """Random poses (n, 4, 4), mm."""
     rng = np.random.default_rng(SEED)
     return rigid.pose(rotations.exp_rotation(rng.normal(size=(n, 3))), rng.normal(0.0, 300.0, (n, 3)))
 
@@ -32,7 +31,6 @@ def units(n=20):
 
 
 def assert_rotation(R):
-    """R^T R = 1 and det R = +1."""
     np.testing.assert_allclose(np.swapaxes(R, -1, -2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-14)
     np.testing.assert_allclose(np.linalg.det(R), 1.0, atol=1e-14)
 

@@ -43,15 +43,6 @@ def test_distance_agrees_with_another_closest_point():
     np.testing.assert_allclose(ours[:1500], plain, atol=1e-9)
 
 
-def test_the_corners_order_and_place_do_not_matter():
-    """A triangle is a set of corners; what moves with the point keeps its distance."""
-    points, triangles = scattered(400)
-    squares = squared_distance(points, triangles)
-    for order in ([1, 2, 0], [2, 1, 0]):
-        np.testing.assert_allclose(squared_distance(points, triangles[:, order]), squares, rtol=1e-7, atol=1e-12)
-    np.testing.assert_allclose(squared_distance(points + 7, triangles + 7), squares, rtol=1e-6, atol=1e-10)
-
-
 def test_broadcast_is_every_pair():
     """Points (a, 1, 3) against triangles (b, 3, 3) give (a, b); nothing against something gives nothing."""
     points, triangles = scattered(12)

@@ -9,6 +9,7 @@ import dicom_world
 import numpy as np
 import pydicom
 import trimesh
+from case_world import case_text, structure
 
 from puncture_twin.planning.base.cache import entry_file
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE
@@ -62,6 +63,10 @@ def _pipe(rng, path):
     os.mkfifo(path)
 
 
+def _lacks(rng, path):
+    path.unlink()
+
+
 def _hidden(rng, path):
     path.rename(path.with_name(f".{path.name}"))
 
@@ -70,29 +75,12 @@ def _closed(rng, path):
     path.chmod(0)
 
 
-CASE = """schema = 2
-region = "other"
-name = "files"
-space = "LPS"
-[target]
-position_mm = [0.0, 0.0, 0.0]
-structure = "liver"
-[needle]
-length_mm = 200.0
-shaft_mm = 150.0
-diameter_mm = 1.2
-[[structure]]
-name = "skin"
-mesh = "skin.stl"
-unit = "mm"
-role = "skin"
-[[structures]]
-masks = "masks"
-target = ["liver"]
-avoid = { "*" = 2.0 }
-[end]
-structures = 6
-"""
+CASE = case_text(
+    structure("skin", "skin"),
+    '[[structures]]\nmasks = "masks"\ntarget = ["liver"]\navoid = { "*" = 2.0 }\n',
+    target='position_mm = [0.0, 0.0, 0.0]\nstructure = "liver"',
+    listed=5,
+)
 
 
 def _masks(slip_of, rng, folder, slip):
@@ -136,10 +124,6 @@ def _meshes(slip_of, rng, folder, slip):
         return None if set(ORGANS) <= names else Answer(SILENT)
 
     return answer(call)
-
-
-def _slice_lacks(rng, path):
-    path.unlink()
 
 
 def _slice_cut(rng, path):
@@ -268,7 +252,7 @@ VANISH = (
 KINDS = (
     *(Kind(f"a mask is {name}", share, partial(_masks, of)) for name, of, _, share in VANISH),
     *(Kind(f"a mesh is {name}", share // 2, partial(_meshes, of)) for name, _, of, share in VANISH),
-    Kind("a slice lacks", 16, partial(_slices, _slice_lacks)),
+    Kind("a slice lacks", 16, partial(_slices, _lacks)),
     Kind("a slice is cut", 16, partial(_slices, _slice_cut)),
     Kind("a slice is a link to nothing", 10, partial(_slices, _dangling)),
     Kind("a slice lies at another's place", 10, partial(_slices, _slice_moved)),

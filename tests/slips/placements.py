@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 import trimesh
+from case_world import case_text, structure
 
 from benchmarks.placements import CHANGES, Patient, changed, meshes_of, phantoms, source_of
 from puncture_twin.planning.evidence.checks import findings
@@ -48,21 +49,14 @@ def _scale(rng, source):
     return _about(about, np.eye(3) * rng.choice([0.9, 0.95, 1.05, 1.1]))
 
 
-def _mirror(rng, source):
-    return _about(source.middles[int(rng.integers(2))], np.diag(np.where(np.arange(3) == rng.integers(3), -1.0, 1.0)))
-
-
-def _half_turn(rng, source):
-    return _about(source.middles[int(rng.integers(2))], np.diag(np.where(np.arange(3) == rng.integers(3), 1.0, -1.0)))
+def _mirror(rng, source, axis=None, sign=1.0):
+    about, axis = int(rng.integers(2)), rng.integers(3) if axis is None else axis
+    return _about(source.middles[about], sign * np.diag(np.where(np.arange(3) == axis, -1.0, 1.0)))
 
 
 def _turn(rng, source):
     axis = rng.normal(size=3)
     return _about(source.middles[0], exp_rotation(axis / np.linalg.norm(axis) * np.radians(rng.uniform(8, 25))))
-
-
-def _reversed(rng, source):
-    return _about(source.middles[0], np.diag([1.0, 1.0, -1.0]))
 
 
 def _permuted(rng, source):
@@ -95,26 +89,7 @@ def _whole(kind, slip_of, rng, folder, slip):
     return Answer(TOLD, "edges_cannot_tell") if kind in found.open else Answer(SILENT)
 
 
-CASE = """schema = 2
-region = "phantom"
-name = "full"
-space = "LPS"
-[target]
-position_mm = {target}
-structure = "part_1"
-[needle]
-length_mm = 250.0
-shaft_mm = 200.0
-diameter_mm = 1.2
-[[structure]]
-name = "skin"
-ct = "ct.nii.gz"
-role = "skin"
-{structures}[end]
-structures = {count}
-"""
 MASKS = '[[structures]]\nmasks = "masks"\ntarget = ["part_1"]\navoid = { "part_*" = 2.0 }\n'
-MESH = '[[structure]]\nname = "{0}"\nmesh = "{0}.stl"\nunit = "mm"\nrole = "{1}"\n'
 PARTS = 16
 
 
@@ -154,11 +129,12 @@ def _full(seed, written):
                 write_nifti(folder / "masks" / f"{part}.nii.gz", mask.astype(np.uint8), patient.T)
             else:
                 trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(folder / f"{part}.stl")
-        sections = "".join(MESH.format(one, "target" if one == "part_1" else "avoid") for one in meshes)
-        text = CASE.format(
-            target=target.tolist(), structures=MASKS if written == "masks" else sections, count=len(meshes) + 1
-        )
-        (folder / "case.toml").write_text(text)
+        skin = structure("skin", "skin", {"ct": "ct.nii.gz"})
+        sections = [structure(one, "target" if one == "part_1" else "avoid") for one in meshes]
+        many, listed = ([MASKS], len(meshes)) if written == "masks" else (sections, 0)
+        keys = {"region": "phantom", "target": f'position_mm = {target.tolist()}\nstructure = "part_1"'}
+        needle = "length_mm = 250.0\nshaft_mm = 200.0\ndiameter_mm = 1.2"
+        (folder / "case.toml").write_text(case_text(skin, *many, needle=needle, search="", listed=listed, **keys))
         context = prepare(folder, arm=False)
     return context.case, context.anatomy, _said(context.case, context.anatomy).warnings
 
@@ -224,9 +200,9 @@ KINDS = (
     Kind("labels shifted", 40, partial(_whole, "shift", _shift)),
     Kind("labels scaled", 25, partial(_whole, "scale", _scale)),
     Kind("labels mirrored", 25, partial(_whole, "axes", _mirror)),
-    Kind("labels by half a turn", 25, partial(_whole, "axes", _half_turn)),
+    Kind("labels by half a turn", 25, partial(_whole, "axes", partial(_mirror, sign=-1.0))),
     Kind("labels turned", 20, partial(_whole, "turn", _turn)),
-    Kind("labels reversed", 15, partial(_whole, "axes", _reversed)),
+    Kind("labels reversed", 15, partial(_whole, "axes", partial(_mirror, axis=2))),
     Kind("labels with exchanged axes", 20, partial(_whole, "axes", _permuted)),
     Kind("one mask 15 mm off", 30, partial(_one_off, "masks", _beside), may_pass=MAY_PASS),
     Kind("one mesh 15 mm off", 20, partial(_one_off, "meshes", _beside), may_pass=MAY_PASS),

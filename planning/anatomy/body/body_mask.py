@@ -7,7 +7,7 @@ circle of reconstruction, beside the slab of a tilted gantry, in slices that fil
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,16 +25,12 @@ from puncture_twin.planning.formats.volumes.volume_files import Volume, canonica
 from puncture_twin.planning.geometry.parts import largest_part, middle_of, parts_of
 from puncture_twin.planning.geometry.rigid import apply
 
-UNSCANNED_HU, BLANK_HU = -1500.0, -2000.0
-"""Nothing real is less dense than air; and what is written in the place of paddings that are denser, such as 0."""
-NEARLY_AIR_HU = -900.0
-"""Below this a voxel is air, with its noise."""
-BLOCK_VOXELS = 3
-"""A cube of so many voxels along each edge that have one value is no noise, also where a scanner clips at -1024."""
-MEASURED_AIR = 0.02
-"""So much of what may be air is measured, or nothing tells: of a blanked background only the skin's seam is left."""
-ALIKE_PAIRS = 0.5
-"""Of the neighbours in measured air that have one value: noise of 2 HU leaves less than a fifth."""
+UNSCANNED_HU, BLANK_HU, NEARLY_AIR_HU = -1500.0, -2000.0, -900.0
+"""Nothing real is less dense than air; what is written in the place of paddings that are denser, such as 0; and below
+this a voxel is air, with its noise."""
+MEASURED_AIR, ALIKE_PAIRS = 0.02, 0.5
+"""So much of what may be air is measured, or nothing tells: of a blanked background only the skin's seam is left. And
+so many of its neighbours have one value at most: noise of 2 HU leaves less than a fifth."""
 BODY_HU = -500.0
 """Half way between air (-1000) and water (0): where a voxel is half skin, half air."""
 OUTSIDE_AIR_HU, MIN_OUTSIDE_ML = -940.0, 50.0
@@ -72,7 +68,9 @@ def find_unscanned(hu: NDArray[Any]) -> Bools:
     corners = tuple(slice(None, None, max(1, n - 1)) for n in hu.shape)
     cubes = [hu[cube] for cube in itertools.product((slice(0, 2), slice(-2, None)), repeat=3)]
     for value in {cube.flat[0] for cube in cubes if cube.min() == cube.max() >= UNSCANNED_HU}:
-        blocks, at_corners = _block(same := hu == value), np.zeros(hu.shape, bool)
+        same, at_corners = hu == value, np.zeros(hu.shape, bool)
+        # Cubes of 3 voxels of one value are no noise, also where a scanner clips at -1024; beyond the faces it goes on.
+        blocks = widened(~widened(~same, (1, 1, 1)), (2, 2, 2)) & same
         at_corners[corners] = True
         if (blocks & at_corners).any() and _measured_air_has_noise(hu, value):
             parts = parts_of(blocks)
@@ -83,12 +81,6 @@ def find_unscanned(hu: NDArray[Any]) -> Bools:
         if not found[:, :, z].all() and (hu[:, :, z] == value).all() and _measured_air_has_noise(hu, value):
             found[:, :, z] = True
     return found
-
-
-def _block(same: Bools) -> Bools:
-    """Voxels of a mask that lie in a cube of it, or beside one; beyond the image's faces the mask goes on."""
-    blocks = ~widened(~same, (BLOCK_VOXELS // 2,) * 3)
-    return widened(blocks, (BLOCK_VOXELS - 1,) * 3) & same
 
 
 def _measured_air_has_noise(hu: NDArray[Any], value: Any) -> bool:
@@ -102,12 +94,9 @@ def _measured_air_has_noise(hu: NDArray[Any], value: Any) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class BodyMask:
-    """What was found.
+    """The solid body (nx, ny, nz): the trunk, and parts that do not touch it; and what the scanner did not measure.
 
-    Attributes:
-        body: Shape (nx, ny, nz), the solid body: the trunk, and parts of the patient that do not touch it.
-        unscanned: Same shape, voxels that the scanner did not measure.
-        tables: Where the body ends as a table, cradle or board does that touches it.
+    ``tables``: where the body ends as a table, cradle or board does that touches it.
     """
 
     body: Bools
@@ -123,9 +112,8 @@ class CtImage:
     Attributes:
         hu: Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head; of 16 bits
             where the file has such, else of single precision.
-        T_ct_index: Shape (4, 4), voxel index to LPS mm.
-        as_stored: Shape of ``hu``, as the file has them, where that differs.
-        not_measured: Shape of ``hu``, what was not, where that is known.
+        as_stored: As the file has them, where that differs.
+        not_measured: What was not, where that is known.
     """
 
     hu: NDArray[Any]
@@ -187,14 +175,11 @@ def body_mask(
     unscanned: Bools | None = None,
     at: Ints | None = None,
 ) -> BodyMask:
-    """The patient, or the phantom, in a CT.
+    """The patient, or the phantom, in a CT (nx, ny, nz) of `measured_hu`, axis 2 along the patient.
 
-    Threshold, opening, largest part without the table that touches it, and all others that look like a limb; then air
-    that each encloses in an axial slice is filled, and air at the image's border that does not look like the room's.
-
-    Args:
-        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
-        at: Shape (3,), a voxel of the part that is meant, where that need not be the largest.
+    Threshold, opening, largest part (or the one with the voxel ``at``) without the table that touches it, and all
+    others that look like a limb; then air that each encloses in an axial slice is filled, and air at the image's border
+    that does not look like the room's.
 
     Raises:
         InputError: No body, an implausibly small one, or no air around it.
@@ -214,7 +199,9 @@ def body_mask(
             dense &= ~touching.cut_off  # what is left of parts is still drawn from it
             trunk = largest_part(trunk & dense)
     limbs = [part for part in (parts if shown.limbs else ()) if _is_limb(part.mask, hu[part.box], spacing_mm)]
-    warnings += limb_warnings(limbs, trunk, voxel_ml)
+    if limbs:
+        named = ", ".join(_where(limb, middle_of(trunk), voxel_ml) for limb in limbs)
+        warnings.append(f"parts not connected to the trunk (arms, legs?) count as body: {named}")
     filled = filled_slices(trunk)
     for box, limb in limbs:
         filled[box] |= filled_slices(limb)
@@ -281,9 +268,7 @@ def thick_parts(mask: Bools, spacing_mm: Floats, at: Ints | None = None) -> Iter
 def nearest_parts(mask: Bools, radius_mm: float, spacing_mm: Floats, most_mm: float = np.inf) -> Ints32:
     """Number the parts of a mask into which a ball fits, 1 the largest, and what lies nearest to each; 0 elsewhere.
 
-    Args:
-        mask: Shape (nx, ny, nz); beyond its border it goes on.
-        most_mm: So far from where the ball's middle may lie.
+    Beyond its border it goes on; ``most_mm`` is how far from where the ball's middle may lie.
     """
     reach = np.ceil(radius_mm / spacing_mm).astype(int)
     padded = np.pad(mask, [(r, r) for r in reach], mode="edge")
@@ -310,17 +295,9 @@ def _is_limb(part: Bools, hu: NDArray[Any], spacing_mm: Floats) -> bool:
     return bool(bone.sizes.max(initial=0) * voxel_ml >= MIN_BONE_ML)
 
 
-def limb_warnings(limbs: Sequence[Piece], trunk: Bools, voxel_ml: float) -> Iterator[str]:
-    """One sentence that names every detached part, where there is one."""
-    if limbs:
-        middle = middle_of(trunk)
-        named = [f"{_side(limb, middle)} ({np.count_nonzero(limb.mask) * voxel_ml:.0f} ml)" for limb in limbs]
-        yield f"parts not connected to the trunk (arms, legs?) count as body: {', '.join(named)}"
-
-
-def _side(limb: Piece, middle: Floats) -> str:
-    """Where a part lies, seen from the trunk; axes run to the left and to the back."""
+def _where(limb: Piece, middle: Floats, voxel_ml: float) -> str:
+    """Where a part lies, seen from the trunk's middle, and how much it is; axes run to the left and to the back."""
     away = middle_of(limb.mask) + [one.start for one in limb.box] - middle
-    if abs(away[0]) >= abs(away[1]):
-        return "left of it" if away[0] > 0 else "right of it"
-    return "behind it" if away[1] > 0 else "in front of it"
+    axis = int(abs(away[1]) > abs(away[0]))
+    side = (("right of it", "left of it"), ("in front of it", "behind it"))[axis][int(away[axis] > 0)]
+    return f"{side} ({np.count_nonzero(limb.mask) * voxel_ml:.0f} ml)"

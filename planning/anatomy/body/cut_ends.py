@@ -30,10 +30,9 @@ SPECK_MM2, THICK_MM = 100.0, 12.0
 WIDE, ROUND_MM = 0.75, 150.0
 """A ball's outermost slice is at most half as large as the next one, a lying cylinder's .71 of it; and no head, foot or
 stump is flatter than a ball of this radius."""
-CAP_MM2, WALL = 100.0, 0.5
-"""Area of the flat end of an organ that was cut; what is so much of the face is the body, or a phantom's wall."""
-AT_PLANE = 0.75
-"""Of a voxel: so near to the face ends what was cut there."""
+CAP_MM2, WALL, AT_PLANE = 100.0, 0.5, 0.75
+"""Area of the flat end of an organ that was cut; what is so much of the face is the body, or a phantom's wall. It ends
+so near to the face, voxels."""
 
 Box = tuple[tuple[int, int], ...]
 """Along each axis the first voxel and the one after the last."""
@@ -74,14 +73,10 @@ class FieldOfView:
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What an image holds that is denser than air, by the slices across each axis.
+    """What an image holds that is denser than air: the outermost slices across each axis, low and high, shape (3, 2).
 
-    Attributes:
-        T_ct_index: Shape (4, 4), voxel index to LPS mm.
-        last: Shape (3, 2), the outermost slice that holds something at the low and the high end of each axis.
-        area_mm2: Shape (3, 2), how much that is.
-        thick: Shape (3, 2), whether it is thick enough for a body.
-        wide: Shape (3, 2), whether it is wider than any round body is that ends there by itself.
+    ``last`` is their number; ``thick`` tells whether what they hold is thick enough for a body, ``wide`` whether it is
+    wider than any round body is that ends there by itself.
     """
 
     shape: tuple[int, int, int]

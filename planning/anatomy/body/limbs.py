@@ -69,10 +69,8 @@ class Piece(NamedTuple):
 class LimbSearch(NamedTuple):
     """Limbs of a body: all that takes long is found once, and chosen of for each target.
 
-    Attributes:
-        parts: Shape (nx, ny, nz), from 1 the number of the part that a block belongs to, 0 outside.
-        T_ct_index: Shape (4, 4), LPS mm.
-        pieces: Of a part by its number: those beyond a narrow neck, and what lies about exposed bones.
+    ``parts`` numbers the parts of blocks (nx, ny, nz), 0 outside; ``pieces`` are those of a part by its number: beyond
+    a narrow neck, and what lies about exposed bones.
     """
 
     parts: Ints32
@@ -119,10 +117,7 @@ def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> Lim
 def _pieces(body: Bools, solid: Bools, bone: Bools, spacing_mm: Floats) -> Iterator[Piece]:
     """Parts of a body beyond narrow necks, and what lies about bones with air on more sides than a trunk's have.
 
-    Args:
-        body: Shape (nx, ny, nz), what holds together; a block counts where any of its voxels does.
-        solid: Same shape, what is no air; beyond the border it goes on.
-        bone: Same shape, what is evidence.
+    Of blocks that hold together, of what is no air (beyond the border it goes on), and of bones that are evidence.
     """
     block_ml = float(np.prod(spacing_mm)) / 1000.0
     cores = np.where(body, nearest_parts(body, NECK_MM, spacing_mm), 0)

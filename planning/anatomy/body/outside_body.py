@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy
@@ -27,10 +27,9 @@ SMOOTH_MM = (3.0, 6.0, 9.0, 12.0)
 QUIET, THIN = 4.5, 3
 """Air is quiet whose median is below the limit by so many times what its lower quarter is below it: three deviations,
 and what is denser makes no bulky piece. Foam does not move that quarter. Asked of every third voxel along each axis."""
-LEAST_HU = -1024
-"""What is below counts as this in a mean: some scanners write less than air has."""
-DENSE_HU = -700.0
-"""A single voxel above this is no noise (ten times that of a low-dose image)."""
+LEAST_HU, DENSE_HU = -1024, -700.0
+"""What is below counts as this in a mean: some scanners write less than air has. A single voxel above the second is no
+noise (ten times that of a low-dose image)."""
 MIN_PIECE_MM3, MIN_SOFT_MM3, SOLID_HU = 100.0, 500.0, -250.0
 """Pieces that hold less above ``BODY_HU`` are noise, or cloth; where nothing in them is solid, less than the second. A
 line of 4 mm has the first in 8 mm of its length, between voxels of 3 mm the second in 30. A gown on the skin of a real
@@ -38,11 +37,10 @@ chest has -850, and -260 in its folds; so has a line of 2 mm, or with a bore: it
 BULKY_ML = 50.0
 """Pieces of this volume that the border cuts go on beyond it, also between the places where they are cut: of a table
 that sags below the image both ends are seen."""
-BEYOND_MM = (100.0, 100.0, 2000.0)
+BEYOND_MM, BEYOND_LONG_MM = (100.0, 100.0, 2000.0), (100.0, 100.0, 1000.0)
 """So far what the border cuts goes on to the sides, to front and back, and along the bed: a CT table is at most 550 mm
-wide and an image at least 350; along the bed it goes on farther than a needle reaches."""
-BEYOND_LONG_MM = (*BEYOND_MM[:2], 1000.0)
-"""`BEYOND_MM` where an image is so long that the surface would be larger than any that is plausible."""
+wide and an image at least 350; along the bed it goes on farther than a needle reaches. The second where an image is so
+long that the surface would be larger than any that is plausible."""
 CUT_AT_MM = (30.0, 120.0, 480.0)
 """Along the bed it is cut across there: a triangle as long as all of it would lie near every needle."""
 BLOCK_MM = 2.0
@@ -60,9 +58,6 @@ class OutsideImage:
     """A CT beside its body, axes running to the left, back and head.
 
     Attributes:
-        hu: Shape (nx, ny, nz), Hounsfield units.
-        body, unscanned: Same shape, the body, and what was not measured.
-        T_ct_index: Shape (4, 4), voxel index to LPS mm.
         slopes: How what lies there moves along axes 0 and 1 beyond the image's ends, mm per mm along the bed.
         beyond_mm: How far what the border cuts is taken to go on.
     """
@@ -82,7 +77,15 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
     Beside the body's surface they are partly skin, partly air; there only what is denser than half of both counts.
     """
     hu, body, unscanned = image.hu, image.body, image.unscanned
-    dense = _denser_around(image, air_hu)
+    for edge_mm in (*SMOOTH_MM, SMOOTH_MM[0]):
+        size = np.maximum(1, np.round(edge_mm / image.spacing_mm)).astype(int)
+        means = scipy.ndimage.uniform_filter(np.maximum(hu, LEAST_HU), size, np.float32, mode="nearest")
+        away = ~widened(body, size // 2 + 1)
+        air = means[::THIN, ::THIN, ::THIN][(away & ~unscanned)[::THIN, ::THIN, ::THIN]]
+        air = air[air < DENSE_HU]
+        if air.size and (1.0 + QUIET) * np.median(air) - QUIET * np.percentile(air, 25) <= air_hu:
+            break
+    dense = away & ((means > air_hu) | (hu > max(DENSE_HU, air_hu)))
     dense |= (hu > BODY_HU) & ~body
     if not unscanned.any():
         return _stiff_pieces(dense, hu, image.spacing_mm)
@@ -94,19 +97,6 @@ def outside_mask(image: OutsideImage, air_hu: float) -> Bools:
         dense |= padded
     dense &= ~body
     return dense
-
-
-def _denser_around(image: OutsideImage, air_hu: float) -> Bools:
-    """Voxels away from the body that are denser than a limit, or in the mean over a cube in which air is quiet."""
-    for edge_mm in (*SMOOTH_MM, SMOOTH_MM[0]):
-        size = np.maximum(1, np.round(edge_mm / image.spacing_mm)).astype(int)
-        means = scipy.ndimage.uniform_filter(np.maximum(image.hu, LEAST_HU), size, np.float32, mode="nearest")
-        away = ~widened(image.body, size // 2 + 1)
-        air = means[::THIN, ::THIN, ::THIN][(away & ~image.unscanned)[::THIN, ::THIN, ::THIN]]
-        air = air[air < DENSE_HU]
-        if air.size and (1.0 + QUIET) * np.median(air) - QUIET * np.percentile(air, 25) <= air_hu:
-            break
-    return away & ((means > air_hu) | (image.hu > max(DENSE_HU, air_hu)))
 
 
 def outside_surface(
@@ -134,35 +124,26 @@ def outside_surface(
         return None
     T_blocks_layered = pose(np.eye(3), [-float(count) for count, _ in pads])
     solid = bulky & (in_blocks(image.hu > DENSE_HU, edge) > 0)  # not what lies beyond a table's back
-    arcs = [_Arc.at_side(solid, end, edge * image.spacing_mm) for end in (0, -1)]
+    arcs = [_arc(solid, end, edge * image.spacing_mm) for end in (0, -1)]
     return _drawn_out(mask_surface(layered, T_blocks_layered, where=where), edge, image, arcs)
 
 
-class _Arc(NamedTuple):
-    """How what a side of the image cuts goes on.
+def _arc(solid: Bools, end: int, block_mm: Floats) -> tuple[Floats, float]:
+    """How solid pieces (nx, ny, nz) go on at one end of axis 0.
 
-    Attributes:
-        back: Shape (nz,), by block along the bed, the block in which its back lies at the border.
-        rise: How much it rises toward the front, mm per mm to the side.
+    By block along the bed (nz,) the block in which their back lies at the border; and how much it rises toward the
+    front, mm per mm to the side.
     """
-
-    back: Floats
-    rise: float
-
-    @classmethod
-    def at_side(cls, solid: Bools, end: int, block_mm: Floats) -> _Arc:
-        """Of solid pieces (nx, ny, nz) at one end of axis 0."""
-        steps = min(max(1, round(RISES_OVER_MM / block_mm[0])), len(solid) - 1)
-        columns = solid[::-1][: steps + 1] if end else solid[: steps + 1]
-        backs = columns.shape[1] - 1.0 - columns[:, ::-1].argmax(axis=1)
-        known = columns.any(axis=1)
-        level = np.abs(np.diff(backs, axis=0)) * block_mm[1] <= STEEPEST * block_mm[0]
-        one = np.asarray(np.concatenate([known, level]).all(axis=0))
-        if np.count_nonzero(one) < max(1.0, DRAWN_FRACTION * columns[0].any(axis=0).sum()):
-            return cls(backs[0], 0.0)
-        risen_mm = float(np.median((backs[-1] - backs[0])[one])) * block_mm[1]
-        back = np.where(one, backs[0], np.median(backs[0, one]))
-        return cls(back, ON_AN_ARC * max(risen_mm, 0.0) / (steps * block_mm[0]))
+    steps = min(max(1, round(RISES_OVER_MM / block_mm[0])), len(solid) - 1)
+    columns = solid[::-1][: steps + 1] if end else solid[: steps + 1]
+    backs = columns.shape[1] - 1.0 - columns[:, ::-1].argmax(axis=1)
+    level = np.abs(np.diff(backs, axis=0)) * block_mm[1] <= STEEPEST * block_mm[0]
+    one = np.asarray(np.concatenate([columns.any(axis=1), level]).all(axis=0))
+    if np.count_nonzero(one) < max(1.0, DRAWN_FRACTION * columns[0].any(axis=0).sum()):
+        return backs[0], 0.0
+    risen_mm = float(np.median((backs[-1] - backs[0])[one])) * block_mm[1]
+    back = np.where(one, backs[0], np.median(backs[0, one]))
+    return back, ON_AN_ARC * max(risen_mm, 0.0) / (steps * block_mm[0])
 
 
 def _layers_mm(image: OutsideImage) -> tuple[tuple[float, ...], ...]:
@@ -172,13 +153,12 @@ def _layers_mm(image: OutsideImage) -> tuple[tuple[float, ...], ...]:
 
 
 def _drawn_out(
-    surface: TriangleMesh, edge: NDArray[np.int_], image: OutsideImage, arcs: Sequence[_Arc]
+    surface: TriangleMesh, edge: NDArray[np.int_], image: OutsideImage, arcs: Sequence[tuple[Floats, float]]
 ) -> TriangleMesh:
     """A surface that counts blocks of ``edge`` voxels, in LPS mm; layers beyond the border moved outward with the bed.
 
-    Those beyond a side, of which a cradle rises along one of the arcs, in front of its back to the front.
-
-    Every vertex lies on a face between two blocks; caps half a voxel after the last layer's centre.
+    Those beyond a side, where a cradle rises, in front of its back to the front. Every vertex lies on a face between
+    two blocks; caps half a voxel after the last layer's centre.
     """
     index = surface.vertices.copy()
     for axis, layers_mm in enumerate(_layers_mm(image)):
@@ -192,9 +172,9 @@ def _drawn_out(
             np.concatenate([-beyond[::-1], [0.0], np.arange(last) + 0.5, [last], last + beyond]),
             np.concatenate([-moved[::-1], ends[:1], at[1:] - 0.5, ends[1:], size - 1.0 + moved]),
         )
-    for arc, beyond in zip(arcs, (-index[:, 0], index[:, 0] - (image.hu.shape[0] - 1.0)), strict=True):
-        backs = np.interp(surface.vertices[:, 2], np.arange(len(arc.back)), arc.back)
-        risen = arc.rise * np.maximum(beyond, 0.0) * image.spacing_mm[0] / image.spacing_mm[1]
+    for (back, rise), beyond in zip(arcs, (-index[:, 0], index[:, 0] - (image.hu.shape[0] - 1.0)), strict=True):
+        backs = np.interp(surface.vertices[:, 2], np.arange(len(back)), back)
+        risen = rise * np.maximum(beyond, 0.0) * image.spacing_mm[0] / image.spacing_mm[1]
         index[:, 1] -= np.where(surface.vertices[:, 1] < backs, risen, 0.0)
     beyond = index[:, 2] - np.clip(index[:, 2], 0.0, image.hu.shape[2] - 1.0)
     index[:, :2] += beyond[:, None] * image.slopes * image.spacing_mm[2] / image.spacing_mm[:2]
@@ -217,6 +197,5 @@ def _stiff_pieces(mask: Bools, hu: NDArray[Any], spacing_mm: Floats) -> Bools:
 
 
 def _bulky(mask: Bools, spacing_mm: Floats) -> Bools:
-    """The bulky pieces of a mask."""
     found = parts_of(mask, corners=True)
     return found.painted(found.sizes * np.prod(spacing_mm) >= 1000.0 * BULKY_ML)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,14 +30,12 @@ ONE_PIECE_MM, ONE_PIECE = 0.25, 0.945
 drawn CTs. Of a trunk's straight back it is .80, of flanks .93: a back has no edge, flanks are none beside a table."""
 THICKEST_MM, ALIKE_MM = 80.0, 5.0
 """No table is thicker, and beside the body it is as thick to so much all over."""
-LEAST_LENGTH_MM, LEAST_SLICES, TILTS_FROM_MM = 50.0, 12, 100.0
-"""A shorter image, or fewer slices of a part of one, may show any body as one section; a bed at an angle needs more."""
-EDGE_MM = 30.0
-"""The edge of a table or cradle is no thicker."""
-NEAR_MM = 60.0
-"""A face is near the body up to this distance. Mattresses are at most 50 mm thick, and their foam is hardly seen."""
-CUT_FRACTION = 0.5
-"""A face cuts what the body lies on where something outside of the body ends at it in so many of the slices."""
+LEAST_LENGTH_MM, LEAST_SLICES, TILTS_FROM_MM, EDGE_MM = 50.0, 12, 100.0, 30.0
+"""A shorter image, or fewer slices of a part of one, may show any body as one section; a bed at an angle needs more.
+The edge of a table or cradle is no thicker than the last."""
+NEAR_MM, CUT_FRACTION = 60.0, 0.5
+"""A face is so near the body: mattresses are at most 50 mm thick, and their foam is hardly seen. It cuts what the body
+lies on where something outside of the body ends at it in so many of the slices."""
 TOO_SHORT = (
     "the image is only {length:.0f} mm long: a table or cradle that is as dense as the body and touches the body "
     "cannot be distinguished from it"
@@ -65,7 +64,6 @@ class Shown:
     """What a person says of an image: then no rule guesses it.
 
     Attributes:
-        phantom: It shows a phantom: no limb, and what holds together is the phantom.
         arms, table: ``none`` or ``present`` (one table, which may be cut off); None where nobody said so.
         whole: The image shows all of it, in air.
         about: Of several phantoms the one that holds this point is meant, LPS mm; the largest where none does.
@@ -96,9 +94,8 @@ class TableSide(NamedTuple):
 
     Attributes:
         line: Shape (n, nz), by line of sight and slice, where it ends or may end, voxels along the face's axis.
-        lines: Shape (n,), which lines of sight are those of the table.
+        lines: Shape (n,), which lines of sight are those of the table; ``width_mm`` of them are drawn.
         slope: How it moves along the face's axis, mm per mm along the bed.
-        width_mm: How much of them is drawn.
         firm: Whether the ends keep to one another, as those of a straight flank do less.
     """
 
@@ -117,7 +114,7 @@ class TableSide(NamedTuple):
 
 
 class Touching(NamedTuple):
-    """What touches the body: tables, shape of the body, that are cut off it; sides at which it ends as others do."""
+    """Voxels of tables that are cut off the body, and sides at which it ends as other tables do."""
 
     cut_off: Bools
     sides: tuple[TableSide, ...]
@@ -127,13 +124,9 @@ class Touching(NamedTuple):
 def touching_tables(
     hu: NDArray[Any], trunk: Bools, spacing_mm: Floats, shown: Shown = PATIENT, level: float = 0.0
 ) -> Touching:
-    """The tables that hold together with a body.
+    """The tables that hold together with a body (nx, ny, nz), axis 2 along the bed; of a phantom only what is cut off.
 
-    Args:
-        hu: Shape (nx, ny, nz), axis 2 along the bed.
-        trunk: Same shape; what is as dense and connected with it counts too, however thin.
-        shown: Of a phantom only what can be cut off is a table, unless there is said to be one.
-        level: Where the body's surface is, of the values.
+    What is denser than a level and connected with the body counts as body, however thin.
     """
     dense = hu > level
     parts = parts_of(dense | trunk)
@@ -161,10 +154,7 @@ def touching_tables(
 
 
 def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
-    """The table on which a body lies, shape of ``dense``; nothing where it is not seen beside the body.
-
-    Below the body its thickness is that between the two places beside the body where it is seen.
-    """
+    """The table on which a body lies, shape of ``dense``, below the body as thick as beside it; nothing if not seen."""
     axis, end = side.face
     table, along_mm = np.zeros(dense.shape, bool), float(spacing_mm[axis])
     view, out = (np.moveaxis(one, axis, 0)[:: -1 if end else 1] for one in (dense, table))  # as it is seen
@@ -188,10 +178,9 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
 
 
 def surface_ends(hu: NDArray[Any], body: Bools, level: float = 0.0) -> dict[Face, Floats]:
-    """Where a body's surface is, at a level of the values (nx, ny, nz), along each line of an axis, from each end.
+    """By face, where a body's surface is at a level, voxels along its axis, shape (n, nz).
 
-    Returns:
-        By face, voxels along its axis, shape (n, nz); NaN where there is no body, and where the image cuts it.
+    NaN where there is no body, and where the image cuts it.
     """
     surfaces = {}
     for (axis, end), at in zip(FACES, ends_of(body), strict=True):
@@ -208,73 +197,67 @@ def surface_ends(hu: NDArray[Any], body: Bools, level: float = 0.0) -> dict[Face
 def drawn_sides(
     surfaces: dict[Face, Floats], body: Bools, spacing_mm: Floats, *, touching: bool = True
 ) -> tuple[TableSide, ...]:
-    """The sides at which surfaces end in one section along the bed, beyond the middle of a body.
+    """The sides at which surfaces, as of `surface_ends`, end in one section along the bed, beyond a body's middle.
 
-    Args:
-        surfaces: By face, as `surface_ends` gives them.
-        body: Shape (nx, ny, nz).
-        touching: Whether the body itself ends there, or what is apart from it: that is known to a voxel.
+    ``touching``: the body itself ends there; what is apart from it is known to a voxel.
     """
     if body.shape[2] * spacing_mm[2] < LEAST_LENGTH_MM:
         return ()
     found, middle = list[TableSide | None](), middle_of(body)
     for face, ends in surfaces.items():
-        view = _View(face, ends, spacing_mm, touching)
-        parts = (view.side(middle, part) for part in view.parts())
-        found.append(view.side(middle) or max(filter(None, parts), key=lambda side: side.width_mm, default=None))
+        side_of = partial(_side, face, ends, spacing_mm, middle, touching)
+        parts = map(side_of, _parts(ends, spacing_mm[face[0]], spacing_mm[1 - face[0]], float(spacing_mm[2])))
+        found.append(side_of() or max(filter(None, parts), key=lambda side: side.width_mm, default=None))
     return tuple(filter(None, found))
 
 
-class _View(NamedTuple):
-    """Where lines of sight end at one side of a body.
+def _side(
+    face: Face, ends: Floats, spacing_mm: Floats, middle: Floats, touching: bool, part: slice = slice(None)
+) -> TableSide | None:
+    """The table's side in some of the slices, if there is one beyond the middle of the body, voxels.
 
-    Attributes:
-        ends: Shape (n, nz), voxels along its axis, NaN where they end at nothing that counts.
-        touching: Whether the body itself ends there: then beyond both edges nothing is free either.
+    By where lines of sight end (n, nz), voxels, NaN for nothing that counts. Where the body itself ends there, nothing
+    is free beyond both edges either.
     """
+    axis, end = face
+    along_mm, across_mm, step_mm = spacing_mm[[axis, 1 - axis, 2]].tolist()
+    near_mm, outward = DRAWN_MM if touching else max(DRAWN_MM, along_mm), 1.0 if end else -1.0
+    along_bed, ends_mm = np.arange(ends.shape[1]) * step_mm, ends[:, part] * along_mm
+    slope = _slopes(ends_mm, step_mm, across_mm)
+    level_mm = ends_mm - slope[:, None] * along_bed[part]
+    at = _medians(level_mm)
+    off_mm = level_mm - at[:, None]
+    drawn = (np.abs(off_mm) <= near_mm).mean(axis=1) >= DRAWN_FRACTION
+    drawn &= outward * (at + slope * middle[2] * step_mm) > outward * middle[axis] * along_mm
+    width_mm, closed = float(drawn.sum() * across_mm), scipy.ndimage.binary_closing(drawn, np.ones(3))
+    runs = scipy.ndimage.binary_opening(closed, np.ones(max(1, int(RUN_MM / across_mm))))
+    first, last = np.flatnonzero(runs)[[0, -1]] if runs.any() else (np.inf, -np.inf)
+    if width_mm < DRAWN_WIDTH_MM or not first <= middle[1 - axis] <= last:
+        return None
+    farthest = outward * np.fmax.reduce(outward * level_mm, axis=1)
+    at, across = np.where(drawn, at, farthest), np.arange(len(at))
+    within = (across >= first) & (across <= last)
+    known = np.isfinite(at) & within
+    line = np.interp(across, across[known], at[known])
+    # A table's ends keep to one another but for the noise of all; those of a straight back do so less.
+    noise_mm = float(np.nanmedian(np.abs(np.diff(ends_mm, 2, axis=1))))
+    apart_mm = np.abs(off_mm[drawn] - _medians(off_mm[drawn].T))
+    alike = apart_mm <= max(ONE_PIECE_MM, 3.0 * noise_mm)
+    firm = not touching or bool(alike.sum() >= ONE_PIECE * np.isfinite(apart_mm).sum())
+    line[~within] -= outward * ((EDGE_MM if firm else 0.0) if touching else -np.inf)
+    steady = np.interp(across, across[drawn], slope[drawn])[:, None] * along_bed
+    lines, of_bed = runs | (known & drawn), float(np.median(slope[drawn]))
+    return TableSide(face, (line[:, None] + steady) / along_mm, lines, of_bed, width_mm, firm)
 
-    face: Face
-    ends: Floats
-    spacing_mm: Floats
-    touching: bool
 
-    def side(self, middle: Floats, part: slice = slice(None)) -> TableSide | None:
-        """The table's side in some of the slices, if there is one beyond the middle of the body, voxels."""
-        axis, end = self.face
-        along_mm, across_mm, step_mm = self.spacing_mm[[axis, 1 - axis, 2]].tolist()
-        near_mm, outward = DRAWN_MM if self.touching else max(DRAWN_MM, along_mm), 1.0 if end else -1.0
-        along_bed, ends_mm = np.arange(self.ends.shape[1]) * step_mm, self.ends[:, part] * along_mm
-        slope = _slopes(ends_mm, step_mm, across_mm)
-        level_mm = ends_mm - slope[:, None] * along_bed[part]
-        at = _medians(level_mm)
-        off_mm = level_mm - at[:, None]
-        drawn = (np.abs(off_mm) <= near_mm).mean(axis=1) >= DRAWN_FRACTION
-        drawn &= outward * (at + slope * middle[2] * step_mm) > outward * middle[axis] * along_mm
-        width_mm, closed = float(drawn.sum() * across_mm), scipy.ndimage.binary_closing(drawn, np.ones(3))
-        runs = scipy.ndimage.binary_opening(closed, np.ones(max(1, int(RUN_MM / across_mm))))
-        first, last = np.flatnonzero(runs)[[0, -1]] if runs.any() else (np.inf, -np.inf)
-        if width_mm < DRAWN_WIDTH_MM or not first <= middle[1 - axis] <= last:
-            return None
-        farthest = outward * np.fmax.reduce(outward * level_mm, axis=1)
-        at, across = np.where(drawn, at, farthest), np.arange(len(at))
-        within = (across >= first) & (across <= last)
-        known = np.isfinite(at) & within
-        line = np.interp(across, across[known], at[known])
-        firm = not self.touching or _one_piece(ends_mm, off_mm[drawn])
-        line[~within] -= outward * ((EDGE_MM if firm else 0.0) if self.touching else -np.inf)
-        steady = np.interp(across, across[drawn], slope[drawn])[:, None] * along_bed
-        lines, of_bed = runs | (known & drawn), float(np.median(slope[drawn]))
-        return TableSide(self.face, (line[:, None] + steady) / along_mm, lines, of_bed, width_mm, firm)
-
-    def parts(self) -> Iterator[slice]:
-        """The parts of the bed between slices at which something as wide as a table begins or ends."""
-        axis, count = self.face[0], self.ends.shape[1]
-        ends_mm = np.nan_to_num(self.ends, nan=-1e6) * self.spacing_mm[axis]
-        moved = np.abs(ends_mm[:, 2:] - ends_mm[:, :-2]) >= ALIKE_MM
-        whole = np.pad(moved.sum(axis=0) * self.spacing_mm[1 - axis] < DRAWN_WIDTH_MM, 1, constant_values=True)
-        for (part,) in scipy.ndimage.find_objects(scipy.ndimage.label(whole)[0]):
-            if max(LEAST_SLICES, LEAST_LENGTH_MM / self.spacing_mm[2]) <= part.stop - part.start < count:
-                yield part
+def _parts(ends: Floats, along_mm: float, across_mm: float, step_mm: float) -> Iterator[slice]:
+    """The parts of the bed between slices at which something as wide as a table begins or ends."""
+    ends_mm = np.nan_to_num(ends, nan=-1e6) * along_mm
+    moved = np.abs(ends_mm[:, 2:] - ends_mm[:, :-2]) >= ALIKE_MM
+    whole = np.pad(moved.sum(axis=0) * across_mm < DRAWN_WIDTH_MM, 1, constant_values=True)
+    for (part,) in scipy.ndimage.find_objects(scipy.ndimage.label(whole)[0]):
+        if max(LEAST_SLICES, LEAST_LENGTH_MM / step_mm) <= part.stop - part.start < ends.shape[1]:
+            yield part
 
 
 def _slopes(ends_mm: Floats, step_mm: float, across_mm: float) -> Floats:
@@ -286,14 +269,6 @@ def _slopes(ends_mm: Floats, step_mm: float, across_mm: float) -> Floats:
     return scipy.ndimage.median_filter(slope, 2 * round(RUN_MM / across_mm) + 1)
 
 
-def _one_piece(ends_mm: Floats, off_mm: Floats) -> bool:
-    """Whether ends (k, nz), off their lines, keep to one another but for the noise of all: a back does so less."""
-    noise_mm = float(np.nanmedian(np.abs(np.diff(ends_mm, 2, axis=1))))
-    apart_mm = np.abs(off_mm - _medians(off_mm.T))
-    near = apart_mm <= max(ONE_PIECE_MM, 3.0 * noise_mm)
-    return bool(near.sum() >= ONE_PIECE * np.isfinite(apart_mm).sum())
-
-
 def _medians(values: Floats) -> Floats:
     """Of each row (n, k) the median of those that are known, shape (n,), the lower one of two; NaN without any."""
     ordered, count = np.sort(values, axis=1), np.isfinite(values).sum(axis=1)  # NaN comes last
@@ -301,13 +276,7 @@ def _medians(values: Floats) -> Floats:
 
 
 class Support(NamedTuple):
-    """What a body lies on.
-
-    Attributes:
-        drawn: Its far side, where it does not hold together with the body; one or none.
-        seen: Whether the image shows any, there or as one with the body.
-        open_faces: Faces beyond which nothing is known.
-    """
+    """Where a body lies: the far side of what is apart from it, whether any is seen, faces with the unknown beyond."""
 
     drawn: tuple[TableSide, ...]
     seen: bool
@@ -319,11 +288,8 @@ def find_support(
 ) -> Support:
     """What the body lies on, and the faces of the image beyond which nothing is known.
 
-    Args:
-        outside: Shape (nx, ny, nz), what was scanned, lies outside of the body and is not air; axis 2 along the bed.
-        body: Same shape.
-        touching: Tables that hold together with the body, so that they are not outside of it.
-        shown: A phantom lies on nothing where nothing is seen.
+    ``outside`` was scanned, lies outside of the body (nx, ny, nz), and is not air; tables that touch the body are not
+    in it.
     """
     if shown.table == "none":
         return Support((), False, ())
@@ -337,7 +303,8 @@ def find_support(
     arms = shown.limbs and bool(body[:, :, [0, -1]].any())  # of a body that ends in the image its arms are there too
 
     def hides(face: Face) -> bool:
-        axis, gap_mm = face[0], _gap_mm(body, face, spacing_mm)
+        axis, occupied = face[0], np.flatnonzero(body.any(axis=(1 - face[0], 2)))
+        gap_mm = float(spacing_mm[axis] * (body.shape[axis] - 1 - occupied[-1] if face[1] else occupied[0]))
         arm = arms and (shown.arms != "present" or gap_mm == 0.0)  # else they lie in the image
         if gap_mm > NEAR_MM or not (axis == 1 or arm):
             return False
@@ -362,11 +329,3 @@ def support_warnings(seen: bool, open_faces: Sequence[Face]) -> Iterator[str]:
             )
     if not seen and not open_faces:
         yield "the CT shows no support below the body; the space beyond its faces counts as air"
-
-
-def _gap_mm(body: Bools, face: Face, spacing_mm: Floats) -> float:
-    """From the body to a face of the image; 0 where the face cuts it."""
-    axis, end = face
-    occupied = np.flatnonzero(body.any(axis=(1 - axis, 2)))
-    voxels = occupied[0] if end == 0 else body.shape[axis] - 1 - occupied[-1]
-    return float(voxels * spacing_mm[axis])

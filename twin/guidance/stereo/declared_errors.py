@@ -14,7 +14,7 @@ from pydantic import Field, Strict, model_validator
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.errors import ARM_KINDS, ArmErrors
-from puncture_twin.planning.case.toml_types import Number, Section
+from puncture_twin.planning.case.tables import Number, Section
 
 Millimetres = Annotated[Number, Field(ge=0, le=50)]
 Degrees = Annotated[Number, Field(ge=0, le=10)]

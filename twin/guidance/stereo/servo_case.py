@@ -13,7 +13,7 @@ from puncture_twin.planning.base.errors import SchemaError, refuse
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
-from puncture_twin.planning.case.toml_types import Coordinate, Length, Name, Number, Section, Vector
+from puncture_twin.planning.case.tables import Coordinate, Length, Name, Number, Section, Vector
 from puncture_twin.planning.formats import points
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh

@@ -16,7 +16,7 @@ from puncture_twin.planning.base.errors import SchemaError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
 from puncture_twin.planning.case.errors import ArmErrors
-from puncture_twin.planning.case.toml_types import Length, Name, Number, Section, Sextuple, Vector
+from puncture_twin.planning.case.tables import Length, Name, Number, Section, Sextuple, Vector
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArm, DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise

@@ -45,7 +45,6 @@ from puncture_twin.planning.batch.run import (
     WHOLE,
     Estimate,
     Part,
-    Request,
     RunCounts,
     estimate,
     on_scheduler,
@@ -147,9 +146,10 @@ def run_part(out: Path, where: Where, watcher: Watcher) -> RunCounts:
     """
     part = _part(where.part, watcher)
     write_page = write_case_page if where.pages else None
-    request = Request(part, where.jobs, where.limits, write_page)
     elsewhere = None if where.scheduler is None else on_scheduler(where.scheduler)
-    return run_cohort(out, request, watcher, elsewhere)
+    return run_cohort(
+        out, watcher, part=part, jobs=where.jobs, limits=where.limits, write_page=write_page, elsewhere=elsewhere
+    )
 
 
 def _part(typed: str | None, watcher: Watcher) -> Part:
