@@ -27,7 +27,6 @@ class Breathing:
     Attributes:
         amplitude_mm: b, of the target, from exhale to full inhale.
         direction_ct: Shape (3,), unit: whereto inhaling moves it.
-        weights: Of everything else.
         scanned_at: The position s in which the CT shows the body.
         gate: The needle goes in while s is at most this; None for any time.
     """
@@ -92,10 +91,9 @@ SAME = 12
 
 
 def positions(phases: int, exponent: int) -> Floats:
-    """The distinct positions of so many phases, evenly spaced in time from exhale on; ascending, each in 0..1.
+    """The distinct positions of so many phases of a period, evenly spaced in time from exhale on; ascending, in 0..1.
 
-    Args:
-        phases: Of one period. An even number holds full inhale.
+    An even number holds full inhale.
 
     >>> positions(8, 2).round(3).tolist()
     [0.0, 0.021, 0.25, 0.729, 1.0]
@@ -105,20 +103,12 @@ def positions(phases: int, exponent: int) -> Floats:
 
 
 def fraction_within(position: float, exponent: int) -> float:
-    """Fraction of the time that the breath is at this position or nearer to exhale: 2/pi arcsin(s^(1/2n)).
-
-    Args:
-        position: s, 0 at exhale, 1 at full inhale.
-    """
+    """Fraction of the time that the breath is at this position or nearer to exhale: 2/pi arcsin(s^(1/2n))."""
     return float(2 / np.pi * np.arcsin(np.clip(position, 0.0, 1.0) ** (1 / (2 * exponent))))
 
 
 def position_at(fraction: Floats, position: float, exponent: int) -> Floats:
-    """Positions s of the breath at fractions of the time that it is at a position or nearer to exhale.
-
-    Args:
-        fraction: Any shape, each in 0..1.
-        position: The greatest, such as the gate.
+    """Positions s of the breath at fractions of the time that it is at a position, the gate, or nearer to exhale.
 
     >>> position_at(np.array([0.0, 1.0]), 0.25, 4).round(12).tolist()
     [0.0, 0.25]
@@ -131,10 +121,6 @@ def mean_square_within(position: float, exponent: int, about: float) -> float:
     """Mean of (s - about)^2 over the time that the breath is at this position or nearer to exhale.
 
     Without a gate it is C(4n, 2n) / 2^4n - 2 about C(2n, n) / 2^2n + about^2, of the powers of a sine.
-
-    Args:
-        position: s, 0 at exhale, 1 at full inhale.
-        about: s of the place that is compared with.
 
     >>> round(12 * mean_square_within(1.0, 4, 0.0) ** 0.5, 1)
     5.3

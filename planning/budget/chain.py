@@ -26,13 +26,7 @@ from puncture_twin.planning.uncertainty.pose_error import Bend, PoseError
 
 @dataclass(frozen=True, eq=False)
 class BentPath:
-    """A needle that bends, and the tissues of its path.
-
-    Attributes:
-        anatomy: Its structures, whose tissues the path passes.
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        path_length: Target to skin, mm.
-    """
+    """A needle that bends, and the tissues of its path, of ``path_length`` from target to skin, mm."""
 
     case: Case
     anatomy: Anatomy
@@ -56,11 +50,7 @@ class BentPath:
 
 
 def bent_path(case: Case, anatomy: Anatomy, outward_ct: Floats) -> BentPath | None:
-    """The path of one direction; None where the needle is straight, or the direction enters no skin.
-
-    Args:
-        outward_ct: Shape (3,), unit.
-    """
+    """The path of one direction; None where the needle is straight, or the direction enters no skin."""
     if case.bending is None:
         return None
     paths = case_paths(case, anatomy.skin, outward_ct[None])
@@ -89,38 +79,12 @@ GATES = (None, 0.5, 0.25, 0.1)
 
 
 @dataclass(frozen=True, eq=False)
-class Breath:
-    """The breathing of a case, in its base frame.
-
-    Attributes:
-        R_base_ct: Shape (3, 3).
-    """
-
-    breathing: Breathing
-    R_base_ct: Floats
-
-    def mean_square_base(self) -> Floats:
-        """Shape (3, 3), mm^2, of the target against where the CT shows it, base axes."""
-        moved = self.R_base_ct @ self.breathing.spread_ct
-        return np.asarray(moved @ moved.T)
-
-
-@dataclass(frozen=True, eq=False)
 class Chain:
     """The chain from a target in the CT to a needle's tip: registration, arm, errors.
 
     Attributes:
-        tip_mm: Flange to tip.
-        method: Of the registration: triad, rigid, weighted or joint.
         errors: As declared, times ``scale``.
         scale: By which the markers' residuals multiply every declared error: 1 where they agree.
-        points_ct: Shape (N, 3), mm, the markers.
-        q_touch: Shape (N, 6), rad, how the arm touches them.
-        T_base_ct: Shape (4, 4), mm.
-        target_ct: Shape (3,), mm.
-        q_insertion: Shape (6,), rad, the tip on the target.
-        path: Of a needle that bends; None for a straight one.
-        breath: None where it is not declared.
         motion_base: Shape (3, 3), mm^2, of the target since the scan, base axes; None where it is not declared.
         aim: The insertion that a joint registration is corrected for.
     """
@@ -136,7 +100,7 @@ class Chain:
     target_ct: Floats
     q_insertion: Floats
     path: BentPath | None = None
-    breath: Breath | None = None
+    breathing: Breathing | None = None
     motion_base: Floats | None = None
     aim: Aim | None = None
 
@@ -158,7 +122,10 @@ class Chain:
 
     def body_mean_squares(self) -> dict[str, Floats]:
         """What the body adds, by source: shape (3, 3) each, mm^2, base axes."""
-        found = {} if self.breath is None else {"breathing": self.breath.mean_square_base()}
+        found = {}
+        if self.breathing is not None:  # of the target against where the CT shows it
+            moved = self.T_base_ct[:3, :3] @ self.breathing.spread_ct
+            found["breathing"] = moved @ moved.T
         return found if self.motion_base is None else {**found, "motion": self.motion_base}
 
     def expected_mm(self) -> float:
@@ -172,13 +139,7 @@ class Chain:
 
 
 def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: BentPath | None = None) -> Chain:
-    """The chain of a case, with its breathing and motion.
-
-    Args:
-        registration: Of its markers, with the case's own declaration, to whose residuals the errors are scaled.
-        q_insertion: Shape (6,), rad, the tip on the target.
-        path: Of the needle there, where it bends.
-    """
+    """The chain of a case, with its breathing and motion."""
     assert case.errors is not None and registration.uncertainty is not None
     scale, R = registration.uncertainty.test.scale, registration.T_base_ct[:3, :3]
     return Chain(
@@ -193,7 +154,7 @@ def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: 
         case.target_ct,
         q_insertion,
         path,
-        None if case.breathing is None else Breath(case.breathing, R),
+        case.breathing,
         None if case.motion is None else R @ case.motion.target_cov_ct @ R.T,
         registration.aim,
     )

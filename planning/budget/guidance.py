@@ -66,11 +66,7 @@ _DEVICES = MappingProxyType({"cameras": "stereo", "target": "ultrasound", "tip":
 
 
 def check_way(way: str) -> None:
-    """Refuse a way that there is not.
-
-    Raises:
-        InputError: Naming those that there are.
-    """
+    """Refuse a way that there is not."""
     if way not in guided.WAYS:
         refuse(f"guidance '{way}' is not known", "--guidance", ", ".join(guided.WAYS), "unknown_guidance")
 
@@ -79,11 +75,7 @@ MOST_STEPS = 10
 
 
 def stepped(way: str | None, steps: int | None) -> str | None:
-    """The way that reads a control scan after each of so many steps; without steps, the way as it is.
-
-    Raises:
-        InputError: Steps of another way than ct, or too few or many.
-    """
+    """The way that reads a control scan after each of so many steps; without steps, the way as it is."""
     if steps is None:
         return way
     if way != "ct":
@@ -94,11 +86,7 @@ def stepped(way: str | None, steps: int | None) -> str | None:
 
 
 def ways_of(text: str) -> tuple[str, ...]:
-    """Ways of guidance in a list with commas between them.
-
-    Raises:
-        InputError: One that there is not, or the same twice.
-    """
+    """Ways of guidance in a list with commas between them, each once."""
     ways = tuple(part.strip() for part in text.split(","))
     for row, way in enumerate(ways):
         check_way(way)
@@ -125,27 +113,20 @@ def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
     if "ultrasound" in needed and case.ultrasound is None:
         probe = ultrasound_of(UltrasoundSection(), case.space, case.path)
         assert probe is not None
-        target, tip = (
-            "{:g} mm in the picture and {:g} mm across".format(*sd) for sd in (probe.target_sd_mm, probe.tip_sd_mm)
-        )
+        both = "{0[0]:g} mm in the picture and {0[1]:g} mm across"
+        target, tip = both.format(probe.target_sd_mm), both.format(probe.tip_sd_mm)
         said.append(f"[ultrasound] target read to {target}, tip to {tip}, calibrated to {probe.calibration_sd_mm:g} mm")
         case = replace(case, ultrasound=probe)
     if "control_scan" in needed and case.control_scan is None:
         scan = ControlScanSection()
-        said.append(
-            f"[control_scan] slices of {scan.slice_mm:g} mm that show the target, {scan.dose_msv:g} mSv and "
-            f"{scan.seconds:g} s each"
-        )
+        cost = f"{scan.dose_msv:g} mSv and {scan.seconds:g} s each"
+        said.append(f"[control_scan] slices of {scan.slice_mm:g} mm that show the target, {cost}")
         case = replace(case, control_scan=scan)
     return case, tuple(f"assumed: {one}" for one in said)
 
 
 def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
-    """The pose error of trials: touched in stated configurations, errors of the estimated size as if declared.
-
-    Args:
-        q_touch: Shape (N, 6), rad: known, or likely ones.
-    """
+    """The pose error of trials: touched in configurations (N, 6), errors of the estimated size as if declared."""
     errors, fit = error.errors.scaled(error.fit.test.scale), error.fit
     noise = reading_noise(errors, error.model, error.tip_mm, q_touch, known=True)
     test = NoiseTest(fit.test.count, float(fit.test.freedom))
@@ -154,13 +135,7 @@ def as_rehearsed(error: PoseError, q_touch: Floats) -> PoseError:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What the devices see during an insertion.
-
-    Attributes:
-        cameras: None where they are not asked about.
-        probe: None where it is not.
-        no_cameras: Why there is no place for cameras; empty where there is one.
-    """
+    """What those devices see of an insertion that were asked about, and why there is no place for cameras, if so."""
 
     cameras: CameraView | None = None
     probe: ProbeView | None = None
@@ -222,10 +197,6 @@ def guided_model(
     """What guidance knows of one insertion.
 
     Args:
-        case: Declares the devices, and what moves.
-        error: Of the needle, as rehearsed.
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        q: Shape (6,), rad, the tip on the target.
         sight: What the devices see of it; None hides nothing, and has the picture along the body.
         steps: After each of so many a control scan is read, and nothing else looks; None scans nothing.
     """
@@ -234,8 +205,16 @@ def guided_model(
     if breathing is not None:
         breath, skin_weight = breathing.spread_ct, moving_weights(case, breathing, anatomy).skin
     motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
-    looks = _looks(case, anatomy, error, outward_ct, q, sight or Sight(), steps)
-    push = target_push(case, anatomy, outward_ct)
+    sight = sight or Sight()
+    looks = _looks(case, anatomy, error, outward_ct, q, sight, steps)
+    push, push_mm = target_push(case, anatomy, outward_ct), None
+    if push is not None:  # at each look, and at the end
+        push_mm = push.at(push.target_mm - np.array([*(look.out_mm for look in looks), 0.0]))
+    if sight.probe is not None and sight.probe.T_ct_image is not None:
+        across = sight.probe.T_ct_image[:3, 2]
+    else:  # the normal of the plane of the needle that comes nearest to the body's long axis
+        across = np.cross(outward_ct, [0.0, 0.0, 1.0] if abs(outward_ct[2]) < 0.9 else [1.0, 0.0, 0.0])
+        across = across / np.linalg.norm(across)
     return guided.GuidedModel(
         error=error,
         markers=registration.markers.names,
@@ -248,8 +227,8 @@ def guided_model(
         stereo=case.stereo if steps is None else None,
         ultrasound=case.ultrasound if steps is None else None,
         scan=None if steps is None else case.control_scan,
-        across=R @ _across(outward_ct, sight or Sight()),
-        push=None if push is None else np.outer(_push_mm(push, looks), -R @ outward_ct),
+        across=R @ across,
+        push=None if push_mm is None else np.outer(push_mm, -R @ outward_ct),
     )
 
 
@@ -266,11 +245,6 @@ def target_push(case: Case, anatomy: Anatomy, outward_ct: Floats) -> Pushed | No
         return None
     end = case.target_ct - BEYOND_TARGET_MM * outward_ct
     return pushed(path_layers(case.bending, anatomy, end, outward_ct, length + BEYOND_TARGET_MM), length)
-
-
-def _push_mm(push: Pushed, looks: Sequence[guided.Look]) -> Floats:
-    """At each look, and at the end."""
-    return push.at(push.target_mm - np.array([*(look.out_mm for look in looks), 0.0]))
 
 
 def _looks(
@@ -299,25 +273,10 @@ def _drawn_back(model: UrModel, q: Floats, outs: Sequence[float] | Floats) -> Fl
     return np.asarray(there[np.arange(len(there)), off.argmin(axis=1)])
 
 
-def _across(outward_ct: Floats, sight: Sight) -> Floats:
-    """Normal of the picture: the probe's, or of the plane of the needle that comes nearest to the body's long axis."""
-    if sight.probe is not None and sight.probe.T_ct_image is not None:
-        return sight.probe.T_ct_image[:3, 2]
-    along = np.array([0.0, 0.0, 1.0]) if abs(outward_ct[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
-    across = np.cross(outward_ct, along)
-    return np.asarray(across / np.linalg.norm(across))
-
-
 def way_chances(
     context: CaseContext, outward_ct: Floats, q: Floats, sight: Sight | None = None
 ) -> tuple[guided.WayChance, ...]:
-    """What each way would leave of an insertion, ct first, by the devices of a case; nothing where it declares none.
-
-    Args:
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        q: Shape (6,), rad, the tip on the target.
-        sight: What the devices see; None hides nothing.
-    """
+    """What each way would leave of an insertion, ct first, by the devices of a case; nothing where it declares none."""
     case, chance = context.case, context.chance
     ways = declared_ways(case)
     if len(ways) == 1 or chance is None or context.placement is None or context.placement.registration is None:
@@ -349,11 +308,7 @@ def with_ways(context: CaseContext, plan: Plan) -> Plan:
 
 
 def check_ways(context: CaseContext, plan: Plan, where: str | Path) -> None:
-    """Refuse a plan that states other chances by guidance than its case gives: people read them.
-
-    Raises:
-        InputError: It does.
-    """
+    """Refuse a plan that states other chances by guidance than its case gives: people read them."""
     known = with_ways(context, plan).guidance
     same = len(known) == len(plan.guidance) and all(
         a.way == b.way
@@ -410,19 +365,16 @@ def followers(case: Case, anatomy: Anatomy) -> tuple[guided.Follows, ...]:
 
 def lost_sight(model: guided.GuidedModel, way: str) -> tuple[str, ...]:
     """What a way's devices do not see, where and why, a sentence each; that the tip is not yet in the body is none."""
-    return tuple(
-        f"{_where(look)}: {what} out of sight: {why}"
-        for look in model.looks
-        for what, why in look.hidden.items()
-        if guided.device_of(what) in guided.READS[way] and why != OUTSIDE
-    )
+    said = []
+    for look in model.looks:
+        where = "at the target" if look.out_mm <= 0 else f"{look.out_mm:.0f} mm before the target"
+        for what, why in look.hidden.items():
+            if guided.device_of(what) in guided.READS[way] and why != OUTSIDE:
+                said.append(f"{where}: {what} out of sight: {why}")
+    return tuple(said)
 
 
 OUTSIDE = "it is not in the body yet"
-
-
-def _where(look: guided.Look) -> str:
-    return "at the target" if look.out_mm <= 0 else f"{look.out_mm:.0f} mm before the target"
 
 
 def guided_error(model: guided.GuidedModel, way: str, follows: guided.Follows = guided.WHOLLY) -> guided.GuidedError:
@@ -448,11 +400,7 @@ PHASES = 8
 def at_phases(
     model: guided.GuidedModel, way: str, chance: ChanceModel, follows: guided.Follows = guided.WHOLLY
 ) -> list[ChanceModel]:
-    """The chances of a way's needle against such anatomy at each position of the breath in the gate, known there.
-
-    Raises:
-        NoAnswerError: As `guided_error`.
-    """
+    """The chances of a way's needle against such anatomy at each position of the breath in the gate, known there."""
     error, breathing, deviations = guided_error(model, way, follows), chance.case.breathing, np.zeros(1)
     if breathing is not None:
         gate = 1.0 if breathing.gate is None else breathing.gate
@@ -464,11 +412,7 @@ def at_phases(
 
 
 def guided_chances(model: guided.GuidedModel, way: str, chance: ChanceModel, corridor_mm: float) -> tuple[float, float]:
-    """The chance that a way's needle is not stopped, and hits, and the chance that it is stopped.
-
-    Raises:
-        NoAnswerError: As `guided_error`.
-    """
+    """The chance that a way's needle is not stopped, and hits, and the chance that it is stopped."""
     q, p_stop = model.q_insertion[None], model.stop_chance(way, corridor_mm)
     hit = [one.hit_chance(one.error.covariance_ct(q))[0] for one in at_phases(model, way, chance)]
     return (1.0 - p_stop) * float(np.mean(hit)), p_stop

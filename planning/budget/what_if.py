@@ -9,12 +9,12 @@ import numpy as np
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.base.arrays import Floats, Ints
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.breathing.breathing import fraction_within
 from puncture_twin.planning.budget.chain import GATES, Chain, other_gauges
-from puncture_twin.planning.case.errors import ARM_KINDS, UNIFORM, ErrorModel
+from puncture_twin.planning.case.errors import ARM_KINDS, UNIFORM
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.uncertainty.pose_error import error_budget
@@ -24,10 +24,8 @@ SPACINGS_MM = (1.0, 2.0, 3.0, 5.0)
 MOST_MARKERS = 10
 CANDIDATES = 40
 """Places on the skin that are tried for each further marker."""
-
 APART_MM = 20.0
 """One more marker is no nearer than this to another."""
-
 PIVOTED_MM = 0.05
 """What a pivot calibration with 20 poses leaves of the tip's offset, per axis."""
 
@@ -52,7 +50,6 @@ class Change:
 
     Attributes:
         group: slices, markers, touches, arm, tip, needle, breath or body.
-        rms_mm: The tip's expected error then, all else as it is.
         point_ct: Shape (3,), mm, where the last of further markers sits; None for other changes.
     """
 
@@ -77,19 +74,13 @@ def source_costs(chain: Chain) -> tuple[SourceCost, ...]:
 
 
 def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tuple[Change, ...]:
-    """The changes of a chain, each alone.
-
-    Args:
-        skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
-        bed_ct: Shape (3,), unit, across the CT's slices; None where it is not stated, and slices are left out.
-    """
+    """The changes of a chain, each alone."""
     return (
         *([] if bed_ct is None else _slices(chain, bed_ct)),
         *_touches(chain),
         *_arms(chain),
         *_needles(chain),
-        *_gates(chain),
-        *_fixation(chain),
+        *_body(chain),
         *_fewer_markers(chain),
         *_more_markers(chain, skin_points_ct),
     )
@@ -105,14 +96,11 @@ def _slices(chain: Chain, bed_ct: Floats) -> Iterator[Change]:
     across = np.outer(bed_ct, bed_ct)
     for spacing in SPACINGS_MM:
         reading = cov + ((chain.scale * UNIFORM * spacing) ** 2 - bed_ct @ cov @ bed_ct) * across
-        errors = replace(chain.errors, marker_cov_ct=reading, target_cov_ct=_target(chain.errors, reading))
+        # the target is read in other slices too, unless it was declared by itself
+        alike = np.array_equal(chain.errors.target_cov_ct, cov)
+        errors = replace(chain.errors, marker_cov_ct=reading)
+        errors = replace(errors, target_cov_ct=reading) if alike else errors
         yield Change("slices", f"slices of {spacing:g} mm", chain.with_errors(errors).expected_mm())
-
-
-def _target(errors: ErrorModel, reading: Floats) -> Floats:
-    """Chains in which the target is read in other slices too, unless it was declared by itself."""
-    alike = np.array_equal(errors.target_cov_ct, errors.marker_cov_ct)
-    return reading if alike else errors.target_cov_ct
 
 
 def _touches(chain: Chain) -> Iterator[Change]:
@@ -148,20 +136,16 @@ def _needles(chain: Chain) -> Iterator[Change]:
         yield Change("needle", "a needle without a bevel", replace(chain, path=path.without_bevel()).expected_mm())
 
 
-def _gates(chain: Chain) -> Iterator[Change]:
-    if chain.breath is None:
-        return
-    declared = chain.breath.breathing
+def _body(chain: Chain) -> Iterator[Change]:
+    declared = chain.breathing
     for gate in GATES:
-        if gate == declared.gate:
+        if declared is None or gate == declared.gate:
             continue
-        breath = replace(chain.breath, breathing=replace(declared, gate=gate))
-        part = 1.0 if gate is None else fraction_within(gate, declared.exponent)
-        when = "at any phase" if gate is None else f"at s <= {gate:g} ({100 * part:.0f} % of the time)"
-        yield Change("breath", f"inserted {when}", replace(chain, breath=breath).expected_mm())
-
-
-def _fixation(chain: Chain) -> Iterator[Change]:
+        when = "at any phase"
+        if gate is not None:
+            when = f"at s <= {gate:g} ({100 * fraction_within(gate, declared.exponent):.0f} % of the time)"
+        gated = replace(chain, breathing=replace(declared, gate=gate))
+        yield Change("breath", f"inserted {when}", gated.expected_mm())
     if chain.motion_base is not None:
         fixed = replace(chain, motion_base=None)
         yield Change("body", "a body that is fixed as it was scanned", fixed.expected_mm())
@@ -172,41 +156,30 @@ def _fewer_markers(chain: Chain) -> Iterator[Change]:
     found = []
     while len(chain.points_ct) > MIN_MARKERS:
         every = np.arange(len(chain.points_ct))
-        rest = [_with_rows(chain, np.delete(every, row)) for row in every]
+        kept = [np.delete(every, row) for row in every]
+        rest = [replace(chain, points_ct=chain.points_ct[rows], q_touch=chain.q_touch[rows]) for rows in kept]
         chain = min(rest, key=lambda one: one.expected_mm())
         found.append(Change("markers", f"only {plural(len(chain.points_ct), 'marker')}", chain.expected_mm()))
     yield from reversed(found)
 
 
-def _with_rows(chain: Chain, rows: Ints) -> Chain:
-    return replace(chain, points_ct=chain.points_ct[rows], q_touch=chain.q_touch[rows])
-
-
 def _more_markers(chain: Chain, skin_points_ct: Floats) -> Iterator[Change]:
-    """The effect of more markers, each where it helps most, touched in the insertion's orientation."""
     points = skin_points_ct[:: max(1, len(skin_points_ct) // CANDIDATES)]
-    q = _touch_like_insertion(chain, points)
+    # joints (n, 6) that touch the points in the insertion's orientation, nearest to it; NaN where none do
+    R, poses = flange_pose(chain.model, chain.q_insertion)[:3, :3], np.tile(np.eye(4), (len(points), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = R, apply(chain.T_base_ct, points) - chain.tip_mm * R[:, 2]
+    every = nearest_within_limits(chain.model, inverse(chain.model, poses), chain.q_insertion)
+    far = np.abs(every - chain.q_insertion).max(axis=2)
+    q = every[np.arange(len(every)), np.where(np.isnan(far), np.inf, far).argmin(axis=1)]
     points, q = points[~np.isnan(q).any(axis=1)], q[~np.isnan(q).any(axis=1)]
     while len(chain.points_ct) < MOST_MARKERS:
         gaps = np.linalg.norm(points[:, None] - chain.points_ct, axis=2).min(axis=1, initial=np.inf)
-        grown = [_with_one_more(chain, points[row], q[row]) for row in np.flatnonzero(gaps >= APART_MM)]
+        method = "rigid" if chain.method == "triad" else chain.method  # a triad takes three
+        grown = []
+        for row in np.flatnonzero(gaps >= APART_MM):
+            more = np.vstack([chain.points_ct, points[row]]), np.vstack([chain.q_touch, q[row]])
+            grown.append(replace(chain, points_ct=more[0], q_touch=more[1], method=method).with_errors(chain.errors))
         if not grown:
             return
         chain = min(grown, key=lambda one: one.expected_mm())
         yield Change("markers", f"{plural(len(chain.points_ct), 'marker')}", chain.expected_mm(), chain.points_ct[-1])
-
-
-def _with_one_more(chain: Chain, point_ct: Floats, q: Floats) -> Chain:
-    """A triad takes three: with more markers the fit is that of the declared errors."""
-    grown = replace(chain, points_ct=np.vstack([chain.points_ct, point_ct]), q_touch=np.vstack([chain.q_touch, q]))
-    return (replace(grown, method="rigid") if chain.method == "triad" else grown).with_errors(chain.errors)
-
-
-def _touch_like_insertion(chain: Chain, points_ct: Floats) -> Floats:
-    """Joints (n, 6), rad, that touch points (n, 3) in the insertion's orientation, nearest to it; NaN where none do."""
-    R = flange_pose(chain.model, chain.q_insertion)[:3, :3]
-    poses = np.tile(np.eye(4), (len(points_ct), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = R, apply(chain.T_base_ct, points_ct) - chain.tip_mm * R[:, 2]
-    q = nearest_within_limits(chain.model, inverse(chain.model, poses), chain.q_insertion)
-    far = np.abs(q - chain.q_insertion).max(axis=2)
-    return np.asarray(q[np.arange(len(q)), np.where(np.isnan(far), np.inf, far).argmin(axis=1)])

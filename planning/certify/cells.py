@@ -8,6 +8,7 @@ corner: docs/concepts/certificate.md proves that it encloses the cell.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,34 +19,23 @@ from puncture_twin.planning.case.entry import outward
 
 ROUNDING_RAD = 1e-12
 """Added to a cell's radius: thousands of times the rounding of its corners."""
-
 WIDEST_BETA = np.pi
 """A wider cell has no enclosing cone here: its farthest point need not be a corner."""
-
 SQUARE = 1.5
 """A cell longer than this times its width is halved along its length only."""
-
 NEARLY = 1.25
 """Half a square cell has 0.79 times its diameter."""
-
 OFF_CENTRE = (0.6373, 0.5719)
 """Where in a cell (fraction of θ, fraction of β) its test ray runs: meshes are regular, so not through the middle."""
-
 SPLITS = "tbq"
 """How a cell is halved: along θ, along β, or both (quartered)."""
-
 SQUARE_DEGREES = (180 / np.pi) ** 2
 """Square degrees in a steradian."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """n cells of the entry frame, rad.
-
-    Attributes:
-        theta: Shape (n, 2), lowest and highest puncture angle.
-        beta: Shape (n, 2), lowest and highest azimuth.
-    """
+    """n cells of the entry frame, rad."""
 
     theta: Floats
     beta: Floats
@@ -73,12 +63,7 @@ class Cells:
         return np.asarray(2 * np.sin(middle) * np.sin(half) * np.ptp(self.beta, axis=1))
 
     def splits(self, radius: Floats, size: float = 0.0) -> NDArray[np.str_]:
-        """How each cell is best halved, letters of `SPLITS`, shape (n,).
-
-        Args:
-            radius: Of the cells, shape (n,), rad.
-            size: The wanted angular diameter, rad: where one half is about as small, no quarters are made.
-        """
+        """How each cell is best halved, letters of `SPLITS`; no quarters where a half is about of ``size``, rad."""
         tall = self.theta[:, 1] - self.theta[:, 0]
         widest = np.clip(np.pi / 2, self.theta[:, 0], self.theta[:, 1])
         wide = self.beta[:, 1] - self.beta[:, 0]
@@ -108,7 +93,6 @@ class Cones:
     Attributes:
         centres: Shape (n, 3), unit, the middle of each cell.
         radius: Shape (n,), half-angle of the cone about it that encloses the cell, rad; π where none is known.
-        corners: Shape (n, 4, 3), unit.
         bulge: Shape (n,), every direction of the cell is a sum of its corners, with weights that are not negative and
             add up to at least 1, and of a vector no longer than this.
     """
@@ -144,8 +128,7 @@ def _cones(theta, beta, R, centres, radius, corners, bulge):  # type: ignore[no-
         bulge[i] = 2 * from_pole * np.sin(wide / 4) ** 2 + ROUNDING_RAD
 
 
-@dataclass(frozen=True, eq=False)
-class Children:
+class Children(NamedTuple):
     """Parts of cells, and the row of the cell that each is part of, shape (n,)."""
 
     cells: Cells
@@ -175,15 +158,7 @@ def _part(ranges: Floats, which: NDArray[np.int64]) -> Floats:
 
 
 def nearest_cell(theta: Floats, beta: Floats, cells: Cells) -> Floats:
-    """Angle from each direction to the nearest of the cells, shape (n,), rad.
-
-    0 inside a cell, π where there is no cell at all.
-
-    Args:
-        theta: Shape (n,), rad.
-        beta: Shape (n,), rad.
-        cells: Where to; also ones too wide for a cone.
-    """
+    """Angle from each direction to the nearest of the cells, (n,), rad; 0 inside, π where there is none at all."""
     theta, beta = np.atleast_1d(np.asarray(theta, dtype=float)), np.atleast_1d(np.asarray(beta, dtype=float))
     cone = cells.centres(), np.cos(cells.radius()), np.sin(cells.radius())
     return np.asarray(_nearest(theta, beta, outward(theta, beta), cells.theta, cells.beta, *cone))

@@ -15,7 +15,7 @@ from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
-from puncture_twin.planning.base.polar_map import Entry, PolarMap, Sectors, polar_map
+from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
 from puncture_twin.planning.base.provenance import inputs_document, read_inputs
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason, Rgb
 from puncture_twin.planning.base.strict_json import (
@@ -46,7 +46,6 @@ the body, and beyond the image, counts up to each direction's own flange."""
 
 MAX_CERTIFICATE_BYTES = 500_000_000
 """A certificate has some ten thousand cells; a larger file is something else."""
-
 CERTIFICATE_ALLOWED = f"a certificate of version {CERTIFICATE_VERSION}, as search --certify writes it"
 
 NAMES = frozenset({
@@ -55,10 +54,8 @@ NAMES = frozenset({
     *("touch", "size_rad", "queries", "summary", "tree", "witness"),
 })  # fmt: skip
 """The keys of a certificate."""
-
 CONE_ROUNDING_RAD = 1e-7
 """Taken from a safe cone: arccos near 1 rounds to 1e-8."""
-
 CERTIFIED = (
     "clearance to every structure with a margin",
     "what is outside of the body, or beyond the image, up to the flange at standoff; faces that cut the body",
@@ -68,15 +65,14 @@ CERTIFIED = (
     "skin angle",
 )
 """The constraints that hold all over a safe cell."""
-
 TOUCH_CERTIFIED = "chance to touch each structure: at most {:g}"
 """Also certified where a chance was stated; margins are then so wide that a cell is rejected for it."""
-
 NOT_CERTIFIED = ("reach of the arm", "approach of the arm", "limits of chances (min_hit, max_touch)")
 """Constraints that a certificate does not prove."""
-
 PROVED_SAFE, REJECTED, UNDECIDED = "SRU"
 """Letters of the leaves in the tree; lower-case letters are splits (`puncture_twin.planning.certify.cells.SPLITS`)."""
+UNDECIDED_COLOUR: Rgb = (255, 255, 255)
+"""Colour of cells that are too small to decide: neither a safe colour nor a reason's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +115,26 @@ class Certificate(Shown):
         return f"Certificate of {self.question.case_name}"
 
     def _facts(self) -> Facts:
-        return _facts(self)
+        summary = self.summary()
+        for word in ("safe", "rejected", "undecided"):
+            text = "proven safe for the organs" if word == "safe" else word
+            yield text, f"{summary[f'{word}_square_deg']:.2f} deg², {summary[f'{word}_cells']:,} cells"
+        yield "smallest cell", f"{summary['size_deg']:g}°"
+        yield "proven for every direction of a safe cell", "; ".join(summary["certified"])
+        yield "not certified", "; ".join(summary["not_certified"])
 
     def _picture(self) -> str:
-        return _map(self)._repr_html_()
+        legend = [
+            Entry("proven safe for the organs", SAFE),
+            *(Entry(REASON_TEXT[reason], colour) for reason, colour in REASON_COLOURS.items()),
+            Entry("undecided", UNDECIDED_COLOUR),
+        ]
+        number = {reason.value: row for row, reason in enumerate(REASON_COLOURS, start=1)}
+        of_letter, letters = {"S": 0, "U": len(legend) - 1}, zip(self.verdict, self.reason, strict=True)
+        code = np.array([of_letter.get(letter, number.get(str(why), 1)) for letter, why in letters])
+        beta = self.leaves.beta
+        shifted = beta - 2 * np.pi * np.floor(beta[:, :1] / (2 * np.pi))
+        return polar_map(Sectors(self.leaves.theta, shifted, code), legend)._repr_html_()
 
     @cached_property
     def areas(self) -> dict[str, float]:
@@ -139,29 +151,18 @@ class Certificate(Shown):
         """Verdict letter at directions (n,) of the entry frame, rad; "" outside the cap."""
         found = np.full(len(theta), "", dtype="U1")
         for letter in (UNDECIDED, REJECTED, PROVED_SAFE):
-            found[self._distance(theta, beta, self.verdict == letter) == 0] = letter
+            found[nearest_cell(theta, beta, self.leaves.take(self.verdict == letter)) == 0] = letter
         return found
 
     def safe_cone(self, outward_ct: Floats) -> Floats:
-        """Angle by which each direction may be off in any direction and still be proven safe, shape (n,), rad.
+        """Angle by which each direction (n, 3) may be off in any direction and still be proven safe, shape (n,), rad.
 
         0 for a direction in a cell that is not safe, or outside the cap: nothing is proven there.
-
-        Args:
-            outward_ct: Shape (n, 3), unit vectors.
         """
         theta, beta = angles(outward_ct @ self.question.R_ct_entry)
-        free = self._distance(theta, beta, self.verdict != PROVED_SAFE)
-        return np.maximum(np.minimum(free, self._to_border(theta, beta)) - CONE_ROUNDING_RAD, 0.0)
-
-    def _distance(self, theta: Floats, beta: Floats, which: NDArray[np.bool_]) -> Floats:
-        return nearest_cell(theta, beta, self.leaves.take(which))
-
-    def _to_border(self, theta: Floats, beta: Floats) -> Floats:
-        """Angle to the nearest direction outside the cap; 0 outside it."""
+        free = nearest_cell(theta, beta, self.leaves.take(self.verdict != PROVED_SAFE))
         (low, high), (first, last) = self.question.theta, self.question.beta
-        outside = []
-        turn = 2 * np.pi
+        outside, turn = [], 2 * np.pi  # the cap
         if low > 0:
             outside.append((0.0, low, 0.0, turn))
         if high < np.pi:
@@ -169,15 +170,13 @@ class Certificate(Shown):
         if last - first < turn:
             outside.append((0.0, np.pi, last, first + turn))
         ranges = np.array(outside, float).reshape(-1, 4)
-        return nearest_cell(theta, beta, Cells(ranges[:, :2], ranges[:, 2:]))
+        to_border = nearest_cell(theta, beta, Cells(ranges[:, :2], ranges[:, 2:]))
+        return np.maximum(np.minimum(free, to_border) - CONE_ROUNDING_RAD, 0.0)
 
     def summary(self) -> dict[str, Any]:
         """The main numbers as plain values; degrees, square degrees."""
-        areas, cells = (
-            self.areas,
-            {letter: int((self.verdict == letter).sum()) for letter in (PROVED_SAFE, REJECTED, UNDECIDED)},
-        )
-        touch = self.question.touch
+        areas, touch = self.areas, self.question.touch
+        cells = {letter: int((self.verdict == letter).sum()) for letter in areas}
         return {
             "size_deg": float(np.degrees(self.size)),
             "certified": [*CERTIFIED, *(() if touch is None else (TOUCH_CERTIFIED.format(touch),))],
@@ -219,6 +218,7 @@ def leaves_of(cap: Cells, tree: tuple[str, ...], where: str | Path = "certificat
 def write_certificate(certificate: Certificate, path: Path) -> None:
     """Write a certificate as JSON, whole or not at all; lengths in mm, angles in rad where not named ``_deg``."""
     question = certificate.question
+    columns = certificate.reason, certificate.structure, certificate.triangle, certificate.bound
     document = {
         "version": CERTIFICATE_VERSION,
         "case": question.case_name,
@@ -240,19 +240,13 @@ def write_certificate(certificate: Certificate, path: Path) -> None:
         "queries": certificate.queries,
         "summary": certificate.summary(),
         "tree": list(certificate.tree),
-        "witness": _witnesses(certificate),
+        "witness": [  # of each leaf
+            [reason, structure, triangle, round(bound, 6) if np.isfinite(bound) else None]
+            for reason, structure, triangle, bound in zip(*(column.tolist() for column in columns), strict=True)
+        ],
     }
     with atomic(path) as temporary:
         temporary.write_text(json.dumps(document, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _witnesses(certificate: Certificate) -> list[list[Any]]:
-    """Reason, structure, triangle and bound of each leaf."""
-    columns = certificate.reason, certificate.structure, certificate.triangle, certificate.bound
-    return [
-        [reason, structure, triangle, round(bound, 6) if np.isfinite(bound) else None]
-        for reason, structure, triangle, bound in zip(*(column.tolist() for column in columns), strict=True)
-    ]
 
 
 def read_certificate(path: Path) -> Certificate:
@@ -261,8 +255,7 @@ def read_certificate(path: Path) -> Certificate:
     Raises:
         InputError: It cannot be read, its folder's manifest lists other bytes, or see `parse_certificate`.
     """
-    source = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
-    return parse_certificate(source.data, path)
+    return parse_certificate(read_output(path, max_bytes=MAX_CERTIFICATE_BYTES).data, path)
 
 
 def parse_certificate(data: bytes, path: Path) -> Certificate:
@@ -285,7 +278,25 @@ def parse_certificate(data: bytes, path: Path) -> Certificate:
 
 
 def _certificate(document: dict[str, Any], path: Path) -> Certificate:
-    question = _question(document)
+    names, standoff, touch = tuple(document["margins_mm"]), document["standoff_mm"], document["touch"]
+    question = Question(
+        case_name=field(document, "case", text),
+        inputs=field(document, "inputs", read_inputs),
+        target_ct=field(document, "target_ct_mm", point),
+        R_ct_entry=array(document["R_ct_entry"], (3, 3)),
+        theta=field(document, "theta_rad", _range),
+        beta=field(document, "beta_rad", _range),
+        length=field(document, "length_mm", number),
+        standoff=None if standoff is None else number(standoff),
+        skin_gap=field(document, "skin_gap_mm", number),
+        farthest=field(document, "farthest_flange_mm", number),
+        radius=field(document, "radius_mm", number),
+        longest=field(document, "longest_path_mm", number),
+        max_skin_angle=field(document, "max_skin_angle_rad", number),
+        structures=names,
+        margins=array([document["margins_mm"][name] for name in names], (len(names),)),
+        touch=None if touch is None else number(touch),
+    )
     tree = field(document, "tree", texts)
     leaves = leaves_of(question.cap(), tree, path)
     rows = document["witness"]
@@ -306,62 +317,9 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     )
 
 
-def _question(document: dict[str, Any]) -> Question:
-    names, standoff, touch = tuple(document["margins_mm"]), document["standoff_mm"], document["touch"]
-    margins = [document["margins_mm"][name] for name in names]
-    return Question(
-        case_name=field(document, "case", text),
-        inputs=field(document, "inputs", read_inputs),
-        target_ct=field(document, "target_ct_mm", point),
-        R_ct_entry=array(document["R_ct_entry"], (3, 3)),
-        theta=field(document, "theta_rad", _range),
-        beta=field(document, "beta_rad", _range),
-        length=field(document, "length_mm", number),
-        standoff=None if standoff is None else number(standoff),
-        skin_gap=field(document, "skin_gap_mm", number),
-        farthest=field(document, "farthest_flange_mm", number),
-        radius=field(document, "radius_mm", number),
-        longest=field(document, "longest_path_mm", number),
-        max_skin_angle=field(document, "max_skin_angle_rad", number),
-        structures=names,
-        margins=array(margins, (len(names),)),
-        touch=None if touch is None else number(touch),
-    )
-
-
 def _range(values: Any) -> tuple[float, float]:
     low, high = map(number, values)
     return low, high
-
-
-UNDECIDED_COLOUR: Rgb = (255, 255, 255)
-"""Colour of cells that are too small to decide: neither a safe colour nor a reason's."""
-
-
-def _facts(certificate: Certificate) -> Facts:
-    summary = certificate.summary()
-    for word in ("safe", "rejected", "undecided"):
-        text = "proven safe for the organs" if word == "safe" else word
-        yield text, f"{summary[f'{word}_square_deg']:.2f} deg², {summary[f'{word}_cells']:,} cells"
-    yield "smallest cell", f"{summary['size_deg']:g}°"
-    yield "proven for every direction of a safe cell", "; ".join(summary["certified"])
-    yield "not certified", "; ".join(summary["not_certified"])
-
-
-def _map(certificate: Certificate) -> PolarMap:
-    """Map of the cells: proven safe for the organs, rejected, undecided."""
-    reasons = list(REASON_COLOURS)
-    legend = [
-        Entry("proven safe for the organs", SAFE),
-        *(Entry(REASON_TEXT[reason], REASON_COLOURS[reason]) for reason in reasons),
-        Entry("undecided", UNDECIDED_COLOUR),
-    ]
-    number = {reason.value: row for row, reason in enumerate(reasons, start=1)}
-    letters = zip(certificate.verdict, certificate.reason, strict=True)
-    code = np.array([{"S": 0, "U": len(legend) - 1}.get(letter, number.get(str(why), 1)) for letter, why in letters])
-    beta = certificate.leaves.beta
-    shifted = beta - 2 * np.pi * np.floor(beta[:, :1] / (2 * np.pi))
-    return polar_map(Sectors(certificate.leaves.theta, shifted, code), legend)
 
 
 def with_safe_cone(case: Case, candidates: Candidates, certificate: Certificate) -> Candidates:

@@ -168,7 +168,6 @@ class _Checker:
         return Verification(*(int((self._certificate.verdict == letter).sum()) for letter in "SRU"))
 
     def _learn(self, cell: _Cell, whole: _Known) -> _Known:
-        """Facts of a cell beyond those of the whole that it is part of."""
         question = self._question
         if cell.rho > WIDEST:
             return whole
@@ -216,7 +215,6 @@ class _Checker:
             refuse(what, "certificate", "claims that the case supports", "cell_not_proven")
 
     def _safe(self, known: _Known) -> bool:
-        """Whether no structure comes near, and the skin is crossed once, soon enough and steeply enough."""
         lost = any(self._inside) or self._even
         return not lost and len(known.organs) == 0 and known.skin_good
 
@@ -248,7 +246,6 @@ class _Checker:
         )
 
     def _skin_rejects(self, known: _Known, reason: str) -> bool:
-        """Whether no skin is soon enough (whatever else is there), or is crossed twice, or too flatly."""
         if reason == "unknown_region" and self._even:
             return True
         facts = known.facts

@@ -55,7 +55,6 @@ def zones(corners: Floats, limit: Floats | float) -> Zones:
     """Zones of triangles seen from the origin, grown so that a needle within ``limit`` of a triangle points into it.
 
     Args:
-        corners: Shape (m, 3, 3), mm from the target.
         limit: Shape (m,) or a number; 0 for the directions that hit the triangle, mm.
     """
     limits = np.ascontiguousarray(np.broadcast_to(np.asarray(limit, dtype=np.float64), len(corners)))
@@ -105,15 +104,11 @@ def _length(x, y, z):  # type: ignore[no-untyped-def]  # numba infers
 
 
 def narrowed(zone: Zones, lists: Lists, parent: Ints, centres: Floats, radius: Floats) -> Lists:
-    """Keep of each parent's list what matters to its part.
+    """Keep of each parent's list what matters to its part: lists of n cells.
 
     Args:
         parent: Shape (n,), row of each cell's parent.
-        centres: Shape (n, 3), unit.
         radius: Shape (n,), rad, at most π/2.
-
-    Returns:
-        Lists of the n cells.
     """
     cone = np.ascontiguousarray(centres), np.cos(radius), np.sin(radius)
     return Lists(*_narrowed(zone.axis, zone.cosine, zone.sine, lists.start, lists.items, parent, *cone))

@@ -18,7 +18,6 @@ from puncture_twin.planning.clearance.kernels.segment_triangle import axis_trian
 
 BULGES = 3.0
 """Times L and the bulge: what a witness must lack so that directions outside the hull of the corners are covered."""
-
 SURELY_MIXED = np.radians(0.5)
 """A cell with a smaller radius of which the inherited witness rejects some corners, not all, is split unmeasured:
 it is not safe, and at such a size another triangle rejects all of it in one case of a hundred."""
@@ -36,7 +35,6 @@ class Organs:
         corners: Shape (m, 9), mm.
         group: Shape (m,), the structure of each, 0 to k - 1.
         limits: Shape (k,), needle radius plus margin, mm.
-        zones: The directions to which each triangle matters.
     """
 
     corners: Floats

@@ -52,8 +52,6 @@ class PlainSkin:
 
         Args:
             rows: Triangles among which are all that the cone intersects.
-            u: Shape (3,), unit.
-            rho: Less than π/2.
             ray: Shape (3,), a direction inside the cell.
         """
         rho = rho + CONE_PAD_RAD
@@ -103,7 +101,6 @@ def _vertex_normals(mesh: TriangleMesh) -> Floats:
 
 
 def _folds(mesh: TriangleMesh, corners: Floats) -> Bools:
-    """Edges (m, 3) that are not shared by exactly two triangles, one on each side as seen from the origin."""
     names: dict[tuple[float, ...], int] = {}
     welded = np.array([names.setdefault(tuple(v), len(names)) for v in (mesh.vertices + 0.0).tolist()])
     a, b, c = np.moveaxis(corners, 1, 0)

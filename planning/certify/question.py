@@ -25,13 +25,10 @@ class Question:
     """The question of a certificate: everything but the surfaces that a verdict depends on; mm and rad.
 
     Attributes:
-        target_ct: Shape (3,).
-        R_ct_entry: Shape (3, 3).
         theta, beta: The cap: lowest and highest angle.
         standoff: Distance tip to target before the insertion where the case states one, else None.
         skin_gap: The least distance from the waiting tip to the skin, along the needle.
         farthest: The flange's greatest distance from the target while the tip waits: how far skin matters.
-        max_skin_angle: The largest angle at the skin.
         structures: Names of the k structures that demand a margin.
         margins: Shape (k,), their margins; with ``touch`` at least so wide that the chance is kept.
         touch: The chance to touch each structure that no safe cell exceeds; None asks for none.
@@ -80,6 +77,9 @@ def question_of(
     if not (0 <= theta[0] <= theta[1] <= np.pi + 1e-12 and beta[0] <= beta[1] <= beta[0] + 2 * np.pi + 1e-12):
         refuse("the cap is not a range of angles", "certify", "theta 0 to 180, beta 0 to 360", "out_of_range")
     demanding = [s for s in anatomy.checked if s.demands_margin]
+    margins = np.array([s.margin_mm for s in demanding], dtype=np.float64)
+    if touch is not None:  # where it is more than a margin, what keeps the chance in any configuration
+        margins = np.maximum(margins, _kept(case, demanding, touch, error))
     return Question(
         case_name=case.name,
         inputs=case.inputs,
@@ -95,16 +95,13 @@ def question_of(
         longest=case.needle.longest_path_mm,
         max_skin_angle=float(case.search.max_skin_angle),
         structures=tuple(s.name for s in demanding),
-        margins=_margins(case, demanding, touch, error),
+        margins=margins,
         touch=touch,
     )
 
 
-def _margins(case: Case, demanding: list[Structure], touch: float | None, error: PoseError | None) -> Floats:
-    """The structures' margins, (k,), mm; where that is more, what keeps the chance in any configuration."""
-    margins = np.array([s.margin_mm for s in demanding], dtype=np.float64)
-    if touch is None:
-        return margins
+def _kept(case: Case, demanding: list[Structure], touch: float, error: PoseError | None) -> Floats:
+    """Clearances, (k,), mm, at which structures are touched no more often than ``touch``."""
     if not 0.0 < touch <= MOST_TOUCH:
         refuse(f"chance to touch {touch:g}", "certify", f"above 0, at most {MOST_TOUCH:g}", "out_of_range")
     if error is None:
@@ -114,5 +111,4 @@ def _margins(case: Case, demanding: list[Structure], touch: float | None, error:
     waiting = farthest_flange(case.needle, case.search.max_skin_angle)
     lengths = np.array([waiting if s.outside else case.needle.length_mm for s in demanding])
     surface_mm = np.sqrt([np.linalg.eigvalsh(error.surface_cov_ct(s.voxel_ct))[-1] for s in demanding])
-    kept = any_pose(error).margin(touch, error.freedom, farthest, lengths, case.needle.radius_mm, surface_mm)
-    return np.asarray(np.maximum(margins, kept))
+    return any_pose(error).margin(touch, error.freedom, farthest, lengths, case.needle.radius_mm, surface_mm)

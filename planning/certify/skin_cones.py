@@ -17,10 +17,8 @@ from puncture_twin.planning.certify.skin_surface import SkinSurface
 
 CONE_PAD_RAD = 3e-7
 """Widens every cone: the search turns a ray that hits an edge by 1e-7, and angles round to 1e-8."""
-
 LENGTH_PAD_MM = 1e-5
 """Widens every depth: rounding at a metre is 1e-10, and crossings within 1e-6 mm are one."""
-
 SIDE_ROUNDING = 1e-11
 """A test ray whose edge function is below this, relative to the edge's ends, may pass on either side."""
 

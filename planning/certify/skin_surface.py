@@ -11,11 +11,9 @@ from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.certify.cones import Zones, zones
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 EDGE_ON = 1e-10
 """A triangle whose solid angle's determinant is below this, relative to its corners' lengths, is seen edge-on."""
-
 RAYS, SEED = 5, 11
 """Directions that vote on parity, always the same: a regular direction hits the edges of surfaces made on a grid."""
 
@@ -45,16 +43,15 @@ class SkinSurface:
 def skin_surface(skin: Skin, target_ct: Floats) -> SkinSurface:
     """Prepare a skin for one target."""
     corners = np.ascontiguousarray(skin.mesh.triangles - target_ct)
-    odd = not skin.mesh.closed or _leaves_oddly(corners)
-    fold = _folds(skin.mesh, corners)
-    return SkinSurface(corners, _corner_normals(skin.mesh), fold, skin.cut_faces, zones(corners, 0.0), odd)
-
-
-def _corner_normals(mesh: TriangleMesh) -> Floats:
-    """Area-weighted vertex normals, per corner, shape (m, 3, 3)."""
-    normals = np.zeros((len(mesh.vertices), 3))
+    mesh, rays = skin.mesh, np.random.default_rng(SEED).normal(size=(RAYS, 3))
+    # one of some random rays may hit an edge: what most of them say counts
+    odd = not mesh.closed or 2 * sum(bool(_crosses_odd(corners, ray)) for ray in rays) > RAYS
+    normals = np.zeros((len(mesh.vertices), 3))  # weighted by area
     _add_normals(mesh.vertices, mesh.faces, normals)
-    return normals[mesh.faces]
+    faces = welded(mesh.vertices)[mesh.faces]
+    fold = np.empty(faces.shape, bool)
+    _mark_folds(faces, _side(corners), len(mesh.vertices), fold)
+    return SkinSurface(corners, normals[mesh.faces], fold, skin.cut_faces, zones(corners, 0.0), odd)
 
 
 @nb.njit(cache=True)
@@ -71,14 +68,6 @@ def _add_normals(vertices, faces, normals):  # type: ignore[no-untyped-def]  # n
         if length > 0.0:
             for k in range(3):
                 normals[i, k] /= length
-
-
-def _folds(mesh: TriangleMesh, corners: Floats) -> Bools:
-    """Edges (m, 3) past which the number of crossings may change."""
-    faces = welded(mesh.vertices)[mesh.faces]
-    fold = np.empty(faces.shape, bool)
-    _mark_folds(faces, _side(corners), len(mesh.vertices), fold)
-    return fold
 
 
 def welded(vertices: Floats) -> NDArray[np.int64]:
@@ -134,12 +123,6 @@ def _side(corners):  # type: ignore[no-untyped-def]  # numba infers
         if abs(determinant) > EDGE_ON * scale:
             side[i] = 1 if determinant > 0.0 else -1
     return side
-
-
-def _leaves_oddly(corners: Floats) -> bool:
-    """Whether most of some random rays cross a closed surface an odd number of times; one of them may hit an edge."""
-    rays = np.random.default_rng(SEED).normal(size=(RAYS, 3))
-    return 2 * sum(bool(_crosses_odd(corners, ray)) for ray in rays) > RAYS
 
 
 @nb.njit(cache=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -24,31 +24,23 @@ from puncture_twin.planning.certify.question import Question, question_of
 from puncture_twin.planning.certify.skin_cones import LENGTH_PAD_MM, SkinBounds, skin_bounds
 from puncture_twin.planning.certify.skin_surface import SkinSurface, skin_surface
 from puncture_twin.planning.geometry.containment import Side, side_of
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.reach.standoff import waiting_flange
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 TOO_WIDE = np.radians(80)
 """Cells with a larger radius are halved at once."""
-
 SKIN_BELOW = np.radians(25)
 """The skin is checked for cells with a smaller radius: no wider cone is ever all good."""
-
 MEASURE_BELOW = np.radians(4)
 """Organs are checked for cells with a smaller radius: wider ones are settled by the skin or not at all."""
-
 SMALLEST_SIZE = np.radians(0.01)
 """A finer map would need millions of cells, and the padding against rounding would begin to count."""
-
 CLEARANCE_PAD_MM = 2e-4
 """Kept from every margin: within 1e-4 mm of one the search leaves the verdict to FCL's capsule."""
-
 DEPTH_PAD_MM = 1e-4
 """Kept from every limit on a depth, and from where a flange is."""
-
 ANGLE_PAD_RAD = 1e-7
 """Kept from the largest skin angle: arccos near 0 rounds to 1e-8."""
-
 REASONS = tuple(Reason)
 """A reason as a number, while cells are checked."""
 
@@ -67,10 +59,8 @@ def certify(
 
     Args:
         size: Cells of a smaller angular diameter stay undecided, rad.
-        theta: The cap's puncture angles, rad; the case's own for None.
-        beta: The cap's azimuths, rad; the case's own for None.
-        touch: A chance to touch each structure that no safe cell may exceed in any configuration of
-            the arm; None asks for none.
+        theta: The cap's puncture angles, rad, and ``beta`` its azimuths; None for the case's own.
+        touch: A chance to touch each structure that no safe cell may exceed in any configuration of the arm.
         error: Of the case's needle; needed for a chance.
 
     Raises:
@@ -80,20 +70,25 @@ def certify(
     if not SMALLEST_SIZE <= size <= np.pi:
         allowed = f"{np.degrees(SMALLEST_SIZE):g} to 180 degrees"
         refuse(f"size {np.degrees(size):g} degrees", "certify", allowed, "out_of_range")
-    evaluator = _Evaluator(question, anatomy, case.needle)
-    record = _Record()
+    evaluator, tree, leaves = _Evaluator(question, anatomy, case.needle), list[str](), []
     cells, state = question.cap(), evaluator.start()
     while len(cells):
         cones = cells.cones(question.R_ct_entry)
         verdicts = evaluator.level(cells, cones, state)
         letters = np.where(verdicts.letter != UNDECIDED, verdicts.letter, cells.splits(cones.radius, size))
         letters = np.where((verdicts.letter == UNDECIDED) & (2 * cones.radius <= size), UNDECIDED, letters)
-        record.add(cells, letters, verdicts)
+        tree.append("".join(letters.tolist()))
+        columns = cells.theta, cells.beta, letters, verdicts.reason, verdicts.triangle, verdicts.bound
+        leaves.append([column[np.char.isupper(letters)] for column in columns])
         inner = np.flatnonzero(np.char.islower(letters))
         children = split(cells.take(inner), letters[inner])
         state = verdicts.state.of(inner[children.parent])
         cells = children.cells
-    return record.certificate(question, size, evaluator)
+    low_high, first_last, verdict, code, triangle, bound = map(np.concatenate, zip(*leaves, strict=True))
+    reason = np.array([reason.value for reason in REASONS], dtype=np.str_)[code]
+    structure, face = evaluator.names(triangle)
+    found = Cells(low_high, first_last), verdict, reason, structure, face, bound
+    return Certificate(question, size, tuple(tree), *found, evaluator.queries)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +119,6 @@ class _State:
 
 @dataclass(frozen=True, eq=False)
 class _Verdicts:
-    """The verdicts on the n cells of a level, with their witnesses, and what their parts inherit."""
-
     letter: NDArray[np.str_]
     reason: Ints
     triangle: Ints
@@ -145,8 +138,6 @@ class _Verdicts:
 
 
 class _Evaluator:
-    """Evaluates the cells of one question, level by level."""
-
     def __init__(self, question: Question, anatomy: Anatomy, needle: Needle) -> None:
         self.queries = 0
         self._question, self._needle = question, needle
@@ -157,7 +148,8 @@ class _Evaluator:
         group = np.concatenate([one.group for one in self._organs])
         self._column = np.concatenate([group, [len(demanding)]])
         self._first = np.array([np.argmax(self._column == column) for column in range(len(demanding) + 1)])
-        self._inside = [_is_inside(s.mesh, question.target_ct) for s in demanding]
+        meshes, target = [s.mesh for s in demanding], question.target_ct
+        self._inside = [bool(_in_box(one.vertices, target)) and side_of(one, target) is Side.INSIDE for one in meshes]
 
     def start(self) -> _State:
         """State of the whole cap: only which triangles a needle can come to at all."""
@@ -172,8 +164,13 @@ class _Evaluator:
 
     def level(self, cells: Cells, cones: Cones, state: _State) -> _Verdicts:
         """Evaluate the cells of one level."""
-        if any(self._inside) or not self._skin.odd:
-            return self._all_rejected(state)
+        if any(self._inside) or not self._skin.odd:  # in a structure to avoid, or no ray leaves the skin as it must
+            verdicts, everywhere = _Verdicts.none(state), np.ones(len(state.parent), bool)
+            if any(self._inside):
+                verdicts.reject(everywhere, Reason.TOO_CLOSE, -self._question.radius)
+                verdicts.triangle[:] = self._first[self._inside.index(True)]
+            verdicts.reject(everywhere, Reason.UNKNOWN_REGION)
+            return verdicts
         if cones.radius.max() > TOO_WIDE:
             return _Verdicts.none(state)
         skin = narrowed(self._skin.zones, state.skin, state.parent, cones.centres, cones.radius)
@@ -206,16 +203,6 @@ class _Evaluator:
         column = self._column[triangle]
         face = np.where(triangle < 0, -1, triangle - self._first[column])
         return np.array([*self._question.structures, ""], dtype=np.str_)[column], face
-
-    def _all_rejected(self, state: _State) -> _Verdicts:
-        """Whether the target lies in a structure to avoid, or no ray leaves the skin as it must."""
-        verdicts = _Verdicts.none(state)
-        everywhere = np.ones(len(state.parent), bool)
-        if any(self._inside):
-            verdicts.reject(everywhere, Reason.TOO_CLOSE, -self._question.radius)
-            verdicts.triangle[:] = self._first[self._inside.index(True)]
-        verdicts.reject(everywhere, Reason.UNKNOWN_REGION)
-        return verdicts
 
     def _check_skin(self, verdicts: _Verdicts, cells: Cells, cones: Cones, which: Bools) -> None:
         question, state = self._question, verdicts.state
@@ -271,7 +258,6 @@ def flange_bounds(needle: Needle, question: Question, skin: SkinBounds) -> Float
 
 
 def _organs(demanding: list[Structure], question: Question, limits: Floats, which: Bools) -> Organs:
-    """The triangles of some structures that demand a margin, in one array."""
     columns = np.flatnonzero(which)
     meshes = [demanding[column].mesh for column in columns]
     group = np.repeat(columns, [len(mesh.faces) for mesh in meshes])
@@ -280,13 +266,7 @@ def _organs(demanding: list[Structure], question: Question, limits: Floats, whic
 
 
 def _filled(lists: Lists) -> Bools:
-    """Which cells have a list that is not empty."""
     return np.asarray(lists.start[1:] > lists.start[:-1])
-
-
-def _is_inside(mesh: TriangleMesh, point: Floats) -> bool:
-    """Whether a point lies in a closed surface; outside its box it cannot."""
-    return bool(_in_box(mesh.vertices, point)) and side_of(mesh, point) is Side.INSIDE
 
 
 @nb.njit(cache=True)
@@ -297,31 +277,6 @@ def _in_box(vertices, point):  # type: ignore[no-untyped-def]  # numba infers
             below[axis] |= vertices[i, axis] <= point[axis]
             above[axis] |= vertices[i, axis] >= point[axis]
     return below.all() and above.all()
-
-
-@dataclass(eq=False)
-class _Record:
-    """Collects levels into a certificate."""
-
-    tree: list[str] = field(default_factory=list)
-    leaves: list[tuple[NDArray[np.generic], ...]] = field(default_factory=list)
-
-    def add(self, cells: Cells, letters: NDArray[np.str_], verdicts: _Verdicts) -> None:
-        """Record one level."""
-        self.tree.append("".join(letters.tolist()))
-        leaf = np.char.isupper(letters)
-        columns = cells.theta, cells.beta, letters, verdicts.reason, verdicts.triangle, verdicts.bound
-        self.leaves.append(tuple(column[leaf] for column in columns))
-
-    def certificate(self, question: Question, size: float, evaluator: _Evaluator) -> Certificate:
-        """The certificate of all recorded levels."""
-        theta, beta, verdict, code, triangle, bound = (
-            np.concatenate(column) for column in zip(*self.leaves, strict=True)
-        )
-        reason = np.array([reason.value for reason in REASONS], dtype=np.str_)[code]
-        structure, face = evaluator.names(triangle)
-        leaves, tree = Cells(theta, beta), tuple(self.tree)
-        return Certificate(question, size, tree, leaves, verdict, reason, structure, face, bound, evaluator.queries)
 
 
 def _spread(values: NDArray[np.generic], rows: Ints, count: int) -> NDArray[Any]:

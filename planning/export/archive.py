@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydicom import dcmread
 from pydicom.dataset import Dataset
 from pydicom.sr.coding import Code
@@ -30,7 +29,6 @@ from puncture_twin.planning.base.errors import refuse, require_extra
 from puncture_twin.planning.formats.dicom.ct_series import CtSeries
 from puncture_twin.planning.formats.dicom.dicom_file import parse_dicom
 from puncture_twin.planning.formats.dicom.segmentation import parse_segmentation
-from puncture_twin.planning.formats.dicom.slices import Slice, Stack
 from puncture_twin.planning.geometry.rigid import apply
 
 DICOM = "dicom"
@@ -60,12 +58,7 @@ WHOSE = ("PatientID", "PatientName", "PatientBirthDate", "StudyInstanceUID")
 
 
 class Region(NamedTuple):
-    """A region that becomes one segment: every voxel that holds one of its points.
-
-    Attributes:
-        kind: One of `KINDS`.
-        points_ct: Shape (n, 3), LPS mm, denser than the voxels.
-    """
+    """A region that becomes one segment: every voxel that holds one of its points."""
 
     name: str
     kind: str
@@ -82,13 +75,7 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ArchiveContent:
-    """What is to be archived, LPS mm.
-
-    Attributes:
-        title: Of the report.
-        lines: Shape (n, 3) each: a point, or a line of several.
-        sentences: By their headings.
-    """
+    """What is to be archived: lines of one or several points (n, 3), LPS mm, and sentences by their headings."""
 
     title: str
     regions: tuple[Region, ...]
@@ -144,7 +131,7 @@ def _sources(scan: CtSeries) -> list[Dataset]:
 def _mask(scan: CtSeries, region: Region) -> Bools:
     """Voxels of the scan's own slices that hold a point of a region, shape (columns, rows, slices)."""
     stack, shape = scan.stack, (*scan.slice_shape, len(scan.stack.slices))
-    at = np.rint(apply(inverse_of(stack), region.points_ct)).astype(int)
+    at = np.rint(apply(np.linalg.inv(stack.T_ct_index), region.points_ct)).astype(int)
     at = at[((at >= 0) & (at < shape)).all(axis=1)]
     if not len(at):
         refuse(f"'{region.name}' lies outside of the scan", scan.path, "a scan that shows it", "outside_image")
@@ -159,18 +146,8 @@ def finest_mm(scan: CtSeries) -> float:
     return 0.4 * min(*plane.spacing_mm, float(np.linalg.norm(scan.stack.step_ct)))
 
 
-def inverse_of(stack: Stack) -> Floats:
-    """From LPS mm to (column, row, slice), shape (4, 4)."""
-    return np.asarray(np.linalg.inv(stack.T_ct_index))
-
-
 def rod_points(ends_ct: Floats, radius_mm: float, step_mm: float) -> Floats:
-    """Points of a rod, shape (n, 3), LPS mm.
-
-    Args:
-        ends_ct: Shape (m, 3), of its axis: a straight line, or one of several pieces.
-        step_mm: Between neighbouring points.
-    """
+    """Points of a rod about the line through ``ends_ct`` (m, 3), shape (n, 3), mm, ``step_mm`` apart."""
     pieces = []
     for start, end in itertools.pairwise(ends_ct):
         length = float(np.linalg.norm(end - start))
@@ -223,8 +200,10 @@ def _segmentation(sources: list[Dataset], scan: CtSeries, content: ArchiveConten
         for number, region in enumerate(content.regions, start=1)
     ]
     stacked = np.stack([mask.transpose(2, 1, 0) for mask in masks], axis=-1).astype(np.uint8)
-    if len(sources) == 1:
-        stacked = _of_frames(stacked, scan.stack.slices, int(sources[0].NumberOfFrames))
+    if len(sources) == 1:  # the stack need not have every frame of its file in its order
+        placed = np.zeros((int(sources[0].NumberOfFrames), *stacked.shape[1:]), stacked.dtype)
+        placed[[one.frame for one in scan.stack.slices]] = stacked
+        stacked = placed
     return hd.seg.Segmentation(
         source_images=sources,
         pixel_array=stacked,
@@ -233,13 +212,6 @@ def _segmentation(sources: list[Dataset], scan: CtSeries, content: ArchiveConten
         content_label="PUNCTURE",
         **_series(content.title, 9001),
     )
-
-
-def _of_frames(stacked: NDArray[np.uint8], slices: Sequence[Slice], frames: int) -> NDArray[np.uint8]:
-    """Slices of the stack as the frames of their file, where the stack does not have every frame in its order."""
-    placed = np.zeros((frames, *stacked.shape[1:]), stacked.dtype)
-    placed[[one.frame for one in slices]] = stacked
-    return placed
 
 
 def _report(sources: list[Dataset], scan: CtSeries, content: ArchiveContent) -> Dataset:
@@ -274,7 +246,6 @@ def _named(name: str) -> Code:
 
 
 def _bytes(made: Dataset) -> bytes:
-    """The file."""
     stream = io.BytesIO()
     made.save_as(stream, enforce_file_format=True)
     return stream.getvalue()
@@ -289,7 +260,7 @@ def _check_segments(data: bytes, scan: CtSeries, regions: Sequence[Region], mask
     read = parse_segmentation(Path(SEGMENTS), SEGMENTS, content, scan).masks
     if list(read) != [region.name for region in regions]:
         raise RuntimeError(f"{SEGMENTS} reads back with the segments {list(read)}")
-    T_stack_ct = inverse_of(scan.stack)
+    T_stack_ct = np.linalg.inv(scan.stack.T_ct_index)
     for region, mask in zip(regions, masks, strict=True):
         volume = read[region.name].volume()
         found = apply(T_stack_ct @ volume.T_ct_index, np.argwhere(volume.values > 0).astype(float))

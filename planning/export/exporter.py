@@ -41,13 +41,10 @@ from puncture_twin.planning.plan.plan_check import check_geometry
 
 GRID_MM = MAX_SWEEP_MM / 2.0
 """In two directions: no state of the triangle is farther from a checked one than half of ``MAX_SWEEP_MM``."""
-
 LARGEST_BLEND_MM = 5.0
 """The first radius tried: enough not to stop, small against the space that a plan leaves."""
-
 SMALLEST_BLEND_MM = 1.0
 """Radii are halved down to this; then the arm stops at the waypoint."""
-
 LARGEST_FRACTION = 0.45
 """Fraction of each segment, so that two blends never overlap: the controller skips a waypoint whose blend overlaps the
 next."""
@@ -57,31 +54,18 @@ SAMPLES = 400
 
 
 def blend_radii_mm(checker: StateChecker, waypoints: Floats) -> Floats:
-    """Blend radius of each waypoint between the ends, mm; 0 where no corner may be cut.
-
-    Args:
-        checker: Checks contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
-        waypoints: Shape (k, 6), rad.
-
-    Returns:
-        Shape (k - 2,), mm.
-    """
-    corners = range(1, len(waypoints) - 1)
-    return np.array([_radius_mm(checker, waypoints[at - 1 : at + 2]) for at in corners])
-
-
-def _radius_mm(checker: StateChecker, waypoints: Floats) -> float:
-    """The largest radius tried that is free, of the corner between three waypoints (3, 6)."""
-    before, corner, after = waypoints
-    radius = LARGEST_BLEND_MM
-    while radius >= SMALLEST_BLEND_MM:
-        starts, ends = (_fraction_within(checker, corner, other, radius) for other in (before, after))
-        if max(starts, ends) <= LARGEST_FRACTION and _free(
-            checker, corner, starts * (before - corner), ends * (after - corner)
-        ):
-            return radius
-        radius /= 2.0
-    return 0.0
+    """Blend radius of each waypoint between the ends, mm; 0 where no corner may be cut."""
+    radii = np.zeros(max(len(waypoints) - 2, 0))
+    for at, (before, corner, after) in enumerate(zip(waypoints, waypoints[1:], waypoints[2:], strict=False)):
+        radius = LARGEST_BLEND_MM  # the largest one tried that is free
+        while radius >= SMALLEST_BLEND_MM and radii[at] == 0.0:
+            starts, ends = (_fraction_within(checker, corner, other, radius) for other in (before, after))
+            if max(starts, ends) <= LARGEST_FRACTION:
+                states = _triangle(checker, corner, starts * (before - corner), ends * (after - corner))
+                if all(checker.contact(q, needle_may_touch_patient=False) is None for q in states):
+                    radii[at] = radius
+            radius /= 2.0
+    return radii
 
 
 def _fraction_within(checker: StateChecker, corner: Floats, other: Floats, radius_mm: float) -> float:
@@ -96,12 +80,6 @@ def _fraction_within(checker: StateChecker, corner: Floats, other: Floats, radiu
     if radius_mm > LARGEST_FRACTION * far[-1]:
         return 1.0
     return float(fractions[min(SAMPLES, int(np.flatnonzero(far <= radius_mm)[-1]) + 1)])
-
-
-def _free(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats) -> bool:
-    """Whether every state of the triangle corner, corner + back, corner + ahead is free of contact."""
-    states = _triangle(checker, corner, back, ahead)
-    return all(checker.contact(q, needle_may_touch_patient=False) is None for q in states)
 
 
 def _triangle(checker: StateChecker, corner: Floats, back: Floats, ahead: Floats) -> Floats:
@@ -138,11 +116,7 @@ def csv_text(plan: Plan, *, case_checked: bool) -> str:
 
 
 def read_csv(text: str, *, where: Path) -> SampledMotion:
-    """Read such a CSV back.
-
-    Raises:
-        InputError: Another header, another phase, or rows that are no motion.
-    """
+    """Read such a CSV back; what is no motion is refused."""
     rows = list(csv.reader(io.StringIO("\n".join(line for line in text.splitlines() if not line.startswith("#")))))
     if not rows or tuple(rows[0]) != COLUMNS:
         refuse("the table has another header", where, ",".join(COLUMNS), "wrong_columns")
@@ -172,8 +146,6 @@ class Exported(Shown):
 
 
 class _Draft(NamedTuple):
-    """A text that was read back and equals the plan, with its notes."""
-
     text: str
     notes: tuple[str, ...] = ()
 
@@ -184,9 +156,6 @@ def export_plan(
     """Write a plan for a robot.
 
     Args:
-        plan: A plan that has been read (and so checked), or made.
-        folder: Where the file goes, under the plan file's name.
-        source: The plan's file, for its name and for errors.
         checker: Of the plan's own case, against which the plan has been checked (``plan_check``); without it nothing is
             known off the plan's path, so no corner is rounded, and the file says so.
 
@@ -262,7 +231,6 @@ FORMATS: Mapping[str, tuple[str, Drafting]] = MappingProxyType(
     }
 )
 """Format to the file name's end and who writes it."""
-
 GROUP = "puncture_twin.exporters"
 """Of entry points: a format's name to an `Exporter`. None takes the place of a name in `FORMATS`."""
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.arm.links import address_file, model_urdf
-from puncture_twin.planning.arm.tool import Box, Tool, ToolBody
+from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.arm.urdf.arm_urdf import ArmUrdf
 from puncture_twin.planning.base.arrays import Floats
@@ -33,26 +33,21 @@ PATIENT, NEEDLE, HOLDER = "patient", "needle", "needle_holder"
 def scene_message(case: Case, anatomy: Anatomy, plan: Plan) -> dict[str, Any]:
     """The scene as a difference to what MoveIt knows: all that the plan was checked against, and its first state."""
     frames = RosFrames.of(model_urdf(plan.model))
-    solids = [_solid(box, frames) for box in case_boxes(case, plan.T_base_ct)]
+    # the skin with all that the CT shows outside of it, in its own frame; the pose says where it lies
+    pose = pose_message(frames.T_root_base @ plan.T_base_ct)
+    patient = {"meshes": [mesh_message(patient_surface(anatomy))], "mesh_poses": [pose]}
+    objects = [_object(PATIENT, frames.root) | patient]
+    for box in case_boxes(case, plan.T_base_ct):
+        primitive, pose = box_message(box, frames)
+        objects.append(_object(box.name, frames.root) | {"primitives": [primitive], "primitive_poses": [pose]})
     start = {"name": list(plan.model.joint_names), "position": [float(angle) for angle in plan.approach.q[0]]}
     carried = _attached(case_tool(case), frames)
     return {
         "name": "puncture",
         "is_diff": True,
         "robot_state": {"is_diff": True, "joint_state": start, "attached_collision_objects": carried},
-        "world": {"collision_objects": [_patient(anatomy, plan, frames), *solids]},
+        "world": {"collision_objects": objects},
     }
-
-
-def _patient(anatomy: Anatomy, plan: Plan, frames: RosFrames) -> dict[str, Any]:
-    """The skin with all that the CT shows outside of it, in its own frame; the pose says where it lies."""
-    pose = pose_message(frames.T_root_base @ plan.T_base_ct)
-    return _object(PATIENT, frames.root) | {"meshes": [mesh_message(patient_surface(anatomy))], "mesh_poses": [pose]}
-
-
-def _solid(box: Box, frames: RosFrames) -> dict[str, Any]:
-    primitive, pose = box_message(box, frames)
-    return _object(box.name, frames.root) | {"primitives": [primitive], "primitive_poses": [pose]}
 
 
 def _attached(tool: Tool, frames: RosFrames) -> list[dict[str, Any]]:
@@ -60,18 +55,14 @@ def _attached(tool: Tool, frames: RosFrames) -> list[dict[str, Any]]:
     parts = [(NEEDLE, *ends, tool.needle_diameter_mm)]
     if ends[0] > 0:
         parts.insert(0, (HOLDER, 0.0, ends[0], tool.holder_diameter_mm))
-    made = []
+    bodies = []
     for name, start, end, diameter in parts:
         primitive, pose = cylinder_message(start, end, diameter)
-        body = _object(name, frames.flange) | {"primitives": [primitive], "primitive_poses": [pose]}
-        made.append({"link_name": frames.flange, "object": body, "touch_links": list(frames.touching)})
+        bodies.append(_object(name, frames.flange) | {"primitives": [primitive], "primitive_poses": [pose]})
     if tool.body is not None:
-        body = _object("tool", frames.flange) | {
-            "meshes": [mesh_message(tool.body.mesh)],
-            "mesh_poses": [pose_message(np.eye(4))],
-        }
-        made.append({"link_name": frames.flange, "object": body, "touch_links": list(frames.touching)})
-    return made
+        meshes = {"meshes": [mesh_message(tool.body.mesh)], "mesh_poses": [pose_message(np.eye(4))]}
+        bodies.append(_object("tool", frames.flange) | meshes)
+    return [{"link_name": frames.flange, "object": one, "touch_links": list(frames.touching)} for one in bodies]
 
 
 def _object(name: str, frame: str) -> dict[str, Any]:
@@ -81,30 +72,28 @@ def _object(name: str, frame: str) -> dict[str, Any]:
 
 PATH_TOLERANCE_RAD, GOAL_TOLERANCE_RAD = 0.02, 0.002
 """Beyond them the controller gives up: along the path 20 mm at a metre, at the end 2 mm."""
-
 GOAL_TIME_S = 1
 """How much later than planned the arm may arrive."""
 
 
 def goal_messages(plan: Plan) -> dict[str, Any]:
     """The goals ``approach`` and ``insertion``."""
-    return {phase: _goal(plan, getattr(plan, phase)) for phase in SampledMotion._fields}
-
-
-def _goal(plan: Plan, trajectory: Trajectory) -> dict[str, Any]:
-    speeds, names = velocities(plan.model, trajectory), plan.model.joint_names
-    points = [_point(*row) for row in zip(trajectory.times_s, trajectory.q, speeds, strict=True)]
-    return {
-        "trajectory": {"header": {"frame_id": ""}, "joint_names": list(names), "points": points},
-        "path_tolerance": [{"name": name, "position": PATH_TOLERANCE_RAD} for name in names],
-        "goal_tolerance": [{"name": name, "position": GOAL_TOLERANCE_RAD} for name in names],
-        "goal_time_tolerance": {"sec": GOAL_TIME_S, "nanosec": 0},
-    }
-
-
-def _point(time_s: float, q: Floats, speeds: Floats) -> dict[str, Any]:
-    sec, nanosec = divmod(round(float(time_s) * NANOSECONDS), NANOSECONDS)
-    return {"positions": q.tolist(), "velocities": speeds.tolist(), "time_from_start": {"sec": sec, "nanosec": nanosec}}
+    goals, names = {}, plan.model.joint_names
+    for phase in SampledMotion._fields:
+        trajectory: Trajectory = getattr(plan, phase)
+        points = []
+        speeds = velocities(plan.model, trajectory)
+        for time_s, q, rates in zip(trajectory.times_s.tolist(), trajectory.q.tolist(), speeds.tolist(), strict=True):
+            sec, nanosec = divmod(round(time_s * NANOSECONDS), NANOSECONDS)
+            start = {"sec": sec, "nanosec": nanosec}
+            points.append({"positions": q, "velocities": rates, "time_from_start": start})
+        goals[phase] = {
+            "trajectory": {"header": {"frame_id": ""}, "joint_names": list(names), "points": points},
+            "path_tolerance": [{"name": name, "position": PATH_TOLERANCE_RAD} for name in names],
+            "goal_tolerance": [{"name": name, "position": GOAL_TOLERANCE_RAD} for name in names],
+            "goal_time_tolerance": {"sec": GOAL_TIME_S, "nanosec": 0},
+        }
+    return goals
 
 
 def check_goals(goals: Any, plan: Plan, *, where: Path) -> None:
@@ -124,7 +113,6 @@ MOVEIT = "moveit"
 
 SCENE, GOALS, URDF, SENDER = "scene.json", "goals.json", "urdf", "send.py"
 """Ends of the files' names, in the order of `moveit_names`."""
-
 SENDER_TEXT = '''"""Give MoveIt the scene, send one phase: python {sender} approach|insertion. Research software."""
 import json, pathlib, sys, rclpy
 from control_msgs.action import FollowJointTrajectory
@@ -153,9 +141,6 @@ def moveit_names(stem: str) -> tuple[str, ...]:
 def moveit_files(plan: Plan, case: Case, anatomy: Anatomy, *, source: Path) -> Mapping[str, str]:
     """Name to text of the MoveIt files.
 
-    Args:
-        source: The plan's file, for the names and for errors.
-
     Raises:
         InputError: A plan that contradicts itself, or a number beyond the arm's limits.
     """
@@ -178,7 +163,6 @@ M_PER_MM = 1e-3
 
 BOX, CYLINDER = 1, 3
 """Of ``shape_msgs/SolidPrimitive``."""
-
 GRAIN_M = 1e-6
 """m to which coordinates are rounded."""
 
@@ -249,44 +233,31 @@ def urdf_with_needle(model: UrModel, tool: Tool) -> str:
         file = address_file(urdf, mesh.get("filename", ""))
         mesh.set("filename", Path(file).as_uri() if Path(file).is_absolute() else file)
     start = tool.needle_length_mm - tool.shaft_mm
+    cylinders = [("needle", start, tool.shaft_mm, tool.needle_diameter_mm)]
     if start > 0:
-        _add_cylinder(robot, flange, "needle_holder", 0.0, start, tool.holder_diameter_mm)
-    _add_cylinder(robot, flange, "needle", start, tool.shaft_mm, tool.needle_diameter_mm)
-    if tool.body is not None:
-        _add_mesh(robot, flange, tool.body)
-    ElementTree.SubElement(robot, "link", name=TIP_FRAME)
-    _fix(robot, flange, TIP_FRAME, tool.needle_length_mm)
+        cylinders.insert(0, ("needle_holder", 0.0, start, tool.holder_diameter_mm))
+    for name, at_mm, length_mm, diameter_mm in cylinders:
+        origin = {"rpy": "0 0 0", "xyz": f"0 0 {_metres(length_mm / 2)}"}
+        shape = {"radius": _metres(diameter_mm / 2), "length": _metres(length_mm)}
+        _add_link(robot, flange, name, at_mm, origin, "cylinder", shape)
+    if tool.body is not None:  # the tool's own file, scaled to metres
+        T, scale = tool.body.T_flange_file, f"{tool.body.unit_mm * M_PER_MM:.9g}"
+        rpy = " ".join(f"{angle:.12g}" for angle in Rotation.from_matrix(T[:3, :3]).as_euler("xyz"))
+        origin = {"rpy": rpy, "xyz": " ".join(_metres(value) for value in T[:3, 3])}
+        shape = {"filename": tool.body.file.resolve().as_uri(), "scale": " ".join([scale] * 3)}
+        _add_link(robot, flange, "tool", 0.0, origin, "mesh", shape)
+    _add_link(robot, flange, TIP_FRAME, tool.needle_length_mm)
     ElementTree.indent(robot, " ")
     return '<?xml version="1.0"?>\n' + ElementTree.tostring(robot, encoding="unicode") + "\n"
 
 
-def _add_cylinder(
-    robot: ElementTree.Element, flange: str, name: str, start_mm: float, length_mm: float, diameter_mm: float
-) -> None:
+def _add_link(robot: ElementTree.Element, flange: str, name: str, at_mm: float, *shape: Any) -> None:
+    """Bolt a link to the flange: of a shape, by its origin, tag and numbers, or of none."""
     link = ElementTree.SubElement(robot, "link", name=name)
-    for kind in ("visual", "collision"):
-        part = ElementTree.SubElement(link, kind)
-        ElementTree.SubElement(part, "origin", rpy="0 0 0", xyz=f"0 0 {_metres(length_mm / 2)}")
-        shape = {"radius": _metres(diameter_mm / 2), "length": _metres(length_mm)}
-        ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), "cylinder", shape)
-    _fix(robot, flange, name, start_mm)
-
-
-def _add_mesh(robot: ElementTree.Element, flange: str, body: ToolBody) -> None:
-    """The tool's own file, scaled to metres."""
-    link = ElementTree.SubElement(robot, "link", name="tool")
-    T, scale = body.T_flange_file, f"{body.unit_mm * M_PER_MM:.9g}"
-    rpy = " ".join(f"{angle:.12g}" for angle in Rotation.from_matrix(T[:3, :3]).as_euler("xyz"))
-    for kind in ("visual", "collision"):
-        part = ElementTree.SubElement(link, kind)
-        ElementTree.SubElement(part, "origin", rpy=rpy, xyz=" ".join(_metres(value) for value in T[:3, 3]))
-        mesh = {"filename": body.file.resolve().as_uri(), "scale": " ".join([scale] * 3)}
-        ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), "mesh", mesh)
-    _fix(robot, flange, "tool", 0.0)
-
-
-def _fix(robot: ElementTree.Element, flange: str, name: str, at_mm: float) -> None:
-    """Bolt a link to the flange."""
+    for kind in ("visual", "collision") if shape else ():
+        part, (origin, tag, numbers) = ElementTree.SubElement(link, kind), shape
+        ElementTree.SubElement(part, "origin", origin)
+        ElementTree.SubElement(ElementTree.SubElement(part, "geometry"), tag, numbers)
     joint = ElementTree.SubElement(robot, "joint", name=f"{flange}-{name}", type="fixed")
     ElementTree.SubElement(joint, "parent", link=flange)
     ElementTree.SubElement(joint, "child", link=name)

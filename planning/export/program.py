@@ -4,10 +4,7 @@ The approach runs along the plan's own path: its straight joint segments from re
 between two waypoints, so `corner_rows` finds the waypoints again in the samples. A smooth approach has no rests, and is
 streamed instead. The insertion is one ``movel``: the plan's tip runs straight at one orientation, and so does this
 move, on the one branch that leads on from the standoff without a jump.
-`check_trajectory` compares positions, speeds and accelerations with the arm's limits; `plain_text` keeps what a plan
-names inside its comment or string.
-
-`check_program` holds what was read back to the plan's motion and the arm's limits.
+`check_trajectory` compares samples with the arm's limits, `check_program` a program that was read back with the plan.
 """
 
 from __future__ import annotations
@@ -39,7 +36,6 @@ from puncture_twin.planning.plan.plan_document import PLAN_VERSION
 
 STREAM_S = SAMPLE_S
 """Period of a streamed approach: that of a CB3 controller, and four of an e-Series one."""
-
 MOST_SAMPLES = 200_000
 """Samples of one phase: 27 minutes of a stream. The straight move is checked in no more steps, however slow it is."""
 
@@ -50,15 +46,10 @@ class Program:
 
     Attributes:
         tcp_mm: Needle tip in the flange frame, along z.
-        start_q: Shape (6,), the arm's joints at the start.
         moves: The approach as moves from rest to rest, or empty.
         stream_q: Shape (n, 6), the approach as angles every ``STREAM_S``, or n = 0.
-        T_base_standoff: Shape (4, 4), needle tip before the insertion.
-        T_base_target: Shape (4, 4), needle tip after it.
-        standoff_q: Shape (6,), the arm before the insertion.
-        target_q: Shape (6,), the arm after it.
-        insertion_mm_s: Tip speed of the insertion.
-        insertion_mm_s2: Tip acceleration of the insertion.
+        T_base_standoff: Shape (4, 4), needle tip before the insertion; ``standoff_q`` (6,) the arm there.
+        T_base_target: Shape (4, 4), needle tip after it; ``target_q`` (6,) the arm there.
     """
 
     tcp_mm: float
@@ -86,13 +77,6 @@ class JointMove(NamedTuple):
     """Radius about its end within which the tip may round the corner; 0 stops there."""
 
 
-class _Ramp(NamedTuple):
-    """Peak speed and acceleration of a trapezoid."""
-
-    speed: float
-    acceleration: float
-
-
 def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
     """The program of a plan.
 
@@ -104,27 +88,32 @@ def program_of(plan: Plan, blends_mm: Floats | None = None) -> Program:
     """
     rows = waypoint_rows(plan)
     between = np.zeros(max(0, len(rows) - 2)) if blends_mm is None else np.asarray(blends_mm, dtype=np.float64)
-    moves = tuple(
-        _joint_move(plan.approach, first, last, blend)
-        for (first, last), blend in zip(pairwise(rows.tolist()), [*between.tolist(), 0.0], strict=False)
-    )
+    moves = []
+    for (first, last), blend in zip(pairwise(rows.tolist()), [*between.tolist(), 0.0], strict=False):
+        q, times = plan.approach.q[first : last + 1], plan.approach.times_s[first : last + 1]
+        leading = int(np.argmax(np.abs(q[-1] - q[0])))  # movej's speed is that of the joint that moves farthest
+        moves.append(JointMove(q[-1], *_ramp(np.abs(q[:, leading] - q[0, leading]), times), blend))
     steps = math.ceil(plan.approach.duration_s / STREAM_S) if len(rows) == 0 else 0
     if steps > MOST_SAMPLES:
         what = f"a smooth approach of {plan.approach.duration_s:.0f} s"
         refuse(what, "plan", f"at most {MOST_SAMPLES * STREAM_S:.0f} s", "too_long")
     tips = tip_poses(plan)
-    insertion = _insertion_ramp(plan, tips)
+    points = tips[:, :3, 3]
+    length = float(np.linalg.norm(points[-1] - points[0]))
+    if length <= POSE_TOLERANCE_MM or len(points) < 2:
+        refuse("the insertion does not move the tip", "plan", "an insertion", "no_motion")
+    speed, acceleration = _ramp((points - points[0]) @ (points[-1] - points[0]) / length, plan.insertion.times_s)
     return Program(
         tcp_mm=plan.needle_length_mm,
         start_q=plan.approach.q[0],
-        moves=moves,
-        stream_q=plan.approach.at(stream_times(steps)[1:]).reshape(-1, 6),
+        moves=tuple(moves),
+        stream_q=plan.approach.at(STREAM_S * np.arange(1, steps + 1, dtype=np.float64)).reshape(-1, 6),
         T_base_standoff=tips[0],
         T_base_target=tips[-1],
         standoff_q=plan.insertion.q[0],
         target_q=plan.insertion.q[-1],
-        insertion_mm_s=insertion.speed,
-        insertion_mm_s2=insertion.acceleration,
+        insertion_mm_s=speed,
+        insertion_mm_s2=acceleration,
     )
 
 
@@ -133,8 +122,7 @@ def waypoint_rows(plan: Plan) -> NDArray[np.intp]:
     if np.abs(plan.approach.q - plan.approach.q[0]).max() <= STRAIGHT_RAD:
         return np.zeros(1, dtype=np.intp)
     rows = corner_rows(plan.approach.q)
-    straight = rests_at(plan.model, plan.approach, rows[1:-1])
-    return rows if straight else rows[:0]
+    return rows if rests_at(plan.model, plan.approach, rows[1:-1]) else rows[:0]
 
 
 def straight_move(model: UrModel, program: Program) -> Trajectory:
@@ -159,24 +147,12 @@ def straight_move(model: UrModel, program: Program) -> Trajectory:
     return Trajectory(times, np.concatenate([first[None], first + np.cumsum(wrap_to_pi(np.diff(q, axis=0)), axis=0)]))
 
 
-def _joint_move(trajectory: Trajectory, first: int, last: int, blend_mm: float) -> JointMove:
-    """The move over the samples first..last, in the time that the plan takes."""
-    q, times = trajectory.q[first : last + 1], trajectory.times_s[first : last + 1]
-    leading = int(np.argmax(np.abs(q[-1] - q[0])))  # movej's speed is that of the joint that moves farthest
-    ramp = _ramp(np.abs(q[:, leading] - q[0, leading]), times)
-    return JointMove(q[-1], ramp.speed, ramp.acceleration, blend_mm)
-
-
-def _ramp(travelled: Floats, times: Floats) -> _Ramp:
-    """The trapezoid from rest to rest with a motion's length L, duration T and highest acceleration a.
+def _ramp(travelled: Floats, times: Floats) -> tuple[float, float]:
+    """Peak speed v and acceleration a of the trapezoid with a motion's length L, duration T and highest acceleration.
 
     From T = L / v + v / a follows v = a (T - sqrt(T^2 - 4 L / a)) / 2: below the motion's own peak speed, since a plan
     takes time to build up its acceleration and a trapezoid does not. Where a is too low for T, which samples too far
     apart can make it seem, v = a T / 2 takes longer.
-
-    Args:
-        travelled: Shape (m,), rad or mm.
-        times: Shape (m,), s.
     """
     steps = np.diff(times)
     speeds = np.concatenate([[0.0], np.diff(travelled) / steps, [0.0]])
@@ -184,12 +160,7 @@ def _ramp(travelled: Floats, times: Floats) -> _Ramp:
     acceleration = float(np.abs(np.diff(speeds) / between).max())
     duration = float(times[-1] - times[0])
     spare = max(0.0, duration**2 - 4.0 * float(travelled[-1]) / acceleration)
-    return _Ramp(acceleration * (duration - math.sqrt(spare)) / 2.0, acceleration)
-
-
-def stream_times(steps: int) -> Floats:
-    """Times of a stream from 0, shape (steps + 1,), s."""
-    return np.asarray(STREAM_S * np.arange(steps + 1), dtype=np.float64)
+    return acceleration * (duration - math.sqrt(spare)) / 2.0, acceleration
 
 
 def tip_poses(plan: Plan) -> Floats:
@@ -197,14 +168,6 @@ def tip_poses(plan: Plan) -> Floats:
     poses = flange_pose(plan.model, plan.insertion.q)
     poses[:, :3, 3] += plan.needle_length_mm * poses[:, :3, 2]
     return poses
-
-
-def _insertion_ramp(plan: Plan, tips: Floats) -> _Ramp:
-    points, times = tips[:, :3, 3], plan.insertion.times_s
-    length = float(np.linalg.norm(points[-1] - points[0]))
-    if length <= POSE_TOLERANCE_MM or len(points) < 2:
-        refuse("the insertion does not move the tip", "plan", "an insertion", "no_motion")
-    return _ramp((points - points[0]) @ (points[-1] - points[0]) / length, times)
 
 
 def _trapezoid(length: float, speed: float, acceleration: float) -> tuple[Floats, Floats]:
@@ -221,7 +184,6 @@ def _trapezoid(length: float, speed: float, acceleration: float) -> tuple[Floats
 
 ANGLE_TOLERANCE_RAD = 1e-9
 """How far an angle that was read back may be from the plan's."""
-
 TIME_TOLERANCE_S = 1e-9
 """How far a time that was read back may be from the plan's: ROS counts nanoseconds, which is half of one at most."""
 
@@ -234,14 +196,7 @@ class SampledMotion(NamedTuple):
 
 
 def check_sampled(motion: SampledMotion, plan: Plan, *, time_resolution_s: float, where: Path) -> None:
-    """Refuse samples that are not the plan's, or that break a limit.
-
-    Args:
-        time_resolution_s: To what the format rounds times; 0 for exact ones.
-
-    Raises:
-        InputError: Says what differs or which limit is broken.
-    """
+    """Refuse samples that are not the plan's, or that break a limit."""
     for name in SampledMotion._fields:
         read, planned = getattr(motion, name), getattr(plan, name)
         same = (
@@ -256,45 +211,24 @@ def check_sampled(motion: SampledMotion, plan: Plan, *, time_resolution_s: float
 
 POSITION_SLACK_RAD = 1e-9
 """A printed angle may round beyond its limit by this."""
-
 RELATIVE_SLACK = 1e-6
 """Rounding of printed speeds and of differences, as a fraction of the limit."""
-
 ROUNDINGS = 8.0
 """Differences of differences of angles carry at most this many roundings of one angle."""
 
 
 def check_positions(model: UrModel, q: Floats, *, what: str, where: Path) -> None:
-    """Refuse angles outside the joints' limits.
-
-    Args:
-        q: Shape (m, 6), rad.
-
-    Raises:
-        InputError: Names the joint and the angle. NaN is outside.
-    """
+    """Refuse angles (m, 6), rad, outside the joints' limits; NaN is outside."""
     inside = (q >= model.joint_limits[:, 0] - POSITION_SLACK_RAD) & (q <= model.joint_limits[:, 1] + POSITION_SLACK_RAD)
     if not inside.all():
         row, joint = np.argwhere(~inside)[0]
         low, high = np.degrees(model.joint_limits[joint])
-        refuse(
-            f"{what}: {model.joint_names[joint]} at {np.degrees(q[row, joint]):.3f} deg",
-            where,
-            f"{low:.0f} to {high:.0f} deg",
-            "joint_beyond_limits",
-        )
+        at = f"{what}: {model.joint_names[joint]} at {np.degrees(q[row, joint]):.3f} deg"
+        refuse(at, where, f"{low:.0f} to {high:.0f} deg", "joint_beyond_limits")
 
 
 def check_rates(model: UrModel, speeds: Floats, accelerations: Floats, *, what: str, where: Path) -> None:
-    """Refuse speeds and accelerations above the limits.
-
-    Args:
-        speeds: Shape (m, 6), rad/s.
-        accelerations: Shape (k, 6), rad/s^2.
-
-    Raises:
-        InputError: Names the joint, the rate and the limit. NaN is above.
-    """
+    """Refuse speeds (m, 6), rad/s, and accelerations (k, 6), rad/s^2, above the limits; NaN is above."""
     for rates, limits, unit in (
         (speeds, model.max_speeds, "rad/s"),
         (accelerations, np.full(6, model.max_acceleration), "rad/s^2"),
@@ -302,12 +236,8 @@ def check_rates(model: UrModel, speeds: Floats, accelerations: Floats, *, what: 
         kept = np.abs(rates) <= limits * (1.0 + RELATIVE_SLACK)
         if not kept.all():
             row, joint = np.argwhere(~kept)[0]
-            refuse(
-                f"{what}: {model.joint_names[joint]} at {abs(rates[row, joint]):.6g} {unit}",
-                where,
-                f"at most {limits[joint]:.6g} {unit}",
-                "joint_too_fast",
-            )
+            at = f"{what}: {model.joint_names[joint]} at {abs(rates[row, joint]):.6g} {unit}"
+            refuse(at, where, f"at most {limits[joint]:.6g} {unit}", "joint_too_fast")
 
 
 def check_trajectory(
@@ -317,9 +247,6 @@ def check_trajectory(
 
     The mean speeds of neighbouring intervals differ by no more than the acceleration times the distance of their
     middles, so a motion within the limits is never refused, but for rounding, which is taken off here.
-
-    Args:
-        time_resolution_s: To what the times were rounded; 0 for exact ones.
     """
     q, steps = trajectory.q, np.diff(trajectory.times_s)[:, None]
     check_positions(model, q, what=what, where=where)
@@ -331,18 +258,12 @@ def check_trajectory(
     angle_rounding = ROUNDINGS * np.finfo(float).eps * max(1.0, float(np.abs(q).max()))
     blur = angle_rounding / steps + time_resolution_s * np.abs(speeds) / steps
     blur_between = np.maximum(np.concatenate([blur, blur[-1:]]), np.concatenate([blur[:1], blur])) * 2.0
-    check_rates(
-        model,
-        np.maximum(np.abs(speeds) - blur, 0.0),
-        np.maximum(np.abs(change) - blur_between, 0.0) / between,
-        what=what,
-        where=where,
-    )
+    accelerations = np.maximum(np.abs(change) - blur_between, 0.0) / between
+    check_rates(model, np.maximum(np.abs(speeds) - blur, 0.0), accelerations, what=what, where=where)
 
 
 STRAIGHT_RAD = 1e-9
 """Joint distance within which samples lie on a straight segment: far above rounding, a millionth of a degree."""
-
 REST_SLACK = 1e-6
 """Relative rounding of a speed by differences."""
 
@@ -351,13 +272,7 @@ def corner_rows(q: Floats) -> NDArray[np.intp]:
     """Rows of the corners and reversals of a path, with both ends; every other row lies between two of them.
 
     Splits at the row farthest from the chord until none is off (Douglas and Peucker 1973, in six dimensions). For a
-    path of straight segments that row is always one of its waypoints.
-
-    Args:
-        q: Shape (m, 6), rad.
-
-    Returns:
-        Rising rows, shape (k,); ``[0]`` for a single row.
+    path of straight segments that row is always one of its waypoints. Shape (k,), rising, of q (m, 6), rad.
     """
     kept, pending = {0, len(q) - 1}, [(0, len(q) - 1)]
     while pending:
@@ -394,7 +309,6 @@ def rests_at(model: UrModel, trajectory: Trajectory, rows: NDArray[np.intp]) -> 
 
 PLAIN = frozenset(string.ascii_letters + string.digits + " ._-+:/()")
 """What may be in a comment or a string of any of the formats: nothing that ends, escapes or nests one."""
-
 LONGEST = 200
 """Characters of one name; a longer one is cut."""
 
@@ -431,11 +345,7 @@ def plain_sentence(text: str) -> str:
 
 
 def heading(plan: Plan, notes: Iterable[str], *, case_checked: bool) -> list[str]:
-    """Comment lines that say what a file is, what it was made from, and how to read it.
-
-    Args:
-        case_checked: Whether the plan was compared with its case when it was exported.
-    """
+    """Comment lines that say what a file is, what it was made from, and how to read it."""
     lines = [
         "research software, not a medical device",
         f"made by puncture-twin {version('puncture-twin')} from a plan of version {PLAN_VERSION}, seed {plan.seed}",
@@ -452,24 +362,14 @@ def heading(plan: Plan, notes: Iterable[str], *, case_checked: bool) -> list[str
 
 SAME_BRANCH_RAD = 0.01
 """How far the joints of the straight move may end from the plan's: a hundredth of the path to another branch."""
-
 SAME_RATE = 1e-6
 """How far, as a fraction, a printed speed may be from the plan's: a speed of 1e-6 rad/s still has six digits."""
-
 TURN_TOLERANCE_RAD = 1e-3
 """How far the straight move's orientation may be from the plan's: 0.2 mm over 200 mm of needle."""
 
 
 def check_program(program: Program, plan: Plan, blends_mm: Floats | None = None, *, where: Path) -> None:
-    """Refuse a program that is not the plan's motion, or that breaks a limit.
-
-    Args:
-        blends_mm: The radii that were found free, as for :func:`program_of`.
-
-    Raises:
-        InputError: Says what differs or which limit is broken.
-    """
-    model = plan.model
+    """Refuse a program that is not the plan's motion, or that breaks a limit."""
     for name, read, planned in (
         ("start", program.start_q, plan.approach.q[0]),
         ("standoff", program.standoff_q, plan.insertion.q[0]),
@@ -477,14 +377,12 @@ def check_program(program: Program, plan: Plan, blends_mm: Floats | None = None,
     ):
         _check_same(read, planned, f"the {name}", where)
     wanted = program_of(plan, blends_mm)
-    if not (
-        len(program.moves) == len(wanted.moves)
-        and np.allclose(_rates(program), _rates(wanted), rtol=SAME_RATE, atol=0.0)
-    ):
+    rates, wanted_rates = _rates(program), _rates(wanted)
+    if len(rates) != len(wanted_rates) or not np.allclose(rates, wanted_rates, rtol=SAME_RATE, atol=0.0):
         what = "a speed, an acceleration or a radius does not read back"
         refuse(what, where, "the plan's, above 1e-6", "not_read_back")
-    _check_approach(program, plan, model, where)
-    _check_insertion(program, plan, model, where)
+    _check_approach(program, plan, where)
+    _check_insertion(program, plan, where)
 
 
 def _rates(program: Program) -> Floats:
@@ -493,9 +391,10 @@ def _rates(program: Program) -> Floats:
     return np.array([program.tcp_mm, program.insertion_mm_s, program.insertion_mm_s2, *np.ravel(moves)])
 
 
-def _check_approach(program: Program, plan: Plan, model: UrModel, where: Path) -> None:
+def _check_approach(program: Program, plan: Plan, where: Path) -> None:
+    model = plan.model
     if len(program.stream_q):
-        times = stream_times(len(program.stream_q))
+        times = STREAM_S * np.arange(len(program.stream_q) + 1, dtype=np.float64)
         streamed = Trajectory(times, np.concatenate([program.start_q[None], program.stream_q]))
         _check_same(streamed.q, plan.approach.at(times), "the streamed approach", where)
         check_trajectory(model, streamed, time_resolution_s=0.0, what="approach", where=where)
@@ -507,23 +406,18 @@ def _check_approach(program: Program, plan: Plan, model: UrModel, where: Path) -
         fraction = np.abs(end - start) / np.abs(end - start).max()
         rates = fraction[None] * move.speed, fraction[None] * move.acceleration
         check_rates(model, *rates, what="approach", where=where)
-        _check_tip(model, start, end, fraction * move.speed * np.sign(end - start), plan, where)
+        steps, speeds = math.ceil(float(np.linalg.norm(end - start)) / TIP_STEP_RAD), fraction * move.speed
+        q = start + np.linspace(0.0, 1.0, steps + 1)[:, None] * (end - start)
+        fastest = float(tip_rates(model, q, speeds * np.sign(end - start), plan.needle_length_mm).max())
+        if not fastest <= plan.speeds.tip_speed_mm_s * (1.0 + SPEED_ROUNDING):
+            what = f"a joint move takes the tip to {fastest:.4g} mm/s"
+            refuse(what, where, f"at most {plan.speeds.tip_speed_mm_s:g} mm/s", "tip_too_fast")
     if program.moves and program.moves[-1].blend_mm != 0.0:
         refuse("the approach does not stop at its end", where, "a blend radius of 0 at the end", "not_read_back")
 
 
-def _check_tip(model: UrModel, start: Floats, end: Floats, speeds: Floats, plan: Plan, where: Path) -> None:
-    """Refuse a joint move at whose peak joint speeds (6,) the tip would be too fast somewhere."""
-    steps = math.ceil(float(np.linalg.norm(end - start)) / TIP_STEP_RAD)
-    q = start + np.linspace(0.0, 1.0, steps + 1)[:, None] * (end - start)
-    fastest = float(tip_rates(model, q, speeds, plan.needle_length_mm).max())
-    if not fastest <= plan.speeds.tip_speed_mm_s * (1.0 + SPEED_ROUNDING):
-        what = f"a joint move takes the tip to {fastest:.4g} mm/s"
-        refuse(what, where, f"at most {plan.speeds.tip_speed_mm_s:g} mm/s", "tip_too_fast")
-
-
-def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) -> None:
-    tips = tip_poses(plan)
+def _check_insertion(program: Program, plan: Plan, where: Path) -> None:
+    model, tips = plan.model, tip_poses(plan)
     for name, read, planned in (
         ("standoff", program.T_base_standoff, tips[0]),
         ("target", program.T_base_target, tips[-1]),
@@ -541,20 +435,13 @@ def _check_insertion(program: Program, plan: Plan, model: UrModel, where: Path) 
     ends = np.abs(moved.q[[0, -1]] - np.stack([program.standoff_q, program.target_q])).max()
     if not ends <= SAME_BRANCH_RAD:
         refuse(f"the straight move ends {ends:.3g} rad off", where, "the plan's own branch", "not_read_back")
-    worst = _farthest_mm(flange_pose(model, moved.q)[:, :3, 3], flange_pose(model, plan.insertion.q)[:, :3, 3])
+    line = flange_pose(model, plan.insertion.q)[:, :3, 3]
+    unit = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
+    away = np.concatenate([flange_pose(model, moved.q)[:, :3, 3], line]) - line[0]  # both, from one straight line
+    worst = float(np.linalg.norm(away - (away @ unit)[:, None] * unit, axis=1).max())
     if not worst <= STRAIGHT_TOLERANCE_MM:
         refuse(f"the straight move is {worst:.3g} mm off the planned path", where, "the plan", "not_straight")
     check_trajectory(model, moved, time_resolution_s=0.0, what="insertion", where=where)
-
-
-def _farthest_mm(points: Floats, line: Floats) -> float:
-    """The farthest that points (m, 3) lie from the straight line through the ends of another path (k, 3)."""
-    unit = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
-    worst = 0.0
-    for path in (points, line):
-        away = path - line[0]
-        worst = max(worst, float(np.linalg.norm(away - (away @ unit)[:, None] * unit, axis=1).max()))
-    return worst
 
 
 def _pose_difference(T_a: Floats, T_b: Floats) -> tuple[float, float]:

@@ -18,7 +18,6 @@ NANOSECONDS = 1_000_000_000
 
 LONGEST_S = 2**31 - 1
 """``sec`` is a signed 32-bit integer."""
-
 TIME_RESOLUTION_S = 1.0 / NANOSECONDS
 
 MONOTONE = 3.0
@@ -41,23 +40,18 @@ def ros2_text(plan: Plan, *, case_checked: bool) -> str:
     """One YAML mapping with the messages ``approach`` and ``insertion``."""
     lines = heading(plan, NOTES, case_checked=case_checked)
     for phase in SampledMotion._fields:
-        lines += [f"{phase}:", *_message(plan.model, getattr(plan, phase))]
+        lines += [
+            f"{phase}:",
+            "  header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}",
+            f"  joint_names: [{', '.join(plan.model.joint_names)}]",
+            "  points:",
+        ]
+        part: Trajectory = getattr(plan, phase)
+        for time, q, speeds in zip(part.times_s, part.q, velocities(plan.model, part), strict=True):
+            sec, nanosec = divmod(round(float(time) * NANOSECONDS), NANOSECONDS)
+            at = f"time_from_start: {{sec: {sec}, nanosec: {nanosec}}}"
+            lines.append(f"    - {{positions: {_floats(q)}, velocities: {_floats(speeds)}, {at}}}")
     return "\n".join(lines) + "\n"
-
-
-def _message(model: UrModel, trajectory: Trajectory) -> list[str]:
-    lines = [
-        "  header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}",
-        f"  joint_names: [{', '.join(model.joint_names)}]",
-        "  points:",
-    ]
-    for time, q, speeds in zip(trajectory.times_s, trajectory.q, velocities(model, trajectory), strict=True):
-        sec, nanosec = divmod(round(float(time) * NANOSECONDS), NANOSECONDS)
-        lines.append(
-            f"    - {{positions: {_floats(q)}, velocities: {_floats(speeds)}, "
-            f"time_from_start: {{sec: {sec}, nanosec: {nanosec}}}}}"
-        )
-    return lines
 
 
 def _floats(row: Floats) -> str:
@@ -72,9 +66,6 @@ def velocities(model: UrModel, trajectory: Trajectory) -> Floats:
     Of three parabolas through a sample and two neighbours (both before, one on each side, both after) at least two have
     the motion's own slope when its acceleration changes at samples only, and not at two in a row: the middle one of the
     three slopes is taken. It is kept within what keeps a cubic through the samples between its neighbours.
-
-    Returns:
-        Shape (m, 6), rad/s.
     """
     speeds = np.zeros_like(trajectory.q)
     if len(speeds) < 3:
@@ -82,30 +73,18 @@ def velocities(model: UrModel, trajectory: Trajectory) -> Floats:
     steps = np.diff(trajectory.times_s)[:, None]
     slopes = np.diff(trajectory.q, axis=0) / steps
     before, after = slopes[:-1], slopes[1:]
+    bends = np.diff(slopes, axis=0) / (steps[1:] + steps[:-1])
+    around = before + steps[:-1] * bends
+    behind, ahead = around.copy(), around.copy()
+    behind[1:] = slopes[1:-1] + steps[1:-1] * bends[:-1]
+    ahead[:-1] = slopes[1:-1] - steps[1:-1] * bends[1:]
+    middle = np.median(np.stack([behind, around, ahead]), axis=0)
     most = MONOTONE * np.minimum(np.abs(before), np.abs(after))
-    speeds[1:-1] = np.where(before * after > 0.0, np.clip(_middle_slope(slopes, steps), -most, most), 0.0)
+    speeds[1:-1] = np.where(before * after > 0.0, np.clip(middle, -most, most), 0.0)
     corners = corner_rows(trajectory.q)[1:-1]
     if rests_at(model, trajectory, corners):
         speeds[corners] = 0.0
     return speeds
-
-
-def _middle_slope(slopes: Floats, steps: Floats) -> Floats:
-    """The middle one of three parabolas' slopes at each inner sample.
-
-    Args:
-        slopes: Shape (m - 1, 6), between the samples.
-        steps: Shape (m - 1, 1), s.
-
-    Returns:
-        Shape (m - 2, 6).
-    """
-    bends = np.diff(slopes, axis=0) / (steps[1:] + steps[:-1])
-    around = slopes[:-1] + steps[:-1] * bends
-    behind, ahead = around.copy(), around.copy()
-    behind[1:] = slopes[1:-1] + steps[1:-1] * bends[:-1]
-    ahead[:-1] = slopes[1:-1] - steps[1:-1] * bends[1:]
-    return np.median(np.stack([behind, around, ahead]), axis=0)
 
 
 def read_ros2(text: str, model: UrModel, *, where: Path) -> SampledMotion:
@@ -117,31 +96,25 @@ def read_ros2(text: str, model: UrModel, *, where: Path) -> SampledMotion:
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     parts: dict[str, Trajectory] = {}
     for phase in SampledMotion._fields:
-        if lines[:1] != [f"{phase}:"] or lines[2:4] != [
-            f"  joint_names: [{', '.join(model.joint_names)}]",
-            "  points:",
-        ]:
+        joints = f"  joint_names: [{', '.join(model.joint_names)}]"
+        if lines[:1] != [f"{phase}:"] or lines[2:4] != [joints, "  points:"]:
             refuse(f"no message '{phase}' of the six joints", where, "approach, insertion", "missing_message")
         lines = lines[4:]
         points = []
         while lines and (match := _POINT.fullmatch(lines[0])):
             points.append(match.groups())
             lines = lines[1:]
-        parts[phase] = _trajectory(points, model, phase, where)
+        try:
+            parts[phase] = _trajectory(points, model, phase, where)
+        except ValueError as error:
+            allowed = "six positions and velocities a point"
+            raise InputError(f"{phase}: {error}", where=where, allowed=allowed, code="bad_value") from error
     if lines:
         refuse(f"line {lines[0]!r:.80}", where, "points of two messages", "wrong_format")
     return SampledMotion(**parts)
 
 
 def _trajectory(points: list[tuple[str, ...]], model: UrModel, phase: str, where: Path) -> Trajectory:
-    try:
-        return _parsed(points, model, phase, where)
-    except ValueError as error:
-        what = f"{phase}: {error}"
-        raise InputError(what, where=where, allowed="six positions and velocities a point", code="bad_value") from error
-
-
-def _parsed(points: list[tuple[str, ...]], model: UrModel, phase: str, where: Path) -> Trajectory:
     times = np.array([int(sec) + int(nanosec) / NANOSECONDS for _, _, sec, nanosec in points])
     if len(times) and times[-1] > LONGEST_S:
         refuse(f"{phase} of {times[-1]:.3g} s", where, f"at most {LONGEST_S} s", "too_long")

@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -49,13 +49,8 @@ _SHOWN = {
 }
 
 
-@dataclass(frozen=True)
-class SceneNode:
-    """One node of a scene.
-
-    Attributes:
-        file: Where it is stored, next to the scene.
-    """
+class SceneNode(NamedTuple):
+    """One node of a scene, stored in a file next to it."""
 
     kind: Kind
     name: str
@@ -108,13 +103,7 @@ _AXES = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 
 @dataclass(frozen=True, eq=False)
 class SceneContent:
-    """Content of the files for Slicer.
-
-    Attributes:
-        entry_ct: Shape (3,), where the path enters the skin, mm.
-        area: Through which safe paths enter.
-        placement: Where the patient lies for the robot, or None.
-    """
+    """Content of the files for Slicer."""
 
     name: str
     entry_ct: Floats
@@ -122,8 +111,7 @@ class SceneContent:
     placement: Placement | None
 
 
-@dataclass(frozen=True, eq=False)
-class SlicerFiles:
+class SlicerFiles(NamedTuple):
     """The files by their names, and notes for whoever opens them."""
 
     texts: Mapping[str, str]
@@ -156,7 +144,13 @@ def slicer_files(case: Case, drawn: SceneContent) -> SlicerFiles:
         nodes.append(SceneNode("MarkupsFiducial", "markers", MARKERS))
         _read_points(texts[MARKERS], MARKERS, markers.names, markers.points_ct)
     if len(drawn.area.faces):
-        texts[AREA] = _area(drawn.area)
+        texts[AREA] = text = area_vtp(drawn.area)
+        read, (window, cone) = read_vtp(text.encode(), AREA), area_scalars(text)
+        if read.space is not Space.LPS:
+            raise RuntimeError(f"{AREA} does not read back as LPS")
+        written = (drawn.area.points_ct, drawn.area.faces, drawn.area.window, drawn.area.safe_cone_deg)
+        for one, other in zip((read.vertices, read.faces, window, cone), written, strict=True):
+            _same(one, other, AREA)
         nodes.append(SceneNode("Model", "safe entry", AREA))
     else:
         notes.append("no four neighbouring directions are safe: no entry area")
@@ -165,17 +159,6 @@ def slicer_files(case: Case, drawn: SceneContent) -> SlicerFiles:
     if missing or not files <= texts.keys():
         raise RuntimeError(f"{SCENE} refers to {sorted(missing | files - texts.keys())}")
     return SlicerFiles(texts, tuple(notes))
-
-
-def _area(area: EntryArea) -> str:
-    text = area_vtp(area)
-    read, (window, cone) = read_vtp(text.encode(), AREA), area_scalars(text)
-    if read.space is not Space.LPS:
-        raise RuntimeError(f"{AREA} does not read back as LPS")
-    written = (area.points_ct, area.faces, area.window, area.safe_cone_deg)
-    for one, other in zip((read.vertices, read.faces, window, cone), written, strict=True):
-        _same(one, other, AREA)
-    return text
 
 
 def _read_points(text: str, name: str, labels: tuple[str, ...], points_ct: Floats) -> None:
@@ -191,12 +174,7 @@ def _same(read: object, written: object, name: str) -> None:
 
 
 def markups_text(kind: Literal["Fiducial", "Line"], name: str, labels: Sequence[str], points_ct: Floats) -> str:
-    """One markup as JSON text.
-
-    Args:
-        kind: ``Line`` has two points.
-        points_ct: Shape (n, 3), LPS mm.
-    """
+    """One markup of points (n, 3), LPS mm, as JSON text; a line has two."""
     points = [
         {
             "id": str(number),
@@ -233,8 +211,6 @@ class EntryArea:
 
     Attributes:
         points_ct: Shape (n, 3), LPS mm: where the paths enter.
-        faces: Shape (m, 3), indices of points.
-        window: Shape (n,), the number of each point's window.
         safe_cone_deg: Shape (n,), degrees by which each direction may err all round; 0 where nothing is known.
     """
 
@@ -260,8 +236,7 @@ def _faces(candidates: Candidates, grid: AngleGrid, windows: Ints) -> Ints:
         rows = np.concatenate([rows, rows[:, :1]], axis=1)
     a, b, c, d = (part.ravel() for part in (rows[:-1, :-1], rows[1:, :-1], rows[1:, 1:], rows[:-1, 1:]))
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
-    whole = (windows[faces] > 0).all(axis=1) & (windows[faces] == windows[faces[:, :1]]).all(axis=1)
-    faces = faces[whole]
+    faces = faces[(windows[faces] > 0).all(axis=1) & (windows[faces] == windows[faces[:, :1]]).all(axis=1)]
     corners = candidates.path.entry_ct[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     span = np.sqrt(2.0) * grid.step * candidates.path.length[faces].max(axis=1)

@@ -27,23 +27,18 @@ M_PER_MM = 1e-3
 
 DIGITS = 12
 """After the point: 1e-12 rad and 1e-9 mm. Never an exponent, which not every controller reads."""
-
 START_TOLERANCE_RAD = 0.002
 """How far each joint may be from a planned one: 0.1 deg, 2 mm at a metre; a controller stops closer than that."""
-
 KINEMATICS_TOLERANCE_RAD = 0.02
 """How far the controller's own joints for the target may be from the plan's: the calibration of one arm moves them by
 some thousandths, another model of the family or another TCP by much more."""
 
 STANDOFF_TOLERANCE_M = 0.002
 """How far the controller may say that the tip is from the standoff: its calibration against the model's lengths."""
-
 ALIGN_M_S = 0.005
 """Tip speed of the correction by that distance."""
-
 FIRST_WORDS = 90
 """Characters of the first warning that the popup before the insertion shows."""
-
 _NUMBER = r"-?\d+\.\d+"
 _LIST = rf"\[{_NUMBER}(?:, {_NUMBER}){{5}}\]"
 _MOVEJ = re.compile(rf"  movej\(({_LIST}), a=({_NUMBER}), v=({_NUMBER}), r=({_NUMBER})\)")
@@ -98,24 +93,16 @@ def urscript_text(program: Program, plan: Plan, *, case_checked: bool) -> str:
         "threshold: it does not distinguish tissues and does not protect people.",
     ]
     lines = ["def puncture():", *(f"  {line}" for line in heading(plan, notes, case_checked=case_checked))]
-    lines += [*_values(program), "", *_FUNCTIONS.splitlines(), ""]
-    lines += [*_checks(), "", *_approach(program), "", *_insertion(program, plan.warnings), "end"]
-    return "\n".join(lines) + "\n"
-
-
-def _values(program: Program) -> list[str]:
-    return [
+    lines += [
         f"  tcp_m = p{_list([0.0, 0.0, program.tcp_mm * M_PER_MM, 0.0, 0.0, 0.0])}",
         f"  start_q = {_list(program.start_q)}",
         f"  standoff_q = {_list(program.standoff_q)}",
         f"  target_q = {_list(program.target_q)}",
         f"  standoff_m = p{_list(_pose_m(program.T_base_standoff))}",
         f"  target_m = p{_list(_pose_m(program.T_base_target))}",
-    ]
-
-
-def _checks() -> list[str]:
-    return [
+        "",
+        *_FUNCTIONS.splitlines(),
+        "",
         "  set_tcp(tcp_m)",
         f"  if far_from(start_q, {START_TOLERANCE_RAD}):",
         '    refuse("The arm is not at the start of the plan.")',
@@ -123,29 +110,24 @@ def _checks() -> list[str]:
         f"  if differ_but_for_turns(get_inverse_kin(target_m, target_q), target_q, {KINEMATICS_TOLERANCE_RAD}):",
         '    refuse("This arm or its TCP is not the one of the plan.")',
         "  end",
+        "",
     ]
-
-
-def _approach(program: Program) -> list[str]:
-    lines = [
-        f"  movej({_list(move.q)}, a={_number(move.acceleration)}, v={_number(move.speed)}, "
-        f"r={_number(move.blend_mm * M_PER_MM)})"
-        for move in program.moves
-    ]
-    lines += [f"  servoj({_list(q)}, 0, 0, {_number(STREAM_S)}, 0.1, 300)" for q in program.stream_q]
-    return [*lines, *(["  stopj(1.4)", _SETTLE] if len(program.stream_q) else [])]
-
-
-def _of_warnings(warnings: Sequence[str]) -> str:
-    """Warnings in the popup: how many, and how the first begins."""
-    if not warnings:
-        return ""
-    first = textwrap.shorten(plain_sentence(warnings[0]), FIRST_WORDS, placeholder=" ...")
-    return f"{plural(len(warnings), 'warning')}: {first} See the program. "
+    for move in program.moves:
+        rates = f"a={_number(move.acceleration)}, v={_number(move.speed)}, r={_number(move.blend_mm * M_PER_MM)}"
+        lines.append(f"  movej({_list(move.q)}, {rates})")
+    if len(program.stream_q):
+        lines += [f"  servoj({_list(q)}, 0, 0, {_number(STREAM_S)}, 0.1, 300)" for q in program.stream_q]
+        lines += ["  stopj(1.4)", _SETTLE]
+    return "\n".join([*lines, "", *_insertion(program, plan.warnings), "end"]) + "\n"
 
 
 def _insertion(program: Program, warnings: Sequence[str]) -> list[str]:
-    acceleration = _number(program.insertion_mm_s2 * M_PER_MM)
+    """The insertion in a thread that a contact ends, then the retraction along the same line, at the same speed."""
+    acceleration, speed = _number(program.insertion_mm_s2 * M_PER_MM), _number(program.insertion_mm_s * M_PER_MM)
+    popup = ""
+    if warnings:  # how many, and how the first begins
+        first = textwrap.shorten(plain_sentence(warnings[0]), FIRST_WORDS, placeholder=" ...")
+        popup = f"{plural(len(warnings), 'warning')}: {first} See the program. "
     return [
         f"  if far_from(standoff_q, {START_TOLERANCE_RAD}):",
         '    refuse("The arm did not come to the standoff.")',
@@ -155,17 +137,10 @@ def _insertion(program: Program, warnings: Sequence[str]) -> list[str]:
         "  end",
         f"  movel(standoff_m, a={acceleration}, v={_number(ALIGN_M_S)})",
         "  held_q = get_actual_joint_positions()",
-        _WAIT.format(warnings=_of_warnings(warnings)),
+        _WAIT.format(warnings=popup),
         f"  if far_from(held_q, {START_TOLERANCE_RAD}):",
         '    refuse("The arm moved while it waited.")',
         "  end",
-        *_guarded(acceleration, _number(program.insertion_mm_s * M_PER_MM)),
-    ]
-
-
-def _guarded(acceleration: str, speed: str) -> list[str]:
-    """The insertion in a thread that a contact ends, then the retraction along the same line, at the same speed."""
-    return [
         "  global inserted = False",
         "  global touched = False",
         "  thread insert():",
@@ -234,7 +209,6 @@ def read_urscript(text: str, *, where: Path) -> Program:
 
 
 def _number(value: float) -> str:
-    """A number in fixed point, without a negative zero."""
     text = f"{value:.{DIGITS}f}"
     return text.lstrip("-") if float(text) == 0.0 else text
 

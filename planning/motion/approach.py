@@ -29,13 +29,10 @@ from puncture_twin.planning.motion.trajectory import Trajectory
 
 ATTEMPTS = 6
 """Paths that the finer check may refuse; for FCL alone each next one is planned at half the resolution."""
-
 CUT_FRACTION = 0.5
 """A corner is rounded from the middle of its shorter segment on: the farther, the faster."""
-
 HALVINGS = 5
 """Halvings of a rounding that is not free; then the arm stops at the corner."""
-
 CURVE_PIECES = 8
 """Straight pieces as which a rounding is checked when it is chosen; the finished trajectory is checked at samples."""
 
@@ -48,8 +45,7 @@ class Approach:
         waypoints: Shape (k, 6), rad, k >= 2: straight joint segments from home to the goal.
         cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there.
         trajectory: The motion: rounded at the waypoints, within the limits of speed, acceleration and jerk.
-        checked_q: Shape (m, 6), rad: the states that FCL found free, in order; no body moves more than
-            ``MAX_SWEEP_MM`` between two of them. For :func:`least_clearance`.
+        checked_q: Shape (m, 6), rad: the states that FCL found free, in order, as of :func:`dense_states`.
     """
 
     waypoints: Floats
@@ -79,22 +75,26 @@ def plan_approach(
     Args:
         q_home: Shape (6,), rad, within the joint limits.
         q_goals: Shape (6,) or (g, 6), rad, within the joint limits.
-        max_samples: Of the planner, in each of its runs.
 
     Raises:
         NoAnswerError: If home or every goal is in collision, or no path was found; it names the contacts that blocked.
     """
     home, goals = np.asarray(q_home, dtype=np.float64), np.atleast_2d(q_goals)
-    _require_free(checker, home)
+    touched = checker.contact(home, needle_may_touch_patient=False)  # no segment's check looks at where it begins
+    if touched is not None:
+        raise NoAnswerError(f"home is in collision: {touched.body} touches {touched.other}", code="home_in_collision")
+    limits, tip = slowed(checker.model, speeds), TipLimit(checker.tool.needle_length_mm, speeds.tip_speed_mm_s)
     refused, ends = "", _Ends(checker, home, goals)
     for attempt in range(ATTEMPTS):
         contact_of = _segment_check(checker, RESOLUTION_RAD / 2**attempt)
-        path = _path(ends, contact_of, seed + shortest.RUNS * attempt, max_samples)
+        path: shortest.Path | Connected | None = shortest.direct_path(contact_of, home, goals)
+        if path is None:
+            path = _searched(ends, contact_of, seed + shortest.RUNS * attempt, max_samples)
         if isinstance(path, Connected):  # two trees that were not joined
             raise NoAnswerError(_why_none(path, ends, seed) + refused, code="no_approach")
         cuts = _cuts(contact_of, path.waypoints)
         for rounding in (cuts, np.zeros_like(cuts)) if cuts.any() else (cuts,):  # rounded, else with stops at corners
-            trajectory = _timed(checker, path.waypoints, rounding, speeds)
+            trajectory = follow(limits, path.waypoints, rounding, tip=tip)
             checked = dense_states(checker, trajectory.q, RESOLUTION_RAD / FINER)
             contact = first_contact(checker, checked)  # FCL's, along the finished motion
             if contact is None:
@@ -112,8 +112,12 @@ class _Ends:
 
     @cached_property
     def open_goals(self) -> NDArray[np.int64]:
-        """Rows of the goals that are free of contact."""
-        return _free_goals(self.checker, self.goals)
+        """Rows of the goals that are free of contact; an error where none is."""
+        contacts = self.checker.contacts(self.goals, needle_may_touch_patient=False)
+        if all(contacts):
+            named = sorted({f"{contact.body} touches {contact.other}" for contact in contacts if contact})
+            raise NoAnswerError(f"every goal is in collision: {', '.join(named)}", code="goals_in_collision")
+        return np.flatnonzero([contact is None for contact in contacts])
 
     @cached_property
     def cut(self) -> shortest.Cut | None:
@@ -124,27 +128,16 @@ class _Ends:
         return shortest.Cut(self.checker.model, self.checker.boxes, points, self.home, goals)
 
 
-def _path(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> shortest.Path | Connected:
-    """The direct path from home to a goal where it is free, else the shortest of a search."""
-    return shortest.direct_path(contact_of, ends.home, ends.goals) or _searched(ends, contact_of, seed, max_samples)
-
-
 def _searched(ends: _Ends, contact_of: SegmentContact, seed: int, max_samples: int) -> shortest.Path | Connected:
     """The shortest path that a search to the free goals finds; its ``goal_index`` is a row of all goals."""
-    limits, clear_of = ends.checker.model.joint_limits, _shortcut_check(ends.checker)
+    checker, limits = ends.checker, ends.checker.model.joint_limits
+    clear_of = checker.segment_checker(CLEARANCE_MM) if isinstance(checker, FastChecker) else None
     task = shortest.Task(limits, contact_of, ends.home, ends.goals[ends.open_goals], ends.cut, clear_of)
     path = shortest.shortest_path(task, seed=seed, max_samples=max_samples)
     return path if isinstance(path, Connected) else path._replace(goal_index=int(ends.open_goals[path.goal_index]))
 
 
-def _timed(checker: StateChecker, waypoints: Floats, cuts: Floats, speeds: SpeedLimits) -> Trajectory:
-    """Time the motion along waypoints, as fast as the limits allow."""
-    tip = TipLimit(checker.tool.needle_length_mm, speeds.tip_speed_mm_s)
-    return follow(slowed(checker.model, speeds), waypoints, cuts, tip=tip)
-
-
 def _segment_check(checker: StateChecker, resolution_rad: float) -> SegmentContact:
-    """The check of segments: the fast checker's proof, or FCL at samples."""
     if isinstance(checker, FastChecker):
         return checker.segment_checker()
 
@@ -156,20 +149,13 @@ def _segment_check(checker: StateChecker, resolution_rad: float) -> SegmentConta
     return sampled
 
 
-def _shortcut_check(checker: StateChecker) -> SegmentContact | None:
-    """The check of shortcuts: the fast checker's proof of their clearance; None for FCL alone."""
-    return checker.segment_checker(CLEARANCE_MM) if isinstance(checker, FastChecker) else None
-
-
 def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:
     """Distance from each inner waypoint at which its rounding may begin, shape (k - 2,), rad; 0 where none is free."""
-    if len(waypoints) == 2:
-        return np.zeros(0)
-    steps = np.diff(waypoints, axis=0)
+    steps, cuts = np.diff(waypoints, axis=0), np.zeros(len(waypoints) - 2)
     lengths = np.linalg.norm(steps, axis=1)
     if not lengths.all():
-        return np.zeros(len(waypoints) - 2)
-    directions, cuts = steps / lengths[:, None], np.zeros(len(waypoints) - 2)
+        return cuts
+    directions = steps / lengths[:, None]
     fraction = np.linspace(0.0, 1.0, CURVE_PIECES + 1)
     for at in range(len(cuts)):
         cut = CUT_FRACTION * float(lengths[at : at + 2].min())
@@ -182,24 +168,7 @@ def _cuts(contact_of: SegmentContact, waypoints: Floats) -> Floats:
     return cuts
 
 
-def _require_free(checker: StateChecker, home: Floats) -> None:
-    """Refuse a home in collision: no segment's check looks at where it begins."""
-    contact = checker.contact(home, needle_may_touch_patient=False)
-    if contact is not None:
-        raise NoAnswerError(f"home is in collision: {contact.body} touches {contact.other}", code="home_in_collision")
-
-
-def _free_goals(checker: StateChecker, goals: Floats) -> NDArray[np.int64]:
-    """Rows of the goals that are free of contact; an error where none is."""
-    contacts = checker.contacts(goals, needle_may_touch_patient=False)
-    if all(contacts):
-        named = sorted({f"{contact.body} touches {contact.other}" for contact in contacts if contact})
-        raise NoAnswerError(f"every goal is in collision: {', '.join(named)}", code="goals_in_collision")
-    return np.array([row for row, contact in enumerate(contacts) if contact is None], dtype=np.int64)
-
-
 def _why_none(found: Connected, ends: _Ends, seed: int) -> str:
-    """Sentence on why there is no path: a proof, else what the search reached and what blocked it."""
     cut, n_goals, n_free = ends.cut, len(ends.goals), len(ends.open_goals)
     busy = "" if n_free == n_goals else f"; {n_goals - n_free} of {n_goals} goals are in collision themselves"
     n_off = 0 if cut is None else int(cut.off.sum())

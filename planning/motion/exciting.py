@@ -13,13 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from puncture_twin.planning.arm.dynamics import (
-    MOST_CONDITION,
-    JointMotion,
-    base_parameters,
-    condition_of,
-    regressor,
-)
+from puncture_twin.planning.arm.dynamics import MOST_CONDITION, JointMotion, base_parameters, condition_of, regressor
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
@@ -27,11 +21,9 @@ from puncture_twin.planning.base.errors import NoAnswerError
 PERIOD_S = 20.0
 RATES = 2.0 * np.pi / PERIOD_S * np.arange(1, 6)
 """l w, rad/s: five terms, the fastest of 4 s."""
-
 DRAWS = 20
 TRIED = 5
 """Of the best conditioned, whether they are free of contact."""
-
 TINY = 1e-9
 
 SIZES = (0.95, 0.6, 0.35)
@@ -56,12 +48,10 @@ class Series:
 def exciting_motion(
     model: UrModel, down_base: Floats, home: Floats, free: Callable[[Floats], bool], seed: int
 ) -> Series:
-    """The motion of one arm at one mount.
+    """The motion of one arm at one mount, within its limits of angle, speed and acceleration.
 
     Args:
-        model: Its limits of angle, speed and acceleration are kept.
         down_base: Shape (3,), unit vector of gravity, base frame.
-        home: Shape (6,), rad.
         free: Whether the arm is free of contact along a path (m, 6).
 
     Raises:
@@ -80,7 +70,6 @@ def exciting_motion(
 
 
 def _drawn(model: UrModel, home: Floats, size: float, rng: np.random.Generator) -> Series:
-    """One series, each joint as large as its limits allow."""
     a, b = rng.normal(size=(2, 6, len(RATES)))
     a -= a.mean(axis=1, keepdims=True)
     b -= (b @ RATES / (RATES @ RATES))[:, None] * RATES

@@ -32,27 +32,21 @@ limit; this is for the needle, which swings after every jolt."""
 
 STANDSTILL_RAD = 1e-12
 """A segment on which no joint turns farther is no motion: rounding."""
-
 SAME_STEP = 1e-9
 """Fraction of a sample: a duration that is a whole number of samples but for this is one."""
-
 TIP_STEP_RAD = 0.005
 """rad between the samples at which the tip's speed along a path is computed; between two of them it rises by at most
 5e-5 of what the arm's whole reach would have: h^2 / 8 times the second derivative."""
 
 TIP_FRACTION = 0.999
 """Fraction of the tip's speed limit that is used: what samples may miss."""
-
 TINY = 1e-30
 """Below every rate that means anything: keeps divisions finite."""
-
 SPLINE_SAMPLES = 8
 """Samples between two rows of a smooth motion, to find its fastest joint; the spline's slope is quadratic there."""
 
 
 class _Straight(NamedTuple):
-    """A straight stretch of a segment."""
-
     start: Floats
     direction: Floats
     law: TimeLaw
@@ -66,8 +60,6 @@ class _Straight(NamedTuple):
 
 
 class _Round(NamedTuple):
-    """A rounded corner."""
-
     corner: Floats
     before: Floats
     after: Floats
@@ -85,58 +77,35 @@ class _Round(NamedTuple):
 _Stretch = _Straight | _Round
 
 
-class _Slow(NamedTuple):
-    """Further speed limits besides the arm's own: the tip's."""
-
-    speed_scale: float
-    tip: TipLimit | None
-
-    def by_tip(self, model: UrModel, q: Floats, directions: Floats) -> float:
-        """The highest speed along a path through q (m, 6) that keeps the tip's limit, per unit of ``directions``."""
-        if self.tip is None:
-            return math.inf
-        fastest = float(tip_rates(model, q, directions, self.tip.tip_mm).max())
-        return TIP_FRACTION * self.tip.speed_mm_s / max(fastest, TINY)
+def _tip_speed(model: UrModel, q: Floats, directions: Floats, tip: TipLimit | None) -> float:
+    """The highest speed along a path through q (m, 6) that keeps the tip's limit, per unit of ``directions``."""
+    if tip is None:
+        return math.inf
+    return TIP_FRACTION * tip.speed_mm_s / max(float(tip_rates(model, q, directions, tip.tip_mm).max()), TINY)
 
 
 def rounded(corner: Floats, before: Floats, after: Floats, cut: float, fraction: Floats) -> Floats:
     """The curve past a corner, as in the module's equations.
 
     Args:
-        corner: Shape (6,), rad.
-        before: Shape (6,), unit direction of the segment that leads to it.
-        after: Shape (6,), unit direction of the one that leads on.
+        before: Shape (6,), unit direction of the segment that leads to the corner; ``after`` of the one that leads on.
         cut: How far from the corner the curve begins and ends, rad.
         fraction: Shape (m,), 0..1: of the time on the curve.
-
-    Returns:
-        Shape (m, 6), rad.
     """
     covered = fraction**3 - fraction**4 / 2.0  # of f, from 0 to the fraction
     along, across = -1.0 + 2.0 * (fraction - covered), 2.0 * covered  # of the two directions, over the cut
     return np.asarray(corner + cut * (along[:, None] * before + across[:, None] * after))
 
 
-def follow(
-    model: UrModel,
-    waypoints: Floats,
-    cuts: Floats | None = None,
-    *,
-    speed_scale: float = 1.0,
-    tip: TipLimit | None = None,
-) -> Trajectory:
+def follow(model: UrModel, waypoints: Floats, cuts: Floats | None = None, *, tip: TipLimit | None = None) -> Trajectory:
     """Run straight joint segments as fast as the limits allow, past rounded corners, from rest to rest.
 
+    Samples are ``SAMPLE_S`` apart, every stop among them.
+
     Args:
-        model: The arm: its speed and acceleration limits; the jerk's is ``MAX_JERK``.
-        waypoints: Shape (k, 6), rad.
         cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there. None
             stops at all of them.
-        speed_scale: Fraction of the speed limits to use, above 0, at most 1.
         tip: How fast the needle's tip may move; None for as fast as the joints take it.
-
-    Returns:
-        Samples every ``SAMPLE_S``, every stop among them.
     """
     cuts = np.zeros(max(0, len(waypoints) - 2)) if cuts is None else np.asarray(cuts, dtype=np.float64)  # one a corner
     if not cuts.any():  # every waypoint is a stop: those without motion between go
@@ -144,24 +113,20 @@ def follow(
         cuts = np.zeros(max(0, len(waypoints) - 2))
     if len(waypoints) == 1:
         return Trajectory(np.zeros(1), waypoints)
-    straight = _straight_lengths(waypoints, cuts)
-    return _sampled(waypoints, _runs(model, waypoints, cuts, straight, _Slow(speed_scale, tip)))
-
-
-def _straight_lengths(waypoints: Floats, cuts: Floats) -> Floats:
-    """Length of each segment between its rounded corners, shape (k - 1,), rad."""
     lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
-    straight = lengths - np.append(cuts, 0.0) - np.append(0.0, cuts)
-    return np.asarray(straight.clip(0.0))  # two cuts may use a segment up, but for rounding
+    straight = (lengths - np.append(cuts, 0.0) - np.append(0.0, cuts)).clip(0.0)  # two cuts may use a segment up
+    return _sampled(waypoints, _runs(model, waypoints, cuts, straight, tip))
 
 
-def _runs(model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, slow: _Slow) -> Iterator[list[_Stretch]]:
+def _runs(
+    model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, tip: TipLimit | None
+) -> Iterator[list[_Stretch]]:
     """Straight stretches (``straight`` long, one a segment) and rounded corners in turn, from stop to stop."""
     steps = np.diff(waypoints, axis=0)
     directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
-    rates = [_segment_rates(model, *ends, slow) for ends in pairwise(waypoints)]
+    rates = [_segment_rates(model, *ends, tip) for ends in pairwise(waypoints)]
     round_speeds = [
-        _round_speed(model, waypoints[at + 1], directions[at], directions[at + 1], cut, slow)
+        _round_speed(model, waypoints[at + 1], directions[at], directions[at + 1], cut, tip)
         for at, cut in enumerate(cuts.tolist())
     ]
     speeds = _corner_speeds(round_speeds, straight, rates)
@@ -177,18 +142,19 @@ def _runs(model: UrModel, waypoints: Floats, cuts: Floats, straight: Floats, slo
             run.append(_Round(waypoints[at + 1], direction, directions[at + 1], float(cuts[at]), speeds[at + 1]))
 
 
-def _segment_rates(model: UrModel, start: Floats, end: Floats, slow: _Slow) -> Rates:
-    """Highest rates along a segment by the limits of joints and tip."""
+def _segment_rates(model: UrModel, start: Floats, end: Floats, tip: TipLimit | None) -> Rates:
     length = float(np.linalg.norm(end - start))
     direction = (end - start) / length
     fraction = np.maximum(np.abs(direction), TINY)
-    limits = (slow.speed_scale * model.max_speeds, model.max_acceleration, MAX_JERK)
+    limits = (model.max_speeds, model.max_acceleration, MAX_JERK)
     rates = Rates(*(float((limit / fraction).min()) for limit in limits))  # the slowest joint decides
     along = np.linspace(0.0, 1.0, math.ceil(length / TIP_STEP_RAD) + 1)[:, None]
-    return rates._replace(speed=min(rates.speed, slow.by_tip(model, start + along * (end - start), direction)))
+    return rates._replace(speed=min(rates.speed, _tip_speed(model, start + along * (end - start), direction, tip)))
 
 
-def _round_speed(model: UrModel, corner: Floats, before: Floats, after: Floats, cut: float, slow: _Slow) -> float:
+def _round_speed(
+    model: UrModel, corner: Floats, before: Floats, after: Floats, cut: float, tip: TipLimit | None
+) -> float:
     """Highest speed past a corner by acceleration, jerk and tip; 0 where the arm stops."""
     if cut == 0.0:
         return 0.0
@@ -197,7 +163,7 @@ def _round_speed(model: UrModel, corner: Floats, before: Floats, after: Floats, 
     by_jerk = (MAX_JERK * cut * cut / (1.5 * turn)) ** (1.0 / 3.0)
     x = np.linspace(0.0, 1.0, math.ceil(2.0 * cut / TIP_STEP_RAD) + 2)
     f = (3.0 * x**2 - 2.0 * x**3)[:, None]
-    by_tip = slow.by_tip(model, rounded(corner, before, after, cut, x), (1.0 - f) * before + f * after)
+    by_tip = _tip_speed(model, rounded(corner, before, after, cut, x), (1.0 - f) * before + f * after, tip)
     return min(by_acceleration, by_jerk, by_tip)
 
 
@@ -230,7 +196,6 @@ def _sampled(waypoints: Floats, runs: Iterable[list[_Stretch]]) -> Trajectory:
 
 
 def _steps(duration_s: float) -> int:
-    """Number of samples in a duration."""
     return max(1, math.ceil(duration_s / SAMPLE_S - SAME_STEP))
 
 
@@ -252,24 +217,12 @@ def follow_smoothly(model: UrModel, q: Floats, depths_mm: Floats, *, max_tip_spe
     Args:
         q: Shape (m, 6), rad, m >= 2.
         depths_mm: Shape (m,), strictly rising, mm inserted at each row.
-        max_tip_speed_mm_s: mm/s.
-
-    Returns:
-        Samples every ``SAMPLE_S``.
 
     Raises:
         InputError: No joint moves.
     """
     depths = np.asarray(depths_mm, dtype=np.float64)
     spline = scipy.interpolate.CubicSpline(depths, q)
-    law = time_law(float(depths[-1] - depths[0]), _tip_rates(model, spline, max_tip_speed_mm_s))
-    steps = _steps(law.duration_s)
-    return _ending_at(q[-1], spline(depths[0] + law.travelled(law.duration_s * np.arange(steps + 1) / steps)))
-
-
-def _tip_rates(model: UrModel, spline: scipy.interpolate.CubicSpline, max_tip_speed_mm_s: float) -> Rates:
-    """The tip's highest speed, acceleration and jerk for which every joint keeps its limits all along a spline."""
-    depths = spline.x
     fraction = np.linspace(0.0, 1.0, SPLINE_SAMPLES, endpoint=False)
     dense = np.append((depths[:-1, None] + np.diff(depths)[:, None] * fraction).ravel(), depths[-1])
     slope = np.abs(spline(dense, 1)).max(axis=0)
@@ -281,12 +234,14 @@ def _tip_rates(model: UrModel, spline: scipy.interpolate.CubicSpline, max_tip_sp
     speed = min(speed, (MAX_JERK / 3.0 / max(twist, TINY)) ** (1.0 / 3.0))  # a third to q3 v^3
     acceleration = model.max_acceleration / 2.0 / float(slope.max())  # the other half to q1 a
     acceleration = min(acceleration, MAX_JERK / 9.0 / max(bend * speed, TINY))  # a third of the jerk to 3 q2 v a
-    return Rates(speed, acceleration, MAX_JERK / 3.0 / float(slope.max()))
+    rates = Rates(speed, acceleration, MAX_JERK / 3.0 / float(slope.max()))
+    law = time_law(float(depths[-1] - depths[0]), rates)
+    steps = _steps(law.duration_s)
+    return _ending_at(q[-1], spline(depths[0] + law.travelled(law.duration_s * np.arange(steps + 1) / steps)))
 
 
 LENGTH_SLACK = 1e-6
 """Fraction of a length to spare for a change of speed: without, ruckig may miss the fit and take a detour."""
-
 BISECTIONS = 60
 """Bisections of an interval of speeds: to rounding."""
 
@@ -311,23 +266,16 @@ class TimeLaw(NamedTuple):
         """The length run at some times (m,) from 0 to ``duration_s``."""
         if self.profile is None:
             return np.asarray(self.length * times_s / self.duration_s)
-        return np.asarray(_positions(self.profile, np.asarray(times_s)).clip(0.0, self.length))
-
-
-def _positions(profile: Profile, times_s: Floats) -> Floats:
-    """Positions of a profile of one degree of freedom at times (m,), as ``at_time`` has them.
-
-    Within each of its pieces the jerk is constant. An arm that starts above its limits brakes before them; none here
-    does, and ``at_time`` knows how.
-    """
-    steps = profile.profiles[0][0]
-    if steps.brake.duration > 0.0:
-        return np.array([profile.at_time(float(time))[0][0] for time in times_s])
-    ends = np.cumsum(steps.t)
-    piece = np.searchsorted(ends[:-1], times_s, side="right")
-    since = times_s - np.append(0.0, ends)[piece]
-    jerk, acceleration, speed, position = (np.array(rows)[piece] for rows in (steps.j, steps.a, steps.v, steps.p))
-    return np.asarray(position + since * (speed + since * (acceleration / 2.0 + since * jerk / 6.0)))
+        steps = self.profile.profiles[0][0]
+        if steps.brake.duration > 0.0:  # it would start above its limits; none here does, and ``at_time`` knows how
+            at = np.array([self.profile.at_time(float(time))[0][0] for time in times_s])
+            return at.clip(0.0, self.length)
+        ends = np.cumsum(steps.t)  # of pieces of constant jerk
+        piece = np.searchsorted(ends[:-1], times_s, side="right")
+        since = times_s - np.append(0.0, ends)[piece]
+        jerk, acceleration, speed, position = (np.array(rows)[piece] for rows in (steps.j, steps.a, steps.v, steps.p))
+        at = position + since * (speed + since * (acceleration / 2.0 + since * jerk / 6.0))
+        return np.asarray(at.clip(0.0, self.length))
 
 
 def time_law(length: float, rates: Rates, start_speed: float = 0.0, end_speed: float = 0.0) -> TimeLaw:

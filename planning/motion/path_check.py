@@ -13,24 +13,20 @@ from puncture_twin.planning.collision.state_checker import DISTANCE_PAIRS, Conta
 
 RESOLUTION_RAD = 0.05
 """Joint distance of the states at which FCL alone checks a segment: up to 50 mm at a metre, never the last word."""
-
 FINER = 10
 """The check of the finished trajectory is this many times finer, and no body moves more than ``MAX_SWEEP_MM`` between
 its states."""
 
 MAX_SWEEP_MM = 2.0
 """So fine that no body point moves farther between two checked states."""
-
 CLEARANCE_STEP_MM = 1.0
 """The least clearance is found to this: states that cannot improve on it by more are passed over."""
 
 
 ROUGHLY_MM = 10.0
 """To this the least clearance is sought first; then a fast checker passes over what it proves to be no nearer."""
-
 _At = tuple[int, float]
 """Index of a state and a body's distance there, mm."""
-
 _Stretch = tuple[float, str, _At, _At]
 """Of a path: how near a body might come between two states, mm; the body; its ends."""
 
@@ -43,18 +39,13 @@ def path_length(waypoints: Floats) -> float:
 def dense_states(checker: StateChecker, waypoints: Floats, step_rad: float) -> Floats:
     """States along a path, so close that neither joint distance nor any body's motion exceeds its bound.
 
-    Args:
-        waypoints: Shape (k, 6), rad.
-        step_rad: Largest joint distance between two states; ``MAX_SWEEP_MM`` bounds the bodies.
-
-    Returns:
-        Shape (m, 6), rad, all waypoints among them.
+    Shape (m, 6), rad, all waypoints (k, 6) among them. ``MAX_SWEEP_MM`` bounds the motion of the bodies.
     """
     waypoints = np.asarray(waypoints, dtype=np.float64)
     lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
     counts = np.maximum(1, np.ceil(lengths / step_rad)).astype(np.int64)
     while True:
-        states = _between(waypoints, counts)
+        states = path_states(waypoints, counts)
         if len(counts) == 0:
             return states
         farthest = np.maximum.reduceat(checker.sweep_mm(states), np.cumsum(counts) - counts)
@@ -63,7 +54,7 @@ def dense_states(checker: StateChecker, waypoints: Floats, step_rad: float) -> F
         counts = np.ceil(counts * np.maximum(1.0, farthest / MAX_SWEEP_MM)).astype(np.int64)
 
 
-def _between(waypoints: Floats, counts: NDArray[np.int64]) -> Floats:
+def path_states(waypoints: Floats, counts: NDArray[np.int64]) -> Floats:
     """The waypoints (k, 6) and states between them, each segment in its count of equal steps."""
     segment = np.repeat(np.arange(len(counts)), counts)
     fraction = (np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)) / np.repeat(counts, counts)
@@ -78,11 +69,7 @@ def first_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
 
 
 def least_clearance(checker: StateChecker, q_path: Floats) -> Distances:
-    """The least of each distance over states along a path, to ``CLEARANCE_STEP_MM``.
-
-    Args:
-        q_path: Shape (m, 6), rad.
-    """
+    """The least of each distance over states (m, 6) along a path, to ``CLEARANCE_STEP_MM``."""
     path = _Path(checker, np.asarray(q_path, dtype=np.float64))
     return Distances(*(path.least(pair) for pair in DISTANCE_PAIRS))
 

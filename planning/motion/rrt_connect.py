@@ -27,13 +27,10 @@ from puncture_twin.planning.collision.state_checker import Contact
 
 RANGE_RAD = 1.0
 """Longest branch of the planner's trees, with the wrist's joints counted for half."""
-
 END_TOLERANCE_RAD = 1e-9
 """How far the planner's ends may be from home and goal: rounding."""
-
 HOME_TREE, GOAL_TREE = 0, 1
 """The planner's two trees."""
-
 STALLED = 1000
 """When so many samples in a row have made a tree no larger, it is taken to be shut in. Next to a gantry, where most
 branches touch something, a tree that later found its exit grew every 25 samples."""
@@ -78,9 +75,9 @@ def connect(
 ) -> Connected:
     """Plan from home to any of several goals, and shorten what was found.
 
+    Home (6,) and goals (g, 6) are free, rad.
+
     Args:
-        home: Shape (6,), rad, free.
-        goals: Shape (g, 6), rad, free.
         clear_of: Checks a shortcut; ``contact_of`` unless stated.
 
     Raises:
@@ -96,7 +93,8 @@ def connect(
         for goal in goals:
             goal_states.addState(space.state(goal))
         problem.setGoal(goal_states)
-        planner = _planner(space.information)
+        planner = og.RRTConnect(space.information)
+        planner.setRange(RANGE_RAD)
         planner.setProblemDefinition(problem)
         planner.setup()
         planner.solve(ob.PlannerTerminationCondition(validator.next_sample))
@@ -108,12 +106,6 @@ def connect(
         waypoints, goal_index = _with_exact_ends(found, home, goals)
         waypoints = shortened(limits.bounds, clear_of or contact_of, waypoints)
     return none._replace(waypoints=_with_exact_ends(waypoints, home, goals)[0], goal_index=goal_index)
-
-
-def _planner(information: ob.SpaceInformation) -> ob.Planner:
-    planner = og.RRTConnect(information)
-    planner.setRange(RANGE_RAD)
-    return planner
 
 
 class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without types
@@ -146,8 +138,9 @@ class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without
         known, new = angles_of(start), angles_of(end)
         if known not in self._tree_of:
             known, new = (new, known) if new in self._tree_of else (known, new)
-        if self._is_detour(new):
-            return False
+        left = self._limits.shorter_than - math.dist(self._home, new)
+        if left < math.inf and all(math.dist(new, goal) >= left for goal in self._goals):
+            return False  # no path through it is short enough (Gammell, Srinivasa and Barfoot 2014)
         contact = self._contact_of(np.array(known), np.array(new))
         if contact is not None:
             self.blocked[contact] += 1
@@ -158,11 +151,6 @@ class _Validator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without
             self._grew_at[tree] = self.samples
             self.grown[tree] += 1
         return True
-
-    def _is_detour(self, q: Angles) -> bool:
-        """Whether no path through a state is short enough (Gammell, Srinivasa and Barfoot 2014)."""
-        left = self._limits.shorter_than - math.dist(self._home, q)
-        return left < math.inf and all(math.dist(q, goal) >= left for goal in self._goals)
 
 
 def _with_exact_ends(waypoints: Floats, home: Floats, goals: Floats) -> tuple[Floats, int]:
@@ -182,10 +170,8 @@ segment that begins at a state known to be free the check gets that state first.
 
 Angles = tuple[float, ...]
 """Six joint angles, rad."""
-
 WRIST_DIVISOR = 2.0
 """OMPL's coordinates of the wrist's three joints are their angles over this: a power of two, so that no bit is lost."""
-
 SEEDS = 2**31 - 1
 """OMPL takes positive seeds; 0 would mean its own choice."""
 
@@ -194,7 +180,6 @@ class JointSpace:
     """A box of joint angles as OMPL sees it.
 
     Args:
-        bounds: Shape (6, 2), rad: lowest and highest angles.
         wrist_divisor: What the wrist's angles are divided by; a power of two.
     """
 
@@ -242,10 +227,8 @@ def seeded(seed: int) -> Iterator[None]:
 
 ROUNDS = 2
 """Rounds of shortcuts."""
-
 STEPS = 60
 """Shortcuts tried in each round. By itself OMPL tries as many as the path has vertices: few where branches are long."""
-
 CLEARANCE_MM = 20.0
 """What a shortcut keeps from patient and boxes beyond the arm's padding, where both of its ends do. The shortest path
 round an obstacle runs along it, and then an arm that errs by more than the padding touches."""
@@ -257,12 +240,7 @@ UNSCALED = 1.0
 def shortened(joint_limits: Floats, contact_of: SegmentContact, waypoints: Floats) -> Floats:
     """A path with the same ends that is no longer, with every joint counted in full.
 
-    Args:
-        joint_limits: Shape (6, 2), rad.
-        waypoints: Shape (k, 6), rad: straight free segments.
-
-    Returns:
-        Shape (m, 6), rad.
+    ``waypoints`` (k, 6), rad, are joined by straight free segments.
     """
     space = JointSpace(joint_limits, UNSCALED)
     space.set_up(_ShortcutValidator(space.information, contact_of))
@@ -279,8 +257,6 @@ def shortened(joint_limits: Floats, contact_of: SegmentContact, waypoints: Float
 
 
 class _ShortcutValidator(ob.MotionValidator):  # type: ignore[misc]  # compiled, without types
-    """Hands segments between states of the path to a check."""
-
     def __init__(self, information: ob.SpaceInformation, contact_of: SegmentContact) -> None:
         super().__init__(information)  # and not kept: it keeps the validator, and no one would free the two
         self._contact_of = contact_of

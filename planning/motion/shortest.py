@@ -37,10 +37,8 @@ limits of most joints are two whole turns apart, and a way round oneself is seld
 
 PATIENCE, LEAST_SAMPLES = 4, 500
 """A run for a shorter path gets so many times the samples that the first one took, or at least so many."""
-
 RUNS = 3
 """Runs of the planner, while it might find a path that is much shorter; see ``SHORT_ENOUGH``."""
-
 SHORT_ENOUGH = 1.3
 """No run seeks a path shorter than one that is this many times as long as the straight line to the nearest goal."""
 
@@ -63,7 +61,6 @@ class Task(NamedTuple):
     joint_limits: Floats
     """Shape (6, 2), rad."""
     contact_of: SegmentContact
-    """Checks a segment."""
     home: Floats
     """Shape (6,), rad, free."""
     goals: Floats
@@ -78,10 +75,6 @@ def direct_path(contact_of: SegmentContact, home: Floats, goals: Floats) -> Path
     """The straight path to the nearest goal that has a free one, where no other goal is worth a search; else None.
 
     It ends where its check has found no contact: whether goals are free need not be known.
-
-    Args:
-        home: Shape (6,), rad, free.
-        goals: Shape (g, 6), rad.
     """
     away = _distances(home, goals)
     found = _straight(contact_of, home, goals, away)
@@ -93,9 +86,6 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
 
     No path is shorter than the straight line to its goal, so once there is one, only goals nearer than it is long are
     sought.
-
-    Args:
-        max_samples: Of the planner, in each of its runs.
     """
     away = _distances(task.home, task.goals)
     best = _straight(task.contact_of, task.home, task.goals, away)
@@ -115,13 +105,11 @@ def shortest_path(task: Task, *, seed: int, max_samples: int = MAX_SAMPLES) -> P
 
 
 def _distances(home: Floats, goals: Floats) -> list[float]:
-    """Joint distance from home to each goal, rad."""
     start = home.tolist()
     return [math.dist(start, goal) for goal in goals.tolist()]
 
 
 def _straight(contact_of: SegmentContact, home: Floats, goals: Floats, away: list[float]) -> Path | None:
-    """The straight path to the nearest goal that has a free one."""
     for goal in sorted(range(len(away)), key=away.__getitem__):
         if contact_of(home, goals[goal]) is None:
             return Path(np.array([home, goals[goal]]), goal)
@@ -160,16 +148,12 @@ def _box(task: Task, margin_rad: Floats | float) -> Floats:
 UPPER_ARM = "upper_arm"
 UPPER_ARM_FRAME = 2
 """Its row among ``link_poses``: the joints before it are the first two."""
-
 CELL_RAD = np.radians(5.0)
 """Largest width of a cell: at the elbow a turn by half of it moves a UR3's upper arm by 11 mm."""
-
 MOST_POINTS = 48
 """Points of the upper arm that are tested."""
-
 SLACK_MM = 0.01
 """A point must lie deeper than it moves by this: rounding, and what FCL may take for no contact."""
-
 SAME_ANGLE = 1e-9
 """Angles this near to each other, whole turns apart, are one."""
 
@@ -179,8 +163,6 @@ class Cut:
 
     Args:
         points: Shape (p, 3), mm: points within the upper arm, in its frame.
-        home: Shape (6,), rad.
-        goals: Shape (g, 6), rad.
     """
 
     def __init__(self, model: UrModel, boxes: Sequence[Box], points: Floats, home: Floats, goals: Floats) -> None:
@@ -214,23 +196,17 @@ class Cut:
         q = np.zeros((len(first), len(second), 6))
         q[..., 0], q[..., 1] = first[:, None], second
         poses = link_poses(self._model, q.reshape(-1, 6))
-        points, levers = self._placed(poses)
+        # the points (c, p, 3) at each cell's middle, mm, and their distances (c, p) to the axes of both joints
+        frames = poses[:, UPPER_ARM_FRAME]
+        points = np.einsum("cij,pj->cpi", frames[:, :3, :3], self._points) + frames[:, None, :3, 3]
+        origins, axes = poses[:, None, :2, :3, 3], poses[:, None, :2, :3, 2]
+        levers = np.moveaxis(np.linalg.norm(np.cross(points[:, :, None] - origins, axes), axis=-1), -1, 0)
         moved = halves[1] * levers[1] + halves[0] * (levers[0] + halves[1] * levers[1])
         found = np.full(len(points), -1)
         for row, box in enumerate(self._boxes):
             inside = np.asarray(box.size_mm) / 2.0 - np.abs(apply(inverse(box.T_base_box), points))
             found[(inside.min(axis=-1) > moved + SLACK_MM).any(axis=1)] = row
         return found.reshape(len(first), len(second))[first_rows][:, second_rows]
-
-    def _placed(self, poses: Floats) -> tuple[Floats, Floats]:
-        """The points (c, p, 3) at each cell's middle, mm, and their distances (2, c, p) to the axes of both joints."""
-        frames = poses[:, UPPER_ARM_FRAME]
-        points = np.einsum("cij,pj->cpi", frames[:, :3, :3], self._points) + frames[:, None, :3, 3]
-        levers = [
-            np.linalg.norm(np.cross(points - poses[:, None, joint, :3, 3], poses[:, None, joint, :3, 2]), axis=-1)
-            for joint in range(2)
-        ]
-        return points, np.array(levers)
 
     @cached_property
     def _parts(self) -> Ints:

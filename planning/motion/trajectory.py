@@ -29,10 +29,6 @@ class Peaks(NamedTuple):
 class Trajectory:
     """Joint angles over time, straight between the samples.
 
-    Attributes:
-        times_s: Shape (m,), from 0, strictly rising, s.
-        q: Shape (m, 6), rad.
-
     Raises:
         InputError: If shapes, times or numbers make no sense.
     """
@@ -58,14 +54,7 @@ class Trajectory:
         return float(self.times_s[-1])
 
     def at(self, time_s: Floats | float) -> Floats:
-        """Joint angles at a time, or at many, clamped to the ends.
-
-        Args:
-            time_s: A number or shape (...), s.
-
-        Returns:
-            Shape (..., 6), rad.
-        """
+        """Joint angles (..., 6) at a time, or at many (...), clamped to the ends."""
         return np.stack([np.interp(time_s, self.times_s, self.q[:, joint]) for joint in range(6)], axis=-1)
 
     def max_speeds(self) -> Floats:

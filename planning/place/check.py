@@ -27,13 +27,10 @@ from puncture_twin.planning.collision import workcell
 from puncture_twin.planning.collision.bodies import Solid
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.patient import FclSkin
-from puncture_twin.planning.collision.state_checker import PATIENT, Contact
+from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.place.mounts import (
-    WantedDirections,
-    wanted_directions,
-)
+from puncture_twin.planning.place.mounts import WantedDirections, wanted_directions
 from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.survey import ReachAnswer, ReachRequest
 from puncture_twin.planning.registration.fit_uncertainty import reading_noise, touches
@@ -67,11 +64,8 @@ class Verdict:
     """Exact reach from one placement, in the directions that were checked.
 
     Attributes:
-        fraction: Solid angle of the reached directions over that of all that are wanted, 0..1; where not all were
-            checked, each counts for those that are nearest to it.
-        margin: Mean reach margin of the reached ones, 0..1; 0 for none.
+        fraction: Of the wanted solid angle, 0..1; where not all were checked, each counts for those nearest to it.
         home_contact: What the arm touches in its home configuration, or "".
-        q_insertion: Shape (reached, 6), rad, the tip on the target.
         answers: Of each checked direction; where all were checked, in the order of the candidates.
     """
 
@@ -97,13 +91,9 @@ class PlacementCheck:
     """Checks placements. Its values can be sent to another process.
 
     Attributes:
-        skin: CT frame.
-        outside: CT frame, what the CT shows outside of it, or None.
+        outside: What the CT shows outside of the skin, or None; CT frame, as the skin.
         fixed: Boxes that stand with the patient; their ``T_base_box`` is in the CT frame.
         carried: Boxes that stand with the arm, base frame.
-        padding_mm: Of the arm.
-        target_ct: Shape (3,), mm.
-        home: Shape (6,), rad.
     """
 
     model: UrModel
@@ -121,7 +111,15 @@ class PlacementCheck:
         """Check some directions from a pose ``T_base_ct`` (4, 4); a base in the patient or the unseen reaches none."""
         T_base_ct, rows = piece
         try:
-            checker = self._checker(T_base_ct)
+            checker = FastChecker(
+                self.model,
+                self.tool,
+                (*(Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed), *self.carried),
+                self.skin.transformed(T_base_ct),
+                outside=None if self.outside is None else self.outside.transformed(T_base_ct),
+                padding_mm=self.padding_mm,
+                cache=user_cache(),
+            )
         except InputError as error:
             if not error.code.startswith("base_in"):
                 raise
@@ -133,18 +131,8 @@ class PlacementCheck:
         ]
         home = checker.contact(self.home, needle_may_touch_patient=False)
         answers = assess_reach_all(checker, requests)
-        return Checked([replace(one, insertion_q=one.insertion_q[-1:]) for one in answers], _contact_text(home))
-
-    def _checker(self, T_base_ct: Floats) -> FastChecker:
-        boxes = [Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed]
-        outside = None if self.outside is None else self.outside.transformed(T_base_ct)
-        model, everything = self.model, (*boxes, *self.carried)
-        skin, cache = self.skin.transformed(T_base_ct), user_cache()
-        return FastChecker(model, self.tool, everything, skin, outside=outside, padding_mm=self.padding_mm, cache=cache)
-
-
-def _contact_text(contact: Contact | None) -> str:
-    return "" if contact is None else f"{contact.body} touches {contact.other}"
+        touched = "" if home is None else f"{home.body} touches {home.other}"
+        return Checked([replace(one, insertion_q=one.insertion_q[-1:]) for one in answers], touched)
 
 
 def expected_tip_error_mm(case: Case, placement: Placement | None, T_base_ct: Floats, q: Floats) -> float | None:
@@ -152,10 +140,6 @@ def expected_tip_error_mm(case: Case, placement: Placement | None, T_base_ct: Fl
 
     How the arm will touch the markers from there nobody has said, so that the arm's own errors do not cancel (2 J_f
     Sigma_eta J_f' stands for them); the residuals of the old touches say nothing of the new ones.
-
-    Args:
-        T_base_ct: Shape (4, 4), mm: where the arm is to stand.
-        q: Joints (rad) with the tip on the target from there.
     """
     registration = None if placement is None else placement.registration
     if case.errors is None or registration is None or not len(q):
@@ -180,18 +164,7 @@ def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -
 def needle_can_start(
     tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: WantedDirections, padding_mm: float
 ) -> NDArray[np.bool_]:
-    """Whether the padded needle at standoff is clear of the skin: else no placement can reach the direction.
-
-    Args:
-        tool: With the needle.
-        skin: CT frame.
-        target_ct: Shape (3,), mm.
-        wanted: n directions.
-        padding_mm: What the arm's checker keeps from the patient.
-
-    Returns:
-        Shape (n,).
-    """
+    """Whether the padded needle at standoff is clear of the skin, (n,): else no placement reaches the direction."""
     start, end = tool.needle_span_mm
     radius, length = tool.needle_diameter_mm / 2 + padding_mm, end - start + 2 * padding_mm
     needle, half = Solid(partial(fcl.Cylinder, radius, length)), np.array([radius, radius, length / 2])

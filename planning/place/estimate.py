@@ -30,10 +30,8 @@ from puncture_twin.planning.place.mounts import Site, WantedDirections
 
 SPHERE_MM = 30.0
 """Bodies are cut until their spheres are no larger: half of a UR3 wrist's size."""
-
 FLANGE = 6
 """The frame of wrist 3, with which the holder moves."""
-
 WITHIN = 0.65
 """Spheres of two bodies of the arm, at so much of their radii, must not intersect: whole ones of links two joints apart
 nearly always do. FCL finds 31 % of 1,500 random states of a UR3 in contact with themselves; spheres of this size miss
@@ -87,19 +85,18 @@ class ArmSpheres:
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """Patient and boxes that the arm must not touch.
-
-    Attributes:
-        skin: The patient, CT frame.
-        fixed: The boxes that stand with the patient, CT frame.
-        carried: The boxes that stand with the arm, base frame.
-        padding_mm: The distance to be kept from all of them.
-    """
+    """Patient, boxes that stand with them (CT frame) and with the arm (base frame), and the distance to be kept."""
 
     skin: SkinField
     fixed: Boxes
     carried: Boxes
     padding_mm: float
+
+    @property
+    def compiled(self) -> tuple[tuple[Floats, Floats], ...]:
+        """As compiled code takes them."""
+        boxes = ((some.T_box_frame, some.halves) for some in (self.fixed, self.carried))
+        return (self.skin.origin, self.skin.values), *boxes
 
 
 def clear_branches(
@@ -108,17 +105,10 @@ def clear_branches(
     """Which motions keep clear of the surroundings, and the arm of itself, at each of their states.
 
     The base is checked against the arm alone.
-
-    Args:
-        T_ct_base: Shape (4, 4), mm.
-        frames: Shape (k, m, 7, 4, 4), mm, base frame: ``link_poses`` of k motions of m states.
-
-    Returns:
-        Shape (k,).
     """
     arm = (spheres.centres, spheres.radii + surroundings.padding_mm, spheres.starts[1:], spheres.frames[1:])
     clear = np.empty(len(frames), np.bool_)
-    _clear(arm, spheres.own, _compiled(surroundings), np.ascontiguousarray(T_ct_base), frames, clear)
+    _clear(arm, spheres.own, surroundings.compiled, np.ascontiguousarray(T_ct_base), frames, clear)
     return clear
 
 
@@ -129,17 +119,8 @@ def base_is_clear(spheres: ArmSpheres, surroundings: Surroundings, T_ct_base: Fl
     alone = Surroundings(surroundings.skin, surroundings.fixed, Boxes.of([]), surroundings.padding_mm)
     clear = np.empty(1, np.bool_)
     own = (*spheres.own[:4], spheres.own[4][:0])
-    _clear(base, own, _compiled(alone), np.ascontiguousarray(T_ct_base), np.tile(np.eye(4), (1, 1, 7, 1, 1)), clear)
+    _clear(base, own, alone.compiled, np.ascontiguousarray(T_ct_base), np.tile(np.eye(4), (1, 1, 7, 1, 1)), clear)
     return bool(clear[0])
-
-
-def _compiled(surroundings: Surroundings) -> tuple[tuple[Floats, Floats], ...]:
-    skin, fixed, carried = surroundings.skin, surroundings.fixed, surroundings.carried
-    return (
-        (skin.origin, skin.values),
-        (fixed.T_box_frame, fixed.halves),
-        (carried.T_box_frame, carried.halves),
-    )
 
 
 @nb.njit(cache=True)
@@ -171,7 +152,6 @@ def skin_distance(origin, values, x, y, z):
 
 @nb.njit(cache=True)
 def _touches_box(boxes, x, y, z, radius):
-    """Whether a sphere intersects one of the boxes."""
     poses, halves = boxes
     for k in range(len(halves)):
         squared = 0.0
@@ -185,7 +165,6 @@ def _touches_box(boxes, x, y, z, radius):
 
 @nb.njit(cache=True)
 def _touches(surroundings, T_ct_base, T_base_body, centre, radius):
-    """Whether one sphere intersects anything."""
     skin, fixed, carried = surroundings
     x, y, z = _moved(T_base_body, centre[0], centre[1], centre[2])
     if _touches_box(carried, x, y, z, radius):
@@ -261,7 +240,6 @@ def _clear(arm, own, surroundings, T_ct_base, frames, clear):
 
 CELL_MM = 8.0
 """Between the field's nodes; where the skin is smooth the values between them are right to about 1 mm."""
-
 SAMPLE_MM = 6.0
 """The skin's triangles are divided until no edge is longer: the distance to a corner exceeds that to the skin by
 little where it matters, some mm away."""
@@ -307,19 +285,14 @@ class SkinField:
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Boxes of one frame, as compiled code takes them.
-
-    Attributes:
-        T_box_frame: Shape (k, 4, 4), mm.
-        halves: Shape (k, 3), half sizes, mm.
-    """
+    """Boxes of one frame: ``T_box_frame`` (k, 4, 4), mm, and half sizes (k, 3), mm."""
 
     T_box_frame: Floats
     halves: Floats
 
     @classmethod
     def of(cls, boxes: Sequence[Box]) -> Boxes:
-        """Boxes whose ``T_base_box`` is their pose in that frame, for compiled code."""
+        """Boxes whose ``T_base_box`` is their pose in that frame."""
         poses = [np.linalg.inv(box.T_base_box) for box in boxes]
         halves = [np.asarray(box.size_mm) / 2 for box in boxes]
         return cls(np.array(poses).reshape(-1, 4, 4), np.array(halves).reshape(-1, 3))
@@ -358,8 +331,6 @@ def insertion_branches(
     """Every branch of many insertions, by kinematics alone; joint limits are not tested.
 
     Args:
-        target_base: Shape (3,), mm.
-        outward_base: Shape (n, 3), unit.
         distances_mm: Shape (n, m): target to flange at each state.
         at_least: Each singularity must be farther than this.
     """
@@ -372,11 +343,7 @@ def insertion_branches(
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """Estimates placements of one arm about one target. Its values can be sent to another process.
-
-    Attributes:
-        T_ct_bed: Shape (4, 4), mm, its origin the target.
-    """
+    """Estimates placements of one arm about one target. Its values can be sent to another process."""
 
     model: UrModel
     tool: Tool
@@ -395,29 +362,18 @@ class Estimator:
         depths = np.linspace(0.0, 1.0, STATES)
         distances = self.tool.needle_length_mm + self.wanted.standoff_mm[:, None] * (1.0 - depths)
         found = insertion_branches(model, target, self.wanted.outward_ct @ T_base_ct[:3, :3].T, distances)
-        best = self._open_margins(found, T_ct_base)
-        fraction = self._fraction(best)
-        margin = float(best @ self.wanted.weight) / fraction if fraction > 0.0 else 0.0
-        return ReachEstimate(self._fraction(found.margin.max(axis=1)), fraction, margin)
-
-    def _open_margins(self, branches_reached: Branches, T_ct_base: Floats) -> Floats:
-        """The margin of each direction's best branch that keeps clear of the surroundings, shape (n,); 0 for none."""
-        model, spheres = self.model, _spheres(self.model, self.tool)
-        best = np.zeros(len(branches_reached.margin))
-        order = np.argsort(-branches_reached.margin, axis=1, kind="stable")
-        rows = np.arange(len(order))
+        # the margin of each direction's best branch that keeps clear of the surroundings, shape (n,); 0 for none
+        best, order = np.zeros(len(found.margin)), np.argsort(-found.margin, axis=1, kind="stable")
+        rows, weight = np.arange(len(order)), self.wanted.weight
         for place in range(N_BRANCHES):
-            rows = rows[branches_reached.margin[rows, order[rows, place]] > 0.0]
+            rows = rows[found.margin[rows, order[rows, place]] > 0.0]
             branches = order[rows, place]
-            clear = clear_branches(
-                spheres, self.surroundings, T_ct_base, link_poses(model, branches_reached.q[rows, branches])
-            )
-            best[rows[clear]] = branches_reached.margin[rows[clear], branches[clear]]
+            frames = link_poses(model, found.q[rows, branches])
+            clear = clear_branches(spheres, self.surroundings, T_ct_base, frames)
+            best[rows[clear]] = found.margin[rows[clear], branches[clear]]
             rows = rows[~clear]
-        return best
-
-    def _fraction(self, margins: Floats) -> float:
-        return float(self.wanted.weight[margins > 0.0].sum())
+        reach, fraction = (float(weight[some > 0.0].sum()) for some in (found.margin.max(axis=1), best))
+        return ReachEstimate(reach, fraction, float(best @ weight) / fraction if fraction > 0.0 else 0.0)
 
 
 @cache

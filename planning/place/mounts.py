@@ -14,7 +14,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
@@ -29,40 +28,27 @@ Range = tuple[float, float]
 
 FREE_MM = 100.0
 """By how much the default bounds go beyond what upper arm, forearm and needle span together."""
-
 ABOVE_MM = 200.0
 """A floor mount may stand so much higher than the target, a ceiling or side mount so much lower, by default."""
-
 RAIL_MM = 100.0
 """Height of a base at the rail above or below the table's top, at most, by default."""
-
 ROUNDS_MM = 50.0
 """Default bounds are multiples of this."""
-
 STRAIGHT_UP_MM = 1.0
 """A base whose axis passes the target this close has no direction away from it."""
-
 FACINGS: Mapping[str, tuple[int, int, int]] = MappingProxyType(
     {"to +along": (1, 0, 0), "to -along": (-1, 0, 0), "to +across": (0, 1, 0), "to -across": (0, -1, 0)}
 )
 """A side mount's base axis, toward the target, in the bed frame."""
-
 POSITION_DIGITS = 1
 """Decimals of positions, 0.1 mm: no base is set up more exactly."""
-
 AXIS_DIGITS = 6
 """Axes are written to six digits: 1e-3 mm at a metre."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A region for bases of one kind, in the bed frame about the target.
-
-    Attributes:
-        facing: What tells two regions of a mount apart, or "".
-        axis: The base's z axis, unit.
-        low: Lowest position of the base's origin, mm.
-    """
+    """A region for bases of one kind, in the bed frame about the target."""
 
     mount: MountName
     facing: str
@@ -93,21 +79,13 @@ class Region:
 
 @dataclass(frozen=True)
 class Site:
-    """One place for the base.
-
-    Attributes:
-        position: The base's origin in the bed frame: along, across, up from the target, mm.
-    """
+    """One place for the base."""
 
     region: Region
     position: tuple[float, float, float]
 
     def T_bed_base(self) -> Floats:  # noqa: N802  # the field writes T_a_b
-        """The base's pose: its x axis leads away from the target, so that the arm reaches for it at q1 = 0.
-
-        Returns:
-            Shape (4, 4), mm.
-        """
+        """The base's pose, mm: its x axis leads away from the target, so that the arm reaches for it at q1 = 0."""
         z, at = np.array(self.region.axis, dtype=float), np.array(self.position)
         x = at - z * (z @ at)
         if np.linalg.norm(x) < STRAIGHT_UP_MM:
@@ -128,25 +106,23 @@ def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
     if table is None and settings.mounts is not None and "rail" in mounts:
         what = f"place.mounts has a rail, and no obstacle '{settings.table}' of frame ct is the table"
         refuse(what, case.path, "an [[obstacle]] of that name, or place.table", "no_table")
-    reach = default_reach_mm(model, case.needle.length_mm)
+    span = abs(model.a2) + abs(model.a3) + case.needle.length_mm + FREE_MM
+    reach = ROUNDS_MM * math.ceil(span / ROUNDS_MM)  # default distance of a base from the target, rounded up
     found: list[Region] = []
     for mount in mounts:
         if mount == "rail":
             found += [] if table is None else _rails(case, table, T_ct_bed, reach)
         elif mount == "side":
-            found += [_side(facing, axis, settings.side, reach) for facing, axis in FACINGS.items()]
+            toward = {1: (-reach, 0.0), -1: (0.0, reach), 0: (-reach, reach)}  # level, to the target's side
+            for facing, axis in FACINGS.items():
+                sides = (toward[axis[0]], toward[axis[1]], (-ABOVE_MM, reach))
+                found.append(_region("side", facing, axis, settings.side, sides))
         else:
             heights = (-reach, ABOVE_MM) if mount == "floor" else (-ABOVE_MM, reach)
-            axis = (0, 0, 1) if mount == "floor" else (0, 0, -1)
+            up = (0, 0, 1) if mount == "floor" else (0, 0, -1)
             bounds = settings.floor if mount == "floor" else settings.ceiling
-            found.append(_region(mount, "", axis, bounds, ((-reach, reach), (-reach, reach), heights)))
+            found.append(_region(mount, "", up, bounds, ((-reach, reach), (-reach, reach), heights)))
     return tuple(found)
-
-
-def default_reach_mm(model: UrModel, needle_length_mm: float) -> float:
-    """Default distance of a base from the target, mm."""
-    span = abs(model.a2) + abs(model.a3) + needle_length_mm + FREE_MM
-    return ROUNDS_MM * math.ceil(span / ROUNDS_MM)  # rounded up
 
 
 def _region(
@@ -157,14 +133,7 @@ def _region(
     return Region(mount, facing, axis, low, high)
 
 
-def _side(facing: str, axis: tuple[int, int, int], bounds: MountBounds, reach: float) -> Region:
-    """The base's axis lies level and leads to the target's side."""
-    toward = {1: (-reach, 0.0), -1: (0.0, reach), 0: (-reach, reach)}
-    return _region("side", facing, axis, bounds, (toward[axis[0]], toward[axis[1]], (-ABOVE_MM, reach)))
-
-
 def _rails(case: Case, table: Obstacle, T_ct_bed: Floats, reach: float) -> list[Region]:
-    """Regions of an upright base along either long edge of the table, at about the height of its top."""
     half = np.abs(T_ct_bed[:3, :3].T) @ np.asarray(table.size_mm) / 2
     centre = T_ct_bed[:3, :3].T @ (np.asarray(table.center_mm) - T_ct_bed[:3, 3])
     bounds = case.place.rail
@@ -180,11 +149,7 @@ def _rails(case: Case, table: Obstacle, T_ct_bed: Floats, reach: float) -> list[
 
 
 def mount_section(T_ct_base: Floats, space: Space) -> MountSection:
-    """The section that states this pose in the case's space, rounded.
-
-    Args:
-        T_ct_base: Shape (4, 4), mm.
-    """
+    """The section that states this pose in the case's space, rounded."""
     # LPS to RAS is its own inverse.
     position, x, z = to_lps(np.stack([T_ct_base[:3, 3], T_ct_base[:3, 0], T_ct_base[:3, 2]]), space)
     return MountSection(
@@ -211,13 +176,7 @@ SAME_RING_DIGITS = 7
 
 @dataclass(frozen=True, eq=False)
 class WantedDirections:
-    """n directions to be reached, each with the solid angle that it represents.
-
-    Attributes:
-        outward_ct: Shape (n, 3), unit, from the target outward.
-        standoff_mm: Shape (n,), tip to target before the insertion.
-        weight: Shape (n,), fraction of the organ-safe solid angle that each stands for.
-    """
+    """n directions to be reached, each with the solid angle that it represents."""
 
     outward_ct: Floats
     standoff_mm: Floats
@@ -263,12 +222,7 @@ def wanted_directions(case: Case, candidates: Candidates) -> WantedDirections:
 
 
 def ring_weights(theta: Floats, step: float) -> Floats:
-    """The solid angle of each cell of a grid of (θ, β), up to a common factor: a grid is denser near θ = 0.
-
-    Args:
-        theta: Shape (n,), rad.
-        step: Of the grid, rad.
-    """
+    """The solid angle of each cell of a grid of (θ, β), up to a common factor: a grid is denser near θ = 0."""
     low, high = np.maximum(theta - step / 2, 0.0), np.minimum(theta + step / 2, np.pi)
     _, ring, sizes = np.unique(np.round(theta, SAME_RING_DIGITS), return_inverse=True, return_counts=True)
     return np.asarray((np.cos(low) - np.cos(high)) / sizes[ring])

@@ -32,10 +32,7 @@ from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.case.tables import MountSection
 from puncture_twin.planning.collision.bodies import connected_parts
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.workcell import (
-    ARM_PADDING_MM,
-    patient_surface,
-)
+from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, patient_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
 from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.place.check import (
@@ -47,13 +44,7 @@ from puncture_twin.planning.place.check import (
     placement_check,
 )
 from puncture_twin.planning.place.estimate import Boxes, Estimator, ReachEstimate, SkinField, Surroundings
-from puncture_twin.planning.place.mounts import (
-    Site,
-    WantedDirections,
-    mount_lines,
-    mount_section,
-    regions,
-)
+from puncture_twin.planning.place.mounts import Site, mount_lines, mount_section, regions
 from puncture_twin.planning.reach.survey import ReachAnswer
 from puncture_twin.planning.registration.placement import Placement
 from puncture_twin.planning.search.candidates import Candidates
@@ -64,28 +55,20 @@ known); False ends the search."""
 
 COARSE_DIRECTIONS = 64
 """Directions that a site is estimated with at first."""
-
 FINE_DIRECTIONS = 128
 """Directions that sites near the best are estimated with."""
-
 SEEDS, OF_MOUNT = 12, 3
 """Sites that are refined; so many of each mount are among them: the best estimate is not always of the best site."""
-
 HALVINGS = 3
 """How often the step is halved: from 150 mm to 19 mm, about as exactly as a base is set up."""
-
 FIRST, SECOND = 64, 512
 """Directions, evenly spread, in which a placement is checked before it is checked in all."""
-
 PIECE = 256
 """Directions checked in one piece: some tenths of a second to some seconds."""
-
 FINALISTS = 10
 """Placements that are checked in all directions; each mount's best two are among them."""
-
 FRACTION_DIGITS = 3
 """Fractions that agree to so many digits are equal; then the expected error decides, then the margin."""
-
 ERROR_DIGITS = 2
 """Expected errors (mm) that agree to so many digits are equal."""
 
@@ -95,8 +78,7 @@ class RatedPlacement:
     """A placement, checked and rated.
 
     Attributes:
-        site: Position of the base; None for the case's own placement.
-        estimate: The estimate that it was chosen by; None for the case's own.
+        site: Position of the base, and by which estimate it was chosen; None for the case's own placement.
         verdict: The result of the exact check, in some directions or all.
         expected_mm: Expected (rms) error of the tip over its insertions, the markers touched anew from there; None
             where the case declares no errors, or has no markers.
@@ -119,12 +101,7 @@ class PlaceSearch(Shown):
     """Result of a search for placements.
 
     Attributes:
-        T_ct_bed: Shape (4, 4), mm: the frame of the sites.
-        coarse: Every site of the first lattice with its estimate.
-        refined: How many more sites were estimated.
-        resolution_mm: The step between sites at the end.
         possible: Fraction of directions, 0..1, in which the needle may wait at its standoff: no placement reaches more.
-        directions: How many are safe for the organs.
         checked: Directions checked, summed over placements, and how many would have been in the end, if known.
         rated: Best first; the case's own placement is not among them.
         own: The case's own placement, checked; None where it has none, or the search ended before.
@@ -144,16 +121,6 @@ class PlaceSearch(Shown):
     def complete(self) -> bool:
         """Whether the search came to its end."""
         return self.checked[1] is not None and self.checked[0] >= self.checked[1]
-
-
-def _startable(check: PlacementCheck, anatomy: Anatomy, target_ct: Floats) -> WantedDirections:
-    """The directions, of `SECOND` evenly spread, in which the needle itself is clear at its standoff."""
-    spread = check.wanted.spread(SECOND)
-    found = spread.only(needle_can_start(check.tool, patient_surface(anatomy), target_ct, spread, ARM_PADDING_MM))
-    if not len(found):
-        what = "in every organ-safe direction the needle would start too near the skin"
-        raise NoAnswerError(what, code="standoff_in_skin")
-    return found
 
 
 def search_placements(
@@ -185,7 +152,12 @@ def search_placements(
     surroundings = Surroundings(
         SkinField.of(near), Boxes.of((*check.fixed, *beyond)), Boxes.of(check.carried), ARM_PADDING_MM
     )
-    startable = _startable(check, anatomy, case.target_ct)
+    spread = check.wanted.spread(SECOND)
+    starts = needle_can_start(check.tool, patient_surface(anatomy), case.target_ct, spread, ARM_PADDING_MM)
+    if not starts.any():
+        what = "in every organ-safe direction the needle would start too near the skin"
+        raise NoAnswerError(what, code="standoff_in_skin")
+    startable = spread.only(starts)
     # 2. All sites of a lattice, by bounding spheres (an estimate); the best of them checked in a few directions.
     estimator = Estimator(check.model, check.tool, surroundings, T_ct_bed, startable.spread(COARSE_DIRECTIONS))
     coarse = tuple(
@@ -209,18 +181,9 @@ def search_placements(
         race.run(contenders, own, jobs)
     rated = sorted((race.rated(one, placement) for one in contenders if one.answers), key=_worth)
     rated_own = None if own is None or not own.answers else race.rated(own, placement)
-    possible = float(startable.weight.sum())
-    return PlaceSearch(
-        T_ct_bed,
-        coarse,
-        walk.estimated,
-        walk.step_mm,
-        possible,
-        len(check.wanted),
-        race.checked,
-        tuple(rated),
-        rated_own,
-    )
+    possible, count = float(startable.weight.sum()), len(check.wanted)
+    walked = (coarse, walk.estimated, walk.step_mm, possible, count)
+    return PlaceSearch(T_ct_bed, *walked, (race.done, race.total), tuple(rated), rated_own)
 
 
 def _worth(one: RatedPlacement) -> tuple[float, float, float]:
@@ -265,8 +228,6 @@ def _parted(anatomy: Anatomy) -> tuple[TriangleMesh, list[Box]]:
 
 @dataclass(eq=False)
 class _Contender:
-    """A placement that is checked in ever more directions."""
-
     site: Site | None
     mount: MountSection
     T_base_ct: Floats
@@ -285,17 +246,12 @@ class _Race:
     def __init__(self, case: Case, T_ct_bed: Floats, check: PlacementCheck, goes_on: GoesOn) -> None:
         self._case, self._T_ct_bed, self._check, self._goes_on = case, T_ct_bed, check, goes_on
         self._order, self._all = check.wanted.order(SECOND), len(check.wanted)
-        self._done = 0
-        self._total: int | None = None
-
-    @property
-    def checked(self) -> tuple[int, int | None]:
-        """Directions checked, and how many will be, summed over the contenders; None where that is not known yet."""
-        return self._done, self._total
+        self.done = 0
+        self.total: int | None = None  # directions that will be checked, summed over the contenders; as far as known
 
     def goes_on(self) -> bool:
         """Whether the search may."""
-        return self._goes_on(self._done, self._total)
+        return self._goes_on(self.done, self.total)
 
     def contender(self, site: Site, estimate: ReachEstimate) -> _Contender:
         """A site, its pose rounded as it is written."""
@@ -317,11 +273,11 @@ class _Race:
             scores = [(one.site, self.verdict(one)) for one in contenders if one.site is not None]
             chosen = [site for site, _ in _best_apart(scores, 0.0, FINALISTS, 2)]
             left = [one for one in contenders if one.site in chosen]
-            self._total = few * len(everyone) + (self._all - few) * (len(left) + len(others))
+            self.total = few * len(everyone) + (self._all - few) * (len(left) + len(others))
             while left or others:
                 most = max((len(one.answers) for one in contenders), default=self._all)
                 follows = others and (len(others[0].answers) < most or not left)
-                one = others[0] if follows else max(left, key=self._fraction)
+                one = others[0] if follows else max(left, key=self.fraction)
                 if not self.further(work, [one], SECOND if len(one.answers) < SECOND else self._all):
                     return
                 left, others = ([one for one in some if len(one.answers) < self._all] for some in (left, others))
@@ -335,12 +291,13 @@ class _Race:
         for (one, begin, end), piece in zip(pieces, found, strict=True):
             one.answers += piece.answers
             one.home_contact = piece.home_contact
-            self._done += end - begin
+            self.done += end - begin
             if not self.goes_on():
                 return False
         return True
 
-    def _fraction(self, one: _Contender) -> float:
+    def fraction(self, one: _Contender) -> float:
+        """What a contender reaches by its checks so far."""
         return self.verdict(one).fraction
 
     def verdict(self, one: _Contender) -> Verdict:
@@ -372,8 +329,6 @@ class _Race:
 
 
 class _Walk(NamedTuple):
-    """Where sites have come to."""
-
     ends: Sequence[tuple[Site, ReachEstimate]]
     estimated: int
     step_mm: float
@@ -387,29 +342,21 @@ def _walked(
     pairs, halvings = list(seeds), 0
     while halvings < HALVINGS and goes_on():
         halvings += 1
-        groups = [[end, *_neighbours(end, step_mm / 2**halvings)] for end in dict(pairs)]
+        groups = []
+        for end in dict(pairs):
+            around = end.region.around(np.array(end.position), step_mm / 2**halvings)
+            groups.append([end, *(Site(end.region, (float(x), float(y), float(z))) for x, y, z in around)])
         for site in (site for group in groups for site in group if site not in known):
             known[site] = estimator.estimate(site)
         pairs = [max(((site, known[site]) for site in group), key=lambda pair: _score(pair[1])) for group in groups]
     return _Walk(list(dict(pairs).items()), len(known), step_mm / 2**halvings)
 
 
-def _neighbours(site: Site, step_mm: float) -> list[Site]:
-    around = site.region.around(np.array(site.position), step_mm)
-    return [Site(site.region, (float(x), float(y), float(z))) for x, y, z in around]
-
-
 Scored = TypeVar("Scored", ReachEstimate, Verdict)
 
 
 def _score(estimate: ReachEstimate | Verdict) -> tuple[float, float]:
-    """Sort key of an estimate, more is better."""
     return round(estimate.fraction, FRACTION_DIGITS), estimate.margin
-
-
-def _order(estimate: ReachEstimate | Verdict) -> tuple[float, float]:
-    fraction, margin = _score(estimate)
-    return -fraction, -margin
 
 
 def _best_apart(
@@ -419,7 +366,8 @@ def _best_apart(
     firsts: list[tuple[Site, Scored]] = []
     others: list[tuple[Site, Scored]] = []
     mounts: Counter[str] = Counter()
-    for pair in sorted((pair for pair in pairs if pair[1].fraction > 0.0), key=lambda pair: _order(pair[1])):
+    reaching = [pair for pair in pairs if pair[1].fraction > 0.0]
+    for pair in sorted(reaching, key=lambda pair: _score(pair[1]), reverse=True):
         mount = pair[0].region.mount
         chosen = firsts if mounts[mount] < of_mount else others
         if (chosen is firsts or len(others) < count) and all(_far(pair[0], k, distance_mm) for k, _ in firsts + others):
@@ -435,13 +383,11 @@ def _far(one: Site, other: Site, distance_mm: float) -> bool:
 
 PLACE_VERSION = 2
 """Version of ``place.json``'s layout."""
-
 COLUMNS = (
     *("rank", "placement", "along_mm", "across_mm", "height_mm", "share", "held", "asked", "margin", "home_contact"),
     *("base_x_mm", "base_y_mm", "base_z_mm"),
 )
 """Columns of ``placements.csv``; the base's coordinates are in the case's space."""
-
 EXPECTED = "expected_error_mm"
 """A further column where the case declares errors and has markers."""
 
@@ -460,17 +406,15 @@ def _row(rank: int | None, one: RatedPlacement) -> dict[str, Any]:
     return row if one.expected_mm is None else {**row, EXPECTED: round(one.expected_mm, 4)}
 
 
-def _estimate(estimate: ReachEstimate) -> dict[str, float]:
-    return {"reach": estimate.reach, "share": estimate.fraction, "margin": estimate.margin}
-
-
 def place_document(found: PlaceSearch, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Everything as plain values: mm; fractions and margins 0..1."""
     rows = placement_rows(found)
     for row, one in zip(rows, (*found.rated, *((found.own,) if found.own else ())), strict=True):
         row["mount"] = {key: list(value) for key, value in one.mount.model_dump().items()}
         row["reasons"] = dict(one.verdict.reasons)
-        row["estimate"] = None if one.estimate is None else _estimate(one.estimate)
+        row["estimate"] = None
+        if one.estimate is not None:
+            row["estimate"] = dict(zip(("reach", "share", "margin"), one.estimate, strict=True))
     best = found.rated[0] if found.rated else None
     return {
         "version": PLACE_VERSION,

@@ -1,9 +1,4 @@
-"""The chosen pose and its motion: what is rehearsed, exported and stored.
-
-How a plan shows itself in a notebook.
-
-A plan's motion, looked at anew: what it touches, and how near it comes.
-"""
+"""The chosen pose and its motion: what is rehearsed, exported and stored; what it touches, and how near it comes."""
 
 from __future__ import annotations
 
@@ -33,10 +28,6 @@ class Plan(Shown):
         T_base_ct: Shape (4, 4), the belief of where the patient is.
         expected_target_error_mm: Expected tip error (rms), in the insertion's configuration of the arm; without
             ``[errors]`` the registration's TRE alone; NaN for a stated mount or transform.
-        entry_ct: Shape (3,), skin entry.
-        target_ct: Shape (3,).
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        standoff_mm: Tip to target before the insertion.
         clearance_mm: Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder
             to patient and workcell, ``needle`` to the nearest structure with a margin.
         guidance: What each way of guidance would leave; empty where the case declares no devices.
@@ -84,7 +75,21 @@ class Plan(Shown):
         return f"Plan of {self.case_name}"
 
     def _facts(self) -> Facts:
-        return _facts(self)
+        point = "({:.1f}, {:.1f}, {:.1f}) mm".format
+        yield "direction", f"θ {self.theta_deg:g}°, β {self.beta_deg:g}°"
+        yield "skin entry, CT (LPS or local)", point(*self.entry_ct)
+        yield "target, CT", point(*self.target_ct)
+        yield "depth, skin to target", f"{np.linalg.norm(self.entry_ct - self.target_ct):.1f} mm"
+        yield "standoff", f"{self.standoff_mm:g} mm, tip to target"
+        error = self.expected_target_error_mm
+        yield ("expected tip error", f"{error:.2f} mm (rms)" if np.isfinite(error) else "unknown: no markers")
+        yield "robot", self.model.name
+        for name, phase in (("approach", self.approach), ("insertion", self.insertion)):
+            yield name, f"{phase.times_s[-1]:.1f} s, {len(phase.times_s):,} samples"
+        for name, millimetres in self.clearance_mm.items():
+            yield CLEARANCE_TEXT[name], f"{millimetres:.1f} mm"
+        yield "seed", str(self.seed)
+        yield "warnings", "; ".join(self.warnings) or "none"
 
 
 CLEARANCE_TEXT = MappingProxyType(
@@ -95,29 +100,6 @@ CLEARANCE_TEXT = MappingProxyType(
     }
 )
 """What each of a plan's clearances is of."""
-
-
-def _facts(plan: Plan) -> Facts:
-    """Direction, entry and target, motion, and the least distances that were found."""
-    yield "direction", f"θ {plan.theta_deg:g}°, β {plan.beta_deg:g}°"
-    yield "skin entry, CT (LPS or local)", _point(plan.entry_ct)
-    yield "target, CT", _point(plan.target_ct)
-    yield "depth, skin to target", f"{np.linalg.norm(plan.entry_ct - plan.target_ct):.1f} mm"
-    yield "standoff", f"{plan.standoff_mm:g} mm, tip to target"
-    error = plan.expected_target_error_mm
-    yield ("expected tip error", f"{error:.2f} mm (rms)" if np.isfinite(error) else "unknown: no markers")
-    yield "robot", plan.model.name
-    for name in ("approach", "insertion"):
-        phase = getattr(plan, name)
-        yield name, f"{phase.times_s[-1]:.1f} s, {len(phase.times_s):,} samples"
-    for phase, millimetres in plan.clearance_mm.items():
-        yield CLEARANCE_TEXT[phase], f"{millimetres:.1f} mm"
-    yield "seed", str(plan.seed)
-    yield "warnings", "; ".join(plan.warnings) or "none"
-
-
-def _point(point: Floats) -> str:
-    return "({:.1f}, {:.1f}, {:.1f}) mm".format(*point)
 
 
 def phase_clearances(plan: Plan, checker: StateChecker) -> dict[str, float]:
@@ -132,16 +114,8 @@ def phase_clearances(plan: Plan, checker: StateChecker) -> dict[str, float]:
 def motion_contact(plan: Plan, checker: CellChecker) -> str | None:
     """The contact of a plan's motion, in words, or None: by FCL at ten times the planner's resolution."""
     for phase, q, needle_free in (("approach", plan.approach.q, False), ("insertion", plan.insertion.q, True)):
-        contact = _contact(checker, q, needle_free)
-        if contact is not None:
-            return f"{phase} is not free: {contact}"
-    return None
-
-
-def _contact(checker: CellChecker, q_path: Floats, needle_free: bool) -> str | None:
-    """The first contact along a motion, sampled as densely as when it was planned; None if there is none."""
-    for q in dense_states(checker, q_path, RESOLUTION_RAD / FINER):
-        contact = CellChecker.contact(checker, q, needle_may_touch_patient=needle_free)  # FCL alone, no bounds
-        if contact is not None:
-            return f"{contact.body} touches {contact.other}"
+        for state in dense_states(checker, q, RESOLUTION_RAD / FINER):
+            contact = CellChecker.contact(checker, state, needle_may_touch_patient=needle_free)  # FCL alone, no bounds
+            if contact is not None:
+                return f"{phase} is not free: {contact.body} touches {contact.other}"
     return None

@@ -1,9 +1,4 @@
-"""Whether a plan does what it says, and is still its case's: what must hold of its numbers alone.
-
-The arm of a plan as its file states it: a name, and for any but the table's own arm the numbers behind it.
-
-A plan, compared with its case again: same inputs, same verdict, and a motion that FCL finds free.
-"""
+"""Whether a plan does what it says, is still its case's, and is free of contact; and how its file states an arm."""
 
 from __future__ import annotations
 
@@ -16,7 +11,6 @@ import numpy as np
 from puncture_twin.planning.arm.insertion import needle_lines
 from puncture_twin.planning.arm.kinematics import flange_pose, slowed, tip_speeds
 from puncture_twin.planning.arm.ur import UR_MODELS, UrModel, ur_model
-from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.base.strict_json import array, number, text
@@ -24,6 +18,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import needle_pose
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.motion.follow import MAX_JERK
+from puncture_twin.planning.motion.path_check import path_states
 from puncture_twin.planning.motion.trajectory import Peaks
 from puncture_twin.planning.plan.plan import Plan, motion_contact, phase_clearances
 from puncture_twin.planning.reach.standoff import standoffs
@@ -35,28 +30,20 @@ from puncture_twin.planning.uncertainty.pose_error import expected_error_mm
 
 POSE_TOLERANCE_MM = 0.01
 """How far the tip of the stored joint angles may be from the stored pose: well above rounding, far below any error."""
-
 JOIN_TOLERANCE_RAD = 1e-9
 """How far the insertion may start from where the approach ends: rounding of the time laws."""
-
 STRAIGHT_TOLERANCE_MM = 0.1
 """How far the tip may leave the straight path during the insertion: what a UR3 repeats."""
-
 BETWEEN_RAD = 0.002
 """Joint step at which an insertion is looked at between its rows: up to 1.3 mm at the tip, bent by far less."""
-
 MOST_STATES = 100_000
 """Joints that turn through more steps than this (200 rad) during one insertion do something else."""
-
 ROLL_TOLERANCE_RAD = 1e-4
 """How far the stated roll may be from that of the joint angles: what the pose's tolerance lets the flange turn."""
-
 ANGLE_ROUNDING = 1e-12
 """Share of a turn by which degrees and radians round."""
-
 SPEED_ROUNDING = 1e-3
 """A time law that just keeps a speed may exceed it by its sampling."""
-
 AGREE = "T_base_ct, target_ct_mm, outward_ct, needle_length_mm, standoff_mm and joint angles must agree"
 
 
@@ -78,32 +65,23 @@ def check_inputs(plan: Plan, case: Case, path: Path) -> None:
 
 
 def check_geometry(plan: Plan, path: Path) -> None:
-    """Refuse a plan whose motion does not do what it says: join, start at standoff, end on the target.
-
-    Raises:
-        InputError: Says which end is off, and by how much.
-    """
+    """Refuse a plan whose motion does not do what it says: join, start at standoff, end on the target."""
     if not np.allclose(plan.approach.q[-1], plan.insertion.q[0], rtol=0, atol=JOIN_TOLERANCE_RAD):
         refuse("the insertion does not start where the approach ends", path, "connected phases", "phases_not_joined")
     _check_straight(plan, path)
     _check_speeds(plan, path)
-    model = plan.model
     for name, q, standoff in (
         ("standoff", plan.insertion.q[0], plan.standoff_mm),
         ("target", plan.insertion.q[-1], 0.0),
     ):
         pose = needle_pose(plan.target_ct, plan.outward_ct, standoff=standoff, length=plan.needle_length_mm)
-        T_base_flange = flange_pose(model, q)
+        T_base_flange = flange_pose(plan.model, q)
         tip = T_base_flange[:3, 3] + plan.needle_length_mm * T_base_flange[:3, 2]
         for what, point, wanted in (("tip", tip, pose.tip_ct), ("flange", T_base_flange[:3, 3], pose.top_ct)):
             error = float(np.linalg.norm(point - plan.T_base_ct[:3, :3] @ wanted - plan.T_base_ct[:3, 3]))
             if not error <= POSE_TOLERANCE_MM:
-                refuse(
-                    f"the {what} at {name} is {error:.3g} mm off the stored pose",
-                    path,
-                    f"at most {POSE_TOLERANCE_MM} mm: {AGREE}",
-                    "plan_contradicted",
-                )
+                stated = f"the {what} at {name} is {error:.3g} mm off the stored pose"
+                refuse(stated, path, f"at most {POSE_TOLERANCE_MM} mm: {AGREE}", "plan_contradicted")
 
 
 def check_angles(plan: Plan, path: Path) -> None:
@@ -131,8 +109,11 @@ def _check_straight(plan: Plan, path: Path) -> None:
 
     Between two stored rows the joints turn evenly, so the motion is looked at there too.
     """
-    model = plan.model
-    poses = flange_pose(model, _between(plan.insertion.q, path))
+    q = plan.insertion.q
+    counts = np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) / BETWEEN_RAD).clip(min=1)
+    if counts.sum() > MOST_STATES:
+        refuse("the joints rotate repeatedly during the insertion", path, "a straight insertion", "not_straight")
+    poses = flange_pose(plan.model, path_states(q, counts.astype(np.int64)))
     forward = poses[:, :3, 2]
     tips = poses[:, :3, 3] + plan.needle_length_mm * forward
     R, t = plan.T_base_ct[:3, :3], plan.T_base_ct[:3, 3]
@@ -153,19 +134,7 @@ def _check_straight(plan: Plan, path: Path) -> None:
             refuse(f"the {what} by {amount:.3g} mm", f"{path}: insertion", allowed, "not_straight")
 
 
-def _between(q: Floats, path: Path) -> Floats:
-    """The rows of a joint path and points between them, no more than `BETWEEN_RAD` apart in any joint."""
-    counts = np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) / BETWEEN_RAD).clip(min=1)
-    if counts.sum() > MOST_STATES:
-        refuse("the joints rotate repeatedly during the insertion", path, "a straight insertion", "not_straight")
-    segment = np.repeat(np.arange(len(counts)), counts.astype(np.int64))
-    starts = np.cumsum(counts) - counts
-    fraction = (np.arange(len(segment)) - starts[segment]) / counts[segment]
-    return np.concatenate([q[segment] + fraction[:, None] * (q[segment + 1] - q[segment]), q[-1:]])
-
-
 def _check_speeds(plan: Plan, path: Path) -> None:
-    """Refuse joints beyond their limits, rates beyond the plan's own limits, or a tip that is too fast."""
     model = plan.model
     for phase, part, limit in (
         ("approach", plan.approach, plan.speeds.tip_speed_mm_s),
@@ -209,10 +178,7 @@ def arm_document(model: UrModel) -> dict[str, Any] | None:
 
 
 def read_arm(name: str, document: Any) -> UrModel:
-    """The arm of a plan that was read; one of the user's own has no shapes yet, which its case holds.
-
-    Args:
-        document: Of `arm_document`, or None.
+    """The arm of a plan, from its `arm_document`; one of the user's own has no shapes yet, which its case holds.
 
     Raises:
         InputError: No arm of that name.
@@ -232,17 +198,7 @@ def read_arm(name: str, document: Any) -> UrModel:
         joint_names=tuple(text(one) for one in document["joint_names"]),
         shipped=document["shipped"] is True,
     )
-    _check(model)
-    return model
-
-
-def same_arm(one: UrModel, other: UrModel) -> bool:
-    """Whether two arms have the same numbers; the shapes of an own arm are those of the case's inputs."""
-    return replace(one, urdf=None) == replace(other, urdf=None)
-
-
-def _check(model: UrModel) -> None:
-    """Refuse numbers that no arm has, and an arm of the table that is not the table's but for narrower limits."""
+    # numbers that no arm has, and an arm of the table that is not the table's but for narrower limits
     positive = np.array([1, -1, -1, 1, 1, 1]) * model.lengths
     low, high = model.joint_limits.T
     above_zero = [positive, high - low, model.max_speeds, model.max_torques, np.array([model.max_acceleration])]
@@ -254,6 +210,12 @@ def _check(model: UrModel) -> None:
         within = known.within_limits(model.joint_limits.T).all() and (model.max_speeds <= known.max_speeds).all()
         if narrower != model or not within:
             raise ValueError(f"the numbers are not those of a {model.name}")
+    return model
+
+
+def same_arm(one: UrModel, other: UrModel) -> bool:
+    """Whether two arms have the same numbers; the shapes of an own arm are those of the case's inputs."""
+    return replace(one, urdf=None) == replace(other, urdf=None)
 
 
 SAME_DIRECTION = 1e-6
@@ -269,9 +231,6 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
 
     Args:
         seed: That the plan must state: the command ``plan`` takes the case's. None where code chose another.
-
-    Returns:
-        The candidate of the plan, checked.
 
     Raises:
         InputError: The inputs changed, the direction is not safe any more, or the motion touches something.
@@ -290,7 +249,10 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
     if seed is not None:
         _check_same("seed", plan.seed, seed, path)
     _check_labels(plan, context, candidates, path)
-    _check_warnings(plan, context, path)
+    if plan.warnings != context.anatomy.warnings:  # people decide by them
+        apart = set(plan.warnings) ^ set(context.anatomy.warnings)
+        shown = f", such as '{min(apart)}'" if apart else ""
+        refuse(f"its warnings differ from the case's{shown}", path, "plan again", "plan_of_another")
     check_angles(plan, path)
     touched = motion_contact(plan, context.reach.checker)
     if touched is not None:
@@ -298,14 +260,6 @@ def check_plan(plan: Plan, context: CaseContext, path: Path, *, seed: int | None
     for phase, known in phase_clearances(plan, context.reach.checker).items():
         _check_same(f"clearance_mm.{phase}", plan.clearance_mm.get(phase, np.nan), known, path)
     return candidates
-
-
-def _check_warnings(plan: Plan, context: CaseContext, path: Path) -> None:
-    """Refuse a plan that states other warnings than its case has: people decide by them."""
-    if plan.warnings != context.anatomy.warnings:
-        apart = set(plan.warnings) ^ set(context.anatomy.warnings)
-        shown = f", such as '{min(apart)}'" if apart else ""
-        refuse(f"its warnings differ from the case's{shown}", path, "plan again", "plan_of_another")
 
 
 def _check_limits(plan: Plan, context: CaseContext, path: Path) -> None:

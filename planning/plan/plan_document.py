@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -36,36 +34,21 @@ from puncture_twin.planning.uncertainty.guided import WayChance
 
 PLAN_VERSION = 3
 """Version of the file's layout. `arm` is absent for an arm of the table: its name gives its numbers."""
-
 PLAN_ALLOWED = f"a plan.json of version {PLAN_VERSION}; plan again"
 
 NAMES = (
-    *(
-        "version",
-        "case",
-        "inputs",
-        "seed",
-        "robot",
-        "arm",
-        "T_base_ct",
-        "expected_target_error_mm",
-        "theta_deg",
-        "beta_deg",
-    ),
-    *("entry_ct_mm", "target_ct_mm", "outward_ct", "roll_deg", "standoff_mm", "needle_length_mm", "limits"),
+    *("version", "case", "inputs", "seed", "robot", "arm", "T_base_ct", "expected_target_error_mm", "theta_deg"),
+    *("beta_deg", "entry_ct_mm", "target_ct_mm", "outward_ct", "roll_deg", "standoff_mm", "needle_length_mm", "limits"),
     *("speed_limits", "approach", "insertion", "clearance_mm", "warnings", "guidance"),
 )
 PHASE_NAMES = ("times_s", "q_rad", "peaks")
 CLEARANCE_NAMES = ("approach", "insertion", "needle")
 INPUT_NAMES = ("role", "path", "sha256")
 """The keys of a plan and of its parts."""
-
 SAME_TIME_S = 1e-9
 """Rounding of the samples' times."""
-
 SAME_PEAK = 1e-6
 """Share by which a stated peak may differ from the samples' own: rounding."""
-
 MAX_PLAN_BYTES = 50_000_000
 """A plan is some thousand waypoints; a larger file is something else."""
 
@@ -102,11 +85,7 @@ def write_plan(plan: Plan, path: Path) -> None:
 
 
 def read_plan(path: Path) -> Plan:
-    """Read a plan, from a whole output set or from outside of any, and check it as `parse_plan` does.
-
-    Raises:
-        InputError: It cannot be read, its folder's manifest lists other bytes, or see `parse_plan`.
-    """
+    """Read a plan, from a whole output set or from outside of any, and check it as `parse_plan` does."""
     return parse_plan(read_output(path, max_bytes=MAX_PLAN_BYTES).data, path)
 
 
@@ -127,7 +106,6 @@ def parse_plan(data: bytes, path: Path) -> Plan:
 
 
 def _check_stated(document: dict[str, Any], plan: Plan, path: Path) -> None:
-    """Refuse limits and peaks that are not the arm's and the samples' own: people read them."""
     stated: tuple[tuple[str, Any, dict[str, list[float]]], ...] = (
         ("limits", document.get("limits"), _rates_document(rate_limits(plan.model))),
         ("peaks of the approach", document["approach"].get("peaks"), _rates_document(plan.approach.peaks())),
@@ -191,7 +169,7 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
         needle_length_mm=field(document, "needle_length_mm", number),
         approach=field(document, "approach", _trajectory),
         insertion=field(document, "insertion", _trajectory),
-        clearance_mm=field(document, "clearance_mm", _clearances),
+        clearance_mm={phase: number_or_nan(one) for phase, one in field(document, "clearance_mm", dict).items()},
         speeds=field(document, "speed_limits", _speed_limits),
         warnings=field(document, "warnings", texts),
         guidance=tuple(_way(one) for one in document.get("guidance", [])),
@@ -204,17 +182,12 @@ def _way(value: Any) -> WayChance:
 
 
 def _speed_limits(value: Any) -> SpeedLimits:
-    """Limits of speed that a plan says it keeps."""
     if set(value) != set(SpeedLimits._fields):
         raise ValueError(f"speed_limits are {', '.join(SpeedLimits._fields)}")
     speeds = SpeedLimits(*(number(value[name]) for name in SpeedLimits._fields))
     if not all(0.0 < speed <= most for speed, most in zip(speeds, HIGHEST, strict=True)):
         raise ValueError(f"speed_limits are above 0 and at most {', '.join(f'{most:g}' for most in HIGHEST)}")
     return speeds
-
-
-def _clearances(value: Any) -> Mapping[str, float]:
-    return MappingProxyType({phase: number_or_nan(one) for phase, one in value.items()})
 
 
 def _trajectory(document: Any) -> Trajectory:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from puncture_twin.planning.arm.kinematics import slowed
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.collision.workcell import home_configuration
@@ -63,33 +64,25 @@ def make_plan(
             plan = _plan(context, candidates, int(row), seed)
         except NoAnswerError as error:
             last = str(error)
-            candidates = _without_approach(context, candidates, int(row), last)
+            why = {"reason": Reason.APPROACH_NOT_FOUND.value, "detail": last}
+            candidates = replace(candidates, verdict=candidates.verdict.put(np.array([row]), **why))
+            candidates = ranked(context.case, candidates)
             continue
         return Planned(plan, candidates, int(row))
     raise NoAnswerError(f"no plan: {last}", counts=candidates.counts(), code="no_plan")
 
 
-def _without_approach(context: CaseContext, candidates: Candidates, row: int, why: str) -> Candidates:
-    """The candidates with one rejected as ``approach_not_found``, ranked again."""
-    reason, detail = candidates.verdict.reason.copy(), candidates.verdict.detail.copy()
-    reason[row], detail[row] = Reason.APPROACH_NOT_FOUND.value, why
-    verdict = replace(candidates.verdict, reason=reason, detail=detail)
-    return ranked(context.case, replace(candidates, verdict=verdict))
-
-
 def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> Plan:
-    """Plan to one candidate, and check the plan."""
     assert context.reach is not None and context.placement is not None  # the caller has refused this
     case, checker = context.case, context.reach.checker
     # 0. The direction, checked anew: candidates may be of another engine, or changed; here they are an order alone.
     candidates = context.check(candidates.theta[row], candidates.beta[row])
-    row = 0
     if not candidates.safe[0]:
         raise NoAnswerError(f"its direction is rejected: {reason_text(candidates, 0)}", code="direction_rejected")
     # 1. The approach: from home to the standoff, in any of the arm's configurations that keep the limits of chances.
-    request = reach_request(case, candidates, row, context.reach.T_base_ct)
+    request = reach_request(case, candidates, 0, context.reach.T_base_ct)
     home, speeds = home_configuration(case), case.robot.speeds
-    goals = _within_limits(context, candidates, row, approach_goals(checker, request, home))
+    goals = _within_limits(context, candidates.outward_ct[0], approach_goals(checker, request, home))
     approach = plan_approach(checker, home, np.array([goal.insertion_q[0] for goal in goals]), seed=seed, speeds=speeds)
     answer = goals[approach.goal_index]
     # The tip's error is that of all declared errors, else of the markers alone.
@@ -103,11 +96,11 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
         model=case.robot.model,
         T_base_ct=context.placement.T_base_ct,
         expected_target_error_mm=error_mm,
-        theta=float(candidates.theta[row]),
-        beta=float(candidates.beta[row]),
-        entry_ct=candidates.path.entry_ct[row],
+        theta=float(candidates.theta[0]),
+        beta=float(candidates.beta[0]),
+        entry_ct=candidates.path.entry_ct[0],
         target_ct=case.target_ct,
-        outward_ct=candidates.outward_ct[row],
+        outward_ct=candidates.outward_ct[0],
         roll=answer.roll,
         standoff_mm=request.standoff_mm,
         needle_length_mm=case.needle.length_mm,
@@ -118,7 +111,7 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
             answer.insertion_depth_mm,
             max_tip_speed_mm_s=speeds.insertion_speed_mm_s,
         ),
-        clearance_mm={"needle": float(candidates.clearance.least[row])},
+        clearance_mm={"needle": float(candidates.clearance.least[0])},
         speeds=speeds,
         warnings=context.anatomy.warnings,
     )
@@ -129,15 +122,12 @@ def _plan(context: CaseContext, candidates: Candidates, row: int, seed: int) -> 
     return replace(plan, clearance_mm={**phase_clearances(plan, checker), **plan.clearance_mm})
 
 
-def _within_limits(
-    context: CaseContext, candidates: Candidates, row: int, goals: list[ReachAnswer]
-) -> list[ReachAnswer]:
-    """The configurations of a candidate that keep the case's limits of chances; the search has checked one alone."""
+def _within_limits(context: CaseContext, outward_ct: Floats, goals: list[ReachAnswer]) -> list[ReachAnswer]:
+    """The configurations of a direction that keep the case's limits of chances; the search has checked one alone."""
     if context.chance is None or not goals:
         return goals
     q = np.array([goal.insertion_q[-1] for goal in goals])
-    outward = np.tile(candidates.outward_ct[row], (len(goals), 1))
-    satisfied = satisfies_limits(context.chance, outward, q)
+    satisfied = satisfies_limits(context.chance, np.tile(outward_ct, (len(goals), 1)), q)
     if not satisfied.any():
         what = "no configuration at the end of an approach keeps search.min_hit and max_touch"
         raise NoAnswerError(what, code="limits_not_kept")

@@ -14,7 +14,6 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.spaces import Space, to_lps
 
@@ -41,7 +40,7 @@ class EntryFacts:
     needle_mm: float | None = None
 
     def rows(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of a label and its text for people."""
+        """Pairs of a label and its text, for people."""
         stated: list[tuple[str, str]] = []
         if self.place is not None:
             point = ", ".join(f"{mm:.1f}" for mm in self.entry_mm)
@@ -116,21 +115,10 @@ def slice_numbers(grid: VolumeGrid) -> tuple[Floats, int]:
     return (index + [0, 0, 0, 1] if grid.T_ct_index[2, axis] > 0 else [0, 0, 0, count] - index), count
 
 
-def shortest_needle(needle: Needle, path_mm: float) -> float | None:
-    """Of a needle's catalogue the shortest for a path, tip to flange, mm; NaN where none reaches, None without one."""
-    reaching = (mm for mm in sorted(needle.lengths_mm) if needle.of_length(mm).longest_path_mm >= path_mm)
-    return next(reaching, np.nan) if needle.lengths_mm else None
-
-
 def entry_facts(
     case: Case, markers: Sequence[Landmark], entry_ct: Floats, outward_ct: Floats, grid: VolumeGrid | None = None
 ) -> EntryFacts:
-    """Skin entry, nearest landmark and scanner angles of one path.
-
-    Args:
-        entry_ct: Shape (3,), mm; NaN without a skin entry.
-        outward_ct: Shape (3,), unit, from the target outward.
-    """
+    """Skin entry, nearest landmark and scanner angles of one path."""
     landmarks = markers or (Landmark("the target", np.asarray(case.target_ct)),)
     planes = None if case.space is Space.LOCAL else needle_planes(outward_ct)
     entry_mm = to_lps(entry_ct[None], case.space)[0]  # the change of signs undoes itself
@@ -139,8 +127,11 @@ def entry_facts(
         number, count = slice_numbers(grid)
         x, y, z = entry_ct.tolist()
         scanned = ScannedEntry(int(np.rint(number @ [x, y, z, 1.0])), count, z, x, y)
-    needle_mm = shortest_needle(case.needle, float(np.linalg.norm(entry_ct - case.target_ct)))
-    return EntryFacts(case.space, entry_mm, place, planes, scanned, None if place is None else needle_mm)
+    path_mm, needle, needle_mm = float(np.linalg.norm(entry_ct - case.target_ct)), case.needle, None
+    if place is not None and needle.lengths_mm:
+        reaching = [mm for mm in needle.lengths_mm if needle.of_length(mm).longest_path_mm >= path_mm]
+        needle_mm = min(reaching, default=np.nan)
+    return EntryFacts(case.space, entry_mm, place, planes, scanned, needle_mm)
 
 
 class NeedlePlanes(NamedTuple):
@@ -177,7 +168,6 @@ class NeedlePlanes(NamedTuple):
 
 LEAST_IN_PLANE = 1e-6
 """Least part of a unit direction within the slice: a needle along the patient has no angle there."""
-
 MOST_TILT = np.radians(30.0)
 """rad: gantries of CT scanners tilt no farther."""
 
@@ -199,14 +189,12 @@ def needle_planes(outward_ct: Floats) -> NeedlePlanes:
 
 LEAST_MM = 0.5
 """mm: a ruler on the skin does not show less; texts are in whole mm."""
-
 PATIENT = (
     (0, "to the left", "to the right"),
     (2, "toward the head", "toward the feet"),
     (1, "toward the back", "toward the front"),
 )
 """Axis of LPS, and its positive and negative direction; in the order in which they are measured on a lying patient."""
-
 LOCAL = tuple((axis, f"along +{name}", f"along -{name}") for axis, name in enumerate("xyz"))
 """A space of its own has no anatomy."""
 
@@ -220,12 +208,7 @@ class Landmark(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EntryPlace:
-    """A skin entry as seen from a landmark.
-
-    Attributes:
-        landmark: From where it is measured.
-        offset_ct: Shape (3,), from the landmark to the entry, mm.
-    """
+    """A skin entry as seen from a landmark, ``offset_ct`` (3,), mm, from there."""
 
     landmark: Landmark
     offset_ct: Floats

@@ -7,7 +7,7 @@ clearance of margin and bound is enough whatever side the bevel points to: `with
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import groupby
 from typing import NamedTuple
 
@@ -36,40 +36,33 @@ from puncture_twin.planning.needle.insertion_force import InsertionForce, insert
 from puncture_twin.planning.search.candidates import Candidates, Verdict
 
 
-def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBound | None) -> Candidates:
-    """Reject candidates whose clearance is less than the margin and the largest deflection.
-
-    Args:
-        anatomy: The structures of ``candidates``.
-        bound: How far the needle may bend; None bends nothing.
-    """
-    if bound is None:
-        return candidates
+def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBound) -> Candidates:
+    """Reject candidates whose clearance is less than the margin and the largest deflection."""
     deflection = bound.at(candidates.path.length)
     verdict = bent_verdict(candidates.verdict, anatomy.checked, candidates.clearance.distance, deflection)
     return replace(candidates, verdict=verdict, deflection=deflection)
 
 
 def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance: Floats, deflection: Floats) -> Verdict:
-    """A verdict with candidates rejected whose clearance is less than margin + deflection; others keep theirs.
-
-    Args:
-        clearance: Shape (n, k), of the straight needle, mm.
-        deflection: Shape (n,), the greatest, mm.
-    """
+    """A verdict with candidates rejected whose clearance is less than margin + deflection; others keep theirs."""
     demanding = np.flatnonzero([one.demands_margin for one in structures])
     if not len(demanding):
         return verdict
     excess = clearance[:, demanding] - np.array([structures[column].margin_mm for column in demanding])
     nearest = demanding[excess.argmin(axis=1)]
-    rows = np.flatnonzero((verdict.reason == Reason.NONE.value) & ~(excess.min(axis=1) >= deflection))
-    arrays = {field.name: getattr(verdict, field.name).copy() for field in fields(verdict)}
-    arrays["reason"][rows] = Reason.NEEDLE_BENDS.value
-    for row in rows:
-        one = structures[nearest[row]]
-        arrays["structure"][row], arrays["amount"][row] = one.name, clearance[row, nearest[row]]
-        arrays["detail"][row] = f"it may bend by {deflection[row]:.2f} mm; the margin is {one.margin_mm:g} mm"
-    return Verdict(**arrays)
+    rows = np.flatnonzero(verdict.safe & ~(excess.min(axis=1) >= deflection))
+    broken = [structures[column] for column in nearest[rows]]
+    details = [
+        f"it may bend by {bend:.2f} mm; the margin is {one.margin_mm:g} mm"
+        for bend, one in zip(deflection[rows], broken, strict=True)
+    ]
+    return verdict.put(
+        rows,
+        reason=Reason.NEEDLE_BENDS.value,
+        structure=np.array([one.name for one in broken], dtype=object),
+        amount=clearance[rows, nearest[rows]],
+        detail=np.array(details, dtype=object),
+    )
 
 
 class Insertion(NamedTuple):
@@ -98,13 +91,7 @@ class Insertion(NamedTuple):
 def insertion_along(
     bending: Bending, anatomy: Anatomy, end_ct: Floats, outward_ct: Floats, path_length: float
 ) -> Insertion:
-    """Deflection, forces and buckling of the insertion along one direction.
-
-    Args:
-        end_ct: Shape (3,), mm, where the path ends: the target.
-        outward_ct: Shape (3,), unit.
-        path_length: From there to the skin, mm.
-    """
+    """Deflection, forces and buckling of the insertion along one direction."""
     layers = path_layers(bending, anatomy, end_ct, outward_ct, path_length)
     stiffest = max(layer.tissue.stiffness_n_mm2 for layer in layers)
     count = max(1, int(np.ceil(path_length / step_for(bending.shaft, stiffest))))
@@ -141,34 +128,22 @@ def path_layers(
     """The tissue layers of a path, skin first; in nested structures the smallest box counts.
 
     A surface is a capsule where it is entered. That of the rest is the skin: coming out of an organ there is none.
-
-    Args:
-        anatomy: The case's structures; only closed ones have an inside.
-        target_ct: Shape (3,), mm.
-        outward_ct: Shape (3,), unit.
-        path_length: Target to skin, mm.
     """
     count = max(1, round(path_length / STEP_MM))
     edges = np.linspace(0.0, path_length, count + 1)
     depths = path_length - 0.5 * (edges[1:] + edges[:-1])
     names = np.full(count, REST, dtype=object)
-    for one in sorted((s for s in anatomy.structures if s.mesh.closed), key=_size, reverse=True):
+    closed = [one for one in anatomy.structures if one.mesh.closed]
+    for one in sorted(closed, key=lambda one: float(np.prod(np.ptp(one.mesh.bounds, axis=0))), reverse=True):
         names[inside_at(one, target_ct, outward_ct, depths)] = one.name
     layers: list[Layer] = []
     for name, group in groupby(range(count), key=lambda at: names[at]):
         rows = list(group)
         tissue = bending.tissues.of(str(name)) or bending.tissues.of_pattern[REST]
-        at_skin = not layers
-        if not at_skin and tissue == bending.tissues.of_pattern[REST]:
+        if layers and tissue == bending.tissues.of_pattern[REST]:
             tissue = replace(tissue, capsule_n=0.0, capsule_mm=0.0)
         layers.append(Layer(float(edges[rows[0]]), float(edges[rows[-1] + 1]), tissue))
     return tuple(layers)
-
-
-def _size(structure: Structure) -> float:
-    """Volume of a structure's bounding box, mm^3."""
-    low, high = structure.mesh.bounds
-    return float(np.prod(high - low))
 
 
 PROFILE_STEP_MM = 1.0
@@ -178,12 +153,7 @@ BEYOND_SKIN_MM = 30.0
 
 
 class Stretch(NamedTuple):
-    """A part of a path along which the same structures are.
-
-    Attributes:
-        structures: Names of the closed structures that hold it.
-        hu_low: Least Hounsfield units of its samples, NaN where the image does not reach.
-    """
+    """A part of a path along which the same structures are."""
 
     start_mm: float
     end_mm: float
@@ -194,37 +164,25 @@ class Stretch(NamedTuple):
 
 
 def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_length: float) -> tuple[Stretch, ...]:
-    """Follow a path from the target to ``BEYOND_SKIN_MM`` outside of the skin; empty without a CT.
-
-    Args:
-        target_ct: Shape (3,), LPS mm.
-        outward_ct: Shape (3,), unit.
-        path_length: Target to skin, mm; NaN without an entry: nothing is followed.
-    """
+    """Follow a path from the target to ``BEYOND_SKIN_MM`` outside of the skin; empty without a CT."""
     if anatomy.scan is None or not np.isfinite(path_length):
         return ()
     depths = np.arange(0.0, path_length + BEYOND_SKIN_MM, PROFILE_STEP_MM)
     hu = anatomy.scan.hu_at(target_ct + depths[:, None] * outward_ct)
-    around = np.array([inside_at(s, target_ct, outward_ct, depths) for s in anatomy.checked if s.mesh.closed])
-    names = np.array([s.name for s in anatomy.checked if s.mesh.closed], dtype=object)
+    closed = [s for s in anatomy.checked if s.mesh.closed]
+    around = np.array([inside_at(s, target_ct, outward_ct, depths) for s in closed])
+    names = np.array([s.name for s in closed], dtype=object)
     keys = [(*names[around[:, row]], "" if depth <= path_length else "outside") for row, depth in enumerate(depths)]
-    parts, first = [], 0
-    for key, group in groupby(keys):
-        rows = slice(first, first + len(list(group)))
-        first = rows.stop
-        end = depths[rows][-1] + PROFILE_STEP_MM
-        parts.append(Stretch(float(depths[rows][0]), float(end), tuple(filter(None, key)), *_range(hu[rows])))
+    parts: list[Stretch] = []
+    for key, group in groupby(range(len(keys)), key=keys.__getitem__):
+        rows = list(group)
+        end = depths[rows[-1]] + PROFILE_STEP_MM
+        parts.append(Stretch(float(depths[rows[0]]), float(end), tuple(filter(None, key)), *_range(hu[rows])))
     return tuple(parts)
 
 
 def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
-    """Which depths of a path are inside a closed structure, by the parity of the crossings before.
-
-    Args:
-        target_ct: Shape (3,), mm.
-        outward_ct: Shape (3,), unit.
-        depths: Shape (n,), from the target outward, mm.
-    """
+    """Which depths of a path, from the target outward, are inside a closed structure, by parity of its crossings."""
     points = target_ct + depths[:, None] * outward_ct
     low, high = structure.mesh.bounds
     if not np.any(np.all((low <= points) & (points <= high), axis=1)):

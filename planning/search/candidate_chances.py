@@ -11,12 +11,12 @@ from dataclasses import fields, replace
 import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
-from puncture_twin.planning.base.arrays import Floats, Ints, Texts
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.clearance.engine import AxisDistances
 from puncture_twin.planning.reach.standoff import case_axis_lengths
-from puncture_twin.planning.search.candidates import Candidates, Verdict
+from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.uncertainty.chance_model import (
     ChanceModel,
@@ -30,20 +30,17 @@ from puncture_twin.planning.uncertainty.hit import Proximity, touch_bound
 
 
 def with_chances(
-    case: Case, anatomy: Anatomy, candidates: Candidates, model: ChanceModel | None, axes: AxisDistances | None = None
+    case: Case, anatomy: Anatomy, candidates: Candidates, model: ChanceModel | None, axes: AxisDistances | None
 ) -> Candidates:
     """Compute the chances of all candidates that are safe so far, and reject those beyond the case's limits.
 
     Args:
-        case: Declares errors; else nothing is computed.
         model: None where the pose's error is not known: the chances are blank.
         axes: Distances of the candidates' axes; None measures those of the safe ones again.
 
     Raises:
         InputError: A limit that nothing can be compared with.
     """
-    if case.errors is None:
-        return candidates
     check_limits(case, anatomy, model is not None)
     names = tuple(anatomy.checked[column].name for column in demanding(anatomy.checked))
     rows = np.flatnonzero(candidates.safe & np.isfinite(candidates.arm.q_insertion).all(axis=1))
@@ -62,31 +59,24 @@ def limited(case: Case, candidates: Candidates) -> Candidates:
     """Reject candidates whose chance to hit is below, or to touch above, the case's limit; unknown ones too."""
     chances, least = candidates.chances, case.search.min_hit
     assert chances is not None
+    verdict = candidates.verdict
     if least is not None:
-        rows = np.flatnonzero(candidates.safe & ~(chances.hit >= least))  # true for NaN
-        target = np.full(len(rows), case.target_structure, dtype=object)
-        candidates = _rejected(candidates, rows, Reason.HIT_UNLIKELY, target, chances.hit[rows])
+        rows = np.flatnonzero(verdict.safe & ~(chances.hit >= least))  # true for NaN
+        reason, target = Reason.HIT_UNLIKELY.value, case.target_structure
+        verdict = verdict.put(rows, reason=reason, structure=target, amount=chances.hit[rows])
     limits = np.array([touch_limit(case, name) for name in chances.structures])
     touch = np.where(np.isnan(chances.touch), np.inf, chances.touch)
     with np.errstate(invalid="ignore"):  # without a limit both may be infinite
         beyond = np.where(touch > limits, touch - limits, -np.inf)
-    rows = np.flatnonzero(candidates.safe & (beyond > 0).any(axis=1))
+    rows = np.flatnonzero(verdict.safe & (beyond > 0).any(axis=1))
     worst = beyond[rows].argmax(axis=1) if len(rows) else rows
-    names = np.array(chances.structures, dtype=object)[worst]
-    return _rejected(candidates, rows, Reason.TOUCH_LIKELY, names, chances.touch[rows, worst])
-
-
-def _rejected(candidates: Candidates, rows: Ints, reason: Reason, structure: Texts, amount: Floats) -> Candidates:
-    """The candidates with some rows rejected, each by a structure, shape (m,), and a number, shape (m,)."""
-    arrays = {field.name: getattr(candidates.verdict, field.name).copy() for field in fields(candidates.verdict)}
-    arrays["reason"][rows], arrays["structure"][rows], arrays["amount"][rows] = reason.value, structure, amount
-    return replace(candidates, verdict=Verdict(**arrays))
+    names, amount = np.array(chances.structures, dtype=object)[worst], chances.touch[rows, worst]
+    verdict = verdict.put(rows, reason=Reason.TOUCH_LIKELY.value, structure=names, amount=amount)
+    return replace(candidates, verdict=verdict)
 
 
 BEST = 200
 """How many of the best candidates get the chances that take long to compute."""
-
-
 REFINED_FROM = 1 / 60
 """Fraction of its limit from which on a chance of first order, or its bound, is refined. The chance to be displaced so
 far to any side is 56 times that to one side at 3.5 standard deviations, and less for less."""
@@ -101,24 +91,17 @@ def refined_near_limits(candidates: Candidates, model: ChanceModel) -> Candidate
     assert chances is not None
     if not np.isfinite(limits).any():
         return candidates
-    greatest = np.fmax(chances.touch, _touch_bounds(candidates, model))  # first order may be too low
-    rows = np.flatnonzero((greatest >= REFINED_FROM * limits).any(axis=1) & np.isfinite(chances.hit))
-    return with_refined(candidates, model, rows) if len(rows) else candidates
-
-
-def _touch_bounds(candidates: Candidates, model: ChanceModel) -> Floats:
-    """Upper bounds of the safe candidates' chances to touch, shape (n, k); NaN for others."""
     error, columns = model.error, model.columns
     surface_mm = np.sqrt(np.linalg.eigvalsh(model.surfaces)[:, -1])  # in the worst direction
-    bounds, rows = np.full((len(candidates), len(columns)), np.nan), np.flatnonzero(candidates.safe)
+    greatest, rows = chances.touch.copy(), np.flatnonzero(candidates.safe)
     for part in (rows[start : start + ROWS_AT_ONCE] for start in range(0, len(rows), ROWS_AT_ONCE)):
-        length = float(case_axis_lengths(model.case, model.anatomy, candidates.outward_ct[part])[:, columns].max())
-        slack, cov_ct = (
-            candidates.clearance.distance[part][:, columns],
-            error.covariance_ct(candidates.arm.q_insertion[part]),
-        )
-        bounds[part] = touch_bound(slack, candidates.outward_ct[part], cov_ct, length, surface_mm, error.freedom)
-    return bounds
+        outward, slack = candidates.outward_ct[part], candidates.clearance.distance[part][:, columns]
+        length = float(case_axis_lengths(model.case, model.anatomy, outward)[:, columns].max())
+        cov_ct = error.covariance_ct(candidates.arm.q_insertion[part])
+        bound = touch_bound(slack, outward, cov_ct, length, surface_mm, error.freedom)
+        greatest[part] = np.fmax(greatest[part], bound)  # first order may be too low
+    rows = np.flatnonzero((greatest >= REFINED_FROM * limits).any(axis=1) & np.isfinite(chances.hit))
+    return with_refined(candidates, model, rows) if len(rows) else candidates
 
 
 def with_refined(candidates: Candidates, model: ChanceModel, rows: Ints) -> Candidates:
@@ -131,29 +114,23 @@ def with_refined(candidates: Candidates, model: ChanceModel, rows: Ints) -> Cand
     return replace(candidates, chances=chances.put(rows, better))
 
 
-def with_best_refined(candidates: Candidates, model: ChanceModel | None) -> Candidates:
+def with_best_refined(candidates: Candidates, model: ChanceModel) -> Candidates:
     """Refine the candidates that people are shown: the best of all, and the best of every window.
 
     Those that break a limit then are rejected, and the rest ranked again, until no new one is among them.
     """
-    if model is None or candidates.chances is None:
-        return candidates
-    while len(rows := _shown(candidates)):
+    while True:
+        best, chances = [window.best for window in candidates.windows], candidates.chances
+        assert chances is not None
+        shown = np.unique(np.append(candidates.ranked[:BEST], best)).astype(np.int64)
+        rows = shown[~chances.refined[shown] & np.isfinite(chances.hit[shown])]  # still of first order
+        if not len(rows):
+            return candidates
         candidates = ranked(model.case, limited(model.case, with_refined(candidates, model, rows)))
-    return candidates
-
-
-def _shown(candidates: Candidates) -> Ints:
-    """Rows of the candidates that are shown to people and whose chances are still of first order."""
-    assert candidates.chances is not None
-    best = [window.best for window in candidates.windows]
-    shown = np.unique(np.append(candidates.ranked[:BEST], best)).astype(np.int64)
-    return shown[~candidates.chances.refined[shown] & np.isfinite(candidates.chances.hit[shown])]
 
 
 NORMALS = 4096
 """Fixed draws of the jointly linearised chance: its own error is .008 at most."""
-
 DRAWS_SEED = 20191104
 """Seed of those draws, the same in every run: the table must not depend on chance."""
 
@@ -186,13 +163,10 @@ def joint_touch_chance(
     return chances
 
 
-def with_joint_chances(candidates: Candidates, model: ChanceModel | None) -> Candidates:
-    """Add, for the best candidates, the chance to touch anything, all structures linearised together.
-
-    The candidates are ranked; ``model`` as in `with_chances`.
-    """
+def with_joint_chances(candidates: Candidates, model: ChanceModel) -> Candidates:
+    """Add, for the best of the ranked candidates, the chance to touch anything, all structures linearised together."""
     rows = candidates.ranked[:BEST]
-    if model is None or candidates.chances is None or not len(rows):
+    if candidates.chances is None or not len(rows):
         return candidates
     needles = model.needles(candidates.outward_ct[rows], candidates.arm.q_insertion[rows])
     joint = candidates.chances.touch_joint.copy()

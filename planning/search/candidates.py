@@ -5,7 +5,7 @@ from __future__ import annotations
 import pathlib
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -26,15 +26,10 @@ from puncture_twin.planning.uncertainty.chance_model import Chances
 
 ARM_CHECKED = "checked"
 """``Candidates.arm_note`` where "safe" includes that the arm can reach and insert along the candidate."""
-
-
 CONE_OF_GRID, CONE_CERTIFIED = "grid", "certificate"
 """Where a safe cone comes from: the directions of the search, or the proof of all between them."""
-
 NOT_SEEN = "not seen: image or mesh ends"
 """Named in place of the skin for a path that leaves the scanned region."""
-
-
 ANGLE_DIGITS = 9
 """Decimals of an angle in degrees: 59.99999999999999 is 60; 1e-9 degrees move no needle by a nanometre."""
 
@@ -59,6 +54,11 @@ class Verdict(Columns):
     detail: Texts
 
     @property
+    def safe(self) -> Bools:
+        """Shape (n,), which candidates break none."""
+        return self.reason == Reason.NONE.value
+
+    @property
     def not_seen(self) -> Bools:
         """Shape (n,), whether the reason is that the body was not scanned there, and no structure's clearance."""
         return (self.reason == Reason.UNKNOWN_REGION.value) & np.isnan(self.amount)
@@ -71,6 +71,13 @@ class Verdict(Columns):
     def of(self, rows: Ints) -> Verdict:
         """The verdicts of some rows."""
         return Verdict(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+    def put(self, rows: Ints, **columns: Texts | Floats | str) -> Verdict:
+        """The verdicts with some columns of rows (m,) replaced, each by one value or by an array, shape (m,)."""
+        arrays = {name: getattr(self, name).copy() for name in columns}
+        for name, values in columns.items():
+            arrays[name][rows] = values
+        return replace(self, **arrays)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,12 +177,7 @@ class Candidates(Columns, Shown):
     """Every direction of the grid: n rows in groups of columns; mm, radians, points in the CT frame.
 
     Attributes:
-        theta: Shape (n,), puncture angle.
-        beta: Shape (n,), azimuth.
         outward_ct: Shape (n, 3), unit vectors from the target outward.
-        path: From the skin to the target.
-        arm: Whether the arm reaches it.
-        ranking: Which of the safe ones to prefer.
         safe_cone: Shape (n,), by how much one may be off in any direction and still be safe for the organs, rad; NaN
             for rejected candidates, and where neither a grid nor a certificate says.
         arm_note: `ARM_CHECKED`, or "not checked: " and why: then a safe candidate is safe for the organs alone.
@@ -212,17 +214,21 @@ class Candidates(Columns, Shown):
 
     @brief
     def __repr__(self) -> str:
-        best = "" if not len(self.ranked) else "; best " + self._direction(int(self.ranked[0]))
-        return f"{plural(len(self), 'direction')}, {int(self.safe.sum()):,} {self.safe_text}{best}; arm {self.arm_note}"
-
-    def _direction(self, row: int) -> str:
-        return f"theta {np.degrees(self.theta[row]):g} deg, beta {np.degrees(self.beta[row]):g} deg"
+        best = self.best
+        at = "" if best is None else f"; best theta {best.theta_deg:g} deg, beta {best.beta_deg:g} deg"
+        return f"{plural(len(self), 'direction')}, {int(self.safe.sum()):,} {self.safe_text}{at}; arm {self.arm_note}"
 
     def _title(self) -> str:
         return f"{len(self):,} candidates, {int(self.safe.sum()):,} {self.safe_text}"
 
     def _facts(self) -> Facts:
-        return _facts(self)
+        yield "arm", self.arm_note
+        if (best := self.best) is not None:
+            yield "best direction", f"θ {best.theta_deg:g}°, β {best.beta_deg:g}°"
+            yield "its path, target to skin", f"{self.path.length[best.row]:.1f} mm"
+            yield "its least clearance", f"{self.least_clearance[best.row]:.1f} mm"
+        for code, count in self.counts().items():
+            yield self.safe_text if code == "safe" else REASON_TEXT[Reason(code)], f"{count:,}"
 
     def _picture(self) -> str:
         return self.plot_map()._repr_html_()
@@ -240,7 +246,7 @@ class Candidates(Columns, Shown):
     @property
     def safe(self) -> Bools:
         """Which rows are not rejected, shape (n,)."""
-        return self.verdict.reason == Reason.NONE.value
+        return self.verdict.safe
 
     @property
     def unseen_air(self) -> Bools:
@@ -284,11 +290,7 @@ class Candidates(Columns, Shown):
         return find_windows(self)
 
     def to_pandas(self) -> Any:
-        """The table that `write` writes, as a pandas DataFrame: a row a direction, mm and degrees.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
+        """The table that `write` writes, as a pandas DataFrame: a row a direction, mm and degrees."""
         require_extra("pandas", "to_pandas")
         from puncture_twin.planning.search.table import to_table
 
@@ -309,14 +311,20 @@ class Candidates(Columns, Shown):
 
     def plot_map(self) -> PolarMap:
         """The map of the directions by verdict: a picture for a notebook, or to be written; θ outward, β around."""
-        return _map(self)
+        if not 0 < len(self) <= MOST_ROWS:
+            return NO_MAP
+        reasons = [Reason.NONE, *REASON_COLOURS]
+        legend = [Entry(self.safe_text, SAFE), *(Entry(REASON_TEXT[r], REASON_COLOURS[r]) for r in reasons[1:])]
+        number = {reason.value: row for row, reason in enumerate(reasons)}
+        code = np.array([number[str(reason)] for reason in self.verdict.reason])
+        azimuth, half = np.mod(self.beta, 2 * np.pi), np.array([-0.5, 0.5])
+        steps = _step(self.theta), _step(azimuth)
+        theta = np.clip(self.theta[:, None] + half * steps[0], 0.0, np.pi)
+        cells = Sectors(theta, azimuth[:, None] + half * steps[1], code)
+        return polar_map(cells, legend, min(steps) / 2)  # the cells' edges lie at halves of a step
 
     def pick(self, row: int) -> Pick:
-        """One candidate by its row.
-
-        Raises:
-            InputError: There is no such row.
-        """
+        """One candidate by its row."""
         if isinstance(row, bool) or not isinstance(row, int | np.integer) or not 0 <= row < len(self):
             refuse(f"row {row!r}", "pick", f"a row number from 0 to {len(self) - 1}", "out_of_range")
         return Pick(self, int(row))
@@ -350,41 +358,10 @@ class Pick(NamedTuple):
 
 SAME_ANGLE = 1e-7
 """rad: two angles nearer than this are one line of the grid."""
-
 ALONE = np.radians(2.0)
 """rad: how wide a direction is drawn where no other has another angle."""
-
 MOST_ROWS = 200_000
 """Directions that are painted; the table says all that there is to say about more."""
-
-
-def _facts(candidates: Candidates) -> Facts:
-    yield "arm", candidates.arm_note
-    ranked = candidates.ranked
-    if len(ranked):
-        best = int(ranked[0])
-        theta, beta = np.degrees(candidates.theta[best]), np.degrees(candidates.beta[best])
-        yield "best direction", f"θ {theta:g}°, β {beta:g}°"
-        yield "its path, target to skin", f"{candidates.path.length[best]:.1f} mm"
-        yield "its least clearance", f"{candidates.least_clearance[best]:.1f} mm"
-    for code, count in candidates.counts().items():
-        text = candidates.safe_text if code == "safe" else REASON_TEXT[Reason(code)]
-        yield text, f"{count:,}"
-
-
-def _map(candidates: Candidates) -> PolarMap:
-    """Map of the directions by verdict."""
-    if not 0 < len(candidates) <= MOST_ROWS:
-        return NO_MAP
-    reasons = [Reason.NONE, *REASON_COLOURS]
-    legend = [Entry(candidates.safe_text, SAFE), *(Entry(REASON_TEXT[r], REASON_COLOURS[r]) for r in reasons[1:])]
-    number = {reason.value: row for row, reason in enumerate(reasons)}
-    code = np.array([number[str(reason)] for reason in candidates.verdict.reason])
-    azimuth, half = np.mod(candidates.beta, 2 * np.pi), np.array([-0.5, 0.5])
-    steps = _step(candidates.theta), _step(azimuth)
-    theta = np.clip(candidates.theta[:, None] + half * steps[0], 0.0, np.pi)
-    cells = Sectors(theta, azimuth[:, None] + half * steps[1], code)
-    return polar_map(cells, legend, min(steps) / 2)  # the cells' edges lie at halves of a step
 
 
 def _step(values: Floats) -> float:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -35,13 +36,10 @@ from puncture_twin.planning.search.explain import Explanation, reason_text
 
 NEAR_ENTRY_MM = 10.0
 """How far from the skin entry of its path a point may be that is to be that entry: a hand's precision on a screen."""
-
 FILES = (".mrk.json", ".fcsv", ".csv")
 """Endings of files that may hold an entry."""
-
 MOST_POINTS = 2
 """Points in a file with one entry, at most: both ends of a line."""
-
 LEAST_LEVER_MM = 1.0
 """A point nearer to the target than this gives no direction."""
 
@@ -106,23 +104,21 @@ def choose(context: CaseContext, candidates: Candidates | None, choice: Choice) 
     rows = candidates.ranked
     if not len(rows):
         raise NoAnswerError("no candidate is safe", counts=candidates.counts(), code="no_safe_direction")
+    windows = candidates.windows
+    numbers = (choice.rank, len(rows), "--rank", "safe candidate"), (choice.window, len(windows), "--window", "window")
+    for number, count, where, what in numbers:
+        if number is not None and not 1 <= number <= count:
+            there = "there is" if count == 1 else "there are"
+            refuse(f"{number}: {there} {plural(count, what)}", where, f"1 to {count}", "out_of_range")
     if choice.rank is not None:
-        _refuse_beyond(choice.rank, len(rows), "--rank", "safe candidate")
-        return Chosen(candidates, rows[choice.rank - 1 : choice.rank])
-    if choice.window is not None:
-        windows = candidates.windows
-        _refuse_beyond(choice.window, len(windows.windows), "--window", "window")
-        return Chosen(candidates, rows[windows.of_row[rows] == choice.window])
+        rows = rows[choice.rank - 1 : choice.rank]
+    elif choice.window is not None:
+        rows = rows[windows.of_row[rows] == choice.window]
     return Chosen(candidates, rows)
 
 
 def choose_stated(context: CaseContext, choice: Choice) -> Chosen:
-    """The one candidate of a choice by angles or by entry; takes no search.
-
-    Raises:
-        InputError: A point that is no skin entry, or its file.
-        NoAnswerError: It is rejected: says why.
-    """
+    """The one candidate of a choice by angles or by entry, without a search; errors as of `choose`."""
     choice = with_file_read(context.case, choice)
     checked = context.check(*chosen_angles(context.case, choice))
     refuse_other_entry(context.case, checked, choice)
@@ -135,12 +131,7 @@ def choose_stated(context: CaseContext, choice: Choice) -> Chosen:
 
 
 def explain_choice(context: CaseContext, choice: Choice, candidates: Candidates | None = None) -> Explanation:
-    """Explain a choice, safe or not, with the search of the case where it is of one; None searches.
-
-    Raises:
-        InputError: See `chosen_angles`, `choose`; an entry where the path does not enter.
-        NoAnswerError: Nothing is safe, so that there are no ranks.
-    """
+    """Explain a choice, safe or not, with the search of the case where it is of one; None searches."""
     if choice.of_grid:
         chosen, rows = choose(context, candidates, choice)
         return context.explain(chosen.theta[rows[0]], chosen.beta[rows[0]])
@@ -151,11 +142,7 @@ def explain_choice(context: CaseContext, choice: Choice, candidates: Candidates 
 
 
 def chosen_angles(case: Case, choice: Choice) -> tuple[float, float]:
-    """θ and β (rad) of a choice by angles or by entry.
-
-    Raises:
-        InputError: An entry on the target itself.
-    """
+    """θ and β (rad) of a choice by angles or by entry."""
     if choice.angles is not None:
         return choice.angles
     lever = _entry_ct(case, choice) - case.target_ct
@@ -212,12 +199,6 @@ def _entry_ct(case: Case, choice: Choice) -> Floats:
     return np.asarray(to_lps(np.array([choice.entry_mm]), case.space)[0])
 
 
-def _refuse_beyond(number: int, count: int, where: str, what: str) -> None:
-    if not 1 <= number <= count:
-        there = "there is" if count == 1 else "there are"
-        refuse(f"{number}: {there} {plural(count, what)}", where, f"1 to {count}", "out_of_range")
-
-
 def refuse_other_entry(case: Case, checked: Candidates, choice: Choice) -> None:
     """Refuse a point from which a straight path enters the skin somewhere else."""
     real = checked.path.entry_ct[0]
@@ -237,13 +218,9 @@ GREATEST = (180.0, 360.0)
 
 
 class Listed(NamedTuple):
-    """One row of a list of directions or targets.
+    """One row of a list of directions or targets: its number from 1, its name or "", its point in the case's space.
 
-    Attributes:
-        number: 1 for the first.
-        name: As the file states it; "" without one.
-        point_mm: Where it states a point: in the case's space, mm.
-        choice: The direction; of a list of targets, whatever was chosen for all.
+    Its choice is the direction; of a list of targets, whatever was chosen for all.
     """
 
     number: int
@@ -267,31 +244,28 @@ def read_entries(path: Path, case: Case) -> ReadList:
         InputError: A file that cannot be read, or a line that is none; names the line.
     """
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
-    source = content_input("entries", str(path), data)
     if path.suffix.lower() == ".csv" and set(ANGLES) & set(_header(data, path)):
-        return ReadList(_angle_rows(data, path), source, _unfinished(data, path))
-    rows = _points(data, path, case)
-    rows = tuple(one._replace(choice=Choice(entry_mm=one.point_mm)) for one in rows)
-    return ReadList(rows, source, _unfinished(data, path))
+        return _list("entries", path, data, _angle_rows(data, path))
+    points = _points(data, path, case)
+    return _list("entries", path, data, [one._replace(choice=Choice(entry_mm=one.point_mm)) for one in points])
 
 
 def read_targets(path: Path, case: Case, choice: Choice) -> ReadList:
     """Targets as points, in the case's space or in the file's own; the same choice for each."""
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))
-    rows = tuple(one._replace(choice=choice) for one in _points(data, path, case))
-    return ReadList(rows, content_input("targets", str(path), data), _unfinished(data, path))
+    return _list("targets", path, data, [one._replace(choice=choice) for one in _points(data, path, case)])
 
 
-def _unfinished(data: bytes, path: Path) -> tuple[str, ...]:
-    """Warnings about a list that may have been cut within a number."""
-    return unfinished_warnings(data, path.name) if path.suffix.lower() in (".csv", ".fcsv") else ()
+def _list(kind: str, path: Path, data: bytes, rows: Sequence[Listed]) -> ReadList:
+    warnings = unfinished_warnings(data, path.name) if path.suffix.lower() in (".csv", ".fcsv") else ()
+    return ReadList(tuple(rows), content_input(kind, str(path), data), warnings)
 
 
-def _points(data: bytes, path: Path, case: Case) -> tuple[Listed, ...]:
+def _points(data: bytes, path: Path, case: Case) -> list[Listed]:
     listed = parse_points(data, path, default_space=case.space)
     typed = to_lps(listed.points, case.space).tolist()  # the change of signs undoes itself
     named = enumerate(zip(listed.names, typed, strict=True), start=1)
-    return tuple(Listed(number, name, (x, y, z), Choice()) for number, (name, (x, y, z)) in named)
+    return [Listed(number, name, (x, y, z), Choice()) for number, (name, (x, y, z)) in named]
 
 
 def _header(data: bytes, path: Path) -> list[str]:
@@ -299,25 +273,25 @@ def _header(data: bytes, path: Path) -> list[str]:
     return [field.strip() for field in (lines[0] if lines else "").split(",")]
 
 
-def _angle_rows(data: bytes, path: Path) -> tuple[Listed, ...]:
+def _angle_rows(data: bytes, path: Path) -> list[Listed]:
     header = _header(data, path)
     if sorted(header) not in (sorted(ANGLES), sorted((*ANGLES, "name"))):
         refuse(f"columns {header}"[:200], f"{path}, header", ALLOWED_ANGLES, "wrong_columns")
     lines = list(csv_lines(data, str(path), ALLOWED_ANGLES))[1:]
     if not lines:
         refuse("no line", path, ALLOWED_ANGLES, "empty")
-    return tuple(_angle_row(i, header, fields, f"{path}, line {line}") for i, (line, fields) in enumerate(lines, 1))
-
-
-def _angle_row(number: int, header: list[str], fields: list[str], where: str) -> Listed:
-    if len(fields) != len(header):
-        refuse(f"{len(fields)} fields instead of {len(header)}", where, ALLOWED_ANGLES, "ragged_row")
-    stated = dict(zip(header, (field.strip() for field in fields), strict=True))
-    theta, beta = (parse_coordinate(stated[name], where) for name in ANGLES)
-    for name, angle, most in zip(ANGLES, (theta, beta), GREATEST, strict=True):
-        if not 0.0 <= angle <= most:
-            refuse(f"{name} {angle:g}", where, f"0 to {most:g}", "out_of_range")
-    return Listed(number, stated.get("name", ""), None, parse_choice(theta, beta, None, None, None))
+    rows = []
+    for number, (line, fields) in enumerate(lines, 1):
+        where = f"{path}, line {line}"
+        if len(fields) != len(header):
+            refuse(f"{len(fields)} fields instead of {len(header)}", where, ALLOWED_ANGLES, "ragged_row")
+        stated = dict(zip(header, (field.strip() for field in fields), strict=True))
+        theta, beta = (parse_coordinate(stated[name], where) for name in ANGLES)
+        for name, angle, most in zip(ANGLES, (theta, beta), GREATEST, strict=True):
+            if not 0.0 <= angle <= most:
+                refuse(f"{name} {angle:g}", where, f"0 to {most:g}", "out_of_range")
+        rows.append(Listed(number, stated.get("name", ""), None, parse_choice(theta, beta, None, None, None)))
+    return rows
 
 
 def stated_choice(
@@ -334,7 +308,7 @@ def stated_choice(
     Raises:
         InputError: Two of them, half of one, a value outside of its range, or a candidate of another case.
     """
-    for name, angle, most in (("theta_deg", theta_deg, 180.0), ("beta_deg", beta_deg, 360.0)):
+    for name, angle, most in zip(ANGLES, (theta_deg, beta_deg), GREATEST, strict=True):
         if angle is not None:
             checked_degrees([angle], most, f"{where}: {name}")
     if entry is not None:
@@ -344,14 +318,9 @@ def stated_choice(
         return stated
     if stated != Choice():
         refuse("a candidate beside another choice", where, "one of them", "conflicting_options")
-    found, row = _own_pick(context, candidate, where)
-    return Choice(angles=(float(found.theta[row]), float(found.beta[row])))
-
-
-def _own_pick(context: CaseContext, candidate: Pick, where: str) -> Pick:
-    """A candidate of this case: the angles of another's are another path here."""
     found, row = candidate
     if not is_kind("Candidates", found):
         what = f"a candidate of a value {shown_value(found)}"
         refuse(what, where, "candidates.best or candidates.pick(row)", "wrong_type")
-    return context.own(found).pick(row)
+    found, row = context.own(found).pick(row)  # the angles of another case's are another path here
+    return Choice(angles=(float(found.theta[row]), float(found.beta[row])))

@@ -45,9 +45,6 @@ def first_broken(
 
     The order is that of the ``give`` calls. Unscanned regions come first: nothing behind them is known. Structures come
     last: some matter only to a tip that waits at its standoff, so only on paths that satisfy the others.
-
-    Args:
-        max_skin_angle: rad.
     """
     count = len(paths.path_length)
     reasons, names_of, details = (np.full(count, "", dtype=object) for _ in range(3))
@@ -84,8 +81,7 @@ def skin_allows(paths: SkinPaths, needle: Needle, max_skin_angle: float) -> Bool
     """Which paths break no constraint of the skin, shape (n,), whatever structures do; ``max_skin_angle`` in rad."""
     none = np.empty((len(paths.path_length), 0))
     nothing = Clearances(none, none, none.astype(bool))
-    verdict = first_broken(paths, nothing, (), needle=needle, max_skin_angle=max_skin_angle)
-    return np.asarray(verdict.reason == Reason.NONE.value)
+    return first_broken(paths, nothing, (), needle=needle, max_skin_angle=max_skin_angle).safe
 
 
 def worst_violation(clearances: Clearances, structures: tuple[Structure, ...]) -> NDArray[np.int64]:
@@ -112,21 +108,13 @@ def closest_miss(candidates: Candidates) -> int | None:
     """
     late = (Reason.TOUCH_LIKELY, Reason.HIT_UNLIKELY, Reason.UNSAFE_WHEN_BREATHING, Reason.NEEDLE_BENDS)
     of_arm = (Reason.APPROACH_NOT_FOUND, Reason.INSERTION_BLOCKED, Reason.ARM_COLLISION, Reason.UNREACHABLE)
-    allowed = _first_of(candidates, (*late, *of_arm))
-    if allowed is not None:
-        return allowed
-    lacking = np.flatnonzero(candidates.verdict.reason == Reason.TOO_CLOSE.value)
-    if len(lacking):
-        demanded = ~np.isnan(candidates.clearance.margins)
-        lack = (candidates.clearance.margins - candidates.clearance.distance)[:, demanded].max(axis=1)
-        return int(lacking[np.argmin(lack[lacking])])
-    return _first_of(candidates, (Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION))
-
-
-def _first_of(candidates: Candidates, reasons: tuple[Reason, ...]) -> int | None:
-    """The first row of the first reason that any row has; None where none has."""
-    for reason in reasons:
+    of_skin = (Reason.SKIN_ANGLE, Reason.TOO_LONG, Reason.REENTERS_SKIN, Reason.UNKNOWN_REGION)
+    for reason in (*late, *of_arm, Reason.TOO_CLOSE, *of_skin):
         rows = np.flatnonzero(candidates.verdict.reason == reason.value)
+        if len(rows) and reason is Reason.TOO_CLOSE:
+            clearance = candidates.clearance
+            demanded = ~np.isnan(clearance.margins)
+            rows = rows[np.argmin((clearance.margins - clearance.distance[rows])[:, demanded].max(axis=1)) :]
         if len(rows):
             return int(rows[0])
     return None

@@ -49,7 +49,6 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
 """Clearance engines by name: the fast exact engine, and FCL alone as the plain reference."""
-
 EngineChoice = str | Callable[..., ClearanceEngine]
 """A name of `ENGINES`, or a class of one's own that is made of (meshes, progress) and keeps `ClearanceEngine`.
 
@@ -57,10 +56,8 @@ It is held to the fast engine (`HeldEngine`): it may find less clearance, and ne
 
 COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
 """The unit of each engine's progress."""
-
 AT_BYTES = 2_000_000_000
 """What a context keeps for other targets at most, from the first one on."""
-
 NO_BASE = "the case does not state where the robot's base is"
 ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]"
 
@@ -99,7 +96,7 @@ class CaseContext(Shown):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process: what was read; what answers is made there, since compiled libraries are not sent."""
-        return _sent, (self.case, self.anatomy, self.placement, self._engine_choice, self.reach is not None)
+        return _answering, (self.case, self.anatomy, self.placement, self._engine_choice, self.reach is not None)
 
     @property
     def _engine_choice(self) -> EngineChoice:
@@ -133,11 +130,7 @@ class CaseContext(Shown):
         return f"not checked: {NO_BASE if self.placement is None else 'switched off (--no-arm)'}"
 
     def require_arm(self) -> ArmReach:
-        """The checker of the arm, for what cannot do without it.
-
-        Raises:
-            InputError: Says what the case lacks, or that the arm was switched off.
-        """
+        """The checker of the arm, for what cannot do without it."""
         if self.placement is None:
             refuse(NO_BASE, self.case.path, ALLOWED_BASE, "no_base")
         if self.reach is None:
@@ -228,11 +221,7 @@ class CaseContext(Shown):
         return regions
 
     def cross_check(self, count: int) -> CrossChecked:
-        """Measure random directions of the grid again with FCL.
-
-        Raises:
-            CrossCheckError: A distance differs by more than rounding.
-        """
+        """Measure random directions of the grid again with FCL."""
         with self.stages.time("cross-check"):
             case, outward = self.case, self.case.directions().outward_ct
             meshes = tuple(structure.mesh for structure in self.anatomy.checked)
@@ -289,7 +278,14 @@ def prepare(
         anatomy = load_anatomy(case, partial(watcher.step, "anatomy"), cache)
         anatomy = with_surroundings(anatomy, case, None if placement is None else placement.T_base_ct)
         watcher.step("anatomy", "consistency of the inputs")
-        anatomy = _with_findings(case, anatomy, placement, cache)
+        collected = (
+            *(Finding("reading", Severity.WARNING, one) for one in (*case.warnings, *anatomy.warnings)),
+            *anatomy.findings,
+            *findings(case, anatomy, placement, cache),
+            *(Finding("breathing", Severity.WARNING, one) for one in breath_warnings(case, anatomy)),
+        )
+        warnings = tuple(one.sentence for one in collected if one.severity is not Severity.NOTE)
+        anatomy = replace(anatomy, warnings=warnings, findings=collected)
         for warning in anatomy.warnings:
             if warning not in known:
                 LOG.warning(warning)
@@ -298,34 +294,26 @@ def prepare(
     return _answering(case, anatomy, placement, engine, arm is not False, watcher, stages, cache)
 
 
-def _sent(case: Case, anatomy: Anatomy, placement: Placement | None, engine: EngineChoice, arm: bool) -> CaseContext:
-    watcher = Silent()
-    stages = Stages(announce=partial(watcher.step, "stage"))
-    return _answering(case, anatomy, placement, engine, arm, watcher, stages, user_cache())
-
-
 def _answering(
     case: Case,
     anatomy: Anatomy,
     placement: Placement | None,
     engine: EngineChoice,
     arm: bool,
-    watcher: Watcher,
-    stages: Stages,
-    cache: Cache,
+    watcher: Watcher | None = None,
+    stages: Stages | None = None,
+    cache: Cache | None = None,
 ) -> CaseContext:
-    """What questions are answered with: clearance engine, arm's checker, model of errors."""
+    watcher, cache = watcher or Silent(), cache or user_cache()
+    stages = stages or Stages(announce=partial(watcher.step, "stage"))
     memory = Memory(AT_BYTES) if cache.memory is NO_MEMORY else cache.memory
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
         count = partial(watcher.count, COUNTED[engine] if isinstance(engine, str) else COUNTED["fast"])
         clearance_engine: ClearanceEngine
-        if engine == "fcl":
-            clearance_engine = FclEngine(meshes, count)
-        else:
-            clearance_engine = FastEngine(meshes, count, cache.memory)
-            if not isinstance(engine, str) and engine is not FastEngine:
-                clearance_engine = HeldEngine(engine(meshes, count), clearance_engine)
+        clearance_engine = FclEngine(meshes, count) if engine == "fcl" else FastEngine(meshes, count, cache.memory)
+        if not isinstance(engine, str) and engine is not FastEngine:
+            clearance_engine = HeldEngine(engine(meshes, count), clearance_engine)
         reach = None
         if arm and placement is not None:
             T_base_ct = placement.T_base_ct
@@ -336,28 +324,28 @@ def _answering(
     return CaseContext(case, anatomy, placement, clearance_engine, reach, chance, watcher, stages, memory)
 
 
-def _with_findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache) -> Anatomy:
-    """The anatomy with all that reading and the checks of plausibility found; what is more than a note is a warning."""
-    collected = (
-        *(Finding("reading", Severity.WARNING, one) for one in (*case.warnings, *anatomy.warnings)),
-        *anatomy.findings,
-        *findings(case, anatomy, placement, cache),
-        *(Finding("breathing", Severity.WARNING, one) for one in breath_warnings(case, anatomy)),
-    )
-    warnings = tuple(one.sentence for one in collected if one.severity is not Severity.NOTE)
-    return replace(anatomy, warnings=warnings, findings=collected)
-
-
 def alternatives(
     case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates, memory: Memory
 ) -> Iterator[Finding]:
-    """Findings on what else would be safe for the organs, from the ranked candidates of the case."""
+    """Findings on what else would be safe for the organs: were nothing assumed beyond the image, and by needle."""
     more = safe_without_beyond(case, anatomy, candidates, memory)
     if more:
         text = f"{plural(more, 'more direction')} would be safe for the organs with [ct] beyond_mm = 0"
         yield Finding("hangs_on_beyond_image", Severity.NOTE, text, {"directions": more})
-    if case.needle.lengths_mm:
-        yield _needle_catalogue(case, anatomy, engine, candidates)
+    if not case.needle.lengths_mm:
+        return
+    directions = Directions(candidates.theta, candidates.beta, candidates.outward_ct, candidates.grid)
+    safe = {
+        length: organ_safe(replace(case, needle=case.needle.of_length(length)), anatomy, engine, directions)
+        for length in sorted(case.needle.lengths_mm)
+    }
+    text = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())
+    best = [window.best for window in candidates.windows]
+    shortest = [next((length for length, rows in safe.items() if rows[row]), np.nan) for row in best]
+    fits = ", ".join(f"{length:g} mm" for length in shortest)
+    numbers = {"lengths_mm": list(safe), "safe": [float(rows.sum()) for rows in safe.values()], "shortest_mm": shortest}
+    text += f"; shortest for the best path of each window: {fits or 'none'}"
+    yield Finding("needle_catalogue", Severity.NOTE, f"organ-safe directions per needle: {text}", numbers)
 
 
 def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates, memory: Memory) -> int:
@@ -374,19 +362,3 @@ def safe_without_beyond(case: Case, anatomy: Anatomy, candidates: Candidates, me
         case.target_ct, candidates.outward_ct[rows], lengths, shown=False
     )
     return int((axes.distance >= case.needle.radius_mm + solid.margin_mm).sum())
-
-
-def _needle_catalogue(case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates) -> Finding:
-    """How many directions are safe with each needle, and the shortest that fits the best path of each window."""
-    directions = Directions(candidates.theta, candidates.beta, candidates.outward_ct, candidates.grid)
-    safe = {
-        length: organ_safe(replace(case, needle=case.needle.of_length(length)), anatomy, engine, directions)
-        for length in sorted(case.needle.lengths_mm)
-    }
-    text = ", ".join(f"{int(rows.sum())} with {length:g} mm" for length, rows in safe.items())
-    best = [window.best for window in candidates.windows]
-    shortest = [next((length for length, rows in safe.items() if rows[row]), np.nan) for row in best]
-    fits = ", ".join(f"{length:g} mm" for length in shortest)
-    numbers = {"lengths_mm": list(safe), "safe": [float(rows.sum()) for rows in safe.values()], "shortest_mm": shortest}
-    text += f"; shortest for the best path of each window: {fits or 'none'}"
-    return Finding("needle_catalogue", Severity.NOTE, f"organ-safe directions per needle: {text}", numbers)

@@ -26,10 +26,8 @@ from puncture_twin.planning.uncertainty.guided import WayChance
 
 NEAREST = 8
 """Structures listed by default: a case has a hundred, and those far away decide nothing."""
-
 COARSE_VOXEL_MM = 1.0
 """A surface drawn around voxels of this size is somewhere within half of it."""
-
 NO_CHANCES = "no chances to hit and to touch: they need markers, the arm, and a direction safe for organs and arm"
 
 UNITS = {
@@ -102,7 +100,29 @@ class Explanation(Shown):
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees; null where there is no number."""
-        row = self.candidates
+        row, found, insertion = self.candidates, self.candidates.breathing, self.insertion
+        optional: dict[str, Any] = {}
+        if self.case.errors is not None:
+            optional["chances"] = None if self.breakdown is None else self.breakdown.summary()
+        if row.deflection is not None:
+            optional["bending"] = {
+                "deflection_bound_mm": finite(row.deflection[0]),
+                "deflection_mm": None if insertion is None else insertion.tip_mm,
+                "peak_force_n": None if insertion is None else insertion.force.peak_n,
+                "buckling_free_n": None if insertion is None else insertion.buckling_free_n,
+                "buckling_pinned_n": None if insertion is None else insertion.buckling_pinned_n,
+            }
+        if found is not None:
+            optional["breathing"] = {
+                "safe_all_phases": bool(found.safe_all_phases[0]),
+                "worst_phase": finite(found.worst_phase[0]),
+                "breathing_clearance_mm": finite(found.clearance[0]),
+                "safe_means": row.safe_text,
+            }
+        if self.guidance:
+            optional["guidance"] = [one.document() for one in self.guidance]
+        if self.sight:
+            optional["sight"] = dict(self.sight)
         return {
             "case": self.case.name,
             "inputs": inputs_document((*self.read, *self.case.inputs)),
@@ -137,11 +157,7 @@ class Explanation(Shown):
             ],
             "warnings": list(self.anatomy.warnings),
             "findings": [one.document() for one in self.anatomy.findings],
-            **self._chances(),
-            **self._needle(),
-            **self._breathing(),
-            **({"guidance": [one.document() for one in self.guidance]} if self.guidance else {}),
-            **({"sight": dict(self.sight)} if self.sight else {}),
+            **optional,
         }
 
     def _at_target(self) -> dict[str, list[float]] | None:
@@ -152,25 +168,6 @@ class Explanation(Shown):
         T = flange_pose(self.case.robot.model, q)
         tip = T[:3, 3] + self.case.needle.length_mm * T[:3, 2]
         return {"q_deg": np.degrees(q).tolist(), "tip_base_mm": tip.tolist(), "flange_base_mm": T[:3, 3].tolist()}
-
-    def _breathing(self) -> dict[str, Any]:
-        """The key ``breathing``, of a case that declares its breathing."""
-        breathing = self.candidates.breathing
-        if breathing is None:
-            return {}
-        values = {
-            "safe_all_phases": bool(breathing.safe_all_phases[0]),
-            "worst_phase": finite(breathing.worst_phase[0]),
-            "breathing_clearance_mm": finite(breathing.clearance[0]),
-            "safe_means": self.candidates.safe_text,
-        }
-        return {"breathing": values}
-
-    def _chances(self) -> dict[str, Any]:
-        """The key ``chances``, of a case that declares errors."""
-        if self.case.errors is None:
-            return {}
-        return {"chances": None if self.breakdown is None else self.breakdown.summary()}
 
     @cached_property
     def along_path(self) -> tuple[Stretch, ...]:
@@ -183,46 +180,26 @@ class Explanation(Shown):
         row = self.candidates
         verdict = row.safe_text if self.safe else self.verdict
         head = f"theta {np.degrees(row.theta[0]):g} deg, beta {np.degrees(row.beta[0]):g} deg: {verdict}"
-        return [head, *self._reason()]
+        return [head] if self.safe else [head, "  because " + reason_text(row, 0)]
 
     def text(self, most: int | None = NEAREST) -> str:
-        """The whole explanation for a person.
-
-        Args:
-            most: How many structures are listed, the nearest first; None lists all.
-        """
-        return "\n".join(
-            [
-                f"case {self.case.name}",
-                *self.head(),
-                *self._breakdown(),
-                *self._path(),
-                self._target(),
-                *self._bending(),
-                *self._breath(),
-                *self._scan(),
-                *self.structure_lines(most),
-                *self._rest(),
-            ]
+        """The whole explanation for a person."""
+        lines = [f"case {self.case.name}", *self.head(), *self._uncertainty(), *self._path()]
+        lines.append(
+            f"  target         {self.target_depth_mm:8.2f} mm below the surface of {self.case.target_structure}"
         )
+        if self.insertion is not None and self.candidates.deflection is not None:
+            lines += self.insertion.lines(float(self.candidates.deflection[0]))
+        lines += [*self._breath(), *self._scan(), *self.structure_lines(most), *(f"  {line}" for line in self._arm())]
+        return "\n".join([*lines, *(f"  warning: {warning}" for warning in self.anatomy.warnings)])
 
-    def _target(self) -> str:
-        return f"  target         {self.target_depth_mm:8.2f} mm below the surface of {self.case.target_structure}"
-
-    def _reason(self) -> list[str]:
-        return [] if self.safe else ["  because " + reason_text(self.candidates, 0)]
-
-    def _breakdown(self) -> list[str]:
+    def _uncertainty(self) -> list[str]:
+        lines = [] if self.case.errors is None else [NO_CHANCES]
         if self.breakdown is not None:
-            led = (
-                f"  by {way:10s} {mm} mm rms, hits {hit}, stopped {stop}{', not all in sight' if lost else ''}"
-                for way, mm, hit, stop, lost in map(way_cells, self.guidance)
-            )
-            return [*(f"  {line}" for line in self.breakdown.lines()), *led, *self._sight()]
-        return [*([] if self.case.errors is None else [f"  {NO_CHANCES}"]), *self._sight()]
-
-    def _sight(self) -> list[str]:
-        return [f"  {device:14s} {said}" for device, said in self.sight.items()]
+            lines = self.breakdown.lines()
+            for way, mm, hit, stop, lost in map(way_cells, self.guidance):
+                lines.append(f"by {way:10s} {mm} mm rms, hits {hit}, stopped {stop}{lost and ', not all in sight'}")
+        return [f"  {line}" for line in (*lines, *(f"{device:14s} {said}" for device, said in self.sight.items()))]
 
     def _path(self) -> list[str]:
         row, needle = self.candidates, self.case.needle
@@ -247,27 +224,7 @@ class Explanation(Shown):
             return None
         return insertion_along(bending, self.anatomy, self.case.target_ct, row.outward_ct[0], float(row.path.length[0]))
 
-    def _bending(self) -> list[str]:
-        if self.insertion is None or self.candidates.deflection is None:
-            return []
-        return self.insertion.lines(float(self.candidates.deflection[0]))
-
-    def _needle(self) -> dict[str, Any]:
-        """The key ``bending``, of a case that declares its tissue."""
-        if self.candidates.deflection is None:
-            return {}
-        insertion = self.insertion
-        values = {
-            "deflection_bound_mm": finite(self.candidates.deflection[0]),
-            "deflection_mm": None if insertion is None else insertion.tip_mm,
-            "peak_force_n": None if insertion is None else insertion.force.peak_n,
-            "buckling_free_n": None if insertion is None else insertion.buckling_free_n,
-            "buckling_pinned_n": None if insertion is None else insertion.buckling_pinned_n,
-        }
-        return {"bending": values}
-
     def _breath(self) -> list[str]:
-        """Text of the least clearance of all phases that the gate lets through."""
         found, breathing = self.candidates.breathing, self.case.breathing
         if found is None or breathing is None or np.isnan(found.clearance[0]):
             return []
@@ -278,7 +235,6 @@ class Explanation(Shown):
         ]
 
     def _scan(self) -> list[str]:
-        """Depths, Hounsfield units and structures, from the target outward."""
         if not self.along_path:
             return []
         lines = ["  along the path, mm from the target:   HU least, median, most   inside of"]
@@ -290,23 +246,19 @@ class Explanation(Shown):
         return lines
 
     def structure_lines(self, most: int | None = NEAREST) -> list[str]:
-        """Clearance and margin of each structure, the nearest first; beyond ``most``, only of those that are too close.
-
-        Args:
-            most: None lists all.
-        """
+        """Clearance and margin of each structure, the nearest first; beyond ``most`` only of those too near."""
         structures, clearances = self.anatomy.checked, self.candidates.clearance.distance[0]
         order = np.argsort(clearances, kind="stable")
         short = np.array([s.demands_margin and c < s.margin_mm for s, c in zip(structures, clearances, strict=True)])
         shown = [at for rank, at in enumerate(order) if most is None or rank < most or short[at]]
         lines = ["  structure                        role       clearance mm   margin mm"]
         for column in shown:
-            structure = structures[column]
-            margin = f"{structure.margin_mm:11.2f}" if structure.demands_margin else "          -"
-            lines.append(
-                f"  {structure.name:32s} {structure.role:8s} {clearances[column]:14.{decimals(structure)}f} {margin}"
-                + _clearance_note(structure, float(clearances[column]), bool(short[column]))
-            )
+            one, mm = structures[column], clearances[column]
+            margin = f"{one.margin_mm:11.2f}" if one.demands_margin else "          -"
+            crossed = "enters" if one.role == Role.TARGET else "crossed"
+            notes = ", ".join(note for note, holds in (("too close", short[column]), (crossed, mm < 0)) if holds)
+            text = f"  {one.name:32s} {one.role:8s} {mm:14.{decimals(one)}f} {margin}"
+            lines.append(f"{text}  {notes}" if notes else text)
         left = len(order) - len(shown)
         return [*lines, f"  and {left} more, farther away"] if left else lines
 
@@ -315,9 +267,6 @@ class Explanation(Shown):
         clearance = self.candidates.clearance
         demanded = np.where(np.isnan(clearance.margins), np.inf, clearance.distance[0])
         return clearance.structures[int(np.argmin(demanded))] if np.isfinite(demanded).any() else ""
-
-    def _rest(self) -> list[str]:
-        return [*(f"  {line}" for line in self._arm()), *(f"  warning: {warning}" for warning in self.anatomy.warnings)]
 
     def _arm(self) -> list[str]:
         row = self.candidates
@@ -335,13 +284,6 @@ class Explanation(Shown):
 def decimals(structure: Structure) -> int:
     """Decimals of a clearance in mm for people: a surface drawn around coarse voxels has no hundredths."""
     return 1 if structure.voxel_mm >= COARSE_VOXEL_MM else 2
-
-
-def _clearance_note(structure: Structure, clearance_mm: float, short: bool) -> str:
-    """Text after a clearance: too close; crossed where it is below zero, and of the target's structure entered."""
-    below = "enters" if structure.role == Role.TARGET else "crossed"
-    notes = ["too close"] * short + [below] * (clearance_mm < 0)
-    return f"  {', '.join(notes)}" if notes else ""
 
 
 def needle_warnings(case: Case, candidates: Candidates) -> list[str]:
@@ -366,9 +308,16 @@ def reason_text(candidates: Candidates, row: int) -> str:
         parts.append(f"({candidates.verdict.named[row]})")
     if np.isfinite(candidates.verdict.depth[row]):
         parts.append(f"at {candidates.verdict.depth[row]:.1f} mm from the target")
-    text = " ".join(parts)
-    if np.isfinite(candidates.verdict.amount[row]):
-        text += _amount_text(candidates, row)
+    text, reason, amount = " ".join(parts), parts[0], float(candidates.verdict.amount[row])
+    margin, clearance = np.nan, candidates.clearance
+    if reason == Reason.TOO_CLOSE.value:
+        margin = clearance.margins[clearance.structures.index(str(candidates.verdict.structure[row]))]
+    if np.isfinite(amount) and reason not in UNITS and amount < 0:  # a negative clearance ends at minus the radius
+        text += f": the needle crosses it{deep_text(amount)}"
+        text += f"; {margin:g} mm clearance is demanded" if np.isfinite(margin) else ""
+    elif np.isfinite(amount):
+        text += f" with {amount:.2f} {UNITS.get(reason, 'mm clearance')}"
+        text += f" where {margin:g} mm is demanded" if np.isfinite(margin) else ""
     if candidates.verdict.detail[row]:
         text += f" - {candidates.verdict.detail[row]}"
     return text
@@ -382,23 +331,6 @@ def deep_text(clearance_mm: float) -> str:
     """
     deep_mm = math.floor(-100.0 * clearance_mm + 1e-9) / 100.0
     return f", at least {deep_mm:g} mm deep" if deep_mm > 0.0 else ""
-
-
-def _amount_text(candidates: Candidates, row: int) -> str:
-    """Text of the number that fell short; a negative clearance ends at minus the radius."""
-    reason, amount = str(candidates.verdict.reason[row]), float(candidates.verdict.amount[row])
-    margin = _margin(candidates, row) if reason == Reason.TOO_CLOSE.value else np.nan
-    if reason not in UNITS and amount < 0:
-        wanted = f"; {margin:g} mm clearance is demanded" if np.isfinite(margin) else ""
-        return f": the needle crosses it{deep_text(amount)}{wanted}"
-    wanted = f" where {margin:g} mm is demanded" if np.isfinite(margin) else ""
-    return f" with {amount:.2f} {UNITS.get(reason, 'mm clearance')}{wanted}"
-
-
-def _margin(candidates: Candidates, row: int) -> float:
-    """Margin of the structure that the reason names, mm."""
-    found = candidates.clearance
-    return float(found.margins[found.structures.index(str(candidates.verdict.structure[row]))])
 
 
 def finite(value: float) -> float | None:

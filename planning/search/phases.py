@@ -8,7 +8,7 @@ Positions in the gate's window decide the verdict.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -16,15 +16,13 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.skin import SkinPaths
-from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.breathing.breathing import Breathing, fraction_within
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.clearance.engine import ClearanceEngine, Clearances, measure
 from puncture_twin.planning.collision.workcell import GANTRY, OF_CASE_FILE, case_checker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -37,18 +35,14 @@ from puncture_twin.planning.search.constraints import ArmReach, first_broken, wi
 
 
 def with_breathing(
-    case: Case, anatomy: Anatomy, engine: ClearanceEngine, candidates: Candidates, bound: DeflectionBound | None = None
+    case: Case,
+    breathing: Breathing,
+    anatomy: Anatomy,
+    engine: ClearanceEngine,
+    candidates: Candidates,
+    bound: DeflectionBound | None,
 ) -> Candidates:
-    """Check safe candidates at every position of the breath, and reject those that are unsafe in the gate's window.
-
-    Args:
-        case: The case; nothing is done where it declares no breathing.
-        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        bound: How far the needle may bend; None bends nothing.
-    """
-    breathing = case.breathing
-    if breathing is None:
-        return candidates
+    """Check safe candidates at every position of the breath, and reject those that are unsafe in the gate's window."""
     body = BreathingBody(case, breathing, anatomy, engine, moving_weights(case, breathing, anatomy), bound, candidates)
     rows, within = np.flatnonzero(candidates.safe), int(breathing.in_window.sum())
     phases = [body.at(rows, s) for s in breathing.positions.tolist()]
@@ -58,104 +52,63 @@ def with_breathing(
         if at:
             through = checked_between(body, through, phases[at - 1], phase)
         verdict = through if at < within else verdict  # the gate's window is the first of them
-    blank = np.full(len(candidates), np.nan)
-    worst, clearance = blank.copy(), blank.copy()
+    worst, clearance = np.full((2, len(candidates)), np.nan)
     excess = np.array([phase.least_excess for phase in phases[:within]])
     worst[rows] = breathing.positions[excess.argmin(axis=0)]
     clearance[rows] = np.min([phase.clearance.min(axis=1, initial=np.inf) for phase in phases[:within]], axis=0)
-    safe_all = np.asarray(through.reason == Reason.NONE.value) & breathing.whole
+    safe_all = through.safe & breathing.whole
     columns = BreathingColumns(safe_all, worst, clearance, breathing.window_text)
     return replace(candidates, verdict=verdict, breathing=columns)
 
 
-def with_breathing_reach(case: Case, anatomy: Anatomy, candidates: Candidates, reach: ArmReach) -> Candidates:
+def with_breathing_reach(
+    case: Case, breathing: Breathing, anatomy: Anatomy, candidates: Candidates, reach: ArmReach
+) -> Candidates:
     """Reject candidates that the arm cannot reach, or insert along, at a phase in the gate's window.
 
-    Args:
-        case: The case; nothing is done where it declares no breathing.
-        candidates: Checked with the arm where the CT shows the body.
+    The arm has been checked where the CT shows the body.
     """
-    breathing = case.breathing
-    if breathing is None:
-        return candidates
     weights = moving_weights(case, breathing, anatomy)
     for s in breathing.positions[breathing.in_window].tolist():
-        if np.any(breathing.moved_ct(s)) and candidates.safe.any():
-            candidates = _at_phase(case, breathing, anatomy, weights, candidates, reach, s)
+        rows, moved = np.flatnonzero(candidates.safe), breathing.moved_ct(s)
+        if not (moved.any() and len(rows)):
+            continue
+        there = _arm_at(case, breathing, anatomy, weights, s, reach.T_base_ct)
+        paths = case_paths(case, anatomy.skin, candidates.outward_ct, (1 - weights.skin) * moved)
+        path = replace(candidates.path, length=paths.path_length, skin_angle=paths.skin_angle)
+        shifted = replace(candidates, path=path, arm=ArmColumns.unknown(len(candidates)))
+        at_phase = with_reach(replace(case, target_ct=case.target_ct + moved), shifted, there).verdict.of(rows)
+        candidates = replace(candidates, verdict=rejected_at(candidates.verdict, rows, at_phase, breathing, s))
     return candidates
 
 
-def _at_phase(
-    case: Case,
-    breathing: Breathing,
-    anatomy: Anatomy,
-    weights: MovingWeights,
-    candidates: Candidates,
-    reach: ArmReach,
-    s: float,
-) -> Candidates:
-    rows, moved = np.flatnonzero(candidates.safe), breathing.moved_ct(s)
-    displaced = _displaced(anatomy, weights, breathing, s)
-    solids = _with_moved_solids(case, anatomy, weights, breathing, s, reach.T_base_ct)
-    checker = case_checker(solids, displaced, reach.T_base_ct)
-    there = ArmReach(lambda: checker, reach.T_base_ct)
-    paths = case_paths(case, anatomy.skin, candidates.outward_ct, (1 - weights.skin) * moved)
-    path = replace(candidates.path, length=paths.path_length, skin_angle=paths.skin_angle)
-    shifted = replace(candidates, path=path, arm=ArmColumns.unknown(len(candidates)))
-    answered = with_reach(replace(case, target_ct=case.target_ct + moved), shifted, there)
-    at_phase = answered.verdict.of(rows)
-    return replace(candidates, verdict=rejected_at(candidates.verdict, rows, at_phase, breathing, s))
-
-
-def _displaced(anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float) -> Anatomy:
-    """The anatomy at a position of the breath: skin and what lies outside of the body, which an arm may touch."""
-    inside, outside = np.split(weights.structures, [len(anatomy.structures)])
-    del inside  # an arm does not come to it
-    return replace(
-        anatomy,
-        skin=replace(anatomy.skin, mesh=_moved(anatomy.skin.mesh, breathing.moved_ct(s, weights.skin))),
-        surroundings=tuple(
-            _moved_structure(one, breathing.moved_ct(s, float(weight)))
-            for one, weight in zip(anatomy.surroundings, outside, strict=True)
-        ),
-    )
-
-
-def _with_moved_solids(
-    case: Case, anatomy: Anatomy, weights: MovingWeights, breathing: Breathing, s: float, T_base_ct: Floats
-) -> Case:
-    """The case with obstacles and gantry displaced by their weights: the arm's checker reads them from the case."""
+def _arm_at(
+    case: Case, breathing: Breathing, anatomy: Anatomy, weights: MovingWeights, s: float, T_base_ct: Floats
+) -> ArmReach:
+    """The arm among skin, surroundings, obstacles and gantry as they are at a position of the breath."""
     names = [one.name for one in anatomy.checked]
-    of = dict(zip(names, weights.structures.tolist(), strict=True))
+    by_ct = {
+        name: breathing.moved_ct(s, weight) for name, weight in zip(names, weights.structures.tolist(), strict=True)
+    }
+    R, by_skin = {"ct": np.eye(3), "base": T_base_ct[:3, :3]}, breathing.moved_ct(s, weights.skin)
 
-    def moved(obstacle: Obstacle) -> Obstacle:
-        by_ct = breathing.moved_ct(s, of[obstacle.name])
-        by = T_base_ct[:3, :3] @ by_ct if obstacle.frame == "base" else by_ct
-        return replace(obstacle, center_mm=obstacle.center_mm + by)
+    def moved(mesh: TriangleMesh, by: Floats) -> TriangleMesh:
+        return mesh.transformed(pose(np.eye(3), by)) if by.any() else mesh
 
+    skin = replace(anatomy.skin, mesh=moved(anatomy.skin.mesh, by_skin))
+    around = tuple(replace(one, mesh=moved(one.mesh, by_ct[one.name])) for one in anatomy.surroundings)
+    obstacles = [replace(one, center_mm=one.center_mm + R[one.frame] @ by_ct[one.name]) for one in case.obstacles]
     gantry = case.gantry
     if gantry is not None:
-        gantry = replace(gantry, T_ct_gantry=pose(np.eye(3), breathing.moved_ct(s, of[GANTRY])) @ gantry.T_ct_gantry)
-    return replace(case, obstacles=tuple(moved(one) for one in case.obstacles), gantry=gantry)
-
-
-def _moved_structure(structure: Structure, by_ct: Floats) -> Structure:
-    return replace(structure, mesh=_moved(structure.mesh, by_ct))
-
-
-def _moved(mesh: TriangleMesh, by_ct: Floats) -> TriangleMesh:
-    return mesh.transformed(pose(np.eye(3), by_ct)) if np.any(by_ct) else mesh
+        gantry = replace(gantry, T_ct_gantry=pose(np.eye(3), by_ct[GANTRY]) @ gantry.T_ct_gantry)
+    displaced = replace(case, obstacles=tuple(obstacles), gantry=gantry)
+    checker = case_checker(displaced, replace(anatomy, skin=skin, surroundings=around), T_base_ct)
+    return ArmReach(lambda: checker, T_base_ct)
 
 
 @dataclass(frozen=True, eq=False)
 class BreathingBody:
-    """A case that breathes, measured at any position of the breath.
-
-    Attributes:
-        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
-        bound: How far the needle may bend; None bends nothing.
-        candidates: The candidates, checked where the CT shows the body.
-    """
+    """A case that breathes, measured at any position of the breath."""
 
     case: Case
     breathing: Breathing
@@ -199,9 +152,8 @@ class BreathingBody:
     def at(self, rows: Ints, s: float) -> Phase:
         """The phase of candidates ``rows`` (m,) at a position, as if inserted there."""
         case, checked, outward = self.case, self.anatomy.checked, self.candidates.outward_ct[rows]
-        moved = self.breathing.moved_ct(s)
         paths = self.paths(outward, s)
-        shifts = moved[None] * (1 - self.weights.structures)[:, None]
+        shifts = self.breathing.moved_ct(s)[None] * (1 - self.weights.structures)[:, None]
         clearances = self._clearances(rows, shifts)
         limit = case.search.max_skin_angle
         verdict = first_broken(paths, clearances, checked, needle=case.needle, max_skin_angle=limit)
@@ -212,12 +164,7 @@ class BreathingBody:
         return Phase(s, rows, verdict, clearance, clearance - self.margins, deflection)
 
     def excess_at(self, rows: Ints, s: float, columns: Ints) -> Floats:
-        """Clearance beyond the margins of some structures at a position, shape (m, c), mm.
-
-        Args:
-            rows: Shape (m,), which candidates.
-            columns: Shape (c,), which of the structures with a margin.
-        """
+        """Clearance beyond the margins of some structures at a position, shape (m, c), mm."""
         case, which = self.case, self.demanding[columns]
         distance, weights = np.empty((len(rows), len(columns))), self.weights.structures[which]
         for weight in np.unique(weights):
@@ -261,21 +208,10 @@ class Phase:
     deflection: Floats
 
     @property
-    def safe(self) -> Bools:
-        """Which of the candidates are safe at this position, shape (m,)."""
-        return np.asarray(self.verdict.reason == Reason.NONE.value)
-
-    @property
     def least_excess(self) -> Floats:
         """Least clearance beyond a margin, shape (m,), mm; minus infinity where another reason rejects."""
-        near = np.isin(self.verdict.reason, CLEARANCES) | self.safe
+        near = np.isin(self.verdict.reason, CLEARANCES) | self.verdict.safe
         return np.asarray(np.where(near, self.excess.min(axis=1, initial=np.inf), -np.inf))
-
-    def of(self, which: Bools) -> Phase:
-        """The phase of some of the candidates; ``which`` of shape (m,)."""
-        rows = np.flatnonzero(which)
-        arrays = (self.clearance[rows], self.excess[rows], self.deflection[rows])
-        return Phase(self.s, self.rows[rows], self.verdict.of(rows), *arrays)
 
 
 CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE_BENDS.value)
@@ -283,20 +219,20 @@ CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE
 
 
 def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Breathing, s: float) -> Verdict:
-    """A verdict with candidates rejected that are unsafe at one phase; those rejected already keep their reason.
-
-    Args:
-        rows: Shape (m,), those that were checked at the phase.
-    """
-    new = (at_phase.reason != Reason.NONE.value) & (verdict.reason[rows] == Reason.NONE.value)
-    arrays = {field.name: getattr(verdict, field.name).copy() for field in fields(verdict)}
-    near = np.isin(at_phase.reason[new], CLEARANCES)
-    arrays["structure"][rows[new]], arrays["depth"][rows[new]] = at_phase.structure[new], at_phase.depth[new]
-    arrays["amount"][rows[new]] = np.where(near, at_phase.amount[new], np.nan)
-    arrays["reason"][rows[new]] = Reason.UNSAFE_WHEN_BREATHING.value
-    for row, reason, more in zip(rows[new], at_phase.reason[new], at_phase.detail[new], strict=True):
-        arrays["detail"][row] = f"at {breathing.phase_text(s)}: {REASON_TEXT[Reason(reason)]}{more and f', {more}'}"
-    return Verdict(**arrays)
+    """A verdict with candidates rejected that are unsafe at one phase; those rejected already keep their reason."""
+    new = ~at_phase.safe & verdict.of(rows).safe
+    at_phase = at_phase.of(np.flatnonzero(new))
+    reasons = zip(at_phase.reason, at_phase.detail, strict=True)
+    when = f"at {breathing.phase_text(s)}"
+    details = [f"{when}: {REASON_TEXT[Reason(reason)]}{more and f', {more}'}" for reason, more in reasons]
+    return verdict.put(
+        rows[new],
+        reason=Reason.UNSAFE_WHEN_BREATHING.value,
+        structure=at_phase.structure,
+        depth=at_phase.depth,
+        amount=np.where(np.isin(at_phase.reason, CLEARANCES), at_phase.amount, np.nan),
+        detail=np.array(details, dtype=object),
+    )
 
 
 def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Phase) -> Verdict:
@@ -304,9 +240,6 @@ def checked_between(body: BreathingBody, verdict: Verdict, low: Phase, high: Pha
 
     A structure moves by m between them, so a clearance changes by m at most: its least in between is at least
     (low + high - m) / 2. Where that does not suffice, the interval is halved and measured in the middle (`_checked`).
-
-    Args:
-        verdict: Of the candidates, with what is rejected at the two positions.
     """
     deflection = np.fmax(low.deflection, high.deflection)
     columns = np.arange(len(body.demanding))
@@ -338,36 +271,30 @@ LEAST_MM = 0.1
 def _checked(body: BreathingBody, verdict: Verdict, gap: _Gap) -> Verdict:
     moves = body.moves_mm(gap.low, gap.high)[gap.columns]
     least = (gap.at_low + gap.at_high - moves) / 2 - gap.deflection[:, None]  # no clearance falls faster than it moves
-    short = (least < 0) & (moves > 0) & (verdict.reason[gap.rows] == Reason.NONE.value)[:, None]
-    rows, columns = short.any(axis=1), short.any(axis=0)
+    short = (least < 0) & (moves > 0) & verdict.of(gap.rows).safe[:, None]
+    rows, columns = np.asarray(short.any(axis=1)), np.asarray(short.any(axis=0))
     if not rows.any():
         return verdict
     gap, least, middle = gap.of(rows, columns), least[np.ix_(rows, columns)], (gap.low + gap.high) / 2
     if moves[columns].max() <= LEAST_MM:
-        nearest = _names(body, gap, least)
-        return rejected_at(
-            verdict, gap.rows, _too_close(nearest, np.full(len(nearest), np.nan)), body.breathing, middle
-        )
+        close = _too_close(body, gap, least, np.full(len(least), np.nan))
+        return rejected_at(verdict, gap.rows, close, body.breathing, middle)
     excess = body.excess_at(gap.rows, middle, gap.columns)
     left = excess - gap.deflection[:, None]
     bad = left.min(axis=1) < 0
     column = left[bad].argmin(axis=1)
     amount = excess[bad][np.arange(len(column)), column] + body.margins[gap.columns[column]]
-    close = _too_close(_names(body, gap, left)[bad], amount)
+    close = _too_close(body, gap, left[bad], amount)
     verdict = rejected_at(verdict, gap.rows[bad], close, body.breathing, middle)
     verdict = _checked(body, verdict, gap._replace(high=middle, at_high=excess))
     return _checked(body, verdict, gap._replace(low=middle, at_low=excess))
 
 
-def _names(body: BreathingBody, gap: _Gap, left: Floats) -> Texts:
-    """Name of the structure with the least excess for each candidate."""
+def _too_close(body: BreathingBody, gap: _Gap, left: Floats, amount: Floats) -> Verdict:
+    """Verdict of m candidates that come too close to the structure of their least excess, of ``left`` (m, k)."""
     names = np.array([body.anatomy.checked[column].name for column in body.demanding], dtype=object)
-    return np.asarray(names[gap.columns[left.argmin(axis=1)]])
-
-
-def _too_close(names: Texts, amount: Floats) -> Verdict:
-    blank, reason = np.full(len(names), "", dtype=object), np.full(len(names), Reason.TOO_CLOSE.value, dtype=object)
-    return Verdict(reason, names, np.full(len(names), np.nan), amount, blank)
+    blank, reason = np.full(len(left), "", dtype=object), np.full(len(left), Reason.TOO_CLOSE.value, dtype=object)
+    return Verdict(reason, names[gap.columns[left.argmin(axis=1)]], np.full(len(left), np.nan), amount, blank)
 
 
 class MovingWeights(NamedTuple):
@@ -388,7 +315,10 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
     """
     skin = case.skin_section.name
     stated = breathing.weights.of_pattern
-    fixed = {one.name: _by_itself(case, one) for one in anatomy.checked}
+    fixed = {one.name: 0.0 if one.source == OF_CASE_FILE else None for one in anatomy.checked}
+    fixed |= dict.fromkeys(
+        fixed.keys() & {case.target_structure, BEYOND_IMAGE}, 1.0
+    )  # the breath has widened the latter
     needed = [skin, *(name for name, weight in fixed.items() if weight is None)]
     others = [name for name in fixed if name not in needed]
     breathing.weights.check(needed, "breathing.weights", case.path, others=others)
@@ -401,38 +331,23 @@ def moving_weights(case: Case, breathing: Breathing, anatomy: Anatomy) -> Moving
     return MovingWeights(float(of(skin) or 0.0), np.array(weights, dtype=np.float64))
 
 
-def _by_itself(case: Case, structure: Structure) -> float | None:
-    """The weight of a structure that needs no statement; None of all others."""
-    if structure.name in {case.target_structure, BEYOND_IMAGE}:  # which the breath has widened already
-        return 1.0
-    return 0.0 if structure.source == OF_CASE_FILE else None
-
-
-SAFE_WHEN = (
-    "breathing: a safe direction is safe {when}; checked at {count}, with clearances between them; an "
-    "inserted needle moves with the organ and bends"
-)
-
-PLANS = (
-    "breathing: plans and rehearsals go to the target where the CT shows it (s = {s:g}), with the patient at rest there"
-)
-
-OPEN = "breathing: the gate is open {part:.0%} of the time, if the breathing follows the curve"
-
-OUTSIDE_GATE = "breathing: the CT shows the body at s = {s:g}, outside the gate (s <= {gate:g})"
-
-
 def breath_warnings(case: Case, anatomy: Anatomy) -> tuple[str, ...]:
     """Warnings about what a breathing case's verdicts mean; none where it declares no breathing."""
     breathing = case.breathing
     if breathing is None:
         return ()
     moving_weights(case, breathing, anatomy)
-    count = int(breathing.in_window.sum())
-    warnings = [SAFE_WHEN.format(when=breathing.window_text, count=plural(count, "position"))]
-    if breathing.gate is not None:
-        warnings.append(OPEN.format(part=fraction_within(breathing.gate, breathing.exponent)))
-    warnings.append(PLANS.format(s=breathing.scanned_at))
-    if breathing.gate is not None and breathing.scanned_at > breathing.gate:
-        warnings.append(OUTSIDE_GATE.format(s=breathing.scanned_at, gate=breathing.gate))
+    gate, s = breathing.gate, breathing.scanned_at
+    count = plural(int(breathing.in_window.sum()), "position")
+    warnings = [
+        f"breathing: a safe direction is safe {breathing.window_text}; checked at {count}, with clearances between "
+        "them; an inserted needle moves with the organ and bends"
+    ]
+    if gate is not None:
+        part = fraction_within(gate, breathing.exponent)
+        warnings.append(f"breathing: the gate is open {part:.0%} of the time, if the breathing follows the curve")
+    where = f"to the target where the CT shows it (s = {s:g}), with the patient at rest there"
+    warnings.append(f"breathing: plans and rehearsals go {where}")
+    if gate is not None and s > gate:
+        warnings.append(f"breathing: the CT shows the body at s = {s:g}, outside the gate (s <= {gate:g})")
     return tuple(warnings)

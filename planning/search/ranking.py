@@ -5,12 +5,12 @@ One of the terms is the safe cone: by how much a direction may be off and still 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import allocation_free
 from puncture_twin.planning.case.case import Case
@@ -20,35 +20,23 @@ from puncture_twin.planning.search.candidates import CONE_OF_GRID, Candidates, R
 
 COMFORT_MM = 20.0
 """Clearance from which on more is no better: several times any registration error that a case should have."""
-
 TIE_DIGITS = 9
 """Costs that agree to so many digits are equal: rounding must not decide a rank, nor differ between engines."""
-
 COMFORT_CONE = np.radians(5.0)
 """Safe cone from which on more is no better: a hand-held or robotic needle is aimed within a degree or two."""
-
 NO_RISK = 1e-6
 """Chance to touch from which down less is no better: what no model of a patient can tell."""
-
 TERMS = ("clearance", "path_length", "skin_angle", "tissue", "reach", "safe_cone")
 """The cost's terms, in the order of the columns."""
 
 
-@dataclass(frozen=True, eq=False)
-class Order:
-    """Cost, rank and Pareto front of n safe candidates.
-
-    Attributes:
-        terms: Shape (n, 6), each in 0..1, 0 is best, columns as `TERMS`.
-        cost: Shape (n,), weighted mean of the terms.
-        rank: Shape (n,), 1 is best; equal costs keep their order.
-        pareto: Shape (n,), no other candidate is at least as good in every term and better in one.
-    """
+class Order(NamedTuple):
+    """Terms (n, 6) in 0..1 of n safe candidates, their weighted mean, the ranks by it, and `pareto_front`."""
 
     terms: Floats
     cost: Floats
-    rank: NDArray[np.int32]
-    pareto: NDArray[np.bool_]
+    rank: Ints32
+    pareto: Bools
 
 
 def ranked(case: Case, candidates: Candidates) -> Candidates:
@@ -68,7 +56,7 @@ def ranked(case: Case, candidates: Candidates) -> Candidates:
     )
     blank = Ranking.none(len(candidates))
     cost, ranks, pareto = blank.cost.copy(), blank.rank.copy(), blank.pareto.copy()
-    cost[rows], ranks[rows], pareto[rows] = order.cost, order.rank, order.pareto
+    cost[rows], ranks[rows], pareto[rows] = order[1:]
     return replace(candidates, ranking=Ranking(cost, ranks, pareto))
 
 
@@ -113,9 +101,13 @@ def rank(
     reach        1 - reach margin (0 for all where reach was not checked)
     safe_cone    1 - min(safe cone, 5 degrees) / 5 degrees (0 for all where no cone is known)
     """
+    risk = np.asarray(1 - np.clip(min_clearance, 0, COMFORT_MM) / COMFORT_MM)
+    if touch_chance is not None:
+        decades = np.log10(np.maximum(touch_chance, NO_RISK) / NO_RISK) / -np.log10(NO_RISK)  # 0 at 1e-6, 1 at 1
+        risk = np.where(np.isnan(touch_chance), risk, np.minimum(decades, 1.0))
     terms = np.stack(
         [
-            _risk(min_clearance, touch_chance),
+            risk,
             path_length / shaft,
             skin_angle / max_skin_angle,
             tissue / shaft,
@@ -133,16 +125,7 @@ def rank(
     return Order(terms, cost, ranks, pareto_front(terms))
 
 
-def _risk(min_clearance: Floats, touch_chance: Floats | None) -> Floats:
-    """The first term: by the chance to touch where it is known, else by clearance."""
-    by_clearance = 1 - np.clip(min_clearance, 0, COMFORT_MM) / COMFORT_MM
-    if touch_chance is None:
-        return np.asarray(by_clearance)
-    decades = np.log10(np.maximum(touch_chance, NO_RISK) / NO_RISK) / -np.log10(NO_RISK)  # 0 at 1e-6, 1 at 1
-    return np.where(np.isnan(touch_chance), by_clearance, np.minimum(decades, 1.0))
-
-
-def pareto_front(terms: Floats) -> NDArray[np.bool_]:
+def pareto_front(terms: Floats) -> Bools:
     """Which rows of (n, m) no other row dominates (at most as large everywhere, smaller somewhere); shape (n,).
 
     In ascending order of the sum no row is dominated by a later one: the first is of the front, and takes out its own.
@@ -160,16 +143,10 @@ DIAGONAL = np.sqrt(2.0)
 """Diagonal of a cell, in steps, at the equator; nearer to the poles cells are narrower."""
 
 
-def with_grid_cone(candidates: Candidates) -> Candidates:
-    """The candidates with the safe cone of each safe one; those of no regular grid as they are.
-
-    Args:
-        candidates: Candidates with their verdicts by the organs alone: what an arm reaches makes no path safer.
-    """
-    if candidates.grid is None:
-        return candidates
+def with_grid_cone(candidates: Candidates, grid: AngleGrid) -> Candidates:
+    """The candidates of a grid with the safe cone of each safe one."""
     cone = np.full(len(candidates), np.nan)
-    cone[candidates.safe] = grid_cone(candidates.grid, candidates.safe)
+    cone[candidates.safe] = grid_cone(grid, candidates.safe)
     return replace(candidates, safe_cone=cone, cone_source=CONE_OF_GRID)
 
 
@@ -180,9 +157,6 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
     diagonal. A disc as wide as that diagonal holds a direction of the grid; so where such a disc fits into what is not
     safe, at its border, the cone ends before it. What is thinner may pass between the directions: only a
     certificate excludes that.
-
-    Args:
-        safe: Shape (n,), row by row.
     """
     theta, beta = np.repeat(grid.theta, len(grid.beta)), np.tile(grid.beta, len(grid.theta))
     border = _border(grid, safe)

@@ -36,10 +36,7 @@ class SafeMap(Shown):
     """Which directions the margins of the structures block.
 
     Attributes:
-        target_ct: Shape (3,), mm, LPS.
-        directions: The n directions of the case's grid.
         structures: Names of all that is checked; ``structure`` are places in it.
-        blocked: Shape (n,), whether the needle comes nearer to some structure than its margin.
         structure: Shape (n,), the first in the case's order that blocks the direction; -1 where none does.
     """
 
@@ -90,8 +87,6 @@ class BestTarget(Shown):
         points_ct: Shape (n, 3), mm, LPS; the context's own target is the first.
         window_deg2: Shape (n,), the widest window of each, square degrees, in the anatomy of the context.
         best: Row of the point with the widest window, of those that the case could have as its target.
-        context: The context of that point.
-        best_deg2: Its window there.
     """
 
     points_ct: Floats

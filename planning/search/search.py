@@ -53,14 +53,18 @@ def search(
     """
     axes = None if chance is None else organ_distances(case, anatomy, engine, directions)  # two stages read them
     candidates = organ_candidates(case, anatomy, engine, directions, axes)  # skin entry, clearance, bending, breathing
-    candidates = with_grid_cone(candidates)  # by how much a direction may be off and still be safe for the organs
-    if reach is not None:
-        candidates = with_reach(case, candidates, reach, progress)  # inverse kinematics and collisions, to the target
-        candidates = with_breathing_reach(case, anatomy, candidates, reach)  # the same, the patient breathing
-    candidates = with_chances(case, anatomy, candidates, chance, axes)  # of hitting the target, of touching structures
+    if directions.grid is not None:  # by how much a direction may be off and still be safe for the organs
+        candidates = with_grid_cone(candidates, directions.grid)
+    if reach is not None:  # inverse kinematics and collisions, to the target
+        candidates = with_reach(case, candidates, reach, progress)
+    if reach is not None and case.breathing is not None:  # the same, the patient breathing
+        candidates = with_breathing_reach(case, case.breathing, anatomy, candidates, reach)
+    if case.errors is not None:  # chances of hitting the target, of touching structures
+        candidates = with_chances(case, anatomy, candidates, chance, axes)
     candidates = ranked(case, candidates)  # cost, rank, Pareto front
-    candidates = with_best_refined(candidates, chance)  # chances of the best by sampling; ranks again if it rejects
-    return with_joint_chances(candidates, chance)  # of touching any structure, for the best
+    if chance is not None:  # chances of the best by sampling; ranks again if it rejects; of touching any structure
+        candidates = with_joint_chances(with_best_refined(candidates, chance), chance)
+    return candidates
 
 
 def organ_distances(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> AxisDistances:
@@ -75,11 +79,11 @@ def organ_candidates(
     """Check every direction against skin and organs, needle bending and breathing included; without arm and ranks.
 
     Args:
-        engine: Prepared for the meshes of ``anatomy.checked``, in that order.
         axes: `organ_distances` of the directions; None measures them here.
     """
     needle, outward, checked = case.needle, directions.outward_ct, anatomy.checked
     paths = case_paths(case, anatomy.skin, outward)  # where each path crosses the skin, and at which angle
+    tissue = tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length)
     lengths = axis_lengths(case, checked, paths.path_length, paths.skin_angle)  # how far out each axis is checked
     clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm, axes=axes)
     demanding, count = np.array([s.demands_margin for s in checked], bool), len(directions)
@@ -88,12 +92,7 @@ def organ_candidates(
         beta=directions.beta,
         outward_ct=outward,
         verdict=first_broken(paths, clearances, checked, needle=needle, max_skin_angle=case.search.max_skin_angle),
-        path=Path(
-            entry_ct=paths.entry_ct,
-            length=paths.path_length,
-            skin_angle=paths.skin_angle,
-            tissue=tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length),
-        ),
+        path=Path(entry_ct=paths.entry_ct, length=paths.path_length, skin_angle=paths.skin_angle, tissue=tissue),
         clearance=Clearance(
             structures=tuple(s.name for s in checked),
             margins=np.array([s.margin_mm if s.demands_margin else np.nan for s in checked]),
@@ -106,17 +105,20 @@ def organ_candidates(
         grid=directions.grid,
     )
     bound = None if case.bending is None else case.bending.bound(needle.longest_path_mm)
-    candidates = with_bending(anatomy, candidates, bound)
-    return with_breathing(case, anatomy, engine, candidates, bound)
+    if bound is not None:
+        candidates = with_bending(anatomy, candidates, bound)
+    if case.breathing is not None:
+        candidates = with_breathing(case, case.breathing, anatomy, engine, candidates, bound)
+    return candidates
 
 
 class Blocking(NamedTuple):
-    """What blocks the directions of a grid.
+    """What blocks n directions of a grid.
 
     Attributes:
-        structure: Shape (n,), the first of ``anatomy.checked`` whose margin a direction breaks; -1 where none.
-        enters: Shape (n,), which of the directions that no structure of the body blocks enter through the skin as the
-            case demands: seen, short enough, at a small enough angle.
+        structure: The first of ``anatomy.checked`` whose margin a direction breaks; -1 where none.
+        enters: Which of the directions that no structure of the body blocks enter through the skin as the case demands:
+            seen, short enough, at a small enough angle.
     """
 
     structure: Ints32
@@ -129,11 +131,7 @@ class Blocking(NamedTuple):
 
 
 def first_blocking(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Blocking:
-    """What blocks the directions of a grid at a case's target: structures in the order of ``anatomy.checked``.
-
-    Args:
-        engine: Prepared for the meshes of ``anatomy.checked``; any but the fast one is asked for its own distances.
-    """
+    """What blocks the directions of a grid at a case's target: structures in the order of ``anatomy.checked``."""
     outward, grid, inside, radius = directions.outward_ct, directions.grid, anatomy.structures, case.needle.radius_mm
     if fast := grid is not None and isinstance(engine, FastEngine):
         found = VerdictMap(case.target_ct, grid, outward, case.T_ct_entry[:3, :3])

@@ -13,26 +13,21 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, GRID_SLACK, angles, grid
 from puncture_twin.planning.geometry.containment import crossings
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.search.explain import finite
 
 STEP = np.radians(10.0)
 """rad between the directions that are tested: each side has about a hundred of them."""
-
 LEAST_OPEN = 0.1
 """Open fraction of a side's solid angle below which it is no side to puncture from."""
-
 LEAST_SEARCHED = 0.4
 """Fraction of a side's directions from which on a grid covers it: a grid about the front holds half of what is to the
 right and to the left."""
 
 ROUND_ABOUT = ("front", "back", "right", "left")
 """The sides that are reported; through feet and head no image shows skin."""
-
 NOT_SHOWN = "is where the image does not show the body"
 """Reason for the closed back of a patient without a CT, while the front is open."""
-
 AXES = {"front": "anterior", "back": "posterior", "right": "right", "left": "left", "feet": "feet", "head": "head"}
 FRONT, BACK, WHOLE = '"bed"', '{ z = "posterior", x = "head" }', (0.0, 180.0)
 
@@ -71,11 +66,7 @@ class Grid(NamedTuple):
 
 
 def sides_of(case: Case, anatomy: Anatomy) -> tuple[Side, ...]:
-    """The sides of the body by skin, what lies outside of it and the needle's length; organs do not count.
-
-    Args:
-        case: The validated case; none of a patient has no sides.
-    """
+    """The sides of the body by skin, what lies outside of it and the needle's length; organs do not count."""
     if case.space is Space.LOCAL:
         return ()
     around = grid((0.0, np.pi), (0.0, 2.0 * np.pi), STEP, np.eye(3))
@@ -106,9 +97,9 @@ def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) 
     table = "lies on the table" if anatomy.couch is not None else "is near the end of the image"
     closed = [("is beyond the end of the image", np.asarray(unseen))]
     for name, why in ((OUTSIDE_BODY, table), (ATTACHED_LIMB, "is at a probable limb")):
-        meshes = [one.mesh for one in anatomy.checked if one.name == name]
-        for mesh in meshes:
-            closed.append((why, ~unseen & _crosses(mesh, case.target_ct, outward_ct, needle.length_mm)))
+        for mesh in (one.mesh for one in anatomy.checked if one.name == name):
+            count = crossings(mesh, case.target_ct, outward_ct, needle.length_mm).count
+            closed.append((why, ~unseen & (count > 0)))
     return [
         *closed,
         (f"is farther than the needle's longest path, {needle.longest_path_mm:g} mm", length > needle.longest_path_mm),
@@ -117,13 +108,7 @@ def _closed(case: Case, anatomy: Anatomy, paths: SkinPaths, outward_ct: Floats) 
     ]
 
 
-def _crosses(mesh: TriangleMesh, target_ct: Floats, outward_ct: Floats, length_mm: float) -> Bools:
-    """Which straight needles intersect a surface, shape (n,)."""
-    return np.asarray(crossings(mesh, target_ct, outward_ct, length_mm).count > 0)
-
-
 def _within(case: Case, outward_ct: Floats) -> Bools:
-    """Which directions the case's grid holds, shape (n,)."""
     theta, beta = angles(outward_ct @ case.T_ct_entry[:3, :3])
     (low, high), (first, last), slack = case.search.theta, case.search.beta, GRID_SLACK
     within_beta = (first - slack <= beta) & (beta <= last + slack)
@@ -140,11 +125,7 @@ def grid_of(sides: Sequence[Side]) -> Grid:
 
 
 def sides_text(sides: Sequence[Side], *, searched: bool = False) -> str:
-    """The open sides in words, and why the others are closed.
-
-    Args:
-        searched: Whether the case's grid counts: what it does not hold is named.
-    """
+    """The open sides in words, and why the others are closed."""
     reported = [side for side in sides if side.name in ROUND_ABOUT]
     here = [side.name for side in reported if side.is_open and (not searched or side.searched >= LEAST_SEARCHED)]
     parts = [_listed(here) or "no side"]

@@ -20,11 +20,7 @@ TABLE = "candidates.parquet"
 
 
 def to_table(candidates: Any) -> pa.Table:
-    """One row per direction, columns as DESIGN names them: `theta_deg`, `beta_deg`, `verdict`, `reason`, ...
-
-    Args:
-        candidates: The search's result, `Candidates`; its provenance is stored under the key ``run`` as JSON.
-    """
+    """One row per direction, columns as DESIGN names them: `theta_deg`, `beta_deg`, `verdict`, `reason`, ..."""
     columns = _path_columns(candidates) | _choice_columns(candidates)
     if candidates.chances is not None:
         columns |= chance_columns(candidates.chances)
@@ -43,7 +39,6 @@ def to_table(candidates: Any) -> pa.Table:
 
 
 def _path_columns(candidates: Any) -> dict[str, Any]:
-    """Direction, verdict, and the straight path with its clearances."""
     columns: dict[str, Any] = {
         "theta_deg": candidates.theta_deg,
         "beta_deg": candidates.beta_deg,
@@ -66,7 +61,6 @@ def _path_columns(candidates: Any) -> dict[str, Any]:
 
 
 def _choice_columns(candidates: Any) -> dict[str, Any]:
-    """Columns that compare safe directions: reach, safe cone, cost, rank and window."""
     reachable = candidates.arm.reachable
     return {
         "reachable": truths(reachable > 0, reachable >= 0),

@@ -59,7 +59,7 @@ class Clear(NamedTuple):
 
     @property
     def sure(self) -> bool:
-        """Whether it keeps its margin by `SURE` standard deviations."""
+        """Whether it keeps its margin by as much as `SURE` demands."""
         return bool(np.isnan(self.margin_mm)) or self.clearance_mm - SURE * self.sd_mm >= self.margin_mm
 
     def document(self) -> dict[str, Any]:
@@ -95,7 +95,6 @@ def check_line(context: CaseContext, path_ct: Floats, covs_ct: Floats) -> LineCh
     """Check a needle where it lies.
 
     Args:
-        context: Of the case; its arm is not asked.
         path_ct: Shape (m, 3), LPS mm, from the tip outward; beyond its last point it goes on straight.
         covs_ct: Shape (m, 6, 6), of each point and of the direction there, as rotation.
     """
@@ -113,19 +112,13 @@ def check_line(context: CaseContext, path_ct: Floats, covs_ct: Floats) -> LineCh
     each.sort(key=lambda one: (np.isnan(one.margin_mm), one.clearance_mm - np.nan_to_num(one.margin_mm)))
     verdict, structure = str(broken.reason[0]), str(broken.structure[0])
     if not verdict:
-        unsure = min(
-            (one for one in each if not one.sure), key=lambda one: one.clearance_mm - one.margin_mm, default=None
-        )
-        verdict, structure = (SAFE, "") if unsure is None else (UNCERTAIN, unsure.name)
+        unsure = [one.name for one in each if not one.sure]
+        verdict, structure = (UNCERTAIN, unsure[0]) if unsure else (SAFE, "")
     return LineCheck(verdict, structure, tuple(each), paths.entry_ct[0], float(paths.path_length[0]))
 
 
 def _nearest(context: CaseContext, path_ct: Floats, covs_ct: Floats, starts: Floats) -> tuple[dict[str, Floats], Bools]:
-    """Of each structure the least clearance of all pieces, its depth, deviation and chance to touch; which is violated.
-
-    Args:
-        starts: Shape (m - 1,), where each piece begins, mm behind the tip.
-    """
+    """Of each structure least clearance of all pieces, depth, deviation and chance to touch; which is violated."""
     case, checked, engine = context.case, context.anatomy.checked, context.engine
     steps = np.diff(path_ct, axis=0)
     sizes = np.linalg.norm(steps, axis=1)
@@ -201,8 +194,7 @@ def next_aims(context: CaseContext, path_ct: Floats, covs_ct: Floats, forward_ct
     """Everything that can be done with a needle, the best first.
 
     Args:
-        path_ct: As for `check_line`, which gave ``now``; and
-        covs_ct: the same.
+        path_ct: As for `check_line`, which gave ``now``; ``covs_ct`` too.
         forward_ct: Shape (3,), unit, the direction in which it goes on.
     """
     target, tip, cov_ct = context.case.target_ct, path_ct[0], covs_ct[0]
@@ -231,17 +223,12 @@ def next_aims(context: CaseContext, path_ct: Floats, covs_ct: Floats, forward_ct
         turn = float(np.degrees(np.arccos(np.clip(-forward_ct @ outward, -1.0, 1.0))))
         chance = hit_chance(context, target, cov[:3, :3])
         aims.append(Aim("turn", now.inserted_mm, turn, chance, 0.0, then.verdict, then.structure))
-    return _ranked(context, aims, now)
-
-
-def _ranked(context: CaseContext, aims: list[Aim], now: LineCheck) -> list[Aim]:
-    """The least change first that is safe and hits as often as wanted; else the safe one that hits most."""
-    wanted = context.case.search.min_hit or WANTED_HIT
     allowed = [one for one in aims if one.allowed]
     if not allowed:
         out = Aim("withdraw", now.inserted_mm, 0.0, float("nan"), float("nan"), now.verdict, now.structure)
         return [out, *aims]
-    most = max(np.nan_to_num(one.p_hit) for one in allowed)
+    # the least change first that hits as often as wanted, or else as often as any
+    wanted, most = context.case.search.min_hit or WANTED_HIT, max(np.nan_to_num(one.p_hit) for one in allowed)
     first = next(one for one in allowed if np.nan_to_num(one.p_hit) >= min(wanted, most - BETTER))
     return [first, *(one for one in aims if one is not first)]
 

@@ -23,10 +23,8 @@ from puncture_twin.planning.uncertainty.sources import SOURCES, deviation, not_m
 
 WISHED_HIT = 0.99
 """Chance to hit that is wanted where the case demands none."""
-
 HALVINGS = 40
 """Halvings of a factor's interval: its error is far below any digit that is printed."""
-
 LEAST_FRACTION = 0.005
 """Fraction of the variance below which a source is not named to people."""
 
@@ -45,8 +43,6 @@ class Goal:
 
     Attributes:
         structure: What is touched too likely; "" where the target is hit too unlikely.
-        limit: The chance that is demanded or allowed.
-        stated: Whether the case states the limit.
         remedies: The single sources that could mend it, the one that has to shrink least first.
         all_sources: By which factor all of them together would have to shrink; None where not even 0 is enough.
     """
@@ -57,23 +53,17 @@ class Goal:
     remedies: tuple[Remedy, ...]
     all_sources: float | None
 
-    @property
-    def claim(self) -> str:
-        """The limit's demand as text."""
-        return f"{self.limit:g} to {f'touch {self.structure}' if self.structure else 'hit'}"
-
     def text(self) -> str:
         """One sentence on the errors that would have to shrink."""
+        claim = f"{self.limit:g} to {f'touch {self.structure}' if self.structure else 'hit'}"
         if not self.remedies:
             if self.all_sources is None:
-                return f"{self.claim} is not possible, however small the errors"
+                return f"{claim} is not possible, however small the errors"
             shrunk = f"all errors together would have to shrink to {100 * self.all_sources:.0f} %"
-            return f"for {self.claim} no single error suffices: {shrunk}"
+            return f"for {claim} no single error suffices: {shrunk}"
         source, declared, needed = self.remedies[0]
         source_text, key, unit = SOURCES[source]
-        return (
-            f"for {self.claim} the {source_text} ({key}) would have to be {needed:.2g} {unit} instead of {declared:.2g}"
-        )
+        return f"for {claim} the {source_text} ({key}) would have to be {needed:.2g} {unit} instead of {declared:.2g}"
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON, in the units of the keys of ``[errors]``."""
@@ -96,7 +86,6 @@ class UncertaintyBreakdown:
     Attributes:
         p_touch: Structure to chance to touch it.
         p_touch_any: Of any, min(1, sum).
-        budget: The tip's expected error and its sources.
         declaration: Whether the markers' residuals agree with the declared errors, in one sentence.
         goals: Limits that are not satisfied: the case's, or `WISHED_HIT` where it demands no chance to hit.
     """
@@ -151,22 +140,15 @@ class UncertaintyBreakdown:
             "p_hit": self.p_hit,
             "p_touch": dict(self.p_touch),
             "p_touch_any": self.p_touch_any,
-            **budget_summary(self.budget),
+            "expected_rms_mm": self.budget.rms_mm,
+            "expected_lateral_mm": self.budget.lateral_mm,
+            "expected_depth_mm": self.budget.depth_mm,
+            "half_axes_95_mm": self.budget.half_axes_mm.tolist(),
+            "share": dict(self.budget.fraction),
             "declaration": self.declaration,
             "for_the_limits": [goal.summary() for goal in self.goals],
             "not_modelled": self.not_modelled,
         }
-
-
-def budget_summary(budget: ErrorBudget) -> dict[str, Any]:
-    """A budget as plain values, mm."""
-    return {
-        "expected_rms_mm": budget.rms_mm,
-        "expected_lateral_mm": budget.lateral_mm,
-        "expected_depth_mm": budget.depth_mm,
-        "half_axes_95_mm": budget.half_axes_mm.tolist(),
-        "share": dict(budget.fraction),
-    }
 
 
 def chance_text(chance: float) -> str:
@@ -190,16 +172,11 @@ WAY_HEAD = ("guidance", "expected tip error (rms), mm", "chance to hit", "to be 
 
 
 def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown:
-    """The uncertainty breakdown of one candidate, its chances line-sampled as those of the table's best are.
-
-    Args:
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        q: Shape (6,), rad, the tip on the target.
-    """
+    """The uncertainty breakdown of one candidate, its chances line-sampled as those of the table's best are."""
     needle = (outward_ct[None], q[None])
     chances = refined_chances(model, *needle, model.chances(*needle))
     touch = dict(zip(chances.structures, map(float, chances.touch[0]), strict=True))
-    sources = shrinkable(model, model.needles(*needle), q)
+    sources = ShrinkableNeedle(model, model.needles(*needle), error_parts(model, q))
     return UncertaintyBreakdown(
         float(chances.hit[0]),
         MappingProxyType(touch),
@@ -218,7 +195,7 @@ class _Part(NamedTuple):
     target: Floats
 
 
-def _parts(model: ChanceModel, q: Floats) -> dict[str, _Part]:
+def error_parts(model: ChanceModel, q: Floats) -> dict[str, _Part]:
     """Parts of all sources at one configuration (6,); a target read in the markers' CT shrinks with them."""
     error, R = model.error, model.error.fit.R_base_ct
     turn, scale = np.kron(np.eye(2), R), error.fit.test.scale**2
@@ -236,7 +213,7 @@ def _parts(model: ChanceModel, q: Floats) -> dict[str, _Part]:
 
 
 class ShrinkableNeedle(NamedTuple):
-    """One candidate whose sources can be shrunk: `shrinkable` makes one."""
+    """One candidate whose error is split into sources that can be shrunk."""
 
     model: ChanceModel
     needles: Needles
@@ -247,39 +224,24 @@ class ShrinkableNeedle(NamedTuple):
         squares = {source: factors.get(source, 1.0) ** 2 for source in self.parts}
         cov6 = np.asarray(sum(squares[source] * part.cov6 for source, part in self.parts.items()))
         surface_mm = factors.get("surface", 1.0) * self.surface_mm(structure)
+        hit, freedom, near = self.model.hit, self.model.error.freedom, self.needles.near
         if structure:
-            return self._touch(structure, cov6, surface_mm)
-        target = np.asarray(sum(squares[source] * part.target for source, part in self.parts.items()))
-        return self._hit(cov6[:3, :3], target, surface_mm)
+            at = [self.model.structures.index(structure)]
+            gradient = near.gradient[:, at]
+            variance = np.einsum("nka,ab,nkb->nk", gradient, cov6, gradient) + surface_mm**2
+            shrunk = Proximity(near.distance[:, at], gradient, np.sqrt(np.maximum(variance, 0.0)))
+            return float(touch_chance(shrunk, self.model.case.needle.radius_mm, freedom)[0, 0])
+        if hit.radius_mm is not None:
+            target = np.asarray(sum(squares[source] * part.target for source, part in self.parts.items()))
+            return float(hit_in_ball((cov6[:3, :3] + target)[None], hit.radius_mm, freedom)[0])
+        assert hit.rays is not None
+        return float(hit_in_mesh(hit.rays, cov6[None, :3, :3], freedom, surface_mm)[0])
 
     def surface_mm(self, structure: str) -> float:
         """Standard deviation of a structure's surface as a whole, or of the target's where it is "", mm."""
         if not structure:
             return self.model.target_surface_mm
         return float(self.needles.surface_mm[0, self.model.structures.index(structure)])
-
-    def _hit(self, cov: Floats, target: Floats, surface_mm: float) -> float:
-        hit, freedom = self.model.hit, self.model.error.freedom
-        if hit.radius_mm is not None:
-            return float(hit_in_ball((cov + target)[None], hit.radius_mm, freedom)[0])
-        assert hit.rays is not None
-        return float(hit_in_mesh(hit.rays, cov[None], freedom, surface_mm)[0])
-
-    def _touch(self, structure: str, cov6: Floats, surface_mm: float) -> float:
-        at = [self.model.structures.index(structure)]
-        gradient = self.needles.near.gradient[:, at]
-        variance = np.einsum("nka,ab,nkb->nk", gradient, cov6, gradient) + surface_mm**2
-        near = Proximity(self.needles.near.distance[:, at], gradient, np.sqrt(np.maximum(variance, 0.0)))
-        return float(touch_chance(near, self.model.case.needle.radius_mm, self.model.error.freedom)[0, 0])
-
-
-def shrinkable(model: ChanceModel, needles: Needles, q: Floats) -> ShrinkableNeedle:
-    """Split one candidate's error into sources that can be shrunk.
-
-    Args:
-        q: Shape (6,), rad, the tip on the target.
-    """
-    return ShrinkableNeedle(model, needles, _parts(model, q))
 
 
 def goals_of(needle: ShrinkableNeedle, p_hit: float, p_touch: Mapping[str, float]) -> list[Goal]:

@@ -26,9 +26,6 @@ class Window(Shown):
 
     Attributes:
         number: 1 for the window that holds the best candidate, then by the rank of each one's best.
-        best: Row of its best candidate.
-        directions: How many directions of the grid it holds.
-        square_deg: Its solid angle, square degrees.
         entry_cm2: Area of skin through which its paths enter, cm2.
         widest_cone: Largest safe cone of its candidates, rad; NaN where none is known.
     """
@@ -57,7 +54,6 @@ class Windows(Shown):
 
     Attributes:
         of_row: Shape (n,), the number of each candidate's window; 0 for a rejected candidate.
-        windows: In the order of their numbers.
     """
 
     of_row: Ints
@@ -103,9 +99,14 @@ def find_windows(candidates: Any) -> Windows:
     for one, row in enumerate(firsts, start=1):
         number[(label == label[row]) & candidates.safe] = one
     cell = np.zeros(len(candidates)) if candidates.grid is None else candidates.grid.solid_angle()
-    skin = _entry_area(candidates, cell)
-    parts = (_window(one, candidates, number == one, int(row), cell, skin) for one, row in enumerate(firsts, start=1))
-    return Windows(number, tuple(parts))
+    # each cell's skin, mm2: the sphere's patch over the cosine of the skin angle
+    skin, windows = cell * candidates.path.length**2 / np.cos(candidates.path.skin_angle), []
+    for one, best in enumerate(firsts.tolist(), start=1):
+        rows = number == one
+        square_deg, entry_cm2 = float(cell[rows].sum()) * SQUARE_DEGREES, float(skin[rows].sum()) / 100.0
+        widest = float(np.fmax.reduce(candidates.safe_cone[rows]))
+        windows.append(Window(one, best, int(rows.sum()), square_deg, entry_cm2, widest))
+    return Windows(number, tuple(windows))
 
 
 def nearest_row(candidates: Any, outward_ct: Floats) -> int | None:
@@ -133,20 +134,3 @@ def connected(grid: AngleGrid | None, safe: Bools) -> Ints:
             np.minimum.at(label, end, least)
         label = label[label]  # pointer jumping
     return label
-
-
-def _entry_area(candidates: Any, cell: Floats) -> Floats:
-    """Skin area of each direction's cell, mm2: the sphere's patch over the cosine of the skin angle."""
-    area = cell * candidates.path.length**2 / np.cos(candidates.path.skin_angle)
-    return np.asarray(np.where(candidates.safe, area, 0.0))
-
-
-def _window(number: int, candidates: Any, rows: Bools, best: int, cell: Floats, skin: Floats) -> Window:
-    return Window(
-        number=number,
-        best=best,
-        directions=int(rows.sum()),
-        square_deg=float(cell[rows].sum()) * SQUARE_DEGREES,
-        entry_cm2=float(skin[rows].sum()) / 100.0,
-        widest_cone=float(np.fmax.reduce(candidates.safe_cone[rows])),
-    )

@@ -39,7 +39,6 @@ class SweepPlan:
     Attributes:
         point_base: Shape (3,), mm: where the virtual TCP stays, the target.
         angles: Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less.
-        wanted: Theta and beta, rad, where it should have ended.
         stopped: Where and why it ends before; empty where it does not.
     """
 
@@ -62,10 +61,8 @@ class SweepPlan:
 
 STEP = np.radians(1.0)
 """Between two directions that are checked, at most: half of the search's usual grid."""
-
 MOST_JOINT_STEP = 0.2
 """A joint that turns more from one direction to the next jumps, rad."""
-
 SWEEP_SPEED_MM_S = 30.0
 """Speed of the needle's tip, in the air."""
 
@@ -76,7 +73,6 @@ def plan_sweep(
     """Plan from one direction to another, on the straight line in theta and beta, as far as it is allowed.
 
     Args:
-        context: Of a case that says where the arm's base is.
         start: Theta and beta, rad.
         end: (theta, beta) of the end; beta takes the shorter arc.
 
@@ -85,7 +81,11 @@ def plan_sweep(
         NoAnswerError: The first directions are not allowed, or no approach to them was found.
     """
     reach = context.require_arm()
-    route = _allowed(context, _angles(start, end), progress)
+    change = np.array([end[0] - start[0], (end[1] - start[1] + np.pi) % (2 * np.pi) - np.pi])
+    count = int(np.ceil(np.abs(change).max() / STEP))
+    if count == 0:
+        refuse("the sweep ends where it starts", "--to", "another direction", "no_motion")
+    route = _allowed(context, start + np.linspace(0.0, 1.0, count + 1)[:, None] * change, progress)
     point = apply(reach.T_base_ct, context.case.target_ct)
     T_base_ct, frame = reach.T_base_ct, context.case.T_ct_entry[:3, :3]
     directions = outward(route.angles[:, 0], route.angles[:, 1]) @ (T_base_ct[:3, :3] @ frame).T
@@ -97,33 +97,13 @@ def plan_sweep(
     rotated = np.arccos(np.clip(np.vecdot(directions[1 : len(q)], directions[: len(q) - 1]), -1.0, 1.0))
     arc = route.standoff_mm * np.concatenate([[0.0], np.cumsum(rotated)])
     sweep = follow_smoothly(slowed(checker.model, speeds), q, arc, max_tip_speed_mm_s=SWEEP_SPEED_MM_S)
-    contact = checker.first_contact(
-        dense_states(checker, sweep.q, RESOLUTION_RAD / FINER), needle_may_touch_patient=False
-    )
+    states = dense_states(checker, sweep.q, RESOLUTION_RAD / FINER)
+    contact = checker.first_contact(states, needle_may_touch_patient=False)
     if contact is not None:
         what = f"no sweep: between its directions {contact.contact.body} touches {contact.contact.other}"
         raise NoAnswerError(what, code="motion_touches")
-    length = context.case.needle.length_mm
-    return SweepPlan(
-        checker.model,
-        length,
-        route.standoff_mm,
-        point,
-        route.angles[: len(q)],
-        end,
-        approach.trajectory,
-        sweep,
-        stopped,
-    )
-
-
-def _angles(start: tuple[float, float], end: tuple[float, float]) -> Floats:
-    """Directions on the straight line, shape (k, 2), rad, `STEP` apart at most."""
-    change = np.array([end[0] - start[0], (end[1] - start[1] + np.pi) % (2 * np.pi) - np.pi])
-    count = int(np.ceil(np.abs(change).max() / STEP))
-    if count == 0:
-        refuse("the sweep ends where it starts", "--to", "another direction", "no_motion")
-    return np.asarray(start + np.linspace(0.0, 1.0, count + 1)[:, None] * change)
+    lengths, passed = (context.case.needle.length_mm, route.standoff_mm), route.angles[: len(q)]
+    return SweepPlan(checker.model, *lengths, point, passed, end, approach.trajectory, sweep, stopped)
 
 
 def _allowed(context: CaseContext, angles: Floats, progress: Count) -> _SweepPath:
@@ -146,8 +126,6 @@ def _place(angles: Floats) -> str:
 
 
 class _SweepPath(NamedTuple):
-    """Directions that are passed one after the other, and why it ends."""
-
     angles: Floats
     """Shape (k, 2), rad."""
     standoff_mm: float
@@ -178,7 +156,10 @@ def _followed(
     rows = [q_start]
     R = flange_pose(checker.model, q_start)[:3, :3]
     for direction in directions[1:]:
-        R = _least_turn(R, -direction)
+        axis = np.cross(R[:, 2], -direction)
+        sine = float(np.linalg.norm(axis))
+        if sine > 0.0:  # rotated until its z axis is the new one, and no farther
+            R = exp_rotation(axis / sine * float(np.arctan2(sine, R[:, 2] @ -direction))) @ R
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R, point + reach_mm * direction
         every = nearest_within_limits(checker.model, inverse(checker.model, T)[0], rows[-1])
@@ -189,14 +170,6 @@ def _followed(
             return np.array(rows), why
         rows.append(q)
     return np.array(rows), ""
-
-
-def _least_turn(R: Floats, z: Floats) -> Floats:
-    """A rotation (3, 3) whose z axis is rotated to another, shape (3,), unit, and no farther."""
-    axis = np.cross(R[:, 2], z)
-    sine = float(np.linalg.norm(axis))
-    angle = float(np.arctan2(sine, R[:, 2] @ z))
-    return R if sine == 0.0 else np.asarray(exp_rotation(axis / sine * angle) @ R)
 
 
 def _why_not(checker: CellChecker, before: Floats, q: Floats, step: float) -> str:

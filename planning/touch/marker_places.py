@@ -37,7 +37,7 @@ from puncture_twin.planning.registration.method import renamings
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.touch_planner import MOST_MARKERS, PLANNED_PADDING_MM, approach_checkers
-from puncture_twin.planning.touch.tour_motions import ApproachCheckers, why_not
+from puncture_twin.planning.touch.tour_motions import why_not
 from puncture_twin.planning.uncertainty.touch_choice import touch_candidates
 
 DRAWN, PLACES, BETWEEN_PLACES_MM = 12_000, 300, 9.0
@@ -112,8 +112,6 @@ class Proposal:
     Attributes:
         expected_mm: Error (rms) at the target by reading and touching these markers; of the arm's own nothing.
         declared: Whether the case declares the errors, or 1 mm a marker is assumed.
-        arm: Whether the arm was asked, or why not.
-        near_window_mm: Of the nearest one to an entry.
         unmet: What is wanted of places and is not so here, in words.
     """
 
@@ -137,11 +135,7 @@ class _Skin(NamedTuple):
 
 
 def check_count(count: int) -> None:
-    """Refuse a number of markers that none can be proposed for, before a case is searched.
-
-    Raises:
-        InputError: Out of range.
-    """
+    """Refuse a number of markers that none can be proposed for, before a case is searched."""
     if not MIN_MARKERS <= count <= MOST_MARKERS:
         refuse(f"{count} markers", "--propose", f"{MIN_MARKERS} to {MOST_MARKERS}", "out_of_range")
 
@@ -151,8 +145,6 @@ def propose_markers(context: CaseContext, candidates: Candidates, count: int) ->
 
     Args:
         context: With its arm, where the case says where its base is: then the arm can touch every place.
-        candidates: Of the case: markers are put beside their entries.
-        count: 3 to 12.
 
     Raises:
         InputError: A count out of range.
@@ -177,13 +169,15 @@ def propose_markers(context: CaseContext, candidates: Candidates, count: int) ->
         raise NoAnswerError(what, code="no_place")
     order = sorted(chosen, key=lambda row: (-skin.points[row, 2], skin.points[row, 0]))
     put = skin.of(np.array(order))
-    places = tuple(_described(f"M{n}", put.of(np.array([n - 1])), case, anatomy) for n in range(1, count + 1))
+    places = []
+    for number, (point, normal) in enumerate(zip(put.points, put.normals, strict=True), start=1):
+        tape = None if case.space is Space.LOCAL else tape_to(anatomy.skin, point, np.asarray(up_axis(case)))
+        places.append(MarkerPlace(f"M{number}", point, normal, float(point[2] - case.target_ct[2]), tape))
     unmet, near = tuple(_unmet(put, case.target_ct)), float(put.to_entry.min())
-    return Proposal(places, error, case.errors is not None, context.arm, near, unmet)
+    return Proposal(tuple(places), error, case.errors is not None, context.arm, near, unmet)
 
 
 def _unmet(put: _Skin, target_ct: Floats) -> Iterator[str]:
-    """What is wanted of places and is not so of these, in words."""
     if (near := put.to_entry.min()) < WINDOW_MM:
         yield f"a marker is {near:.0f} mm from an entry, less than {WINDOW_MM:g}: mind the drape"
     if (far := np.linalg.norm(put.points - target_ct, axis=1).max()) > FAR_MM:
@@ -232,15 +226,11 @@ def _wanted(every: _Skin, case: Case, anatomy: Anatomy, off_mm: float, far_mm: f
     boxed = [row for row, _ in untouchable(case, skin.points, skin.normals)]
     skin = skin.of(np.setdiff1d(np.arange(len(skin.points)), boxed))
     for solid in (*_others(anatomy), *([] if anatomy.couch is None else [anatomy.couch])):
+        reach_mm = case.needle.length_mm  # so far out of the skin nothing stands over a place, as an arm over a trunk
         places = zip(skin.points, skin.normals, strict=True)
-        clear = [_is_clear(solid, *one, case.needle.length_mm) for one in places]
+        clear = [not crossings(solid, point, normal[None], reach_mm).count[0] for point, normal in places]
         skin = skin.of(np.array(clear, dtype=np.bool_))
     return skin
-
-
-def _is_clear(solid: TriangleMesh, point: Floats, normal: Floats, reach_mm: float) -> bool:
-    """Whether nothing of a solid stands over a place (3,), straight out of the skin, as an arm over a trunk does."""
-    return not crossings(solid, point, normal[None], reach_mm).count[0]
 
 
 def _thinned(points: Floats) -> Ints:
@@ -259,13 +249,11 @@ def _touchable(context: CaseContext, candidates: Candidates, points_ct: Floats) 
         return np.ones(len(points_ct), np.bool_)
     checkers = approach_checkers(context, PLANNED_PADDING_MM)
     q, points = candidates.arm.q_insertion[candidates.best.row], apply(context.reach.T_base_ct, points_ct)
-    return np.array([_is_free(checkers, context.case, point, q) for point in points], dtype=np.bool_)
-
-
-def _is_free(checkers: ApproachCheckers, case: Case, point_base: Floats, q_insertion: Floats) -> bool:
-    tip = case.needle.length_mm
-    found = touch_candidates(case.robot.model, tip, point_base, q_insertion)
-    return any(not why_not(checkers, tip, q) for q in np.concatenate([found.alike, found.others])[:POSES])
+    tip_mm, free = context.case.needle.length_mm, np.zeros(len(points), np.bool_)
+    for row, point in enumerate(points):
+        poses = np.concatenate(touch_candidates(context.case.robot.model, tip_mm, point, q))[:POSES]
+        free[row] = any(not why_not(checkers, tip_mm, one) for one in poses)
+    return free
 
 
 def _exchanged(skin: _Skin, target_ct: Floats, C: Floats, count: int, less: float = 1.0) -> tuple[list[int], float]:
@@ -312,15 +300,8 @@ def _first(costs: Floats, every: Floats, others: list[int], target_ct: Floats, l
 
 
 def _told_apart(points: Floats, target_ct: Floats, slip_mm: float) -> bool:
-    """Whether no swap of names fits as well as a person puts markers."""
     names = tuple(map(str, range(len(points))))
     return not renamings(MarkerPairs(names, points, points), target_ct, slip_mm).found
-
-
-def _described(name: str, place: _Skin, case: Case, anatomy: Anatomy) -> MarkerPlace:
-    (point,), (normal,) = place.points, place.normals
-    tape = None if case.space is Space.LOCAL else tape_to(anatomy.skin, point, np.asarray(up_axis(case)))
-    return MarkerPlace(name, point, normal, float(point[2] - case.target_ct[2]), tape)
 
 
 LEVEL_MM = 4.0

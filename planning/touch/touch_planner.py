@@ -46,14 +46,12 @@ from puncture_twin.planning.touch.tour_motions import (
     why_not,
 )
 from puncture_twin.planning.uncertainty.pose_error import PoseError, expected_error_mm
-from puncture_twin.planning.uncertainty.touch_choice import Candidates, least_error, touch_candidates
+from puncture_twin.planning.uncertainty.touch_choice import least_error, touch_candidates
 
 PLANNED_PADDING_MM = 4.0
 """Distance of a touching needle's shaft from the patient in a plan: the markers are only believed to be there."""
-
 TOUCHING_PADDING_MM = 1.0
 """The same distance while touching, when the needle's line was set onto the marker."""
-
 ALLOWED = "a case with [errors] and markers"
 
 MOST_MARKERS = 12
@@ -64,13 +62,11 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
     """Plan to touch every marker that can be touched.
 
     Args:
-        context: Of a case with declared errors, markers and an arm.
         q_insertion: Shape (6,), rad, the tip on the target: where the error of the touches is to be least.
 
     Raises:
         InputError: The case declares no errors, or has no markers, or too many.
-        NoAnswerError: The markers that can be touched are fewer than three or lie on a line, or no motion home was
-            found.
+        NoAnswerError: Fewer than three can be touched, or they lie on a line, or no motion home was found.
     """
     every = _task(context, q_insertion)
     touchable = _touchable(every)
@@ -94,13 +90,7 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """Some markers of a case, and the insertion that they are touched for.
-
-    Attributes:
-        markers: Those to touch; ``points_base`` are where they are believed to be.
-        method: Of the registration by these touches.
-        q_insertion: Shape (6,), rad, the tip on the target.
-    """
+    """Some markers of a case, and the insertion that they are touched for."""
 
     context: CaseContext
     markers: MarkerPairs
@@ -131,16 +121,11 @@ class _Task:
         noise = reading_noise(case.errors, self.model, self.tip_mm, q, known=True)
         target_ct = case.target_ct
         fitted = register(self.markers, method=self.method, target_ct=target_ct, noise=noise, accept_residuals=True)
-        fitted = self._aimed(fitted)
+        if self.method == "joint":  # the pose is corrected for the insertion
+            fitted = aimed(fitted, aim_at(self.model, self.tip_mm, target_ct, self.q_insertion))
         assert fitted.uncertainty is not None
         target = apply(fitted.T_base_ct, target_ct)
         return PoseError(self.model, self.tip_mm, target, case.errors, fitted.uncertainty)
-
-    def _aimed(self, fitted: Registration) -> Registration:
-        """The pose error corrected for the insertion, where the case's pose is corrected."""
-        if self.method != "joint":
-            return fitted
-        return aimed(fitted, aim_at(self.model, self.tip_mm, self.context.case.target_ct, self.q_insertion))
 
     def expected_mm(self, q_touch: Floats) -> float:
         """Expected (rms) error of the tip at the target, mm."""
@@ -156,13 +141,12 @@ class _Touchable(NamedTuple):
 
     def without(self, place: int, name: str, why: str) -> _Touchable:
         """The touchable markers without that at index ``place`` of ``rows``."""
-        rows, candidates = list(self.rows), list(self.candidates)
-        del rows[place], candidates[place]
-        return _Touchable(tuple(rows), tuple(candidates), {**self.left_out, name: why})
+        rows = self.rows[:place] + self.rows[place + 1 :]
+        candidates = self.candidates[:place] + self.candidates[place + 1 :]
+        return _Touchable(rows, candidates, {**self.left_out, name: why})
 
 
 def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
-    """The pose error after touches in the insertion's orientation."""
     why = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
     count = f"{len(task.markers)} of {len(every.markers)} markers can be touched"
     if len(task.markers) < MIN_MARKERS:
@@ -175,11 +159,7 @@ def _error(task: _Task, every: _Task, left_out: Mapping[str, str]) -> PoseError:
 
 
 def expected_of_touches(context: CaseContext, q_insertion: Floats, read: NamedPoints) -> float:
-    """Expected (rms) error of the tip at the target, mm, with these touches alone.
-
-    Args:
-        q_insertion: Shape (6,), rad, the tip on the target.
-    """
+    """Expected (rms) error of the tip at the target, mm, with these touches alone, for an insertion (6,), rad."""
     task, read = _task(context, q_insertion), _in_order(context, read)
     assert read.joints is not None
     return task.of([task.markers.names.index(name) for name in read.names]).expected_mm(read.joints)
@@ -194,12 +174,7 @@ def _in_order(context: CaseContext, read: NamedPoints) -> NamedPoints:
 
 
 def registered(context: CaseContext, read: NamedPoints) -> Registration:
-    """The registration by touched markers.
-
-    Args:
-        context: For which markers were touched, and what is declared of them.
-        read: Their names, points (N, 3), mm, and joints (N, 6), rad, in any order.
-    """
+    """The registration by touched markers."""
     placement, case = context.placement, context.case
     assert placement is not None and placement.registration is not None and case.errors is not None
     found, read = placement.registration.markers, _in_order(context, read)
@@ -244,49 +219,35 @@ def approach_checkers(context: CaseContext, needle_padding_mm: float) -> Approac
 
 
 def _touchable(task: _Task) -> _Touchable:
-    """Poses for each marker that put the tip on it without contact."""
     checkers = approach_checkers(task.context, PLANNED_PADDING_MM)
     rows, candidates, left_out = [], [], {}
     for row, (name, point) in enumerate(zip(task.markers.names, task.markers.points_base, strict=True)):
-        free, why = _free(checkers, task.tip_mm, touch_candidates(task.model, task.tip_mm, point, task.q_insertion))
-        if len(free):
-            rows.append(row)
-            candidates.append(free)
-        else:
-            left_out[name] = why
+        reasons: list[str] = []
+        for q in touch_candidates(task.model, task.tip_mm, point, task.q_insertion):  # the insertion's own branch first
+            blocked_by = [why_not(checkers, task.tip_mm, one) for one in q]
+            free = q[[not reason for reason in blocked_by]]
+            if len(free):
+                rows.append(row)
+                candidates.append(free)
+                break
+            reasons += blocked_by
+        else:  # what blocks most often
+            left_out[name] = max(set(reasons), key=reasons.count) if reasons else "out of the arm's reach"
     return _Touchable(tuple(rows), tuple(candidates), left_out)
-
-
-def _free(checkers: ApproachCheckers, tip_mm: float, candidates: Candidates) -> tuple[Floats, str]:
-    """Free poses (n, 6), in the insertion's own branch if it has any; where no branch has, what blocks most often."""
-    reasons: list[str] = []
-    for q in (candidates.alike, candidates.others):
-        blocked_by = [why_not(checkers, tip_mm, one) for one in q]
-        free = q[[not reason for reason in blocked_by]]
-        if len(free):
-            return free, ""
-        reasons += blocked_by
-    return np.empty((0, 6)), max(set(reasons), key=reasons.count) if reasons else "out of the arm's reach"
 
 
 LEAST_POSES, MOST_POSES = 4, 12
 """The order of more takes too long to be the best one."""
-
 SPREAD = 2
 """So many free poses are wanted for each that is taken: else they lean to one side."""
-
 RADII = (0.6, 0.8, 0.45)
 """Distances from the shoulder at which the flange is tried, over the arm's reach without its wrist."""
-
 HEIGHTS = (0.0, 0.3, -0.3, 0.6)
 """Heights above the shoulder at which the flange is tried, over the same reach."""
-
 SIDES = 12
 """Directions from the base in which they lie."""
-
 ROLLS = (0.0, 2 * np.pi / 3, -2 * np.pi / 3)
 """Rolls of the flange about the needle, added to each tilt: they tell how far the tip is off the flange's axis."""
-
 RIDGE = 1e-6
 """Added to A'A, so that fewer poses than unknowns can be compared."""
 
@@ -295,7 +256,6 @@ def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, s
     """Plan to set the tip onto one place in several poses, named P1, P2 and so on.
 
     Args:
-        count: How many poses, 4 to 12.
         place_base: Shape (3,), mm, where; None for a place that is found next to the patient.
 
     Raises:
@@ -359,8 +319,12 @@ def _up_base(context: CaseContext) -> Floats:
 def _free_poses(context: CaseContext, checkers: ApproachCheckers, place_base: Floats, count: int) -> Floats:
     """Joints (n, 6), rad, with the tip on a place that nothing obstructs, from above first."""
     model, tip_mm = checkers.whole.model, context.case.needle.length_mm
-    empty = np.empty((0, 6))
-    for q in _from_above(model, tip_mm, place_base, _up_base(context), home_configuration(context.case)):
+    home = home_configuration(context.case)
+    down = inverse(model, flange_poses(place_base, _up_base(context), tip_mm)).reshape(-1, 6)
+    down = nearest_within_limits(model, down, home)
+    down = down[~np.isnan(down).any(axis=1)]
+    down = down[away_from_singularities(model, down)]
+    for q in down[np.argsort(np.abs(down - home).max(axis=1), kind="stable")]:
         if why_not(checkers, tip_mm, q):
             continue
         tilted = touch_candidates(model, tip_mm, place_base, q).alike
@@ -370,13 +334,4 @@ def _free_poses(context: CaseContext, checkers: ApproachCheckers, place_base: Fl
         free = np.array([one for q in every for one in q if not why_not(checkers, tip_mm, one)]).reshape(-1, 6)
         if len(free) >= count:
             return np.asarray(free)
-    return empty
-
-
-def _from_above(model: UrModel, tip_mm: float, place_base: Floats, up_base: Floats, home: Floats) -> Floats:
-    """Joints (n, 6), rad, with the needle straight down onto a place."""
-    q = inverse(model, flange_poses(place_base, up_base, tip_mm)).reshape(-1, 6)
-    q = nearest_within_limits(model, q, home)
-    q = q[~np.isnan(q).any(axis=1)]
-    q = q[away_from_singularities(model, q)]
-    return np.asarray(q[np.argsort(np.abs(q - home).max(axis=1), kind="stable")])
+    return np.empty((0, 6))

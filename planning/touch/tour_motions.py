@@ -42,13 +42,7 @@ from puncture_twin.planning.search.context import CaseContext
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """The touch of one marker.
-
-    Attributes:
-        point_base: Shape (3,), mm: where it is believed to be.
-        q_touch: Shape (6,), rad: the tip on it.
-        come: From the last standoff, or home, to this one.
-    """
+    """The touch of one marker."""
 
     name: str
     point_base: Floats
@@ -58,12 +52,7 @@ class Touch:
 
 @dataclass(frozen=True, eq=False)
 class TouchTour:
-    """Touches one after another.
-
-    Attributes:
-        touches: In the order in which they are touched.
-        leave: From the last standoff home.
-    """
+    """Touches one after another."""
 
     model: UrModel
     tip_mm: float
@@ -76,7 +65,6 @@ class TouchPlan(TouchTour):
     """A planned tour of the markers for a puncture.
 
     Attributes:
-        left_out: Marker to why it is not touched, in words.
         expected_mm: Of the tip at the target when the registration comes from these touches (rms), mm.
         worst_mm: ``expected_mm`` with the worst of the poses that could be taken, mm.
     """
@@ -108,9 +96,6 @@ class Stops(NamedTuple):
 
 def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Count) -> TouchTour:
     """Plan the motions of a tour through stops.
-
-    Args:
-        stops: Each with a straight line to it that the arm can follow.
 
     Raises:
         NoMotionError: None to a stop.
@@ -162,42 +147,28 @@ def shortest_tour(cost: ArrayLike) -> tuple[int, ...]:
 
 STANDOFF_MM = 20.0
 """Where the straight line begins, away from the marker: the needle is clear of the patient there."""
-
 SLOW_MM = 5.0
 """From here on the tip moves at touching speed."""
-
 PAST_MM = 5.0
 """So far beyond its believed place a marker is searched for by contact; then the touch is given up."""
-
 TIP_MM = 8.0
 """Length of the needle that may be nearer than its padding to the patient: the marker sits on their skin."""
-
 STEP_MM = 0.5
 """Between two configurations of the line."""
-
 RESOLUTION_RAD = 0.005
 """Largest joint distance between two checked states of the line."""
 
 
 @dataclass(frozen=True, eq=False)
 class ApproachCheckers:
-    """Two views of one workcell.
-
-    Attributes:
-        blunted: The checker of a needle that is `TIP_MM` shorter.
-    """
+    """Two views of one workcell, ``blunted`` with a needle that is `TIP_MM` shorter."""
 
     whole: CellChecker
     blunted: CellChecker
 
 
 def line_to(model: UrModel, tip_mm: float, q_touch: Floats, from_mm: float, to_mm: float) -> Floats | None:
-    """Joints along the needle's line through a touch, shape (m, 6), rad; None where the arm cannot follow it.
-
-    Args:
-        q_touch: Shape (6,), rad, the tip on the marker.
-        from_mm: Where the tip starts, mm before the marker; negative beyond it.
-    """
+    """Joints along the needle's line through a touch, shape (m, 6), rad; None where the arm cannot follow it."""
     count = max(2, int(np.ceil(abs(from_mm - to_mm) / STEP_MM)) + 1)
     distances = np.linspace(from_mm, to_mm, count)
     poses = np.tile(flange_pose(model, q_touch), (count, 1, 1))
@@ -206,22 +177,15 @@ def line_to(model: UrModel, tip_mm: float, q_touch: Floats, from_mm: float, to_m
     away = np.abs(every - q_touch).max(axis=2)
     q = every[np.arange(count), np.argmin(np.where(np.isnan(away), np.inf, away), axis=1)]
     step = MAX_JOINT_STEP_RAD_PER_MM * abs(from_mm - to_mm) / (count - 1)
-    follows = not np.isnan(q).any() and bool(np.abs(np.diff(q, axis=0)).max() <= step)
-    return q if follows and _is_near(q, q_touch, distances) else None
-
-
-def _is_near(q: Floats, q_touch: Floats, distances: Floats) -> bool:
-    """Whether the row nearest to the marker is the touch's own branch."""
-    allowed = MAX_JOINT_STEP_RAD_PER_MM * (float(np.abs(distances).min()) + STEP_MM)
-    return bool(np.abs(q[int(np.argmin(np.abs(distances)))] - q_touch).max() <= allowed)
+    if np.isnan(q).any() or np.abs(np.diff(q, axis=0)).max() > step:
+        return None
+    nearest = int(np.argmin(np.abs(distances)))  # to the marker: there it is the touch's own branch
+    allowed = MAX_JOINT_STEP_RAD_PER_MM * (abs(float(distances[nearest])) + STEP_MM)
+    return q if np.abs(q[nearest] - q_touch).max() <= allowed else None
 
 
 def why_not(checkers: ApproachCheckers, tip_mm: float, q_touch: Floats) -> str:
-    """Reason that the arm cannot approach straight, in words; empty where it can.
-
-    Args:
-        q_touch: Shape (6,), rad, the tip on the marker.
-    """
+    """Reason that the arm cannot approach a touch (6,), rad, straight, in words; empty where it can."""
     whole = checkers.whole
     if not whole.model.within_limits(q_touch[None])[0]:
         return "a joint would exceed its limits"
@@ -231,12 +195,13 @@ def why_not(checkers: ApproachCheckers, tip_mm: float, q_touch: Floats) -> str:
     standoff = whole.contact(line[0], needle_may_touch_patient=False)
     if standoff is not None:
         return f"at the standoff {standoff.body} touches {standoff.other}"
-    found = whole.first_contact(_dense(whole, line), needle_may_touch_patient=True)
+    found = whole.first_contact(dense_states(whole, line, RESOLUTION_RAD), needle_may_touch_patient=True)
     if found is not None:
         return f"{found.contact.body} touches {found.contact.other}"
     before = line_to(whole.model, tip_mm, q_touch, STANDOFF_MM, 0.0)
     assert before is not None  # a part of the whole line
-    shaft = checkers.blunted.first_contact(_dense(checkers.blunted, before), needle_may_touch_patient=False)
+    states = dense_states(checkers.blunted, before, RESOLUTION_RAD)
+    shaft = checkers.blunted.first_contact(states, needle_may_touch_patient=False)
     if shaft is None:
         return ""
     if shaft.contact == NEEDLE_IN_PATIENT:
@@ -244,22 +209,10 @@ def why_not(checkers: ApproachCheckers, tip_mm: float, q_touch: Floats) -> str:
     return f"{shaft.contact.body} touches {shaft.contact.other}"
 
 
-def _dense(checker: CellChecker, line: Floats) -> Floats:
-    return dense_states(checker, line, RESOLUTION_RAD)
-
-
 def registered_joints(
     model: UrModel, tip_mm: float, q_insertion: Floats, target_ct: Floats, T_base_ct: tuple[Floats, Floats]
 ) -> Floats:
-    """Joints that put the needle as planned in the CT, by a new registration.
-
-    Args:
-        q_insertion: Shape (6,), rad, the tip on the target as it was planned.
-        target_ct: Shape (3,), mm.
-        T_base_ct: The belief of that plan and the new one, shape (4, 4) each, mm.
-
-    Returns:
-        Shape (6,), rad, in the branch nearest to the plan's.
+    """Joints (6,) that put the needle as planned in the CT, by a new registration, in the branch nearest to the plan's.
 
     Raises:
         NoAnswerError: The arm does not reach there.
@@ -278,11 +231,6 @@ def registered_joints(
 def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats, registration: Registration) -> Plan:
     """Plan the puncture along a direction by a new registration, free of contact where that puts the patient.
 
-    Args:
-        context: The case; what it believes of patient and arm is what the touches were planned by.
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        q_insertion: Shape (6,), rad, the tip on the target as the touches were planned for.
-
     Raises:
         NoAnswerError: The arm does not reach there, or not without contact.
     """
@@ -297,9 +245,7 @@ def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
     if line is None:
         what = "the arm cannot follow the needle's line to the target where the touches locate it"
         raise NoAnswerError(what, code="out_of_reach")
-    approach = plan_approach(
-        checker, home_configuration(case), line[0], seed=case.rehearsal.seed, speeds=speeds
-    ).trajectory
+    approach = plan_approach(checker, home_configuration(case), line[0], seed=case.rehearsal.seed, speeds=speeds)
     theta, beta = angles(case.T_ct_entry[:3, :3].T @ outward_ct)
     depths = np.linspace(0.0, standoff, len(line))
     plan = Plan(
@@ -317,7 +263,7 @@ def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
         roll=0.0,
         standoff_mm=standoff,
         needle_length_mm=tip_mm,
-        approach=approach,
+        approach=approach.trajectory,
         insertion=follow_smoothly(slowed(model, speeds), line, depths, max_tip_speed_mm_s=speeds.insertion_speed_mm_s),
         clearance_mm={},
         warnings=context.anatomy.warnings,

@@ -27,7 +27,7 @@ from puncture_twin.planning.uncertainty.hit import (
     touch_chance,
     touching_any,
 )
-from puncture_twin.planning.uncertainty.lines import Needles, Surroundings, refined
+from puncture_twin.planning.uncertainty.lines import Needles, refined
 from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 TAKEN = frozenset({"any", "joint"})
@@ -36,11 +36,7 @@ TAKEN = frozenset({"any", "joint"})
 
 @dataclass(frozen=True, eq=False)
 class ChanceModel:
-    """Chances of any needles of one case.
-
-    Attributes:
-        engine: Prepared for the meshes of ``anatomy.checked``.
-    """
+    """Chances of any needles of one case."""
 
     case: Case
     anatomy: Anatomy
@@ -117,15 +113,12 @@ class ChanceModel:
         """The chances of some needles to first order, the joint one unknown.
 
         Args:
-            outward_ct: Shape (n, 3), unit.
             q: Shape (n, 6), rad, the tip on the target.
             axes: What the engine has measured of the needles already; None measures them.
         """
         needles = self.needles(outward_ct, q, axes)
-        touch, margin = (
-            touch_chance(needles.near, near, self.error.freedom) for near in (self.touching, self.breaking)
-        )
-        touch_any = touching_any(touch)
+        near, freedom = needles.near, self.error.freedom
+        touch, margin = (touch_chance(near, reach, freedom) for reach in (self.touching, self.breaking))
         tip = needles.cov_ct[:, :3, :3] + self.error.target_covariance_ct
         along = np.einsum("na,nab,nb->n", outward_ct, tip, outward_ct)
         return Chances(
@@ -133,7 +126,7 @@ class ChanceModel:
             hit=self.hit_chance(needles.cov_ct),
             touch=touch,
             margin=margin,
-            touch_any=touch_any,
+            touch_any=touching_any(touch),
             touch_joint=np.full(len(q), np.nan),
             lateral_mm=np.sqrt(np.maximum(np.trace(tip, axis1=1, axis2=2) - along, 0.0)),
             depth_mm=np.sqrt(along),
@@ -167,28 +160,20 @@ def refined_chances(
     """Chances to touch, to break a margin and to touch any, by line sampling; the others as they are.
 
     Args:
-        outward_ct: Shape (n, 3), as in `ChanceModel.chances`.
-        q: Shape (n, 6).
-        first: Of these needles, to first order.
         wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
     """
     every = np.ones(first.touch.shape, bool)
-    blocks, lengths = model.engine.blocks, case_axis_lengths(model.case, model.anatomy, outward_ct)[:, model.columns]
-    around = Surroundings(tuple(blocks[column] for column in model.columns), lengths, model.case.target_ct)
+    lengths = case_axis_lengths(model.case, model.anatomy, outward_ct)[:, model.columns]
+    around = [model.engine.blocks[column] for column in model.columns], lengths, model.case.target_ct
     needles = model.needles(outward_ct, q)
-    touch = refined(around, needles, model.touching, first.touch, every if wanted is None else wanted)
-    margin = first.margin if wanted is not None else refined(around, needles, model.breaking, first.margin, every)
+    touch = refined(*around, needles, model.touching, first.touch, every if wanted is None else wanted)
+    margin = first.margin if wanted is not None else refined(*around, needles, model.breaking, first.margin, every)
     whole = np.full(len(q), wanted is None)
     return replace(first, touch=touch, margin=margin, touch_any=touching_any(touch), refined=whole)
 
 
 def satisfies_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
-    """Whether needles satisfy the case's limits in any configuration that reaches the target, shape (n,).
-
-    Args:
-        outward_ct: Shape (n, 3), unit.
-        q: Shape (n, 6), rad, the tip on the target.
-    """
+    """Whether needles satisfy the case's limits, shape (n,); arguments as of `ChanceModel.chances`."""
     kept, least, limits = np.ones(len(q), bool), model.case.search.min_hit, model.limits
     if least is not None:
         kept &= model.hit_chance(model.error.covariance_ct(q)) >= least
@@ -211,8 +196,7 @@ class Chances(Columns):
         touch_joint: Shape (n,), that it touches any, all linearised together; of the best candidates alone.
         lateral_mm: Shape (n,), expected (rms) error of the tip across the needle, target reading included.
         depth_mm: Shape (n,), along it.
-        refined: Shape (n,), whether touch and margin are line-sampled, as `check` has them; else they are of first
-            order.
+        refined: Shape (n,), whether touch and margin are line-sampled; else they are of first order.
     """
 
     structures: tuple[str, ...]
@@ -248,9 +232,6 @@ def demanding(structures: tuple[Structure, ...]) -> Ints:
 
 def check_limits(case: Case, anatomy: Anatomy, error_known: bool) -> None:
     """Refuse limits that no candidate can be tested against: every one would pass untested.
-
-    Args:
-        error_known: Whether markers and arm give the error of the needle's pose.
 
     Raises:
         InputError: Limits without a pose error, or of a structure that has no chance to be touched.

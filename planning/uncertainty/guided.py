@@ -64,35 +64,28 @@ WAYS: Mapping[str, frozenset[str]] = {
     "all": frozenset({"touch", "cameras", "target", "tip"}),
 }
 """Ways of guidance, by the devices whose readings each uses; ultrasound reads a target and a tip."""
-
 SCANS = "ct+scans"
 
 READS: Mapping[str, frozenset[str]] = {**WAYS, SCANS: frozenset({"touch", "scan"})}
 """The ways, and the one that needs a number of steps: after each, a control scan reads tip and target."""
-
 LEVER_MM = 100.0
 """Flat rotations are counted in mm at this distance, so that the columns of F are of one size."""
-
 RANK = 1e-9
 """Relative size below which a singular value of F is 0."""
-
 ALIKE_MM = 1e-6
 """Two readings that differ by less say the same."""
-
 FREE = 0.01
 """mm that the tip's estimate may follow per mm of a flat part that no reading shows: more, and it is open. Cameras do
 not see a roll about the needle; where the registered target is .1 mm beside its line, that is .001."""
 
 STOP_DRAWS = 20_000
 """Draws of the estimates after all looks together: a chance to be stopped is known to .004."""
-
 CAMERAS = "cameras"
 
 SCANNED_TIP, SCANNED_TARGET = "scanned tip", "scanned target"
 
 FLAT = ("pose", "frame")
 """The patient's pose and the cameras' frame: shift and rotation at the target, of which nothing is known beforehand."""
-
 Rows = dict[str, Floats]
 """Values that are linear in the sources: by source the columns, shape (m, k)."""
 
@@ -179,18 +172,11 @@ class GuidedModel:
 
     Attributes:
         error: Of the needle by its registration, the touches known or assumed.
-        markers: Their N names.
-        points_base: Shape (N, 3), mm, by the registration.
-        q_insertion: Shape (6,), rad, the tip on the target.
-        looks: In their order.
         motion: Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan.
         breath: Shape (3, 2), mm: mean and deviation of the target's displacement by the breath; 0 without breathing.
         skin_weight: By how much of it the markers move.
         push: Shape (looks + 1, 3), mm: by how much the needle pushes the target at each look, and at the end.
-        stereo: The cameras, or None.
-        ultrasound: The probe, or None.
         across: Shape (3,), unit: the normal of its picture.
-        scan: What is read in control scans, or None.
     """
 
     error: PoseError

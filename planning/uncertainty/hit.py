@@ -64,27 +64,19 @@ def hit_model(
     """Model of hitting the target: by its radius where one is stated, else by the mesh of its structure.
 
     Args:
-        radius_mm: The radius, or None.
-        target_ct: Shape (3,), mm.
         mean_ct: Shape (3,), mm: by how much tips are off the target on average; None where they are not.
     """
-    if mean_ct is None:
-        return HitModel(radius_mm, None if radius_mm is not None else target_rays(mesh, target_ct))
-    return HitModel(
-        radius_mm, target_rays(mesh, target_ct + mean_ct) if radius_mm is None else rays_to_ball(mean_ct, radius_mm)
-    )
+    if radius_mm is None:
+        return HitModel(None, target_rays(mesh, target_ct if mean_ct is None else target_ct + mean_ct))
+    return HitModel(radius_mm, None if mean_ct is None else rays_to_ball(mean_ct, radius_mm))
 
 
 def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Floats:
-    """The chance that the tip is within a radius of the intended point.
+    """The chance that the tip is within a radius of the intended point, shape (n,).
 
     Args:
         cov: Shape (n, 3, 3), mm^2, of tip against that point, any frame.
-        radius_mm: The radius.
         freedom: Degrees of the errors' size, where the residuals gave it.
-
-    Returns:
-        Shape (n,).
     """
     values = np.asarray(np.linalg.eigvalsh(cov) + LEAST_VARIANCE, dtype=np.float64)
     if freedom is None:
@@ -95,13 +87,7 @@ def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Fl
 
 
 def radius_for_chance(cov: Floats, chance: float, freedom: int | None = None) -> float:
-    """Radius about the intended point within which the tip ends with a chance, mm: the inverse of `hit_in_ball`.
-
-    Args:
-        cov: Shape (3, 3), mm^2, of tip against that point, any frame.
-        chance: Below 1.
-        freedom: Degrees of the errors' size, where the residuals gave it.
-    """
+    """Radius within which the tip ends with a chance below 1, mm: the inverse of `hit_in_ball`, ``cov`` (3, 3)."""
     from scipy.optimize import brentq  # here: it loads 260 modules, and few commands need it
 
     size = float(np.sqrt(np.trace(cov)))
@@ -110,17 +96,11 @@ def radius_for_chance(cov: Floats, chance: float, freedom: int | None = None) ->
     high = size
     while hit_in_ball(cov[None], high, freedom)[0] < chance:
         high *= 2.0
-    return float(
-        brentq(lambda radius: hit_in_ball(cov[None], radius, freedom)[0] - chance, 0.0, high, xtol=1e-4 * size)
-    )
 
+    def missing(radius: float) -> float:
+        return float(hit_in_ball(cov[None], radius, freedom)[0]) - chance
 
-def _with_unknown_size(rays: TargetRays, inverse: Floats, freedom: int) -> Floats:
-    squares = np.einsum("ia,nab,ib->ni", rays.directions, inverse, rays.directions)  # m_i^2
-    weights = squares**-1.5
-    within = fdtr(3, freedom, rays.depth**2 * squares[:, rays.ray] / 3)
-    found = (rays.sign * np.sign(rays.depth) * within * weights[:, rays.ray]).sum(axis=1) / weights.sum(axis=1)
-    return np.asarray(np.clip(found, 0.0, 1.0))
+    return float(brentq(missing, 0.0, high, xtol=1e-4 * size))
 
 
 QUANTILES = 64
@@ -136,10 +116,7 @@ def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
 
     Args:
         eigenvalues: Shape (n, 3), of the covariance, mm^2, all above 0.
-        radii: Shape (n, m), mm.
-
-    Returns:
-        Shape (n, m).
+        radii: Shape (n, m), mm, as what is returned.
     """
     chances = np.empty(radii.shape)
     _ruben(np.sort(eigenvalues, axis=1), np.ascontiguousarray(radii, dtype=np.float64) ** 2, chances)
@@ -148,7 +125,6 @@ def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
 
 SERIES_END = 1e-8
 """The series stops where what is left of its weights, which add up to 1, is smaller."""
-
 MOST_TERMS = 20_000
 """Enough for standard deviations of a ratio of 30; what is left then is not counted, so that P is never too large."""
 
@@ -188,7 +164,6 @@ class TargetRays:
     """A target's mesh as its point sees it.
 
     Attributes:
-        directions: Shape (n, 3), unit vectors, CT frame.
         ray: Shape (c,), row of each crossing's direction.
         depth: Shape (c,), mm from the target.
         sign: Shape (c,), +1 for a direction's last crossing, alternating inwards.
@@ -220,12 +195,7 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
 
 
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
-    """A ball about the target for a tip that is believed elsewhere: a known mean error besides the covariance.
-
-    Args:
-        offset: Shape (3,), mm, believed tip minus target, in the covariance's axes.
-        radius_mm: Of the ball.
-    """
+    """A ball about the target for a tip that is believed elsewhere: a known mean error besides the covariance."""
     directions = even_directions(DIRECTIONS)
     along = directions @ offset
     inside = along**2 - offset @ offset + radius_mm**2  # below 0 the ray misses the ball
@@ -237,15 +207,12 @@ def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
 
 
 def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, surface_mm: float = 0.0) -> Floats:
-    """The chance that the tip is within a mesh.
+    """The chance that the tip is within a mesh, shape (n,).
 
     Args:
         cov_ct: Shape (n, 3, 3), mm^2, of tip against mesh, CT frame.
         freedom: Degrees of the errors' size, where the residuals gave it.
         surface_mm: By which the mesh may lie off as a whole.
-
-    Returns:
-        Shape (n,).
     """
     if surface_mm > 0 and rays.moved is not None:
         z = ndtri((np.arange(SURFACES) + 0.5) / SURFACES)
@@ -257,8 +224,14 @@ def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, su
         x, y, z = np.ascontiguousarray(rays.directions.T)
         _directional(x, y, z, rays.ray, rays.depth, rays.sign, _length_table(), inverse, found)
         return found
-    parts = [inverse[start : start + ROWS_AT_ONCE] for start in range(0, len(inverse), ROWS_AT_ONCE)]
-    return np.concatenate([np.empty(0), *(_with_unknown_size(rays, part, freedom) for part in parts)])
+    chances = [np.empty(0)]
+    for start in range(0, len(inverse), ROWS_AT_ONCE):
+        part = inverse[start : start + ROWS_AT_ONCE]
+        squares = np.einsum("ia,nab,ib->ni", rays.directions, part, rays.directions)  # m_i^2
+        weights = squares**-1.5
+        within = fdtr(3, freedom, rays.depth**2 * squares[:, rays.ray] / 3) * rays.sign * np.sign(rays.depth)
+        chances.append(np.clip((within * weights[:, rays.ray]).sum(axis=1) / weights.sum(axis=1), 0.0, 1.0))
+    return np.concatenate(chances)
 
 
 SURFACES = 32
@@ -267,10 +240,8 @@ one."""
 
 GRAZING = 0.2
 """Least cosine between ray and normal: a crossing that a surface moves farther than this says is not moved by it."""
-
 ROWS_AT_ONCE = 512
 """Covariances at once: a table of rows times crossings stays below some MB."""
-
 LEAST_VARIANCE = 1e-12
 """mm^2, added to every axis, and to areas: what cannot happen must not divide by zero."""
 
@@ -286,11 +257,6 @@ def _areas(mesh: TriangleMesh) -> Floats:
     """Normals of the faces as long as twice their areas, shape (m, 3)."""
     a, b, c = np.moveaxis(mesh.triangles.reshape(-1, 3, 3), 1, 0)
     return np.asarray(np.cross(b - a, c - a))
-
-
-ROOT_HALF = math.sqrt(0.5)
-
-ROOT_TWO_OVER_PI = math.sqrt(2.0 / math.pi)
 
 
 @nb.njit(cache=True, error_model="numpy")
@@ -320,7 +286,7 @@ TABLE_STEPS = 256
 def _length_table() -> Floats:
     """F3 at steps of 1 / `TABLE_STEPS`, up to where it is 1."""
     t = np.arange(9 * TABLE_STEPS + 1) / TABLE_STEPS
-    return np.asarray(erf(t * ROOT_HALF) - ROOT_TWO_OVER_PI * t * np.exp(-0.5 * t * t))
+    return np.asarray(erf(t * math.sqrt(0.5)) - math.sqrt(2.0 / math.pi) * t * np.exp(-0.5 * t * t))
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,10 +310,8 @@ def proximity(
     """The first-order model of every needle and structure.
 
     Args:
-        distance: Shape (n, k), mm.
         depth: Shape (n, k), of the nearest axis point, from the target, mm.
         normal: Shape (n, k, 3), unit, from the structure to that point.
-        outward_ct: Shape (n, 3), unit.
         cov_ct: Shape (n, 6, 6), Sigma6, CT axes, its point of reference the target.
         surface_mm: By which each structure's surface may lie off as a whole along that normal: one number or (n, k).
     """
@@ -409,11 +373,8 @@ def touch_bound(
 
     Args:
         slack_mm: Shape (n, k), distance beyond the threshold.
-        outward_ct: Shape (n, 3), unit.
-        cov_ct: Shape (n, 6, 6), Sigma6, CT axes, its point of reference the target.
         length_mm: Of the axis.
         surface_mm: The most that each structure's surface may lie off by along any normal: one number or (k,).
-        freedom: As in `touch_chance`.
     """
     lever = np.concatenate([np.broadcast_to(np.eye(3), (len(cov_ct), 3, 3)), -length_mm * skew(outward_ct)], axis=-1)
     ends = np.stack([cov_ct[:, :3, :3], lever @ cov_ct @ np.swapaxes(lever, -1, -2)])

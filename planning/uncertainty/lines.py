@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import NamedTuple
@@ -43,21 +43,6 @@ from puncture_twin.planning.uncertainty.hit import Proximity
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
-    """The structures that must not be touched about one target; CT frame, mm.
-
-    Attributes:
-        blocks: The faces of each of the k structures.
-        length: Shape (n, k), of each needle's axis for each.
-        target_ct: Shape (3,), where every axis starts.
-    """
-
-    blocks: tuple[Blocks, ...]
-    length: Floats
-    target_ct: Floats
-
-
-@dataclass(frozen=True, eq=False)
 class Needles:
     """n needles with their covariances and proximity to the structures.
 
@@ -76,35 +61,43 @@ class Needles:
     freedom: int | None
 
 
-def refined(around: Surroundings, needles: Needles, threshold_mm: Floats, first: Floats, wanted: Bools) -> Floats:
-    """First-order chances with the wanted ones refined by line sampling.
+def refined(
+    blocks: Sequence[Blocks],
+    length: Floats,
+    target_ct: Floats,
+    needles: Needles,
+    threshold_mm: Floats,
+    first: Floats,
+    wanted: Bools,
+) -> Floats:
+    """First-order chances with the wanted ones refined by line sampling, shape (n, k).
 
     A structure of which no face is within the needle's reach keeps its first order: it is touched less than once in
     100,000 times.
 
     Args:
+        blocks: The faces of each of the k structures.
+        length: Shape (n, k), of each needle's axis for each, mm.
+        target_ct: Shape (3,), mm, where every axis starts.
         threshold_mm: Shape (k,), needle radius, or that and a margin.
         first: Shape (n, k), to first order; NaN where a needle intersects a structure already.
         wanted: Shape (n, k).
-
-    Returns:
-        Shape (n, k).
     """
     found = first.copy()
     rows = np.flatnonzero((wanted & np.isfinite(first)).any(axis=1))
     for row in rows:
         outward = needles.outward_ct[row]
-        pose = needle_uncertainty(around.target_ct, outward, needles.cov_ct[row], 0.0, needles.freedom)
-        for column in np.flatnonzero(wanted[row] & np.isfinite(first[row])):
+        pose = needle_uncertainty(target_ct, outward, needles.cov_ct[row], 0.0, needles.freedom)
+        for column in np.flatnonzero(wanted[row] & np.isfinite(first[row])).tolist():
             surface_mm = float(needles.surface_mm[row, column])
             uncertainty = replace(pose, surface_mm=surface_mm) if surface_mm > 0 else pose
-            length, threshold = float(around.length[row, column]), float(threshold_mm[column])
-            reach = uncertainty.reach(length, threshold)
+            axis, threshold = float(length[row, column]), float(threshold_mm[column])
+            reach = uncertainty.reach(axis, threshold)
             if needles.near.distance[row, column] > max(reach):  # no line leads so far
                 continue
-            faces = near_faces(around.blocks[column], around.target_ct, outward, length, reach)
+            faces = near_faces(blocks[column], target_ct, outward, axis, reach)
             if len(faces):
-                chance = line_chance(faces, uncertainty, length, threshold, needles.near.gradient[row, column])
+                chance = line_chance(faces, uncertainty, axis, threshold, needles.near.gradient[row, column])
                 found[row, column] = first[row, column] if np.isnan(chance) else chance
     return found
 
@@ -114,78 +107,46 @@ def line_chance(
 ) -> float:
     """P that the needle comes nearer to a structure than a threshold; NaN where nothing displaces it.
 
+    By the small rule; by many lines where its lines disagree, or several things are touched, or by most lines. Where
+    the errors' size is uncertain every line has its own, and the lines say by how much first order errs.
+
     Args:
         near: The structure's faces within `NeedleUncertainty.reach` of the axis.
-        uncertainty: The needle and the distribution of its displacement.
         length: Of the axis, mm.
         threshold: Needle radius, or that and a margin, mm.
         gradient: Shape (6,), g: what shift and rotation do to the distance, to first order.
     """
-    problem = (
-        near.triangles,
-        near.faces,
-        near.blocks,
-        uncertainty.origin,
-        uncertainty.outward,
-        float(length),
-        float(threshold),
-    )
-    slope = uncertainty.root.T @ gradient
+    origin, outward, freedom = uncertainty.origin, uncertainty.outward, uncertainty.freedom
+    problem = (near.triangles, near.faces, near.blocks, origin, outward, float(length), float(threshold))
+    ends = tuple(origin.tolist()), tuple(outward.tolist())
+    nominal = displaced_distance(near.triangles, near.faces, near.blocks, *ends, float(length), -1.0, 0)[0]
+    slack, slope = min(float(nominal), 1e9) - threshold, uncertainty.root.T @ gradient
     sigma = math.hypot(float(np.linalg.norm(slope)), uncertainty.surface_mm)
-    likeliest, alone = likeliest_slope(problem, uncertainty, slope, _slack(problem))
+    likeliest, alone = likeliest_slope(problem, uncertainty, slope, slack)
     steep = math.hypot(float(np.linalg.norm(likeliest)), uncertainty.surface_mm)
     if not steep > 0.0:  # nothing moves the needle against the structure
         return math.nan
     basis = line_basis(likeliest, uncertainty.surface_mm / steep, float(np.linalg.norm(likeliest)) / steep)
-    first = -_slack(problem) / max(sigma, 1e-12)
-    return chance_by_rules(problem, uncertainty, basis, first, alone)
-
-
-def _slack(problem: Problem) -> float:
-    """Slack of the nominal needle: its distance beyond the threshold, mm."""
-    triangles, faces, blocks, origin, outward, length, threshold = problem
-    tip = (float(origin[0]), float(origin[1]), float(origin[2]))
-    along = (float(outward[0]), float(outward[1]), float(outward[2]))
-    return min(float(displaced_distance(triangles, faces, blocks, tip, along, length, -1.0, 0)[0]), 1e9) - threshold
-
-
-def chance_by_rules(
-    problem: Problem, uncertainty: NeedleUncertainty, basis: Floats, first: float, alone: bool
-) -> float:
-    """By the small rule; by many lines where its lines disagree, or several things are touched, or by most lines.
-
-    Where the errors' size is uncertain every line has its own, and the lines say by how much first order, of quantile
-    ``first``, errs.
-    """
-    surface = uncertainty.surface_mm > 0.0
-    rules = [many_lines(surface, count, uncertainty.freedom) for count in (MANY_LINES, MOST_LINES)]
-    if alone and uncertainty.freedom is None:
+    first, surface = -slack / max(sigma, 1e-12), uncertainty.surface_mm > 0.0
+    rules = [many_lines(surface, count, freedom) for count in (MANY_LINES, MOST_LINES)]
+    if alone and freedom is None:
         rules.insert(0, few_lines(surface))  # exact enough only about one smooth nearest surface
     for lines in rules:
-        mean, spread = by_lines(problem, uncertainty, basis, lines, first)
-        if spread <= DISAGREE:
+        chances = walked(problem, uncertainty.root, uncertainty.surface_mm, basis, lines.offsets, lines.sizes)
+        whole = 0.0
+        if freedom is not None:
+            whole, chances = float(stdtr(freedom, first)), chances - ndtr(first / lines.sizes)
+        mean = float(lines.weights @ chances)
+        if math.sqrt(float(lines.weights @ (chances - mean) ** 2)) <= DISAGREE:
             break
-    return min(max(mean, 0.0), 1.0)
+    return min(max(whole + mean, 0.0), 1.0)
 
 
 MANY_LINES, MOST_LINES = 128, 512
 """Where something else is touched about as soon as what is likeliest, or sizes are uncertain; where these disagree."""
-
 DISAGREE = 0.1
 """Standard deviation of the lines' chances up to which few are trusted with .003: against 4,096 lines they err by that
 at most, and by .013 where it is .2 (three anatomies; next to a lung and between ribs)."""
-
-
-def by_lines(
-    problem: Problem, uncertainty: NeedleUncertainty, basis: Floats, lines: Lines, first: float
-) -> tuple[float, float]:
-    """The mean chance of some lines, and their standard deviation; beyond first order's where sizes are uncertain."""
-    chances = walked(problem, uncertainty.root, uncertainty.surface_mm, basis, lines.offsets, lines.sizes)
-    whole = 0.0
-    if uncertainty.freedom is not None:
-        whole, chances = float(stdtr(uncertainty.freedom, first)), chances - ndtr(first / lines.sizes)
-    mean = float(lines.weights @ chances)
-    return whole + mean, math.sqrt(float(lines.weights @ (chances - mean) ** 2))
 
 
 class Lines(NamedTuple):
@@ -221,23 +182,19 @@ def few_lines(surface: bool) -> Lines:
 def many_lines(surface: bool, count: int, freedom: int | None) -> Lines:
     """Lines spread evenly over a normal, with sizes that are equally likely."""
     mixed = 1 if surface else 0
-    drawn = _sobol(4 + mixed + (freedom is not None), count)
+    dimensions = 4 + mixed + (freedom is not None)
+
+    def make() -> Arrays:
+        return {"points": scipy.stats.qmc.Sobol(dimensions, scramble=True, seed=SCRAMBLED_WITH).random(count)}
+
+    made_from = {"what": "sobol", "dimensions": dimensions, "count": count, "seed": SCRAMBLED_WITH}
+    drawn = user_cache().arrays(made_from, make, by=__name__)["points"]  # shape (count, dimensions), in 0..1
     normal = ndtri(np.clip(drawn[:, : 4 + mixed], 1e-12, 1 - 1e-12))
     length = np.linalg.norm(normal, axis=1)[:, None]
     offsets = np.zeros((count, 5))
     offsets[:, : 4 + mixed] = normal * np.minimum(1.0, WIDEST / length)  # farther ones are pulled in
     sizes = np.ones(count) if freedom is None else error_sizes(freedom)[(drawn[:, -1] * SIZES).astype(np.int64)]
     return Lines(offsets, sizes, np.full(count, 1.0 / count))
-
-
-def _sobol(dimensions: int, count: int) -> Floats:
-    """Points spread evenly over the unit cube, shape (count, dimensions), from the user's cache if they are there."""
-
-    def make() -> Arrays:
-        return {"points": scipy.stats.qmc.Sobol(dimensions, scramble=True, seed=SCRAMBLED_WITH).random(count)}
-
-    made_from = {"what": "sobol", "dimensions": dimensions, "count": count, "seed": SCRAMBLED_WITH}
-    return user_cache().arrays(made_from, make, by=__name__)["points"]
 
 
 SCRAMBLED_WITH = 20191104
@@ -258,13 +215,10 @@ def line_basis(slope: Floats, by_surface: float, by_pose: float) -> Floats:
 
 Problem = tuple[Floats, Floats, Floats, Floats, Floats, float, float]
 """Faces near a needle and spheres around them, its start and direction, its length and the threshold."""
-
 FARTHEST = 5.0
 """Standard deviations that a line is walked to either side; a stretch that is open there goes on for ever."""
-
 WIDEST = 4.0
 """Standard deviations across which a line may lie: what lies beyond has a chance of .003 and less to matter."""
-
 SIZES = 16
 """Quantiles of chi-squared, at the middles of equal parts, where the errors' size is uncertain."""
 
@@ -275,7 +229,6 @@ class NeedleUncertainty:
 
     Attributes:
         origin: Shape (3,), the tip's own place, where the axis starts.
-        outward: Shape (3,), unit.
         root: Shape (6, 5), B: shift and lean of each of five standard normals.
         surface_mm: Standard deviation of the surface, as a whole, of the structure in question.
         freedom: Degrees of the errors' size where the residuals gave it.
@@ -320,28 +273,18 @@ def needle_uncertainty(
 
     Args:
         origin: Shape (3,), mm, the covariance's point of reference.
-        outward: Shape (3,), unit.
         cov_ct: Shape (6, 6), CT axes.
         surface_mm: Deviation of each structure's surface, mm, as in `proximity`.
-        freedom: Of the errors' size, as in `touch_chance`.
     """
     across = frame_about(outward)[:, :2]
     keep = np.zeros((6, 5))
     keep[:3, :3], keep[3:, 3:] = np.eye(3), across
-    values, axes = np.linalg.eigh(_balanced(keep.T @ cov_ct @ keep))
-    root = keep @ (_scales(keep.T @ cov_ct @ keep)[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))
+    cov = keep.T @ cov_ct @ keep
+    sizes = np.sqrt(np.maximum(np.diag(cov), 0.0))  # mm and rad differ by orders of magnitude: correlations are rooted
+    scale = np.where(sizes > 0, sizes, 1.0)
+    values, axes = np.linalg.eigh(cov / np.outer(scale, scale))
+    root = keep @ (sizes[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))
     return NeedleUncertainty(origin, outward, np.ascontiguousarray(root), surface_mm, freedom)
-
-
-def _scales(cov: Floats) -> Floats:
-    """Standard deviations; mm and rad differ by orders of magnitude."""
-    return np.asarray(np.sqrt(np.maximum(np.diag(cov), 0.0)))
-
-
-def _balanced(cov: Floats) -> Floats:
-    """A covariance scaled to correlations."""
-    scale = np.where(_scales(cov) > 0, _scales(cov), 1.0)
-    return np.asarray(cov / np.outer(scale, scale))
 
 
 @cache
@@ -416,16 +359,12 @@ def gap_beyond(scene, start, ahead, beta, hint):  # type: ignore[no-untyped-def]
 
 SMALLEST_STEP, INSIDE_STEP = 0.04, 0.25
 """Standard deviations: of a walk that all but touches, and through what it touches."""
-
 END_WITHIN = 0.005
 """Standard deviations within which an end of a stretch is known; counted as touched, so that no chance is too small."""
-
 LITTLE = 0.01
 """A walk ends where what is left of its normal is this part of what it has: all that is left counts as touched."""
-
 NUDGE_MM = 1e-6
 """mm by which a tip's path is moved aside, so that it does not run through an edge of a face."""
-
 ROOT_HALF = math.sqrt(0.5)
 
 

@@ -36,12 +36,8 @@ def not_cancelled(fit: FitUncertainty, J: Floats, target_base: Floats) -> Floats
     and at the target, independent.
 
     Args:
-        fit: What the registration makes of the declared errors: its map L and the arm's Jacobian J at the touches.
         J: Shape (n, 6, 28), J_f, of configurations with the tip on the target; tip (mm) then rotation (rad), base axes.
         target_base: Shape (3,), mm, to which X carries the registration's shift and rotation.
-
-    Returns:
-        Shape (n, 6, 28).
     """
     if not fit.noise.touches_known:
         return np.asarray(np.sqrt(2.0) * J)  # as if the markers' errors were new ones of the same size
@@ -60,11 +56,7 @@ class Bend(NamedTuple):
         For the sides x and y of the needle, whose z points to the tip: the tip by d x with the shaft about y by d / h,
         and by d y with the shaft about -x; each with half the variance.
 
-        Args:
-            q: Shape (..., 6), rad.
-
-        Returns:
-            Shape (..., 6, 2), base axes.
+        Shape (..., 6, 2), base axes, for q of shape (..., 6), rad.
         """
         R = flange_pose(model, q)[..., :3, :3]  # the needle lies along the flange's z
         x, y, turn = R[..., 0], R[..., 1], 1 / self.clamped_mm
@@ -77,8 +69,6 @@ class PoseError:
     """The needle's pose error in any configuration that puts its tip on the target.
 
     Attributes:
-        tip_mm: Flange to tip.
-        target_base: Shape (3,), mm.
         fit: What the registration makes of them; its test's scale multiplies every covariance but that of the bend.
         bend: Of one direction's needle; None where it is straight, or where it is not of one direction.
     """
@@ -136,8 +126,29 @@ class PoseError:
 
     def parts(self, q: Floats) -> dict[str, Floats]:
         """Sigma6 by source, each of shape (n, 6, 6); they add up to `covariance`."""
+        # of the markers: CT reading, touch, and the arm's repeatability there, the same for all rows
         J = error_jacobian(self.model, q, self.tip_mm)
-        found = {**self._reading_parts(len(q)), **self._arm_parts(J)}
+        at, noise = self.fit.map_at(self.target_base), self.fit.noise
+        marks = at.reshape(6, -1, 3)
+        R, touch = self.fit.R_base_ct, self.errors.touch_mm**2 * np.eye(3)
+        blocks = {
+            **{source: R @ cov @ R.T for source, cov in reading_parts(noise.cov_ct).items()},
+            "touch": touch,
+            "repeatability": noise.cov_base - touch,
+        }
+        found = dict[str, Floats]()
+        for source, block in blocks.items():
+            of_each = np.broadcast_to(block, noise.cov_base.shape)
+            cov = np.einsum("anb,nbc,dnc->ad", marks, of_each, marks)
+            found[source] = np.broadcast_to(cov, (len(q), 6, 6))
+        # of the arm's parameters, of its drift since the touches, and of one arrival at the target
+        G, eta = not_cancelled(self.fit, J, self.target_base), self.fit.noise.eta_variances
+        found |= {source: _outer(G[..., part], eta[part]) for source, part in PARAMETERS.items()}
+        Jq, arm = J[..., PARAMETERS["joint"]], self.errors.arm
+        found["drift"] = _outer(Jq, np.full(6, arm.drift**2))
+        found["arrival"] = _outer(Jq, np.full(6, arm.repeatability**2))
+        if arm.jitter != 0.0:
+            found["jitter"] = _outer(Jq, np.full(6, arm.jitter**2))
         parts = {source: self.fit.test.scale**2 * cov for source, cov in found.items()}
         return parts if self.bend is None else {**parts, "bend": _bend_covariance(self.model, q, self.bend)}
 
@@ -148,49 +159,18 @@ class PoseError:
         parts["target"] = float(np.trace(self.target_covariance))
         return parts
 
-    def _reading_parts(self, count: int) -> dict[str, Floats]:
-        """Parts of the markers: CT reading, touch, and the arm's repeatability there; the same for all rows."""
-        at, noise = self.fit.map_at(self.target_base), self.fit.noise
-        marks = at.reshape(6, -1, 3)
-        R, touch = self.fit.R_base_ct, self.errors.touch_mm**2 * np.eye(3)
-        blocks = {
-            **{
-                source: np.broadcast_to(R @ cov @ R.T, noise.cov_base.shape)
-                for source, cov in reading_parts(noise.cov_ct).items()
-            },
-            "touch": np.broadcast_to(touch, noise.cov_base.shape),
-            "repeatability": noise.cov_base - touch,
-        }
-        covs = {source: np.einsum("anb,nbc,dnc->ad", marks, block, marks) for source, block in blocks.items()}
-        return {source: np.broadcast_to(cov, (count, 6, 6)) for source, cov in covs.items()}
-
-    def _arm_parts(self, J: Floats) -> dict[str, Floats]:
-        """Parts of the arm's parameters, of its drift since the touches, and of one arrival at the target."""
-        G, eta = not_cancelled(self.fit, J, self.target_base), self.fit.noise.eta_variances
-        found = {source: _outer(G[..., part], eta[part]) for source, part in PARAMETERS.items()}
-        Jq, arm = J[..., PARAMETERS["joint"]], self.errors.arm
-        found["drift"] = _outer(Jq, np.full(6, arm.drift**2))
-        found["arrival"] = _outer(Jq, np.full(6, arm.repeatability**2))
-        return found if arm.jitter == 0.0 else {**found, "jitter": _outer(Jq, np.full(6, arm.jitter**2))}
-
 
 def _bend_covariance(model: UrModel, q: Floats, bend: Bend) -> Floats:
-    """Covariance of the bend, (n, 6, 6), base axes."""
     sides = bend.sides(model, q)
     return np.asarray(sides @ np.swapaxes(sides, -1, -2))
 
 
 def _outer(J: Floats, variances: Floats) -> Floats:
-    """J diag(v) J', shape (n, 6, 6)."""
     return np.asarray((J * variances) @ np.swapaxes(J, -1, -2))
 
 
 def pose_error(case: Case, registration: Registration | None) -> PoseError | None:
-    """The pose error of a case; None where it declares no errors, or no markers tie its frames.
-
-    Args:
-        registration: Of its markers, with the case's own declaration.
-    """
+    """The pose error of a case; None where it declares no errors, or no markers tie its frames."""
     if case.errors is None or registration is None or registration.uncertainty is None:
         return None
     target = apply(registration.T_base_ct, case.target_ct)
@@ -202,9 +182,7 @@ class ErrorBudget:
     """The tip's expected error and the fraction of each source.
 
     Attributes:
-        rms_mm: Tip to the point that was meant, rms.
-        lateral_mm: Its part across the needle, rms.
-        depth_mm: Its part along the needle, rms.
+        rms_mm: Tip to the point that was meant; ``lateral_mm`` across, ``depth_mm`` along the needle.
         half_axes_mm: Shape (3,), of the 95 % ellipsoid, longest first.
         fraction: Source to its part of rms_mm squared; they add up to 1.
     """
@@ -222,12 +200,7 @@ def expected_error_mm(error: PoseError, q: Floats) -> float:
 
 
 def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudget:
-    """The budget of one configuration.
-
-    Args:
-        q: Shape (6,), rad, the tip on the target.
-        outward_base: Shape (3,), unit, from the target along the needle.
-    """
+    """The budget of one configuration."""
     parts, whole = error.mean_squares(q), error.tip_covariance(q[None])[0]
     variance, along = float(np.trace(whole)), float(outward_base @ whole @ outward_base)
     return ErrorBudget(
@@ -283,7 +256,6 @@ class AnyPose(NamedTuple):
             freedom: Of the residuals that gave the noise's size; None where it is declared.
             farthest_mm: Shape (k,), the structures' greatest distances from the target.
             lengths_mm: Shape (k,), how long the axis is.
-            radius_mm: The needle's.
             surface_mm: Shape (k,), by which each structure's surface may lie off as a whole, at most.
         """
         count = 5 + int((surface_mm > 0).any())  # normals: shift, lean across the axis, the surface's
@@ -300,7 +272,13 @@ class AnyPose(NamedTuple):
 def any_pose(error: PoseError) -> AnyPose:
     """The bounds of a pose error."""
     noise, arm, scale = error.fit.noise, error.errors.arm, error.fit.test.scale
-    variance, levers = noise.eta_variances, _levers_mm(error)
+    model, target, variance = error.model, error.target_base, noise.eta_variances
+    # bounds of distances of frame origins 0 to 6 from a tip on the target, shape (7,): the chain from either end
+    links = np.hypot(model.a, model.d)  # straight from one frame's origin to the next
+    from_tip = error.tip_mm + np.append(np.cumsum(links[::-1])[::-1], 0.0)
+    to_base, to_shoulder = np.linalg.norm(target), np.linalg.norm(target - model.shoulder_base)
+    from_base = np.concatenate([[to_base], to_shoulder + np.concatenate([[0.0], np.cumsum(links[1:])])])
+    levers = np.minimum(from_tip, from_base)  # each is a bound: the triangle inequality
     link, twist, joint, tip, direction = (variance[PARAMETERS[kind]] for kind in PARAMETERS)
     own_mm = np.sqrt(link.sum() + twist @ levers[1:] ** 2 + joint @ levers[:6] ** 2 + tip.max())
     own_rad = np.sqrt(twist.sum() + joint.sum() + direction.max())
@@ -319,13 +297,3 @@ def any_pose(error: PoseError) -> AnyPose:
         largest = np.linalg.eigvalsh(readings[rows, rows])[-1]  # ascending: the last is the largest
         bounds.append(float(np.sqrt(largest + scale**2 * (lasting**2 + arrival**2))))
     return AnyPose(bounds[0], bounds[1])
-
-
-def _levers_mm(error: PoseError) -> Floats:
-    """Bounds of distances of frame origins 0 to 6 from a tip on the target, shape (7,): the chain from either end."""
-    model, target = error.model, error.target_base
-    links = np.hypot(model.a, model.d)  # straight from one frame's origin to the next
-    from_tip = error.tip_mm + np.append(np.cumsum(links[::-1])[::-1], 0.0)
-    to_base, to_shoulder = np.linalg.norm(target), np.linalg.norm(target - model.shoulder_base)
-    from_base = np.concatenate([[to_base], to_shoulder + np.concatenate([[0.0], np.cumsum(links[1:])])])
-    return np.asarray(np.minimum(from_tip, from_base))  # each is a bound: the triangle inequality

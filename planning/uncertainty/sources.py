@@ -22,7 +22,6 @@ NOT_MODELLED: Mapping[str, tuple[str, str]] = MappingProxyType(
     }
 )
 """Effects that no source models, which does not make them 0; and where the case declares them, what is done instead."""
-
 NAMED = 3
 """Meshes that are named; of more their number is stated."""
 
@@ -40,7 +39,6 @@ def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
 
 
 def _unknown_contours(case: Case) -> list[str]:
-    """Text on the meshes without a declared surface error: those to avoid, and the target's."""
     if case.errors is None or case.errors.surface_mm is not None:
         return []
     hit = case.target_structure if case.hit_radius_mm is None else None
@@ -113,5 +111,4 @@ def deviation(errors: ErrorModel, source: str) -> float:
 
 
 def _attribute(source: str) -> str:
-    """Attribute of `ErrorModel` or its arm that stores a source."""
     return f"{source}_mm" if SOURCES[source].unit == "mm" else source

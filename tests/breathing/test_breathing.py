@@ -13,7 +13,6 @@ BREATHING = '[breathing]\namplitude_mm = 12.0\ndirection = "feet"\n{keys}\n[brea
 
 
 def case_with(folder, keys="", text=BREATHING, space="LPS"):
-    """A case that breathes."""
     write_balls(folder)
     sections = (text.format(keys=keys), SKIN, ORGAN, structure("rib", "avoid"))
     (folder / "case.toml").write_text(case_text(*sections, space=space))
@@ -21,7 +20,6 @@ def case_with(folder, keys="", text=BREATHING, space="LPS"):
 
 
 def breathing(**keys):
-    """Twelve millimetres to the feet."""
     usual = {"amplitude_mm": 12.0, "direction_ct": np.array([0, 0, -1.0]), "weights": ByName({"*": 0.0})}
     return Breathing(**{**usual, "phases": 8, "exponent": 2, "scanned_at": 0.0, "gate": None, **keys})
 
@@ -37,9 +35,13 @@ def test_positions_are_those_of_the_curve_in_time(exponent):
     assert np.abs(curve[:, None] - found).min(axis=0).max() < 1e-11
 
 
-def test_one_phase_is_exhale():
-    """A breath that is looked at once is the body at rest."""
+def test_one_phase_is_exhale_and_weights_follow_the_most_specific_pattern():
     assert positions(1, 2).tolist() == [0.0]
+    np.testing.assert_allclose(breathing(scanned_at=1.0).moved_ct(0.0), [0, 0, 12])
+    np.testing.assert_allclose(breathing().moved_ct(1.0, 0.5), [0, 0, -6])
+    weights = ByName({"*": 0.0, "rib*": 0.2, "rib_left_7": 0.4})
+    assert [weights.of(name) for name in ("Rib_1", "rib_1", "rib_left_7")] == [0.0, 0.2, 0.4]
+    assert ByName({"rib*": 0.2}).of("liver") is None
 
 
 @pytest.mark.parametrize(("exponent", "published"), [(1, 0.27), (2, 0.44), (3, 0.53), (4, 0.59)])
@@ -60,19 +62,6 @@ def test_a_gate_lets_through_itself_and_all_below():
     assert breathing().in_window.all()
 
 
-def test_what_is_seen_at_inhale_moves_the_other_way():
-    """A CT at full inhale shows the target low: at exhale it is higher."""
-    np.testing.assert_allclose(breathing(scanned_at=1.0).moved_ct(0.0), [0, 0, 12])
-    np.testing.assert_allclose(breathing().moved_ct(1.0, 0.5), [0, 0, -6])
-
-
-def test_the_most_specific_pattern_gives_the_weight():
-    """As for margins; capitals count."""
-    weights = ByName({"*": 0.0, "rib*": 0.2, "rib_left_7": 0.4})
-    assert [weights.of(name) for name in ("Rib_1", "rib_1", "rib_left_7")] == [0.0, 0.2, 0.4]
-    assert ByName({"rib*": 0.2}).of("liver") is None
-
-
 @pytest.mark.parametrize(
     ("patterns", "message"),
     [
@@ -82,13 +71,11 @@ def test_the_most_specific_pattern_gives_the_weight():
     ],
 )
 def test_weights_that_leave_a_doubt_are_refused(patterns, message):
-    """A structure that nobody thought of must not count as resting."""
     with refused(*message.split()):
         ByName(patterns).check(["rib", "liver"], "breathing.weights", "case.toml")
 
 
 def test_a_direction_need_not_be_a_unit_vector(tmp_path):
-    """It says whereto; the amplitude says how far. In RAS it is turned."""
     text = BREATHING.replace('"feet"', "[0.0, 3.0, -4.0]")
     np.testing.assert_allclose(case_with(tmp_path, text=text).breathing.direction_ct, [0, 0.6, -0.8])
     np.testing.assert_allclose(case_with(tmp_path, text=text, space="RAS").breathing.direction_ct, [0, -0.6, -0.8])
@@ -110,13 +97,11 @@ def test_a_direction_need_not_be_a_unit_vector(tmp_path):
     ],
 )
 def test_a_breath_that_cannot_be_meant_is_refused(tmp_path, keys, text, space, message):
-    """In one line that names the key."""
     with refused(*message.split()):
         case_with(tmp_path, keys, text, space)
 
 
 def test_a_case_without_the_table_declares_none(tmp_path):
-    """Nothing changes for it."""
     assert case_with(tmp_path, text="").breathing is None
 
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.breathing.breathing import Breathing, fraction_within, mean_square_within
-from puncture_twin.planning.budget.chain import Breath, chain_of, other_gauges
+from puncture_twin.planning.budget.chain import chain_of, other_gauges
 from puncture_twin.planning.budget.what_if import changes, source_costs
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.labels.naming import ByName
@@ -58,7 +58,6 @@ def test_the_mean_square_of_the_breath_has_a_closed_form(exponent, about):
 
 
 def drawn_positions(one, count, rng):
-    """Positions s at times evenly drawn from those that the gate lets through."""
     s = np.sin(rng.uniform(0, np.pi / 2, 8 * count)) ** (2 * one.exponent)
     s = s[s <= (1.0 if one.gate is None else one.gate)]
     return s[:count]
@@ -67,7 +66,7 @@ def drawn_positions(one, count, rng):
 @pytest.mark.parametrize("gate", [None, 0.25])
 def test_rooms_with_bevel_and_breath_err_as_predicted(chain, gate):
     """Whole chains, each needle bent to a side and inserted at a time that are drawn; also per axis of the base."""
-    both = replace(chain, path=Path(), breath=Breath(breath(gate, scanned_at=0.1), chain.T_base_ct[:3, :3]))
+    both = replace(chain, path=Path(), breathing=breath(gate, scanned_at=0.1))
     noise = reading_noise(chain.errors, chain.model, chain.tip_mm, chain.q_touch, known=True)
     outward_ct = -(chain.T_base_ct[:3, :3].T @ flange_pose(chain.model, chain.q_insertion)[:3, 2])
     puncture = Puncture(
@@ -76,7 +75,7 @@ def test_rooms_with_bevel_and_breath_err_as_predicted(chain, gate):
     )  # fmt: skip
     rng = np.random.default_rng(11)
     rooms = draw_trials(puncture, chain.errors, ROOMS, rng).reached_alone()
-    one = both.breath.breathing
+    one = both.breathing
     s = drawn_positions(one, len(rooms.tip_ct), rng)
     target = rooms.target_ct[: len(s)] + (s - one.scanned_at)[:, None] * one.amplitude_mm * one.direction_ct
     missed = (rooms.tip_ct[: len(s)] - target) @ chain.T_base_ct[:3, :3].T
@@ -85,9 +84,8 @@ def test_rooms_with_bevel_and_breath_err_as_predicted(chain, gate):
     np.testing.assert_allclose(drawn, predicted, rtol=0.03)
 
 
-def test_sources_with_the_body_add_up(chain):
-    """Their squares, as of all others; nobody sees them where they are not declared."""
-    both = replace(chain, path=Path(), breath=Breath(breath(None), chain.T_base_ct[:3, :3]))
+def test_sources_of_the_body_add_up_and_gates_and_fixation_take_them_away(chain):
+    both = replace(chain, path=Path(), breathing=breath(None))
     costs = {cost.source: cost for cost in source_costs(both)}
     assert costs["bend"].alone_mm == pytest.approx(1.9)
     assert costs["breathing"].alone_mm == pytest.approx(12.0 * mean_square_within(1.0, 2, 0.0) ** 0.5)
@@ -95,10 +93,6 @@ def test_sources_with_the_body_add_up(chain):
     assert not {"bend", "breathing"} & {cost.source for cost in source_costs(chain)}
     groups = {change.group for change in changes(chain, np.empty((0, 3)), None)}
     assert not {"needle", "breath"} & groups
-
-
-def test_a_fixed_body_takes_its_motion_away(chain):
-    """The motion is a source whose squares add up; fixed, the error is that of the chain without it; else no word."""
     motion = np.diag([0.4, 0.4, 1.0]) ** 2
     one = replace(chain, motion_base=motion)
     costs = {cost.source: cost for cost in source_costs(one)}
@@ -107,10 +101,7 @@ def test_a_fixed_body_takes_its_motion_away(chain):
     (fixed,) = (change for change in changes(one, np.empty((0, 3)), None) if change.group == "body")
     assert fixed.rms_mm == pytest.approx(chain.expected_mm()) == pytest.approx(costs["motion"].without_mm)
     assert not {"body"} & {change.group for change in changes(chain, np.empty((0, 3)), None)}
-
-
-def test_narrower_gates_cost_time_and_win_millimetres(chain):
-    one = replace(chain, breath=Breath(breath(0.5), chain.T_base_ct[:3, :3]))
+    one = replace(chain, breathing=breath(0.5))
     found = {c.what: c.rms_mm for c in changes(one, np.empty((0, 3)), None) if c.group == "breath"}
     assert list(found) == [
         "inserted at any phase",
@@ -144,7 +135,6 @@ target_sd_mm = [0.4, 0.4, 1.0]
 
 
 def test_register_shows_them_where_they_are_declared(tmp_path):
-    """A round body with markers: sources, gauges, gates, and what is no longer called not modelled."""
     ball(tmp_path / "skin.stl", 100.0, (0, 0, 0))
     ball(tmp_path / "organ.stl", 20.0, (0, 0, 0))
     markers = [("A", 90.0, 10.0, 40.0), ("B", -80.0, 20.0, 55.0), ("C", 5.0, -85.0, 50.0), ("D", 10.0, 80.0, 58.0)]

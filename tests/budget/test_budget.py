@@ -27,14 +27,12 @@ from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 ABDOMEN_CASE, CARTON_CASE = "abdomen/case.toml", "carton/case_m_setup2.toml"
 BEDS = {ABDOMEN_CASE: (0.0, 0.0, 1.0), CARTON_CASE: (1.0, 0.0, 0.0)}
 """Of each case, the direction across its slices."""
-
 ABDOMEN = ROOT / "meshes" / "abdomen"
 NOTHING = ArmUncertainty(**{field.name: 0.0 for field in fields(ArmUncertainty)})
 
 
 @cache
 def chain(name):
-    """The chain of an embedded case, at an insertion that its arm reaches."""
     case = load_case(ROOT / "meshes" / name)
     placement = load_placement(case)
     return chain_of(case, placement.registration, reached_insertion(case, placement.T_base_ct))
@@ -95,7 +93,6 @@ def test_rooms_drawn_with_one_source_err_as_it_costs(name, source):
 
 
 def test_changes_obey_what_is_known_of_them(found):
-    """Thinner slices, a better arm, better touches and more markers never cost, beyond what another fit weighs."""
     one, all_changes = found
     now, of = one.expected_mm(), {}
     for change in all_changes:
@@ -106,6 +103,9 @@ def test_changes_obey_what_is_known_of_them(found):
     assert min(of["tip"]) <= now + 1e-9
     assert of["markers"][-1] < of["markers"][0]
     assert best_change(all_changes).rms_mm < now
+    one, all_changes = found
+    counts = [int(c.what.removeprefix("only ").split()[0]) for c in all_changes if c.group == "markers"]
+    assert counts == [n for n in range(3, MOST_MARKERS + 1) if n != len(one.points_ct)]
 
 
 def test_slices_as_they_are_change_nothing():
@@ -113,12 +113,6 @@ def test_slices_as_they_are_change_nothing():
     one = chain("carton/case_m_setup2.toml")
     same = [c for c in changes(one, np.empty((0, 3)), np.array([1.0, 0.0, 0.0])) if c.what == "slices of 5 mm"]
     assert same[0].rms_mm == pytest.approx(one.expected_mm())
-
-
-def test_markers_are_counted_from_three_to_ten(found):
-    one, all_changes = found
-    counts = [int(c.what.removeprefix("only ").split()[0]) for c in all_changes if c.group == "markers"]
-    assert counts == [n for n in range(3, MOST_MARKERS + 1) if n != len(one.points_ct)]
 
 
 def test_register_prints_the_budget_and_draws_it(tmp_path):

@@ -12,6 +12,7 @@ from puncture_twin import api as pt
 from puncture_twin.planning.budget.guidance import Sight, check_ways, sight_of, way_chances, with_ways
 from puncture_twin.planning.plan.plan_document import parse_plan, write_plan
 from puncture_twin.planning.search.uncertainty_breakdown import WAY_HEAD
+from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.visibility.probe import ProbeView
 from puncture_twin.twin.rehearsal.distribution import rehearse_trials
 from puncture_twin.twin.report import patient
@@ -22,7 +23,6 @@ DEVICES = "touch_mm = 0.2\n[motion]\ntarget_sd_mm = [0.4, 0.4, 1.0]\n[stereo]\n[
 
 @pytest.fixture(scope="module")
 def planned(tmp_path_factory):
-    """A round patient with all devices, and a plan of its best direction with what each way would leave."""
     context = pt.prepare(ball(tmp_path_factory.mktemp("ball"), errors=DEVICES))
     return context, pt.plan(context)
 
@@ -31,16 +31,7 @@ def test_a_plan_says_what_the_rehearsal_predicts(planned):
     """Expected error and chance to hit of each way are those of its rooms, by the same line of sight."""
     context, plan = planned
     q, sight = plan.insertion.q[-1], sight_of(context, plan, "all")
-    assert [one.way for one in plan.guidance] == [
-        "ct",
-        "stereo",
-        "us",
-        "us+tip",
-        "ct+stereo",
-        "ct+us",
-        "ct+us+tip",
-        "all",
-    ]
+    assert [one.way for one in plan.guidance] == list(WAYS)
     for one in plan.guidance:
         found = rehearse_trials(context, plan.outward_ct, q, 1, 0, one.way, sight)
         assert found.predicted_rms_mm == pytest.approx(one.expected_error_mm, rel=1e-9), one.way
@@ -48,7 +39,6 @@ def test_a_plan_says_what_the_rehearsal_predicts(planned):
 
 
 def test_a_plan_keeps_it_in_its_file_and_states_no_other(planned, tmp_path):
-    """Written and read it is the same, a number that is another is refused, and so is an unknown key."""
     context, plan = planned
     path = tmp_path / "plan.json"
     write_plan(plan, path)
@@ -76,8 +66,7 @@ def test_a_probe_without_a_place_loses_its_ways_alone(planned):
     assert found["stereo"].p_hit > 0.0
 
 
-def test_a_checked_direction_says_it_too(planned):
-    """`check` has the ways in text and JSON; a case without devices has neither."""
+def test_a_checked_direction_says_the_ways_and_why_there_is_no_window(planned):
     context, plan = planned
     explained = pt.check(context, theta_deg=plan.theta_deg, beta_deg=plan.beta_deg)
     assert [one["way"] for one in explained.summary()["guidance"]] == [one.way for one in plan.guidance]
@@ -93,11 +82,6 @@ def test_a_checked_direction_says_it_too(planned):
     assert with_ways(bare, plan).guidance == ()
     with refused("plan_of_another"):
         check_ways(bare, plan, "plan.json")
-
-
-def test_a_checked_direction_says_why_there_is_no_window(planned):
-    """A probe that sees too shallow: ultrasound has no number, the text names what would let it; cameras go on."""
-    context, plan = planned
     shallow = replace(context, case=replace(context.case, ultrasound=replace(context.case.ultrasound, depth_mm=5.0)))
     explained = pt.check(shallow, theta_deg=plan.theta_deg, beta_deg=plan.beta_deg)
     found = {one.way: one for one in explained.guidance}
@@ -107,7 +91,6 @@ def test_a_checked_direction_says_why_there_is_no_window(planned):
 
 
 def test_terminal_and_page_show_one_table(planned):
-    """A row a way; a way that does not see enough has no numbers but its reason."""
     _, plan = planned
     blind = plan.guidance[1]._replace(expected_error_mm=np.nan, p_hit=np.nan, lost_sight="behind the arm")
     shown = patient.plan(replace(plan, guidance=(plan.guidance[0], blind)), (), declared=True)

@@ -23,7 +23,6 @@ DRAWN = 400
 
 @pytest.fixture(scope="module")
 def certified():
-    """A case with its arm, its plain certificate, and the one that keeps the chance."""
     context = prepare(folder() / "abdomen")
     size = np.radians(2.0)
     plain = certify(context.case, context.anatomy, size=size)
@@ -32,7 +31,6 @@ def certified():
 
 
 def inside(certificate, rng):
-    """Directions (n, 3), CT, anywhere in the safe cells."""
     cells = certificate.leaves.take(certificate.verdict == PROVED_SAFE)
     rows = rng.integers(0, len(cells), DRAWN)
     theta, beta = (rng.uniform(r[rows, 0], r[rows, 1]) for r in (cells.theta, cells.beta))
@@ -41,7 +39,6 @@ def inside(certificate, rng):
 
 
 def every_configuration(context, outward_ct):
-    """Rows of directions and configurations (n, 6): all branches of six rolls that reach the target."""
     error, R = context.chance.error, context.placement.T_base_ct[:3, :3]
     rolls = np.radians(np.arange(0, 360, 60))
     rows, found = [], []
@@ -64,18 +61,13 @@ def test_no_configuration_touches_more_often(certified, rng):
     assert 0.0 < touch.max() <= found.question.touch
 
 
-def test_the_search_finds_every_certified_direction_safe(certified, rng):
-    """Its margins are never narrower, and what it certifies was certified without a chance too."""
+def test_certified_directions_are_safe_and_proven_for_their_chance(certified, rng, tmp_path):
     _, plain, found = certified
     theta, beta, _ = inside(found, rng)
     assert (found.question.margins >= plain.question.margins).all()
     assert (found.question.margins > plain.question.margins).any()
     assert 0 < found.areas[PROVED_SAFE] < plain.areas[PROVED_SAFE]
     assert "R" not in set(plain.at(theta, beta))
-
-
-def test_the_checker_proves_it_and_refuses_another_chance(certified, tmp_path):
-    """Written, read and proven; with another chance, or errors declared smaller, it was made for something else."""
     context, _, found = certified
     case, anatomy, error = context.case, context.anatomy, context.pose_error
     path = tmp_path / "certificate.json"
@@ -100,7 +92,6 @@ def carton():
 
 
 def test_nothing_is_proven_where_the_error_is_too_large(carton):
-    """No safe cell, and the certificate says to what chance."""
     found = certify(carton.case, carton.anatomy, size=np.radians(8.0), touch=0.5, error=carton.pose_error)
     assert found.areas[PROVED_SAFE] == 0 and found.summary()["touch"] == 0.5
 
@@ -125,7 +116,6 @@ def test_no_configuration_errs_more_than_the_bound(name, request, rng):
 
 @pytest.mark.parametrize("touch", [0.0, -0.1, 0.51, 1.0, np.nan, np.inf])
 def test_a_chance_that_makes_no_sense_is_refused(certified, touch):
-    """Above 0, and at most a half."""
     context, _, _ = certified
     with refused("out_of_range"):
         certify(context.case, context.anatomy, size=0.1, touch=touch, error=context.pose_error)

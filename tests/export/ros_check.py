@@ -31,7 +31,6 @@ def through_ros(store, value, name):
 
 
 def made(store, value, kind, where):
-    """A value of a type; what is not given gets ROS's default."""
     node, inside = kind
     if node == Nodetype.BASE:
         check_base(value, inside[0], where)
@@ -65,12 +64,10 @@ def check_base(value, kind, where):
 
 
 def is_number(kind):
-    """Whether rosbags keeps a list of it as an array."""
     return kind[0] == Nodetype.BASE and kind[1][0] != "string"
 
 
 def default(store, kind):
-    """What ROS fills in."""
     node, inside = kind
     if node == Nodetype.NAME:
         return store.types[inside](**{field: default(store, one) for field, one in store.fielddefs[inside][1]})
@@ -82,12 +79,10 @@ def default(store, kind):
 
 
 def plain(store, message, name):
-    """A message as a mapping of all its fields."""
     return {field: plain_value(store, getattr(message, field), one) for field, one in store.fielddefs[name][1]}
 
 
 def plain_value(store, value, kind):
-    """A field's value."""
     node, inside = kind
     if node == Nodetype.NAME:
         return plain(store, value, inside)

@@ -79,7 +79,6 @@ MESSAGES = {
 
 
 def type_store(store=Stores.ROS2_HUMBLE):
-    """All types of a release, these included."""
     made = get_typestore(store)
     types = {}
     for name, fields in MESSAGES.items():

@@ -32,7 +32,6 @@ MARKUP = {
     "display": dict,
 }
 """Properties of a markup: a type, or how many numbers."""
-
 POINT = {
     **dict.fromkeys(("id", "label", "description", "associatedNodeID", "positionStatus"), str),
     "position": 3,
@@ -40,7 +39,6 @@ POINT = {
     **dict.fromkeys(("selected", "locked", "visibility"), bool),
 }
 """Properties of a control point."""
-
 VALUES = {
     "type": TYPES,
     "coordinateSystem": ("LPS", "RAS"),
@@ -48,7 +46,6 @@ VALUES = {
     "positionStatus": ("undefined", "preview", "defined"),
 }
 """What some of them may be."""
-
 BOOLEAN = ("true", "false")
 NUMBER = float
 DISPLAY = {
@@ -65,7 +62,6 @@ DISPLAY = {
     "activeAttributeLocation": ("point", "cell"),
 }
 """Attributes of a display node: words, a number, how many numbers, or any text."""
-
 DATA, STORED = {"references": str}, {"fileName": str}
 NODES = {
     "MarkupsLine": DATA,
@@ -79,7 +75,6 @@ NODES = {
     "ModelDisplay": DISPLAY,
 }
 """Tags by which node classes name themselves, to the attributes that may be written; ``id`` and ``name`` of all."""
-
 SHIPPED = ("vtkMRMLColorTableNodeFileViridis.txt",)
 """Nodes that every Slicer has before a scene is opened; scalars without a color node are not shown."""
 

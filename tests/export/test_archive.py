@@ -33,15 +33,10 @@ SHAPE = (40, 36, 12)
 NAME = "Björk^Åsa=山田^太郎"
 
 
-def tilted():
-    """A stack whose slices lean by 20 degrees against the table."""
-    axes = world.rotation(np.radians(20.0), (1, 2))
-    return world.affine(axes, step=(0.0, 0.0, 2.5))
-
-
+TILTED = world.affine(world.rotation(np.radians(20.0), (1, 2)), step=(0.0, 0.0, 2.5))
 SCANS = {
-    "upright": lambda values: world.series(values),
-    "tilted": lambda values: world.series(values, tilted()),
+    "upright": world.series,
+    "tilted": lambda values: world.series(values, TILTED),
     "backwards": lambda values: world.series(values, world.affine(step=(0.0, 0.0, -2.5)))[::-1],
     "enhanced": lambda values: [world.enhanced(values)],
 }
@@ -49,16 +44,20 @@ SCANS = {
 
 @pytest.fixture(params=sorted(SCANS))
 def scan(request, tmp_path):
-    """A series in memory, with a patient whose name needs two character sets."""
     slices = SCANS[request.param](world.phantom(SHAPE) % 2000)
-    content = {}
-    for number, one in enumerate(slices):
+    for one in slices:
         one.SpecificCharacterSet, one.PatientName = "ISO_IR 192", NAME
         one.StudyDate, one.AccessionNumber = "20261126", "A-7"
+    return series_of(slices, tmp_path)
+
+
+def series_of(slices, folder):
+    content = {}
+    for number, one in enumerate(slices):
         stream = io.BytesIO()
         one.save_as(stream, enforce_file_format=True)
         content[f"{number}.dcm"] = stream.getvalue()
-    return CtSeries(tmp_path, tuple(content), content.__getitem__)
+    return CtSeries(folder, tuple(content), content.__getitem__)
 
 
 def centres(scan):
@@ -72,7 +71,6 @@ def centres(scan):
 
 
 def content_of(scan):
-    """A needle across the whole volume, a triangle as its window, and three numbers."""
     at = centres(scan)
     ends = np.stack([at[6, 5, 2], at[31, 28, 9]])
     corners = np.stack([at[30, 26, 9], at[36, 26, 9], at[33, 33, 10]])
@@ -109,8 +107,7 @@ def read_masks(data, scan):
     return masks
 
 
-def test_regions_lie_where_they_are(scan):
-    """Every voxel of the needle is near its axis; the axis leaves none out; all positions by the slices' headers."""
+def test_regions_lie_where_they_are_and_report_and_patient_are_the_scans(scan):
     content, ends = content_of(scan)
     files = archive_files(scan, content)
     masks, at = read_masks(files[NAMES[0]], scan), centres(scan)
@@ -123,6 +120,20 @@ def test_regions_lie_where_they_are(scan):
     inside = distance <= 0.95  # by the axis itself, not by its rasterised points
     assert masks["needle"][inside].all() and inside.sum() > 20
     assert masks["entry window 1"][[30, 36, 33], [26, 26, 33], [9, 9, 10]].all()
+    read = report_content(files[NAMES[1]])
+    assert read.quantities == {"length_mm": (np.pi * 10, "mm"), "theta_deg": (1 / 3, "deg"), "p": (0.97, "1")}
+    assert np.allclose(read.lines["path"], ends, atol=1e-4) and read.sentences == content.sentences
+    tree = hd.sr.srread(io.BytesIO(files[NAMES[1]]))
+    (line,) = (one for one in tree.ContentSequence if one.get("GraphicType") == "POLYLINE")
+    assert line.ReferencedFrameOfReferenceUID == world.FRAME
+    for data in files.values():
+        read = pydicom.dcmread(io.BytesIO(data))
+        stated = (str(read.PatientName), read.PatientID, read.StudyInstanceUID, read.StudyDate, read.AccessionNumber)
+        assert stated == (NAME, "phantom", world.STUDY, "20261126", "A-7")
+        assert read.SeriesInstanceUID != world.SERIES
+    away = Region("far", "skin", np.full((1, 3), 5000.0))
+    with refused("outside_image"):
+        archive_files(scan, ArchiveContent("A path", (away,), {}, (), ()))
 
 
 def test_another_reader_finds_the_voxels_where_they_are(scan, tmp_path):
@@ -151,51 +162,17 @@ def test_another_reader_finds_the_voxels_where_they_are(scan, tmp_path):
         assert np.linalg.norm(points[:, None] - true, axis=2).min(axis=1).max() < 1e-3
 
 
-def test_the_report_has_numbers_lines_and_words(scan):
-    """Numbers exactly, lines in the single precision that DICOM has, in the scan's frame of reference."""
-    content, ends = content_of(scan)
-    data = archive_files(scan, content)[NAMES[1]]
-    read = report_content(data)
-    assert read.quantities == {"length_mm": (np.pi * 10, "mm"), "theta_deg": (1 / 3, "deg"), "p": (0.97, "1")}
-    assert np.allclose(read.lines["path"], ends, atol=1e-4) and read.sentences == content.sentences
-    tree = hd.sr.srread(io.BytesIO(data))
-    (line,) = (one for one in tree.ContentSequence if one.get("GraphicType") == "POLYLINE")
-    assert line.ReferencedFrameOfReferenceUID == world.FRAME
-
-
-def test_patient_and_study_are_the_scans(scan):
-    """And every slice that the objects rest on is named."""
-    for data in archive_files(scan, content_of(scan)[0]).values():
-        read = pydicom.dcmread(io.BytesIO(data))
-        stated = (str(read.PatientName), read.PatientID, read.StudyInstanceUID, read.StudyDate, read.AccessionNumber)
-        assert stated == (NAME, "phantom", world.STUDY, "20261126", "A-7")
-        assert read.SeriesInstanceUID != world.SERIES
-
-
-def test_what_lies_outside_is_refused(scan):
-    """A region that no voxel holds would be an empty segment, which says that there is nothing."""
-    away = Region("far", "skin", np.full((1, 3), 5000.0))
-    with refused("outside_image"):
-        archive_files(scan, ArchiveContent("A path", (away,), {}, (), ()))
-
-
 @pytest.mark.parametrize(("name", "value"), [("PatientID", "another"), ("StudyInstanceUID", "1.2.3.4")])
 def test_slices_of_several_patients_are_refused(tmp_path, name, value):
-    """One slice that names another: nobody could say whose the needle is."""
-    slices, content = world.series(world.phantom(SHAPE) % 2000), {}
+    slices = world.series(world.phantom(SHAPE) % 2000)
     setattr(slices[5], name, value)
-    for number, one in enumerate(slices):
-        stream = io.BytesIO()
-        one.save_as(stream, enforce_file_format=True)
-        content[f"{number}.dcm"] = stream.getvalue()
-    scan = CtSeries(tmp_path, tuple(content), content.__getitem__)
+    scan = series_of(slices, tmp_path)
     with refused("several_patients"):
         archive_files(scan, content_of(scan)[0])
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A trunk as DICOM and as NIfTI, searched every 5 degrees, so that it has windows."""
     made = tmp_path_factory.mktemp("patient")
     write_scene(made)
     for name in ("dicom", "nifti"):
@@ -205,8 +182,7 @@ def folder(tmp_path_factory):
     return made
 
 
-def test_a_case_is_exported(folder, capsys):
-    """Its windows and its best direction: the table's row is in the report."""
+def test_a_case_is_exported_only_to_a_study_with_a_frame(folder, capsys, tmp_path):
     out = folder / "out"
     case = str(folder / "dicom.toml")
     assert main(["export", case, "--format", "dicom", "--rank", "1", "--out", str(out), "--json"]) == 0
@@ -220,18 +196,10 @@ def test_a_case_is_exported(folder, capsys):
     seg = hd.seg.segread(out / NAMES[0])
     names = [one.SegmentLabel for one in seg.SegmentSequence]
     assert names[0] == "planned needle" and "entry window 1" in names
-
-
-def test_a_case_without_a_series_is_refused(folder, tmp_path, capsys):
-    """There is no study; nothing is written."""
     out = tmp_path / "out"
     assert main(["export", str(folder / "nifti.toml"), "--format", "dicom", "--out", str(out), "--json"]) == 2
     assert json.loads(capsys.readouterr().out)["error"]["code"] == "no_dicom_series"
     assert not out.exists()
-
-
-def test_a_series_without_a_frame_of_reference_is_refused(folder, tmp_path, capsys):
-    """Nothing may refer to its coordinates."""
     shutil.copytree(folder, tmp_path / "again", ignore=shutil.ignore_patterns("out", "found"))
     for path in (tmp_path / "again" / "series").iterdir():
         data = pydicom.dcmread(path)

@@ -39,7 +39,6 @@ SLOWER = 30.0
 
 @pytest.fixture(scope="module")
 def room():
-    """The small patient between a table and a gantry, and a plan."""
     case = world.make_case()
     plan = world.make_plan(case, world.make_candidates(case))
     case.obstacles = (Obstacle("table", "ct", np.array([0.0, 120.0, 0.0]), np.array([500.0, 20.0, 1800.0])),)
@@ -50,7 +49,6 @@ def room():
 
 
 def matrix(pose):
-    """A message's pose as (4, 4), mm."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat([pose["orientation"][name] for name in "xyzw"]).as_matrix()
     T[:3, 3] = [1000 * pose["position"][name] for name in "xyz"]
@@ -59,7 +57,6 @@ def matrix(pose):
 
 @pytest.mark.parametrize("release", [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY])
 def test_messages_are_what_their_definitions_say(room, release):
-    """Scene, goals and trajectories go through ROS's own bytes and back: no unknown field, every value of its type."""
     case, anatomy, plan = room
     store = type_store(release)
     scene = scene_message(case, anatomy, plan)
@@ -95,7 +92,6 @@ def test_shapes_and_lists_mean_what_their_definitions_say(room):
 
 
 def test_the_scene_holds_patient_table_gantry_and_needle(room):
-    """The patient where the registration has him, in ROS's base; the table's middle and sides; all of the bore."""
     case, anatomy, plan = room
     scene = scene_message(case, anatomy, plan)
     things = {one["id"]: one for one in scene["world"]["collision_objects"]}
@@ -114,7 +110,6 @@ def test_the_scene_holds_patient_table_gantry_and_needle(room):
 
 
 def matrix_at(place):
-    """A shift, mm."""
     T = np.eye(4)
     T[:3, 3] = place
     return T
@@ -138,14 +133,12 @@ def test_the_attached_needle_ends_on_the_target(room):
 
 
 def slowly(plan):
-    """The same way, slowly enough for the arm's limits."""
     parts = {name: getattr(plan, name) for name in ("approach", "insertion")}
     slow = {name: Trajectory(SLOWER * part.times_s, part.q) for name, part in parts.items()}
     return SimpleNamespace(**{**vars(plan), **slow})
 
 
 def test_goals_read_back_as_the_plan(room, tmp_path):
-    """Through JSON; another joint's order, or one angle that differs, is refused."""
     plan = slowly(room[2])
     text = json.dumps(goal_messages(plan))
     check_goals(json.loads(text), plan, where=tmp_path)
@@ -161,7 +154,6 @@ def test_goals_read_back_as_the_plan(room, tmp_path):
 
 @pytest.mark.parametrize("name", ["ur3", "ur10e"])
 def test_the_urdf_carries_the_needle(name):
-    """Six joints as the arm's, meshes that exist, and the tip at the needle's length from the flange."""
     robot = ElementTree.fromstring(urdf_with_needle(ur_model(name), Tool(210.0, 150.0, 1.2, 30.0)))
     links = {link.get("name") for link in robot.findall("link")}
     assert {"base_link", "tool0", "needle", "needle_holder", "needle_tip"} <= links
@@ -184,7 +176,6 @@ def test_the_sender_is_short_and_sound():
 
 
 def test_a_plan_without_its_case_has_no_scene(tmp_path, capsys):
-    """One line, exit code 2."""
     (tmp_path / "plan.json").write_text("{}")
     command = ["export", tmp_path / "plan.json", "--format", "moveit", "--out", tmp_path / "out"]
     refused_command(command, capsys, "missing_option", "--case CASE")

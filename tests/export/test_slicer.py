@@ -34,7 +34,6 @@ ALL = {"path.mrk.json", "markers.mrk.json", "safe_entry.vtp", "ct_to_robot.tfm",
 
 
 def placed_case(folder):
-    """The usual patient in RAS, with a robot that stands askew."""
     write_case(folder, *CHANGES)
     touched = apply(T_BASE_CT, MARKERS * [-1, -1, 1])
     rows = [f"{name},{x!r},{y!r},{z!r}" for name, (x, y, z) in zip("ABCD", touched.tolist(), strict=True)]
@@ -44,19 +43,16 @@ def placed_case(folder):
 
 @pytest.fixture(scope="module")
 def context(tmp_path_factory):
-    """Of that case, its arm not checked."""
     return prepare(placed_case(tmp_path_factory.mktemp("slicer")), arm=False)
 
 
 @pytest.fixture(scope="module")
 def exported(context, tmp_path_factory):
-    """The folder of an export of rank 3, and what the job says."""
     out = tmp_path_factory.mktemp("out")
     return out, export_path(context, "slicer", out, Choice(rank=3))
 
 
 def check_markups(document):
-    """By the published schema, version 1.0.3."""
     assert set(document) == {"@schema", "markups"} and document["@schema"] == SCHEMA
     (markup,) = document["markups"]
     check_properties(markup, MARKUP)
@@ -67,7 +63,6 @@ def check_markups(document):
 
 
 def test_the_files_are_one_set_and_the_scene_names_what_is_there(exported):
-    """Each file of the scene lies beside it, each node that another names is there, each id stands once."""
     out, done = exported
     assert {path.name for path in done.files} == ALL
     entries = json.loads((out / "manifest.json").read_text())["entries"]
@@ -85,8 +80,7 @@ def test_the_files_are_one_set_and_the_scene_names_what_is_there(exported):
             assert number in ids and role in ("storage", "display")
 
 
-def test_the_line_goes_from_the_entry_to_the_target(exported, context):
-    """In LPS mm, of the rank that was asked for, by the names under which a case takes it."""
+def test_the_line_and_the_markers_read_back(exported, context):
     out, done = exported
     found = context.search()
     row = found.ranked[2]
@@ -96,10 +90,6 @@ def test_the_line_goes_from_the_entry_to_the_target(exported, context):
     assert read.names == ("entry", "target")
     assert np.array_equal(read.points, np.stack([found.path.entry_ct[row], context.case.target_ct]))
     assert f"theta {np.degrees(found.theta[row]):g}" in done.facts["path"]
-
-
-def test_markers_read_back_as_a_case_reads_them(exported, context):
-    """Names and places in LPS, though the case speaks RAS."""
     out, _ = exported
     assert check_markups(json.loads((out / "markers.mrk.json").read_text()))["type"] == "Fiducial"
     read = read_points(out / "markers.mrk.json", default_space=Space.RAS)
@@ -147,7 +137,6 @@ def test_the_area_of_a_whole_window_is_that_of_the_search(context):
 
 
 def test_without_a_robot_there_is_no_transform_and_that_is_said(tmp_path, capfd):
-    """From the outside: line, area and scene; the summary names the files and what is missing."""
     write_case(tmp_path, *CHANGES, NO_ROBOT)
     out = tmp_path / "out"
     assert main(["export", str(tmp_path), "--format", "slicer", "--rank", "2", "--out", str(out), "--json"]) == 0
@@ -159,7 +148,6 @@ def test_without_a_robot_there_is_no_transform_and_that_is_said(tmp_path, capfd)
 
 
 def test_what_cannot_be_shown_is_refused_and_nothing_is_written(tmp_path, context):
-    """A plan, a rank beyond the last, a rejected direction, a frame of its own."""
     with refused("out_of_range"):
         export_path(context, "slicer", tmp_path / "a", Choice(rank=10_000))
     with refused("direction_rejected", by=NoAnswerError):

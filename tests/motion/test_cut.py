@@ -32,7 +32,6 @@ def cut_of(checker: CellChecker, goals: np.ndarray) -> Cut:
 
 @pytest.mark.parametrize("model", ["ur3", "ur5", "ur10e"])
 def test_all_of_a_blocked_cell_is_in_contact(model: str) -> None:
-    """At random states of random blocked cells, their edges too, FCL finds the upper arm itself in a box."""
     arm, rng = ur_model(model), np.random.default_rng(1)
     T = np.eye(4)
     T[:3, 3] = (-300.0, 100.0, 250.0)
@@ -49,7 +48,6 @@ def test_all_of_a_blocked_cell_is_in_contact(model: str) -> None:
 
 
 def test_the_upper_arm_moves_with_the_first_two_joints() -> None:
-    """Its frame is the one that the proof takes, of every arm's bodies."""
     for model in ("ur3", "ur5e", "ur10"):
         frames = [body.frame for body in arm_bodies(ur_model(model), TOOL, 0.0) if body.name == UPPER_ARM]
         assert frames == [UPPER_ARM_FRAME]
@@ -65,13 +63,9 @@ def test_a_whole_turn_through_the_table_is_proven_impossible() -> None:
     assert plan_approach(checker, FREE, np.stack([TURNED, base_turned]), seed=1).goal_index == 1
 
 
-def test_what_is_not_proven_is_unknown() -> None:
-    """A table too thin to prove anything by: nothing is cut off, and the refusal counts the samples."""
+def test_what_is_not_proven_is_unknown():
     checker = built(FastChecker, ur_model("ur3"), TOOL, [floor(2.0)])
     assert not cut_of(checker, TURNED[None]).off.any()
     with refused("no_approach", "200", by=NoAnswerError):
         plan_approach(checker, FREE, TURNED, seed=1, max_samples=200)
-
-
-def test_without_boxes_nothing_is_cut_off() -> None:
     assert not cut_of(CellChecker(ur_model("ur3"), TOOL), np.stack([TURNED, FREE])).off.any()

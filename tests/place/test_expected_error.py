@@ -18,34 +18,23 @@ from puncture_twin.planning.registration.placement import load_placement
 
 @pytest.fixture(scope="module")
 def abdomen():
-    """Case, placement, and one insertion of it."""
     case = load_case(folder() / "abdomen")
     placement = load_placement(case)
-    return case, placement, insertion(case, placement.T_base_ct)
-
-
-def insertion(case, T_base_ct):
-    """The configuration farthest from singular along the entry frame's axis, shape (1, 6)."""
+    T_base_ct = placement.T_base_ct
     outward = T_base_ct[:3, :3] @ case.T_ct_entry[:3, 2]
     target, rolls = apply(T_base_ct, case.target_ct), np.radians(np.arange(0, 360, 30))
     model = case.robot.model
     q = inverse(model, flange_poses(target, outward, case.needle.length_mm, rolls)).reshape(-1, 6)
-    return farthest_from_singular(model, q, outward)[None]
+    return case, placement, farthest_from_singular(model, q, outward)[None]
 
 
-def test_where_the_arm_stands_already_it_is_the_cases_own_error(abdomen):
-    """Of the case's declaration and markers, its touches not known: to the residuals' size."""
+def test_it_is_the_cases_own_where_the_arm_stands_and_turns_with_both(abdomen):
     case, placement, q = abdomen
     own = placement.registration.uncertainty
     unknown = replace(own, noise=replace(own.noise, touches_known=False))
     error = replace(pose_error_from(case, placement.registration, placement.T_base_ct), fit=unknown)
     expected = float(np.sqrt(np.trace(error.covariance(q)[0, :3, :3])))
     assert expected_tip_error_mm(case, placement, placement.T_base_ct, q) == pytest.approx(expected, rel=0.02)
-
-
-def test_turning_base_and_patient_together_changes_nothing(abdomen):
-    """About the base's own axis, with the first joint turned along; farther away the error grows."""
-    case, placement, q = abdomen
     c, s = np.cos(0.7), np.sin(0.7)
     turn = pose(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
     turned = q + np.array([0.7, 0, 0, 0, 0, 0])
@@ -54,11 +43,6 @@ def test_turning_base_and_patient_together_changes_nothing(abdomen):
     readings = replace(case.errors, arm=case.errors.arm.scaled(0.0))
     exact = expected_tip_error_mm(replace(case, errors=readings), placement, placement.T_base_ct, q)
     assert exact < 0.7 * here
-
-
-def test_without_errors_markers_or_insertions_there_is_none(abdomen):
-    """Nothing is said: it is not 0."""
-    case, placement, q = abdomen
     T = placement.T_base_ct
     assert expected_tip_error_mm(replace(case, errors=None), placement, T, q) is None
     assert expected_tip_error_mm(case, None, T, q) is None

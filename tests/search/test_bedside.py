@@ -28,7 +28,6 @@ WORDS = {
 
 
 def walked(text, start):
-    """Where somebody arrives who starts at a point and does what the words say."""
     steps = re.findall(r"(\d+) mm (to the \w+|toward the \w+)", text)
     return start + sum((float(mm) * WORDS[way] for mm, way in steps), np.zeros(3))
 
@@ -61,18 +60,14 @@ def test_the_words(offset, text):
     assert place.text(Space.RAS) == text
 
 
-def test_a_local_space_has_axes_and_no_anatomy():
+def test_without_an_entry_or_anatomy_words_are_fewer():
     place = entry_place(np.array([10.0, -20.0, 0.0]), [Landmark("marker A", np.zeros(3))])
     assert place.text(Space.LOCAL) == "10 mm along +x and 20 mm along -y from marker A"
-
-
-def test_without_an_entry_there_is_no_place():
     assert entry_place(np.full(3, np.nan), [Landmark("marker A", np.zeros(3))]) is None
 
 
 @given(st.floats(-179, 179), st.floats(-89, 89))
 def test_a_needle_that_is_turned_by_the_angles_is_the_needle(in_plane_deg, out_of_plane_deg):
-    """From the front: first turned in the slice toward the left, then lifted out of it toward the head."""
     axis = Rotation.from_rotvec(np.radians(in_plane_deg) * HEAD)  # front (-y) turns to the left (+x) about the head
     in_slice = axis.apply(FRONT)
     lifted = Rotation.from_rotvec(-np.radians(out_of_plane_deg) * np.cross(HEAD, in_slice)).apply(in_slice)
@@ -100,7 +95,6 @@ def test_a_needle_along_the_patient_has_no_angle_in_the_slice():
 
 
 def test_check_answers_in_the_space_that_was_typed_and_from_the_nearest_marker(tmp_path):
-    """RAS in, RAS out; markers of the registration; the JSON keeps its LPS entry."""
     context = prepare(write_case(tmp_path, ('space = "LPS"', 'space = "RAS"')), arm=False)
     found = context.explain(np.radians(10), np.radians(90))
     summary = found.summary()

@@ -36,7 +36,6 @@ capsule_mm = 2.0
 
 
 def written(folder, needle=BENT, tissue=TISSUE):
-    """A round body with an organ of 20 mm in its middle, and a rib and a vessel to avoid."""
     write_balls(folder)
     ball(folder / "vessel.stl", 6.0, (-35, -25, 30))
     avoided = [structure("rib", "avoid", margin_mm=3.0), structure("vessel", "avoid", margin_mm=1.0)]
@@ -74,20 +73,18 @@ def test_what_lacks_the_clearance_to_bend_is_rejected_and_nothing_else(patient):
     assert with_tissue.select(same).equals(today.select(same))
 
 
-def test_a_symmetric_tip_leaves_the_sag_alone(patient):
+def test_a_needle_that_bends_little_or_further_than_anything_is_clear_of(patient):
     bending = replace(patient.case.bending, alpha=0.0)
     found = searched(patient, bending=bending)
     known = np.isfinite(found.deflection)
     assert np.all(found.deflection[known] == bending.shaft.sag_mm)
-
-
-def test_a_needle_that_bends_further_than_anything_is_clear_of_leaves_nothing_safe(patient):
     found = searched(patient, bending=replace(patient.case.bending, alpha=np.radians(30.0)))
     assert not found.safe.any() and "needle_bends" in found.verdict.reason
+    with refused("not_certifiable"):
+        certify(patient.case, patient.anatomy, size=0.1)
 
 
 def test_a_body_that_breathes_is_checked_with_a_needle_that_bends(patient):
-    """At every phase, against bodies that are moved and searched anew with the same bound."""
     weights = {"skin": 0.4, "rib": 0.0, "vessel": 0.5}
     breath = Breathing(25.0, np.array([0.0, 0.0, -1.0]), ByName(weights), 4, 2, 0.0, None)
     found = searched(patient, breathing=breath)
@@ -109,27 +106,17 @@ def test_a_body_that_breathes_is_checked_with_a_needle_that_bends(patient):
     assert 0 < found.safe.sum() < safe[0].sum()
 
 
-def test_layers_are_those_that_the_path_passes(patient):
-    """From the skin at 90 mm to the organ's surface at 20, whose capsule it meets; the skin is the rest's."""
+def test_layers_are_those_of_the_path_and_a_check_says_how_far_it_bends(patient):
     outward = np.array([0.0, -1.0, 0.0])
     rest, organ = path_layers(patient.case.bending, patient.anatomy, np.zeros(3), outward, 90.0)
     assert (rest.start_mm, rest.end_mm) == (0.0, organ.start_mm) and organ.end_mm == 90.0
     assert organ.start_mm == pytest.approx(70.0, abs=1.0)
     assert (rest.tissue.capsule_n, organ.tissue.capsule_n) == (3.0, 1.0)
-
-
-def test_a_check_says_how_far_it_bends_and_what_it_needs(patient):
-    """The path of a bevel that never turns is within the bound, and the peak above the skin's rupture."""
     explained = patient.explain(0.0, 0.0)
     told = explained.summary()["bending"]
     assert 0 < told["deflection_mm"] < told["deflection_bound_mm"]
     assert told["peak_force_n"] >= 3.0
     assert "are added to the margins" in explained.text() and "buckles at" in explained.text()
-
-
-def test_a_certificate_refuses_a_needle_that_bends(patient):
-    with refused("not_certifiable"):
-        certify(patient.case, patient.anatomy, size=0.1)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ class Grid(SimpleNamespace):
 
 
 def grid(step_deg):
-    """All safe, on a full cap up to 60 degrees."""
     theta, beta = np.meshgrid(np.arange(0, 60.01, step_deg), np.arange(0, 360, step_deg), indexing="ij")
     n = theta.size
     return Grid(
@@ -33,7 +32,6 @@ def grid(step_deg):
 
 @pytest.mark.parametrize("step_deg", [1.0, 2.0, 5.0, 12.0])
 def test_a_safe_cap_is_one_whole_disc(step_deg):
-    """Every pixel of it: no other colour but white beyond, and circles and axes over both."""
     shown = Candidates.plot_map(grid(step_deg))._repr_html_()
     data = base64.b64decode(re.search(r'base64,([^"]+)"', shown)[1])
     picture = np.asarray(Image.open(io.BytesIO(data))).astype(int)

@@ -34,14 +34,11 @@ def found(context):
     return context.search()
 
 
-def test_nothing_chosen_is_every_safe_candidate_in_the_order_of_ranks_and_a_rank_one_row(context, found):
+def test_a_rank_is_one_row_and_a_window_its_rows_the_best_first(context, found):
     assert parse_choice(None, None, None, None, None) == BEST
     np.testing.assert_array_equal(choose(context, found, BEST).rows, found.ranked)
     chosen = choose(context, found, Choice(rank=5))
     assert chosen.candidates.ranking.rank[chosen.rows].tolist() == [5]
-
-
-def test_a_window_is_its_rows_the_best_first(context, found):
     windows = find_windows(found)
     chosen = choose(context, found, Choice(window=len(windows.windows)))
     assert set(windows.of_row[chosen.rows]) == {len(windows.windows)}
@@ -49,7 +46,6 @@ def test_a_window_is_its_rows_the_best_first(context, found):
 
 
 def test_an_entry_is_in_the_space_of_the_case_and_gives_its_own_direction_back(context, found):
-    """Typed in RAS: x and y are turned; between the grid's directions too."""
     row = int(found.ranked[0])
     typed = tuple((found.path.entry_ct[row] * [-1, -1, 1]).tolist())
     theta, beta = chosen_angles(context.case, Choice(entry_mm=typed))
@@ -58,22 +54,14 @@ def test_an_entry_is_in_the_space_of_the_case_and_gives_its_own_direction_back(c
     np.testing.assert_allclose(chosen.candidates.path.entry_ct[0], found.path.entry_ct[row], atol=1e-6)
 
 
-def test_a_point_off_the_skin_is_refused_with_the_place_of_the_skin(context, found):
-    """Half way in: the needle would enter somewhere else than where the person points."""
+def test_points_that_are_no_entry_and_rejected_directions_are_refused(context, found):
     row = int(found.ranked[0])
     off = context.case.target_ct + 0.5 * (found.path.entry_ct[row] - context.case.target_ct)
     with refused("entry_elsewhere", "RAS"):
         choose(context, found, Choice(entry_mm=tuple((off * [-1, -1, 1]).tolist())))
-
-
-def test_the_target_itself_gives_no_direction(context, found):
     typed = tuple((context.case.target_ct * [-1, -1, 1]).tolist())
     with refused("entry_at_target"):
         choose(context, found, Choice(entry_mm=typed))
-
-
-def test_a_rejected_direction_is_refused_with_its_reason(context, found):
-    """A wrong "safe" by choice: what the search rejects no choice brings back."""
     row = int(np.flatnonzero(~found.safe)[0])
     with refused("direction_rejected", found.verdict.reason[np.flatnonzero(~found.safe)[0]], by=NoAnswerError):
         choose(context, found, Choice(angles=(found.theta[row], found.beta[row])))

@@ -19,15 +19,13 @@ NEEDLE = Needle(200.0, 150.0, 1.0, None, 10.0, 30.0)
 UP = np.array([[0.0, 0.0, 1.0]])
 
 
-def verdict(skin, structures=(), direction=UP, needle=NEEDLE, target=(0, 0, 0), max_angle=60.0):
-    """The first broken constraint of one direction: reason, structure, depth, amount."""
-    target = np.asarray(target, float)
+def verdict(skin, structures=(), direction=UP, needle=NEEDLE):
+    target = np.zeros(3)
     direction = np.asarray(direction, float).reshape(-1, 3)
     paths = skin_paths(skin, target, direction, needle.length_mm)
-    structures = tuple(structures)
     engine = FclEngine([s.mesh for s in structures])
     found = measure(engine, structures, target, direction, length=needle.length_mm, radius=needle.radius_mm)
-    rated = first_broken(paths, found, structures, needle=needle, max_skin_angle=np.radians(max_angle))
+    rated = first_broken(paths, found, structures, needle=needle, max_skin_angle=np.radians(60.0))
     return str(rated.reason[0]), str(rated.structure[0]), rated.depth[0], rated.amount[0]
 
 
@@ -39,18 +37,18 @@ def both(*meshes):
     )
 
 
-def test_free_path_is_safe(box):
-    assert verdict(skin_from_mesh(box([100, 100, 100])))[0] == ""
-
-
 def test_path_length_and_angle_are_geometry(box):
-    """In a box the path to the top face is height over cosine, and the skin angle is the tilt."""
+    assert verdict(skin_from_mesh(box([100, 100, 100])))[0] == ""
     skin = skin_from_mesh(box([400, 400, 100]))
     tilt = np.radians(np.array([0.0, 20, 45]))
     directions = np.stack([np.sin(tilt), 0 * tilt, np.cos(tilt)], axis=1)
     paths = skin_paths(skin, np.zeros(3), directions, 200.0)
     np.testing.assert_allclose(paths.path_length, 50 / np.cos(tilt), atol=1e-9)
     np.testing.assert_allclose(paths.entry_ct[:, 2], 50, atol=1e-9)
+    needle = Needle(200.0, 150.0, 1.0, 60.0, 10.0, 30.0)
+    assert needle.longest_path_mm == 50
+    assert verdict(skin_from_mesh(box([100, 100, 99])), needle=needle)[0] == ""
+    assert verdict(skin_from_mesh(box([100, 100, 101])), needle=needle)[0] == Reason.TOO_LONG
 
 
 def test_skin_angle_on_a_ball(ball):
@@ -88,7 +86,6 @@ def test_a_smooth_skin_is_blended_even_without_shared_corners(ball):
 
 
 def test_a_doubled_open_skin_stays_open(ball):
-    """Every triangle of a half sphere twice: no inside, and the warning says so."""
     mesh = ball(100)
     half = mesh.faces[mesh.triangles[:, :, 2].min(axis=1) > 0]
     doubled = skin_from_mesh(TriangleMesh(mesh.vertices, np.concatenate([half, half])))
@@ -96,14 +93,6 @@ def test_a_doubled_open_skin_stays_open(ball):
     assert doubled.warnings
     whole = TriangleMesh(mesh.vertices, np.concatenate([mesh.faces, mesh.faces]))
     assert whole.closed
-
-
-def test_a_fixed_standoff_limits_the_path(box):
-    """With the tip 60 mm from the target before the insertion, and 10 mm off the skin, 50 mm of path are the most."""
-    needle = Needle(200.0, 150.0, 1.0, 60.0, 10.0, 30.0)
-    assert needle.longest_path_mm == 50
-    assert verdict(skin_from_mesh(box([100, 100, 99])), needle=needle)[0] == ""
-    assert verdict(skin_from_mesh(box([100, 100, 101])), needle=needle)[0] == Reason.TOO_LONG
 
 
 def test_reenters_skin(ball):
@@ -115,30 +104,25 @@ def test_reenters_skin(ball):
     assert verdict(skin_from_mesh(far))[0] == ""
 
 
-def test_too_close_names_structure_depth_and_mm(ball, box):
+def test_margins_and_roles_decide_the_reason(ball, box):
     near = Structure("vessel", Role.AVOID, 5.0, ball(10, (14, 0, 30), 4), "")
     other = Structure("rib", Role.AVOID, 1.0, ball(10, (-11, 0, 40), 4), "")
-    reason, structure, depth, amount = verdict(skin_from_mesh(box([100, 100, 100])), [other, near])
+    reason, structure, depth, amount = verdict(skin_from_mesh(box([100, 100, 100])), (other, near))
     assert (reason, structure) == (Reason.TOO_CLOSE, "vessel")
     assert depth == pytest.approx(30, abs=0.5)
     assert amount == pytest.approx(14 - 10 - 0.5, abs=0.05)
-
-
-def test_margin_is_held_against_the_clearance(ball, box):
-    """Clearance 3.5: a margin of 3.4 is kept, one of 3.6 is not."""
     for margin, expected in ((3.4, ""), (3.6, Reason.TOO_CLOSE)):
         structure = Structure("organ", Role.AVOID, margin, ball(10, (14, 0, 30), 6), "")
-        assert verdict(skin_from_mesh(box([100, 100, 100])), [structure])[0] == expected
-
-
-def test_role_unknown_is_an_unknown_region(ball, box):
-    """A path through a structure of which nothing is known is unknown, never safe."""
+        assert verdict(skin_from_mesh(box([100, 100, 100])), (structure,))[0] == expected
     cloud = Structure("fog", Role.UNKNOWN, 0.0, ball(10, (0, 0, 30)), "")
-    assert verdict(skin_from_mesh(box([100, 100, 100])), [cloud])[:2] == (Reason.UNKNOWN_REGION, "fog")
+    assert verdict(skin_from_mesh(box([100, 100, 100])), (cloud,))[:2] == (Reason.UNKNOWN_REGION, "fog")
+    anatomy = Anatomy((Structure("liver", Role.TARGET, 0, ball(10), ""),), skin_from_mesh(box([100, 100, 100])), ())
+    assert anatomy.structure("liver").role is Role.TARGET
+    with pytest.raises(Exception, match="no structure 'lver'.*liver"):
+        anatomy.structure("lver")
 
 
 def cut_skin(box, cut_high_z):
-    """A box whose top may be a cut of the field of view instead of skin."""
     mesh = box([100, 100, 100])
     top = np.all(mesh.triangles[:, :, 2] == 50, axis=1)
     T = np.eye(4)
@@ -149,27 +133,19 @@ def cut_skin(box, cut_high_z):
     return Skin(mesh, top if cut_high_z else np.zeros(len(top), bool), field, ())
 
 
-def test_leaving_through_a_cut_face_is_unknown(box):
-    """Where the field of view cuts the body there is no skin: unknown, with the depth."""
+def test_what_leaves_through_a_cut_or_a_hole_is_unknown(box):
     assert verdict(cut_skin(box, True))[0] == Reason.UNKNOWN_REGION
     assert verdict(cut_skin(box, True))[2] == pytest.approx(50)
     assert verdict(cut_skin(box, False))[0] == ""
-
-
-def test_a_needle_that_leaves_the_image_beside_a_cut_body_is_unknown(box):
-    """Out through real skin, but then past the face at which the body was cut: what is there is not known."""
     flat = np.array([0.7, 0, 0.5])
     flat /= np.linalg.norm(flat)
     skin = cut_skin(box, True)
     for wider, expected in ((np.inf, Reason.UNKNOWN_REGION), (10.0, "")):  # it passes 20 mm beside the body
         solid = beyond_image(skin.field_of_view, skin.mesh.vertices, wider)
         unseen = Structure("beyond", Role.UNKNOWN, 0.0, solid, "")
-        reason, _, depth, _ = verdict(skin, [unseen], direction=flat)
+        reason, _, depth, _ = verdict(skin, (unseen,), direction=flat)
         assert reason == expected
         assert reason == "" or depth == pytest.approx(50 / flat[2])
-
-
-def test_no_skin_entry_through_a_hole(box):
     mesh = box([100, 100, 100])
     top = np.all(mesh.triangles[:, :, 2] == 50, axis=1)
     opened = skin_from_mesh(TriangleMesh(mesh.vertices, mesh.faces[~top]))
@@ -179,7 +155,6 @@ def test_no_skin_entry_through_a_hole(box):
 
 
 def test_a_ray_through_a_corner_is_judged_like_its_neighbours(box):
-    """Exactly through an edge or a corner of the skin: one entry, no false re-entry."""
     skin = skin_from_mesh(box([100, 100, 100]))
     for direction in ([1, 1, 1], [1, 0, 1], [1, 1, 0.5]):
         u = np.array(direction, float) / np.linalg.norm(direction)
@@ -187,13 +162,6 @@ def test_a_ray_through_a_corner_is_judged_like_its_neighbours(box):
         assert np.isfinite(paths.path_length[0])
         assert np.isnan(paths.reentry_depth[0])
         assert np.isnan(paths.unknown_depth[0])
-
-
-def test_anatomy_finds_structures_by_name(ball, box):
-    anatomy = Anatomy((Structure("liver", Role.TARGET, 0, ball(10), ""),), skin_from_mesh(box([100, 100, 100])), ())
-    assert anatomy.structure("liver").role is Role.TARGET
-    with pytest.raises(Exception, match="no structure 'lver'.*liver"):
-        anatomy.structure("lver")
 
 
 def test_a_skin_mesh_may_say_where_the_body_was_cut(box):

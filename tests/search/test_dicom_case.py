@@ -41,17 +41,7 @@ max_skin_angle_deg = 75
 """
 
 
-def write_dicom(nifti, folder):
-    """The CT of a NIfTI file as a series, slice by slice along its last axis."""
-    volume = read_volume(nifti)
-    values, T = volume.values, volume.T_ct_index.copy()
-    stored = (np.asarray(values, np.int32) + 1024).astype(np.int16)
-    assert np.array_equal(stored.astype(np.float32) - 1024, values)
-    return world.write_series(folder, world.series(stored, T))
-
-
 def write_scene(folder):
-    """A trunk on a bed as NIfTI and as a series, with labels of lesion (1) and spine (2)."""
     grid, parts = supine.grid(), supine.trunk_parts() + supine.bed_parts()
     hu = rendered(parts, grid, noise_hu=15.0, rng=np.random.default_rng(3))
     labels = np.zeros(grid.shape, np.uint8)
@@ -63,7 +53,10 @@ def write_scene(folder):
         image.SetSpacing(grid.spacing_mm)
         image.SetOrigin(grid.low_mm)
         sitk.WriteImage(image, str(folder / f"{name}.nii.gz"))
-    write_dicom(folder / "ct.nii.gz", folder / "series")
+    volume = read_volume(folder / "ct.nii.gz")
+    stored = (np.asarray(volume.values, np.int32) + 1024).astype(np.int16)
+    assert np.array_equal(stored.astype(np.float32) - 1024, volume.values)
+    world.write_series(folder / "series", world.series(stored, volume.T_ct_index.copy()))
     write_case(folder, "nifti", "ct.nii.gz")
     write_case(folder, "dicom", "series")
 
@@ -80,22 +73,17 @@ def scene(tmp_path_factory):
     return folder
 
 
-def same_verdicts(one, other):
-    """Two searches that agree in every verdict, reason and clearance."""
+def test_a_series_gives_the_verdicts_of_the_same_ct_in_nifti(scene):
+    nifti, dicom = (prepare(scene / f"{name}.toml", arm=False) for name in ("nifti", "dicom"))
+    one, other = nifti.search(), dicom.search()
     assert np.array_equal(one.verdict.reason, other.verdict.reason)
     assert np.allclose(one.clearance.distance, other.clearance.distance, atol=1e-3, equal_nan=True)
     assert np.allclose(one.path.length, other.path.length, atol=1e-3, equal_nan=True)
     assert one.safe.any()
-
-
-def test_a_series_gives_the_verdicts_of_the_same_ct_in_nifti(scene):
-    """Skin, bed and what no label names come from the series as from the file."""
-    nifti, dicom = (prepare(scene / f"{name}.toml", arm=False) for name in ("nifti", "dicom"))
-    same_verdicts(nifti.search(), dicom.search())
     assert dicom.anatomy.warnings == tuple(line.replace("ct.nii.gz", "series") for line in nifti.anatomy.warnings)
 
 
-def test_every_slice_is_an_input_with_the_hash_of_its_bytes(scene):
+def test_every_slice_is_an_input_and_may_name_the_series(scene):
     case = load_case(scene / "dicom.toml")
     slices = [one for one in case.inputs if one.role == "ct"]
     files = sorted((scene / "series").iterdir())
@@ -107,29 +95,22 @@ def test_every_slice_is_an_input_with_the_hash_of_its_bytes(scene):
         assert differing_input(case.inputs, load_case(scene / "dicom.toml").inputs) == f"ct ({slices[3].path})"
     finally:
         files[3].write_bytes(content)
-
-
-def test_a_file_of_the_series_names_it(scene):
     write_case(scene, "file", f"series/{sorted(path.name for path in (scene / 'series').iterdir())[5]}")
     file, folder = (load_case(scene / f"{name}.toml").inputs for name in ("file", "dicom"))
     assert [one for one in file if one.role == "ct"] == [one for one in folder if one.role == "ct"]
+    text = (scene / "dicom.toml").read_text()
+    (scene / "wrong.toml").write_text(text.replace(json.dumps("labels.nii.gz"), json.dumps("series"), 1))
+    with refused("no_such_file"):
+        load_case(scene / "wrong.toml")
 
 
 def test_a_case_without_dicom_does_not_load_its_library(scene):
-    """A seventh of a second, and the native decoders that come with it."""
     code = f"import sys; from {load_case.__module__} import load_case; load_case(sys.argv[1])"
     code += "; print('pydicom' in sys.modules)"
     for name in ("nifti", "dicom"):
         command = [sys.executable, "-c", code, str(scene / f"{name}.toml")]
         done = subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT)
         assert done.stdout.strip() == str(name == "dicom")
-
-
-def test_a_folder_as_a_label_map_is_refused(scene):
-    text = (scene / "dicom.toml").read_text()
-    (scene / "wrong.toml").write_text(text.replace(json.dumps("labels.nii.gz"), json.dumps("series"), 1))
-    with refused("no_such_file"):
-        load_case(scene / "wrong.toml")
 
 
 def boxes_of(mask, T):
@@ -144,7 +125,6 @@ def boxes_of(mask, T):
 
 
 def write_structures(folder):
-    """Lesion and spine of the label map as SEG and as RTSTRUCT, and the cases that name them."""
     labels = read_volume(folder / "labels.nii.gz")
     masks = {"the lesion": labels.values == 1, "spine": labels.values == 2}
     world.write(world.segmentation(masks, labels.T_ct_index), folder / "seg.dcm")
@@ -160,7 +140,6 @@ def write_structures(folder):
 
 
 def test_seg_and_rtstruct_give_the_verdicts_of_a_label_map(scene):
-    """Names by pattern, roles and margins as for labels; file and slices are inputs."""
     write_structures(scene)
     labels = prepare(scene / "dicom.toml", arm=False).search()
     for kind, file in (("seg", "seg.dcm"), ("rtstruct", "rt.dcm")):

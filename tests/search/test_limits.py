@@ -24,25 +24,21 @@ NO_READING = (
 NO_ARM = "link_mm = 0\ntwist_deg = 0\njoint_deg = 0\ntip_offset_mm = 0\n"
 
 
-def test_limits_without_the_arm_are_refused(tmp_path):
-    """Without a configuration there is no error of the needle, so that no limit can be kept."""
-    context = prepare(ball(tmp_path, search=LIMITS), arm=False)
+@pytest.mark.parametrize(("arm", "base"), [(False, None), (None, MOUNT), (None, "")])
+def test_limits_without_the_arm_or_markers_are_refused(tmp_path, arm, base):
+    context = prepare(ball(tmp_path, search=LIMITS, **({} if base is None else {"base": base})), arm=arm)
     with refused("no_needle_error"):
         context.search()
     with refused("no_needle_error"):
         context.check(0.35, 0.0)
 
 
-@pytest.mark.parametrize("base", [MOUNT, ""])
-def test_limits_without_markers_are_refused(tmp_path, base):
-    """A stated mount has no errors of its own, and no base at all has no arm."""
-    with refused("no_needle_error"):
-        prepare(ball(tmp_path, search=LIMITS, base=base)).search()
-
-
-def test_without_limits_the_same_cases_are_searched(tmp_path):
+def test_without_limits_cases_are_searched_and_computed_readings_err_not(tmp_path):
     found = prepare(ball(tmp_path), arm=False).search()
     assert found.safe.any() and np.isnan(found.chances.hit).all()
+    with refused("no_marker_noise"):
+        prepare(ball(tmp_path, errors='marker_noise = "found"', noise=0.0))
+    assert prepare(ball(tmp_path, errors='marker_noise = "found"')).chance is not None
 
 
 @pytest.mark.parametrize("name", ["ribb", "organ", "skin"])
@@ -52,7 +48,6 @@ def test_a_limit_of_a_structure_that_none_is_judged_by_is_refused(tmp_path, name
 
 
 def test_a_chance_that_is_not_known_keeps_no_limit(tmp_path):
-    """NaN is neither likely enough to hit, nor unlikely enough to touch; without a limit it is let pass."""
     context = prepare(ball(tmp_path), arm=False)
     found = context.search()
     found = replace(found, chances=Chances.unknown(("rib",), len(found)))
@@ -69,7 +64,6 @@ def test_a_chance_that_is_not_known_keeps_no_limit(tmp_path):
 
 @pytest.mark.parametrize("limit", ["min_hit", "max_touch"])
 def test_limits_are_kept_in_a_configuration_or_not_as_the_search_says(tmp_path, limit):
-    """Asked of the configurations that the search had, with a limit between their chances."""
     context = prepare(ball(tmp_path, errors="touch_mm = 3.0\n"))
     found = context.search()
     rows = np.flatnonzero(np.isfinite(found.chances.hit))
@@ -88,13 +82,6 @@ def test_readings_without_any_error_are_refused(tmp_path, across):
     """A covariance that has no inverse weighs nothing, along an oblique axis too."""
     with refused("no_marker_noise"):
         prepare(ball(tmp_path, errors=NO_READING.format(across=across) + NO_ARM))
-
-
-def test_noise_is_not_found_in_computed_readings(tmp_path):
-    """Residuals of rounding alone say that one side was made from the other, not that nothing errs."""
-    with refused("no_marker_noise"):
-        prepare(ball(tmp_path, errors='marker_noise = "found"', noise=0.0))
-    assert prepare(ball(tmp_path, errors='marker_noise = "found"')).chance is not None
 
 
 @pytest.mark.parametrize("name", ["any", "joint"])
@@ -117,7 +104,6 @@ def test_a_surface_that_lies_off_takes_from_the_chance_to_hit(tmp_path):
 
 @pytest.mark.parametrize(("errors", "told"), [("", True), ("surface_mm = 0", False), ("surface_mm = 0.5", False)])
 def test_meshes_of_which_nobody_knows_how_far_they_lie_off_are_named(tmp_path, errors, told):
-    """In the text and in the values; a 0 that is written is an answer."""
     context = prepare(ball(tmp_path, errors=errors))
     found = context.search()
     row = found.ranked[0]
@@ -181,7 +167,6 @@ def test_what_is_shown_or_may_decide_is_line_sampled_and_the_rest_is_marked(tmp_
 
 
 def test_the_bound_is_never_below_first_order(rng):
-    """Whatever the pose's error, and wherever on the axis the nearest point is."""
     root = rng.normal(size=(50, 6, 6)) * np.array([1, 1, 1, 0.01, 0.01, 0.01])[:, None]
     cov = root @ np.swapaxes(root, -1, -2)
     outward, normal = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in rng.normal(size=(2, 50, 3)))

@@ -32,7 +32,6 @@ WEIGHTS = {"skin": 0.4, "rib": 0.0, "vessel": 0.7, "dome": 1.4}
 
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
-    """A round body that holds an organ, and about it a rib, a vessel, and a dome that moves more than the target."""
     folder = tmp_path_factory.mktemp("breathing")
     write_balls(folder)
     ball(folder / "vessel.stl", 6.0, (-35, -25, 30))
@@ -44,7 +43,6 @@ def patient(tmp_path_factory):
 
 
 def breathing(**keys):
-    """Thirty millimetres to the feet and a little to the front: enough to bring ribs in."""
     direction = np.array([0.1, -0.2, -1.0])
     usual = {"amplitude_mm": 30.0, "direction_ct": direction / np.linalg.norm(direction), "weights": ByName(WEIGHTS)}
     return Breathing(**{**usual, "phases": 8, "exponent": 2, "scanned_at": 0.0, "gate": None, **keys})
@@ -56,9 +54,17 @@ def searched(patient, breath=None, case=None, anatomy=None):
     return organ_candidates(case, anatomy, engine, case.directions())
 
 
-def moved_body(patient, breath, s):
-    """The oracle: every mesh truly moved to where it is at a position, and the target with it."""
+@pytest.fixture(scope="module")
+def static(patient):
+    return searched(patient)
 
+
+@pytest.fixture(scope="module")
+def every(patient):
+    return searched(patient, breathing())
+
+
+def moved_body(patient, breath, s):
     def moved(mesh, weight):
         return mesh.transformed(pose(np.eye(3), breath.moved_ct(s, weight)))
 
@@ -72,9 +78,9 @@ def moved_body(patient, breath, s):
 
 
 @pytest.mark.parametrize(("gate", "scanned_at"), [(None, 0.0), (0.4, 0.6)])
-def test_phases_are_those_of_a_body_that_is_moved_and_searched_anew(patient, gate, scanned_at):
+def test_phases_are_those_of_a_body_that_is_moved_and_searched_anew(patient, static, gate, scanned_at):
     breath = breathing(gate=gate, scanned_at=scanned_at)
-    found, static = searched(patient, breath), searched(patient)
+    found = searched(patient, breath)
     anew = [searched(patient, None, *moved_body(patient, breath, s)) for s in breath.positions]
     safe = np.array([one.safe for one in anew])
     window = breath.in_window
@@ -89,10 +95,10 @@ def test_phases_are_those_of_a_body_that_is_moved_and_searched_anew(patient, gat
     assert np.isnan(found.breathing.clearance[~static.safe]).all()
 
 
-def test_what_passes_the_needle_between_two_positions_is_found(patient):
+def test_what_passes_the_needle_between_two_positions_is_found(patient, static):
     """Two positions 30 mm apart: what is safe is so at 61 between, what is not comes nearer than a tenth somewhere."""
     breath = breathing(phases=2)
-    found, static = searched(patient, breath), searched(patient)
+    found = searched(patient, breath)
     between = np.linspace(0, 1, 61)
     anew = [searched(patient, None, *moved_body(patient, breath, s)) for s in between]
     safe = np.array([one.safe for one in anew])
@@ -104,30 +110,12 @@ def test_what_passes_the_needle_between_two_positions_is_found(patient):
     assert np.all(excess[lost] < 0.1 + 30.0 * 1.4 / 60 / 2)
 
 
-def test_the_breath_only_takes_away_and_a_gate_gives_back(patient):
-    """Every phase within the gated set, and that within the body at rest; the example has some of each."""
-    every, gated, static = searched(patient, breathing()), searched(patient, breathing(gate=0.4)), searched(patient)
+def test_a_breath_only_takes_away_and_says_where_and_when(patient, static, every):
+    gated = searched(patient, breathing(gate=0.4))
     assert 0 < every.safe.sum() < gated.safe.sum() < static.safe.sum()
     assert not np.any(every.safe & ~gated.safe) and not np.any(gated.safe & ~static.safe)
     np.testing.assert_array_equal(gated.breathing.safe_all_phases, every.safe)
-
-
-@pytest.mark.parametrize("breath", [breathing(amplitude_mm=0.0), breathing(phases=1), breathing(gate=0.0)])
-def test_a_body_that_does_not_move_keeps_its_map(patient, breath):
-    """No amplitude, one phase, or a gate at exhale, where the CT was taken: all of today's columns, to the last bit."""
-    found, static = searched(patient, breath), searched(patient)
-    today, moving = to_table(static), to_table(found)
-    assert moving.select(today.column_names).equals(today)
-    assert moving.column_names[len(today.column_names) :] == [
-        "safe_all_phases",
-        "worst_phase",
-        "breathing_clearance_mm",
-    ]
-
-
-def test_a_rejected_direction_names_structure_and_phase(patient):
-    """And says how near it comes there; what was rejected before keeps its reason."""
-    found, static = searched(patient, breathing()), searched(patient)
+    found = every
     new = static.safe & ~found.safe
     assert set(found.verdict.reason[new]) == {"unsafe_when_breathing"}
     hit = [row for row in np.flatnonzero(new) if "hits a structure" in found.verdict.detail[row]]
@@ -138,16 +126,25 @@ def test_a_rejected_direction_names_structure_and_phase(patient):
         assert not found.verdict.amount[row] >= margins[found.verdict.structure[row]]
     before = ~static.safe
     np.testing.assert_array_equal(found.verdict.reason[before], static.verdict.reason[before])
+    assert every.safe_text.endswith("at each phase if inserted at that phase")
+    assert gated.safe_text.endswith("when gated to this window (s <= 0.4)")
+    assert "stay" not in every.safe_text
 
 
-def test_what_is_safe_says_when_and_never_that_a_needle_may_stay(patient):
-    assert searched(patient, breathing()).safe_text.endswith("at each phase if inserted at that phase")
-    assert searched(patient, breathing(gate=0.25)).safe_text.endswith("when gated to this window (s <= 0.25)")
-    assert "stay" not in searched(patient, breathing()).safe_text
+@pytest.mark.parametrize("breath", [breathing(amplitude_mm=0.0), breathing(phases=1), breathing(gate=0.0)])
+def test_a_body_that_does_not_move_keeps_its_map(patient, static, breath):
+    """No amplitude, one phase, or a gate at exhale, where the CT was taken: all of today's columns, to the last bit."""
+    found = searched(patient, breath)
+    today, moving = to_table(static), to_table(found)
+    assert moving.select(today.column_names).equals(today)
+    assert moving.column_names[len(today.column_names) :] == [
+        "safe_all_phases",
+        "worst_phase",
+        "breathing_clearance_mm",
+    ]
 
 
 def test_a_weight_for_the_targets_own_structure_is_refused_unless_it_is_one(patient):
-    """The amplitude is the target's; a pattern for all does not mean it."""
     with refused("breathing_weight"):
         searched(patient, breathing(weights=ByName({**WEIGHTS, "organ": 0.5})))
     rest = searched(patient, breathing(weights=ByName({"*": 0.0})))
@@ -156,13 +153,11 @@ def test_a_weight_for_the_targets_own_structure_is_refused_unless_it_is_one(pati
 
 
 def test_a_breath_that_takes_the_target_out_of_the_skin_leaves_nothing_safe(patient):
-    """A skin that stays, and a target that leaves it, are a slip of weights: nothing is known then."""
     found = searched(patient, breathing(amplitude_mm=95.0, weights=ByName({"*": 0.0})))
     assert not found.safe.any()
 
 
 def test_where_nothing_is_safe_before_the_breath_nothing_is_safe_with_it(patient, tmp_path, capfd):
-    """It was a traceback, exit code 3: of no direction no crossings were made."""
     strict = replace(patient.case, needle=replace(patient.case.needle, shaft_mm=30.0))
     found = searched(patient, breathing(), case=strict)
     assert not found.safe.any() and np.array_equal(found.verdict.reason, searched(patient, case=strict).verdict.reason)
@@ -176,12 +171,9 @@ def test_where_nothing_is_safe_before_the_breath_nothing_is_safe_with_it(patient
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_a_certificate_refuses_a_body_that_moves(patient):
+def test_a_certificate_refuses_a_body_that_moves_before_a_search(patient, tmp_path):
     with refused("not_certifiable"):
         certify(replace(patient.case, breathing=breathing()), patient.anatomy, size=0.1)
-
-
-def test_a_search_that_cannot_be_certified_searches_nothing(patient, tmp_path):
     context = replace(patient, case=replace(patient.case, breathing=breathing()))
     with refused("not_certifiable"):
         search_case(context, tmp_path / "out", certify=CertifyOptions(1.0, None))
@@ -189,7 +181,6 @@ def test_a_search_that_cannot_be_certified_searches_nothing(patient, tmp_path):
 
 
 def test_the_arm_is_checked_where_the_breath_puts_target_and_skin():
-    """Against an arm that is asked anew in a carton whose skin, obstacles apart, truly moved."""
     context = prepare(folder() / "carton" / "case_m.toml")
     weights = ByName({"*": 0.5})
     breath = breathing(amplitude_mm=60.0, weights=weights, direction_ct=np.array([1.0, 0, 0]), phases=2)
@@ -198,7 +189,7 @@ def test_the_arm_is_checked_where_the_breath_puts_target_and_skin():
     base = context.placement.T_base_ct
     organs = organ_candidates(case, context.anatomy, context.engine, case.directions())
     static = with_reach(case, organs, context.reach)
-    found = with_breathing_reach(case, context.anatomy, static, context.reach)
+    found = with_breathing_reach(case, case.breathing, context.anatomy, static, context.reach)
     there = replace(case, target_ct=case.target_ct + breath.moved_ct(1.0), breathing=None)
     moved = pose(np.eye(3), breath.moved_ct(1.0, 0.5))
     skin = context.anatomy.skin
@@ -215,7 +206,6 @@ def test_the_arm_is_checked_where_the_breath_puts_target_and_skin():
 
 @pytest.mark.parametrize("frame", ["ct", "base"])
 def test_the_arm_is_checked_against_an_obstacle_where_its_stated_weight_puts_it(frame):
-    """A box that moves twice as far as the target: as in a case whose box truly stands there."""
     context = prepare(folder() / "carton" / "case_m.toml")
     base, by = context.placement.T_base_ct, np.array([60.0, 0.0, 0.0])
     weights = ByName({"*": 1.0, "box": 2.0})
@@ -229,7 +219,9 @@ def test_the_arm_is_checked_against_an_obstacle_where_its_stated_weight_puts_it(
     anatomy = with_surroundings(replace(context.anatomy, surroundings=()), case, base)
     organs = organ_candidates(replace(bare, breathing=None), context.anatomy, context.engine, bare.directions())
     static = with_reach(case, organs, ArmReach(partial(case_checker, case, anatomy, base), base))
-    found = with_breathing_reach(case, anatomy, static, ArmReach(partial(case_checker, case, anatomy, base), base))
+    found = with_breathing_reach(
+        case, case.breathing, anatomy, static, ArmReach(partial(case_checker, case, anatomy, base), base)
+    )
     skin = anatomy.skin
     body = replace(anatomy, skin=replace(skin, mesh=skin.mesh.transformed(pose(np.eye(3), by))))
 

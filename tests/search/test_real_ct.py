@@ -21,7 +21,6 @@ pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="the real CT (totalseg
 
 @pytest.fixture(scope="module")
 def searches(tmp_path_factory):
-    """Both cases beside the data, searched at 4° without the arm."""
     here = tmp_path_factory.mktemp("real")
     for file in CASES.iterdir():
         shutil.copy(file, here)
@@ -38,12 +37,23 @@ def _searched(path):
     return context, context.search()
 
 
-def test_every_structure_is_there_and_closed(searches):
-    """58 organs, vessels and bones of version 1 and 60 of version 2, beside the liver; each a closed surface."""
+def test_every_structure_is_closed_and_the_maps_agree_by_and_large(searches, record_property):
     for version, count in (("v1", 61), ("v2", 63)):
         structures = searches[version][0].anatomy.structures
         assert len(structures) == count
         assert all(s.mesh.closed for s in structures)
+    for context, found in searches.values():
+        rows = found.safe
+        assert rows.sum() > 20
+        demanding = ~np.isnan(found.clearance.margins)
+        assert (found.clearance.distance[rows][:, demanding] >= found.clearance.margins[demanding] - 1e-4).all()
+        assert (found.path.length[rows] <= context.case.needle.shaft_mm).all()
+        assert (found.path.skin_angle[rows] <= context.case.search.max_skin_angle).all()
+    verdicts = [searches[version][1].safe for version in ("v1", "v2")]
+    differ = int(np.sum(verdicts[0] != verdicts[1]))
+    record_property("verdicts that differ", f"{differ} of {len(verdicts[0])}")
+
+    assert 0 < differ < 0.2 * len(verdicts[0])
 
 
 def flange_beyond(context, found):
@@ -59,7 +69,6 @@ def path_of(found):
 
 
 def test_where_nothing_says_where_the_arms_lie_no_flange_leaves_the_image(searches):
-    """The field of view cuts four faces of this body: a needle keeps its radius and the margin from their planes."""
     context, found = searches["v2"]
     assert context.anatomy.skin.field_of_view.cut.sum() == 4
     beyond = flange_beyond(context, found)
@@ -88,23 +97,3 @@ def test_what_hangs_on_the_body_beyond_is_what_a_search_without_it_adds(searches
         outside = ((index < 0) | (index >= body.shape)).any(axis=1)
         nearest = np.clip(index, 0, np.array(body.shape) - 1)
         assert not body[tuple(nearest[outside].T)].any()
-
-
-def test_some_paths_are_safe_and_keep_every_margin(searches):
-    """Each safe row keeps each margin, enters through skin, and is short and steep enough."""
-    for context, found in searches.values():
-        rows = found.safe
-        assert rows.sum() > 20
-        demanding = ~np.isnan(found.clearance.margins)
-        assert (found.clearance.distance[rows][:, demanding] >= found.clearance.margins[demanding] - 1e-4).all()
-        assert (found.path.length[rows] <= context.case.needle.shaft_mm).all()
-        assert (found.path.skin_angle[rows] <= context.case.search.max_skin_angle).all()
-
-
-def test_two_label_maps_of_one_patient_disagree(searches, record_property):
-    """How many verdicts differ between version 1 and version 2 is reported; most must agree."""
-    verdicts = [searches[version][1].safe for version in ("v1", "v2")]
-    differ = int(np.sum(verdicts[0] != verdicts[1]))
-    record_property("verdicts that differ", f"{differ} of {len(verdicts[0])}")
-
-    assert 0 < differ < 0.2 * len(verdicts[0])

@@ -21,7 +21,6 @@ def case(tmp_path_factory):
 
 
 def test_another_target_is_what_the_case_with_that_target_is(tmp_path):
-    """Candidates, inputs, findings and placement are those of the case prepared anew, the second time too."""
     context = prepare(coarse_carton(tmp_path / "carton"))
     for target in context.case.target_ct + [[0.5, -0.4, -1.0], [-0.5, 0.4, -2.0]]:
         moved, fresh = context.at(target), prepare(context.case.replace(target_ct=target))
@@ -38,7 +37,6 @@ def test_another_target_is_what_the_case_with_that_target_is(tmp_path):
 
 
 def test_of_two_phantoms_another_target_chooses_the_one_that_holds_it(tmp_path):
-    """The smaller block at x = -70, the larger at 70, and back; between them there is no body."""
     x, y, z = (np.arange(-160.0, 161.0, 5.0)[at] for at in np.ix_(*[range(65)] * 3))
     dense = [np.maximum(abs(x - at), np.maximum(abs(y), abs(z))) < half for at, half in ((-70.0, 42.0), (70.0, 52.0))]
     air = np.random.default_rng(1).normal(-1000.0, 10.0, dense[0].shape)
@@ -58,7 +56,6 @@ def test_of_two_phantoms_another_target_chooses_the_one_that_holds_it(tmp_path):
 
 
 def test_a_target_that_the_case_could_not_have_is_refused(case):
-    """Outside the label map, outside its structure, and no point at all."""
     context = prepare(case, arm=False)
     for target, code in (([0.0, 0.0, 500.0], "labels_end"), ([0.0, 0.0, 40.0], "target_misplaced")):
         with refused(code):
@@ -68,7 +65,6 @@ def test_a_target_that_the_case_could_not_have_is_refused(case):
 
 
 def test_the_map_is_that_of_the_reference_engine(case):
-    """FCL alone, right by definition, blocks the same directions by the same structures: rib, vessel, and a table."""
     path = case.with_name("table.toml")
     table = (
         '[[obstacle]]\nname = "table"\nframe = "ct"\ncenter_mm = [0.0, 130.0, 0.0]\nsize_mm = [300.0, 40.0, 400.0]\n'
@@ -82,7 +78,6 @@ def test_the_map_is_that_of_the_reference_engine(case):
 
 
 def test_the_best_target_has_the_widest_window_and_is_a_case(case):
-    """Its window is that of its own search; of points that the case could not have none is taken."""
     context = prepare(case, arm=False)
     found = pt.best_target(context, [[0.0, 0.0, 40.0], [2.0, 3.0, 1.0], [-3.0, -2.0, 0.0]])
     windows = [
@@ -98,17 +93,13 @@ def test_the_best_target_has_the_widest_window_and_is_a_case(case):
         pt.best_target(context, np.zeros((0, 3)))
 
 
-def test_a_moved_context_goes_to_another_process_without_its_memory(case):
-    """What it holds of other targets stays here, and the map there is the same."""
+def test_a_moved_context_goes_to_another_process_and_threads_share_one(case):
     context = prepare(case, arm=False).at([2.0, 3.0, 1.0])
     assert context.memory.held_bytes > 0
     sent = pickle.loads(pickle.dumps(context))
     assert sent.memory.held_bytes == 0
     assert np.array_equal(pt.safe_map(sent).structure, pt.safe_map(context).structure)
     assert np.array_equal(sent.at([0.0, 1.0, 0.0]).case.target_ct, [0.0, 1.0, 0.0])
-
-
-def test_threads_share_a_context(case):
     context, targets = prepare(case, arm=False), [[0.5 * k, 0.2 * k, -0.3 * k] for k in range(8)]
     with ThreadPoolExecutor(4) as pool:
         found = list(pool.map(lambda target: pt.safe_map(context, target).structure, targets))

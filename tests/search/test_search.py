@@ -33,14 +33,21 @@ def found(carton):
     return carton.search()
 
 
-def test_every_direction_has_one_row(carton, found):
-    """46 x 180 directions at 2°, each with a verdict, in the grid's order."""
+def test_every_direction_has_one_row_ranked_by_cost(carton, found):
     assert len(found) == 46 * 180
     R = carton.case.T_ct_entry[:3, :3]
     np.testing.assert_allclose(found.outward_ct, outward(found.theta, found.beta) @ R.T, atol=1e-12)
     assert set(found.verdict.reason) <= {reason.value for reason in Reason}
     assert sum(found.counts().values()) == len(found)
     assert (found.arm.reachable == -1).all()
+    order = found.ranked
+    assert (
+        np.diff(found.ranking.cost[order]) >= -1e-9
+    ).all()  # costs that agree to nine digits keep the order of the grid
+    np.testing.assert_array_equal(np.sort(found.ranking.rank[found.safe]), np.arange(1, found.safe.sum() + 1))
+    assert np.isnan(found.ranking.cost[~found.safe]).all()
+    assert not found.ranking.pareto[~found.safe].any()
+    assert found.ranking.pareto[order[0]]
 
 
 def test_clearances_equal_the_analytic_truth(carton, found, rng):
@@ -54,19 +61,7 @@ def test_clearances_equal_the_analytic_truth(carton, found, rng):
                 assert found.clearance.distance[row, column] == pytest.approx(truth, abs=0.02)
 
 
-def test_the_ranks_follow_the_cost(found):
-    order = found.ranked
-    assert (
-        np.diff(found.ranking.cost[order]) >= -1e-9
-    ).all()  # costs that agree to nine digits keep the order of the grid
-    np.testing.assert_array_equal(np.sort(found.ranking.rank[found.safe]), np.arange(1, found.safe.sum() + 1))
-    assert np.isnan(found.ranking.cost[~found.safe]).all()
-    assert not found.ranking.pareto[~found.safe].any()
-    assert found.ranking.pareto[order[0]]
-
-
 def test_the_table_holds_what_was_found(carton, found, tmp_path):
-    """The Parquet file has every column, in mm and degrees, and says where it comes from."""
     path = tmp_path / "candidates.parquet"
     write_table(found, path)
     table = pq.read_table(path)
@@ -85,7 +80,6 @@ def test_the_table_holds_what_was_found(carton, found, tmp_path):
 
 
 def test_tissue_is_the_length_inside(carton, found, ball):
-    """Through a ball of radius 20 about a point 60 mm away: two radii where the path goes through its centre."""
     organ = Structure("organ", Role.TRAVERSE, 0, ball(20, (0, 0, 60), 5), "")
     up = np.array([[0, 0, 1.0], [0, 0, 1.0], [0, 0, 1.0], [1.0, 0, 0]])
     lengths = inside_length(organ, np.zeros(3), up, np.array([100.0, 60, 30, 100]))
@@ -121,16 +115,12 @@ def test_each_term_of_the_cost_says_what_it_should():
     np.testing.assert_array_equal(order.pareto, [False, True])
 
 
-def test_the_fast_engine_and_fcl_give_the_same_table(carton, found):
+def test_other_engines_give_the_same_or_are_caught(carton, found):
     plain = prepare(folder() / "carton" / "case_m.toml", arm=False, engine="fcl").search()
     np.testing.assert_array_equal(plain.verdict.reason, found.verdict.reason)
     np.testing.assert_array_equal(plain.verdict.structure, found.verdict.structure)
     np.testing.assert_allclose(plain.clearance.distance, found.clearance.distance, atol=1e-9)
     np.testing.assert_array_equal(plain.ranking.rank, found.ranking.rank)
-
-
-def test_the_cross_check_sees_a_wrong_engine(carton):
-    """An engine that errs by a thousandth of a millimetre in one structure is caught."""
     assert carton.cross_check(40).pairs == 40 * 4  # three bolts and the table
 
     class Wrong:
@@ -140,8 +130,16 @@ def test_the_cross_check_sees_a_wrong_engine(carton):
 
     with pytest.raises(CrossCheckError, match="structure 2: the engine finds"):
         replace(carton, engine=Wrong()).cross_check(40)
-
-
-def test_an_unknown_engine_is_refused():
     with refused("unknown_engine", "quick"):
         prepare(folder() / "carton" / "case_m.toml", engine="quick")
+
+
+@pytest.mark.parametrize(("voxel_mm", "shown"), [(0.0, "5.00"), (0.7, "5.00"), (1.0, "5.0"), (3.0, "5.0")])
+def test_clearances_of_coarse_voxels_are_printed_without_hundredths_and_json_keeps_them(carton, voxel_mm, shown):
+    found = carton.explain(0.0, 0.0)
+    voxel_ct = voxel_mm * np.eye(3) if voxel_mm else None
+    structures = tuple(replace(one, voxel_ct=voxel_ct) for one in found.anatomy.structures)
+    coarse = replace(found, anatomy=replace(found.anatomy, structures=structures))
+    line = next(line for line in coarse.text().splitlines() if line.split()[:1] == ["bolt_h"])
+    assert line.split()[2] == shown
+    assert coarse.summary()["clearance_mm"] == found.summary()["clearance_mm"]

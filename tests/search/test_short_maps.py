@@ -32,7 +32,6 @@ def oblique_case(folder, half_mm, turn):
 
 @pytest.mark.parametrize("degrees", [(0, 0, 0), (0, 0, 45), (20, -30, 40), (90, 0, 0), (180, 0, 5)])
 def test_an_oblique_map_that_holds_the_body_is_accepted(tmp_path, degrees):
-    """The corners of the body's box lie outside of a turned map; the body does not."""
     turn = Rotation.from_euler("xyz", degrees, degrees=True)
     names = [s.name for s in prepare(oblique_case(tmp_path, 92.0, turn), arm=False).anatomy.structures]
     assert "vessel" in names
@@ -65,7 +64,6 @@ def test_only_what_the_needle_reaches_counts(tmp_path, half_mm, ends):
 
 
 def vessels():
-    """Labels (z, y, x) of the usual body's box: one vessel to each side of the target, label 3."""
     at = np.arange(100) * STEP_MM - 99.0
     z, y, x = np.meshgrid(at, at, at, indexing="ij")
     labels = np.zeros(z.shape, np.uint8)
@@ -75,7 +73,6 @@ def vessels():
 
 
 def verdicts(folder, labels, first):
-    """Which of all directions are safe, and the reasons, with a map whose voxel (0, 0, 0) is at an index (z, y, x)."""
     folder.mkdir()
     search = "theta_deg = [0, 180]\nstep_deg = 6.0"
     path = write_case(folder, ("theta_deg = [0, 10]\nstep_deg = 10.0", search))
@@ -100,7 +97,6 @@ def before(tmp_path_factory):
     ],
 )  # fmt: skip
 def test_what_was_unsafe_is_never_safe_with_a_cropped_map(tmp_path, before, kept):
-    """Whichever sides were cut off, with or without the vessel there; and some directions stay safe."""
     labels = vessels()
     after, reason, structure = verdicts(tmp_path / "cut", labels[kept], [one.start or 0 for one in kept])
     assert before.sum() > 1000

@@ -32,7 +32,6 @@ def test_the_grid_covers_the_sides_that_are_open(closed, theta, frame):
 
 
 def test_it_is_said_in_words():
-    """Where, and why not elsewhere; closed for one reason they share a sentence."""
     opened = [side("front", True), side("back", False), side("right", True), side("left", True)]
     assert sides_text(opened) == "front and sides; the back lies on the table"
     oblique = side("left", False, "is met too obliquely")
@@ -59,7 +58,6 @@ def test_a_side_is_open_as_far_as_the_needle_reaches(tmp_path, place, near):
 
 
 def test_what_is_searched_is_what_the_grid_holds(tmp_path):
-    """Half of a grid about the front holds no back; a wider one does."""
     wide, narrow = (prepare(write_case(tmp_path, ("[0, 10]", f"[0, {most}]")), arm=False).sides for most in (180, 90))
     assert all(one.searched == pytest.approx(1.0) for one in wide)
     assert sides_text(wide, searched=True) == "front and sides; the back is where the image does not show the body"
@@ -72,14 +70,11 @@ def test_what_is_searched_is_what_the_grid_holds(tmp_path):
     assert searched["front"] == pytest.approx(1.0) and searched["back"] == 0.0
 
 
-def test_without_a_ct_the_back_lies_on_something(tmp_path):
+def test_without_a_ct_the_back_lies_on_something_and_a_local_place_has_no_sides(tmp_path):
     path = write_case(tmp_path)
     backs = []
     for more in ("", '\n[ct]\ntable = "none"\n'):
         path.write_text(path.read_text() + more)
         backs.append({one.name: one.is_open for one in prepare(path, arm=False).sides}["back"])
     assert backs == [False, True]
-
-
-def test_a_place_without_a_head_has_no_sides():
     assert sides_of(SimpleNamespace(space=Space.LOCAL), SimpleNamespace()) == ()

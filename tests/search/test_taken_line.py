@@ -23,7 +23,6 @@ def context():
 
 @pytest.fixture(scope="module")
 def best(context):
-    """A safe direction of a coarse grid, unit vector (3,)."""
     theta, beta = np.meshgrid(np.radians(np.arange(20, 80, 10)), np.radians(np.arange(0, 360, 20)))
     found = context.check(theta.ravel(), beta.ravel())
     return found.outward_ct[np.flatnonzero(found.safe)[np.argmax(found.clearance.least[found.safe])]]
@@ -36,7 +35,6 @@ def straight(context, outward, off=(0.0, 0.0, 0.0)):
 
 @pytest.mark.parametrize("pieces", [1, 12])
 def test_a_needle_on_a_direction_has_that_directions_clearances(context, pieces):
-    """In one piece or in many: every structure's clearance is that of `check`, and so is the verdict."""
     theta, beta = np.radians([25.0, 60.0, 40.0]), np.radians([30.0, 200.0, 120.0])
     candidates = context.check(theta, beta)
     for row, outward in enumerate(candidates.outward_ct):
@@ -56,7 +54,6 @@ def test_a_needle_on_a_direction_has_that_directions_clearances(context, pieces)
 
 
 def test_clearance_of_a_bent_needle_is_that_of_its_points(context, best):
-    """Against the distances of densely spread points from every triangle."""
     s = np.linspace(0.0, 80.0, 17)
     side = np.cross(best, [0.0, 0.0, 1.0])
     path = context.case.target_ct + np.outer(s, best) + np.outer(0.002 * s**2, side / np.linalg.norm(side))
@@ -72,7 +69,6 @@ def test_clearance_of_a_bent_needle_is_that_of_its_points(context, best):
 
 
 def test_what_the_reading_errs_is_no_safety(context, best):
-    """A clear line is safe, not so if its reading might be off by its slack: and one through a rib never."""
     path = straight(context, best)
     known = check_line(context, path, exact(path))
     assert known.verdict == SAFE and all(one.sure for one in known.each)
@@ -114,7 +110,6 @@ def test_a_tip_outside_of_the_body_has_no_safe_line(context, best):
 
 
 def test_the_chance_to_hit_is_that_of_draws(context):
-    """A tip read beside the target, in a ball of errors: by directional simulation, and by 20,000 draws."""
     rng = np.random.default_rng(5)
     mesh, target = context.anatomy.structure("lesion").mesh, context.case.target_ct
     size = float(np.ptp(mesh.vertices, axis=0).mean()) / 2
@@ -127,7 +122,6 @@ def test_the_chance_to_hit_is_that_of_draws(context):
 
 
 def test_next_aims(context, best):
-    """On the target it is accepted; short of it deeper; beside it turned, about its entry."""
     cov = np.diag([0.04] * 3 + [1e-6] * 3)
     side = np.cross(best, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)

@@ -10,7 +10,13 @@ from uncertainty_world import declared, world
 
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.search.context import prepare
-from puncture_twin.planning.search.uncertainty_breakdown import WISHED_HIT, chance_text, goals_of, shrinkable
+from puncture_twin.planning.search.uncertainty_breakdown import (
+    WISHED_HIT,
+    ShrinkableNeedle,
+    chance_text,
+    error_parts,
+    goals_of,
+)
 from puncture_twin.planning.uncertainty.chance_model import ChanceModel
 from puncture_twin.planning.uncertainty.hit import HitModel, hit_in_ball, proximity
 from puncture_twin.planning.uncertainty.lines import Needles
@@ -20,7 +26,6 @@ KEYS = {"ct_in_plane_mm": 0.3, "ct_slice_mm": 1.2, "bed_axis": (1.0, 0.0, 0.0), 
 
 
 def asked(radius_mm, **keys):
-    """A puncture of the abdomen with declared errors, and the sources of its needle."""
     made = world("abdomen/case.toml", "rigid", declared(**keys))
     case, q = load_case(ROOT / "meshes" / "abdomen"), made.puncture.q_insertion
     anatomy = SimpleNamespace(checked=(SimpleNamespace(name="rib", demands_margin=True, margin_mm=1.0),))
@@ -30,17 +35,13 @@ def asked(radius_mm, **keys):
     normal /= np.linalg.norm(normal)
     cov_ct, off = made.error.covariance_ct(q[None]), np.full((1, 1), keys.get("surface_mm", 0.0))
     near = proximity(np.array([[2.0]]), np.array([[30.0]]), normal[:, None], outward, cov_ct, off)
-    return made, shrinkable(model, Needles(outward, cov_ct, near, off, None), q)
+    return made, ShrinkableNeedle(model, Needles(outward, cov_ct, near, off, None), error_parts(model, q))
 
 
-def test_parts_add_up_to_the_chance_of_the_table():
+def test_parts_add_up_and_shrinking_gives_the_wished_chance():
     made, needle = asked(1.5, **KEYS)
     told = hit_in_ball(made.error.tip_covariance(made.puncture.q_insertion[None]), 1.5)[0]
     assert needle.chance("", {}) == pytest.approx(told, abs=1e-9)
-
-
-def test_a_source_that_shrinks_to_what_is_told_gives_the_wished_chance():
-    """Each remedy, declared anew, gives the chance: the method is rigid, so that the weights stay."""
     made, needle = asked(2.0, **KEYS)
     p_hit = needle.chance("", {})
     (goal,) = goals_of(needle, p_hit, {"rib": 0.0})
@@ -51,9 +52,6 @@ def test_a_source_that_shrinks_to_what_is_told_gives_the_wished_chance():
         again, _ = asked(2.0, **(KEYS | {SOURCES[remedy.source].key: remedy.needed}))
         told = hit_in_ball(again.error.tip_covariance(made.puncture.q_insertion[None]), 2.0)[0]
         assert told == pytest.approx(WISHED_HIT, abs=1e-5)
-
-
-def test_where_no_single_source_is_enough_all_together_are():
     _, needle = asked(0.3, **KEYS)
     (goal,) = goals_of(needle, needle.chance("", {}), {})
     assert not goal.remedies and "no single error suffices" in goal.text()
@@ -90,18 +88,15 @@ SHOWN = {1.0: ">0.9999", 0.0: "<0.0001", 0.93: "0.93", 1 - 1e-9: ">0.9999", 0.00
 
 @pytest.mark.parametrize(("chance", "words"), SHOWN.items())
 def test_what_is_not_sure_never_reads_as_sure(chance, words):
-    """Neither 0 nor 1 by rounding."""
     assert chance_text(chance) == words
 
 
 @pytest.fixture(scope="module")
 def carton():
-    """The carton, which declares its errors and a radius within which its target counts as hit."""
     return prepare(ROOT / "meshes" / "carton" / "case_m.toml")
 
 
-def test_explanation_says_the_chances_of_the_table(carton):
-    """To the last bit, with the sources and the test of the declaration."""
+def test_explanation_says_the_chances_of_the_table_or_that_there_are_none(carton):
     found = carton.explain(np.radians(18), np.radians(232))
     chances = found.summary()["chances"]
     assert chances["p_hit"] == found.candidates.chances.hit[0]
@@ -110,8 +105,5 @@ def test_explanation_says_the_chances_of_the_table(carton):
     text = found.text()
     assert f"{chance_text(chances['p_hit'])} to hit; " in text and "not modelled: breathing" in text
     assert "do not agree with the declared errors" in text
-
-
-def test_explanation_says_where_there_are_no_chances(carton):
     found = carton.explain(np.radians(90), np.radians(0))
     assert found.breakdown is None and found.summary()["chances"] is None and "no chances to hit" in found.text()

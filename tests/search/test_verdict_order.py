@@ -19,15 +19,7 @@ NAN = np.nan
 MAX_ANGLE = np.radians(60)
 
 
-def paths(rows):
-    """Skin paths of (length, angle in degrees, re-entry, unknown) per row."""
-    length, angle, reentry, unknown = np.array(rows, float).T
-    entry = np.zeros((len(length), 3))
-    return SkinPaths(entry, length, np.radians(angle), reentry, unknown)
-
-
 def structure(name, margin=2.0, role=Role.AVOID):
-    """A structure of no matter which shape."""
     return Structure(name, role, margin, DOT, "made")
 
 
@@ -36,11 +28,11 @@ def nothing(count):
     return Clearances(empty, empty, empty.astype(bool))
 
 
-def rated(skin_rows, clearances=None, structures=(), needle=NEEDLE):
-    """Verdicts as rows of (reason, structure, depth, amount)."""
-    skin = paths(skin_rows)
+def rated(skin_rows, clearances=None, structures=()):
+    length, angle, reentry, unknown = np.array(skin_rows, float).T
+    skin = SkinPaths(np.zeros((len(length), 3)), length, np.radians(angle), reentry, unknown)
     clearances = nothing(len(skin_rows)) if clearances is None else clearances
-    found = first_broken(skin, clearances, tuple(structures), needle=needle, max_skin_angle=MAX_ANGLE)
+    found = first_broken(skin, clearances, tuple(structures), needle=NEEDLE, max_skin_angle=MAX_ANGLE)
     return list(zip(found.reason, found.structure, found.depth, found.amount, strict=True))
 
 
@@ -51,7 +43,6 @@ def same(found, expected):
 
 
 def test_each_reason_of_the_skin_and_its_numbers():
-    """One row for each, in one call: what the reason names, where, and what fell short."""
     rows = [
         (100, 10, NAN, NAN),
         (100, 10, NAN, 70),
@@ -88,32 +79,22 @@ def test_the_first_broken_constraint_gives_the_reason():
         Reason.UNKNOWN_REGION, Reason.NO_SKIN_ENTRY, Reason.REENTERS_SKIN, Reason.TOO_LONG, Reason.SKIN_ANGLE,
         Reason.TOO_CLOSE,
     ]  # fmt: skip
-
-
-def test_limits_themselves_are_kept():
     assert [row[0] for row in rated([(150, 10, NAN, NAN), (100, 60, NAN, NAN)])] == ["", ""]
 
 
 @pytest.mark.parametrize(("standoff", "longest"), [(None, 150), (100.0, 90), (170.0, 150), (160.0, 150), (159.0, 149)])
 def test_the_longest_path(standoff, longest):
-    """The shaft; with a fixed standoff no more than leaves the tip its gap outside."""
     assert Needle(200.0, 150.0, 1.0, standoff, 10.0, 30.0).longest_path_mm == longest
 
 
-def scene():
-    """Four candidates and three structures: who is violated, by how much, and where."""
+def test_the_structure_that_lacks_most_is_named():
     clearance = np.array([[1.0, 4.0, -0.5], [1.0, 4.0, 0.5], [9.0, 9.0, 9.0], [1.5, 2.0, 0.9]])
     depth = np.array([[30.0, 20, 50], [30, 20, 10], [1, 2, 3], [30, 20, 10]])
     violated = np.array([[True, True, True], [True, False, False], [False, False, False], [True, True, False]])
-    return Clearances(clearance, depth, violated)
-
-
-def test_the_structure_that_lacks_most_is_named_with_its_depth_and_clearance():
-    """Margin less clearance decides, not the least clearance; what is not violated has no say."""
     structures = [structure("a", 2.0), structure("b", 7.0), structure("c", 1.0)]
     rows = [(100, 10, NAN, NAN)] * 4
     same(
-        rated(rows, scene(), structures),
+        rated(rows, Clearances(clearance, depth, violated), structures),
         [
             (Reason.TOO_CLOSE, "b", 20, 4),
             (Reason.TOO_CLOSE, "a", 30, 1),
@@ -121,20 +102,12 @@ def test_the_structure_that_lacks_most_is_named_with_its_depth_and_clearance():
             (Reason.TOO_CLOSE, "b", 20, 2),
         ],
     )
-
-
-def test_of_equal_lacks_the_one_met_first_is_named():
-    """Along the needle, whatever the order of the structures; without a structure there is column 0."""
     structures = tuple(structure(name, margin) for name, margin in (("a", 2.0), ("b", 5.0), ("c", 1.0)))
     clearances = Clearances(
         np.array([[1.0, 4.0, 0.0]] * 2), np.array([[30.0, 20, 50], [5, 20, 4]]), np.ones((2, 3), bool)
     )
     assert worst_violation(clearances, structures).tolist() == [1, 2]
     assert worst_violation(nothing(3), ()).tolist() == [0, 0, 0]
-
-
-def test_the_worst_structure_decides_between_unknown_and_too_close():
-    """Of a role unknown and one to avoid, whichever lacks more gives the reason."""
     clearances = Clearances(np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([[30.0, 20], [30, 20]]), np.ones((2, 2), bool))
     structures = [structure("fog", 2.0, Role.UNKNOWN), structure("vessel", 2.0)]
     same(
@@ -144,23 +117,18 @@ def test_the_worst_structure_decides_between_unknown_and_too_close():
 
 
 def rejected(reasons, distance=(), margins=()):
-    """As much of candidates as says how each failed: reasons; clearances and the margins of the same structures."""
     wanted = np.array([reason.value for reason in reasons], dtype=object)
     clear = SimpleNamespace(distance=np.array(distance, float), margins=np.array(margins, float))
     return SimpleNamespace(verdict=SimpleNamespace(reason=wanted), clearance=clear)
 
 
-def test_the_closest_miss_lacks_least_of_what_it_lacks_most():
-    """Of rows that lack only clearance; what has no margin is not asked, and other rows are not looked at."""
+def test_the_closest_miss():
     close, angle = Reason.TOO_CLOSE, Reason.SKIN_ANGLE
     distance = [[1.9, -9, 9.0], [1.0, -9, 4.0], [4.0, -9, 3.5], [0.5, 9, 9.0]]
     found = rejected([angle, close, close, close], distance, [2.0, NAN, 5.0])
     assert closest_miss(found) == 1
     assert closest_miss(rejected([close, close, close, close], distance, [2.0, NAN, 5.0])) == 0
     assert closest_miss(rejected([angle, close, close, angle], [[0.0], [1.0], [1.5], [1.9]], [2.0])) == 2
-
-
-def test_without_one_that_lacks_clearance_it_is_the_one_that_passed_most():
     found = rejected([Reason.TOO_LONG, Reason.SKIN_ANGLE, Reason.UNREACHABLE, Reason.UNREACHABLE, Reason.TOO_LONG])
     assert closest_miss(found) == 2
     assert closest_miss(rejected([Reason.UNKNOWN_REGION, Reason.REENTERS_SKIN, Reason.TOO_LONG])) == 2

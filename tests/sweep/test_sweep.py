@@ -27,18 +27,15 @@ def quiet(*_):
 
 @pytest.fixture(scope="module")
 def context():
-    """The carton, without a search."""
     return prepare(CASE)
 
 
 @pytest.fixture(scope="module")
 def plan(context):
-    """Eleven directions."""
     return plan_sweep(context, tuple(START), tuple(END), seed=1, progress=quiet)
 
 
-def test_the_plan_goes_through_every_direction_and_keeps_its_point(context, plan):
-    """The needle's axis at each sample: through the point, and along the line in theta and beta."""
+def test_the_plan_goes_through_every_direction_free_of_contact(context, plan):
     assert plan.stopped == ""
     np.testing.assert_allclose(plan.angles[[0, -1]], [START, END])
     T = flange_pose(plan.model, plan.sweep.q)
@@ -48,10 +45,6 @@ def test_the_plan_goes_through_every_direction_and_keeps_its_point(context, plan
     theta = np.degrees(np.arccos(along[:, 2]))
     np.testing.assert_allclose(theta[[0, -1]], np.degrees([START[0], END[0]]), atol=1e-6)
     assert (np.diff(theta) > -1e-9).all()
-
-
-def test_every_state_is_free_with_the_needle_outside(context, plan):
-    """FCL alone, over the timed motion."""
     for q in plan.sweep.q[:: max(1, len(plan.sweep.q) // 20)]:
         assert context.reach.checker.contact(q, needle_may_touch_patient=False) is None
         tip = flange_pose(plan.model, q)
@@ -62,7 +55,6 @@ def test_every_state_is_free_with_the_needle_outside(context, plan):
 
 @pytest.mark.parametrize("control", ["position", "impedance"])
 def test_the_virtual_tcp_stays_on_its_point(context, plan, control):
-    """.05 mm are allowed; nothing is touched."""
     case = dataclasses.replace(context.case, rehearsal=RehearsalSection(control=control))
     swept = execute_sweep(plan, case, context.anatomy, context.placement.T_base_ct)
     assert swept.contacts == ()
@@ -70,7 +62,6 @@ def test_the_virtual_tcp_stays_on_its_point(context, plan, control):
 
 
 def test_a_sweep_stops_where_the_search_says_no(context, tmp_path):
-    """Toward a direction that is rejected: as far as allowed, with the place and the reason; the answer is no."""
     wanted = np.radians([22.0, 260.0])
     run = sweep_case(context, tmp_path, Choice(angles=tuple(START)), tuple(wanted))
     assert not run.whole
@@ -102,20 +93,14 @@ def test_a_box_on_the_way_stops_the_arm(context, plan):
         assert stopped.stopped and len(stopped.angles) < len(plan.angles)
 
 
-def test_a_start_that_is_rejected_gives_no_sweep(context):
-    """With its reason."""
+def test_a_sweep_to_its_start_or_from_a_rejected_one_is_refused(context):
     with refused("sweep_stops", "20.0", "40.0", by=NoAnswerError):
         plan_sweep(context, tuple(np.radians([20.0, 40.0])), tuple(END), seed=1, progress=quiet)
-
-
-def test_a_sweep_to_its_start_is_refused(context):
-    """Nothing would move."""
     with refused("no_motion"):
         plan_sweep(context, tuple(START), tuple(START), seed=1, progress=quiet)
 
 
 @pytest.mark.parametrize("text", ["20", "20,30,40", "200,10", "20,400", "a,b"])
 def test_angles_are_two_numbers_in_range(text):
-    """Of --to."""
     with refused("not_a_number"):
         parse_angles(text)

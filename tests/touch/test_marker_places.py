@@ -29,7 +29,6 @@ from puncture_twin.twin.plant.scanner.image import box
 
 @pytest.fixture(scope="module")
 def carton(tmp_path_factory):
-    """The carton with its arm, its candidates, and proposals by their count."""
     context = prepare(coarse_carton(tmp_path_factory.mktemp("places") / "carton", 20.0))
     candidates = context.search()
     return context, candidates, {count: propose_markers(context, candidates, count) for count in (3, 5)}
@@ -66,7 +65,6 @@ def test_the_expected_error_is_that_of_fits(carton):
 
 
 def test_more_markers_err_less_and_names_cannot_be_swapped(carton):
-    """No permutation of the names fits as well as a person puts markers."""
     context, _, proposals = carton
     assert proposals[5].expected_mm < proposals[3].expected_mm
     for proposal in proposals.values():
@@ -76,7 +74,6 @@ def test_more_markers_err_less_and_names_cannot_be_swapped(carton):
 
 
 def test_a_count_out_of_range_is_refused_and_without_a_window_there_is_no_answer(carton):
-    """Two markers leave a rotation free."""
     context, candidates, _ = carton
     for count in (2, 13):
         with refused("out_of_range"):
@@ -175,7 +172,6 @@ def test_a_tape_round_a_cylinder():
 
 
 def test_where_the_image_cuts_the_sides_nobody_can_halve_them():
-    """Of a box of which one side is no skin."""
     mesh = trimesh.creation.box([300.0, 200.0, 6.0])
     cut = mesh.face_normals[:, 0] > 0.9
     for flags, known in ((cut, False), (np.zeros(len(cut), bool), True)):

@@ -28,7 +28,6 @@ def patient():
 
 
 def checkers(*boxes):
-    """The workcell, and the same with a needle without its tip."""
     tools = (Tool(TIP, 150.0, 1.2, 30.0), Tool(TIP - TIP_MM, 150.0 - TIP_MM, 1.2, 30.0))
     return ApproachCheckers(*(CellChecker(UR3, tool, boxes, patient(), padding_mm=4.0) for tool in tools))
 
@@ -44,7 +43,6 @@ def touching(outward, point=None):
 
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_the_tour_is_the_shortest_of_all_orders(n):
-    """Against every permutation; there and back may differ."""
     cost = np.random.default_rng(n).uniform(1, 9, (n + 1, n + 1))
 
     def length(order):
@@ -66,7 +64,6 @@ def test_a_tour_and_its_reverse_are_told_apart_by_no_rounding():
 
 
 def test_the_line_to_a_marker_is_straight_and_keeps_the_needle():
-    """From the standoff past it, by half millimetres."""
     q = touching([-0.2, 0.1, 1.0])
     line = line_to(UR3, TIP, q, 20.0, -5.0)
     poses, there = flange_pose(UR3, line), flange_pose(UR3, q)
@@ -76,36 +73,22 @@ def test_the_line_to_a_marker_is_straight_and_keeps_the_needle():
     np.testing.assert_allclose(poses[:, :3, :3], np.tile(there[:3, :3], (len(line), 1, 1)), atol=1e-9)
 
 
-def test_a_marker_on_the_near_side_may_be_touched():
-    """Square to the skin, nothing in the way."""
+def test_a_touch_is_refused_for_what_is_in_its_way():
     assert why_not(checkers(), TIP, touching([-0.2, 0.1, 1.0])) == ""
+    side, along = CENTRE + np.array([0.0, -RADIUS, 0.0]), np.array([0.0, -0.1, 1.0])
+    assert "patient" in why_not(checkers(), TIP, touching(along, side))
+    q = touching([-0.2, 0.1, 1.0])
+    T = flange_pose(UR3, q)
+    box = Box("monitor", pose(np.eye(3), T[:3, 3] + 30 * T[:3, 2]), (20.0, 20.0, 20.0))
+    assert "monitor" in why_not(checkers(box), TIP, q)
+    assert why_not(checkers(), TIP, HOME + 100.0) == "a joint would exceed its limits"
 
 
 @pytest.mark.parametrize("aside", [0.0, 30.0, 55.0])
 def test_a_touch_through_the_patient_is_refused(aside):
-    """The tip on the far side, the shaft through the ball: its middle or its edge."""
     outward = np.array([0.0, 0.0, 1.0])
     far = CENTRE + np.array([0.0, aside, -np.sqrt(RADIUS**2 - aside**2)])
     assert why_not(checkers(), TIP, touching(outward, far)) in (
         "the needle's shaft would go through the patient",
         "at the standoff needle touches patient",
     )
-
-
-def test_a_grazing_touch_is_refused():
-    """Nearly along the skin: the shaft would lie on it."""
-    side, along = CENTRE + np.array([0.0, -RADIUS, 0.0]), np.array([0.0, -0.1, 1.0])
-    assert "patient" in why_not(checkers(), TIP, touching(along, side))
-
-
-def test_a_box_in_the_way_is_named():
-    """Where the holder would be."""
-    q = touching([-0.2, 0.1, 1.0])
-    T = flange_pose(UR3, q)
-    box = Box("monitor", pose(np.eye(3), T[:3, 3] + 30 * T[:3, 2]), (20.0, 20.0, 20.0))
-    assert "monitor" in why_not(checkers(box), TIP, q)
-
-
-def test_joints_beyond_their_limits_are_refused():
-    """Before anything else."""
-    assert why_not(checkers(), TIP, HOME + 100.0) == "a joint would exceed its limits"

@@ -13,7 +13,6 @@ PIXEL_MM, PARTS = 0.8, (np.arange(5) + 0.5) / 5 - 0.5
 
 
 def labelled(radius, slice_mm, rng):
-    """The surface of a ball about the origin, a voxel labelled where at least half of it lies within."""
     sizes = np.array([PIXEL_MM, PIXEL_MM, slice_mm])
     count = np.ceil(radius / sizes).astype(int) + 2
     start = -(count + rng.uniform(-0.5, 0.5, 3)) * sizes

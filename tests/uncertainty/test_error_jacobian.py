@@ -12,7 +12,6 @@ STEP = 1e-5
 
 
 def plain_needle(model, q, eta, tip_mm):
-    """Tip and axes of one needle, frame by frame (Denavit and Hartenberg), written anew."""
     a, d = np.array(model.a) + eta[:6], np.array(model.d)
     d[list(FREE_D)] += eta[6:11]
     alpha, q = np.array(model.alpha) + eta[11:17], q + eta[17:23]

@@ -29,7 +29,6 @@ DECLARED = CASE.errors
 NOMINAL = replace(DECLARED, arm=replace(DECLARED.arm, link_mm=0.5, twist=np.radians(0.05), joint=np.radians(0.1)))
 SLICES = np.diag([0.7**2, 0.7**2, 5.0**2]) / 12
 THICK = replace(DECLARED, marker_cov_ct=SLICES, target_cov_ct=SLICES)
-NO_BREATH = np.zeros((3, 2))
 STILL, FEET, ANYWHERE = (0.0, 0.0, 0.0), (0.0, 0.0, 1.1), (3.0 / 3**0.5,) * 3
 
 TABLE = {
@@ -42,42 +41,20 @@ TABLE = {
 }
 
 
-def model(
-    errors=DECLARED,
-    motion_mm=STILL,
-    ultrasound=ULTRASOUND,
-    looks=(1.0,),
-    hidden=None,
-    stereo=STEREO,
-    breath=NO_BREATH,
-    skin=0.0,
-):
-    """One insertion along the case's plan, the picture in the plane of needle and bed axis."""
+def model(errors=DECLARED, motion_mm=STILL, ultrasound=ULTRASOUND, looks=(1.0,), hidden=None, stereo=STEREO):
     points = apply(T_BASE_CT, REGISTRATION.markers.points_ct)
     noise = reading_noise(errors, MODEL, TIP_MM, REGISTRATION.markers.joints, known=True)
     fit = fit_uncertainty("weighted", fit_triad, T_BASE_CT, REGISTRATION.markers.points_ct, points, noise, found=False)
     error = PoseError(MODEL, TIP_MM, apply(T_BASE_CT, CASE.target_ct), errors, fit)
-    across = np.cross(OUTWARD_CT, [0.0, 0.0, 1.0])
-    R = T_BASE_CT[:3, :3]
+    R, across = T_BASE_CT[:3, :3], np.cross(OUTWARD_CT, [0.0, 0.0, 1.0])
+    across = R @ across / np.linalg.norm(across)
     at = [Look(PLANNED, 0.0, inserted, dict(hidden or {})) for inserted in looks]
     motion = R @ np.diag(np.square(motion_mm)) @ R.T
-    return GuidedModel(
-        error,
-        REGISTRATION.markers.names,
-        points,
-        PLANNED,
-        at,
-        motion,
-        R @ breath,
-        skin,
-        stereo,
-        ultrasound,
-        R @ across / np.linalg.norm(across),
-    )
+    devices = stereo, ultrasound, across
+    return GuidedModel(error, REGISTRATION.markers.names, points, PLANNED, at, motion, np.zeros((3, 2)), 0.0, *devices)
 
 
 def rms(found):
-    """Of the tip about the target, mm."""
     return float(np.sqrt(np.trace(found.tip_cov)))
 
 
@@ -107,7 +84,6 @@ def test_chances_to_be_stopped_are_those_of_the_places_in_the_body():
 
 
 def test_ct_is_the_registration_as_it_is():
-    """Sigma6 and the tip's covariance are those of the registration's own model, to rounding."""
     made = model()
     found = made.guided("ct")
     np.testing.assert_allclose(found.cov, made.error.covariance(PLANNED[None])[0], atol=1e-12)
@@ -130,7 +106,6 @@ def test_it_is_the_gaussian_conditioned_on_what_no_flat_part_enters(way):
 
 
 def test_no_flat_part_is_in_the_answer():
-    """Where patient and cameras really are changes no command's error: the gain cancels both exactly."""
     made = model(looks=(0.5, 1.0))
     F = np.vstack([made.matrices(one.rows)[1] for one in made.readings])
     _, pose = made.matrices({"pose": np.eye(6)})
@@ -140,7 +115,6 @@ def test_no_flat_part_is_in_the_answer():
 
 
 def test_without_sight_there_is_no_answer():
-    """Cameras that see no ball, and a picture without the target, do not say where the needle is against it."""
     blind = model(hidden=dict.fromkeys(("ball 80 mm", "ball 160 mm", "target"), ""))
     for way in ("stereo", "us", "us+tip"):
         assert blind.guided(way) is None
@@ -149,7 +123,6 @@ def test_without_sight_there_is_no_answer():
 
 
 def test_more_readings_never_err_more():
-    """The best estimate of a superset is at least as good, look by look and device by device."""
     made = model(motion_mm=FEET, looks=(-0.1, 0.5, 1.0))
     for less, more in (("stereo", "ct+stereo"), ("us", "us+tip"), ("ct+us", "ct+us+tip"), ("ct+us+tip", "all")):
         assert rms(made.guided(more)) <= rms(made.guided(less)) + 1e-9
@@ -159,7 +132,6 @@ def test_more_readings_never_err_more():
 
 
 def test_balls_far_behind_see_less_and_one_ball_not_enough():
-    """Two balls on the holder show the needle's direction less well than two on the needle; one does not show it."""
     on_holder = model(stereo=replace(STEREO, balls_mm=(160.0, 200.0)))
     assert rms(on_holder.guided("stereo")) > 1.1 * rms(model().guided("stereo"))
     hub = model(stereo=replace(STEREO, balls_mm=(150.0,)))
@@ -168,7 +140,6 @@ def test_balls_far_behind_see_less_and_one_ball_not_enough():
 
 
 def test_as_a_pose_error_it_says_the_same():
-    """Whatever asks a pose error gets Sigma6, and the tip about the true target."""
     made = model(motion_mm=FEET)
     for way in WAYS:
         found = made.guided(way)

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.special import chdtr
 
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.uncertainty.hit import (
     chance_within,
     hit_in_ball,
@@ -21,7 +19,6 @@ DEVIATIONS = [(1.0, 1.0, 1.0), (1.0, 1.7, 0.5), (1.0, 10.0, 1.0), (10.0, 10.0, 1
 
 
 def covariance(deviations, seed=0):
-    """A covariance with these standard deviations along random axes, and those axes."""
     axes = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     return axes @ np.diag(np.square(deviations)) @ axes.T, axes
 
@@ -29,7 +26,6 @@ def covariance(deviations, seed=0):
 @pytest.mark.parametrize("deviations", DEVIATIONS)
 @pytest.mark.parametrize("radius", [0.3, 2.5, 8.0])
 def test_within_a_radius_as_a_million_draws_say(deviations, radius):
-    """Ruben's series to .0015, the draws' own error."""
     found = hit_in_ball(covariance(deviations)[0][None], radius)[0]
     assert found == pytest.approx(np.mean(np.sum((DRAWS * deviations) ** 2, axis=1) < radius**2), abs=0.0015)
 
@@ -51,44 +47,37 @@ def test_the_chance_grows_with_the_radius_and_is_never_above_one():
         assert 1 - 1e-6 < found[-1] <= 1
 
 
-def test_a_size_that_is_all_but_known_gives_the_chance_of_a_known_one():
-    """Fisher's F with ten million degrees, by scipy, from a ball that is all but missed to one that is never left."""
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=8.0)
-    rays = target_rays(TriangleMesh(ball.vertices, ball.faces), np.array([3.0, 0.0, 0.0]))
+def test_a_size_that_is_all_but_known_gives_the_chance_of_a_known_one(ball):
+    rays = target_rays(ball(8.0), np.array([3.0, 0.0, 0.0]))
     covs = np.array([covariance(size * np.array([1.0, 2.0, 3.0]))[0] for size in np.geomspace(0.1, 50.0, 20)])
     np.testing.assert_allclose(hit_in_mesh(rays, covs), hit_in_mesh(rays, covs, 10**7), atol=5e-6)
 
 
 @pytest.mark.parametrize("deviations", DEVIATIONS)
 @pytest.mark.parametrize("off", [0.0, 8.0, 12.0])
-def test_within_a_ball_of_triangles_from_inside_on_its_face_and_outside(deviations, off):
-    """The rays' sum to .004 of a million draws, wherever the target lies."""
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=8.0)
+def test_within_a_ball_of_triangles_from_inside_on_its_face_and_outside(ball, deviations, off):
     deviations = 3 * np.array(deviations)
     cov, axes = covariance(deviations, seed=1)
-    found = hit_in_mesh(target_rays(TriangleMesh(ball.vertices, ball.faces), np.array([off, 0.0, 0.0])), cov[None])[0]
+    found = hit_in_mesh(target_rays(ball(8.0, subdivisions=4), np.array([off, 0.0, 0.0])), cov[None])[0]
     tips = (DRAWS * deviations) @ axes.T + [off, 0, 0]
     assert found == pytest.approx(np.mean(np.sum(tips**2, axis=1) < 64), abs=0.004)
 
 
 @pytest.mark.parametrize(("surface", "off"), [(1.0, 0.0), (1.0, 6.0), (2.5, 8.0), (5.0, 0.0)])
-def test_a_surface_that_lies_off_as_a_whole_makes_the_ball_larger_or_smaller(surface, off):
+def test_a_surface_that_lies_off_as_a_whole_makes_the_ball_larger_or_smaller(ball, surface, off):
     """By a normal number; a ball that is less than nothing is never hit."""
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=8.0)
     cov, axes = covariance((2.0, 1.0, 1.5), seed=3)
-    rays = target_rays(TriangleMesh(ball.vertices, ball.faces), np.array([off, 0.0, 0.0]))
+    rays = target_rays(ball(8.0, subdivisions=4), np.array([off, 0.0, 0.0]))
     tips = (DRAWS * [2.0, 1.0, 1.5]) @ axes.T + [off, 0, 0]
     radius = 8.0 + surface * np.random.default_rng(4).normal(size=len(tips))
     truth = np.mean(np.linalg.norm(tips, axis=1) < radius)
     assert hit_in_mesh(rays, cov[None], surface_mm=surface)[0] == pytest.approx(truth, abs=0.02)
 
 
-def test_the_mean_over_faces_is_that_of_the_directions_that_they_face():
-    """Of a slab whose large faces look along z, and of a ball: a third of the trace."""
+def test_the_mean_over_faces_is_that_of_the_directions_that_they_face(ball, box):
     S = np.diag([0.04, 0.09, 2.0])
-    slab, ball = trimesh.creation.box((1000.0, 1000.0, 1e-3)), trimesh.creation.icosphere(subdivisions=3)
-    assert mean_over_faces(TriangleMesh(slab.vertices, slab.faces), S) == pytest.approx(np.sqrt(2.0), rel=1e-3)
-    assert mean_over_faces(TriangleMesh(ball.vertices, ball.faces), S) == pytest.approx(np.sqrt(2.13 / 3), rel=1e-3)
+    assert mean_over_faces(box((1000.0, 1000.0, 1e-3)), S) == pytest.approx(np.sqrt(2.0), rel=1e-3)
+    assert mean_over_faces(ball(1.0), S) == pytest.approx(np.sqrt(2.13 / 3), rel=1e-3)
 
 
 @pytest.mark.parametrize("deviations", DEVIATIONS)
@@ -104,26 +93,23 @@ def test_within_a_radius_of_a_target_beside_which_the_tip_is_believed(deviations
         assert found == pytest.approx(hit_in_ball(cov[None], 2.0)[0], abs=0.004)
 
 
-def test_a_target_on_a_flat_face_is_hit_half_of_the_time_at_most():
-    box = trimesh.creation.box(extents=[50.0, 50.0, 50.0])
-    rays = target_rays(TriangleMesh(box.vertices, box.faces), np.array([25.0, 0.0, 0.0]))
+def test_a_target_on_a_flat_face_is_hit_half_of_the_time_at_most(box):
+    rays = target_rays(box([50.0, 50.0, 50.0]), np.array([25.0, 0.0, 0.0]))
     assert hit_in_mesh(rays, np.eye(3)[None])[0] == pytest.approx(0.5, abs=0.002)
 
 
-def test_an_error_whose_size_was_estimated_follows_fishers_f():
-    """Three markers: far more often off than a known error of that size."""
+def test_an_error_whose_size_was_estimated_follows_fishers_f(ball):
     cov, _ = covariance((1.0, 2.0, 0.7))
     size = np.sqrt(3 / np.random.default_rng(5).chisquare(3, len(DRAWS)))
     drawn = np.sum((DRAWS * [1.0, 2.0, 0.7] * size[:, None]) ** 2, axis=1) < 4
     assert hit_in_ball(cov[None], 2.0, 3)[0] == pytest.approx(drawn.mean(), abs=0.002)
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=2.0)
-    rays = target_rays(TriangleMesh(ball.vertices, ball.faces), np.zeros(3))
+    rays = target_rays(ball(2.0, subdivisions=4), np.zeros(3))
     assert hit_in_mesh(rays, cov[None], 3)[0] == pytest.approx(drawn.mean(), abs=0.006)
 
 
-def test_no_error_hits_for_certain_and_outside_never():
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=2.0)
-    mesh = TriangleMesh(ball.vertices, ball.faces)
+def test_no_error_hits_for_certain_and_outside_never(ball):
     for off, chance in ((0.0, 1.0), (3.0, 0.0)):
-        assert hit_in_mesh(target_rays(mesh, np.array([off, 0, 0])), np.zeros((1, 3, 3)))[0] == pytest.approx(chance)
+        assert hit_in_mesh(target_rays(ball(2.0, subdivisions=2), np.array([off, 0, 0])), np.zeros((1, 3, 3)))[
+            0
+        ] == pytest.approx(chance)
     assert hit_in_ball(np.zeros((1, 3, 3)), 0.5)[0] == pytest.approx(1.0)

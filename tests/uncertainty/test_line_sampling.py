@@ -13,7 +13,7 @@ from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import exp_rotation
 from puncture_twin.planning.uncertainty.hit import proximity, touch_chance
-from puncture_twin.planning.uncertainty.lines import Needles, Surroundings, refined
+from puncture_twin.planning.uncertainty.lines import Needles, refined
 
 LENGTH, RADIUS = 150.0, 0.6
 UP = np.array([0.0, 0.0, 1.0])
@@ -30,34 +30,25 @@ def box(*sizes):
     return trimesh.creation.box(extents=sizes)
 
 
-def chances(mesh, cov, surface=0.0, freedom=None, threshold=RADIUS):
-    """First order and refined, of one needle along z from the origin."""
+def chances(mesh, cov, surface=0.0, freedom=None):
     engine = FastEngine([mesh])
     axes = engine.measure(np.zeros(3), UP[None], LENGTH)
     normal = normals_of(engine.triangles, np.zeros(3), UP[None], axes)
     near = proximity(axes.distance, axes.depth, normal, UP[None], cov[None], surface)
-    first = touch_chance(near, threshold, freedom)
-    around = Surroundings(engine.blocks, np.full((1, 1), LENGTH), np.zeros(3))
+    first = touch_chance(near, RADIUS, freedom)
+    around = engine.blocks, np.full((1, 1), LENGTH), np.zeros(3)
     needles = Needles(UP[None], cov[None], near, np.full((1, 1), surface), freedom)
-    found = refined(around, needles, np.array([threshold]), first, np.ones((1, 1), bool))
+    found = refined(*around, needles, np.array([RADIUS]), first, np.ones((1, 1), bool))
     return first[0, 0], found[0, 0]
 
 
-def displaced(cov, count, seed=0):
-    errors = np.random.default_rng(seed).multivariate_normal(np.zeros(6), cov, count, method="eigh")
+def displaced(cov, count):
+    errors = np.random.default_rng(0).multivariate_normal(np.zeros(6), cov, count, method="eigh")
     return errors[:, :3], exp_rotation(errors[:, 3:]) @ UP
-
-
-def drawn(mesh, cov, count=100_000, threshold=RADIUS):
-    """How many of so many displaced needles come nearer than a threshold, measured on the faces near them."""
-    origins, outward = displaced(cov, count)
-    faces = near_faces(FastEngine([mesh]).blocks[0], np.zeros(3), UP, LENGTH, (15.0, 30.0))
-    return np.mean(faces.distance(origins, outward, LENGTH) < threshold)
 
 
 @pytest.mark.parametrize(("surface", "freedom"), [(0.0, None), (0.7, None), (0.0, 3), (0.7, 6)])
 def test_first_order_stays_where_it_is_exact(surface, freedom):
-    """A wide plane: normal, or Student's t where the residuals gave the errors' size."""
     for distance in (1.5, 3.0, 4.5):
         first, found = chances(moved(box(40.0, 4000.0, 4000.0), distance + 20.0, 0, 0), SHIFT, surface, freedom)
         t = -(distance - RADIUS) / np.hypot(1.0, surface)
@@ -67,7 +58,6 @@ def test_first_order_stays_where_it_is_exact(surface, freedom):
 
 @pytest.mark.parametrize("distance", [1.5, 3.5])
 def test_both_sides_of_a_gap_count(distance):
-    """Between two plates of one structure: twice the chance of one, of which first order sees one."""
     plates = trimesh.util.concatenate(
         [box(1.0, 4000.0, 4000.0).apply_translation([side * (distance + 0.5), 0, 0]) for side in (1, -1)]
     )
@@ -88,7 +78,6 @@ def test_a_tube_around_the_needle_has_a_closed_form(inner):
 
 
 def test_a_thin_wire_is_left_again():
-    """Entry and exit: a wire across is passed by what is displaced farther."""
     wire = moved(trimesh.creation.cylinder(radius=0.2, height=4000.0, sections=24), 0, 0, 0)
     wire = moved(trimesh.Trimesh(wire.vertices[:, [0, 2, 1]], wire.faces), 2.5, 0, 60.0)
     wide = np.diag([4.0, 1.0, 1.0, 0, 0, 0])
@@ -110,14 +99,14 @@ SHAPES = {
 
 @pytest.mark.parametrize(("shape", "size"), list(zip(SHAPES, (1, 2, 2, 1, 2, 1), strict=True)))
 def test_draws_agree(shape, size):
-    """Within .006 of 100,000 displaced needles, for bodies met by the tip, the shaft, its end and from behind."""
     mesh, cov = SHAPES[shape](), size**2 * LEAN
-    found, realised = chances(mesh, cov)[1], drawn(mesh, cov)
-    assert found == pytest.approx(realised, abs=0.006)
+    origins, outward = displaced(cov, 100_000)
+    faces = near_faces(FastEngine([mesh]).blocks[0], np.zeros(3), UP, LENGTH, (15.0, 30.0))
+    realised = np.mean(faces.distance(origins, outward, LENGTH) < RADIUS)
+    assert chances(mesh, cov)[1] == pytest.approx(realised, abs=0.006)
 
 
 def test_the_nearest_face_is_not_always_the_likeliest():
-    """Near where there is no doubt, farther where there is: first order is low without limit."""
     near, far = box(40.0, 4000.0, 4000.0), box(4000.0, 40.0, 4000.0)
     near.apply_translation([22.0, 0, 0])
     far.apply_translation([0, 23.0, 0])
@@ -140,7 +129,6 @@ def test_an_unknown_size_is_averaged(freedom):
 
 @pytest.mark.parametrize("kind", [FastEngine, FclEngine])
 def test_near_faces_answer_as_the_engine_does(rng, kind):
-    """Displaced needles, asked of the faces near the nominal one and of the whole engine."""
     mesh = trimesh.creation.icosphere(subdivisions=4, radius=25.0)
     mesh.vertices = mesh.vertices * rng.normal(1, 0.05, (len(mesh.vertices), 1))
     surface = moved(mesh, 30.0, 5.0, 70.0)

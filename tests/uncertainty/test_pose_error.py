@@ -7,11 +7,14 @@ import pytest
 from scipy.special import chdtri
 from uncertainty_world import NO_ARM, SLICES, declared, world
 
+from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
+from puncture_twin.planning.registration.fit_uncertainty import reading_noise
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residuals import leverage
 from puncture_twin.planning.uncertainty.pose_error import error_budget
+from puncture_twin.planning.uncertainty.touch_choice import choose_touches
 from puncture_twin.twin.rehearsal.trials import draw_trials
 
 ROOMS = 20_000
@@ -63,18 +66,13 @@ def test_isotropic_noise_without_an_arm_is_fitzpatricks_formula():
     assert trace == pytest.approx(3 * (0.5**2 + 0.1**2) * lever**2, rel=1e-9)
 
 
-def test_touching_in_the_insertions_orientation_cancels_a_tip_offset():
-    """Roll included: what the tip is off by moves markers and target alike."""
+def test_touching_as_it_inserts_cancels_tip_offset_and_arm():
     errors = declared(**(NO_ARM | {"tip_offset_mm": 1.0}))
     left = []
     for alike in (True, False):
         w = world("abdomen/case.toml", "rigid", errors, touch_like_insertion=alike)
         left.append(np.trace(w.error.parts(w.puncture.q_insertion[None])["tip_offset"][0, :3, :3]))
     assert left[0] < 0.02 * left[1]
-
-
-def test_an_arms_errors_cancel_where_it_touches_as_it_inserts():
-    """The nominal arm leaves less than half of what touching from elsewhere leaves."""
     errors = declared(**(NO_ARM | {"link_mm": 0.5, "twist_deg": 0.05, "joint_deg": 0.1}))
     left = []
     for alike in (True, False):
@@ -84,19 +82,20 @@ def test_an_arms_errors_cancel_where_it_touches_as_it_inserts():
     assert left[0] < 0.5**2 * left[1]
 
 
-def test_no_errors_leave_no_doubt():
+def test_no_errors_leave_no_doubt_and_a_moved_base_changes_nothing():
     errors = declared(ct_in_plane_mm=0.0, ct_slice_mm=0.0, touch_mm=1e-9, target_mm=0.0, **NO_ARM)
     w = world("abdomen/case.toml", "rigid", errors)
     assert np.abs(w.error.tip_covariance(w.puncture.q_insertion[None])).max() < 1e-15
-
-
-def test_a_base_that_is_moved_changes_nothing_for_the_patient():
-    """Markers' part in CT axes is the same wherever the base stands; the arm's is not asked here."""
     T = pose(exp_rotation(np.array([0.0, 0.0, 0.4])), np.array([20.0, -15.0, 30.0]))
     errors = declared(**(SLICES | NO_ARM))
     one, other = (world("carton/case_m.toml", "weighted", errors, moved=moved) for moved in (None, T))
     covs = [w.error.tip_covariance_ct(w.puncture.q_insertion[None])[0] for w in (one, other)]
     np.testing.assert_allclose(covs[0], covs[1], rtol=1e-9)
+    w = world("carton/case_m.toml", "weighted", declared(**SLICES))
+    budget = error_budget(w.error, w.puncture.q_insertion, w.puncture.T_base_ct[:3, :3] @ w.puncture.outward_ct)
+    assert sum(budget.fraction.values()) == pytest.approx(1.0, abs=1e-12)
+    assert np.hypot(budget.lateral_mm, budget.depth_mm) == pytest.approx(budget.rms_mm, rel=1e-12)
+    assert min(budget.fraction.values()) >= 0
 
 
 @pytest.mark.parametrize("method", ["rigid", "weighted", "joint"])
@@ -118,9 +117,32 @@ def test_ct_axes_in_another_order_change_nothing_for_the_robot(method, axes):
     np.testing.assert_allclose(told[0][1], told[1][1], rtol=1e-7, atol=1e-12)
 
 
-def test_the_budget_adds_up():
-    w = world("carton/case_m.toml", "weighted", declared(**SLICES))
-    budget = error_budget(w.error, w.puncture.q_insertion, w.puncture.T_base_ct[:3, :3] @ w.puncture.outward_ct)
-    assert sum(budget.fraction.values()) == pytest.approx(1.0, abs=1e-12)
-    assert np.hypot(budget.lateral_mm, budget.depth_mm) == pytest.approx(budget.rms_mm, rel=1e-12)
-    assert min(budget.fraction.values()) >= 0
+ARM = {"arm": "nominal", "tip_offset_mm": 0.0, "needle_direction_deg": 0.0, "joint_drift_deg": 0.0}
+
+
+def tip_rms(w, q_touch):
+    noise = reading_noise(w.errors, w.error.model, w.error.tip_mm, q_touch, known=True)
+    error = replace(w.error, fit=replace(w.error.fit, noise=noise))
+    return np.sqrt(np.trace(error.covariance(w.puncture.q_insertion[None])[0, :3, :3]))
+
+
+@pytest.mark.parametrize(
+    ("case", "method", "keys"), [("abdomen/case.toml", "rigid", ARM), ("carton/case_m.toml", "weighted", ARM | SLICES)]
+)
+def test_the_choice_of_touches_leaves_least(case, method, keys):
+    w = world(case, method, declared(**keys))
+    there = apply(w.puncture.T_base_ct, w.puncture.points_ct)
+    q = choose_touches(w.error, there, w.puncture.q_insertion)
+    like = world(case, method, declared(**keys), touch_like_insertion=True).puncture.q_touch
+    chosen, alike, apart = (tip_rms(w, touches) for touches in (q, like, w.puncture.q_touch))
+    assert chosen <= alike + 1e-9
+    assert chosen < 0.7 * apart
+    T = flange_pose(w.error.model, q)
+    np.testing.assert_allclose(T[:, :3, 3] + w.error.tip_mm * T[:, :3, 2], there, atol=1e-6)
+
+
+def test_without_an_arm_s_errors_any_touch_will_do():
+    w = world("abdomen/case.toml", "rigid", declared(**NO_ARM))
+    there = apply(w.puncture.T_base_ct, w.puncture.points_ct)
+    q = choose_touches(w.error, there, w.puncture.q_insertion)
+    assert tip_rms(w, q) == pytest.approx(tip_rms(w, w.puncture.q_touch))

@@ -41,7 +41,6 @@ def near(meshes, cov, surface=0.0):
 
 
 def drawn(meshes, cov, count, threshold, seed=0):
-    """How many of so many displaced needles come nearer than a threshold, per mesh and to any."""
     rng, engine = np.random.default_rng(seed), FastEngine(meshes)
     errors = rng.multivariate_normal(np.zeros(6), cov, count, method="eigh")
     met = np.empty((count, len(meshes)), bool)
@@ -51,17 +50,12 @@ def drawn(meshes, cov, count, threshold, seed=0):
     return met.mean(axis=0), met.any(axis=1).mean()
 
 
-def test_a_half_space_has_a_closed_form():
-    """Sigma of the tip's end, or of the top that leans over it: P = Phi(-(D - r)/sigma), exactly."""
+def test_closed_forms_of_a_half_space_and_a_ball():
     cov = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
     found = touch_chance(near(scene(slab(3.0)), cov), RADIUS)[0, 0]
     assert found == pytest.approx(ndtr(-(3.0 - RADIUS)), rel=1e-9)
     wider = touch_chance(near(scene(slab(3.0)), cov, surface=2.0), RADIUS)[0, 0]
     assert wider == pytest.approx(ndtr(-(3.0 - RADIUS) / np.sqrt(5.0)), rel=1e-9)
-
-
-def test_a_ball_beside_the_needle_feels_the_lean_by_its_depth():
-    """Sigma^2 = s^2 + (depth phi)^2 in the ball's direction."""
     s, phi = 0.4, 0.01
     cov = np.diag([s**2, 9.0, 9.0, phi**2, phi**2, 0.0])
     found = near(scene(ball(5.0, [8.0, 0.0, 100.0])), cov)
@@ -71,7 +65,6 @@ def test_a_ball_beside_the_needle_feels_the_lean_by_its_depth():
 
 @pytest.mark.parametrize("distance", [1.5, 3.0])
 def test_a_round_organ_is_near_what_draws_say(distance):
-    """First order errs on the safe side at a convex body, by less than .03 here."""
     cov = np.diag([1.0, 1.0, 0.5, 0.005**2, 0.005**2, 0.0])
     meshes = scene(ball(12.0, [12.0 + distance, 0.0, 60.0]))
     found = touch_chance(near(meshes, cov), RADIUS)[0, 0]
@@ -80,7 +73,6 @@ def test_a_round_organ_is_near_what_draws_say(distance):
 
 
 def test_any_is_below_the_sum_and_near_the_draws():
-    """Two slabs on both sides, and one twice: joint chances know what excludes and what repeats."""
     cov = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
     left = slab(2.0)
     left.apply_transform(np.diag([-1.0, 1, 1, 1]))
@@ -91,10 +83,6 @@ def test_any_is_below_the_sum_and_near_the_draws():
     assert joint_touch_chance(both, cov[None], RADIUS)[0] == pytest.approx(2 * one, abs=0.02)
     assert joint_touch_chance(twice, cov[None], RADIUS)[0] == pytest.approx(one, abs=0.02)
     assert touch_chance(twice, RADIUS).sum() == pytest.approx(2 * one)
-
-
-def test_every_surface_lies_off_by_a_number_of_its_own():
-    """Two slabs at one place: what moves the needle touches both, what moves the slabs one or the other."""
     cov, surface = np.diag([0.25, 0.25, 0.25, 0.0, 0.0, 0.0]), 1.0
     twice = near(scene(slab(2.0), slab(2.0)), cov, surface=surface)
     rng = np.random.default_rng(8)
@@ -103,24 +91,18 @@ def test_every_surface_lies_off_by_a_number_of_its_own():
     assert joint_touch_chance(twice, cov[None], RADIUS, surface_mm=surface)[0] == pytest.approx(truth, abs=0.02)
 
 
-def test_no_error_touches_for_certain_or_never_and_a_met_structure_has_no_first_order():
-    """P is 0 or 1 without doubt; NaN where the axis meets the structure already."""
+def test_no_error_touches_for_certain_or_never_and_an_estimated_size_more_often():
     nothing = np.zeros((6, 6))
     clear = near(scene(slab(3.0), ball(5.0, [0.0, 0.0, 80.0])), nothing)
     assert touch_chance(clear, RADIUS)[0, 0] == 0.0
     assert touch_chance(clear, 4.0)[0, 0] == 1.0
     assert np.isnan(touch_chance(clear, RADIUS)[0, 1])
-
-
-def test_an_estimated_size_makes_far_organs_likelier():
-    """Student's t with 3 degrees instead of the normal."""
     cov = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
     found = near(scene(slab(4.0)), cov)
     assert touch_chance(found, RADIUS, 3)[0, 0] > 10 * touch_chance(found, RADIUS)[0, 0]
 
 
 def test_both_engines_say_from_where_an_axis_is_nearest(rng):
-    """The same unit vectors, by two codes; NaN where the axis meets the structure."""
     meshes = []
     for _ in range(4):
         mesh = trimesh.creation.icosphere(subdivisions=2, radius=rng.uniform(5, 30))
@@ -141,10 +123,6 @@ def test_both_engines_say_from_where_an_axis_is_nearest(rng):
             away = point - trimesh.triangles.closest_point(mesh.vertices[mesh.faces], [point] * len(mesh.faces))
             away = away[np.linalg.norm(away, axis=1).argmin()]
             np.testing.assert_allclose(normals[row, column] * axes.distance[row, column], away, atol=1e-9)
-
-
-def test_normals_of_some_measured_axes_are_those_of_all(rng):
-    """Rows of an answer say the same alone: nothing is searched again."""
     engine = FastEngine(scene(ball(10.0, [30.0, 0.0, 40.0]), slab(25.0)))
     outward = rng.normal(size=(60, 3))
     outward /= np.linalg.norm(outward, axis=1)[:, None]

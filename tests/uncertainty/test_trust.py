@@ -6,12 +6,12 @@ import pytest
 from benchmarks.trust import calibration_error, scene, tally
 from puncture_twin.meshes import folder
 
-ROOMS = 20_000
+ROOMS = 10_000
+"""Enough to tell a ratio off by .03 from 1: its deviation is .005."""
 
 
 @pytest.fixture(scope="module")
 def carton():
-    """The carton's middle bolt, and four directions, two of them as near to other bolts as the organs allow."""
     return scene("carton-m", folder() / "carton" / "case_m.toml", 4)
 
 
@@ -29,7 +29,7 @@ def test_a_right_declaration_is_kept(carton):
 @pytest.mark.parametrize("truth", [0.5, 2.0])
 def test_a_wrong_declaration_is_seen(carton, truth):
     """Errors that are truly twice or half the declared ones: nothing holds where they are taken at their word."""
-    figures = tally(carton, 4, ROOMS // 4, truth=truth, found=False)["known"]
+    figures = tally(carton, 4, ROOMS // 2, truth=truth, found=False)["known"]
     assert figures.ratio == pytest.approx(truth, rel=0.05)
     assert not 0.94 <= figures.coverage <= 0.96
     assert figures.ece_hit > 0.05

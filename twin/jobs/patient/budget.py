@@ -86,7 +86,7 @@ def _across_and_along(chain: Chain) -> dict[str, float]:
 
 def _counted(chain: Chain) -> list[str]:
     """What a budget counts beside the declared errors."""
-    counted = {"breathing": chain.breath, "bending": chain.path, "motion": chain.motion_base}
+    counted = {"breathing": chain.breathing, "bending": chain.path, "motion": chain.motion_base}
     return [name for name, one in counted.items() if one is not None]
 
 
