@@ -1,6 +1,5 @@
 """Slow, plain versions of what the planner computes: nothing here shares code with it."""
 
-import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,91 +20,63 @@ class PlainEngine:
         return SimpleNamespace(distance=np.array(found))
 
 
-def segment_triangle_distance(p, q, triangle):
-    """Distance of segment p-q from one triangle: crossing, edges against the segment, ends against the face."""
-    p, q, (a, b, c) = _floats(p), _floats(q), map(_floats, triangle)
-    if _crosses(p, q, a, b, c):
-        return 0.0
-    found = [segment_segment_distance(p, q, *edge) for edge in ((a, b), (b, c), (c, a))]
-    found += [point_triangle_distance(end, (a, b, c)) for end in (p, q)]
-    return min(found)
+def segment_mesh_distance(p, q, mesh):
+    """Distance of a segment from a surface: the least over its triangles."""
+    return float(segment_triangle_distance(p, q, mesh.triangles).min())
+
+
+def segment_triangle_distance(p, q, triangles):
+    """Distance of a segment from triangles (..., 3, 3): crossing, edges against it, its ends against the face."""
+    p, q, corners = np.asarray(p, float), np.asarray(q, float), np.moveaxis(np.asarray(triangles, float), -2, 0)
+    edges = list(zip(corners, np.roll(corners, -1, axis=0), strict=True))
+    found = [segment_segment_distance(p, q, *edge) for edge in edges]
+    found += [point_triangle_distance(end, triangles) for end in (p, q)]
+    n = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    above, below = _dot(p - corners[0], n), _dot(q - corners[0], n)
+    passes = (_dot(n, n) > 0) & (above * below <= 0) & (above != below)
+    x = p + (q - p) * (above / np.where(passes, above - below, 1.0))[..., None]
+    return np.where(passes & _left_of_all(x, edges, n), 0.0, np.min(found, axis=0))
 
 
 def segment_segment_distance(p, q, a, b):
-    """Least distance of two segments: interior pair where there is one, else an end of either."""
-    u, v, w = _from(p, q), _from(a, b), _from(a, p)
+    """Least distance of segments, (..., 3) each end: interior pair where there is one, else an end of either."""
+    u, v, w = q - p, b - a, p - a
     found = [point_segment_distance(x, a, b) for x in (p, q)] + [point_segment_distance(x, p, q) for x in (a, b)]
-    determinant = _dot(u, u) * _dot(v, v) - _dot(u, v) ** 2
-    if determinant > 1e-14 * _dot(u, u) * _dot(v, v):
-        s = (_dot(u, v) * _dot(v, w) - _dot(v, v) * _dot(u, w)) / determinant
-        t = (_dot(u, u) * _dot(v, w) - _dot(u, v) * _dot(u, w)) / determinant
-        if 0 <= s <= 1 and 0 <= t <= 1:
-            found.append(_length([w[k] + s * u[k] - t * v[k] for k in range(3)]))
-    return min(found)
+    determinant, product = _dot(u, u) * _dot(v, v) - _dot(u, v) ** 2, _dot(u, u) * _dot(v, v)
+    apart = np.where(determinant > 1e-14 * product, determinant, np.nan)
+    s = (_dot(u, v) * _dot(v, w) - _dot(v, v) * _dot(u, w)) / apart
+    t = (_dot(u, u) * _dot(v, w) - _dot(u, v) * _dot(u, w)) / apart
+    inner = np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
+    inside = (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+    return np.minimum(np.min(found, axis=0), np.where(inside, inner, np.inf))
 
 
 def point_segment_distance(x, a, b):
-    """Distance of a point from a segment, which may be a point."""
-    ab, ax = _from(a, b), _from(a, x)
-    length = _dot(ab, ab)
-    t = 0.0 if length == 0 else min(1.0, max(0.0, _dot(ax, ab) / length))
-    return _length([ax[k] - t * ab[k] for k in range(3)])
+    """Distance of points from segments, (..., 3) each, which may be points."""
+    x, a, b = (np.asarray(one, float) for one in (x, a, b))
+    length = _dot(b - a, b - a)
+    t = np.clip(_dot(x - a, b - a) / np.where(length > 0, length, 1.0), 0.0, 1.0)
+    return np.linalg.norm(x - a - t[..., None] * (b - a), axis=-1)
 
 
-def point_triangle_distance(x, triangle):
-    """Distance of a point from a triangle: its foot on the plane if inside, else the nearest edge."""
-    x, (a, b, c) = _floats(x), map(_floats, triangle)
-    n = _cross(_from(a, b), _from(a, c))
-    found = [point_segment_distance(x, *edge) for edge in ((a, b), (b, c), (c, a))]
-    if _dot(n, n) > 0:
-        above = _dot(_from(a, x), n)
-        foot = [x[k] - n[k] * above / _dot(n, n) for k in range(3)]
-        if _left_of_all_edges(foot, (a, b, c), n):
-            found.append(abs(above) / math.sqrt(_dot(n, n)))
-    return min(found)
+def point_triangle_distance(x, triangles):
+    """Distance of a point from triangles (..., 3, 3): its foot on the plane if inside, else the nearest edge."""
+    x, corners = np.asarray(x, float), np.moveaxis(np.asarray(triangles, float), -2, 0)
+    edges = list(zip(corners, np.roll(corners, -1, axis=0), strict=True))
+    n = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    square, above = _dot(n, n), _dot(x - corners[0], n)
+    flat = square > 0
+    foot = x - n * (above / np.where(flat, square, 1.0))[..., None]
+    away = np.where(flat & _left_of_all(foot, edges, n), np.abs(above) / np.sqrt(np.where(flat, square, 1.0)), np.inf)
+    return np.minimum(np.min([point_segment_distance(x, *edge) for edge in edges], axis=0), away)
 
 
-def _crosses(p, q, a, b, c):
-    n = _cross(_from(a, b), _from(a, c))
-    above, below = _dot(_from(a, p), n), _dot(_from(a, q), n)
-    if _dot(n, n) == 0 or above * below > 0 or above == below:
-        return False
-    x = [p[k] + (q[k] - p[k]) * above / (above - below) for k in range(3)]
-    return _left_of_all_edges(x, (a, b, c), n)
-
-
-def _left_of_all_edges(x, triangle, n):
-    a, b, c = triangle
-    return all(_dot(_cross(_from(e0, e1), _from(e0, x)), n) >= 0 for e0, e1 in ((a, b), (b, c), (c, a)))
-
-
-# Vectors of three floats: for so few numbers plain Python is many times as fast as arrays.
-
-
-def _floats(x):
-    return x if isinstance(x, list) else [float(one) for one in x]
-
-
-def _from(a, b):
-    return [b[0] - a[0], b[1] - a[1], b[2] - a[2]]
+def _left_of_all(x, edges, n):
+    return np.all([_dot(np.cross(end - start, x - start), n) >= 0 for start, end in edges], axis=0)
 
 
 def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a, b):
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-def _length(a):
-    return math.sqrt(_dot(a, a))
-
-
-def segment_mesh_distance(p, q, mesh):
-    """Distance of a segment from a surface, triangle by triangle."""
-    p, q = _floats(p), _floats(q)
-    return min(segment_triangle_distance(p, q, triangle) for triangle in mesh.triangles.tolist())
+    return np.sum(a * b, axis=-1)
 
 
 def ray_crossings(origin, direction, mesh):

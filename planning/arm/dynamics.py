@@ -26,7 +26,7 @@ from scipy.stats import f
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints, read_only
+from puncture_twin.planning.base.arrays import Floats, Ints, read_only
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.base.files import read_input
 from puncture_twin.planning.base.text import Facts, Shown
@@ -74,11 +74,7 @@ class JointMotion(NamedTuple):
 
 
 def regressor(model: UrModel, motion: JointMotion, down_base: Floats) -> Floats:
-    """Y, shape (n, 6, 78), N m per unit of each parameter.
-
-    Args:
-        down_base: Shape (3,), unit vector of gravity, base frame.
-    """
+    """Y, shape (n, 6, 78), N m per unit of each parameter; ``down_base`` (3,), unit vector of gravity, base frame."""
     frames = link_poses(model, motion.q)
     R, origin = frames[..., :3, :3], frames[..., :3, 3] / 1000.0
     axes = R[:, :6, :, 2]  # joint i turns about z of the frame before it
@@ -119,15 +115,12 @@ def _inertia(w: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class BaseParameters:
-    """What torques can show of an arm's parameters: Y phi = Y[:, columns] K phi, whatever the motion.
-
-    Attributes:
-        columns: Shape (r,), of phi.
-        K: Shape (r, 78).
-    """
+    """What torques can show of an arm's parameters: Y phi = Y[:, columns] K phi, whatever the motion."""
 
     columns: Ints
+    """Shape (r,), of phi."""
     K: Floats
+    """Shape (r, 78)."""
 
 
 def base_parameters(model: UrModel, down_base: Floats, seed: int = 0) -> BaseParameters:
@@ -144,27 +137,24 @@ def base_parameters(model: UrModel, down_base: Floats, seed: int = 0) -> BasePar
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identified(Shown):
-    """What a recording says of an arm's dynamics.
-
-    Attributes:
-        values: Shape (r,), of the base parameters, kg, m, N m, s, rad.
-        covariance: Shape (r, r).
-        torque_sd_nm: Shape (6,), of a torque about the model.
-        freedom: Equations less parameters.
-        condition: Of the equations, columns of length 1.
-        unexplained: What is left of the torques, rms, of the torques themselves.
-        correlated: Shape (6,), from one row to the next, of what is left.
-    """
+    """What a recording says of an arm's dynamics."""
 
     base: BaseParameters
     values: Floats
+    """Shape (r,), of the base parameters, kg, m, N m, s, rad."""
     covariance: Floats
+    """Shape (r, r)."""
     torque_sd_nm: Floats
+    """Shape (6,), of a torque about the model."""
     rows: int
     freedom: int
+    """Equations less parameters."""
     condition: float
+    """Of the equations, columns of length 1."""
     unexplained: float
+    """What is left of the torques, rms, of the torques themselves."""
     correlated: Floats
+    """Shape (6,), from one row to the next, of what is left."""
 
     def _facts(self) -> Facts:
         yield "rows", f"{self.rows:,}"
@@ -239,7 +229,9 @@ def identify(
     """
     base, motion, torque = base_parameters(model, down_base), joint_motion(recorded), recorded.torque_nm
     moving = np.abs(motion.speed) > SLOW
-    _refuse_still(moving, where)
+    if len(still := np.flatnonzero(moving.mean(axis=0) < 0.1)):
+        what = f"joint {still[0] + 1} hardly moves (slower than {SLOW:g} rad/s in 9 of 10 rows)"
+        refuse(what, where, "a motion of all joints, as --record has it", "not_exciting")
     half = _window(recorded.step_s) // 2
     moving[:half] = moving[-half:] = False  # at the ends a quintic's slopes are those of noise
     Y, joint = regressor(model, motion, down_base)[:, :, base.columns][moving], np.nonzero(moving)[1]
@@ -270,13 +262,6 @@ TINY = 1e-18
 """N m and N^2 m^2: torques without noise leave rounding."""
 
 
-def _refuse_still(moving: Bools, where: str | Path) -> None:
-    still = np.flatnonzero(moving.mean(axis=0) < 0.1)
-    if len(still):
-        what = f"joint {still[0] + 1} hardly moves (slower than {SLOW:g} rad/s in 9 of 10 rows)"
-        refuse(what, where, "a motion of all joints, as --record has it", "not_exciting")
-
-
 def condition_of(Y: Floats) -> float:
     """Condition of a regressor (.., r), its columns of length 1."""
     rows = Y.reshape(-1, Y.shape[-1])
@@ -286,7 +271,6 @@ def condition_of(Y: Floats) -> float:
 
 
 def _least_squares(Y: Floats, tau: Floats, sd: Floats) -> tuple[Floats, Floats]:
-    """Values (r,) and their covariance (r, r)."""
     Q, R = np.linalg.qr(Y / sd[:, None])
     inverse = solve_triangular(R, np.eye(len(R)))
     return inverse @ (Q.T @ (tau / sd)), inverse @ inverse.T

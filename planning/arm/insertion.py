@@ -104,13 +104,7 @@ def first_stop(model: UrModel, path: Floats, depths_mm: Floats) -> InsertionStop
 
 @allocation_free()
 def _first_stop_at(lengths, path, depths, at_least, fastest):  # type: ignore[no-untyped-def]  # numba infers
-    """Index at which a path ends: no solution, too near a singularity, or a joint faster than it may; -1: nowhere.
-
-    Args:
-        path: Shape (m, 6), rad.
-        depths: Shape (m,), mm, rising.
-        fastest: rad/mm.
-    """
+    """Index at which a path (m, 6), rad, ends: no solution, near a singularity, or a joint too fast; -1: nowhere."""
     last = len(path) - 1
     for k in range(last + 1):
         if not least_term(lengths, path[k]) > at_least:

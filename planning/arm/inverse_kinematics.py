@@ -33,10 +33,7 @@ TURN = 2.0 * math.pi
 
 
 def inverse(model: UrModel, T_base_flange: Floats) -> Floats:
-    """All joint configurations that put the flange at each pose.
-
-    Args:
-        T_base_flange: Shape (n, 4, 4) or (4, 4), mm, rigid.
+    """All joint configurations that put the flange at each pose; ``T_base_flange`` (n, 4, 4) or (4, 4), mm, rigid.
 
     Returns:
         Shape (n, 8, 6), rad, each angle in (-pi, pi]; NaN in all six joints where a branch does not exist.
@@ -52,7 +49,6 @@ def inverse(model: UrModel, T_base_flange: Floats) -> Floats:
 
 @nb.njit(cache=True)
 def _inverse_all(lengths, T, q):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``q`` (n, 8, 6) from flange poses ``T`` (n, 4, 4)."""
     R, p = np.empty((3, 3)), np.empty(3)
     for row in range(len(T)):
         for i in range(3):
@@ -185,10 +181,7 @@ def nearest_within_limits(model: UrModel, q: Floats, q_reference: Floats) -> Flo
 
 
 def wrapped_solutions(model: UrModel, q: Floats) -> Floats:
-    """Every configuration within the limits that differs from one by whole turns.
-
-    Args:
-        q: Shape (6,), rad, finite.
+    """Every configuration within the limits that differs from one by whole turns; ``q`` (6,), rad, finite.
 
     Returns:
         Shape (n, 6), rad; empty when some joint has none.

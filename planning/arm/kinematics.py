@@ -30,10 +30,7 @@ def _rows(q: Floats) -> Floats:
 
 
 def link_poses(model: UrModel, q: Floats) -> Floats:
-    """Frames of the base and the six links.
-
-    Args:
-        q: Shape (..., 6), rad.
+    """Frames of the base and the six links; ``q`` (..., 6), rad.
 
     Returns:
         T_base_link, shape (..., 7, 4, 4), mm: the base (identity) first, the flange last.
@@ -82,10 +79,7 @@ def flange_pose(model: UrModel, q: Floats) -> Floats:
 
 
 def jacobian(model: UrModel, q: Floats) -> Floats:
-    """The geometric Jacobian of the flange, base frame.
-
-    Args:
-        q: Shape (..., 6), rad.
+    """The geometric Jacobian of the flange, base frame; ``q`` (..., 6), rad.
 
     Returns:
         Shape (..., 6, 6): rows 0-2 give the velocity of the flange origin in mm/s, rows 3-5 the angular velocity in
@@ -289,7 +283,6 @@ def farthest_from_singular(model: UrModel, q: Floats, elbow_towards: Floats) -> 
 
 @allocation_free()
 def _singularities(lengths, q, terms):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``terms`` (3, n) from ``q`` (n, 6)."""
     for row in range(len(q)):
         shoulder, elbow, wrist = _singular_terms(lengths, q[row, 1], q[row, 2], q[row, 3], q[row, 4])
         terms[0, row], terms[1, row], terms[2, row] = shoulder, elbow, wrist

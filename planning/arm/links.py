@@ -18,7 +18,7 @@ import numpy as np
 from puncture_twin import meshes
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE, ArmUrdf, Read, read_arm_urdf
+from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE, ArmUrdf, Read, hull, read_arm_urdf, ring_corners
 from puncture_twin.planning.arm.urdf.lengths import NOTHING_STATED, StatedLimits, urdf_limits
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import user_cache
@@ -38,7 +38,7 @@ the mesh itself never does; with these slabs 73.3 % of them are free against 73.
 """
 
 
-PIN_RADIUS_MM = 10.0
+PIN_RADIUS_MM, PIN_SIDES = 10.0, 8
 """Radius of the pin that replaces a joint where the meshes leave a gap: well inside every link."""
 
 FLUSH_MM = 1e-4
@@ -56,17 +56,14 @@ PIN_ROOT_MM = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """One body of the arm.
-
-    Attributes:
-        name: One of ``LINK_NAMES``.
-        frame: Index into the poses of ``link_poses``.
-        pieces: Meshes in that frame, mm; their union is the body.
-    """
+    """One body of the arm."""
 
     name: str
+    """One of ``LINK_NAMES``."""
     frame: int
+    """Index into the poses of ``link_poses``."""
     pieces: tuple[TriangleMesh, ...]
+    """Meshes in that frame, mm; their union is the body."""
 
     @cached_property
     def mesh(self) -> TriangleMesh:
@@ -84,53 +81,46 @@ def collision_links(model: UrModel) -> tuple[Link, ...]:
     Raises:
         InputError: If no meshes ship for this model, or one cannot be used.
     """
-    urdf = model_urdf(model)
+
+    def packed() -> Arrays:
+        shapes = [link.pieces for link in visual_links(model)]
+        links = [
+            tuple(piece for mesh in meshes for piece in _pieces(mesh, name, model))
+            for name, meshes in zip(LINK_NAMES, shapes, strict=True)
+        ]
+        pins = _joint_pins(model, [joined(parts) for parts in links])
+        counts = [len(some) + len(pin) for some, pin in zip(links, pins, strict=True)]
+        return {
+            **packed_meshes([piece for both in zip(links, pins, strict=True) for some in both for piece in some]),
+            "pieces": np.array(counts),
+        }
+
     made_from = {
         "what": "collision links",
         "lengths": model.lengths.tolist(),
-        "urdf": urdf.digest,
+        "urdf": model_urdf(model).digest,
         "shipped": model.shipped,
     }
-    cached = user_cache().arrays(made_from, lambda: _packed(_convex_links(model)), by=__name__, check=unpacked_meshes)
+    cached = user_cache().arrays(made_from, packed, by=__name__, check=unpacked_meshes)
     pieces, ends = unpacked_meshes(cached), np.cumsum(cached["pieces"])
     parts = zip(LINK_NAMES, [0, *ends], ends, strict=False)
     return tuple(Link(name, i, pieces[start:end]) for i, (name, start, end) in enumerate(parts))
-
-
-def _convex_links(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
-    pieces = [
-        tuple(piece for mesh in meshes for piece in _pieces(mesh, name, model))
-        for name, meshes in zip(LINK_NAMES, _link_shapes(model), strict=True)
-    ]
-    pins = _joint_pins(model, [joined(parts) for parts in pieces])
-    return [some + pin for some, pin in zip(pieces, pins, strict=True)]
-
-
-def _packed(links: Sequence[Sequence[TriangleMesh]]) -> Arrays:
-    """The links' pieces for the cache, and the number of pieces of each link."""
-    return {**packed_meshes([piece for link in links for piece in link]), "pieces": np.array([*map(len, links)])}
 
 
 @cache
 def visual_links(model: UrModel) -> tuple[Link, ...]:
     """The links in full detail, for images: same frames as :func:`collision_links`.
 
-    They are the collision shapes themselves (43,000 triangles for the UR3): reading coloured Collada files would need
-    one more package.
+    They are the collision shapes themselves (43,000 triangles for the UR3), from the URDF's link frames to ours: a
+    constant motion each. Reading coloured Collada files would need one more package.
     """
-    return tuple(
-        Link(name, i, meshes) for i, (name, meshes) in enumerate(zip(LINK_NAMES, _link_shapes(model), strict=True))
-    )
-
-
-def _link_shapes(model: UrModel) -> list[tuple[TriangleMesh, ...]]:
-    """The collision shapes of the seven bodies, from the URDF's link frames to ours: a constant motion each."""
     urdf = model_urdf(model)
     T_link_urdflink = np.linalg.inv(link_poses(model, np.zeros(6))) @ urdf.body_poses(np.zeros(6))
-    return [
-        tuple(shape.mesh.transformed(T @ shape.T_body_shape) for shape in shapes)
-        for shapes, T in zip(urdf.shapes, T_link_urdflink, strict=True)
-    ]
+    rows = enumerate(zip(LINK_NAMES, urdf.shapes, T_link_urdflink, strict=True))
+    return tuple(
+        Link(name, i, tuple(shape.mesh.transformed(T @ shape.T_body_shape) for shape in shapes))
+        for i, (name, shapes, T) in rows
+    )
 
 
 def _pieces(mesh: TriangleMesh, name: str, model: UrModel) -> tuple[TriangleMesh, ...]:
@@ -154,32 +144,24 @@ def convex_pieces(mesh: TriangleMesh, count: int) -> tuple[TriangleMesh, ...]:
     cuts = np.linspace(low[axis], high[axis], count + 1)
     corners = mesh.triangles
     starts, ends = corners.reshape(-1, 3), np.roll(corners, -1, axis=1).reshape(-1, 3)
-    points = [mesh.vertices] + [_crossings(starts, ends, axis, cut) for cut in cuts[1:-1]]
+    points = [mesh.vertices] + [plane_crossings(starts, ends, axis, cut) for cut in cuts[1:-1]]
     cloud = np.concatenate(points)
     along = cloud[:, axis]
     slabs = [cloud[(along >= a) & (along <= b)] for a, b in pairwise(cuts)]
-    hulls = [convex_hull(slab) for slab in slabs]
-    if all(hull is not None for hull in hulls):
-        return tuple(hull for hull in hulls if hull is not None)
+    hulls = [one for one in map(convex_hull, slabs) if one is not None]
+    if len(hulls) == count:
+        return tuple(hulls)
     whole = convex_hull(cloud)  # a slab of it is flat or empty: the hull of all contains it
     return () if whole is None else (whole,)
 
 
 def convex_hull(points: Floats) -> TriangleMesh | None:
     """The convex hull of points (n, 3), mm; None where they lie in one plane."""
-    import trimesh  # here: it costs a third of a second, and few need it
-
-    if len(points) == 0 or _thickness_mm(points) < FLAT_MM:
+    if not len(points):
         return None
-    hull = trimesh.convex.convex_hull(points)
-    return TriangleMesh(np.asarray(hull.vertices), np.asarray(hull.faces))
-
-
-def _thickness_mm(points: Floats) -> float:
-    """Extent of points (n, 3), mm, across the plane that fits them best."""
     centred = points - points.mean(axis=0)
     across = np.linalg.eigh(centred.T @ centred).eigenvectors[:, 0]  # of the least eigenvalue
-    return float(np.ptp(centred @ across))
+    return None if np.ptp(centred @ across) < FLAT_MM else hull(points)
 
 
 def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[TriangleMesh, ...]]:
@@ -200,20 +182,12 @@ def _joint_pins(model: UrModel, meshes: Sequence[TriangleMesh]) -> list[tuple[Tr
                 f"shapes that touch along their joint's axis, within {MOST_GAP_MM:g} mm: check unit, scale and origin"
             )
             refuse(what, model_urdf(model).where, allowed, "links_apart")
-        pins.append(tuple(_pin(a - PIN_ROOT_MM, b + PIN_ROOT_MM) for a, b in gaps))
+        ends = [(a - PIN_ROOT_MM, b + PIN_ROOT_MM) for a, b in gaps]
+        pins.append(tuple(hull(ring_corners(PIN_RADIUS_MM, PIN_SIDES, one)) for one in ends))
     return [*pins, ()]
 
 
-def _pin(low: float, high: float) -> TriangleMesh:
-    import trimesh  # here: it costs a third of a second, and few need it
-
-    turn = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
-    ring = PIN_RADIUS_MM * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    hull = trimesh.convex.convex_hull(np.concatenate([np.insert(ring, 2, z, axis=1) for z in (low, high)]))
-    return TriangleMesh(np.asarray(hull.vertices), np.asarray(hull.faces))
-
-
-def _crossings(starts: Floats, ends: Floats, axis: int, cut: float) -> Floats:
+def plane_crossings(starts: Floats, ends: Floats, axis: int, cut: float) -> Floats:
     """Points where edges (n, 3) to (n, 3) pass the plane ``axis = cut``, shape (k, 3), mm."""
     a, b = starts[:, axis], ends[:, axis]
     crosses = (a - cut) * (b - cut) < 0.0
@@ -260,13 +234,8 @@ def _shipped(name: str) -> ArmUrdf:
     if not path.is_file():
         allowed = ", ".join(sorted(p.stem for p in path.parent.glob("*.urdf")))
         refuse(f"no link meshes for robot {name!r}", f"meshes/{SHAPES}", allowed, "no_link_meshes")
-    return read_arm_urdf(
-        path.read_bytes(),
-        path,
-        flange=FLANGE,
-        read=lambda address: _resolved(address).read_bytes(),
-        T_base_root=T_BASE_URDFBASE,
-    )
+    data, read = path.read_bytes(), lambda address: _resolved(address).read_bytes()
+    return read_arm_urdf(data, path, flange=FLANGE, read=read, T_base_root=T_BASE_URDFBASE)
 
 
 def _resolved(address: str) -> Path:
@@ -287,18 +256,5 @@ def own_arm(data: bytes, where: Path, *, flange: str, read: Read, stated: Stated
     urdf = read_arm_urdf(data, where, flange=flange, read=read)
     limits = urdf_limits(urdf.chain.joints, stated, where)
     d1, a2, a3, d4, d5, d6 = urdf.lengths_mm
-    return UrModel(
-        urdf.document.name,
-        d1,
-        a2,
-        a3,
-        d4,
-        d5,
-        d6,
-        limits.angles,
-        limits.speeds,
-        limits.torques,
-        joint_names=urdf.joint_names,
-        shipped=False,
-        urdf=urdf,
-    )
+    names = tuple(joint.name for joint in urdf.chain.joints)
+    return UrModel(urdf.document.name, d1, a2, a3, d4, d5, d6, *limits, joint_names=names, shipped=False, urdf=urdf)

@@ -8,7 +8,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.links import convex_pieces
 from puncture_twin.planning.base.arrays import Floats, read_only
@@ -22,18 +21,15 @@ SLABS = 6
 
 @dataclass(frozen=True, eq=False)
 class ToolBody:
-    """A rigid body that is bolted to the flange.
-
-    Attributes:
-        mesh: Its surface, mm, in the flange's frame.
-        unit_mm: How many millimetres one unit of the file is.
-        T_flange_file: Shape (4, 4), mm: the file's frame in the flange's.
-    """
+    """A rigid body that is bolted to the flange."""
 
     mesh: TriangleMesh
+    """Its surface, mm, in the flange's frame."""
     file: Path
     unit_mm: float
+    """How many millimetres one unit of the file is."""
     T_flange_file: Floats
+    """Shape (4, 4), mm: the file's frame in the flange's."""
     key: str
 
     @cached_property
@@ -65,18 +61,15 @@ NEEDLE_ROOT_MM = 1.0
 
 @dataclass(frozen=True)
 class Tool:
-    """Needle and holder. The holder is a cylinder from the flange along +z; the needle goes on from it to the tip.
-
-    Attributes:
-        shaft_mm: Usable length: from the holder's end to the tip.
-        body: What the flange carries besides them, or None.
-    """
+    """Needle and holder. The holder is a cylinder from the flange along +z; the needle goes on from it to the tip."""
 
     needle_length_mm: float
     shaft_mm: float
+    """Usable length: from the holder's end to the tip."""
     needle_diameter_mm: float
     holder_diameter_mm: float
     body: ToolBody | None = None
+    """What the flange carries besides them, or None."""
 
     @property
     def holder_length_mm(self) -> float:
@@ -96,16 +89,13 @@ class Tool:
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A solid cuboid in the workcell, such as the table.
-
-    Attributes:
-        T_base_box: Shape (4, 4), mm: the box's centre and axes in the base frame.
-        size_mm: Full edge lengths along its axes.
-    """
+    """A solid cuboid in the workcell, such as the table."""
 
     name: str
     T_base_box: Floats
+    """Shape (4, 4), mm: the box's centre and axes in the base frame."""
     size_mm: tuple[float, float, float]
+    """Full edge lengths along its axes."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_base_box", read_only(self.T_base_box))
@@ -127,9 +117,7 @@ SIDES = 24
 """Sides of the polygon of the bore: inscribed, so the bore is up to 0.9 % narrower than it is (3 mm of 350)."""
 
 
-def gantry_boxes(
-    T_base_gantry: NDArray[np.float64], *, bore_diameter_mm: float, wall_mm: float, depth_mm: float
-) -> tuple[Box, ...]:
+def gantry_boxes(T_base_gantry: Floats, *, bore_diameter_mm: float, wall_mm: float, depth_mm: float) -> tuple[Box, ...]:
     """The wall about a bore.
 
     Args:

@@ -38,38 +38,35 @@ DEFAULT_MAX_ACCELERATION = 1.4
 
 @dataclass(frozen=True, eq=False)
 class UrModel:
-    """One arm of the family. Lengths in mm, angles in rad.
-
-    Attributes:
-        name: Such as ``ur3``.
-        d1: Height of the shoulder axis above the base, mm.
-        a2: Upper arm, mm, negative as in the DH table.
-        a3: Forearm, mm, negative as in the DH table.
-        d4: Sideways offset of the wrist, mm.
-        d5: From wrist 1 to wrist 2, mm.
-        d6: From wrist 2 to the flange, mm.
-        joint_limits: Shape (6, 2), rad: lowest and highest angle of each joint.
-        max_speeds: Shape (6,), rad/s.
-        max_torques: Shape (6,), N m: what each joint's motor can give.
-        max_acceleration: rad/s^2, for every joint.
-        shipped: Whether its shapes are those that ship under its name.
-        urdf: Its own URDF, if it has one; an arm that neither ships nor has one is known by its numbers alone.
-    """
+    """One arm of the family. Lengths in mm, angles in rad."""
 
     name: str
+    """Such as ``ur3``."""
     d1: float
+    """Height of the shoulder axis above the base, mm."""
     a2: float
+    """Upper arm, mm, negative as in the DH table."""
     a3: float
+    """Forearm, mm, negative as in the DH table."""
     d4: float
+    """Sideways offset of the wrist, mm."""
     d5: float
+    """From wrist 1 to wrist 2, mm."""
     d6: float
+    """From wrist 2 to the flange, mm."""
     joint_limits: NDArray[np.float64]
+    """Shape (6, 2), rad: lowest and highest angle of each joint."""
     max_speeds: NDArray[np.float64]
+    """Shape (6,), rad/s."""
     max_torques: NDArray[np.float64]
+    """Shape (6,), N m: what each joint's motor can give."""
     max_acceleration: float = DEFAULT_MAX_ACCELERATION
+    """rad/s^2, for every joint."""
     joint_names: tuple[str, ...] = JOINT_NAMES
     shipped: bool = True
+    """Whether its shapes are those that ship under its name."""
     urdf: ArmUrdf | None = None
+    """Its own URDF, if it has one; an arm that neither ships nor has one is known by its numbers alone."""
 
     def __post_init__(self) -> None:
         for name in ("joint_limits", "max_speeds", "max_torques"):

@@ -24,18 +24,15 @@ from puncture_twin.planning.geometry.triangle_distance import nearest_point
 
 @dataclass(frozen=True, eq=False)
 class AxisDistances:
-    """Distances of n needle axes from k structures, mm.
-
-    Attributes:
-        distance: Shape (n, k), least distance of axis i from the surface of structure j; 0 where they intersect.
-        depth: Shape (n, k), distance from the target, along the axis, of the axis point nearest to the structure;
-            where they intersect, of the first point of intersection.
-        nearest: Shape (n, k), a nearest triangle of the structure, as a row of the engine's `triangles`.
-    """
+    """Distances of n needle axes from k structures, mm."""
 
     distance: Floats
+    """Shape (n, k), least distance of axis i from the surface of structure j; 0 where they intersect."""
     depth: Floats
+    """Shape (n, k), distance from the target, along the axis, of the axis point nearest to the structure; where they
+    intersect, of the first point of intersection."""
     nearest: Ints32
+    """Shape (n, k), a nearest triangle of the structure, as a row of the engine's `triangles`."""
 
     def at(self, rows: Ints) -> AxisDistances:
         """The distances of some axes."""
@@ -117,17 +114,14 @@ def too_near(
 
 @dataclass(frozen=True, eq=False)
 class Clearances:
-    """Clearances of n candidates from k structures; mm.
-
-    Attributes:
-        clearance: Shape (n, k), axis distance minus needle radius, never below minus the radius.
-        depth: Shape (n, k), distance from the target, along the needle, of the point nearest to the structure.
-        violated: Shape (n, k), whether the clearance is less than the structure's margin; FCL decides ties.
-    """
+    """Clearances of n candidates from k structures; mm."""
 
     clearance: Floats
+    """Shape (n, k), axis distance minus needle radius, never below minus the radius."""
     depth: Floats
+    """Shape (n, k), distance from the target, along the needle, of the point nearest to the structure."""
     violated: NDArray[np.bool_]
+    """Shape (n, k), whether the clearance is less than the structure's margin; FCL decides ties."""
 
 
 def measure(
@@ -193,16 +187,7 @@ def normals_of(triangles: Sequence[Floats], target_ct: Floats, outward_ct: Float
 
 @nb.njit(cache=True)
 def axis_normals(triangles, nearest, distance, depth, target, outward, normal):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``normal`` (n, 3) with the unit vectors of one surface: see `normals_of`; NaN on contact.
-
-    Args:
-        triangles: Shape (m, 9), corners in rows, mm.
-        nearest: Shape (n,), row of each axis' nearest triangle.
-        distance: Shape (n,), mm.
-        depth: Shape (n,), of the nearest axis point, mm.
-        target: Shape (3,), where the axes start, mm.
-        outward: Shape (n, 3), unit vectors.
-    """
+    """Fill ``normal`` (n, 3) with the unit vectors of one surface: see `normals_of`; NaN on contact."""
     for i in range(len(outward)):
         if distance[i] <= 0.0:
             normal[i] = math.nan

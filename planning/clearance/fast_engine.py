@@ -32,8 +32,8 @@ from puncture_twin.planning.clearance.kernels.segment_triangle import (
     nearest_triangle,
     spheres_around,
 )
-from puncture_twin.planning.clearance.kernels.side_by_side import SearchOutput, scratch_for
-from puncture_twin.planning.clearance.kernels.surface_search import COUNTED, search_bundles
+from puncture_twin.planning.clearance.kernels.side_by_side import SearchOutput
+from puncture_twin.planning.clearance.kernels.surface_search import COUNTED, scratch_for, search_bundles
 from puncture_twin.planning.geometry.kd_order import kd_order
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -177,7 +177,6 @@ def _packed(meshes: Sequence[TriangleMesh], threads: int) -> tuple[Blocks, ...]:
 
 
 def _remembered(meshes: Sequence[TriangleMesh], memory: Memory) -> tuple[Blocks, ...]:
-    """Each surface packed into blocks, or taken from memory where an earlier case has packed it."""
     return tuple(
         memory.get((__name__, mesh.digest), partial(pack, mesh), lambda blocks: blocks.nbytes) for mesh in meshes
     )
@@ -230,21 +229,18 @@ CHORD_SLACK = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Bundles:
-    """Directions cut into bundles: cones of neighbouring directions, each about one of its members.
-
-    Attributes:
-        order: Shape (n,), row of each direction in the caller's order.
-        outward: Shape (n, 3), unit vectors in the order of the bundles.
-        starts: Shape (b + 1,), row in ``outward`` of each bundle's first member.
-        middle: Shape (b,), row in ``outward`` of the member that is each bundle's axis.
-        chord: Shape (b,), largest |u - axis| of its members, rounded up.
-    """
+    """Directions cut into bundles: cones of neighbouring directions, each about one of its members."""
 
     order: NDArray[np.int64]
+    """Shape (n,), row of each direction in the caller's order."""
     outward: Floats
+    """Shape (n, 3), unit vectors in the order of the bundles."""
     starts: NDArray[np.int64]
+    """Shape (b + 1,), row in ``outward`` of each bundle's first member."""
     middle: NDArray[np.int64]
+    """Shape (b,), row in ``outward`` of the member that is each bundle's axis."""
     chord: Floats
+    """Shape (b,), largest |u - axis| of its members, rounded up."""
 
     def parts(self, most: int) -> list[Bundles]:
         """The bundles divided into at most ``most`` runs of equal length, none shorter than ``LEAST_BUNDLES``."""
@@ -253,7 +249,6 @@ class Bundles:
         return [self._run(low, high) for low, high in itertools.pairwise(edges)]
 
     def _run(self, low: int, high: int) -> Bundles:
-        """Bundles ``low`` to ``high``."""
         first = self.starts[low]
         members = slice(first, self.starts[high])
         starts, middle = self.starts[low : high + 1] - first, self.middle[low:high] - first
@@ -308,7 +303,6 @@ def _bundle_axes(outward, starts, middle, chord):  # type: ignore[no-untyped-def
 
 @nb.njit(cache=True)
 def _square_between(outward, i, k):  # type: ignore[no-untyped-def]  # numba infers
-    """Square of the chord between two directions."""
     x, y, z = outward[i, 0] - outward[k, 0], outward[i, 1] - outward[k, 1], outward[i, 2] - outward[k, 2]
     return x * x + y * y + z * z
 
@@ -319,19 +313,16 @@ COORDINATE_SLACK = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class PlacedSurface:
-    """One surface in coordinates about one target.
-
-    Attributes:
-        nodes: Shape (groups, 10, 16), of the tree, as `bounds.disc_bounds` reads them.
-        slack: Rounding of a node's coordinate, mm.
-        distance: Of the target from the surface, mm: no axis is farther, for it starts there.
-        nearest: Row of the triangle nearest to the target.
-    """
+    """One surface in coordinates about one target."""
 
     nodes: NDArray[np.float32]
+    """Shape (groups, 10, 16), of the tree, as `bounds.disc_bounds` reads them."""
     slack: float
+    """Rounding of a node's coordinate, mm."""
     distance: float
+    """Of the target from the surface, mm: no axis is farther, for it starts there."""
     nearest: int
+    """Row of the triangle nearest to the target."""
 
 
 def placed_surface(blocks: Blocks, target: Floats) -> PlacedSurface:
@@ -350,17 +341,14 @@ def placed_surface(blocks: Blocks, target: Floats) -> PlacedSurface:
 
 @dataclass(frozen=True, eq=False)
 class NearFaces:
-    """The faces of a structure near one needle axis, which a small displacement could touch; CT frame, mm.
-
-    Attributes:
-        triangles: Shape (m, 9), corners, in blocks of 16, those that may be nearest first.
-        faces: Shape (m, 4), a sphere around each: centre, radius.
-        blocks: Shape (m / 16, 4), around each 16.
-    """
+    """The faces of a structure near one needle axis, which a small displacement could touch; CT frame, mm."""
 
     triangles: Floats
+    """Shape (m, 9), corners, in blocks of 16, those that may be nearest first."""
     faces: Floats
+    """Shape (m, 4), a sphere around each: centre, radius."""
     blocks: Floats
+    """Shape (m / 16, 4), around each 16."""
 
     def __len__(self) -> int:
         return len(self.triangles)

@@ -133,14 +133,11 @@ OWN_MM = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class HeldEngine:
-    """An engine of one's own, held to an exact one: it may measure less than there is, and never more.
-
-    Attributes:
-        exact: Measures the same axes again, and answers all else.
-    """
+    """An engine of one's own, held to an exact one: it may measure less than there is, and never more."""
 
     own: ClearanceEngine
     exact: ClearanceEngine
+    """Measures the same axes again, and answers all else."""
 
     @property
     def triangles(self) -> tuple[Floats, ...]:

@@ -241,14 +241,12 @@ def _dot(p, q):  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _square(p, q):  # type: ignore[no-untyped-def]  # numba infers
-    """Squared distance of two points."""
     x, y, z = p[0] - q[0], p[1] - q[1], p[2] - q[2]
     return x * x + y * y + z * z
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _area(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
-    """Area of a triangle."""
     dx, dy, dz, ex, ey, ez = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
     x, y, z = dy * ez - dz * ey, dz * ex - dx * ez, dx * ey - dy * ex
     return 0.5 * math.sqrt(x * x + y * y + z * z)

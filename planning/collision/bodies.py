@@ -10,11 +10,10 @@ Where surfaces do not touch, `LooseParts` tells whether a part of one lies withi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import islice, product
-from types import MappingProxyType
+from itertools import combinations, islice, pairwise, product
 from typing import NamedTuple
 
 import fcl
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.links import LINK_NAMES, Link, collision_links
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UrModel
+from puncture_twin.planning.arm.urdf.arm_urdf import hull
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import user_cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
@@ -38,31 +38,13 @@ BODY_NAMES = (*LINK_NAMES, "tool", "holder", "needle")
 FLANGE_FRAME = 6
 """The frame of wrist 3, whose origin and axes are the flange's."""
 
-NEVER_TESTED: Mapping[tuple[str, str], str] = MappingProxyType(
-    {
-        ("base", "shoulder"): "connected by a joint: they overlap at every angle",
-        ("shoulder", "upper_arm"): "joined by a joint",
-        ("upper_arm", "forearm"): "joined by a joint",
-        ("forearm", "wrist_1"): "joined by a joint",
-        ("wrist_1", "wrist_2"): "joined by a joint",
-        ("wrist_2", "wrist_3"): "joined by a joint",
-        ("wrist_3", "tool"): "bolted together",
-        ("tool", "holder"): "bolted together",
-        ("tool", "needle"): "bolted together",
-        ("wrist_3", "holder"): "bolted together",
-        ("wrist_3", "needle"): "bolted together",
-        ("holder", "needle"): "bolted together",
-    }
-)
-"""Pairs that touch by construction, with the reason; of an own arm's neighbours what is not joined is tested."""
+NEVER_TESTED = frozenset((*pairwise(LINK_NAMES), *combinations(("wrist_3", "tool", "holder", "needle"), 2)))
+"""Pairs that touch by construction, connected by a joint or bolted together; of an own arm's neighbours what is not
+joined is tested."""
 
-NEVER_TOUCHING: Mapping[tuple[str, str], str] = MappingProxyType(
-    {
-        ("wrist_2", "holder"): "the holder starts at the flange, beyond wrist 2, and points away at every angle",
-        ("wrist_2", "needle"): "as the holder",
-    }
-)
-"""Pairs that cannot touch where the arm ships with the program; wrist 2 of an own arm may carry a bracket."""
+NEVER_TOUCHING = frozenset({("wrist_2", "holder"), ("wrist_2", "needle")})
+"""Pairs that cannot touch where the arm ships with the program: holder and needle begin at the flange, beyond wrist 2,
+and point away at every angle; wrist 2 of an own arm may carry a bracket."""
 
 
 class Shape(NamedTuple):
@@ -76,22 +58,19 @@ class Shape(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One body of the arm.
-
-    Attributes:
-        name: One of ``BODY_NAMES``.
-        frame: Index of its frame among ``link_poses``.
-        T_frame_body: Shape (4, 4), mm: its shapes in that frame.
-        full: The body grown by the padding; ``bare`` itself where there is none.
-        radius_mm: Every point of ``bare`` lies within this distance of the shapes' origin.
-    """
+    """One body of the arm."""
 
     name: str
+    """One of ``BODY_NAMES``."""
     frame: int
+    """Index of its frame among ``link_poses``."""
     T_frame_body: Floats
+    """Shape (4, 4), mm: its shapes in that frame."""
     bare: Shape
     full: Shape
+    """The body grown by the padding; ``bare`` itself where there is none."""
     radius_mm: float
+    """Every point of ``bare`` lies within this distance of the shapes' origin."""
 
     @cached_property
     def box(self) -> Floats:
@@ -119,14 +98,6 @@ class Body:
         for shape in (self.bare,) if self.full is self.bare else (self.bare, self.full):
             for item in (*shape.solids, shape.surface):
                 item.place(transform)
-
-
-def link_body(link: Link, grown: Link) -> Body:
-    """A link as it is, and grown by the padding; the same object where there is none."""
-    bare = _link_shape(link)
-    full = bare if grown is link else _link_shape(grown)
-    radius_mm = float(np.linalg.norm(link.mesh.vertices, axis=1).max())
-    return Body(link.name, link.frame, np.eye(4), bare, full, radius_mm)
 
 
 def _link_shape(link: Link) -> Shape:
@@ -161,25 +132,26 @@ def arm_bodies(model: UrModel, tool: Tool, padding_mm: float) -> tuple[Body, ...
     """
     own = () if tool.body is None else (Link("tool", FLANGE_FRAME, tool.body.pieces),)
     links = (*collision_links(model), *own)
-    full = padded_links(links, padding_mm) if padding_mm else links
-    return (
-        *(link_body(bare, more) for bare, more in zip(links, full, strict=True)),
-        round_body("holder", tool.holder_diameter_mm, tool.holder_span_mm, padding_mm),
-        round_body("needle", tool.needle_diameter_mm, tool.needle_span_mm, padding_mm),
-    )
-
-
-def padded_links(links: Sequence[Link], padding_mm: float) -> tuple[Link, ...]:
-    """The links with every piece grown by the padding, from the user's cache where they are there."""
     pieces = [piece for link in links for piece in link.pieces]
-    made_from = {"what": "padded", "padding_mm": padding_mm, "pieces": [piece.digest for piece in pieces]}
 
     def grown() -> Arrays:
         return packed_meshes([padded(piece, padding_mm) for piece in pieces])
 
-    cached = user_cache().arrays(made_from, grown, by=__name__, check=unpacked_meshes)
-    following = iter(unpacked_meshes(cached))
-    return tuple(Link(link.name, link.frame, tuple(islice(following, len(link.pieces)))) for link in links)
+    bodies, bare = [], [_link_shape(link) for link in links]
+    full = bare
+    if padding_mm:
+        made_from = {"what": "padded", "padding_mm": padding_mm, "pieces": [piece.digest for piece in pieces]}
+        following = iter(unpacked_meshes(user_cache().arrays(made_from, grown, by=__name__, check=unpacked_meshes)))
+        fuller = [replace(link, pieces=tuple(islice(following, len(link.pieces)))) for link in links]
+        full = [_link_shape(link) for link in fuller]
+    for link, own, more in zip(links, bare, full, strict=True):
+        radius_mm = float(np.linalg.norm(link.mesh.vertices, axis=1).max())
+        bodies.append(Body(link.name, link.frame, np.eye(4), own, more, radius_mm))
+    return (
+        *bodies,
+        round_body("holder", tool.holder_diameter_mm, tool.holder_span_mm, padding_mm),
+        round_body("needle", tool.needle_diameter_mm, tool.needle_span_mm, padding_mm),
+    )
 
 
 class Solid:
@@ -227,13 +199,10 @@ def convex(mesh: TriangleMesh) -> fcl.Convex:
 
 def padded(mesh: TriangleMesh, padding_mm: float) -> TriangleMesh:
     """A convex mesh grown by at least ``padding_mm`` on every side: its sum with the cube about such a sphere."""
-    import trimesh  # here: it costs a third of a second, and few need it
-
     if padding_mm == 0.0:
         return mesh
     corners = padding_mm * np.array(list(product((-1.0, 1.0), repeat=3)))
-    hull = trimesh.convex.convex_hull((mesh.vertices[:, None] + corners).reshape(-1, 3))
-    return TriangleMesh(np.asarray(hull.vertices), np.asarray(hull.faces))
+    return hull((mesh.vertices[:, None] + corners).reshape(-1, 3))
 
 
 PRISM_SIDES = 24
@@ -305,17 +274,14 @@ def _walk_to_centre(points, steps, best):  # type: ignore[no-untyped-def]  # num
 
 @dataclass(frozen=True, eq=False)
 class SphereTree:
-    """Spheres in a tree, the root first: every node's sphere encloses all parts below it.
-
-    Attributes:
-        centres: Shape (n, 3), mm, in the frame of the body.
-        radii: Shape (n,), mm.
-        children: Shape (n, 2): rows of the two children; -1 at a leaf.
-    """
+    """Spheres in a tree, the root first: every node's sphere encloses all parts below it."""
 
     centres: Floats
+    """Shape (n, 3), mm, in the frame of the body."""
     radii: Floats
+    """Shape (n,), mm."""
     children: NDArray[np.int64]
+    """Shape (n, 2): rows of the two children; -1 at a leaf."""
 
     @property
     def leaves(self) -> NDArray[np.int64]:
@@ -363,15 +329,12 @@ def sphere_tree(pieces: Sequence[Floats], leaf_radius_mm: float = LEAF_RADIUS_MM
 
 
 class LooseParts(NamedTuple):
-    """The connected parts of a surface.
-
-    Attributes:
-        corners: Shape (k, 3), mm: a corner of each.
-        sizes: Shape (k, 3), mm: the edges of the box about each.
-    """
+    """The connected parts of a surface."""
 
     corners: Floats
+    """Shape (k, 3), mm: a corner of each."""
     sizes: Floats
+    """Shape (k, 3), mm: the edges of the box about each."""
 
     @classmethod
     def of(cls, mesh: TriangleMesh) -> LooseParts:
@@ -379,11 +342,6 @@ class LooseParts(NamedTuple):
         points, begins = _in_parts(mesh)
         sizes = np.maximum.reduceat(points, begins) - np.minimum.reduceat(points, begins)
         return cls(points[begins], sizes)
-
-    def no_larger_than(self, mm: float) -> LooseParts:
-        """The parts whose box has a diagonal no longer than that."""
-        small = np.linalg.norm(self.sizes, axis=1) <= mm
-        return LooseParts(self.corners[small], self.sizes[small])
 
 
 def connected_parts(mesh: TriangleMesh) -> list[Floats]:

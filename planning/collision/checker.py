@@ -9,13 +9,14 @@ surface counts. What is loose (a block of the table) could hide in a link: see `
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, cached_property, partial
 from itertools import combinations, pairwise, product
 from types import MappingProxyType
 
 import fcl
 import numpy as np
+import scipy
 
 from puncture_twin.planning.anatomy.anatomy import OUTSIDE_BODY
 from puncture_twin.planning.arm.kinematics import link_poses
@@ -65,9 +66,8 @@ class CellChecker:
             more than 2 mm prove that the path between them touches neither patient nor box.
 
     Raises:
-        InputError: If two boxes share a name, the patient's mesh is unusable, the base
-            is in the patient, a shape of an own arm hangs on nothing,
-            or an own tool does not hang on the flange.
+        InputError: If two boxes share a name, the patient's mesh is unusable, the base is in the patient, a shape of an
+            own arm hangs on nothing, or an own tool does not hang on the flange.
     """
 
     def __init__(
@@ -93,7 +93,13 @@ class CellChecker:
         if patient is not None:
             outside_skin = None if outside is None else FclSkin(outside, OUTSIDE_BODY)
             self._patient = FclPatient(FclSkin(patient, PATIENT), outside_skin)
-        self._boxes = _boxes(boxes, {PATIENT, *(body.name for body in self._bodies)})
+        names, taken = [box.name for box in boxes], {PATIENT, *(body.name for body in self._bodies)}
+        if len(set(names)) < len(names) or set(names) & taken:
+            refuse(f"box names {names}", "cell", "unique names, not those of a body or the patient", "duplicate_name")
+        self._boxes: dict[str, Solid] = {}
+        for box in boxes:
+            pose = fcl.Transform(box.T_base_box[:3, :3], box.T_base_box[:3, 3])
+            self._boxes[box.name] = Solid(partial(fcl.Box, *box.size_mm), pose)
         self._bounds = {box.name: box.bounds for box in boxes}
         self._checks = (*self._workcell_checks(), *self._self_checks())
         if patient is not None and self._surface is not None and self._patient is not None:
@@ -106,15 +112,7 @@ class CellChecker:
         return np.concatenate([apply(T, corners) for T, corners in pieces])
 
     def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
-        """The first contact found, or None when the arm is clear.
-
-        Args:
-            q: Shape (6,), rad.
-            needle_may_touch_patient: True while the needle goes in. The holder may never touch.
-
-        Raises:
-            InputError: If ``q`` is not finite: FCL would call it free.
-        """
+        """As `StateChecker.contact`, refusing what is not finite; the holder may never touch."""
         self._place(q)
         for check in self._checks:
             allowed = needle_may_touch_patient and check.contact == NEEDLE_IN_PATIENT
@@ -125,19 +123,11 @@ class CellChecker:
     def contacts(
         self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
     ) -> list[Contact | None]:
-        """First contact of each of many states, shape (n, 6), rad; known contacts are checked first.
-
-        Raises:
-            InputError: If a state is not finite.
-        """
+        """As `StateChecker.contacts`."""
         return [self.contact(state, needle_may_touch_patient=needle_may_touch_patient) for state in q]
 
     def folded(self, q: Floats) -> Bools:
-        """Which of many states (n, 6), rad, have contact between links before the last joint: at any q6.
-
-        Raises:
-            InputError: If a state is not finite.
-        """
+        """As `StateChecker.folded`."""
         before = [check for check in self._checks if check.before_last_joint]
         found = np.zeros(len(q), np.bool_)
         for row, state in enumerate(q):
@@ -146,14 +136,7 @@ class CellChecker:
         return found
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
-        """The first state of a path with a contact, and the contact; None when all are clear.
-
-        Args:
-            q_path: Shape (m, 6), rad.
-
-        Raises:
-            InputError: If a state is not finite.
-        """
+        """As `StateChecker.first_contact`."""
         for index, q in enumerate(q_path):
             contact = self.contact(q, needle_may_touch_patient=needle_may_touch_patient)
             if contact is not None:
@@ -161,16 +144,7 @@ class CellChecker:
         return None
 
     def nearest(self, q: Floats, pair: str, body: str | None = None) -> Nearest:
-        """The smallest of one kind of distance.
-
-        Args:
-            q: Shape (6,), rad.
-            pair: One of ``DISTANCE_PAIRS``.
-            body: Only from this one of the pair's bodies.
-
-        Raises:
-            InputError: If ``q`` is not finite, or there is no such kind or body.
-        """
+        """As `StateChecker.nearest`; refuses another kind or body."""
         names = DISTANCE_PAIRS.get(pair, ())
         if not names or (body is not None and body not in names):
             where, allowed = f"distance {pair!r} of {body!r}", ", ".join(names or DISTANCE_PAIRS)
@@ -181,25 +155,11 @@ class CellChecker:
         return _nearest(bodies, self._boxes if pair == "boxes" else skin, self._bounds)
 
     def distances(self, q: Floats) -> Distances:
-        """Least distances of moving links and tool from patient and boxes.
-
-        Args:
-            q: Shape (6,), rad.
-
-        Raises:
-            InputError: If ``q`` is not finite.
-        """
+        """As `StateChecker.distances`."""
         return Distances(*(self.nearest(q, pair) for pair in DISTANCE_PAIRS))
 
     def sweep_mm(self, q_path: Floats) -> Floats:
-        """Bound on every body's motion along each segment of a path.
-
-        Args:
-            q_path: Shape (m, 6), rad.
-
-        Returns:
-            Shape (m - 1,), mm; see :meth:`SweptBodies.bounds_mm`.
-        """
+        """As `StateChecker.sweep_mm`; see :meth:`SweptBodies.bounds_mm`."""
         return np.asarray(self.swept.bounds_mm(q_path).max(axis=1))
 
     def body_sweeps_mm(self, q_path: Floats) -> dict[str, Floats]:
@@ -214,7 +174,6 @@ class CellChecker:
         return Solid(partial(surface, self._surface))
 
     def _workcell_checks(self) -> Iterator[Check]:
-        """Every moving body against the patient, then the boxes."""
         for body in self._bodies[1:]:
             if self._patient is not None:
                 yield Check(Contact(body.name, PATIENT), self._patient, body.full.surface, None, body, None)
@@ -224,7 +183,7 @@ class CellChecker:
 
     def _self_checks(self) -> Iterator[Check]:
         """Every pair of bodies that might touch, piece by piece; of an own arm's neighbours what is not joined."""
-        left_out = NEVER_TESTED.keys() | (NEVER_TOUCHING.keys() if self.model.urdf is None else set())
+        left_out = NEVER_TESTED | NEVER_TOUCHING if self.model.urdf is None else NEVER_TESTED
         for first, second in combinations(self._bodies, 2):
             joined = self._joined.get((first.name, second.name))
             if joined is None and (first.name, second.name) in left_out:
@@ -259,16 +218,6 @@ def _nearest(bodies: Sequence[Body], others: Mapping[str, Solid], bounds: Mappin
         mm = min(fcl.distance(other.made, shape.made, fcl.DistanceRequest(), fcl.DistanceResult()) for shape in shapes)
         best = min(best, Nearest(max(0.0, float(mm)), body.name, name))  # FCL says -1 for contact
     return best
-
-
-def _boxes(boxes: Sequence[Box], taken: Set[str]) -> dict[str, Solid]:
-    names = [box.name for box in boxes]
-    if len(set(names)) < len(names) or set(names) & taken:
-        refuse(f"box names {names}", "cell", "unique names, not those of a body or the patient", "duplicate_name")
-    return {
-        box.name: Solid(partial(fcl.Box, *box.size_mm), fcl.Transform(box.T_base_box[:3, :3], box.T_base_box[:3, 3]))
-        for box in boxes
-    }
 
 
 @cache
@@ -318,26 +267,21 @@ def _joined(model: UrModel, links: Sequence[Link], solids: Solids, joint: int) -
 
 def _check_hanging(model: UrModel, links: Sequence[Link], solids: Solids, joined: Sequence[Bools]) -> None:
     """Refuse an arm of which a piece is reached from the base by no chain of pieces that lie together."""
-    hanging = {(0, 0)}
-    fresh = [(0, 0)]
-    within = [_gaps_mm(some, some) <= APART_MM for some in solids]
-    while fresh:
-        link, piece = fresh.pop()
-        joined_here = {(link, int(other)) for other in np.flatnonzero(within[link][piece])}
+    ends = np.cumsum([0, *map(len, solids)])
+    together = np.zeros((ends[-1], ends[-1]), np.bool_)
+    for link, some in enumerate(solids):
+        own = slice(ends[link], ends[link + 1])
+        together[own, own] = _gaps_mm(some, some) <= APART_MM
         if link < len(joined):
-            joined_here |= {(link + 1, int(other)) for other in np.flatnonzero(joined[link][piece])}
-        if link > 0:
-            joined_here |= {(link - 1, int(other)) for other in np.flatnonzero(joined[link - 1][:, piece])}
-        fresh += joined_here - hanging
-        hanging |= joined_here
-    for number, body in enumerate(links):
-        for piece, shape in enumerate(body.pieces):
-            if (number, piece) not in hanging:
-                low, high = shape.bounds
-                size = " x ".join(f"{edge:.4g}" for edge in high - low)
-                what = f"a shape of {body.name}, {size} mm, is not connected"
-                allowed = f"connected shapes, within {APART_MM:g} mm: check unit, scale and origin; or use one mesh"
-                refuse(what, model_urdf(model).where, allowed, "shape_detached")
+            together[own, ends[link + 1] : ends[link + 2]] = joined[link]
+    group = scipy.sparse.csgraph.connected_components(together, directed=False)[1]
+    pieces = [(body.name, *piece.bounds) for body in links for piece in body.pieces]
+    for row in np.flatnonzero(group != group[0])[:1].tolist():
+        name, low, high = pieces[row]
+        size = " x ".join(f"{edge:.4g}" for edge in high - low)
+        what = f"a shape of {name}, {size} mm, is not connected"
+        allowed = f"connected shapes, within {APART_MM:g} mm: check unit, scale and origin; or use one mesh"
+        refuse(what, model_urdf(model).where, allowed, "shape_detached")
 
 
 def _place(solids: Sequence[fcl.CollisionObject], T: Floats) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.cache.array_cache import NO_CACHE, Cache
 from puncture_twin.planning.collision.checker import CellChecker
-from puncture_twin.planning.collision.kernels import segments, segments as segment_kernels
+from puncture_twin.planning.collision.kernels import segments
 from puncture_twin.planning.collision.kernels.settled import CLEAR, OPEN, TOUCHES_OUTSIDE
 from puncture_twin.planning.collision.packed import ROUND
 from puncture_twin.planning.collision.patient import Check
@@ -141,7 +140,6 @@ class FastChecker(CellChecker):
 
     @cached_property
     def _segment_scratch(self) -> segments.SegmentScratch:
-        """Scratch in which segments are checked, one after the other."""
         return segments.segment_scratch(self._proofs.scene, self._proofs.movers)
 
     def open_checks(self, q: Floats, *, needle_may_touch_patient: bool) -> list[Contact]:
@@ -185,13 +183,6 @@ QUESTIONS = 256
 """Space for the queries that one segment leaves to FCL, at first."""
 
 
-class _Filled(NamedTuple):
-    """Arrays that the compiled code fills."""
-
-    scratch: segments.SegmentScratch
-    answer: segments.Answer
-
-
 class SegmentChecker:
     """Checks whether straight joint segments are free. Not for several threads.
 
@@ -216,7 +207,7 @@ class SegmentChecker:
         self._model, self._checks, self._clear_mm = model, checks, clear_mm
         self._packed = (proofs.scene, proofs.movers, model.lengths)
         self._order = np.arange(len(checks), dtype=np.int64)
-        self._filled = _Filled(scratch, _empty_answer(QUESTIONS))
+        self._scratch, self._answer = scratch, _empty_answer(QUESTIONS)
 
     def __call__(self, start: Floats, end: Floats) -> Contact | None:
         """Contact on the segment between two states (6,), rad, the needle outside the patient; None if free.
@@ -229,31 +220,27 @@ class SegmentChecker:
             InputError: If a state is not finite.
         """
         start, end, answered = np.array(start, dtype=np.float64), np.array(end, dtype=np.float64), 0
-        halvings = _halvings(end - start)
+        length = math.sqrt(float((end - start) @ (end - start)))
+        halvings = 0  # for all checks together; none of a step that is no number
+        if 0.0 < length < math.inf:
+            halvings = min(segments.HALVINGS, max(0, math.ceil(math.log2(length / LOOK_FIRST_RAD))))
+        settings = halvings, FINE_MM, self._clear_mm
         while True:
-            segment_kernels.check_segment(
-                *self._packed, start, end, answered, halvings, FINE_MM, self._clear_mm, self._order, *self._filled
-            )
-            status, check, answered, count = self._filled.answer.status.tolist()
+            answer = self._answer
+            segments.check_segment(*self._packed, start, end, answered, *settings, self._order, self._scratch, answer)
+            status, check, answered, count = answer.status.tolist()
             if status == segments.NOT_FINITE:
                 require_finite(np.stack([start, end]))
             if status == segments.CONTACT:
                 return self._contact(check)
-            if count > len(self._filled.answer.fractions):
-                self._filled = self._filled._replace(answer=_empty_answer(2 * count))
+            if count > len(answer.fractions):
+                self._answer = _empty_answer(2 * count)
                 continue
-            touching = self._touching(start, end, count)
-            if touching is not None or status != segments.QUERY:
-                return touching
-
-    def _touching(self, start: Floats, end: Floats, queries: int) -> Contact | None:
-        """First contact by FCL where so many queries are left to it."""
-        answer = self._filled.answer
-        where = answer.fractions[:queries].tolist(), answer.checks[:queries].tolist()
-        for fraction, at in zip(*where, strict=True):
-            if self._checks[at].contact_at(link_poses(self._model, start + fraction * (end - start))) is not None:
-                return self._contact(at)
-        return None
+            for fraction, at in zip(answer.fractions[:count].tolist(), answer.checks[:count].tolist(), strict=True):
+                if self._checks[at].contact_at(link_poses(self._model, start + fraction * (end - start))) is not None:
+                    return self._contact(at)
+            if status != segments.QUERY:
+                return None
 
     def _contact(self, check: int) -> Contact:
         """The contact of a check, which is tested first from now on."""
@@ -264,14 +251,6 @@ class SegmentChecker:
 
 def _empty_answer(questions: int) -> segments.Answer:
     return segments.Answer(np.zeros(4, np.int64), np.empty(questions), np.empty(questions, np.int64))
-
-
-def _halvings(step: Floats) -> int:
-    """Number of halvings of a step (6,), rad, for all checks together; none of one that is no number."""
-    length = math.sqrt(float(step @ step))
-    return (
-        min(segments.HALVINGS, max(0, math.ceil(math.log2(length / LOOK_FIRST_RAD)))) if 0.0 < length < math.inf else 0
-    )
 
 
 def halving_order(count: int) -> Floats:

@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import scipy
@@ -92,7 +92,7 @@ class PackedHulls:
         axes = by_axes(corners)
         inner = np.concatenate([inscribed_prism(piece) if about else piece for piece, about in pieces])
         count = len(self._boxes)
-        boxes, arm = (cached_enclosed(some, cache) for some in (self._corners[:count], self._corners[count:]))
+        boxes, arm = (enclosed(some, cache) for some in (self._corners[:count], self._corners[count:]))
         centres, radii, slack, sizes, few, degrees = (
             np.concatenate([boxes[key], arm[key]]) for key in ("centres", "radii", "slack", "sizes", "few", "degrees")
         )
@@ -124,30 +124,28 @@ def by_axes(points: Floats) -> Axes:
     return x, y, z
 
 
-def cached_enclosed(hulls: Sequence[Floats], cache: Cache) -> Arrays:
-    """`enclosed` from the cache: boxes apart from the arm, which is the same for every patient."""
-    return cache.arrays(made_from("hulls", hulls), lambda: enclosed(hulls), by=__name__)
+def enclosed(hulls: Sequence[Floats], cache: Cache) -> Arrays:
+    """A sphere about each convex hull and a coarse hull: their numbers, one array each.
 
+    Boxes are kept apart from the arm, which is the same for every patient.
+    """
 
-def enclosed(hulls: Sequence[Floats]) -> Arrays:
-    """A sphere about each convex hull and a coarse hull: their numbers, one array each."""
-    coarse, edges = [coarse_hull(corners) for corners in hulls], [neighbours(corners) for corners in hulls]
-    first = row_starts([len(corners) for corners in hulls])
-    rows = [hull.rows + start for hull, start in zip(edges, first[:-1], strict=True)]
-    spheres = [enclosing_sphere(corners) for corners in hulls]
-    return {
-        "centres": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
-        "radii": np.array([sphere.radius for sphere in spheres]),
-        "slack": np.array([hull.slack_mm for hull in coarse]),
-        "sizes": np.array([len(hull.corners) for hull in coarse], dtype=np.int64),
-        "few": np.concatenate([np.empty((0, 3)), *(hull.corners for hull in coarse)]),
-        "degrees": np.concatenate([np.empty(0, np.int64), *(hull.degrees for hull in edges)]),
-        "neighbours": np.concatenate([np.empty(0, np.int64), *rows]),
-    }
+    def make() -> Arrays:
+        coarse, edges = [coarse_hull(corners) for corners in hulls], [neighbours(corners) for corners in hulls]
+        first = row_starts([len(corners) for corners in hulls])
+        rows = [own + start for (_, own), start in zip(edges, first[:-1], strict=True)]
+        spheres = [enclosing_sphere(corners) for corners in hulls]
+        return {
+            "centres": np.array([sphere.centre for sphere in spheres]).reshape(-1, 3),
+            "radii": np.array([sphere.radius for sphere in spheres]),
+            "slack": np.array([slack_mm for _, slack_mm in coarse]),
+            "sizes": np.array([len(few) for few, _ in coarse], dtype=np.int64),
+            "few": np.concatenate([np.empty((0, 3)), *(few for few, _ in coarse)]),
+            "degrees": np.concatenate([np.empty(0, np.int64), *(degrees for degrees, _ in edges)]),
+            "neighbours": np.concatenate([np.empty(0, np.int64), *rows]),
+        }
 
-
-def _tree_arrays(pieces: Sequence[Floats]) -> Arrays:
-    return dict(vars(sphere_tree(pieces)))
+    return cache.arrays(made_from("hulls", hulls), make, by=__name__)
 
 
 def packed_trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], tuple[Floats, Floats, Ints]]:
@@ -156,7 +154,8 @@ def packed_trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], 
     centres, radii, children = [np.empty((0, 3))], [np.empty(0)], [np.empty((0, 2), np.int64)]
     for body in bodies:
         pieces = [in_frame(hull, body) for hull in body.full.hulls]
-        tree = SphereTree(**cache.arrays(made_from("balls", pieces), partial(_tree_arrays, pieces), by=__name__))
+        make = partial(lambda parts: dict(vars(sphere_tree(parts))), pieces)
+        tree = SphereTree(**cache.arrays(made_from("balls", pieces), make, by=__name__))
         start = sum(len(part) for part in radii)
         roots[body.name] = start
         centres.append(tree.centres)
@@ -165,9 +164,15 @@ def packed_trees(bodies: Sequence[Body], cache: Cache) -> tuple[dict[str, int], 
     return roots, (np.concatenate(centres), np.concatenate(radii), np.concatenate(children))
 
 
-def settings() -> dict[str, float]:
-    """Constants of this module that decide its results, for cache keys."""
+def made_from(what: str, pieces: Sequence[NDArray[Any]]) -> dict[str, object]:
+    """Cache key of results about some convex pieces: their corners and how they are enclosed."""
+    digest = hashlib.sha256()
+    for corners in pieces:
+        digest.update(f"{corners.shape}".encode())
+        digest.update(np.ascontiguousarray(corners).tobytes())
     return {
+        "what": what,
+        "pieces": digest.hexdigest(),
         "leaf": LEAF_RADIUS_MM,
         "slack": SLACK_MM,
         "steps": CENTRE_STEPS,
@@ -176,53 +181,29 @@ def settings() -> dict[str, float]:
     }
 
 
-def made_from(what: str, pieces: Sequence[NDArray[Any]]) -> dict[str, object]:
-    """Cache key of results about some convex pieces: their corners and how they are enclosed."""
-    digest = hashlib.sha256()
-    for corners in pieces:
-        digest.update(f"{corners.shape}".encode())
-        digest.update(np.ascontiguousarray(corners).tobytes())
-    return {"what": what, "pieces": digest.hexdigest(), **settings()}
-
-
-class Coarse(NamedTuple):
-    """A few corners of a convex hull."""
-
-    corners: Floats
-    """Shape (n, 3), mm."""
-    slack_mm: float
-    """No point of the whole hull lies farther outside the hull of these."""
-
-
-def coarse_hull(corners: Floats) -> Coarse:
-    """The corners (n, 3) that are outermost in some of many directions, mm, and how far the others stand out.
+def coarse_hull(corners: Floats) -> tuple[Floats, float]:
+    """The corners (n, 3) that are outermost in some of many directions, and how far the others stand out, mm.
 
     Distance to a convex set is a convex function, so over the whole hull it is largest at a corner.
     """
     if len(corners) <= COARSE_DIRECTIONS:
-        return Coarse(corners, 0.0)
+        return corners, 0.0
     few = corners[np.unique(np.argmax(even_directions(COARSE_DIRECTIONS) @ corners.T, axis=1))]
     hull = scipy.spatial.ConvexHull(few)
     outside = (corners @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1) > -SLACK_MM  # beyond a face
     triangles = np.ascontiguousarray(few[hull.simplices])
-    return Coarse(few, float(farthest_from(triangles, corners[outside])) + SLACK_MM)
+    return few, float(farthest_from(triangles, corners[outside])) + SLACK_MM
 
 
-class Neighbours(NamedTuple):
-    """The edges of a convex hull of n corners."""
+def neighbours(corners: Floats) -> tuple[Ints, Ints]:
+    """Which corners (n, 3) of a convex hull share an edge of its triangles; a corner within the hull has none.
 
-    degrees: NDArray[np.int64]
-    """Shape (n,): how many neighbours each corner has."""
-    rows: NDArray[np.int64]
-    """The neighbours of the first corner, of the second, and so on."""
-
-
-def neighbours(corners: Floats) -> Neighbours:
-    """Which corners (n, 3) of a convex hull share an edge of its triangles; a corner within the hull has none."""
+    How many neighbours each corner has, shape (n,), and the rows of the first corner's, of the second's, and so on.
+    """
     faces = scipy.spatial.ConvexHull(corners).simplices
     edges = np.concatenate([np.roll(faces, turn, axis=1)[:, :2] for turn in range(3)])  # each face's three
     pairs = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0).astype(np.int64)
-    return Neighbours(np.bincount(pairs[:, 0], minlength=len(corners)), pairs[:, 1])
+    return np.bincount(pairs[:, 0], minlength=len(corners)), pairs[:, 1]
 
 
 def in_frame(corners: Floats, body: Body) -> Floats:
@@ -270,19 +251,16 @@ LEAF_TRIANGLES = 4
 
 @dataclass(frozen=True, eq=False)
 class TriangleTree:
-    """A heap of boxes: the children of node i are 2 i + 1 and 2 i + 2; the last level's nodes are the leaves.
-
-    Attributes:
-        lows: Shape (nodes, 3), mm: lowest corner of each node's box.
-        highs: Shape (nodes, 3), mm.
-        corners: Shape (leaves, k, 3, 3), mm: the triangles of each leaf; some stand in two, so that all have k.
-        rows: Shape (leaves, k): which of the mesh's triangles they are.
-    """
+    """A heap of boxes: the children of node i are 2 i + 1 and 2 i + 2; the last level's nodes are the leaves."""
 
     lows: Floats
+    """Shape (nodes, 3), mm: lowest corner of each node's box."""
     highs: Floats
+    """Shape (nodes, 3), mm."""
     corners: Floats
+    """Shape (leaves, k, 3, 3), mm: the triangles of each leaf; some stand in two, so that all have k."""
     rows: NDArray[np.int32]
+    """Shape (leaves, k): which of the mesh's triangles they are."""
 
     @classmethod
     def of(cls, mesh: TriangleMesh, cache: Cache = NO_CACHE) -> TriangleTree:

@@ -61,6 +61,7 @@ class FclSkin:
         if not usable or mesh.faces.min() < 0 or mesh.faces.max() >= count:
             refuse("mesh is empty, not finite or has an index out of range", name, "a valid mesh", "bad_mesh")
         self._mesh = mesh
+        self._trees: dict[int, fcl.CollisionObject] = {}
 
     def touches(self, solid: Solid, box: Floats) -> bool:
         """Whether a body touches the surface where it is.
@@ -85,15 +86,17 @@ class FclSkin:
         pose = body.full.surface.pose
         if not body.hollow or not self._near(pose, body.box):
             return False
-        small = self._loose.no_larger_than(float(np.linalg.norm(body.box[1] - body.box[0])))
-        points = (small.corners - pose.getTranslation()) @ pose.getRotation()
+        small = np.linalg.norm(self._loose.sizes, axis=1) <= float(np.linalg.norm(body.box[1] - body.box[0]))
+        points = (self._loose.corners[small] - pose.getTranslation()) @ pose.getRotation()
         near = np.all((points >= body.box[0]) & (points <= body.box[1]), axis=1)
         return bool(near.any()) and bool(within(points[near], body.half_spaces).any())
 
     def _near(self, pose: fcl.Transform, box: Floats) -> list[int]:
         """Parts of the surface that a box about a body, in the body's frame, may touch."""
-        low, high = _bounds_at(pose, box)
-        near = np.all((self._bounds[:, 1] >= low) & (self._bounds[:, 0] <= high), axis=1)
+        R = pose.getRotation()
+        centre = R @ (0.5 * (box[0] + box[1])) + pose.getTranslation()
+        reach = np.abs(R) @ (0.5 * (box[1] - box[0])) + ROUNDING_MM
+        near = np.all((self._bounds[:, 1] >= centre - reach) & (self._bounds[:, 0] <= centre + reach), axis=1)
         found: list[int] = np.flatnonzero(near).tolist()
         return found
 
@@ -103,18 +106,12 @@ class FclSkin:
 
     @cached_property
     def _parts(self) -> list[Ints]:
-        """The triangles of each part: rows of the mesh's faces."""
         order = kd_order(self._mesh.triangles.mean(axis=1), PART_TRIANGLES)
         return np.split(order, range(PART_TRIANGLES, len(order), PART_TRIANGLES))
 
     @cached_property
     def _bounds(self) -> Floats:
-        """Shape (parts, 2, 3), mm: a box about each part."""
         return np.array([box_of(self._mesh.triangles[part].reshape(-1, 3)) for part in self._parts])
-
-    @cached_property
-    def _trees(self) -> dict[int, fcl.CollisionObject]:
-        return {}
 
     def _tree(self, part: int) -> fcl.CollisionObject:
         if part not in self._trees:
@@ -136,14 +133,6 @@ class FclPatient(NamedTuple):
         if self.skin.collides_with(body):
             return PATIENT
         return OUTSIDE_BODY if self.outside is not None and self.outside.collides_with(body) else None
-
-
-def _bounds_at(pose: fcl.Transform, box: Floats) -> tuple[Floats, Floats]:
-    """Lowest and highest corner (3,) of a box about a body's own box where the body is."""
-    R = pose.getRotation()
-    centre = R @ (0.5 * (box[0] + box[1])) + pose.getTranslation()
-    reach = np.abs(R) @ (0.5 * (box[1] - box[0])) + ROUNDING_MM
-    return centre - reach, centre + reach
 
 
 class Check(NamedTuple):

@@ -124,17 +124,14 @@ def require_finite(q: Floats) -> None:
 
 @dataclass(frozen=True, eq=False)
 class SweptBodies:
-    """Boxes about the moving bodies, to bound their motion.
-
-    Attributes:
-        corners: Shape (6, 8, 3), mm: a box about each moving link in its frame, the last with all on the flange.
-        longest_lever_mm: No body point is ever farther from a joint's axis than this.
-    """
+    """Boxes about the moving bodies, to bound their motion."""
 
     model: UrModel
     tool: Tool
     corners: Floats
+    """Shape (6, 8, 3), mm: a box about each moving link in its frame, the last with all on the flange."""
     longest_lever_mm: float
+    """No body point is ever farther from a joint's axis than this."""
 
     @classmethod
     def of(cls, model: UrModel, tool: Tool, padding_mm: float = 0.0) -> SweptBodies:
@@ -184,10 +181,7 @@ class SweptBodies:
         return np.unique([*kept, last])
 
     def moving(self, q_path: Floats) -> tuple[Floats, Floats, Floats]:
-        """A path's frames, and how far bodies and joints may have moved since its first state.
-
-        Args:
-            q_path: Shape (m, 6), rad.
+        """A path's frames, and how far bodies and joints may have moved since its first state; ``q_path`` (m, 6), rad.
 
         Returns:
             T_base_link, shape (m, 7, 4, 4), mm; sums of :meth:`bounds_mm`, shape (m, 7), mm, the base's first; sums
@@ -201,7 +195,6 @@ class SweptBodies:
 
 @nb.njit(cache=True)
 def _moving(lengths, q, corners, lever, frames, moved, rotated):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``frames`` (m, 7, 4, 4), ``moved`` (m, 7) and ``rotated`` (m, 6) from ``q`` (m, 6)."""
     link_frames(lengths, q, frames)
     bounds = np.empty((len(q) - 1, 6))
     motion_bounds(frames, q, corners, lever, bounds)

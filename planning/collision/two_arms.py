@@ -87,12 +87,10 @@ def handle_tool(length_mm: float, diameter_mm: float) -> Tool:
 
 def head_body(T_flange_head: Floats, size_mm: Floats, clearance_mm: float) -> Body:
     """A probe's head: a cuboid of full edges (3,), mm, about the origin of its frame on the flange."""
-    shapes = [_cuboid(size_mm + 2.0 * grown) for grown in (0.0, clearance_mm)]
+    shapes = []
+    for size in (size_mm, size_mm + 2.0 * clearance_mm):
+        solid = Solid(partial(fcl.Box, *size))
+        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * size
+        shapes.append(Shape((solid,), solid, (corners,)))
     radius_mm = float(np.linalg.norm(size_mm)) / 2.0
     return Body("probe_head", FLANGE_FRAME, T_flange_head, shapes[0], shapes[1], radius_mm)
-
-
-def _cuboid(size: Floats) -> Shape:
-    solid = Solid(partial(fcl.Box, *size))
-    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * size
-    return Shape((solid,), solid, (corners,))

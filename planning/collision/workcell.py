@@ -14,12 +14,13 @@ import numpy as np
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Role, Structure
+from puncture_twin.planning.arm.links import plane_crossings
 from puncture_twin.planning.arm.tool import Box, Tool, gantry_boxes
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.cache.array_cache import Memory, user_cache
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.case.settings import Gantry, Obstacle
+from puncture_twin.planning.case.settings import Gantry
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box, joined
 from puncture_twin.planning.geometry.rigid import apply, pose
@@ -70,7 +71,8 @@ def case_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats) -> FastChecker
     except InputError as error:
         if not error.code.startswith("base_in"):
             raise
-        raise error.at(f"{case.path}: {_placing_key(case)}") from error
+        stated = "robot.mount" if case.robot.transform is None else "registration.transform"
+        raise error.at(f"{case.path}: {stated if case.registration is None else 'registration'}") from error
 
 
 def own_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory) -> Callable[[], FastChecker]:
@@ -85,13 +87,6 @@ def own_checker(case: Case, anatomy: Anatomy, T_base_ct: Floats, memory: Memory)
     size = CHECKER_BYTES + TREE_COPIES * sum(mesh.nbytes for mesh in meshes)
     make = partial(case_checker, case, anatomy, T_base_ct)
     return lambda: memory.get((*key, get_ident()), make, lambda _: size)
-
-
-def _placing_key(case: Case) -> str:
-    """Key of the case that states where its robot's base is."""
-    if case.registration is not None:
-        return "registration"
-    return "robot.mount" if case.robot.transform is None else "registration.transform"
 
 
 def home_configuration(case: Case) -> Floats:
@@ -118,22 +113,16 @@ NOWHERE = (
 
 def case_boxes(case: Case, T_base_ct: Floats) -> tuple[Box, ...]:
     """The obstacles and the gantry, in the base frame; the gantry's boxes are called ``gantry_0`` ..."""
-    boxes = tuple(_box(obstacle, T_base_ct) for obstacle in case.obstacles)
-    return boxes if case.gantry is None else (*boxes, *_gantry_boxes(case.gantry, T_base_ct))
-
-
-def gantry_in_ct(gantry: Gantry) -> tuple[Box, ...]:
-    """The gantry's boxes in the CT frame, which takes the place of their base frame."""
-    return _gantry_boxes(gantry, np.eye(4))
+    boxes = []
+    for obstacle in case.obstacles:
+        T, (x, y, z) = pose(np.eye(3), obstacle.center_mm), obstacle.size_mm.tolist()
+        boxes.append(Box(obstacle.name, T if obstacle.frame == "base" else T_base_ct @ T, (x, y, z)))
+    return (*boxes, *(() if case.gantry is None else _gantry_boxes(case.gantry, T_base_ct)))
 
 
 def _gantry_boxes(gantry: Gantry, T_base_ct: Floats) -> tuple[Box, ...]:
-    return gantry_boxes(
-        T_base_ct @ gantry.T_ct_gantry,
-        bore_diameter_mm=gantry.bore_diameter_mm,
-        wall_mm=gantry.wall_mm,
-        depth_mm=gantry.thickness_mm,
-    )
+    bore, wall, depth = gantry.bore_diameter_mm, gantry.wall_mm, gantry.thickness_mm
+    return gantry_boxes(T_base_ct @ gantry.T_ct_gantry, bore_diameter_mm=bore, wall_mm=wall, depth_mm=depth)
 
 
 def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
@@ -151,23 +140,9 @@ def gantry_in_patient_mm(gantry: Gantry, skin: TriangleMesh) -> float:
     bore, half = gantry.bore_diameter_mm / 2, gantry.thickness_mm / 2
     corners = at[skin.faces[(np.hypot(at[:, 0], at[:, 1])[skin.faces] > bore).any(axis=1)]]
     start, end = corners.reshape(-1, 3), np.roll(corners, 1, axis=1).reshape(-1, 3)
-    between = [start[np.abs(start[:, 2]) <= half], *(_crossings(start, end, z) for z in (-half, half))]
+    between = [start[np.abs(start[:, 2]) <= half], *(plane_crossings(start, end, 2, z) for z in (-half, half))]
     far = np.concatenate(between)
     return max(0.0, float(np.hypot(far[:, 0], far[:, 1]).max(initial=0.0)) - bore)
-
-
-def _crossings(start: Floats, end: Floats, z: float) -> Floats:
-    """Points where segments between points (n, 3) pass through the plane of a height, shape (m, 3)."""
-    passing = (start[:, 2] < z) != (end[:, 2] < z)
-    a, b = start[passing], end[passing]
-    return np.asarray(a + ((z - a[:, 2]) / (b[:, 2] - a[:, 2]))[:, None] * (b - a))
-
-
-def _box(obstacle: Obstacle, T_base_ct: Floats) -> Box:
-    T = pose(np.eye(3), obstacle.center_mm)
-    T_base_box = T if obstacle.frame == "base" else T_base_ct @ T
-    x, y, z = obstacle.size_mm
-    return Box(obstacle.name, T_base_box, (float(x), float(y), float(z)))
 
 
 def check_gantry(case: Case, skin: TriangleMesh) -> None:
@@ -213,7 +188,7 @@ def surroundings(case: Case, T_base_ct: Floats | None) -> tuple[Structure, ...]:
     T_ct_base = np.asarray(np.linalg.inv(T), dtype=np.float64)
     structures = [_structure(one.name, box(T_ct_base @ one.T_base_box, one.size_mm)) for one in boxes]
     if case.gantry is not None:
-        wall = [box(one.T_base_box, one.size_mm) for one in gantry_in_ct(case.gantry)]
+        wall = [box(one.T_base_box, one.size_mm) for one in _gantry_boxes(case.gantry, np.eye(4))]
         structures.append(_structure(GANTRY, joined(wall)))
     return tuple(structures)
 

@@ -1,4 +1,1 @@
-"""A needle that bends: its cross section, the beam on an elastic foundation, the path of a bevel, the axial force.
-
-Pure mechanics in N and mm; it knows neither cases nor patients.
-"""
+"""A needle that bends: its section, the beam on an elastic foundation, a bevel's path, the axial force; N and mm."""

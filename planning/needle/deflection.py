@@ -45,17 +45,14 @@ MOST_SLENDER = 150.0
 
 @dataclass(frozen=True, eq=False)
 class DeflectionBound:
-    """Greatest deflection over path length, to any side.
-
-    Attributes:
-        depth_mm: Shape (m,), of the tip in the tissue, from 0, ascending.
-        bevel_mm: Shape (m,), that the bevel causes, ascending.
-        sag_mm: That the shaft's own weight causes, held horizontally.
-    """
+    """Greatest deflection over path length, to any side."""
 
     depth_mm: Floats
+    """Shape (m,), of the tip in the tissue, from 0, ascending."""
     bevel_mm: Floats
+    """Shape (m,), that the bevel causes, ascending."""
     sag_mm: float
+    """That the shaft's own weight causes, held horizontally."""
 
     def at(self, path_length: Floats | float) -> Floats:
         """Bound for paths of these lengths, mm: that of the table's next depth; infinite beyond its end.
@@ -94,16 +91,13 @@ def stiffest_resolved(shaft: Shaft) -> float:
 
 @dataclass(frozen=True)
 class Bending:
-    """A needle with a bevel, and the tissues by the names of their structures.
-
-    Attributes:
-        alpha: By which the bevel's cut leaves the shaft's direction, rad.
-        tissues: The pattern ``*`` is all that no structure names.
-    """
+    """A needle with a bevel, and the tissues by the names of their structures."""
 
     shaft: Shaft
     alpha: float
+    """By which the bevel's cut leaves the shaft's direction, rad."""
     tissues: ByName[Tissue]
+    """The pattern ``*`` is all that no structure names."""
 
     def bound(self, longest_mm: float) -> DeflectionBound:
         """Bound of the deflection on paths up to a length, mm."""
@@ -130,15 +124,12 @@ class Shape(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """A shaft cut into equal elements.
-
-    Attributes:
-        stiffness: EI, N mm^2.
-        step: Length of an element, mm.
-    """
+    """A shaft cut into equal elements."""
 
     stiffness: float
+    """EI, N mm^2."""
     step: float
+    """Length of an element, mm."""
     elements: int
 
     def bent(self, foundation: Floats, rest: Floats, *, tip_mm: float | None = None, tip_load: float = 0.0) -> Shape:
@@ -150,7 +141,12 @@ class Beam:
             tip_mm: The deflection at which something holds the tip; None leaves it free.
             tip_load: Lateral force on a free tip, N.
         """
-        bands, load = self._bands(foundation), self._load(foundation, rest)
+        bands, h, first, second = self._bands(foundation), self.step, rest[:-1], rest[1:]
+        load = np.zeros(2 * (self.elements + 1))  # the integral of k c N over each element
+        load[0:-2:2] += foundation * h / 20 * (7 * first + 3 * second)
+        load[1:-2:2] += foundation * h * h / 60 * (3 * first + 2 * second)
+        load[2::2] += foundation * h / 20 * (3 * first + 7 * second)
+        load[3::2] -= foundation * h * h / 60 * (2 * first + 3 * second)
         load[-2] += tip_load  # the last two unknowns are the tip's w and w'
         free = bands[:, 2:]  # the first node is clamped
         right = load[2:].copy()
@@ -172,41 +168,20 @@ class Beam:
     def _bands(self, foundation: Floats) -> Floats:
         """The stiffness matrix in lower banded form, shape (BANDS, 2 (elements + 1))."""
         h, size = self.step, 2 * (self.elements + 1)
-        bending = (
-            self.stiffness
-            / h**3
-            * np.array(
-                [[12, 6 * h, -12, 6 * h], [0, 4 * h * h, -6 * h, 2 * h * h], [0, 0, 12, -6 * h], [0, 0, 0, 4 * h * h]]
-            )
-        )
-        bedding = (
-            h
-            / 420
-            * np.array(
-                [
-                    [156, 22 * h, 54, -13 * h],
-                    [0, 4 * h * h, 13 * h, -3 * h * h],
-                    [0, 0, 156, -22 * h],
-                    [0, 0, 0, 4 * h * h],
-                ]
-            )
-        )
+        bends = [[12, 6 * h, -12, 6 * h], [0, 4 * h * h, -6 * h, 2 * h * h], [0, 0, 12, -6 * h], [0, 0, 0, 4 * h * h]]
+        beds = [
+            [156, 22 * h, 54, -13 * h],
+            [0, 4 * h * h, 13 * h, -3 * h * h],
+            [0, 0, 156, -22 * h],
+            [0, 0, 0, 4 * h * h],
+        ]
+        bending, bedding = self.stiffness / h**3 * np.array(bends), h / 420 * np.array(beds)
         bands = np.zeros((BANDS, size))
         for row in range(4):
             for column in range(row, 4):
                 each = bending[row, column] + foundation * bedding[row, column]
                 bands[column - row, row : row + 2 * self.elements : 2] += each  # two unknowns a node
         return bands
-
-    def _load(self, foundation: Floats, rest: Floats) -> Floats:
-        """Load by the foundation, shape (2 (elements + 1),): the integral of k c N over each element."""
-        h, first, second = self.step, rest[:-1], rest[1:]
-        load = np.zeros(2 * (self.elements + 1))
-        load[0:-2:2] += foundation * h / 20 * (7 * first + 3 * second)
-        load[1:-2:2] += foundation * h * h / 60 * (3 * first + 2 * second)
-        load[2::2] += foundation * h / 20 * (3 * first + 7 * second)
-        load[3::2] -= foundation * h * h / 60 * (2 * first + 3 * second)
-        return load
 
 
 def _shape(found: Floats, force: float, system: tuple[Floats, Floats]) -> Shape:
@@ -239,23 +214,20 @@ def step_for(shaft: Shaft, stiffest: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class BevelPath:
-    """A path of m steps, in the plane of the bevel.
-
-    Attributes:
-        depth_mm: Shape (m + 1,), how far the tip is in.
-        cut_mm: Shape (m + 1,), how far the path is off the straight line there.
-        needle_mm: Shape (m + 1,), how far the shaft is off at those depths, once it is all in.
-        largest_mm: Shape (m + 1,), the greatest deflection anywhere along the shaft, up to each depth.
-        holder_n: Shape (m + 1,), the lateral force of the tissue that the holder bears at each depth.
-        holder_n_mm: Shape (m + 1,), its moment about its clamp.
-    """
+    """A path of m steps, in the plane of the bevel."""
 
     depth_mm: Floats
+    """Shape (m + 1,), how far the tip is in."""
     cut_mm: Floats
+    """Shape (m + 1,), how far the path is off the straight line there."""
     needle_mm: Floats
+    """Shape (m + 1,), how far the shaft is off at those depths, once it is all in."""
     largest_mm: Floats
+    """Shape (m + 1,), the greatest deflection anywhere along the shaft, up to each depth."""
     holder_n: Floats
+    """Shape (m + 1,), the lateral force of the tissue that the holder bears at each depth."""
     holder_n_mm: Floats
+    """Shape (m + 1,), its moment about its clamp."""
 
 
 def bevel_path(shaft: Shaft, stiffness: Floats, alpha: Floats, step_mm: float) -> BevelPath:
@@ -275,21 +247,15 @@ def bevel_path(shaft: Shaft, stiffness: Floats, alpha: Floats, step_mm: float) -
     for done in range(count):
         ahead = 1.5 * slope - 0.5 * before  # Adams and Bashforth, two steps
         cut[done + 1] = cut[done] + step_mm * (ahead + alpha[done])
-        shape = _inserted(beam, stiffness[: done + 1], cut[: done + 2])
+        foundation, rest = np.zeros(elements), np.zeros(elements + 1)  # the shaft's last part is in the tissue
+        foundation[elements - done - 1 :], rest[elements - done - 1 :] = stiffness[: done + 1], cut[: done + 2]
+        shape = beam.bent(foundation, rest, tip_mm=float(cut[done + 1]))
         before, slope = slope, float(shape.slope[-1])
         holder[done + 1], moment[done + 1] = shape.clamp_force, shape.clamp_moment
         largest[done + 1] = max(largest[done], float(np.abs(shape.deflection).max()), abs(cut[done + 1]))
     needle: Floats = cut if shape is None else np.asarray(shape.deflection[elements - count :])
     depth = step_mm * np.arange(count + 1, dtype=np.float64)
     return BevelPath(depth, cut, needle, largest, holder, moment)
-
-
-def _inserted(beam: Beam, stiffness: Floats, cut: Floats) -> Shape:
-    """The shaft with its last part in the tissue, and its tip on the end of the path."""
-    foundation, rest = np.zeros(beam.elements), np.zeros(beam.elements + 1)
-    foundation[beam.elements - len(stiffness) :] = stiffness
-    rest[beam.elements - len(stiffness) :] = cut
-    return beam.bent(foundation, rest, tip_mm=float(cut[-1]))
 
 
 STEEL_GPA = 200.0
@@ -334,18 +300,15 @@ GAUGES: Mapping[int, Gauge] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Shaft:
-    """A straight round shaft, clamped at its holder.
-
-    Attributes:
-        length_mm: From the holder to the tip.
-        inner_mm: Of the bore; 0 for a solid shaft.
-        modulus_gpa: Young's.
-    """
+    """A straight round shaft, clamped at its holder."""
 
     length_mm: float
+    """From the holder to the tip."""
     outer_mm: float
     inner_mm: float = 0.0
+    """Of the bore; 0 for a solid shaft."""
     modulus_gpa: float = STEEL_GPA
+    """Young's."""
 
     @property
     def bending_stiffness(self) -> float:
@@ -365,23 +328,20 @@ class Shaft:
 
 @dataclass(frozen=True)
 class Tissue:
-    """Mechanical properties of one tissue.
-
-    Attributes:
-        stiffness_n_mm2: k, by which it holds the shaft: force by length of shaft and by deflection.
-        cutting_n: Force at the tip while it cuts.
-        friction_n_mm: Along the shaft, by length of it inside.
-        capsule_n: Force at which its surface ruptures; 0 has none.
-        capsule_mm: How far the surface is pushed in by then.
-        held_n_mm: Force along the needle that moves it as a whole by 1 mm against the body; None moves nothing.
-    """
+    """Mechanical properties of one tissue."""
 
     stiffness_n_mm2: float
+    """k, by which it holds the shaft: force by length of shaft and by deflection."""
     cutting_n: float = 0.0
+    """Force at the tip while it cuts."""
     friction_n_mm: float = 0.0
+    """Along the shaft, by length of it inside."""
     capsule_n: float = 0.0
+    """Force at which its surface ruptures; 0 has none."""
     capsule_mm: float = 0.0
+    """How far the surface is pushed in by then."""
     held_n_mm: float | None = None
+    """Force along the needle that moves it as a whole by 1 mm against the body; None moves nothing."""
 
 
 class Layer(NamedTuple):

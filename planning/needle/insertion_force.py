@@ -32,23 +32,22 @@ class Push(NamedTuple):
     start_mm: float
     end_mm: float
     force_n: float
+    reach_mm: float
+    """Of the capsule, also where the target ends the push before its rupture."""
 
 
 @dataclass(frozen=True, eq=False)
 class InsertionForce:
-    """The force over depth; N and mm.
-
-    Attributes:
-        depth_mm: Shape (n,), of the tip from the skin.
-        capsule_n: Shape (n,).
-        cutting_n: Shape (n,).
-        friction_n: Shape (n,).
-    """
+    """The force over depth; N and mm."""
 
     depth_mm: Floats
+    """Shape (n,), of the tip from the skin."""
     capsule_n: Floats
+    """Shape (n,)."""
     cutting_n: Floats
+    """Shape (n,)."""
     friction_n: Floats
+    """Shape (n,)."""
 
     @property
     def total_n(self) -> Floats:
@@ -76,9 +75,11 @@ def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> Inse
         cutting[(depth >= layer.start_mm) & (depth <= layer.end_mm)] = layer.tissue.cutting_n
     for push in pushes:
         pushing = (depth >= push.start_mm) & (depth <= push.end_mm + ROUNDING_MM)
-        capsule[pushing] = _spring(push, layers, depth[pushing])
+        capsule[pushing] = push.force_n * ((depth[pushing] - push.start_mm) / push.reach_mm) ** 2
         cutting[pushing], inside[pushing] = 0.0, push.start_mm  # while it is pushed in nothing is cut
-    friction = sum((_friction(layer, inside) for layer in layers), np.zeros(len(depth)))
+    friction = np.zeros(len(depth))
+    for layer in layers:  # over the shaft's length inside each
+        friction += layer.tissue.friction_n_mm * (np.clip(inside, layer.start_mm, layer.end_mm) - layer.start_mm)
     return InsertionForce(depth, capsule, cutting, friction)
 
 
@@ -105,15 +106,11 @@ def pushed(layers: Sequence[Layer], target_mm: float) -> Pushed | None:
     own = next(layer.tissue for layer in layers if target_mm <= layer.end_mm + ROUNDING_MM)
     if own.held_n_mm is None:
         return None
-    alone = [one if _same(one.tissue, own) else one._replace(tissue=Tissue(0.0)) for one in layers]
+    # of one tissue, whether or not its surface is passed there
+    same = [replace(one.tissue, capsule_n=own.capsule_n, capsule_mm=own.capsule_mm) == own for one in layers]
+    alone = [one if its else one._replace(tissue=Tissue(0.0)) for one, its in zip(layers, same, strict=True)]
     force = insertion_force(alone)
     return Pushed(force.depth_mm, force.total_n / own.held_n_mm, target_mm)
-
-
-def _same(one: Tissue, other: Tissue) -> bool:
-    """One tissue, whether or not its surface is passed there."""
-    bare = (replace(tissue, capsule_n=0.0, capsule_mm=0.0) for tissue in (one, other))
-    return next(bare) == next(bare)
 
 
 def _pushes(layers: Sequence[Layer], end: float) -> list[Push]:
@@ -122,17 +119,6 @@ def _pushes(layers: Sequence[Layer], end: float) -> list[Push]:
     for layer in layers:
         tissue, inside = layer.tissue, found[-1].end_mm if found else 0.0
         if tissue.capsule_n > 0 and tissue.capsule_mm > 0 and layer.start_mm >= inside:
-            found.append(Push(layer.start_mm, min(layer.start_mm + tissue.capsule_mm, end), tissue.capsule_n))
+            reach = tissue.capsule_mm
+            found.append(Push(layer.start_mm, min(layer.start_mm + reach, end), tissue.capsule_n, reach))
     return found
-
-
-def _spring(push: Push, layers: Sequence[Layer], depth: Floats) -> Floats:
-    """P (x / d)^2, with d of the capsule, also where the target ends the push before its rupture."""
-    reach = next(layer.tissue.capsule_mm for layer in layers if layer.start_mm == push.start_mm)
-    return np.asarray(push.force_n * ((depth - push.start_mm) / reach) ** 2)
-
-
-def _friction(layer: Layer, inside: Floats) -> Floats:
-    """Friction over the shaft's length inside one layer, N."""
-    length = np.clip(inside, layer.start_mm, layer.end_mm) - layer.start_mm
-    return np.asarray(layer.tissue.friction_n_mm * length)

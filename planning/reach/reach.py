@@ -39,20 +39,11 @@ from puncture_twin.planning.reach.survey import (
 
 
 def refusal(model: UrModel, found: Surveyed, deepest: Blocked | None) -> ReachAnswer:
-    """The refusal of a request without a clear motion: that of the motion that came farthest.
-
-    Args:
-        deepest: What blocked the motion that came farthest of those that it allows; None if it allows none.
-    """
-    if deepest is None:
-        return _refusal_of_kinematics(model, found)
-    if deepest.at_standoff:
+    """The refusal of a request without a clear motion: ``deepest`` blocked the one that came farthest, if any began."""
+    if deepest is not None and deepest.at_standoff:
         return ReachAnswer.refused(Reason.ARM_COLLISION, None, deepest.detail, deepest.contact)
-    return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)
-
-
-def _refusal_of_kinematics(model: UrModel, found: Surveyed) -> ReachAnswer:
-    """The refusal of a direction along which kinematics allows no motion."""
+    if deepest is not None:
+        return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail, deepest.contact)
     if (found.stop_at < 0).any():
         return ReachAnswer.refused(Reason.UNREACHABLE, None, "every roll and branch leaves the joint limits")
     reached = away_from_singularities(model, found.starts)
@@ -62,8 +53,8 @@ def _refusal_of_kinematics(model: UrModel, found: Surveyed) -> ReachAnswer:
         return ReachAnswer.refused(Reason.UNREACHABLE, None, why_unreachable(model, T_base_flange))
     paths = every_branch(model, found.line, found.distances)
     stops = [first_stop(model, path, found.depths) for path in paths[reached]]
-    deepest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
-    return ReachAnswer.refused(Reason.INSERTION_BLOCKED, deepest.depth_mm, deepest.detail)
+    farthest = max((stop for stop in stops if stop), key=lambda stop: stop.depth_mm)
+    return ReachAnswer.refused(Reason.INSERTION_BLOCKED, farthest.depth_mm, farthest.detail)
 
 
 ROLLS = 8
@@ -94,41 +85,35 @@ def assess_reach_all(
 
 
 def every_reach(checker: StateChecker, request: ReachRequest) -> list[ReachAnswer]:
-    """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first.
-
-    Args:
-        checker: Checks contacts, in the base frame.
-    """
+    """Every roll and branch that reaches the standoff pose and inserts straight, untouched; the best margin first."""
     found = _surveyed(checker, [request], ROLLS)[0]
-    tried = tried_all(checker, [(found, insertion) for insertion in found.insertions()])
-    return [answer for answer in tried if isinstance(answer, ReachAnswer)]
+    motions = [*found.insertions()]
+    standoffs = np.array([insertion.standoff for insertion in motions]).reshape(-1, 6)
+    contacts = checker.contacts(standoffs, needle_may_touch_patient=False)
+    clear = [motion for motion, contact in zip(motions, contacts, strict=True) if contact is None]
+    answers = (tried(checker, found, motion) for motion in clear)
+    return [answer for answer in answers if isinstance(answer, ReachAnswer)]
 
 
 def _answers(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[ReachAnswer]:
     """The reach answer of each request; round by round the next motion of all that have none yet."""
     surveys = _surveyed(checker, requests, n_rolls)
-    search = FirstClear(surveys)
-    _try_next(checker, search)
-    search.drop_folded(checker)
-    while _try_next(checker, search):
-        pass
+    search, first = FirstClear(surveys), True
+    while len((motions := search.next_motions()).rows):
+        clear = motions.round_clear
+        search.take(
+            checker, motions, checker.contacts(motions.standoffs, needle_may_touch_patient=False, round_clear=clear)
+        )
+        if first:
+            search.drop_folded(checker)
+        first = False
     return [
         refusal(checker.model, found, deepest) if answer is None else answer
         for found, answer, deepest in zip(surveys, search.answers, search.deepest, strict=True)
     ]
 
 
-def _try_next(checker: StateChecker, search: FirstClear) -> bool:
-    """Try the next motion of each request whose search goes on; whether there was one."""
-    motions = search.next_motions()
-    clear = motions.round_clear
-    contacts = checker.contacts(motions.standoffs, needle_may_touch_patient=False, round_clear=clear)
-    search.take(checker, motions, contacts)
-    return len(motions.rows) > 0
-
-
 def _surveyed(checker: StateChecker, requests: Sequence[ReachRequest], n_rolls: int) -> list[Surveyed]:
-    """Kinematics of the requests."""
     targets = np.array([request.target_base for request in requests])
     outwards = np.array([request.outward_base for request in requests])
     rolls = 2.0 * math.pi * np.arange(n_rolls) / n_rolls
@@ -182,14 +167,24 @@ class FirstClear:
 
     def take(self, checker: StateChecker, motions: NextMotions, contacts: Sequence[Contact | None]) -> None:
         """Go on from what the motions touch at their standoffs, and check those along the path that touch nothing."""
-        tries = [self._tried(checker, motions, *each) for each in enumerate(contacts)]
-        for row, found in zip(motions.rows.tolist(), tries, strict=True):
-            if isinstance(found, ReachAnswer):
-                self.answers[row] = found
-            elif (most := self.deepest[row]) is None or found.depth_mm > most.depth_mm:
-                self.deepest[row] = found
-        over = np.array([isinstance(found, ReachAnswer) for found in tries], np.bool_)
-        hopeless = np.array([isinstance(found, Blocked) and found.at_any_roll for found in tries], np.bool_)
+        tries: list[ReachAnswer | Blocked] = []
+        for *at, standoff, contact in zip(*motions[:4], contacts, strict=True):
+            if contact is not None:
+                detail = f"{contact.body} touches {contact.other} at standoff"
+                any_roll = ROLL_BODIES.isdisjoint(contact)
+                tries.append(Blocked(0.0, detail, any_roll, at_standoff=True, contact=contact))
+                continue
+            row, branch, roll = map(int, at)
+            found = self._surveyed[row]
+            insertion = Insertion(found.line, branch, float(found.rolls[roll]), found.turns[branch, roll], standoff)
+            tries.append(tried(checker, found, insertion))
+        for row, result in zip(motions.rows.tolist(), tries, strict=True):
+            if isinstance(result, ReachAnswer):
+                self.answers[row] = result
+            elif (most := self.deepest[row]) is None or result.depth_mm > most.depth_mm:
+                self.deepest[row] = result
+        over = np.array([isinstance(one, ReachAnswer) for one in tries], np.bool_)
+        hopeless = np.array([isinstance(one, Blocked) and one.at_any_roll for one in tries], np.bool_)
         self._left[motions.rows, self._left[motions.rows].argmax(axis=1)] = False
         self._left[motions.rows[over]] = False
         rows = motions.rows[hopeless]
@@ -210,17 +205,6 @@ class FirstClear:
         left[rows, branches] = ~checker.folded(self._starts[rows, branches] + self._turns[rows, branches, 0])
         self._left &= np.take_along_axis(left, self._branches, axis=1)
 
-    def _tried(
-        self, checker: StateChecker, motions: NextMotions, at: int, contact: Contact | None
-    ) -> ReachAnswer | Blocked:
-        """Result of one motion with this contact, or none, at its standoff."""
-        if contact is not None:
-            return blocked_at_standoff(contact)
-        found, branch, roll = self._surveyed[motions.rows[at]], int(motions.branches[at]), int(motions.rolls[at])
-        turn = found.turns[branch, roll]
-        insertion = Insertion(found.line, branch, float(found.rolls[roll]), turn, motions.standoffs[at])
-        return tried(checker, found, insertion)
-
 
 ROLL_BODIES = frozenset({"wrist_3", "tool"})
 """The bodies that turn with the roll and are not round about the needle: other contacts are the same at any roll."""
@@ -234,28 +218,6 @@ class Blocked(NamedTuple):
     at_any_roll: bool = True
     at_standoff: bool = False
     contact: Contact | None = None
-
-
-def tried_all(checker: StateChecker, motions: Sequence[tuple[Surveyed, Insertion]]) -> list[ReachAnswer | Blocked]:
-    """Check motions for contacts: the standoffs of all at once, then those motions whose standoff is clear.
-
-    Args:
-        checker: Checks contacts, in the base frame.
-    """
-    standoffs = np.array([insertion.standoff for _, insertion in motions]).reshape(-1, 6)
-    found: list[ReachAnswer | Blocked] = []
-    for motion, contact in zip(motions, checker.contacts(standoffs, needle_may_touch_patient=False), strict=True):
-        if contact is None:
-            found.append(tried(checker, *motion))
-        else:
-            found.append(blocked_at_standoff(contact))
-    return found
-
-
-def blocked_at_standoff(contact: Contact) -> Blocked:
-    """The block that a contact at the standoff means for a motion."""
-    detail = f"{contact.body} touches {contact.other} at standoff"
-    return Blocked(0.0, detail, ROLL_BODIES.isdisjoint(contact), at_standoff=True, contact=contact)
 
 
 def tried(checker: StateChecker, found: Surveyed, insertion: Insertion) -> ReachAnswer | Blocked:
@@ -309,7 +271,6 @@ def missing_reach_mm(model: UrModel, T_base_flange: Floats) -> Floats:
 
 @allocation_free()
 def _missing_reach(lengths, T, missing):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``missing`` (n,) in mm: how far upper arm and forearm are too short or too long for ``T`` (n, 4, 4)."""
     upper, fore, d6 = abs(lengths[1]), abs(lengths[2]), lengths[5]
     for row in range(len(T)):
         R, p = T[row, :3, :3], T[row, :3, 3]
@@ -335,11 +296,7 @@ def approach_goals(checker: StateChecker, request: ReachRequest, q_home: Floats)
     """The motions that may follow an approach, nearest to home first; empty if the arm does not reach the direction.
 
     Each answer of :func:`every_reach`, and the same with any joint rotated by whole turns, as long as all of the
-    insertion stays within the limits.
-
-    Args:
-        checker: Checks contacts, in the base frame.
-        q_home: Shape (6,), rad.
+    insertion stays within the limits. ``q_home`` (6,), rad.
     """
     reached = every_reach(checker, request)
     least = MARGIN_FRACTION * max((answer.margin for answer in reached), default=0.0)

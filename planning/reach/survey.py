@@ -25,18 +25,15 @@ from puncture_twin.planning.collision.state_checker import Contact, SweptBodies,
 
 @dataclass(frozen=True, eq=False)
 class ReachRequest:
-    """One direction that the arm shall reach along.
-
-    Attributes:
-        target_base: Shape (3,), mm: the lesion, base frame.
-        outward_base: Shape (3,), unit: from the target out of the body, base frame.
-        standoff_mm: Tip to target before the insertion starts.
-    """
+    """One direction that the arm shall reach along."""
 
     target_base: Floats
+    """Shape (3,), mm: the lesion, base frame."""
     outward_base: Floats
+    """Shape (3,), unit: from the target out of the body, base frame."""
     needle_length_mm: float
     standoff_mm: float
+    """Tip to target before the insertion starts."""
 
     def __post_init__(self) -> None:
         for name in ("target_base", "outward_base"):
@@ -45,31 +42,28 @@ class ReachRequest:
 
 @dataclass(frozen=True, eq=False)
 class ReachAnswer:
-    """Whether and how the arm reaches along one direction.
-
-    Attributes:
-        reason: ``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``.
-        depth_mm: How far the needle was inserted from standoff when it was blocked; None for other reasons.
-        detail: One sentence for people: what touched what, or what was missing; empty when reachable.
-        contact: What touched what, where that was the reason.
-        roll: Turn about the needle against :func:`flange_poses`' zero, rad; NaN when not reachable.
-        branch: Index among the eight branches of ``inverse``; -1 when not reachable.
-        insertion_q: Shape (m, 6), rad: standoff first, tip on the target last; empty when not reachable.
-        insertion_depth_mm: Shape (m,), mm inserted from standoff at each row.
-        margin: 0..1, the least over the insertion of: each joint's distance to its limits over a quarter turn, and the
-            three singularity terms. 0 when not reachable.
-    """
+    """Whether and how the arm reaches along one direction."""
 
     reachable: bool
     reason: Reason
+    """``NONE``, ``UNREACHABLE``, ``ARM_COLLISION`` (at standoff) or ``INSERTION_BLOCKED``."""
     depth_mm: float | None
+    """How far the needle was inserted from standoff when it was blocked; None for other reasons."""
     detail: str
+    """One sentence for people: what touched what, or what was missing; empty when reachable."""
     contact: Contact | None
+    """What touched what, where that was the reason."""
     roll: float
+    """Turn about the needle against :func:`flange_poses`' zero, rad; NaN when not reachable."""
     branch: int
+    """Index among the eight branches of ``inverse``; -1 when not reachable."""
     insertion_q: Floats
+    """Shape (m, 6), rad: standoff first, tip on the target last; empty when not reachable."""
     insertion_depth_mm: Floats
+    """Shape (m,), mm inserted from standoff at each row."""
     margin: float
+    """0..1, the least over the insertion of: each joint's distance to its limits over a quarter turn, and the three
+    singularity terms. 0 when not reachable."""
 
     @classmethod
     def refused(
@@ -101,17 +95,23 @@ class Insertion(NamedTuple):
 
 
 class Surveyed(NamedTuple):
-    """Kinematics of one request; see :class:`Survey`."""
+    """Kinematics of one request, of every branch and roll."""
 
     request: ReachRequest
     line: NeedleLine
     depths: Floats
+    """Shape (m,), mm: the path's samples from the standoff on, rising."""
     distances: Floats
+    """Shape (m,), mm: target to flange there."""
     rolls: Floats
     stop_at: NDArray[np.int64]
+    """Shape (8,): index of the sample at which the path ends, -1 where it reaches the target."""
     starts: Floats
+    """Shape (8, 6), rad: each path's first configuration at roll 0; NaN where there is none."""
     margins: Floats
+    """Shape (8, r): see :func:`reach_margin`; NaN where the path ends early or leaves the joint limits."""
     turns: Floats
+    """Shape (8, r, 6), rad: what to add to the path at roll 0, the roll and whole turns."""
 
     def insertions(self) -> Iterator[Insertion]:
         """The motions that kinematics allows, the best margin first; of equals the first branch, then roll."""
@@ -129,17 +129,22 @@ MARGIN_DIGITS = 9
 def surveyed(
     model: UrModel, requests: Sequence[ReachRequest], lines: Sequence[NeedleLine], rolls: Floats
 ) -> list[Surveyed]:
-    """Kinematics of each request.
+    """Kinematics of each request: every branch and roll, by whole turns as far from the joint limits as possible.
 
     Args:
         rolls: Shape (r,), rad.
     """
-    depths = [_depths(request.standoff_mm) for request in requests]
-    starts = [request.needle_length_mm + request.standoff_mm for request in requests]
-    distances = [start - depth for start, depth in zip(starts, depths, strict=True)]
-    found = survey(model, lines, distances, depths, rolls)
-    sampled = zip(requests, lines, depths, distances, strict=True)
-    return [Surveyed(*path, rolls, *allowed) for path, *allowed in zip(sampled, *found, strict=True)]
+    bounds = (MIN_SINGULARITY, MAX_JOINT_STEP_RAD_PER_MM, FULL_MARGIN_RAD)
+    stops, starts = np.empty((len(lines), N_BRANCHES), np.int64), np.empty((len(lines), N_BRANCHES, 6))
+    margins = np.empty((len(lines), N_BRANCHES, len(rolls)))
+    turns = np.empty((len(lines), N_BRANCHES, len(rolls), 6))
+    found = []
+    for request, line, *filled in zip(requests, lines, stops, starts, margins, turns, strict=True):
+        depths = _depths(request.standoff_mm)
+        distances = request.needle_length_mm + request.standoff_mm - depths
+        _survey_line(model.lengths, model.joint_limits, *line, distances, depths, rolls, bounds, *filled)
+        found.append(Surveyed(request, line, depths, distances, rolls, *filled))
+    return found
 
 
 def _depths(standoff_mm: float) -> Floats:
@@ -150,66 +155,13 @@ def _depths(standoff_mm: float) -> Floats:
     return depths
 
 
-class Survey(NamedTuple):
-    """Kinematics of many directions, every branch and roll."""
-
-    stop_at: NDArray[np.int64]
-    """Shape (n, 8): index of the sample at which the path ends, -1 where it reaches the target."""
-    starts: Floats
-    """Shape (n, 8, 6), rad: each path's first configuration at roll 0; NaN where there is none."""
-    margins: Floats
-    """Shape (n, 8, r): see :func:`reach_margin`; NaN where the path ends early or leaves the joint limits."""
-    turns: Floats
-    """Shape (n, 8, r, 6), rad: what to add to the path at roll 0, the roll and whole turns."""
-
-
-def survey(
-    model: UrModel,
-    lines: Sequence[NeedleLine],
-    distances_mm: Sequence[Floats],
-    depths_mm: Sequence[Floats],
-    rolls: Floats,
-) -> Survey:
-    """Every branch and roll of many straight insertions, by whole turns as far from the joint limits as possible.
-
-    Args:
-        distances_mm: For each direction, shape (m,): target to flange at the samples of the path.
-        depths_mm: Shape (m,), the distances as depths of insertion, rising.
-        rolls: Shape (r,), rad.
-    """
-    count = len(lines)
-    found = Survey(
-        np.empty((count, N_BRANCHES), np.int64),
-        np.empty((count, N_BRANCHES, 6)),
-        np.empty((count, N_BRANCHES, len(rolls))),
-        np.empty((count, N_BRANCHES, len(rolls), 6)),
-    )
-    bounds = (MIN_SINGULARITY, MAX_JOINT_STEP_RAD_PER_MM, FULL_MARGIN_RAD)
-    for i in range(count):
-        filled = (found.stop_at[i], found.starts[i], found.margins[i], found.turns[i])
-        path = (*lines[i], distances_mm[i], depths_mm[i])
-        _survey_line(model.lengths, model.joint_limits, *path, rolls, bounds, *filled)
-    return found
-
-
 @nb.njit(cache=True)
 def _survey_line(lengths, limits, R, target, outward, distances, depths, rolls, bounds, stops, starts, margins, turns):  # type: ignore[no-untyped-def]  # numba infers
-    """Every branch and roll of one direction, by kinematics alone.
+    """Fill, of one direction, the rows of `Surveyed`: stops (8,), starts (8, 6), margins (8, r), turns (8, r, 6).
 
     Args:
-        limits: Shape (6, 2), rad.
-        R: Shape (3, 3): the flange's rotation at roll 0.
-        target: Shape (3,), mm.
-        outward: Shape (3,), unit.
-        distances: Shape (m,), mm: target to flange.
-        depths: Shape (m,), mm, rising.
-        rolls: Shape (r,), rad.
         bounds: Least of the singular terms; most that a joint may turn, rad/mm; distance from a limit that counts as 1,
             rad.
-        stops: Shape (8,), filled: the index of the sample at which the path ends, -1: nowhere.
-        starts: Shape (8, 6), filled: the configuration at the first distance, roll 0, rad.
-        margins: Shape (8, r), filled: see :func:`reach_margin`; NaN where the path stops or leaves the limits.
-        turns: Shape (8, r, 6), filled: what to add to the path at roll 0, rad: roll and whole turns.
     """
     at_least, fastest, full = bounds
     p, here, least = np.empty(3), np.empty((8, 6)), np.ones(8)
@@ -266,10 +218,9 @@ def _fast_joint(before, after, mm, fastest):  # type: ignore[no-untyped-def]  # 
 
 @allocation_free()
 def _rolled(limits, rolls, full, reached, margins, turns):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``margins`` (r,) and ``turns`` (r, 6) of one branch.
+    """Fill ``margins`` (r,) and ``turns`` (r, 6) of one branch by what it ``reached``.
 
-    ``reached`` holds the least singular term of its path at roll 0, each joint's lowest and highest angle and those at
-    its middle (6,), rad.
+    That is the least singular term of its path at roll 0, each joint's lowest, highest and middle angle (6,), rad.
     """
     least, lowest, highest, middle = reached
     for i in range(len(rolls)):
@@ -288,13 +239,9 @@ def _rolled(limits, rolls, full, reached, margins, turns):  # type: ignore[no-un
 
 
 def every_branch(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Floats:
-    """Every branch's path along the needle at roll 0. A roll adds to q6 and to nothing else.
+    """Every branch's path at flange distances (m,), mm, at roll 0, shape (8, m, 6), rad. A roll adds to q6 alone.
 
-    Args:
-        distance_mm: Shape (m,): target to flange along the path.
-
-    Returns:
-        Shape (8, m, 6), rad, without jumps of whole turns; NaN from where a branch first does not exist.
+    Without jumps of whole turns; NaN from where a branch first does not exist.
     """
     q = np.empty((N_BRANCHES, len(distance_mm), 6))
     _every_branch(model.lengths, *line, distance_mm, q)
@@ -303,10 +250,7 @@ def every_branch(model: UrModel, line: NeedleLine, distance_mm: Floats) -> Float
 
 @nb.njit(cache=True)
 def _every_branch(lengths, R, target, outward, distances, q):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``q`` (8, m, 6): every branch at each distance (m,) from the target, without jumps of whole turns.
-
-    NaN from where a branch first does not exist.
-    """
+    """Fill ``q`` (8, m, 6), see `every_branch`."""
     p, here = np.empty(3), np.empty((8, 6))
     for k in range(len(distances)):
         for i in range(3):
@@ -323,14 +267,9 @@ def _every_branch(lengths, R, target, outward, distances, q):  # type: ignore[no
 
 @nb.njit(cache=True)
 def fill_branch_path(lengths, R, target, outward, distances, branch, turn, q):  # type: ignore[no-untyped-def]  # numba infers
-    """The path of one branch along the needle, without jumps of whole turns; NaN from where it first does not exist.
+    """Fill ``q`` (m, 6), rad: one branch at each distance (m,), mm, ``turn`` (6,), rad, added to every row.
 
-    Args:
-        target: As in :class:`NeedleLine`, mm.
-        distances: Shape (m,), mm: target to flange along the path.
-        branch: Index among the eight of ``inverse``.
-        turn: Shape (6,), rad: added to every row, such as a roll and whole turns.
-        q: Shape (m, 6), filled, rad.
+    Without jumps of whole turns; NaN from where it first does not exist.
     """
     p, here = np.empty(3), np.empty((8, 6))
     for k in range(len(distances)):
@@ -342,15 +281,6 @@ def fill_branch_path(lengths, R, target, outward, distances, branch, turn, q):  
             q[k, joint] = angle if k == 0 else q[k - 1, joint] + wrapped_angle(angle - q[k - 1, joint])
 
 
-class Sampled(NamedTuple):
-    """States of a motion and their distances from the standoff."""
-
-    q: Floats
-    """Shape (m, 6), rad; NaN from where the branch first does not exist."""
-    depths_mm: Floats
-    """Shape (m,), from the standoff, evenly spaced."""
-
-
 def sampled(
     swept: SweptBodies,
     line: NeedleLine,
@@ -359,8 +289,10 @@ def sampled(
     lengths_mm: tuple[float, float],
     samples: int,
     most_mm: float,
-) -> Sampled:
+) -> tuple[Floats, Floats]:
     """The motion of one branch along a needle, sampled so that no body moves more than so far from state to state.
+
+    States (m, 6), rad, NaN from where the branch first does not exist; and depths (m,), mm from the standoff, even.
 
     Args:
         branch: Index among the eight of ``inverse``.
@@ -370,7 +302,8 @@ def sampled(
         most_mm: What no body's motion exceeds; see :meth:`SweptBodies.bounds_mm`.
     """
     bodies = swept.corners, swept.longest_lever_mm
-    return Sampled(*_sampled(swept.model.lengths, *line, branch, turn, lengths_mm, samples, bodies, most_mm))
+    q, depths = _sampled(swept.model.lengths, *line, branch, turn, lengths_mm, samples, bodies, most_mm)
+    return q, depths
 
 
 @nb.njit(cache=True)

@@ -107,28 +107,25 @@ class Shape(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """One dense thing, read as a marker.
-
-    Attributes:
-        centre_ct: Shape (3,), LPS mm.
-        cov_ct: Shape (3, 3), mm².
-        contrast_hu: Its greatest value above soft tissue's; of clipped metal at least so much.
-        clipped: Whether the image's range clips it.
-        misfit: Root mean square of what its drawing lacks beyond noise, over that of its contrast.
-        make: Logarithms of density (HU) and diameter (mm), shape (2,).
-        cov_make: Of these, shape (2, 2).
-        others: Kinds whose drawing is about as near.
-    """
+    """One dense thing, read as a marker."""
 
     centre_ct: Floats
+    """Shape (3,), LPS mm."""
     cov_ct: Floats
+    """Shape (3, 3), mm²."""
     shape: Shape
     contrast_hu: float
+    """Its greatest value above soft tissue's; of clipped metal at least so much."""
     clipped: bool
+    """Whether the image's range clips it."""
     misfit: float
+    """Root mean square of what its drawing lacks beyond noise, over that of its contrast."""
     make: Floats
+    """Logarithms of density (HU) and diameter (mm), shape (2,)."""
     cov_make: Floats
+    """Of these, shape (2, 2)."""
     others: tuple[Kind, ...] = ()
+    """Kinds whose drawing is about as near."""
 
     def alike(self, other: Reading) -> bool:
         """Whether both may be of one product: of one kind, and as large and dense as their readings tell."""
@@ -143,40 +140,34 @@ class Reading:
 
 
 class Box(NamedTuple):
-    """What surrounds one thing.
-
-    Attributes:
-        volume: The voxels of the box, as an image of its own, float64.
-        peak: Shape (3,), index of its densest voxel.
-        ceiling_hu: Where the whole image clips; infinite where it does not.
-        cut: Whether the image ends at the thing.
-    """
+    """What surrounds one thing."""
 
     volume: Volume
+    """The voxels of the box, as an image of its own, float64."""
     peak: Ints
+    """Shape (3,), index of its densest voxel."""
     ceiling_hu: float
+    """Where the whole image clips; infinite where it does not."""
     noise_hu: float
     cut: bool
+    """Whether the image ends at the thing."""
 
 
 @dataclass(frozen=True, eq=False)
 class Middle:
-    """A thing's weighted middle.
-
-    Attributes:
-        centre_ct: Shape (3,), LPS mm.
-        spread: Shape (3, 3), mm², second moment about it.
-        solid_hu: Of what it is made.
-        clear: Of the box: which voxels it does not reach.
-    """
+    """A thing's weighted middle."""
 
     box: Box
     voxels: Bools
     centre_ct: Floats
+    """Shape (3,), LPS mm."""
     spread: Floats
+    """Shape (3, 3), mm², second moment about it."""
     peak_hu: float
     solid_hu: float
+    """Of what it is made."""
     clear: Bools
+    """Of the box: which voxels it does not reach."""
 
     @property
     def near(self) -> Bools:
@@ -348,21 +339,19 @@ class _Drawing:
 
     Its unknowns are the shift (3), logarithms of density and size, the blur; of a disc or ring the logarithm of its
     thickness and two tilts too.
-
-    Attributes:
-        start: Shape (p,), of the unknowns.
-        known: Shape (p,), how well each is known beforehand, standard deviations.
-        near: Shape of the box: the voxels that are compared.
-        background: Of them, shape (n,), HU.
     """
 
     middle: Middle
     kind: Kind
     normal: Floats
     start: Floats
+    """Shape (p,), of the unknowns."""
     known: Floats
+    """Shape (p,), how well each is known beforehand, standard deviations."""
     near: Bools
+    """Shape of the box: the voxels that are compared."""
     background: Floats
+    """Of them, shape (n,), HU."""
 
     @classmethod
     def of(cls, middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | None, background: Floats) -> _Drawing:
@@ -433,14 +422,10 @@ def filled(volume: Volume, shape: Shape, centre_ct: Floats) -> Floats:
 
 @nb.njit(cache=True, error_model="numpy")
 def _fill(T, counts, reach, kind, half, normal, part):  # type: ignore[no-untyped-def]  # numba infers
-    """Set the part of each voxel: that of cells, each as a plane at the surface's distance would fill it.
+    """Set the part (ni, nj, nk) of each voxel: that of cells, each as a plane at the surface's distance would fill it.
 
-    Args:
-        T: Shape (3, 4), index to mm from the marker's centre.
-        counts: Shape (3,), cells along each axis of a voxel.
-        reach: Half of a voxel's diagonal, mm.
-        half: Shape (3,), half diameter, half thickness, half diameter of the hole, mm.
-        part: Shape (ni, nj, nk).
+    T (3, 4) maps an index to mm from the marker's centre; ``reach`` is half of a voxel's diagonal, mm; ``half`` (3,)
+    are the half diameter, thickness and diameter of the hole, mm.
     """
     cell = 2.0 * reach / np.sqrt(float(counts[0] ** 2 + counts[1] ** 2 + counts[2] ** 2))
     for i in range(part.shape[0]):

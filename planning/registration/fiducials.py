@@ -109,15 +109,12 @@ NOTHING_STATED = Stated()
 
 @dataclass(frozen=True, eq=False)
 class Fiducial:
-    """A marker that was found.
-
-    Attributes:
-        gap_mm: Of its centre from the skin, negative inside of the body.
-    """
+    """A marker that was found."""
 
     name: str
     reading: Reading
     gap_mm: float
+    """Of its centre from the skin, negative inside of the body."""
 
     @property
     def position_ct(self) -> Floats:
@@ -131,18 +128,15 @@ class Fiducial:
 
 
 class Passed(NamedTuple):
-    """A dense thing that is not taken for a marker.
-
-    Attributes:
-        point_ct: Shape (3,), LPS mm.
-        nearly: Whether it lacks little: a person should look at it.
-        middle: How wide and dense it is, where it is on the skin and ends.
-    """
+    """A dense thing that is not taken for a marker."""
 
     point_ct: Floats
+    """Shape (3,), LPS mm."""
     why: str
     nearly: bool
+    """Whether it lacks little: a person should look at it."""
     middle: Middle | None = None
+    """How wide and dense it is, where it is on the skin and ends."""
 
     def resembles(self, group: Sequence[Fiducial]) -> bool:
         """Whether markers of a group may be in it, or be it in part."""
@@ -189,7 +183,6 @@ def look_for_fiducials(volume: Volume, skin: Skin, stated: Stated = NOTHING_STAT
 
 
 def _among(point_ct: Floats, found: Sequence[Fiducial], voxel_mm: float) -> bool:
-    """Whether a point lies in a marker that was found, or as near as voxels tell."""
     return any(
         np.linalg.norm(point_ct - one.position_ct) < max(one.reading.shape.diameter_mm, voxel_mm) / 2 for one in found
     )
@@ -198,7 +191,6 @@ def _among(point_ct: Floats, found: Sequence[Fiducial], voxel_mm: float) -> bool
 def _looked_at(
     box: Box, middle: Middle | None, skin: Skin, kinds: tuple[Kind, ...], diameter_mm: float | None
 ) -> Fiducial | Passed:
-    """A thing as a marker, or why it is none."""
     peak_hu, point = float(box.volume.values[tuple(box.peak)]), apply(box.volume.T_ct_index, box.peak.astype(float))
     if middle is None:
         nearly = (box.cut or peak_hu >= METAL_HU) and -UNDER_SKIN_MM <= _at_skin(point, skin)[0] <= LARGEST_MM
@@ -341,8 +333,7 @@ def find_fiducials(
         NoAnswerError: None, too few, too many, several sizes, or none that a layout tells; it says what was seen.
         InputError: A layout that is mirrored.
     """
-    seen = look_for_fiducials(volume, skin, stated)
-    return choose_fiducials(seen, stated, layout, where=where)
+    return choose_fiducials(look_for_fiducials(volume, skin, stated), stated, layout, where=where)
 
 
 def choose_fiducials(seen: Seen, stated: Stated, layout: NamedPoints | None = None, *, where: str | Path) -> Seen:
@@ -364,7 +355,6 @@ def _numbered(fiducials: Sequence[Fiducial]) -> tuple[Fiducial, ...]:
 
 
 def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen) -> Sequence[Fiducial]:
-    """The markers where they are of one product, and as many as stated."""
     if not alike:
         counted = Counter(one.why for one in seen.passed)
         others = ", ".join(f"{count} {why}" for why, count in counted.most_common(3))
@@ -372,9 +362,14 @@ def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen) -> Sequence
         if seen.fiducials:
             what = f"no marker as stated; seen: {seen_text(seen.fiducials)}"
         raise NoAnswerError(what, code="no_markers")
-    groups = _groups(alike)
+    # things that may be alike together, also by others between them, in the order given
+    count, labels = connected_components(np.array([[a.reading.alike(b.reading) for b in alike] for a in alike]))
+    groups = [[one for one, label in zip(alike, labels, strict=True) if label == k] for k in range(count)]
     if stated.count is not None:
-        groups = [one for one in groups if _may_be(one, stated.count, seen)] or groups
+        # a group may lack what is doubtful: each may be two that touch
+        most = [len(group) + 2 * sum(one.resembles(group) for one in seen.passed) for group in groups]
+        fits = [len(group) <= stated.count <= count for group, count in zip(groups, most, strict=True)]
+        groups = [group for group, fit in zip(groups, fits, strict=True) if fit] or groups
     if len(groups) > 1 or not all(one.reading.alike(other.reading) for one in groups[0] for other in groups[0]):
         what = f"things of {max(len(groups), 2)} kinds may be markers: {seen_text(alike)}"
         raise NoAnswerError(f"{what}; --diameter, --kind, --count or --layout tells them apart", code="markers_unclear")
@@ -387,19 +382,6 @@ def _one_kind(alike: Sequence[Fiducial], stated: Stated, seen: Seen) -> Sequence
         what = f"{len(group)} markers instead of {wanted}: {seen_text(group)}; --layout tells them apart"
         raise NoAnswerError(what, code="too_many_markers")
     return group
-
-
-def _groups(fiducials: Sequence[Fiducial]) -> list[list[Fiducial]]:
-    """Things that may be alike together, also by others between them, in the order given."""
-    alike = [[one.reading.alike(other.reading) for other in fiducials] for one in fiducials]
-    count, labels = connected_components(np.array(alike))
-    return [[one for one, label in zip(fiducials, labels, strict=True) if label == group] for group in range(count)]
-
-
-def _may_be(group: Sequence[Fiducial], count: int, seen: Seen) -> bool:
-    """Whether a group has a count, or lacks what is doubtful: each may be two that touch."""
-    doubtful = sum(one.resembles(group) for one in seen.passed)
-    return len(group) <= count <= len(group) + 2 * doubtful
 
 
 def seen_text(fiducials: Sequence[Fiducial]) -> str:

@@ -5,6 +5,7 @@ The declared noise of a case's markers, and how the arm stood, or may have stood
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,20 +27,17 @@ from puncture_twin.planning.registration.residuals import NoiseTest, noise_test
 
 @dataclass(frozen=True, eq=False)
 class FitUncertainty:
-    """The declared errors of the markers, and the map from them to the pose; base axes, mm and rad.
-
-    Attributes:
-        R_base_ct: Shape (3, 3), as registered.
-        center_base: Shape (3,), the markers' centroid, about which `fit_map` turns.
-        fit_map: L, shape (6, 3 N), from the stacked reading errors to shift and rotation.
-        test: Whether the residuals agree with the declaration; its scale is not yet in the covariances below.
-    """
+    """The declared errors of the markers, and the map from them to the pose; base axes, mm and rad."""
 
     noise: fits.ReadingNoise
     R_base_ct: Floats
+    """Shape (3, 3), as registered."""
     center_base: Floats
+    """Shape (3,), the markers' centroid, about which `fit_map` turns."""
     fit_map: Floats
+    """L, shape (6, 3 N), from the stacked reading errors to shift and rotation."""
     test: NoiseTest
+    """Whether the residuals agree with the declaration; its scale is not yet in the covariances below."""
 
     @property
     def fle_mm(self) -> float:
@@ -157,9 +155,14 @@ def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, ne
     Raises:
         NoAnswerError: There are none in the tried directions.
     """
+    frame = frame_about(needle_base)
     for tilt in np.radians(TILTS_DEG):
-        poses = touching_poses(tip_mm, point_base, needle_base, float(tilt))
-        q = np.concatenate([inverse(model, T)[0] for T in poses])
+        branches = []
+        for side in np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False) if tilt > 0 else [0.0]:
+            lean = [np.sin(tilt) * np.cos(side), np.sin(tilt) * np.sin(side), np.cos(tilt)]
+            R = frame_about(frame @ np.array(lean))  # any roll will do: it is q6 alone
+            branches.append(inverse(model, pose(R, point_base - tip_mm * R[:, 2]))[0])
+        q = np.concatenate(branches)
         q = q[model.within_limits(q)]
         if len(q) and kinematics.singularity(model, q).least().max() >= LEAST_SINGULARITY:
             return kinematics.farthest_from_singular(model, q, -needle_base)
@@ -168,20 +171,8 @@ def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, ne
     raise NoAnswerError(what, code="marker_out_of_reach")
 
 
-def touching_poses(tip_mm: float, point_base: Floats, needle_base: Floats, tilt: float) -> list[Floats]:
-    """Flange poses (4, 4) with the tip on a point, leaning by ``tilt`` (rad) to every side; arguments as above."""
-    frame = frame_about(needle_base)
-    sides = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False) if tilt > 0 else [0.0]
-    poses = []
-    for side in sides:
-        lean = [np.sin(tilt) * np.cos(side), np.sin(tilt) * np.sin(side), np.cos(tilt)]
-        R = frame_about(frame @ np.array(lean))  # any roll will do: it is q6 alone
-        poses.append(pose(R, point_base - tip_mm * R[:, 2]))
-    return poses
-
-
 GUESSED_HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
-"""An arm bent at the elbow, its needle down."""
+"""An arm bent at the elbow, its needle down: where it can touch a marker in no direction tried."""
 
 
 def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where: str | Path) -> fits.ReadingNoise:
@@ -203,14 +194,9 @@ def touches(case: Case, markers: MarkerPairs) -> Floats:
     """Joints of the arm at the touch of each marker, shape (N, 6), rad: the file's, or likely ones."""
     if markers.joints is not None:
         return markers.joints
-    model, tip = case.robot.model, case.needle.length_mm
+    model, tip, q = case.robot.model, case.needle.length_mm, np.tile(GUESSED_HOME, (len(markers), 1))
     needle = -(fits.fit_rigid(markers.points_ct, markers.points_base)[:3, :3] @ case.T_ct_entry[:3, 2])
-    return np.array([_guessed(model, tip, point, needle) for point in markers.points_base])
-
-
-def _guessed(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Floats) -> Floats:
-    """How the arm may have stood; its home where it cannot touch the point in any direction tried."""
-    try:
-        return touching_configuration(model, tip_mm, point_base, needle_base)
-    except NoAnswerError:
-        return GUESSED_HOME
+    for row, point in enumerate(markers.points_base):
+        with contextlib.suppress(NoAnswerError):
+            q[row] = touching_configuration(model, tip, point, needle)
+    return q

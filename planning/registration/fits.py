@@ -83,39 +83,34 @@ def carried_along(points: Floats, cov: Floats) -> Floats:
     return np.asarray(X @ cov @ X.transpose(0, 2, 1))
 
 
-def fit_rigid(points_ct: Floats, points_base: Floats) -> Floats:
+def fit_rigid(points_ct: Floats, points_base: Floats, *, mirrored: bool = False) -> Floats:
     """T_base_ct that minimises the squared residuals over rotations (Arun 1987, by SVD; det = +1 after Umeyama 1991).
 
     Args:
         points_ct: Shape (..., n, 3), n >= 3, not collinear, mm; one set, or many.
         points_base: Shape (..., n, 3), the same markers.
+        mirrored: Over the reflections instead.
     """
-    return _least_squares(points_ct, points_base, mirrored=False)
-
-
-def rigid_fre_mm(points_ct: Floats, points_base: Floats) -> float:
-    """The fiducial registration error (rms residual) of `fit_rigid`, mm: the chi-squared test is about that.
-
-    Args:
-        points_ct: Shape (n, 3), n >= 3, not collinear, mm.
-        points_base: Shape (n, 3), the same markers.
-    """
-    residuals = apply(fit_rigid(points_ct, points_base), points_ct) - points_base
-    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-
-
-def _least_squares(points_ct: Floats, points_base: Floats, *, mirrored: bool) -> Floats:
     center_ct, center_base = points_ct.mean(axis=-2), points_base.mean(axis=-2)
     spread = np.swapaxes(points_base - center_base[..., None, :], -1, -2) @ (points_ct - center_ct[..., None, :])
     U, _, Vt = np.linalg.svd(spread)
     sign = np.sign(np.linalg.det(U @ Vt)) * (-1.0 if mirrored else 1.0)
     U = U * np.stack([np.ones_like(sign), np.ones_like(sign), sign], axis=-1)[..., None, :]
     R = U @ Vt
-    return _rigid(R, center_base - (R @ center_ct[..., None])[..., 0])
+    return read_only(pose(R, center_base - (R @ center_ct[..., None])[..., 0]))
 
 
-def _rigid(R: Floats, t: Floats) -> Floats:
-    return read_only(pose(R, t))
+def rms(vectors: Floats) -> float:
+    """Root mean square of the lengths of vectors (n, 3)."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def rigid_fre_mm(points_ct: Floats, points_base: Floats) -> float:
+    """The fiducial registration error (rms residual) of `fit_rigid`, mm: the chi-squared test is about that.
+
+    The arguments are those of `fit_rigid`, of one set.
+    """
+    return rms(apply(fit_rigid(points_ct, points_base), points_ct) - points_base)
 
 
 def fit_triad(points_ct: Floats, points_base: Floats) -> Floats:
@@ -129,7 +124,7 @@ def fit_triad(points_ct: Floats, points_base: Floats) -> Floats:
     """
     R_ct = np.swapaxes(frame_of_points(points_ct), -1, -2)
     R = frame_of_points(points_base) @ R_ct
-    return _rigid(R, np.mean(points_base - points_ct @ np.swapaxes(R, -1, -2), axis=-2))
+    return read_only(pose(R, np.mean(points_base - points_ct @ np.swapaxes(R, -1, -2), axis=-2)))
 
 
 def fit_affine(points_ct: Floats, points_base: Floats) -> Floats:
@@ -157,19 +152,13 @@ def fit_weighted(points_ct: Floats, points_base: Floats, noise: ReadingNoise, T_
         noise: Gives Omega, for the rotation found so far.
         T_start: Shape (..., 4, 4), such as the least-squares fit.
     """
-    R, t, center = T_start[..., :3, :3], T_start[..., :3, 3], points_base.mean(axis=-2)
-    for _ in range(STEPS):
-        fitted = points_ct @ _transposed(R) + t[..., None, :]
-        weights = np.linalg.inv(noise.blocks(R))
-        A = design_blocks(fitted, center)
-        weighted = np.swapaxes(A, -1, -2) @ weights
-        normal, right = (weighted @ A).sum(axis=-3), weighted @ (points_base - fitted)[..., None]
-        step = np.linalg.solve(normal, right.sum(axis=-3))[..., 0]
-        turn = exp_rotation(step[..., 3:])
-        t = (turn @ (t - center)[..., None])[..., 0] + center + step[..., :3]
-        R = turn @ R
-    U, _, Vt = np.linalg.svd(R)  # products of rotations drift from one by rounding
-    return pose(U @ Vt, t)
+
+    def step(R: Floats, blocks: Floats, residuals: Floats) -> Floats:
+        weighted = np.swapaxes(blocks, -1, -2) @ np.linalg.inv(noise.blocks(R))
+        normal, right = (weighted @ blocks).sum(axis=-3), weighted @ residuals[..., None]
+        return np.asarray(np.linalg.solve(normal, right.sum(axis=-3))[..., 0])
+
+    return _gauss_newton(points_ct, points_base, T_start, step)
 
 
 def fit_joint(points_ct: Floats, points_base: Floats, noise: ReadingNoise, T_start: Floats) -> Floats:
@@ -177,24 +166,29 @@ def fit_joint(points_ct: Floats, points_base: Floats, noise: ReadingNoise, T_sta
 
     The arguments are those of `fit_weighted`. C is taken at T_start, from which the fit turns by little.
     """
-    R, t, center = T_start[..., :3, :3], T_start[..., :3, 3], points_base.mean(axis=-2)
-    weights = np.linalg.inv(noise.covariance(R).whole)
-    for _ in range(STEPS):
-        fitted = points_ct @ _transposed(R) + t[..., None, :]
-        blocks = design_blocks(fitted, center)
+    weights = np.linalg.inv(noise.covariance(T_start[..., :3, :3]).whole)
+
+    def step(_: Floats, blocks: Floats, residuals: Floats) -> Floats:
         A = blocks.reshape(*blocks.shape[:-3], -1, 6)
         weighted = np.swapaxes(A, -1, -2) @ weights
-        residuals = (points_base - fitted).reshape(*A.shape[:-1], 1)
-        step = np.linalg.solve(weighted @ A, weighted @ residuals)[..., 0]
-        turn = exp_rotation(step[..., 3:])
-        t = (turn @ (t - center)[..., None])[..., 0] + center + step[..., :3]
+        return np.asarray(np.linalg.solve(weighted @ A, weighted @ residuals.reshape(*A.shape[:-1], 1))[..., 0])
+
+    return _gauss_newton(points_ct, points_base, T_start, step)
+
+
+def _gauss_newton(
+    points_ct: Floats, points_base: Floats, T_start: Floats, step: Callable[[Floats, Floats, Floats], Floats]
+) -> Floats:
+    """Follow the steps (..., 6) that a rotation, the blocks of its design and its residuals (..., N, 3) call for."""
+    R, t, center = T_start[..., :3, :3], T_start[..., :3, 3], points_base.mean(axis=-2)
+    for _ in range(STEPS):
+        fitted = points_ct @ np.swapaxes(R, -1, -2) + t[..., None, :]
+        moved = step(R, design_blocks(fitted, center), points_base - fitted)
+        turn = exp_rotation(moved[..., 3:])
+        t = (turn @ (t - center)[..., None])[..., 0] + center + moved[..., :3]
         R = turn @ R
-    U, _, Vt = np.linalg.svd(R)  # as in `fit_weighted`
+    U, _, Vt = np.linalg.svd(R)  # products of rotations drift from one by rounding
     return pose(U @ Vt, t)
-
-
-def _transposed(R: Floats) -> Floats:
-    return np.swapaxes(R, -1, -2)
 
 
 SIGNIFICANT, SURE = 0.05, 0.01
@@ -211,26 +205,23 @@ KINDS = ("xyz", "x", "y", "z", "xy", "xz", "yz")
 
 @dataclass(frozen=True)
 class Distortion:
-    """The deformation that explains most of the residuals.
-
-    Attributes:
-        axes: Of ``KINDS``, in the case's CT frame.
-        amount: The factor less 1 by which markers_base are longer; of a shear by how much a point moves along the first
-            axis per mm along the second.
-        probability: Of one so sure in any of the seven, where there is none.
-        moved_mm: What it moves the markers by beside a rigid motion, rms.
-        reading_mm: The standard deviation per coordinate that it leaves to the readings.
-        rms_mm: Expected error at the target by the residuals of the rigid fit.
-        rms_without_mm: The rms by the residuals of the fit with the deformation.
-    """
+    """The deformation that explains most of the residuals."""
 
     axes: str
+    """Of ``KINDS``, in the case's CT frame."""
     amount: float
+    """The factor less 1 by which markers_base are longer; of a shear by how much a point moves along the first axis per
+    mm along the second."""
     probability: float
+    """Of one so sure in any of the seven, where there is none."""
     moved_mm: float
+    """What it moves the markers by beside a rigid motion, rms."""
     reading_mm: float
+    """The standard deviation per coordinate that it leaves to the readings."""
     rms_mm: float
+    """Expected error at the target by the residuals of the rigid fit."""
     rms_without_mm: float
+    """The rms by the residuals of the fit with the deformation."""
 
     @property
     def significant(self) -> bool:
@@ -238,18 +229,15 @@ class Distortion:
         return self.probability < SIGNIFICANT and self.moved_mm >= LEAST_MM
 
     def finding(self) -> Finding:
-        """The finding, a warning."""
-        numbers: dict[str, float | str] = {"axes": self.axes, "amount": self.amount, "probability": self.probability}
-        return Finding("lists_deformed", Severity.WARNING, self.text(), numbers)
-
-    def text(self) -> str:
-        """The finding, in one sentence."""
+        """The deformation as a warning."""
         noise = "not noise, because" if self.probability < SURE else "probably more than noise:"
-        return (
+        said = (
             f"{self.brief()}: {noise} besides it, the readings have errors of {self.reading_mm:.2g} mm a "
             "coordinate; without it the expected TRE at the target would be about "
             f"{self.rms_without_mm:.1f} mm instead of {self.rms_mm:.1f}; the registration does not use this"
         )
+        numbers: dict[str, float | str] = {"axes": self.axes, "amount": self.amount, "probability": self.probability}
+        return Finding("lists_deformed", Severity.WARNING, said, numbers)
 
     def brief(self) -> str:
         """How the lists differ, by how much, and how sure that is."""
@@ -340,21 +328,18 @@ class NoiseCovariance(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ReadingNoise:
-    """Declared errors of the readings of N markers, all normal with mean zero.
-
-    Attributes:
-        cov_ct: Shape (3, 3), mm^2, of each reading in the CT.
-        cov_base: Shape (N, 3, 3), mm^2, of each touch: its own noise, and the arm's repeatability there.
-        arm_jacobian: Shape (3 N, 28), how the arm's parameters move the tip at the touches.
-        eta_variances: Shape (28,), of those parameters.
-        touches_known: Whether the file says how the arm stood at the touches; else they are the planner's guess.
-    """
+    """Declared errors of the readings of N markers, all normal with mean zero."""
 
     cov_ct: Floats
+    """Shape (3, 3), mm^2, of each reading in the CT."""
     cov_base: Floats
+    """Shape (N, 3, 3), mm^2, of each touch: its own noise, and the arm's repeatability there."""
     arm_jacobian: Floats
+    """Shape (3 N, 28), how the arm's parameters move the tip at the touches."""
     eta_variances: Floats
+    """Shape (28,), of those parameters."""
     touches_known: bool
+    """Whether the file says how the arm stood at the touches; else they are the planner's guess."""
 
     def covariance(self, R_base_ct: Floats) -> NoiseCovariance:
         """Covariance of all readings stacked, CT axes rotated by (..., 3, 3)."""

@@ -98,20 +98,18 @@ def noise_of(stated: Sequence[float | None]) -> HandEyeNoise | None:
 class PosePairs(Shown):
     """What arm and camera said. Checked when made; the arrays are read-only.
 
-    Attributes:
-        A: T_base_flange, shape (n, 4, 4), mm; of motions T_flange1_flange2.
-        B: T_board_camera, shape (n, 4, 4), mm; of motions T_camera1_camera2.
-        names: One per pair; numbers where nothing is given.
-        motions: Whether A and B are motions from one pose to another.
-
     Raises:
         InputError: Other shapes, names that are used twice, or a matrix that is no rigid motion.
     """
 
     A: Floats
+    """T_base_flange, shape (n, 4, 4), mm; of motions T_flange1_flange2."""
     B: Floats
+    """T_board_camera, shape (n, 4, 4), mm; of motions T_camera1_camera2."""
     names: tuple[str, ...] = ()
+    """One per pair; numbers where nothing is given."""
     motions: bool = False
+    """Whether A and B are motions from one pose to another."""
 
     @brief
     def __repr__(self) -> str:
@@ -142,8 +140,6 @@ def read_pose_pairs(path: Path, *, motions: bool = False) -> PosePairs:
 
 
 class _Value(NamedTuple):
-    """One value of the unknowns."""
-
     X: Floats
     Z: Floats
 
@@ -159,33 +155,30 @@ def _step(T: Floats, step: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class HandEye(Shown):
-    """The calibration of a camera on a flange.
-
-    Attributes:
-        X: T_flange_camera, shape (4, 4), mm.
-        Z: T_base_board, shape (4, 4), mm; None for motions.
-        residuals: Of rotation (rad) and translation (mm), shape (n, 6).
-        covariance: Shape (12, 12), or (6, 6) for motions: rotation (rad, on the right) and translation (mm) of X, of Z.
-        noise: As stated; None where the spreads were found.
-        spread: Of the residuals, rad and mm: their rms over what the unknowns leave free.
-        least_freedom: Of the spread that is known least; infinite where the noise was stated.
-        chi_squared: Of the residuals, where the noise was stated.
-        condition: Least over largest singular value of the Jacobian, lengths in 100 mm.
-        outliers: Poses that do not fit the others; they are used.
-    """
+    """The calibration of a camera on a flange."""
 
     X: Floats
+    """T_flange_camera, shape (4, 4), mm."""
     Z: Floats | None
+    """T_base_board, shape (4, 4), mm; None for motions."""
     names: tuple[str, ...]
     residuals: Floats
+    """Of rotation (rad) and translation (mm), shape (n, 6)."""
     covariance: Floats
+    """Shape (12, 12), or (6, 6) for motions: rotation (rad, on the right) and translation (mm) of X, of Z."""
     freedom: int
     noise: HandEyeNoise | None
+    """As stated; None where the spreads were found."""
     spread: tuple[float, float]
+    """Of the residuals, rad and mm: their rms over what the unknowns leave free."""
     least_freedom: float
+    """Of the spread that is known least; infinite where the noise was stated."""
     chi_squared: float | None
+    """Of the residuals, where the noise was stated."""
     condition: float
+    """Least over largest singular value of the Jacobian, lengths in 100 mm."""
     outliers: tuple[str, ...]
+    """Poses that do not fit the others; they are used."""
 
     @brief
     def __repr__(self) -> str:
@@ -249,10 +242,34 @@ def calibrate_hand_eye(pairs: PosePairs, noise: HandEyeNoise | None = None) -> H
     if not pairs.motions and farthest < METRES:
         refuse(f"the flange is never farther than {farthest:.3g} mm from its base: metres?", "A", ALLOWED, "wrong_unit")
     value = _start(pairs)
-    condition = _require_observable(pairs, value)
+    J = _slopes(pairs, value, pairs.B[:, :3, 3].mean(axis=0))
+    rows = np.repeat([1.0, LENGTH_MM], 3)
+    units = np.tile(rows, J.shape[2] // 6)
+    values = np.linalg.svd((J * units / rows[:, None]).reshape(-1, J.shape[2]), compute_uv=False)
+    condition = float(values[-1] / values[0])
+    if condition < LEAST_RATIO:
+        _refuse_rotations(pairs)
     value, sigma = _fit(pairs, value, noise)
     _refuse_slip(pairs, _size_mm(pairs, value))
-    return _result(pairs, value, sigma, noise, condition)
+    J, r = _slopes(pairs, value), _residuals(pairs, value)
+    C, free = _covariance(J, sigma), _free(pairs, value, sigma)
+    rad, mm = np.sqrt(_squares(pairs, value) / free)
+    own = np.einsum("ni,ni->n", r, np.linalg.solve(sigma, r[:, :, None])[:, :, 0])
+    limit = float(2 * gammaincinv(3, 1 - 0.01 / len(own)))
+    return HandEye(
+        read_only(value.X),
+        None if pairs.motions else read_only(value.Z),
+        pairs.names,
+        read_only(r),
+        read_only(C),
+        r.size - J.shape[2],
+        noise,
+        (float(rad), float(mm)),
+        np.inf if noise is not None else float(free.min()),
+        None if noise is None else float(own.sum()),
+        condition,
+        tuple(name for name, size in zip(pairs.names, own, strict=True) if size > limit),
+    )
 
 
 def _start(pairs: PosePairs) -> _Value:
@@ -357,20 +374,10 @@ def _least_squares(pairs: PosePairs, start: _Value, sigma: Floats) -> _Value:
         J = (W @ _slopes(pairs, value)).reshape(6 * len(W), -1)
         return System(white(value), J, lambda near: float(np.sum(white(near) ** 2)))
 
-    arrived = lambda _, step: bool(np.abs(step).max() < SMALL_STEP)  # noqa: E731 - one of three functions in a row
+    def arrived(_: object, step: Floats) -> bool:
+        return bool(np.abs(step).max() < SMALL_STEP)
+
     return gauss_newton(start, linearised, _Value.moved, arrived, MOST_STEPS).estimate
-
-
-def _require_observable(pairs: PosePairs, value: _Value) -> float:
-    """The conditioning of the poses, least over largest singular value."""
-    J = _slopes(pairs, value, pairs.B[:, :3, 3].mean(axis=0))
-    units = np.tile(np.repeat([1.0, LENGTH_MM], 3), J.shape[2] // 6)
-    rows = np.repeat([1.0, LENGTH_MM], 3)
-    values = np.linalg.svd((J * units / rows[:, None]).reshape(-1, J.shape[2]), compute_uv=False)
-    ratio = float(values[-1] / values[0])
-    if ratio < LEAST_RATIO:
-        _refuse_rotations(pairs)
-    return ratio
 
 
 def _refuse_rotations(pairs: PosePairs) -> NoReturn:
@@ -415,26 +422,3 @@ def _refuse_slip(pairs: PosePairs, size_mm: float) -> None:
     if size_mm > SOUND_MM:
         what = f"residuals of {size_mm:.3g} mm (mm + 100 mm x rad, rms): the poses do not belong together"
         refuse(what, "hand-eye", f"residuals up to {SOUND_MM:g} mm; {ALLOWED}", "residuals_too_large")
-
-
-def _result(pairs: PosePairs, value: _Value, sigma: Floats, noise: HandEyeNoise | None, condition: float) -> HandEye:
-    """The calibration at its fit."""
-    J, r = _slopes(pairs, value), _residuals(pairs, value)
-    C, free = _covariance(J, sigma), _free(pairs, value, sigma)
-    rad, mm = np.sqrt(_squares(pairs, value) / free)
-    own = np.einsum("ni,ni->n", r, np.linalg.solve(sigma, r[:, :, None])[:, :, 0])
-    limit = float(2 * gammaincinv(3, 1 - 0.01 / len(own)))
-    return HandEye(
-        read_only(value.X),
-        None if pairs.motions else read_only(value.Z),
-        pairs.names,
-        read_only(r),
-        read_only(C),
-        r.size - J.shape[2],
-        noise,
-        (float(rad), float(mm)),
-        np.inf if noise is not None else float(free.min()),
-        None if noise is None else float(own.sum()),
-        condition,
-        tuple(name for name, size in zip(pairs.names, own, strict=True) if size > limit),
-    )

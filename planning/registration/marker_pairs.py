@@ -87,7 +87,8 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
         bad = [n for n, a, b in zip(markers.names, markers.points_ct, markers.points_base, strict=True)
                if not np.isfinite([a, b]).all()]  # fmt: skip
         refuse(f"marker {', '.join(bad)} is not finite", where, "finite mm", "not_finite")
-    spreads = [_singular_values(points) for points in (markers.points_ct, markers.points_base)]
+    sides = markers.points_ct, markers.points_base
+    spreads = [np.linalg.svd(points - points.mean(axis=0), compute_uv=False) for points in sides]
     for side, values in zip(("CT", "base"), spreads, strict=True):
         if values[0] == 0 or values[1] / values[0] < COLLINEAR:
             what = f"markers {', '.join(markers.names)} are collinear on the {side} side"
@@ -96,19 +97,10 @@ def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
     if not 1 / UNIT_SLIP < ratio < UNIT_SLIP:
         what = f"base markers spread {ratio:.3g} times as wide as the CT's: probably a wrong unit (mm/cm/m)"
         refuse(what, where, "both sides in mm", "wrong_unit")
-    span = max(_span(markers.points_ct), _span(markers.points_base))
+    span = max(float(np.linalg.norm(points[:, None] - points, axis=2).max()) for points in sides)
     if span < LEAST_SPAN_MM:
         what = (
             f"markers {', '.join(markers.names)} span {span:.2g} mm, too little for a needle to distinguish: "
             "probably a wrong unit (m or cm as mm) on both sides"
         )
         refuse(what, where, f"both sides in mm, markers that span {LEAST_SPAN_MM:g} mm at least", "wrong_unit")
-
-
-def _span(points: Floats) -> float:
-    """The greatest distance between two of the points (n, 3)."""
-    return float(np.linalg.norm(points[:, None] - points[None], axis=2).max())
-
-
-def _singular_values(points: Floats) -> Floats:
-    return np.asarray(np.linalg.svd(points - points.mean(axis=0), compute_uv=False))

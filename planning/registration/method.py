@@ -21,14 +21,7 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits import (
-    ReadingNoise,
-    _least_squares,
-    fit_joint,
-    fit_rigid,
-    fit_triad,
-    fit_weighted,
-)
+from puncture_twin.planning.registration.fits import ReadingNoise, fit_joint, fit_rigid, fit_triad, fit_weighted, rms
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.residuals import MAX_FRE_MM
 
@@ -44,9 +37,6 @@ LEAST_FOUND_MM = 0.01
 SINGULAR = 1e-12
 """Least over greatest variance of the readings below which some of them count as free of error."""
 
-WEIGHING = frozenset({"weighted", "joint"})
-"""Methods that cannot do without declared errors."""
-
 
 def checked_fit(
     markers: MarkerPairs, method: Method, noise: ReadingNoise | None, found_in_mm: float | None, *, where: str | Path
@@ -59,45 +49,29 @@ def checked_fit(
     Raises:
         InputError: ``affine``, ``weighted`` or ``joint`` without noise, or noise that cannot be weighed.
     """
-    _check_method(method, noise, where)
-    fit = _fit_by(method, noise)
-    if noise is not None:
-        _check_noise(markers, method, noise, found_in_mm, where=where)
-    return fit
-
-
-def _fit_by(method: Method, noise: ReadingNoise | None) -> Fit:
-    if method == "weighted" and noise is not None:
-        return lambda ct, base: fit_weighted(ct, base, noise, fit_rigid(ct, base))
-    if method == "joint" and noise is not None:
-        return lambda ct, base: fit_joint(ct, base, noise, fit_rigid(ct, base))
-    return fit_triad if method == "triad" else fit_rigid
-
-
-def _check_method(method: Method, noise: ReadingNoise | None, where: str | Path) -> None:
     if method == "affine":
         allowed = "triad, rigid or weighted; affine only reproduces the paper's Table 6"
         refuse("method 'affine' bends the patient", where, allowed, "method_bends")
     if method not in get_args(Method):
         refuse(f"method {method!r}", where, ", ".join(get_args(Method)), "unknown_method")
-    if method in WEIGHING and noise is None:
-        what = f"method '{method}' needs declared errors as weights"
-        refuse(what, where, "[errors], or method rigid", "method_without_errors")
-
-
-def _check_noise(
-    markers: MarkerPairs, method: Method, noise: ReadingNoise, found_in_mm: float | None, *, where: str | Path
-) -> None:
-    """Refuse noise that cannot be weighed, and an FRE (mm, where the noise is found in it) that holds none."""
-    R = fit_rigid(markers.points_ct, markers.points_base)[:3, :3]
-    covariance = noise.covariance(R)
-    values = np.linalg.eigvalsh(covariance.independent if method in WEIGHING else covariance.whole)
+    weighing = method in {"weighted", "joint"}
+    if noise is None:
+        if weighing:
+            what = f"method '{method}' needs declared errors as weights"
+            refuse(what, where, "[errors], or method rigid", "method_without_errors")
+        return fit_triad if method == "triad" else fit_rigid
+    covariance = noise.covariance(fit_rigid(markers.points_ct, markers.points_base)[:3, :3])
+    values = np.linalg.eigvalsh(covariance.independent if weighing else covariance.whole)
     if not values[0] > SINGULAR * values[-1]:
         allowed = "ct_in_plane_mm, ct_slice_mm or touch_mm above 0"
         refuse("the declared errors leave some marker readings without error", where, allowed, "no_marker_noise")
     if found_in_mm is not None and found_in_mm < LEAST_FOUND_MM:
         message = f"marker_noise = 'found', but the residuals ({found_in_mm:.2g} mm) show none"
         refuse(message, where, "markers measured on both sides, or marker_noise = 'declared'", "no_marker_noise")
+    if weighing:
+        weighted = fit_weighted if method == "weighted" else fit_joint
+        return lambda ct, base: weighted(ct, base, noise, fit_rigid(ct, base))
+    return fit_triad if method == "triad" else fit_rigid
 
 
 MAX_RESIDUAL_MM = 15.0
@@ -105,10 +79,6 @@ MAX_RESIDUAL_MM = 15.0
 
 MIRROR_GAIN = 2.0
 """Factor (and 1 mm) by which a mirrored fit must be better than the proper one: then one list is mirrored."""
-
-
-def _rms(residuals: Floats) -> float:
-    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
 
 
 def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, where: str | Path) -> None:
@@ -121,12 +91,14 @@ def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, 
     Raises:
         InputError: Naming the markers, and the permutations of their names that would fit.
     """
-    mirrored = _least_squares(markers.points_ct, markers.points_base, mirrored=True)
-    best = _rms(apply(mirrored, markers.points_ct) - markers.points_base)
-    if _rms(residuals) > MIRROR_GAIN * best + 1.0:
+    given = rms(residuals)
+    mirrored = rms(
+        apply(fit_rigid(markers.points_ct, markers.points_base, mirrored=True), markers.points_ct) - markers.points_base
+    )
+    if given > MIRROR_GAIN * mirrored + 1.0:
         what = (
-            f"markers {', '.join(markers.names)} match only mirrored (rms {best:.2f} mm against "
-            f"{_rms(residuals):.2f} mm){better_names(markers, target_ct, _rms(residuals))}"
+            f"markers {', '.join(markers.names)} match only mirrored (rms {mirrored:.2f} mm against "
+            f"{given:.2f} mm){better_names(markers, target_ct, given)}"
         )
         refuse(what, where, "both sides right-handed: check LPS/RAS and the marker names", "markers_mirrored")
     lengths = np.linalg.norm(residuals, axis=1)
@@ -134,7 +106,7 @@ def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, 
     if lengths[worst] > MAX_RESIDUAL_MM:
         what = (
             f"marker {markers.names[worst]} misses by {lengths[worst]:.1f} mm: swapped, moved or mistyped"
-            f"{better_names(markers, target_ct, _rms(residuals))}"
+            f"{better_names(markers, target_ct, given)}"
         )
         refuse(what, where, f"residuals up to {MAX_RESIDUAL_MM:g} mm", "marker_misses")
 
@@ -148,23 +120,20 @@ HARMLESS_MM = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Renaming:
-    """Names permuted, and what follows.
-
-    Attributes:
-        names: The CT markers that are paired with another's touch.
-        touched_as: The touches that they are paired with, in the same order.
-        fre_mm: Root mean square residual of the permuted pairs.
-        T_base_ct: Their rigid fit, shape (4, 4), mm.
-        target_mm: How far from the believed target the true one would be.
-        turn: By how much the patient would be turned against the belief, rad.
-    """
+    """Names permuted, and what follows."""
 
     names: tuple[str, ...]
+    """The CT markers that are paired with another's touch."""
     touched_as: tuple[str, ...]
+    """The touches that they are paired with, in the same order."""
     fre_mm: float
+    """Root mean square residual of the permuted pairs."""
     T_base_ct: Floats
+    """Their rigid fit, shape (4, 4), mm."""
     target_mm: float
+    """How far from the believed target the true one would be."""
     turn: float
+    """By how much the patient would be turned against the belief, rad."""
 
     @property
     def slip(self) -> str:
@@ -229,9 +198,8 @@ def matching(x: Floats, y: Floats, bound: float) -> Ints | None:
     for size in range(count):
         if count * partial.shape[0] * max(size, 1) > MAX_NUMBERS:
             return None
-        apart = (
-            in_base[:, partial] - in_ct[size, :size]
-        )  # (n, m, size): the next name's touch, the beginning, its names
+        # shape (n, m, size): the next name's touch, the beginning, its names
+        apart = in_base[:, partial] - in_ct[size, :size]
         costs = cost + np.sum(apart**2, axis=2)
         costs[partial.T, np.arange(len(partial))] = np.inf  # each touch once
         touch, beginning = np.nonzero(costs <= 2 * size * bound * (1 + 1e-9) + 1e-9)
@@ -255,18 +223,13 @@ def _renaming(markers: MarkerPairs, order: Ints, T_given: Floats, target_ct: Flo
     """The permutation, and how far it moves what it moves most (target or marker), mm."""
     permuted = markers.points_base[order]
     T = fit_rigid(markers.points_ct, permuted)
-    fre = float(np.sqrt(np.mean(np.sum((apply(T, markers.points_ct) - permuted) ** 2, axis=1))))
     points = np.vstack([target_ct, markers.points_ct])
     moved = np.linalg.norm(apply(T, points) - apply(T_given, points), axis=1)
+    turn = np.arccos(np.clip((np.trace(T[:3, :3] @ T_given[:3, :3].T) - 1) / 2, -1.0, 1.0))
     rows = np.flatnonzero(order != np.arange(len(order)))
     names, touched_as = (tuple(markers.names[row] for row in which) for which in (rows, order[rows]))
-    return Renaming(names, touched_as, fre, T, float(moved[0]), angle_between(T, T_given)), float(moved.max())
-
-
-def angle_between(T: Floats, T_other: Floats) -> float:
-    """The angle between two poses, rad."""
-    cosine = (np.trace(T[:3, :3] @ T_other[:3, :3].T) - 1) / 2
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    fre = rms(apply(T, markers.points_ct) - permuted)
+    return Renaming(names, touched_as, fre, T, float(moved[0]), float(turn)), float(moved.max())
 
 
 BETTER = 3.0
@@ -287,8 +250,5 @@ def better_names(markers: MarkerPairs, target_ct: Floats, fre_mm: float) -> str:
         return ""
     best = sorted(found, key=lambda one: one.fre_mm)
     more = f" (and {len(best) - SHOWN} more)" if len(best) > SHOWN else ""
-    return f"; {', or '.join(_text(one) for one in best[:SHOWN])}{more}"
-
-
-def _text(one: Renaming) -> str:
-    return f"with {one.slip} they would fit (FRE {one.fre_mm:.2f} mm)"
+    fitting = [f"with {one.slip} they would fit (FRE {one.fre_mm:.2f} mm)" for one in best[:SHOWN]]
+    return f"; {', or '.join(fitting)}{more}"

@@ -49,17 +49,14 @@ MAX_AIM_OFF_MM = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """The belief of where CT and base are to each other.
-
-    Attributes:
-        T_base_ct: Shape (4, 4), mm.
-        registration: How markers gave it, or None where the case states a mount.
-        target_error_mm: Expected (rms) error at the target, NaN without markers.
-    """
+    """The belief of where CT and base are to each other."""
 
     T_base_ct: Floats
+    """Shape (4, 4), mm."""
     registration: Registration | None
+    """How markers gave it, or None where the case states a mount."""
     target_error_mm: float
+    """Expected (rms) error at the target, NaN without markers."""
 
 
 def load_placement(case: Case) -> Placement | None:
@@ -117,27 +114,21 @@ def corrected(case: Case, registration: Registration, *, where: str | Path) -> R
     if registration.markers.joints is None:
         message = "correct = true, but the touches have no joint angles: they give no information on the arm's errors"
         refuse(message, where, "q1_deg to q6_deg in markers_base; or correct = false", "no_touch_joints")
-    model, tip = case.robot.model, case.needle.length_mm
-    q = _aimed_insertion(case, registration.T_base_ct, where)
-    return aimed(registration, aim_at(model, tip, case.target_ct, q))
-
-
-def _aimed_insertion(case: Case, T_base_ct: Floats, where: str | Path) -> Floats:
-    """Joints (6,), rad, of the insertion that is corrected for."""
     assert case.registration is not None  # its markers were registered
-    if case.registration.correct_joints_deg is None:
-        reached = reached_insertion(case, T_base_ct)
-        if reached is None:
+    model, tip, stated = case.robot.model, case.needle.length_mm, case.registration.correct_joints_deg
+    if stated is None:
+        q = reached_insertion(case, registration.T_base_ct)
+        if q is None:
             message = "correct = true, but the arm reaches the target in none of the directions tried"
             refuse(message, where, "correct_joints_deg, the joints at the end of the insertion", "out_of_reach")
-        return reached
-    q = np.radians(np.asarray(case.registration.correct_joints_deg))
-    T = flange_pose(case.robot.model, q)
-    away = float(np.linalg.norm(T[:3, 3] + case.needle.length_mm * T[:3, 2] - apply(T_base_ct, case.target_ct)))
-    if away > MAX_AIM_OFF_MM:
-        allowed = f"within {MAX_AIM_OFF_MM:g} mm: joints at the end of an insertion, with this needle"
-        refuse(f"correct_joints_deg put the tip {away:.1f} mm from the target", where, allowed, "aim_beside_target")
-    return q
+    else:
+        q = np.radians(np.asarray(stated))
+        T = flange_pose(model, q)
+        away = float(np.linalg.norm(T[:3, 3] + tip * T[:3, 2] - apply(registration.T_base_ct, case.target_ct)))
+        if away > MAX_AIM_OFF_MM:
+            allowed = f"within {MAX_AIM_OFF_MM:g} mm: joints at the end of an insertion, with this needle"
+            refuse(f"correct_joints_deg put the tip {away:.1f} mm from the target", where, allowed, "aim_beside_target")
+    return aimed(registration, aim_at(model, tip, case.target_ct, q))
 
 
 def default_method(errors: ErrorModel | None) -> Literal["rigid", "weighted"]:
@@ -180,13 +171,7 @@ def aimed(registration: Registration, aim: Aim) -> Registration:
 def aimed_uncertainty(
     fit: FitUncertainty, points_ct: Floats, T_base_ct: Floats, target_base: Floats, aim: Aim
 ) -> FitUncertainty:
-    """The uncertainty of a joint fit whose pose was corrected.
-
-    Args:
-        points_ct: Shape (N, 3), mm, its markers.
-        T_base_ct: Shape (4, 4), the corrected pose.
-        target_base: Shape (3,), mm, where the pose was turned about.
-    """
+    """The uncertainty of a joint fit of points (N, 3) that was corrected to T_base_ct, turned about the target."""
     A = design(apply(T_base_ct, points_ct), fit.center_base)
     M = np.eye(len(A)) - A @ fit.fit_map
     weights = np.asarray(np.linalg.inv(fit.noise.covariance(fit.R_base_ct).whole), dtype=np.float64)
@@ -201,30 +186,24 @@ APART_MM = 20.0
 
 @dataclass(frozen=True)
 class WithoutMarker:
-    """A registration without one of its markers.
-
-    Attributes:
-        rms_mm: Expected error at the target by the readings of the others, scaled as the registration's is.
-        probability: Of residuals as large as those of the others, if the declaration holds; NaN where three are left
-            and two are not enough.
-    """
+    """A registration without one of its markers."""
 
     name: str
     rms_mm: float
+    """Expected error at the target by the readings of the others, scaled as the registration's is."""
     probability: float
+    """Of residuals as large as those of the others, if the declaration holds; NaN where three are left and two are not
+    enough."""
 
 
 @dataclass(frozen=True, eq=False)
 class OneMore:
-    """The place on the skin where a further marker would help most.
-
-    Attributes:
-        point_ct: Shape (3,), mm.
-        rms_mm: Expected error at the target with it, by the readings, scaled to the residuals where they are.
-    """
+    """The place on the skin where a further marker would help most."""
 
     point_ct: Floats
+    """Shape (3,), mm."""
     rms_mm: float
+    """Expected error at the target with it, by the readings, scaled to the residuals where they are."""
 
 
 def without_each(registration: Registration, target_ct: Floats) -> tuple[WithoutMarker, ...]:

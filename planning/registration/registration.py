@@ -29,54 +29,34 @@ from puncture_twin.planning.registration.method import Method, better_names, che
 from puncture_twin.planning.registration.residuals import (
     Conditioning,
     Interval,
-    OutlierMarker,
     ResidualTest,
     conditioning,
     outlier_marker,
 )
-
-
-def unexplained_residuals(test: ResidualTest, uncertainty: FitUncertainty | None) -> Finding | None:
-    """Warning of residuals that the noise does not explain, and the case accepts: against FRE or declared errors."""
-    declared = test if uncertainty is None else uncertainty.test
-    if test.explained if uncertainty is None else uncertainty.test.agrees:
-        return None
-    scaled = uncertainty is not None and declared.explained
-    said = declared.text() + ("; all errors are scaled to them" if scaled else "; accepted by the case")
-    return Finding("residuals_unexplained", Severity.WARNING, said, {"chi_squared": declared.chi_squared})
-
-
-def outlier_marker_of(markers: MarkerPairs, fle_mm: float | None) -> OutlierMarker | None:
-    """The marker that least fits the others, if chance does not explain it; ``fle_mm``: the declared noise, or None."""
-    return outlier_marker(fits.fit_rigid, markers.names, markers.points_ct, markers.points_base, fle_mm)
-
 
 ALLOWED_RESIDUALS = "check names and readings, declare the true errors, or set registration.accept_residuals = true"
 
 
 @dataclass(frozen=True, eq=False)
 class Registration(Shown):
-    """T_base_ct from markers, and what is known of its error.
-
-    Attributes:
-        T_base_ct: Shape (4, 4), rigid, mm.
-        residuals: Shape (n, 3), T_base_ct markers_ct - markers_base, mm.
-        conditioning: The three flags of a weak set, for the target given.
-        target_ct: That target, shape (3,), mm.
-        uncertainty: Covariance by the declared errors; None where none are declared.
-        aim: The insertion for which the pose was corrected by what the residuals show of the arm's errors; None where
-            it was not. ``residuals`` are those before the correction.
-    """
+    """T_base_ct from markers, and what is known of its error."""
 
     method: str
     T_base_ct: Floats
+    """Shape (4, 4), rigid, mm."""
     markers: MarkerPairs
     residuals: Floats
+    """Shape (n, 3), T_base_ct markers_ct - markers_base, mm."""
     residual_test: ResidualTest
     conditioning: Conditioning
+    """The three flags of a weak set, for the target given."""
     target_ct: Floats
+    """That target, shape (3,), mm."""
     uncertainty: FitUncertainty | None = None
+    """Covariance by the declared errors; None where none are declared."""
     aim: Aim | None = None
+    """The insertion for which the pose was corrected by what the residuals show of the arm's errors; None where it was
+    not. ``residuals`` are those before the correction."""
 
     def _facts(self) -> Facts:
         yield "method", self.method
@@ -101,10 +81,8 @@ class Registration(Shown):
         """Where `fle_mm` comes from: declared, estimated from FRE, or scaled to the residuals."""
         if self.uncertainty is None:
             return self.residual_test.source
-        scaled = (
-            f", scaled by {self.uncertainty.test.scale:.2f} to the residuals" if self.uncertainty.test.scaled else ""
-        )
-        return f"[errors]{scaled}"
+        test = self.uncertainty.test
+        return "[errors]" + (f", scaled by {test.scale:.2f} to the residuals" if test.scaled else "")
 
     @property
     def fle_interval_mm(self) -> Interval:
@@ -119,13 +97,18 @@ class Registration(Shown):
     @property
     def flags(self) -> tuple[Finding, ...]:
         """Warnings of what weakens it: conditioning, accepted residuals, an outlier marker, lists of two sizes."""
-        outlier, deformed = outlier_marker_of(self.markers, self.residual_test.declared_fle_mm), self.distortion
-        found = (
-            unexplained_residuals(self.residual_test, self.uncertainty),
-            None if outlier is None else outlier.finding(),
-            deformed.finding() if deformed is not None and deformed.significant else None,
-        )
-        return (*self.conditioning.flags, *(one for one in found if one is not None))
+        found = list(self.conditioning.flags)
+        test = self.residual_test if self.uncertainty is None else self.uncertainty.test
+        if not (self.residual_test.explained if self.uncertainty is None else self.uncertainty.test.agrees):
+            scaled = self.uncertainty is not None and test.explained
+            said = test.text() + ("; all errors are scaled to them" if scaled else "; accepted by the case")
+            numbers: dict[str, float | str] = {"chi_squared": test.chi_squared}
+            found.append(Finding("residuals_unexplained", Severity.WARNING, said, numbers))
+        if (outlier := outlier_marker(self.markers, self.residual_test.declared_fle_mm)) is not None:
+            found.append(outlier.finding())
+        if self.distortion is not None and self.distortion.significant:
+            found.append(self.distortion.finding())
+        return tuple(found)
 
     @cached_property
     def distortion(self) -> fits.Distortion | None:
@@ -203,8 +186,8 @@ def register(
         accept_residuals: Whether residuals beyond the noise are accepted, and the noise is scaled to them.
 
     Raises:
-        InputError: Fewer than three markers, collinear, mirrored, a unit slip, a marker far off, ``affine``,
-            ``weighted`` or ``joint`` without noise, noise that is none, or residuals that the noise does not explain.
+        InputError: Markers that cannot be fitted, a method without the noise that it needs, noise that is none, or
+            residuals that the noise does not explain.
     """
     # 1. The fit.
     check_pairs(markers, where)
@@ -225,7 +208,7 @@ def register(
     test = ResidualTest(len(markers), fre_mm, fle_mm)
     noise_test = test if uncertainty is None else uncertainty.test
     if not (noise_test.explained or accept_residuals):
-        outlier = outlier_marker_of(markers, fle_mm)
+        outlier = outlier_marker(markers, fle_mm)
         what = noise_test.text() if outlier is None else f"{noise_test.text()}; {outlier.text()}"
         what += better_names(markers, target_ct, fre_mm)
         deformed = fits.distortion(T_base_ct, markers, noise, target_ct)
@@ -238,17 +221,14 @@ def register(
 
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """The insertion for which a pose is corrected.
-
-    Attributes:
-        target_ct: Shape (3,), mm.
-        q: Shape (6,), rad, the tip on the target.
-        arm_jacobian: Shape (6, 28), J_f: motion of the needle there per arm parameter, base axes.
-    """
+    """The insertion for which a pose is corrected."""
 
     target_ct: Floats
+    """Shape (3,), mm."""
     q: Floats
+    """Shape (6,), rad, the tip on the target."""
     arm_jacobian: Floats
+    """Shape (6, 28), J_f: motion of the needle there per arm parameter, base axes."""
 
     def response(self, noise: fits.ReadingNoise, weights: Floats) -> Floats:
         """Correction of the pose at the target per residual, shape (..., 6, 3 N).

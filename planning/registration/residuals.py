@@ -8,7 +8,6 @@ How well a set of markers determines a registration at a point: expected error, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
@@ -19,7 +18,8 @@ from scipy.special import chdtrc, chdtri, fdtrc, fdtri
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fits import least_squares_map
+from puncture_twin.planning.registration.fits import fit_rigid, least_squares_map
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 
 REJECT_LEVEL = 0.001
 """Significance level of rejection: honest noise exceeds such residuals once in 1,000 registrations."""
@@ -54,17 +54,14 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """The residuals of a rigid fit against the noise.
-
-    Attributes:
-        count: Markers, N >= 3.
-        fre_mm: Root mean square residual of the least-squares rigid fit, whatever method the case takes.
-        declared_fle_mm: The noise (rms length, both sides together) that the user states, or None.
-    """
+    """The residuals of a rigid fit against the noise."""
 
     count: int
+    """Markers, N >= 3."""
     fre_mm: float
+    """Root mean square residual of the least-squares rigid fit, whatever method the case takes."""
     declared_fle_mm: float | None = None
+    """The noise (rms length, both sides together) that the user states, or None."""
 
     @property
     def freedom(self) -> int:
@@ -110,7 +107,7 @@ class ResidualTest:
         """
         if self.declared_fle_mm is not None:
             return self.declared_fle_mm * self.scale
-        return max(self._estimate_mm, MIN_FLE_MM)
+        return max(self.fre_mm / self._free, MIN_FLE_MM)
 
     @property
     def fle_interval_mm(self) -> Interval:
@@ -127,7 +124,7 @@ class ResidualTest:
         if self.declared_fle_mm is not None:
             scaled = f", scaled by {self.scale:.2f} to the residuals" if self.scale > 1 else ""
             return f"given{scaled}"
-        if self._estimate_mm < MIN_FLE_MM:
+        if self.fre_mm / self._free < MIN_FLE_MM:
             return f"the floor of {MIN_FLE_MM:g} mm: such a small FRE of {self.count} markers is chance"
         return "estimated from FRE of the rigid fit"
 
@@ -154,7 +151,7 @@ class ResidualTest:
         if self.declared_fle_mm is not None:
             alike = self.limit_mm * self.scale
         else:
-            alike = min(MAX_FRE_MM, max(ALIKE_MM, self._f_ratio * max(self.fre_mm, self._floor_fre_mm)))
+            alike = min(MAX_FRE_MM, max(ALIKE_MM, self._f_ratio * max(self.fre_mm, MIN_FLE_MM * self._free)))
         return max(alike, self.fre_mm)
 
     def contradicted_by(self, other_fre_mm: float) -> bool:
@@ -163,15 +160,11 @@ class ResidualTest:
             return other_fre_mm <= self.limit_mm
         if self.declared_fle_mm is not None:
             return False
-        return self.fre_mm > self._f_ratio * max(other_fre_mm, self._floor_fre_mm)
+        return self.fre_mm > self._f_ratio * max(other_fre_mm, MIN_FLE_MM * self._free)
 
     @property
-    def _estimate_mm(self) -> float:
-        return self.fre_mm / float(np.sqrt(1 - 2 / self.count))
-
-    @property
-    def _floor_fre_mm(self) -> float:
-        return MIN_FLE_MM * float(np.sqrt(1 - 2 / self.count))
+    def _free(self) -> float:
+        return float(np.sqrt(1 - 2 / self.count))
 
     @property
     def _f_ratio(self) -> float:
@@ -180,17 +173,14 @@ class ResidualTest:
 
 
 class OutlierMarker(NamedTuple):
-    """A marker that does not fit the others.
-
-    Attributes:
-        miss_mm: How far off its reading the others place it.
-        others_fre_mm: How well they fit each other, root mean square.
-    """
+    """A marker that does not fit the others."""
 
     name: str
     miss_mm: float
+    """How far off its reading the others place it."""
     others: int
     others_fre_mm: float
+    """How well they fit each other, root mean square."""
 
     def text(self) -> str:
         """Which marker does not fit, by how much, and what to check; one sentence."""
@@ -202,21 +192,11 @@ class OutlierMarker(NamedTuple):
 
     def finding(self) -> Finding:
         """The same, as a warning."""
-        numbers: dict[str, float | str] = {
-            "marker": self.name,
-            "miss_mm": self.miss_mm,
-            "others_fre_mm": self.others_fre_mm,
-        }
-        return Finding("outlier_marker", Severity.WARNING, self.text(), numbers)
+        numbers: dict[str, float | str] = {"miss_mm": self.miss_mm, "others_fre_mm": self.others_fre_mm}
+        return Finding("outlier_marker", Severity.WARNING, self.text(), {"marker": self.name, **numbers})
 
 
-def outlier_marker(
-    fit: Callable[[Floats, Floats], Floats],
-    names: tuple[str, ...],
-    points_ct: Floats,
-    points_base: Floats,
-    fle_mm: float | None,
-) -> OutlierMarker | None:
+def outlier_marker(markers: MarkerPairs, fle_mm: float | None) -> OutlierMarker | None:
     """The marker that least fits the others, if chance does not explain it.
 
     A residual of the common fit hides it, since the outlier pulls the fit. Marker i left out, the others fit with
@@ -225,41 +205,25 @@ def outlier_marker(
     F_i = (d_i^2 / 3) / ((1 + l_i^2) s^2) with s^2 = sum |r_j|^2 / nu follows F(3, nu).
 
     Args:
-        fit: Makes T_base_ct of two sets of points by least squares.
-        points_ct: Shape (n, 3), mm.
-        points_base: Shape (n, 3), the same as they were touched.
         fle_mm: Their noise (rms length, both sides together) where it is declared: no less is taken.
     """
-    count = len(names)
-    if count < LEAST_MARKERS:
+    if len(markers) < LEAST_MARKERS:
         return None
-    least = MIN_FLE_MM if fle_mm is None else fle_mm
-    tests = [_left_out(fit, row, names, points_ct, points_base, least) for row in range(count)]
-    chance, outlier = min((one for one in tests if one is not None), key=lambda one: one[0], default=(1.0, None))
-    return outlier if chance < FALSE_ALARM / count else None  # Bonferroni: each of the markers is tested
-
-
-def _left_out(
-    fit: Callable[[Floats, Floats], Floats],
-    row: int,
-    names: tuple[str, ...],
-    points_ct: Floats,
-    points_base: Floats,
-    least_fle_mm: float,
-) -> tuple[float, OutlierMarker] | None:
-    """Chance of a miss as large as one marker's, and the marker; None where the others lie on a line."""
-    ct, base = np.delete(points_ct, row, axis=0), np.delete(points_base, row, axis=0)
-    spread = np.linalg.svd(ct - ct.mean(axis=0), compute_uv=False)
-    if spread[1] < LEAST_SPREAD * spread[0]:
-        return None
-    T = fit(ct, base)
-    squares = float(np.sum((apply(T, ct) - base) ** 2))
-    freedom = 3 * len(ct) - 6
-    variance = max(squares / freedom, least_fle_mm**2 / 3)
-    miss = float(np.linalg.norm(apply(T, points_ct[row : row + 1]) - points_base[row]))
-    lever = float(leverage(ct, points_ct[row : row + 1])[0])
-    chance = float(fdtrc(3, freedom, miss**2 / 3 / ((1 + lever**2) * variance)))
-    return chance, OutlierMarker(names[row], miss, len(ct), float(np.sqrt(squares / len(ct))))
+    least, chance = MIN_FLE_MM if fle_mm is None else fle_mm, 1.0
+    outlier: OutlierMarker | None = None
+    for row, name in enumerate(markers.names):
+        ct, base = np.delete(markers.points_ct, row, axis=0), np.delete(markers.points_base, row, axis=0)
+        spread = np.linalg.svd(ct - ct.mean(axis=0), compute_uv=False)
+        if spread[1] < LEAST_SPREAD * spread[0]:
+            continue
+        T, point = fit_rigid(ct, base), markers.points_ct[row : row + 1]
+        squares, freedom = float(np.sum((apply(T, ct) - base) ** 2)), 3 * len(ct) - 6
+        variance = max(squares / freedom, least**2 / 3)
+        miss, lever = float(np.linalg.norm(apply(T, point) - markers.points_base[row])), float(leverage(ct, point)[0])
+        its_chance = float(fdtrc(3, freedom, miss**2 / 3 / ((1 + lever**2) * variance)))
+        if its_chance < chance:
+            chance, outlier = its_chance, OutlierMarker(name, miss, len(ct), float(np.sqrt(squares / len(ct))))
+    return outlier if chance < FALSE_ALARM / len(markers) else None  # Bonferroni: each of the markers is tested
 
 
 WARNED = 0.01
@@ -268,17 +232,14 @@ WARNED = 0.01
 
 @dataclass(frozen=True)
 class NoiseTest:
-    """The residuals of a weighted fit against the declared errors.
-
-    Attributes:
-        count: Markers, N >= 3.
-        chi_squared: r' C^-1 r of the weighted residuals: chi-squared with 3 N - 6 degrees where the declaration holds.
-        found: Whether the declaration gives the errors' shape alone, and the residuals their size.
-    """
+    """The residuals of a weighted fit against the declared errors."""
 
     count: int
+    """Markers, N >= 3."""
     chi_squared: float
+    """r' C^-1 r of the weighted residuals: chi-squared with 3 N - 6 degrees where the declaration holds."""
     found: bool = False
+    """Whether the declaration gives the errors' shape alone, and the residuals their size."""
 
     @property
     def freedom(self) -> int:
@@ -364,17 +325,14 @@ WEAK_LEVERAGE = 3.0
 
 @dataclass(frozen=True)
 class Conditioning:
-    """How well a marker set determines the pose at the target.
-
-    Attributes:
-        spread_ratio: s2/s1, singular values of the centred markers.
-        altitude_mm: Least altitude of the widest triangle of markers.
-        leverage: Expected TRE at the target over FLE.
-    """
+    """How well a marker set determines the pose at the target."""
 
     spread_ratio: float
+    """s2/s1, singular values of the centred markers."""
     altitude_mm: float
+    """Least altitude of the widest triangle of markers."""
     leverage: float
+    """Expected TRE at the target over FLE."""
     flags: tuple[Finding, ...]
 
 
@@ -401,7 +359,12 @@ def conditioning(markers: Floats, target: Floats) -> Conditioning:
     """The three flags of a marker set; thresholds are the module's constants."""
     values = np.linalg.svd(markers - markers.mean(axis=0), compute_uv=False)
     ratio = float(values[1] / values[0])
-    altitude = max(_least_altitude(markers[list(three)]) for three in combinations(range(len(markers)), 3))
+    altitude = 0.0
+    for three in combinations(markers, 3):
+        sides = np.array(three) - np.roll(three, 1, axis=0)
+        longest = np.linalg.norm(sides, axis=1).max()  # the least altitude is twice the area over it
+        if longest > 0:
+            altitude = max(altitude, float(np.linalg.norm(np.cross(sides[0], sides[1])) / longest))
     lever = float(leverage(markers, target)[0])
     flags = []
     if ratio < WEAK_SPREAD:
@@ -414,10 +377,3 @@ def conditioning(markers: Floats, target: Floats) -> Conditioning:
         said = f"the target is far from the markers (TRE/FLE {lever:.1f} > {WEAK_LEVERAGE:.0f})"
         flags.append(Finding("target_far_from_markers", Severity.WARNING, said, {"leverage": lever}))
     return Conditioning(ratio, altitude, lever, tuple(flags))
-
-
-def _least_altitude(triangle: Floats) -> float:
-    """Twice the area over the longest side."""
-    sides = triangle - np.roll(triangle, 1, axis=0)
-    longest = np.linalg.norm(sides, axis=1).max()
-    return float(np.linalg.norm(np.cross(sides[0], sides[1])) / longest) if longest > 0 else 0.0

@@ -1,4 +1,1 @@
-"""Where the devices that see needle and target go, and what they see: two cameras, and an ultrasound probe.
-
-It decides by geometry alone: skin, arms, obstacles and organs where the case and its plan have them.
-"""
+"""Where two cameras and an ultrasound probe go, and what they see of needle and target, by geometry alone."""

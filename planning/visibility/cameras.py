@@ -75,24 +75,21 @@ Surfaces = Sequence[tuple[str, TriangleMesh]]
 
 @dataclass(frozen=True, eq=False)
 class CameraView(Shown):
-    """What two cameras see during an insertion.
-
-    Attributes:
-        cameras_ct: Shape (2, 3), mm.
-        proposed: Whether the case left their places open.
-        tip_to_target_mm: Shape (k,): the depths of the insertion, from the standoff to the target.
-        names: What is to be seen: balls by their distance from the tip, then markers.
-        hidden: For each depth and name, by what it is hidden from at least one camera; empty where both see it.
-        clear: Whether nothing is or comes near the cameras; of proposed ones it is so.
-    """
+    """What two cameras see during an insertion."""
 
     cameras_ct: Floats
+    """Shape (2, 3), mm."""
     proposed: bool
+    """Whether the case left their places open."""
     tip_to_target_mm: Floats
+    """Shape (k,): the depths of the insertion, from the standoff to the target."""
     names: tuple[str, ...]
+    """What is to be seen: balls by their distance from the tip, then markers."""
     balls: int
     hidden: tuple[tuple[str, ...], ...]
+    """For each depth and name, by what it is hidden from at least one camera; empty where both see it."""
     clear: bool
+    """Whether nothing is or comes near the cameras; of proposed ones it is so."""
 
     @cached_property
     def seen(self) -> Bools:
@@ -265,9 +262,8 @@ def _hidden(looks: Sequence[_Look], static: Surfaces, markers_ct: Floats, camera
         rows = []
         for points, inside, around in look.balls:
             arm = [one for one in look.arm if not (around and one[0] == "holder")]
-            rows.append(
-                np.full(len(cameras_ct), PATIENT, object) if inside else hidden_by([*static, *arm], points, cameras_ct)
-            )
+            by_body = np.full(len(cameras_ct), PATIENT, object)
+            rows.append(by_body if inside else hidden_by([*static, *arm], points, cameras_ct))
         moving = [hidden_by(look.arm, marker[None], cameras_ct, MARKER_MM) for marker in markers_ct]
         found.append([*rows, *(np.where(one == "", other, one) for one, other in zip(still, moving, strict=True))])
     return np.array(found, object)

@@ -8,7 +8,7 @@ arm that holds it, rules the footprint out; of the rest the one with the least d
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from types import MappingProxyType
 
@@ -21,7 +21,6 @@ from puncture_twin.planning.anatomy.skin import Skin, skin_paths
 from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.arm.inverse_kinematics import inverse as branches, nearest_within_limits
 from puncture_twin.planning.arm.kinematics import away_from_singularities
-from puncture_twin.planning.arm.tool import Box
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints, read_only
 from puncture_twin.planning.base.errors import InputError, refuse
@@ -114,24 +113,21 @@ STAGES = (tuple(Ruled)[6:], tuple(Ruled)[3:6], tuple(Ruled)[:3])
 
 @dataclass(frozen=True, eq=False)
 class ProbeView(Shown):
-    """Where the probe goes, or that it goes nowhere.
-
-    Attributes:
-        T_ct_image: Shape (4, 4), mm: its origin in the middle of the face, x along the face toward the needle, y along
-            the depth, z across the plane; None where there is no footprint.
-        q_probe: Shape (6,), rad, of the arm that holds it, or None.
-        T_base_ct: Shape (4, 4), mm, of that arm's base; None where no assumed place serves.
-        assumed: Whether the case left that arm's place open.
-        depth_mm: From the face to the target, or NaN.
-        counts: How many footprints are ruled out by what, and how many are left or were not needed (``free``).
-    """
+    """Where the probe goes, or that it goes nowhere."""
 
     T_ct_image: Floats | None
+    """Shape (4, 4), mm: its origin in the middle of the face, x along the face toward the needle, y along the depth, z
+    across the plane; None where there is no footprint."""
     q_probe: Floats | None
+    """Shape (6,), rad, of the arm that holds it, or None."""
     T_base_ct: Floats | None
+    """Shape (4, 4), mm, of that arm's base; None where no assumed place serves."""
     assumed: bool
+    """Whether the case left that arm's place open."""
     depth_mm: float
+    """From the face to the target, or NaN."""
     counts: Mapping[str, int]
+    """How many footprints are ruled out by what, and how many are left or were not needed (``free``)."""
 
     @property
     def sentence(self) -> str:
@@ -189,20 +185,17 @@ def probe_view(context: CaseContext, plan: Plan | Watched) -> ProbeView:
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """Footprints, a row each.
-
-    Attributes:
-        target_ct: Shape (3,), mm.
-        T_ct_image: Shape (n, 4, 4), mm, see `ProbeView`; NaN without skin.
-        depth: Shape (n,), mm, from the face to the target.
-        ruled: Shape (n,), what rules each out, by its place among `Ruled`; -1 where nothing has yet.
-    """
+    """Footprints, a row each."""
 
     skin: Skin
     target_ct: Floats
+    """Shape (3,), mm."""
     T_ct_image: Floats
+    """Shape (n, 4, 4), mm, see `ProbeView`; NaN without skin."""
     depth: Floats
+    """Shape (n,), mm, from the face to the target."""
     ruled: Ints
+    """Shape (n,), what rules each out, by its place among `Ruled`; -1 where nothing has yet."""
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -239,8 +232,7 @@ def footprints(skin: Skin, target_ct: Floats, outward_ct: Floats, depth_mm: floa
     R = np.stack([toward, -middle, np.cross(toward, -middle)], axis=2)
     feet = Footprints(skin, target_ct, pose(R, paths.entry_ct), paths.path_length, np.full(len(middle), -1))
     feet.rule_out(paths.skin_angle > TILT, Ruled.TILTED)
-    deep = paths.path_length > depth_mm
-    feet.ruled[deep] = _ORDER.index(Ruled.TOO_DEEP)
+    feet.ruled[paths.path_length > depth_mm] = _ORDER.index(Ruled.TOO_DEEP)
     feet.ruled[~np.isnan(paths.unknown_depth) | np.isnan(paths.path_length)] = _ORDER.index(Ruled.NO_SKIN)
     return feet
 
@@ -278,16 +270,11 @@ def passing(feet: Footprints, surfaces: Opaque, scan: Scan | None, width_mm: flo
             feet.rule_out(rows[((depth > 0.0) & (depth <= far)).reshape(-1, RAYS).any(axis=1)], why)
     if scan is not None and len(rows):
         ends = np.fmin(far, first_crossing(feet.skin.mesh, feet.target_ct, rays, farthest + RIM_MM)) - RIM_MM
-        feet.rule_out(rows[_air_on(scan, feet.target_ct, rays, ends).reshape(-1, RAYS).any(axis=1)], Ruled.AIR)
-
-
-def _air_on(scan: Scan, target_ct: Floats, rays: Floats, ends: Floats) -> Bools:
-    """Whether the CT shows air on each of the lines from the target to where they end, mm."""
-    found = np.zeros(len(rays), np.bool_)
-    for mm in np.arange(0.0, float(ends.max(initial=0.0)), AIR_STEP_MM):
-        open_ = np.flatnonzero(~found & (mm <= ends))
-        found[open_] = scan.hu_at(target_ct + mm * rays[open_]) < AIR_HU  # NaN beyond the image is none
-    return found
+        air = np.zeros(len(rays), np.bool_)
+        for mm in np.arange(0.0, float(ends.max(initial=0.0)), AIR_STEP_MM):
+            open_ = np.flatnonzero(~air & (mm <= ends))
+            air[open_] = scan.hu_at(feet.target_ct + mm * rays[open_]) < AIR_HU  # NaN beyond the image is none
+        feet.rule_out(rows[air.reshape(-1, RAYS).any(axis=1)], Ruled.AIR)
 
 
 def _mounts(context: CaseContext, plan: Plan | Watched) -> Iterator[Floats]:
@@ -352,18 +339,12 @@ def _arm(context: CaseContext, plan: Plan | Watched, probe: Ultrasound, T_base_c
     tool = handle_tool(LENGTH_MM - HEAD_MM[1], HANDLE_MM)
     T_base_needle = T_base_ct @ inverse(plan.T_base_ct)
     boxes = [
-        Box(one.name, T_base_needle @ one.T_base_box, one.size_mm) for one in case_boxes(context.case, plan.T_base_ct)
+        replace(one, T_base_box=T_base_needle @ one.T_base_box) for one in case_boxes(context.case, plan.T_base_ct)
     ]
-    outside = outside_surface(anatomy)
+    surfaces = anatomy.skin.mesh, outside_surface(anatomy)
+    skin, outside = (None if one is None else one.transformed(T_base_ct) for one in surfaces)
     try:
-        checker = CellChecker(
-            probe.model,
-            tool,
-            boxes,
-            anatomy.skin.mesh.transformed(T_base_ct),
-            outside=None if outside is None else outside.transformed(T_base_ct),
-            padding_mm=ARM_PADDING_MM,
-        )
+        checker = CellChecker(probe.model, tool, boxes, skin, outside=outside, padding_mm=ARM_PADDING_MM)
     except InputError as error:
         if probe.T_base_ct_mount is None and error.code.startswith("base_in"):
             return None

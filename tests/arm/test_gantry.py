@@ -28,7 +28,7 @@ TILT[:3, 3] = (420.0, 30.0, 80.0)
 SIZES = {"bore_diameter_mm": 700.0, "wall_mm": 150.0, "depth_mm": 300.0}
 
 
-def test_the_wall_is_whole_and_the_bore_free() -> None:
+def test_the_wall_is_whole_and_the_bore_free():
     """Random points: all of the wall's are in a box; none of those within the inscribed polygon's inner circle is."""
     rng = np.random.default_rng(0)
     boxes = gantry_boxes(TILT, **SIZES)
@@ -43,7 +43,7 @@ def test_the_wall_is_whole_and_the_bore_free() -> None:
     assert not inside[radius < 350.0 * np.cos(np.pi / SIDES) - 1e-9].any()
 
 
-def test_in_a_gantry_both_checkers_agree() -> None:
+def test_in_a_gantry_both_checkers_agree():
     tool = Tool(250.0, 150.0, 1.2, 30.0)
     ahead = trimesh.transformations.rotation_matrix(np.pi / 2.0 + 0.35, [1.0, 0.0, 0.0])
     ahead[:3, 3] = (0.0, 600.0, 150.0)
@@ -144,13 +144,6 @@ def test_gantries_that_make_no_sense_are_refused(in_gantry, change, match):
     path.write_text(path.read_text().replace(*change))
     with refused(*match.split()):
         load_case(path)
-
-
-def test_a_gantry_that_does_not_go_around_the_patient_is_refused(in_gantry):
-    path = in_gantry()
-    path.write_text(path.read_text().replace("bore_diameter_mm = 700.0", "bore_diameter_mm = 300.0"))
-    with refused("gantry_in_patient"):
-        prepare(path)
 
 
 def test_the_physics_feels_the_gantry(in_gantry):

@@ -15,14 +15,14 @@ from puncture_twin.planning.arm.kinematics import flange_pose, singularity
 from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.collision.state_checker import SweptBodies
-from puncture_twin.planning.reach.survey import every_branch, fill_branch_path, survey
+from puncture_twin.planning.reach.survey import ReachRequest, every_branch, fill_branch_path, surveyed
 
 DEPTHS = np.linspace(0.0, 120.0, 61)
 DISTANCES = 320.0 - DEPTHS
 ROLLS = 2.0 * np.pi * np.arange(8) / 8.0
 
 
-def lines(count: int, seed: int) -> list:
+def lines(count, seed):
     """Random needle lines about a target that a UR3 reaches from some sides."""
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(count, 3))
@@ -31,7 +31,7 @@ def lines(count: int, seed: int) -> list:
 
 
 @pytest.mark.parametrize("name", sorted(UR_MODELS))
-def test_a_way_holds_every_flange_pose_along_the_line(name: str) -> None:
+def test_a_way_holds_every_flange_pose_along_the_line(name):
     """Each row of a branch returns its pose to 1e-9 mm and is that branch of the plain inverse, but for whole turns."""
     model = ur_model(name)
     drawn = 0
@@ -51,7 +51,7 @@ def test_a_way_holds_every_flange_pose_along_the_line(name: str) -> None:
     assert drawn > 300
 
 
-def test_one_branch_alone_and_all_eight_agree() -> None:
+def test_one_branch_alone_and_all_eight_agree():
     """The same way to 1e-12 rad, the turn added to every row; NaN in the same rows."""
     model, turn = ur_model("ur3"), np.array([0.0, 2 * np.pi, 0.0, -2 * np.pi, 0.0, 0.7])
     for line in lines(10, seed=2):
@@ -62,7 +62,7 @@ def test_one_branch_alone_and_all_eight_agree() -> None:
             assert np.allclose(alone, every[branch] + turn, rtol=0.0, atol=1e-12, equal_nan=True)
 
 
-def test_the_branches_that_are_wanted_are_the_same_ones_as_of_all() -> None:
+def test_the_branches_that_are_wanted_are_the_same_ones_as_of_all():
     """To the last bit, whichever others are wanted with them: so a survey may drop those that have ended."""
     model, rng, there = ur_model("ur3"), np.random.default_rng(5), 0
     for line in lines(40, seed=5):
@@ -77,12 +77,14 @@ def test_the_branches_that_are_wanted_are_the_same_ones_as_of_all() -> None:
     assert there > 30
 
 
-def test_the_survey_is_what_its_parts_say() -> None:
+def test_the_survey_is_what_its_parts_say():
     """Stops as ``first_stop`` has them, margins as ``reach_margin`` of the motion that the turns give."""
     model, many = ur_model("ur3"), lines(60, seed=4)
-    found = survey(model, many, [DISTANCES] * 60, [DEPTHS] * 60, ROLLS)
+    requests = [ReachRequest(line.target, line.outward, DISTANCES[-1], DEPTHS[-1]) for line in many]
     allowed = 0
-    for line, stop_at, starts, margins, turns in zip(many, *found, strict=True):
+    for found in surveyed(model, requests, many, ROLLS):
+        line, stop_at, starts, margins, turns = found.line, found.stop_at, found.starts, found.margins, found.turns
+        assert np.array_equal(found.depths, DEPTHS) and np.array_equal(found.distances, DISTANCES)
         ways = every_branch(model, line, DISTANCES)
         assert np.array_equal(starts, ways[:, 0], equal_nan=True)
         for branch in range(8):
@@ -104,7 +106,7 @@ def test_the_survey_is_what_its_parts_say() -> None:
     assert allowed > 200
 
 
-def test_margins_are_the_least_term_of_all() -> None:
+def test_margins_are_the_least_term_of_all():
     """Over random motions: joint limits in quarter turns and the three singular terms, nothing else."""
     model = ur_model("ur3")
     for seed in range(20):
@@ -113,7 +115,7 @@ def test_margins_are_the_least_term_of_all() -> None:
         assert reach_margin(model, q) == pytest.approx(min(1.0, limits, singularity(model, q).least().min()), abs=1e-15)
 
 
-def test_a_jump_and_a_singularity_stop_a_way_where_they_are() -> None:
+def test_a_jump_and_a_singularity_stop_a_way_where_they_are():
     """A joint that turns 0.2 rad in 2 mm stops at the sample before; a stretched elbow at its own."""
     model = ur_model("ur3")
     still = np.tile([0.4, -1.9, 1.6, -1.2, -1.5, 0.3], (10, 1))
@@ -132,7 +134,7 @@ def test_a_jump_and_a_singularity_stop_a_way_where_they_are() -> None:
     assert stop is not None and stop.depth_mm == 14.0 and "cannot reach" in stop.detail
 
 
-def test_padding_moves_farther() -> None:
+def test_padding_moves_farther():
     """The bound of the padded bodies is never below that of the bare ones, and holds their outermost corners."""
     model, tool = ur_model("ur3"), Tool(250.0, 150.0, 1.2, 30.0)
     bare, full = SweptBodies.of(model, tool), SweptBodies.of(model, tool, 5.0)

@@ -1,7 +1,6 @@
 """Kinematics of the UR family: laws, the ur-analytic-ik package as oracle, and the URDF's own joint chain."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,14 +19,14 @@ joints = st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6).map(np.array
 models = st.sampled_from(sorted(UR_MODELS))
 
 
-def in_mm(T_m: np.ndarray) -> np.ndarray:
+def in_mm(T_m):
     """A pose of the oracle, in metres, in mm."""
     T = np.array(T_m)
     T[:3, 3] *= 1000.0
     return T
 
 
-def in_m(T_mm: np.ndarray) -> np.ndarray:
+def in_m(T_mm):
     """A pose of ours as the oracle wants it."""
     T = np.array(T_mm, order="C")
     T[:3, 3] /= 1000.0
@@ -36,7 +35,7 @@ def in_m(T_mm: np.ndarray) -> np.ndarray:
 
 @given(name=models, q=joints)
 @settings(max_examples=150, deadline=None)
-def test_every_solution_returns_the_pose_and_the_configuration_is_found(name: str, q: np.ndarray) -> None:
+def test_every_solution_returns_the_pose_and_the_configuration_is_found(name, q):
     """FK(IK(x)) = x on every branch, singular poses included; and a pose that came from somewhere has a solution.
 
     But for an aligned wrist, where q6 is free and the 0 that is taken need not be one that reaches, and a stretched arm
@@ -54,13 +53,13 @@ def test_every_solution_returns_the_pose_and_the_configuration_is_found(name: st
         assert np.abs(wrap_to_pi(found - q)).max(axis=1).min() < 1e-6
 
 
-def oracle_of(name: str) -> Any:
+def oracle_of(name):
     """An arm of ur-analytic-ik, of which there is no wheel after Python 3.11."""
     return getattr(pytest.importorskip("ur_analytic_ik", exc_type=ModuleNotFoundError), name)
 
 
 @pytest.mark.parametrize("name", sorted(UR_MODELS))
-def test_forward_kinematics_agrees_with_the_oracle(name: str) -> None:
+def test_forward_kinematics_agrees_with_the_oracle(name):
     """Our DH numbers and frames are those of ur-analytic-ik, for all six arms."""
     oracle = oracle_of(name)
     for q in np.random.default_rng(1).uniform(-2 * np.pi, 2 * np.pi, (100, 6)):
@@ -70,7 +69,7 @@ def test_forward_kinematics_agrees_with_the_oracle(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "count"), [("ur3", 2000), ("ur3e", 300), ("ur5", 300), ("ur5e", 300), ("ur10", 300), ("ur10e", 300)]
 )
-def test_nothing_is_missed_against_the_oracle(name: str, count: int) -> None:
+def test_nothing_is_missed_against_the_oracle(name, count):
     """Every solution of ur-analytic-ik is one of our eight, on reachable and unreachable poses alike."""
     model, oracle = ur_model(name), oracle_of(name)
     rng = np.random.default_rng(2)
@@ -87,7 +86,7 @@ def test_nothing_is_missed_against_the_oracle(name: str, count: int) -> None:
     assert 0.75 * count <= solved < count
 
 
-def test_batch_and_single_poses_agree() -> None:
+def test_batch_and_single_poses_agree():
     """One call with many poses gives what many calls with one pose give."""
     model = ur_model("ur3")
     poses = flange_pose(model, np.random.default_rng(3).uniform(-np.pi, np.pi, (20, 6)))
@@ -97,7 +96,7 @@ def test_batch_and_single_poses_agree() -> None:
 
 @given(name=models, q=joints)
 @settings(max_examples=60, deadline=None)
-def test_jacobian_is_the_derivative_of_the_pose(name: str, q: np.ndarray) -> None:
+def test_jacobian_is_the_derivative_of_the_pose(name, q):
     """Central differences of position and rotation agree with the Jacobian's columns."""
     model, step = ur_model(name), 1e-5
     J = jacobian(model, q)
@@ -112,7 +111,7 @@ def test_jacobian_is_the_derivative_of_the_pose(name: str, q: np.ndarray) -> Non
 
 @given(name=models, q=joints)
 @settings(max_examples=60, deadline=None)
-def test_the_three_singularities_are_all_there_are(name: str, q: np.ndarray) -> None:
+def test_the_three_singularities_are_all_there_are(name, q):
     """|det J| = a2 a3 L |shoulder elbow wrist|, L the longest in-plane reach: no other factor can vanish."""
     model = ur_model(name)
     far = singularity(model, q)
@@ -134,7 +133,7 @@ def test_the_three_singularities_are_all_there_are(name: str, q: np.ndarray) -> 
         ([0.3, -np.pi / 2 - 0.2, 0.4, np.nan, 0.9, 0.7], "shoulder"),
     ],
 )
-def test_singular_configurations_are_named_and_still_solved(q: list[float], name: str) -> None:
+def test_singular_configurations_are_named_and_still_solved(q, name):
     """The distance is 0, it is named, and the solutions still return the pose.
 
     The shoulder's: the wrist stands above axis 1, with q4 from a2 cos q2 + a3 cos q23 + d5 sin q234 = 0.
@@ -154,7 +153,7 @@ def test_singular_configurations_are_named_and_still_solved(q: list[float], name
 @given(q=st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6).map(np.array), reference=joints)
 @example(q=np.array([0.0, 0.0, 3.1415926535897927, 0.0, 0.0, 0.0]), reference=np.zeros(6))  # rounds beyond the limit
 @settings(max_examples=60, deadline=None)
-def test_whole_turns_stay_within_limits_and_come_nearest(q: np.ndarray, reference: np.ndarray) -> None:
+def test_whole_turns_stay_within_limits_and_come_nearest(q, reference):
     """Of all the wrapped solutions the nearest to the reference is the one returned, joint by joint."""
     model = ur_model("ur3")
     reference = 2.0 * reference
@@ -165,7 +164,7 @@ def test_whole_turns_stay_within_limits_and_come_nearest(q: np.ndarray, referenc
     assert np.abs(nearest - reference).sum() == pytest.approx(np.abs(every - reference).sum(axis=1).min(), abs=1e-9)
 
 
-def test_an_elbow_beyond_its_limit_has_no_turn_that_saves_it() -> None:
+def test_an_elbow_beyond_its_limit_has_no_turn_that_saves_it():
     """The elbow has half the range of the others: no whole turn fits, and the row is NaN."""
     q = np.array([0.0, 0.0, np.pi + 0.1, 0.0, 0.0, 0.0])
     model = ur_model("ur3")
@@ -176,7 +175,7 @@ def test_an_elbow_beyond_its_limit_has_no_turn_that_saves_it() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(UR_MODELS))
-def test_link_frames_agree_with_the_urdf(name: str) -> None:
+def test_link_frames_agree_with_the_urdf(name):
     """Each URDF link frame keeps a constant place in ours at any angles, so one constant motion converts its meshes.
 
     The URDFs write pi with eleven decimals, those of the e-Series with nine: 1e-9 rad over a metre, several times.
@@ -189,13 +188,13 @@ def test_link_frames_agree_with_the_urdf(name: str) -> None:
         )
 
 
-def test_the_urdf_base_is_half_a_turn_from_the_controllers() -> None:
+def test_the_urdf_base_is_half_a_turn_from_the_controllers():
     """At zero a UR3 points along -x of its controller's base and +x of its URDF's."""
     flange = flange_pose(ur_model("ur3"), np.zeros(6))[:3, 3]
     assert flange == pytest.approx([-456.9, -194.25, 66.55])
 
 
-def test_meshes_are_in_millimetres_and_named() -> None:
+def test_meshes_are_in_millimetres_and_named():
     """Seven links, sizes of a real UR3, hulls around the detailed meshes."""
     model = ur_model("ur3")
     hulls, details = collision_links(model), visual_links(model)
@@ -206,14 +205,14 @@ def test_meshes_are_in_millimetres_and_named() -> None:
         assert np.allclose(hull.mesh.bounds, detail.mesh.bounds, atol=1e-6)
 
 
-def test_unknown_models_and_models_without_meshes_are_refused() -> None:
+def test_unknown_models_and_models_without_meshes_are_refused():
     with refused("unknown_robot"):
         ur_model("kuka")
     with refused("no_link_meshes", "ur10", "ur10e", "ur3", "ur3e", "ur5", "ur5e"):
         collision_links(replace(ur_model("ur3e"), name="ur16e"))
 
 
-def test_models_cannot_be_changed() -> None:
+def test_models_cannot_be_changed():
     """Their arrays are read-only, limits are +-360 deg but for the elbow, speeds are per joint."""
     model = ur_model("UR3")
     with pytest.raises(ValueError, match="read-only"):

@@ -154,7 +154,7 @@ def test_triangles_beyond_the_top_over_it_and_beside_it(rng):
     shapes = shapes[shapes[:, :, 2].min(axis=1) > LENGTH]
     distance, depth, marks = beside(shapes.reshape(-1, 9), LENGTH, [Z_FRAME] * len(shapes), np.zeros(3))
     top = np.array([0.0, 0, LENGTH])
-    expected = [segment_triangle_distance(top, top, triangle) for triangle in shapes]
+    expected = segment_triangle_distance(top, top, shapes)
     rims = [min(segment_triangle_distance(top, top, t[[i, j, j]]) for i, j in ((0, 1), (1, 2), (2, 0))) for t in shapes]
     np.testing.assert_allclose(distance, expected, atol=TIGHT_MM)
     np.testing.assert_array_equal(marks, BEYOND)
@@ -199,7 +199,7 @@ def test_the_nearest_triangle_of_a_packed_surface(rng, place):
     detections = {"amid": [1.0, 2, 3], "aside": [70.0, -20, 9], "far": [900.0, 0, -400], "on a corner": corners[17, 1]}
     target, blocks = np.array(detections[place]), pack(mesh)
     placed = placed_surface(blocks, target)
-    each = [segment_triangle_distance(target, target, t.reshape(3, 3)) for t in blocks.triangles]
+    each = segment_triangle_distance(target, target, blocks.triangles.reshape(-1, 3, 3))
     assert placed.distance == pytest.approx(min(each), abs=TIGHT_MM)
     assert each[placed.nearest] == pytest.approx(min(each), abs=TIGHT_MM)
 

@@ -11,13 +11,14 @@ from refusals import refused
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import LINK_NAMES, collision_links, visual_links
 from puncture_twin.planning.arm.tool import HOLDER_ROOT_MM, Box, Tool
-from puncture_twin.planning.arm.ur import UR_MODELS, UrModel, ur_model
+from puncture_twin.planning.arm.ur import UR_MODELS, ur_model
 from puncture_twin.planning.collision.bodies import NEVER_TESTED, convex, surface, touch
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.collision.state_checker import Contact, SweptBodies
 from puncture_twin.planning.geometry.containment import winding_number, winding_numbers
 from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
+from puncture_twin.planning.geometry.rigid import pose
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -28,20 +29,13 @@ BENT = np.array([0.4, -1.9, 1.6, -1.2, -1.5, 0.3])
 """A clear pose: elbow up, needle down."""
 
 
-def translation(x: float, y: float, z: float) -> np.ndarray:
-    """A 4x4 without rotation, mm."""
-    T = np.eye(4)
-    T[:3, 3] = (x, y, z)
-    return T
-
-
-def cuboid(low: np.ndarray, high: np.ndarray) -> TriangleMesh:
+def cuboid(low, high):
     """A closed box as a triangle mesh, mm."""
     box = trimesh.creation.box(extents=high - low)
     return TriangleMesh(np.asarray(box.vertices) + (low + high) / 2.0, np.asarray(box.faces))
 
 
-def body_points(model: UrModel, tool: Tool, q: np.ndarray) -> dict[str, np.ndarray]:
+def body_points(model, tool, q):
     """Every moving body's extreme points in the base frame, by kinematics alone, mm."""
     poses = link_poses(model, q)
     points = {
@@ -59,7 +53,7 @@ def body_points(model: UrModel, tool: Tool, q: np.ndarray) -> dict[str, np.ndarr
     return points
 
 
-def clear_poses(count: int, seed: int) -> list[np.ndarray]:
+def clear_poses(count, seed):
     """Random poses at which the arm does not touch itself."""
     rng, checker, found = np.random.default_rng(seed), CellChecker(UR3, TOOL), []
     while len(found) < count:
@@ -71,7 +65,7 @@ def clear_poses(count: int, seed: int) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("kind", ["box", "patient"])
 @pytest.mark.parametrize(("axis", "sign"), [(0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, 1.0)])
-def test_a_wall_beyond_the_outermost_point_touches_from_there_on(kind: str, axis: int, sign: float) -> None:
+def test_a_wall_beyond_the_outermost_point_touches_from_there_on(kind, axis, sign):
     """A wall 0.01 mm beyond the arm's outermost point is free and measured so; 0.01 mm inside it touches that body."""
     tried = 0
     for q in clear_poses(8, seed=axis):
@@ -89,7 +83,7 @@ def test_a_wall_beyond_the_outermost_point_touches_from_there_on(kind: str, axis
                 checker = CellChecker(UR3, TOOL, patient=cuboid(low, high))
             else:
                 checker = CellChecker(
-                    UR3, TOOL, [Box("patient_wall", translation(*(low + high) / 2), tuple(high - low))]
+                    UR3, TOOL, [Box("patient_wall", pose(np.eye(3), (low + high) / 2), tuple(high - low))]
                 )
             contact = checker.contact(q, needle_may_touch_patient=False)
             if gap < 0.0:
@@ -102,11 +96,11 @@ def test_a_wall_beyond_the_outermost_point_touches_from_there_on(kind: str, axis
     assert tried >= 2
 
 
-def test_padding_grows_the_arm_against_the_room_but_not_in_distances() -> None:
+def test_padding_grows_the_arm_against_the_room_but_not_in_distances():
     """A wall between 4 mm and the padded 5 mm away touches the padded arm; both measure the true distance."""
     for q in clear_poses(6, seed=3):
         edge = max(float(cloud[:, 2].max()) for cloud in body_points(UR3, TOOL, q).values())
-        roof = Box("roof", translation(0.0, 0.0, edge + 4.0 + 50.0), (4000.0, 4000.0, 100.0))
+        roof = Box("roof", pose(np.eye(3), [0.0, 0.0, edge + 4.0 + 50.0]), (4000.0, 4000.0, 100.0))
         bare, full = (CellChecker(UR3, TOOL, [roof], padding_mm=padding) for padding in (0.0, 5.0))
         assert bare.contact(q, needle_may_touch_patient=False) is None
         assert full.contact(q, needle_may_touch_patient=False) is not None
@@ -114,23 +108,23 @@ def test_padding_grows_the_arm_against_the_room_but_not_in_distances() -> None:
         assert full.distances(q).boxes.mm == pytest.approx(4.0, abs=1e-4)
 
 
-def test_a_box_inside_a_link_and_a_link_inside_a_box_both_touch() -> None:
+def test_a_box_inside_a_link_and_a_link_inside_a_box_both_touch():
     """Solids do not hide in one another, though none of their surfaces meet."""
     middle = link_poses(UR3, BENT)[3] @ np.array([106.0, 0.0, 20.0, 1.0])
-    crumb = CellChecker(UR3, TOOL, [Box("crumb", translation(*middle[:3]), (1.0, 1.0, 1.0))])
+    crumb = CellChecker(UR3, TOOL, [Box("crumb", pose(np.eye(3), middle[:3]), (1.0, 1.0, 1.0))])
     assert crumb.contact(BENT, needle_may_touch_patient=False) == Contact("forearm", "crumb")
-    hall = CellChecker(UR3, TOOL, [Box("hall", translation(0.0, 0.0, 0.0), (9000.0, 9000.0, 9000.0))])
+    hall = CellChecker(UR3, TOOL, [Box("hall", pose(np.eye(3), [0.0, 0.0, 0.0]), (9000.0, 9000.0, 9000.0))])
     assert hall.contact(BENT, needle_may_touch_patient=False) == Contact("shoulder", "hall")
     assert hall.distances(BENT).boxes.mm == 0.0
 
 
-def test_the_base_may_stand_on_its_table() -> None:
+def test_the_base_may_stand_on_its_table():
     """The base link overlaps what it is bolted to, and nothing is said."""
-    table = Box("table", translation(0.0, 0.0, -40.0), (1000.0, 1000.0, 100.0))
+    table = Box("table", pose(np.eye(3), [0.0, 0.0, -40.0]), (1000.0, 1000.0, 100.0))
     assert CellChecker(UR3, TOOL, [table]).contact(BENT, needle_may_touch_patient=False) is None
 
 
-def test_the_needle_may_go_in_and_the_holder_may_not() -> None:
+def test_the_needle_may_go_in_and_the_holder_may_not():
     """With the skin across the needle the flag decides; with the skin across the holder it does not help."""
     T = flange_pose(UR3, BENT)
     for depth, names in ((200.0, {"needle"}), (60.0, {"holder"})):
@@ -145,7 +139,7 @@ def test_the_needle_may_go_in_and_the_holder_may_not() -> None:
 
 
 @pytest.mark.parametrize("engine", [CellChecker, FastChecker])
-def test_what_is_outside_of_the_body_is_named_so(engine: type[CellChecker]) -> None:
+def test_what_is_outside_of_the_body_is_named_so(engine):
     """A table, or the side of the image, was named "patient" in the arm's reasons: people looked at the skin."""
     T = flange_pose(UR3, BENT)
     at = T[:3, 3] + 60.0 * T[:3, 2]
@@ -160,7 +154,7 @@ def test_what_is_outside_of_the_body_is_named_so(engine: type[CellChecker]) -> N
         assert checker.contact(BENT, needle_may_touch_patient=True) == Contact("holder", other)
 
 
-def test_an_arm_that_ends_inside_the_patient_is_found_at_its_surface() -> None:
+def test_an_arm_that_ends_inside_the_patient_is_found_at_its_surface():
     """Wrist, holder and needle wholly inside a closed skin: no surface of theirs meets it, the forearm's does."""
     inside = link_poses(UR3, BENT)[4][:3, 3]
     ball = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
@@ -179,7 +173,7 @@ def test_an_arm_that_ends_inside_the_patient_is_found_at_its_surface() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(UR_MODELS))
-def test_neighbouring_bodies_overlap_at_every_angle(name: str) -> None:
+def test_neighbouring_bodies_overlap_at_every_angle(name):
     """The chain has no gap in which a skin could pass between two bodies: what makes the surface test enough."""
     model = ur_model(name)
     links = collision_links(model)
@@ -198,7 +192,7 @@ def test_neighbouring_bodies_overlap_at_every_angle(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(UR_MODELS))
-def test_wrist_2_stays_behind_the_flange_plane(name: str) -> None:
+def test_wrist_2_stays_behind_the_flange_plane(name):
     """Why the tool is never tested against wrist 2: seen from the flange it ends before the holder begins."""
     model = ur_model(name)
     wrist_2 = collision_links(model)[5]
@@ -210,7 +204,7 @@ def test_wrist_2_stays_behind_the_flange_plane(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["ur3", "ur3e", "ur5e", "ur10e"])
-def test_whatever_the_shipped_meshes_meet_is_a_contact(name: str) -> None:
+def test_whatever_the_shipped_meshes_meet_is_a_contact(name):
     """Where two links' own meshes intersect the checker never says free, over random poses; nor is it much stricter.
 
     At most 3 % of the poses are a contact to it in which the open meshes do not meet (hulls are fuller).
@@ -234,7 +228,7 @@ def test_whatever_the_shipped_meshes_meet_is_a_contact(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(UR_MODELS))
-def test_every_mesh_vertex_lies_in_a_convex_piece(name: str) -> None:
+def test_every_mesh_vertex_lies_in_a_convex_piece(name):
     """The pieces contain the link: each shipped vertex is within 1e-6 mm of the inside of one of them."""
     for hull, detail in zip(collision_links(ur_model(name)), visual_links(ur_model(name)), strict=True):
         outside = np.full(len(detail.mesh.vertices), np.inf)
@@ -248,7 +242,7 @@ def test_every_mesh_vertex_lies_in_a_convex_piece(name: str) -> None:
         assert outside.max() < 1e-6, hull.name
 
 
-def test_folded_arms_touch_themselves_and_name_the_links() -> None:
+def test_folded_arms_touch_themselves_and_name_the_links():
     """An elbow folded shut, and a needle turned back on the arm, are contacts; upright the arm is free."""
     checker = CellChecker(UR3, TOOL)
     upright = np.array([0.0, -np.pi / 2, 0.0, -np.pi / 2, 0.0, 0.0])
@@ -266,7 +260,7 @@ def test_folded_arms_touch_themselves_and_name_the_links() -> None:
     assert {"needle"} <= {contact.body for contact in met if contact}
 
 
-def test_a_base_inside_or_through_the_patient_is_refused() -> None:
+def test_a_base_inside_or_through_the_patient_is_refused():
     """Wholly inside, and crossing its surface."""
     for half in (400.0, 40.0):
         low, high = np.full(3, -half), np.full(3, half)
@@ -274,7 +268,7 @@ def test_a_base_inside_or_through_the_patient_is_refused() -> None:
             CellChecker(UR3, TOOL, patient=cuboid(low, high))
 
 
-def test_winding_numbers_are_the_sums_of_solid_angles() -> None:
+def test_winding_numbers_are_the_sums_of_solid_angles():
     """By numpy, of each point by itself: inside, outside and next to a face, of a closed and of an open surface."""
     box = cuboid(np.full(3, -50.0), np.full(3, 50.0))
     points = np.random.default_rng(5).uniform(-60.0, 70.0, (50, 3))
@@ -284,7 +278,7 @@ def test_winding_numbers_are_the_sums_of_solid_angles() -> None:
         assert [winding_number(mesh, point) for point in points] == pytest.approx(by_numpy, abs=1e-12)
 
 
-def solid_angle(mesh: TriangleMesh, point: np.ndarray) -> float:
+def solid_angle(mesh, point):
     """Signed, of all triangles as seen from a point."""
     corners = mesh.triangles - point
     a, b, c = np.moveaxis(corners / np.linalg.norm(corners, axis=2, keepdims=True), 1, 0)
@@ -293,7 +287,7 @@ def solid_angle(mesh: TriangleMesh, point: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("q", [np.full(6, np.nan), np.array([0, 0, np.inf, 0, 0, 0])])
-def test_angles_that_are_not_finite_are_refused(q: np.ndarray) -> None:
+def test_angles_that_are_not_finite_are_refused(q):
     """FCL would call them free."""
     checker = CellChecker(UR3, TOOL)
     with refused("not_finite"):
@@ -312,22 +306,22 @@ def test_angles_that_are_not_finite_are_refused(q: np.ndarray) -> None:
     ],
     ids=["nan vertex", "index too high", "index negative", "no faces"],
 )
-def test_a_skin_that_fcl_would_misjudge_is_refused(mesh: TriangleMesh) -> None:
+def test_a_skin_that_fcl_would_misjudge_is_refused(mesh):
     """Each of these makes FCL say free or kill the process."""
     with refused("bad_mesh"):
         CellChecker(UR3, TOOL, patient=mesh)
 
 
-def test_boxes_of_one_name_and_unknown_distances_are_refused() -> None:
+def test_boxes_of_one_name_and_unknown_distances_are_refused():
     """Contacts and distances are told by these names."""
-    box = Box("table", translation(0, 0, -500), (1.0, 1.0, 1.0))
+    box = Box("table", pose(np.eye(3), [0, 0, -500]), (1.0, 1.0, 1.0))
     with refused("duplicate_name"):
         CellChecker(UR3, TOOL, [box, box])
     with refused("unknown_choice"):
         CellChecker(UR3, TOOL, [box]).nearest(BENT, "ceiling")
 
 
-def test_no_body_point_leaves_the_sweep_bound() -> None:
+def test_no_body_point_leaves_the_sweep_bound():
     """Between two configurations every point of every link and of the tool stays within half the bound of an end."""
     swept = SweptBodies.of(UR3, TOOL)
     rng = np.random.default_rng(8)
@@ -345,7 +339,7 @@ def test_no_body_point_leaves_the_sweep_bound() -> None:
                     assert off.max() <= bound / 2.0 + 1e-9, name
 
 
-def test_rows_of_a_path_within_a_distance(rng: np.random.Generator) -> None:
+def test_rows_of_a_path_within_a_distance(rng):
     """At the kept rows, every point of every body is within the distance of where it is at any state of the path."""
     swept = SweptBodies.of(UR3, TOOL)
     knots = rng.uniform(-1.0, 1.0, (4, 6))

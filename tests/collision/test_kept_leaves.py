@@ -1,20 +1,18 @@
 """What is kept of the skin's tree: its leaves, of which no triangle may be missing."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
 
 from puncture_twin.planning.base.cache.array_cache import Cache
-from puncture_twin.planning.base.cache.entry_file import Arrays, packed, unpacked
+from puncture_twin.planning.base.cache.entry_file import packed, unpacked
 from puncture_twin.planning.base.errors import CacheWarning
 from puncture_twin.planning.collision import packed as module
 from puncture_twin.planning.collision.packed import TriangleTree
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
 
-def ball(subdivisions: int, stretch: float = 1.0) -> TriangleMesh:
+def ball(subdivisions, stretch=1.0):
     """An egg."""
     made = trimesh.creation.icosphere(subdivisions=subdivisions, radius=80.0)
     return TriangleMesh(made.vertices * [1.0, stretch, 0.5], made.faces)
@@ -23,13 +21,13 @@ def ball(subdivisions: int, stretch: float = 1.0) -> TriangleMesh:
 MESH = ball(3)
 
 
-def content(tree: TriangleTree) -> list[bytes]:
+def content(tree):
     """All that a tree holds."""
     return [array.tobytes() for array in vars(tree).values()]
 
 
 @pytest.fixture
-def kept(tmp_path: Path) -> tuple[Cache, Path]:
+def kept(tmp_path):
     """A cache that holds the leaves of a mesh, and the file of the entry."""
     cache = Cache(tmp_path)
     TriangleTree.of(MESH, cache)
@@ -38,9 +36,7 @@ def kept(tmp_path: Path) -> tuple[Cache, Path]:
 
 
 @pytest.mark.parametrize("mesh", [ball(0), MESH, ball(2, 3.0), TriangleMesh(MESH.vertices, MESH.faces[:1])])
-def test_the_tree_is_the_same_from_the_cache_and_without(
-    tmp_path: Path, mesh: TriangleMesh, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_tree_is_the_same_from_the_cache_and_without(tmp_path, mesh, monkeypatch):
     """To the bit; its boxes hold all triangles below them; the second time nothing is sorted."""
     tree, made = TriangleTree.of(mesh), TriangleTree.of(mesh, Cache(tmp_path))
     monkeypatch.delattr(module, "_leaves")
@@ -57,13 +53,13 @@ def test_the_tree_is_the_same_from_the_cache_and_without(
         assert np.array_equal(tree.highs[node], below.max(axis=0))
 
 
-def test_another_mesh_has_leaves_of_its_own(kept: tuple[Cache, Path]) -> None:
+def test_another_mesh_has_leaves_of_its_own(kept):
     """Of as many triangles and vertices."""
     other = ball(3, 1.0001)
     assert content(TriangleTree.of(other, kept[0])) == content(TriangleTree.of(other))
 
 
-def without_one(leaves: Arrays) -> Arrays:
+def without_one(leaves):
     """One triangle is in no leaf."""
     rows = leaves["rows"].copy()
     rows[rows == 17] = 18
@@ -84,7 +80,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_leaves_that_cannot_be_of_the_mesh_are_made_anew(kept: tuple[Cache, Path], wrong: str) -> None:
+def test_leaves_that_cannot_be_of_the_mesh_are_made_anew(kept, wrong):
     """Under a forged digest too: through a triangle that is in no leaf the arm would pass."""
     cache, path = kept
     key, whole = path.name.split(".")[-2], path.read_bytes()

@@ -39,7 +39,7 @@ def test_distance_agrees_with_another_closest_point():
     ours = np.sqrt(squared_distance(points, triangles))
     closest = trimesh.triangles.closest_point(triangles, points)
     assert np.abs(ours - np.linalg.norm(points - closest, axis=1)).max() < 1e-6
-    plain = [point_triangle_distance(*pair) for pair in zip(points[:1500], triangles[:1500], strict=True)]
+    plain = point_triangle_distance(points[:1500], triangles[:1500])
     np.testing.assert_allclose(ours[:1500], plain, atol=1e-9)
 
 

@@ -179,21 +179,15 @@ def test_it_changes_by_no_more_than_the_needle_moves(engine, mesh, rng):
         assert (np.abs(distances(engine, [mesh], target, turned) - before) <= moved + TIGHT_MM).all()
 
 
-def test_beside_a_wall_it_is_known(engine, rng):
-    """A plane at x = 40: the nearer end's distance, and none where the axis passes it."""
+def test_beside_a_wall_and_a_point_it_is_known(engine, rng):
+    """A plane at x = 40: the nearer end's distance, none where the axis passes it; a triangle shrunk to one point."""
     wall = TriangleMesh([[40.0, -9e3, -9e3], [40, 9e3, -9e3], [40, 0, 2e4]], [[0, 1, 2]])
-    directions = units(rng, 60)
-    expected = np.maximum(0.0, 40.0 - LENGTH * np.maximum(0.0, directions[:, 0]))
-    np.testing.assert_allclose(distances(engine, [wall], np.zeros(3), directions)[:, 0], expected, atol=TIGHT_MM)
-
-
-def test_beside_a_point_it_is_known(engine, rng):
-    """A triangle shrunk to one point: the point's distance from a segment."""
     point, directions = np.array([50.0, 20.0, -10.0]), units(rng, 60)
-    speck = TriangleMesh(np.tile(point, (3, 1)), [[0, 1, 2]])
     along = np.clip(directions @ point, 0.0, LENGTH)
-    expected = np.linalg.norm(point - along[:, None] * directions, axis=1)
-    np.testing.assert_allclose(distances(engine, [speck], np.zeros(3), directions)[:, 0], expected, atol=TIGHT_MM)
+    expected = np.maximum(0.0, 40.0 - LENGTH * np.maximum(0.0, directions[:, 0]))
+    expected = np.stack([expected, np.linalg.norm(point - along[:, None] * directions, axis=1)], axis=1)
+    found = distances(engine, [wall, TriangleMesh(np.tile(point, (3, 1)), [[0, 1, 2]])], np.zeros(3), directions)
+    np.testing.assert_allclose(found, expected, atol=TIGHT_MM)
 
 
 def test_beside_a_sphere_it_is_known(engine, ball, rng):

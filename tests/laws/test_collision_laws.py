@@ -4,7 +4,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.tool import Box, Tool
@@ -13,7 +12,7 @@ from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import inverse
+from puncture_twin.planning.geometry.rigid import exp_rotation, inverse, pose
 
 UR3 = ur_model("ur3")
 TOOL = Tool(needle_length_mm=250.0, shaft_mm=150.0, needle_diameter_mm=1.2, holder_diameter_mm=30.0)
@@ -22,17 +21,14 @@ CLEAR = np.array([0.4, -1.9, 1.6, -1.2, -1.5, 0.3])
 """Elbow up, needle down."""
 
 
-def pose(t, axis=(0.0, 0.0, 1.0), angle=0.0):
+def placed(t, axis=(0.0, 0.0, 1.0), angle=0.0):
     """A 4x4, mm and rad."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_rotvec(angle * np.asarray(axis) / np.linalg.norm(axis)).as_matrix()
-    T[:3, 3] = t
-    return T
+    return pose(exp_rotation(angle * np.asarray(axis) / np.linalg.norm(axis)), t)
 
 
-TABLE = Box("table", pose((400.0, 30.0, -140.0), (0.2, 0.1, 1.0), 0.3), (600.0, 900.0, 60.0))
-LAMP = Box("lamp", pose((150.0, 250.0, 420.0)), (120.0, 80.0, 60.0))
-POLE = Box("pole", pose((-250.0, 150.0, 300.0)), (60.0, 60.0, 700.0))
+TABLE = Box("table", placed((400.0, 30.0, -140.0), (0.2, 0.1, 1.0), 0.3), (600.0, 900.0, 60.0))
+LAMP = Box("lamp", placed((150.0, 250.0, 420.0)), (120.0, 80.0, 60.0))
+POLE = Box("pole", placed((-250.0, 150.0, 300.0)), (60.0, 60.0, 700.0))
 
 
 @pytest.fixture(scope="module", params=[CellChecker, FastChecker], ids=lambda kind: kind.__name__)
@@ -104,7 +100,7 @@ def test_a_larger_obstacle_or_a_wider_padding_never_frees(build, states, patient
 def test_far_obstacles_are_irrelevant(build, states, patient):
     """Beyond the arm's reach nothing changes a word."""
     away = ball_at(patient, (9000.0, 0.0, 0.0))
-    far = [Box(f"far {n}", pose(t), (500.0, 500.0, 500.0)) for n, t in enumerate(4000.0 * np.eye(3))]
+    far = [Box(f"far {n}", placed(t), (500.0, 500.0, 500.0)) for n, t in enumerate(4000.0 * np.eye(3))]
     near = contacts(build([TABLE], patient), states)
     assert contacts(build([TABLE, *far], patient), states) == near
     assert contacts(build([TABLE], joined(patient, away)), states) == near
@@ -136,7 +132,10 @@ def test_orders_are_irrelevant(build, states, patient):
 def test_base_and_obstacles_moved_together_change_nothing(build, states, patient):
     """The room knows no place: seen from the base, wherever that stands, it is the same room."""
     said = contacts(build([TABLE, LAMP], patient), states)
-    for T_world_base in (pose((800.0, -300.0, 900.0), (0, 0, 1), 2.0), pose((-5e3, 4e3, 30.0), (1.0, 2.0, -0.5), 2.9)):
+    for T_world_base in (
+        placed((800.0, -300.0, 900.0), (0, 0, 1), 2.0),
+        placed((-5e3, 4e3, 30.0), (1.0, 2.0, -0.5), 2.9),
+    ):
         T_base_world = inverse(T_world_base)
         boxes = [Box(b.name, T_base_world @ (T_world_base @ b.T_base_box), b.size_mm) for b in (TABLE, LAMP)]
         moved = patient.transformed(T_world_base).transformed(T_base_world)
@@ -149,7 +148,7 @@ def test_the_shoulder_and_the_room_turned_together_change_nothing(build, states,
 
     The base link stays, so states that touch it, by the arm's own shape, are left out.
     """
-    T = pose((0.0, 0.0, 0.0), angle=angle)
+    T = placed((0.0, 0.0, 0.0), angle=angle)
     turned = states + np.array([angle, 0, 0, 0, 0, 0])
     alone = free(build(), states) & free(build(), turned)
     boxes = [Box(b.name, T @ b.T_base_box, b.size_mm) for b in (TABLE, LAMP)]
@@ -162,10 +161,10 @@ def test_a_box_looks_the_same_from_behind(build, states):
     """Half turns about its own axes, and sides that are exchanged, are no other box."""
     said = contacts(build([TABLE]), states)
     for axis in np.eye(3):
-        T = TABLE.T_base_box @ pose((0.0, 0.0, 0.0), axis, np.pi)
+        T = TABLE.T_base_box @ placed((0.0, 0.0, 0.0), axis, np.pi)
         assert contacts(build([Box("table", T, TABLE.size_mm)]), states) == said
     x, y, z = TABLE.size_mm
-    T = TABLE.T_base_box @ pose((0.0, 0.0, 0.0), (0, 0, 1), np.pi / 2)
+    T = TABLE.T_base_box @ placed((0.0, 0.0, 0.0), (0, 0, 1), np.pi / 2)
     assert contacts(build([Box("table", T, (y, x, z))]), states) == said
 
 

@@ -22,7 +22,7 @@ SOLID_18 = Shaft(200.0, 1.27)
 TUBE_18 = Shaft(150.0, *GAUGES[18])
 
 
-def beyond(slenderness: float, depth: float = 12.0) -> float:
+def beyond(slenderness, depth=12.0):
     """By which fraction a thin stiff layer before a gap takes the tip beyond the stiffest tissue alone, at most."""
     rate, count = slenderness / SOLID_18.length_mm, int(16 * min(depth, slenderness))
     stiffest, alpha = 4 * SOLID_18.bending_stiffness * rate**4, np.full(count, 0.01)
@@ -34,7 +34,7 @@ def beyond(slenderness: float, depth: float = 12.0) -> float:
     return worst
 
 
-def in_every_order(shaft: Shaft, tissues: tuple[float, ...], layers: int, longest: float) -> float:
+def in_every_order(shaft, tissues, layers, longest):
     """The greatest deflection in any order of equally thick layers over the stiffest tissue's alone, at any depth."""
     count = layers * int(np.ceil(longest / layers / step_for(shaft, max(tissues))))
     alpha, step = np.full(count, 0.01), longest / count
@@ -43,7 +43,7 @@ def in_every_order(shaft: Shaft, tissues: tuple[float, ...], layers: int, longes
     return max(float((bevel_path(shaft, k, alpha, step).largest_mm[1:] / alone).max()) for k in orders)
 
 
-def proven(shaft: Shaft, alpha: float, stiffest: float, longest: float) -> np.ndarray:
+def proven(shaft, alpha, stiffest, longest):
     """A bound that is proven for every order of layers, and bevels that turn: what `docs` call the bound by energy.
 
     With W the energy of shaft and foundation, F the tip's lateral force, M the clamp's moment, a step of the insertion
@@ -214,15 +214,11 @@ def test_a_bevel_steers_a_long_needle_along_a_circle(k):
 
 def test_the_path_is_linear_in_the_angle():
     """And a degree takes an 18G off by millimetres in 100 mm, the more the stiffer the tissue is."""
-    one, three = path(1.0), path(3.0)
+    none, one, three = path(0.0), path(1.0), path(3.0)
+    assert not none.cut_mm.any() and not none.needle_mm.any()
     np.testing.assert_allclose(three.cut_mm, 3 * one.cut_mm, rtol=1e-9, atol=1e-12)
     ends = [path(1.0, k).cut_mm[-1] for k in (0.01, 0.1, 0.4)]
     assert 3 < ends[0] < ends[1] < ends[2] < 8
-
-
-def test_a_needle_without_a_bevel_goes_straight():
-    straight_on = path(0.0)
-    assert not straight_on.cut_mm.any() and not straight_on.needle_mm.any()
 
 
 def test_a_needle_that_is_turned_comes_back():

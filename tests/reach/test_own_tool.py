@@ -64,7 +64,7 @@ TARGET = np.array([330.0, 40.0, 20.0])
 @pytest.fixture(scope="module")
 def answers():
     """Of four tools, for the same directions from above to a target before the arm."""
-    outward = np.random.default_rng(11).normal(size=(24, 3)) * 0.5 + [-0.2, 0.0, 1.0]
+    outward = np.random.default_rng(11).normal(size=(16, 3)) * 0.5 + [-0.2, 0.0, 1.0]
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     asked = [ReachRequest(TARGET, one, 210.0, 80.0) for one in outward]
     tools = {
@@ -81,7 +81,7 @@ def answers():
 
 def test_a_mesh_cylinder_is_the_holder(answers):
     """The mesh of a holder, 0.002 mm thinner at its flats: verdict and joints are those of the holder itself."""
-    assert 5 < sum(answer.reachable for answer in answers["none"]) < 24
+    assert 5 < sum(answer.reachable for answer in answers["none"]) < 16
     for known, own in zip(answers["none"], answers["rod"], strict=True):
         assert (known.reason, known.branch, known.margin) == (own.reason, own.branch, own.margin)
         np.testing.assert_array_equal(known.insertion_q, own.insertion_q)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from chen2019_reach import SHARES, WINDOWS, PublishedShare, cap, runs
+from chen2019_reach import SHARES, WINDOWS, cap, runs
 
 from puncture_twin.planning.arm.insertion import flange_poses, needle_lines, reach_margin
 from puncture_twin.planning.arm.inverse_kinematics import inverse
@@ -32,7 +32,7 @@ LESION_M_CT = np.array([50.0, 130.0, 63.0])
 """Markers A, B, C and lesion M: Tables 1 and 2 of Chen 2019, mm."""
 
 
-def triad(points: np.ndarray) -> np.ndarray:
+def triad(points):
     """Chen 2019 Eq. 1-3: the frame of three markers, as a rotation."""
     e1 = points[1] - points[0]
     e3 = np.cross(e1, points[2] - points[0])
@@ -40,14 +40,14 @@ def triad(points: np.ndarray) -> np.ndarray:
     return np.stack([e1, np.cross(e3, e1), e3], axis=1)
 
 
-def paper_placement() -> tuple[np.ndarray, np.ndarray]:
+def paper_placement():
     """R_base_ct and lesion M in the base frame, mm: setup 1, A-B-C."""
     R = triad(MARKERS_BASE) @ triad(MARKERS_CT).T
     t = np.mean(MARKERS_BASE - MARKERS_CT @ R.T, axis=0)
     return R, R @ LESION_M_CT + t
 
 
-def outward(R_base_ct: np.ndarray, theta_deg: float, beta_deg: np.ndarray) -> np.ndarray:
+def outward(R_base_ct, theta_deg, beta_deg):
     """u(theta, beta) in the base frame, (n, 3)."""
     theta, beta = np.radians(theta_deg), np.radians(np.atleast_1d(beta_deg))
     u = np.stack(
@@ -56,18 +56,18 @@ def outward(R_base_ct: np.ndarray, theta_deg: float, beta_deg: np.ndarray) -> np
     return u @ R_base_ct.T
 
 
-def directions(count: int, seed: int) -> np.ndarray:
+def directions(count, seed):
     """Random unit vectors of the upper half space, (n, 3)."""
     u = np.random.default_rng(seed).normal(size=(count, 3))
     u[:, 2] = np.abs(u[:, 2])
     return np.asarray(u / np.linalg.norm(u, axis=1, keepdims=True))
 
 
-def request(u: np.ndarray, standoff_mm: float = STANDOFF_MM) -> ReachRequest:
+def request(u, standoff_mm=STANDOFF_MM):
     return ReachRequest(TARGET, u, TOOL.needle_length_mm, standoff_mm)
 
 
-def reached(checker: CellChecker, count: int, seed: int) -> list:
+def reached(checker, count, seed):
     found = []
     for u in directions(60, seed):
         answer = assess_reach_all(checker, [request(u)])[0]
@@ -92,7 +92,7 @@ def ik_exists(model, target, u, *, needle_length_mm, standoff_mm, depths_mm=None
 
 
 @pytest.mark.parametrize("theta_deg", sorted(WINDOWS))
-def test_the_windows_of_the_papers_placement(theta_deg: int) -> None:
+def test_the_windows_of_the_papers_placement(theta_deg):
     """Exactly the specification's windows with |sin q5| > .05; within 1 deg with all three singularities kept off."""
     R, target = paper_placement()
     u = outward(R, theta_deg, np.arange(360))
@@ -105,7 +105,7 @@ def test_the_windows_of_the_papers_placement(theta_deg: int) -> None:
 
 
 @pytest.mark.parametrize("row", SHARES, ids=str)
-def test_the_shares_of_the_reach_table(row: PublishedShare) -> None:
+def test_the_shares_of_the_reach_table(row):
     """Share of the cap of 60 deg that a UR3 holds: within 1 point with |sin q5| > .05, as the table counts.
 
     With the other two singularities kept off as well it stays within 3.
@@ -117,7 +117,7 @@ def test_the_shares_of_the_reach_table(row: PublishedShare) -> None:
     assert exists.mean() == pytest.approx(row.share, abs=0.03)
 
 
-def test_the_worked_example_of_the_paper_is_out_of_reach() -> None:
+def test_the_worked_example_of_the_paper_is_out_of_reach():
     """The flange would stand 701.9 mm from the shoulder; the answer says so. A UR5 has eight solutions there."""
     R, target = paper_placement()
     u = outward(R, 10.0, np.array([45.0]))[0]
@@ -131,7 +131,7 @@ def test_the_worked_example_of_the_paper_is_out_of_reach() -> None:
     assert not np.isnan(inverse(ur_model("ur5"), T)).any()
 
 
-def test_a_reachable_answer_is_a_straight_clear_drive() -> None:
+def test_a_reachable_answer_is_a_straight_clear_drive():
     """At every row the needle lies on its line, within limits, without contact; the tip ends on the target."""
     T_base_table = np.eye(4)
     T_base_table[2, 3] = -60.0
@@ -156,7 +156,7 @@ def test_a_reachable_answer_is_a_straight_clear_drive() -> None:
             q[0, 0] = 0.0
 
 
-def test_in_an_empty_room_the_best_margin_wins() -> None:
+def test_in_an_empty_room_the_best_margin_wins():
     """A branch with a higher margin than the answer's was passed over only for a contact."""
     checker = CellChecker(UR3, Tool(200.0, 199.0, 0.1, 0.1))
     tried = 0
@@ -172,7 +172,7 @@ def test_in_an_empty_room_the_best_margin_wins() -> None:
     assert tried >= 2
 
 
-def test_a_drive_that_leaves_the_arms_reach_is_blocked_at_its_depth() -> None:
+def test_a_drive_that_leaves_the_arms_reach_is_blocked_at_its_depth():
     """Standoff holds and the target does not: blocked by kinematics, at a depth before which the branch exists."""
     checker = CellChecker(UR3, Tool(200.0, 199.0, 0.1, 0.1))
     near_base, lengths = np.array([250.0, 0.0, 100.0]), {"needle_length_mm": 200.0, "standoff_mm": STANDOFF_MM}
@@ -187,7 +187,7 @@ def test_a_drive_that_leaves_the_arms_reach_is_blocked_at_its_depth() -> None:
         assert ik_exists(UR3, near_base, direction, depths_mm=(0.0, max(0.0, answer.depth_mm - 2.0)), **lengths).all()
 
 
-def test_what_kinematics_rejects_is_never_reached() -> None:
+def test_what_kinematics_rejects_is_never_reached():
     """A False of the batch is final: the full answer for it is a refusal by kinematics."""
     checker = CellChecker(UR3, TOOL)
     u = directions(120, seed=3)
@@ -199,12 +199,12 @@ def test_what_kinematics_rejects_is_never_reached() -> None:
         assert "touches" not in answer.detail
 
 
-def slab(u: np.ndarray, start_mm: float, thickness_mm: float) -> np.ndarray:
+def slab(u, start_mm, thickness_mm):
     """T_base_box of a plate square to the needle, from ``start_mm`` outward of the target."""
     return flange_poses(TARGET, u, start_mm + thickness_mm / 2.0)[0]
 
 
-def test_the_holder_stops_at_the_skin_where_geometry_says() -> None:
+def test_the_holder_stops_at_the_skin_where_geometry_says():
     """Skin h above the target: the holder's end, r - depth + shaft away, meets it at depth r + shaft - h."""
     empty = CellChecker(UR3, TOOL)
     height, standoff = 170.0, 180.0  # the tip starts 10 mm outside the skin
@@ -219,7 +219,7 @@ def test_the_holder_stops_at_the_skin_where_geometry_says() -> None:
     assert exact - 1e-6 <= answer.depth_mm <= exact + MAX_SWEEP_MM
 
 
-def test_a_plate_across_the_needles_way_blocks_at_its_depth() -> None:
+def test_a_plate_across_the_needles_way_blocks_at_its_depth():
     """A room's box is not skin: the tip meets it r - height deep, and the needle is named."""
     empty = CellChecker(UR3, TOOL)
     asked, _ = reached(empty, 1, seed=6)[0]
@@ -230,7 +230,7 @@ def test_a_plate_across_the_needles_way_blocks_at_its_depth() -> None:
     assert exact - 1e-6 <= answer.depth_mm <= exact + MAX_SWEEP_MM
 
 
-def test_an_obstacle_at_the_flange_is_a_collision_at_standoff() -> None:
+def test_an_obstacle_at_the_flange_is_a_collision_at_standoff():
     """A box about the standoff flange stops every branch and roll; link and box are named."""
     asked, _ = reached(CellChecker(UR3, TOOL), 1, seed=7)[0]
     lamp = Box("lamp", flange_poses(TARGET, asked.outward_base, 320.0)[0], (40.0, 40.0, 40.0))
@@ -240,7 +240,7 @@ def test_an_obstacle_at_the_flange_is_a_collision_at_standoff() -> None:
     assert answer.insertion_q.shape == (0, 6) and answer.branch == -1 and answer.margin == 0.0
 
 
-def test_another_roll_is_taken_where_one_meets_something() -> None:
+def test_another_roll_is_taken_where_one_meets_something():
     """A knob where the rim of wrist 3 ends up at roll 0: that roll is passed over, and the drive holds another."""
     asked, plain = reached(CellChecker(UR3, TOOL), 1, seed=7)[0]
     assert plain.roll == 0.0
@@ -258,7 +258,7 @@ def test_another_roll_is_taken_where_one_meets_something() -> None:
     assert np.abs(flange_pose(UR3, answer.insertion_q) - expected).max() < 1e-9
 
 
-def test_a_standoff_that_starts_inside_the_skin_is_a_collision() -> None:
+def test_a_standoff_that_starts_inside_the_skin_is_a_collision():
     asked, _ = reached(CellChecker(UR3, TOOL), 1, seed=8)[0]
     ball = trimesh.creation.icosphere(subdivisions=3, radius=STANDOFF_MM + 5.0)
     skin = TriangleMesh(np.asarray(ball.vertices) + TARGET, np.asarray(ball.faces))
@@ -269,11 +269,11 @@ def test_a_standoff_that_starts_inside_the_skin_is_a_collision() -> None:
 class Unfolded(FastChecker):
     """Never says that an arm is folded: of each motion its contacts are checked."""
 
-    def folded(self, q: np.ndarray) -> np.ndarray:
+    def folded(self, q):
         return np.zeros(len(q), np.bool_)
 
 
-def test_branches_on_which_the_arm_is_folded_are_passed_over_and_change_no_answer() -> None:
+def test_branches_on_which_the_arm_is_folded_are_passed_over_and_change_no_answer():
     """The same answers, to the bit, as where each of their motions is tried."""
     ball = trimesh.creation.icosphere(radius=80.0)
     skin = TriangleMesh(ball.vertices + TARGET - [0.0, 0.0, 90.0], np.asarray(ball.faces))
@@ -289,7 +289,7 @@ def test_branches_on_which_the_arm_is_folded_are_passed_over_and_change_no_answe
 
 
 @pytest.mark.parametrize("roll", np.linspace(0.0, 2 * np.pi, 5))
-def test_the_roll_is_joint_six_alone(roll: float) -> None:
+def test_the_roll_is_joint_six_alone(roll):
     """Turning the flange about the needle adds to q6 and moves no other joint; tip and axis stay."""
     u = next(d for d in directions(60, 1) if ik_exists(UR3, TARGET, d, needle_length_mm=200.0, standoff_mm=120.0)[0])
     plain, turned = (inverse(UR3, flange_poses(TARGET, u, 320.0, angle))[0] for angle in (0.0, roll))
@@ -300,7 +300,7 @@ def test_the_roll_is_joint_six_alone(roll: float) -> None:
     assert np.max(np.abs(difference[:, 5] - np.exp(1j * roll))) < 1e-9
 
 
-def test_the_samples_are_those_of_the_plain_loop() -> None:
+def test_the_samples_are_those_of_the_plain_loop():
     """Depths as ``np.linspace`` has them, states as ``fill_branch_path``, as many as the largest motion asks for."""
     swept, rng = SweptBodies.of(UR3, TOOL), np.random.default_rng(5)
     ended = 0
@@ -310,7 +310,7 @@ def test_the_samples_are_those_of_the_plain_loop() -> None:
         branch, turn, standoff = int(rng.integers(8)), rng.normal(size=6), float(rng.uniform(20.0, 200.0))
         lengths = TOOL.needle_length_mm, standoff
         count = math.ceil(standoff / MAX_SWEEP_MM) + 1
-        found = sampled(swept, line, branch, turn, lengths, count, MAX_SWEEP_MM)
+        found_q, found_depths = sampled(swept, line, branch, turn, lengths, count, MAX_SWEEP_MM)
         while True:
             depths = np.linspace(0.0, standoff, count)
             q = np.empty((len(depths), 6))
@@ -319,11 +319,11 @@ def test_the_samples_are_those_of_the_plain_loop() -> None:
                 break
             count = math.ceil((count - 1) * worst / MAX_SWEEP_MM) + 1
         ended += bool(np.isnan(q).any())
-        assert np.array_equal(found.depths_mm, depths) and np.array_equal(found.q, q, equal_nan=True)
+        assert np.array_equal(found_depths, depths) and np.array_equal(found_q, q, equal_nan=True)
     assert 20 < ended < 180
 
 
-def test_how_far_a_path_may_have_moved_is_the_sum_of_its_bounds() -> None:
+def test_how_far_a_path_may_have_moved_is_the_sum_of_its_bounds():
     swept = SweptBodies.of(UR3, TOOL, 5.0)
     path = np.random.default_rng(6).uniform(-3.0, 3.0, (30, 6))
     frames, moved, rotated = swept.moving(path)

@@ -38,7 +38,7 @@ def needle(diameter=1.2, gap=10.0, standoff=None):
     return Needle(200.0, 150.0, diameter, standoff, gap, 30.0)
 
 
-def touches_flat_skin(diameter: float, gap_mm: float, angle: float) -> bool:
+def touches_flat_skin(diameter, gap_mm, angle):
     """FCL's word: the padded needle, its tip so far along it from the origin of a flat slab, its top outward."""
     length = 150.0 + 2.0 * ARM_PADDING_MM
     shaft = fcl.CollisionObject(fcl.Cylinder(diameter / 2.0 + ARM_PADDING_MM, length))
@@ -77,7 +77,7 @@ def test_the_arms_checker_lets_an_oblique_needle_start():
     model = ur_model("ur5")
     checker = CellChecker(model, tool, patient=TriangleMesh(skin.vertices, skin.faces), padding_mm=ARM_PADDING_MM)
 
-    def met(standoff: float) -> set[tuple[str, str]]:
+    def met(standoff):
         solutions = inverse(model, flange_poses(target, outward, 200.0 + standoff))[0]
         contacts = [
             checker.contact(q, needle_may_touch_patient=False) for q in solutions[~np.isnan(solutions).any(axis=1)]

@@ -9,7 +9,7 @@ from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.reach.reach import missing_reach_mm
 
 
-def test_reach_is_missing_exactly_where_no_solution_exists() -> None:
+def test_reach_is_missing_exactly_where_no_solution_exists():
     """0 mm missing and a solution go together; a straight arm asked to be 12.5 mm longer misses 12.5 mm."""
     model = ur_model("ur3")
     rng = np.random.default_rng(5)

@@ -51,24 +51,20 @@ def test_the_statistic_is_chi_squared_and_its_regions_hold(count, rng):
     L = least_squares_map(A, np.linalg.inv(omega))
     target = np.array([50.0, 130.0, 63.0])
     error = T[:, :3, :3] @ target + T[:, :3, 3] - apply(T_TRUE, target)
-    X = np.concatenate([np.eye(3), -_skew(apply(T_TRUE, target) - fitted.mean(axis=0))], axis=1)
+    X = np.concatenate([np.eye(3), -np.cross(np.eye(3), apply(T_TRUE, target) - fitted.mean(axis=0))], axis=1)
     cov = X @ L @ omega @ L.T @ X.T
     square = np.einsum("na,ab,nb->n", error, np.linalg.inv(cov), error)
     residuals = base - (np.einsum("nab,nmb->nma", T[:, :3, :3], ct) + T[:, None, :3, 3])
-    tests = [noise_test(r.ravel(), omega, A) for r in residuals[:4000]]
+    tests = [noise_test(r.ravel(), omega, A) for r in residuals[:2500]]
     assert np.mean([test.probability < 0.01 for test in tests]) == pytest.approx(0.01, abs=0.006)
     assert np.mean([test.probability > 0.9 for test in tests]) == pytest.approx(0.1, abs=0.02)
     assert np.mean(square <= chdtri(3, 0.05)) == pytest.approx(0.95, abs=0.006)
     s = np.array([test.estimate for test in tests])
     factor = NoiseTest(count, 1.0, found=True).region_factor
-    assert np.mean(square[:4000] <= (s * factor) ** 2) == pytest.approx(0.95, abs=0.012)
-    assert np.mean(square[:4000] <= s**2 * chdtri(3, 0.05)) < {3: 0.82, 4: 0.88, 5: 0.905, 6: 0.925}[count]
+    assert np.mean(square[:2500] <= (s * factor) ** 2) == pytest.approx(0.95, abs=0.012)
+    assert np.mean(square[:2500] <= s**2 * chdtri(3, 0.05)) < {3: 0.82, 4: 0.88, 5: 0.905, 6: 0.925}[count]
     held = [test.interval.low <= 1 <= test.interval.high for test in tests]
     assert np.mean(held) == pytest.approx(0.95, abs=0.012)
-
-
-def _skew(v):
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
 
 
 @pytest.mark.parametrize(
@@ -108,9 +104,3 @@ def test_residuals_far_beyond_the_declaration_are_refused_and_can_be_accepted():
     assert found.uncertainty.test.scale > 2
     assert any(flag.code == "residuals_unexplained" for flag in found.flags)
     assert found.fle_interval_mm.low < found.fle_mm < found.fle_interval_mm.high
-
-
-def test_weights_need_a_declaration():
-    pairs = MarkerPairs(tuple("ABCDEF"), MARKERS, apply(T_TRUE, MARKERS))
-    with refused("method_without_errors"):
-        register(pairs, method="weighted", target_ct=np.zeros(3))

@@ -22,13 +22,6 @@ def registered(points_ct, points_base):
     return register(MarkerPairs(names, points_ct, points_base), method="rigid", target_ct=TARGET, accept_residuals=True)
 
 
-def sheared(points, plane, k):
-    """Points moved by k along the plane's first axis per mm along its second."""
-    moved = points.copy()
-    moved[:, plane[0]] += k * (points[:, plane[1]] - points[:, plane[1]].mean())
-    return moved
-
-
 def deformed(points, axes, amount):
     """Points moved as a deformation of the CT's frame about their middle moves them."""
     moved, center = points.copy(), points.mean(axis=0)
@@ -67,7 +60,7 @@ def test_a_deformation_is_named_by_its_kind(axes):
     found = registered(MARKERS, touched).distortion
     assert found.axes == axes
     assert found.significant
-    assert found.text() in [flag.sentence for flag in registered(MARKERS, touched).flags]
+    assert found.finding().sentence in [flag.sentence for flag in registered(MARKERS, touched).flags]
     assert found.amount == pytest.approx(0.03, abs=0.004)
     assert found.moved_mm == pytest.approx(np.sqrt(_sse(deformed(MARKERS, axes, 0.03), MARKERS) / 5), rel=0.1)
     assert 0.02 < found.reading_mm < 0.1

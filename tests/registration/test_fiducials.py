@@ -45,11 +45,14 @@ def scans():
     ]
 
 
-def test_all_are_found_and_nothing_else(scans):
-    """Each of six, and neither bone, wire, clip, needle, calcification nor bolt."""
+def test_all_are_found_and_nothing_else_with_kind_and_size(scans):
+    """Neither bone, wire, clip, needle, calcification nor bolt; size to a tenth, the kind where four voxels show it."""
     for (markers, spacing, _), (true, seen) in zip(KINDS, scans, strict=True):
         errors, _, false = matched(true, seen.fiducials)
         assert (len(errors), false) == (len(true), 0), (markers, spacing, seen.passed)
+        shapes = [one.reading.shape for one in seen.fiducials]
+        assert np.allclose([one.diameter_mm for one in shapes], markers.diameter, rtol=0.1)
+        assert markers.diameter <= 4 * 0.9 or {one.kind for one in shapes} == {markers.kind}
 
 
 def test_centres_are_as_sure_as_they_say(scans):
@@ -91,15 +94,6 @@ def test_a_marker_that_the_image_cuts_is_doubtful_and_a_disc_under_the_skin_is_n
     assert (len(errors), false) == (2, 0)
     cut = [one.point_ct for one in seen.doubtful if one.why == "cut by the image"]
     assert min(np.linalg.norm(one - true[4]) for one in cut) < 6.0
-
-
-def test_kind_and_size_are_read(scans):
-    """Size to a tenth, and the kind, where it is wider than four voxels in the plane."""
-    for (markers, _, _), (_, seen) in zip(KINDS, scans, strict=True):
-        shapes = [one.reading.shape for one in seen.fiducials]
-        assert np.allclose([one.diameter_mm for one in shapes], markers.diameter, rtol=0.1)
-        if markers.diameter > 4 * 0.9:
-            assert {one.kind for one in shapes} == {markers.kind}
 
 
 def test_what_is_not_clipped_is_not_taken_for_it():

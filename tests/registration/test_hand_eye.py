@@ -65,18 +65,18 @@ def test_with_noise_it_is_nearer_than_the_closed_form():
 @pytest.mark.parametrize("motions", [False, True])
 @pytest.mark.parametrize("noise", [NOISE, None])
 def test_region_and_intervals_hold_the_truth(motions, noise):
-    """95 % of both in 200 problems, with a noise that is stated and with one that is found; few poses stand out."""
+    """95 % of both in 100 problems, with a noise that is stated and with one that is found; few poses stand out."""
     inside, within, aside = [], [], 0
-    for seed in range(200):
+    for seed in range(100):
         pairs, X, Z = hand_eye_problem(np.random.default_rng([3, seed]), 15, NOISE, motions=motions)
         found = calibrate_hand_eye(pairs, noise)
         e = found.error(X, Z)
         inside.append(e @ np.linalg.solve(found.covariance, e) <= found.region_limit())
         within.append(np.abs(e) <= found.intervals())
         aside += bool(found.outliers)
-    assert 0.91 <= np.mean(inside) <= 0.99  # one in 200 is half a percent, its deviation 1.5 %
+    assert 0.91 <= np.mean(inside) <= 0.99  # its deviation is 2.2 %
     assert 0.92 <= np.mean(within) <= 0.98
-    assert aside <= 12
+    assert aside <= 6
 
 
 def test_a_noise_that_is_too_small_and_a_pose_that_is_wrong_are_said():

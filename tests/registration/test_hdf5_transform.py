@@ -136,25 +136,19 @@ def displacement_field(folder, name):
     SimpleITK.WriteTransform(SimpleITK.CompositeTransform([SimpleITK.AffineTransform(3), field]), str(folder / name))
 
 
-def scaled(parent, _):
-    """One axis 1 mm longer in 1 m."""
-    numbers = parent["0/TransformParameters"][()]
-    numbers[:9] = (numbers[:9].reshape(3, 3) @ np.diag([1.001, 1.0, 1.0])).ravel()
-    parent["0/TransformParameters"][...] = numbers
+def times(matrix):
+    """The affine part, by another matrix."""
 
+    def change(parent, _):
+        numbers = parent["0/TransformParameters"][()]
+        numbers[:9] = (numbers[:9].reshape(3, 3) @ matrix).ravel()
+        parent["0/TransformParameters"][...] = numbers
 
-def sheared(parent, _):
-    numbers = parent["0/TransformParameters"][()]
-    numbers[:9] = (numbers[:9].reshape(3, 3) @ [[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]).ravel()
-    parent["0/TransformParameters"][...] = numbers
+    return change
 
 
 def set_to(name, value):
     return lambda parent, _: replace(parent["0"], name, value)
-
-
-def renumbered(parent, _):
-    del parent["2"]
 
 
 def no_composite(parent, _):
@@ -174,8 +168,8 @@ def stored_outside(parent, _):
 
 
 BAD = [
-    ("affine", scaled, "not_rigid"),
-    ("affine", sheared, "not_rigid"),
+    ("affine", times(np.diag([1.001, 1.0, 1.0])), "not_rigid"),
+    ("affine", times([[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]), "not_rigid"),
     ("affine", lambda parent, _: parent["0"].pop("TransformType"), "missing_key /TransformGroup/0"),
     ("affine", lambda parent, file: file.pop("TransformGroup"), "wrong_format"),
     ("affine", lambda parent, _: parent.pop("0"), "wrong_count"),
@@ -189,7 +183,7 @@ BAD = [
     ("affine", stored_outside, "data_elsewhere"),
     ("versor", set_to("TransformParameters", np.array([1.0, 0.1, 0, 0, 0, 0])), "not_unit 1.00498756"),
     ("euler", set_to("TransformParameters", np.array([np.inf, 0, 0, 0, 0, 0])), "not_finite"),
-    ("composite", renumbered, "wrong_format"),
+    ("composite", lambda parent, _: parent.pop("2"), "wrong_format"),
     ("composite", no_composite, "several_transforms"),
 ]
 
@@ -234,7 +228,6 @@ WITHOUT = """
 import sys
 sys.modules["h5py"] = None  # as if it were not installed
 from pathlib import Path
-from puncture_twin.planning.formats.itk_transform import HEAP_HEAD_BYTES
 from puncture_twin.planning.formats.itk_transform import parse_transform
 parse_transform(b"x", Path("a.h5"))
 """

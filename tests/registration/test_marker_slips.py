@@ -1,10 +1,14 @@
-"""Slips that leave no residual, from outside: permuted names, half turns; refused by name, or flagged everywhere."""
+"""Slips that leave no residual, from outside: permuted names, half turns; refused by name, or flagged everywhere.
+
+The couch that a CT shows is held against the markers as a declared obstacle is: no needle comes through it.
+"""
 
 import json
 import shutil
 
 import numpy as np
 import pytest
+import SimpleITK as sitk  # noqa: N813
 import trimesh
 from case_world import (
     NEEDLE,
@@ -36,12 +40,13 @@ IN_FRONT = np.array([-450.0, 0.0, 100.0])
 """Where the target is in the base frame: the base stands 450 mm in front of the patient."""
 
 
-def on_skin(directions, center=LOPSIDED):
+def on_skin(directions, center=LOPSIDED, radii=RADII):
     """Where rays from the ellipsoid's centre leave it, LPS, mm."""
     directions = np.asarray(directions, float)
-    return center + directions / np.linalg.norm(directions / RADII, axis=1, keepdims=True)
+    return center + directions / np.linalg.norm(directions / radii, axis=1, keepdims=True)
 
 
+SKIN_MESH = {"mesh": "skin.stl", "unit": "mm", "space": "LPS"}
 FRONT = on_skin([[-0.9, -1, 0.3], [0.5, -1, 0.9], [0.1, -1, -0.8], [0.9, -0.7, 0.0], [-0.3, -1, 0.7]])
 """Five markers on the front, without a symmetry."""
 
@@ -58,14 +63,14 @@ def touched(points):
 
 @pytest.fixture
 def case(tmp_path):
-    """A function: a case with an ellipsoid for a body, and these markers."""
+    """A function: a case with an ellipsoid for a body, or one whose skin is found in a CT, and these markers."""
 
-    def make(points_ct, points_base, registration="", more="", center=LOPSIDED, space="LPS"):
+    def make(points_ct, points_base, registration="", more="", center=LOPSIDED, space="LPS", ct=False):
         here = tmp_path / f"case{len(list(tmp_path.iterdir()))}"
         here.mkdir()
         text = case_text(
             registration_section(registration),
-            structure("skin", "skin", {"mesh": "skin.stl", "unit": "mm", "space": "LPS"}),
+            structure("skin", "skin", {"ct": "scan.nii.gz"} if ct else SKIN_MESH),
             ORGAN,
             structure("rib", "avoid"),
             f"{more}\n[end]\nstructures = 3\n",
@@ -75,8 +80,11 @@ def case(tmp_path):
             needle=NEEDLE.replace("150", "180"),
         )
         (here / "case.toml").write_text(text)
-        body = trimesh.creation.icosphere(subdivisions=5)
-        trimesh.Trimesh(body.vertices * RADII + center, body.faces).export(here / "skin.stl")
+        if ct:
+            write_scan(here / "scan.nii.gz", center)
+        else:
+            body = trimesh.creation.icosphere(subdivisions=5)
+            trimesh.Trimesh(body.vertices * RADII + center, body.faces).export(here / "skin.stl")
         write_balls(here, "organ", "rib")
         write_markers(here, points_file(points_ct), points_file(points_base))
         return here
@@ -256,3 +264,62 @@ def test_residuals_that_the_case_accepts_are_flagged_everywhere(case, capfd):
     assert report["fle_mm"] == pytest.approx(0.3 * report["noise_scale"])
     assert any("accepted by the case" in flag for flag in report["flags"])
     assert any("does not explain" in one for one in warned(here))
+
+
+COUCHED = np.array([140.0, 90.0, 170.0])
+"""Radii of a body in a CT that shows the couch below it."""
+ON_FRONT = np.array([[-0.1, -1, 0.3], [0.3, -1, 0.2], [0.1, -1, -0.3], [-0.2, -1, -0.25]])
+BEHIND = "lies behind the couch that the CT shows"
+
+
+def write_scan(path, center, step_mm=5.0):
+    """An ellipsoid in air, and below it a couch of 10 mm; LPS."""
+    x, y, z = (np.arange(n) * step_mm - (n - 1) * step_mm / 2 for n in (84, 72, 90))
+    Z, Y, X = np.meshgrid(z, y, x, indexing="ij")
+    away = np.sqrt(sum(((axis - c) / r) ** 2 for axis, c, r in zip((X, Y, Z), center, COUCHED, strict=True)))
+    hu, top = np.where(away < 1, 40.0, -1000.0), center[1] + COUCHED[1] + 20.0
+    hu[(top < Y) & (top + 12.0 > Y) & (np.abs(X) < 200.0)] = 100.0
+    hu += np.random.default_rng(5).normal(0, 10, hu.shape)
+    image = sitk.GetImageFromArray(hu.astype(np.int16))
+    image.SetSpacing([step_mm] * 3)
+    image.SetOrigin([float(axis[0]) for axis in (x, y, z)])
+    sitk.WriteImage(image, str(path))
+
+
+def on_couch(case, directions, center=(0.0, 0.0, 0.0), signs=(1, 1, 1)):
+    """A case of markers on a body on a couch, whose list in the CT has these signs."""
+    points = on_skin(directions, np.array(center), COUCHED)
+    return case(points * signs, touched(points), "accept_symmetry = true", center=center, ct=True)
+
+
+def of_readings(here):
+    return [one for one in warned(here) if "negated" in one or "behind" in one]
+
+
+def test_markers_that_lie_on_the_couch_are_refused_with_every_reading_that_fits(case, capfd):
+    """A round body: the skin tells nothing, and the list was taken with a warning. Two half turns explain it."""
+    here = on_couch(case, ON_FRONT, signs=(-1, -1, 1))
+    for command in (["register", here], ["search", here, "--no-arm", "--out", here / "out"]):
+        line = refused_command(command, capfd, "other_axes")
+        assert BEHIND in line and "with x and y negated" in line and "or with y and z negated" in line
+        assert "x and z negated" not in line and "where no needle can touch it" in line
+    assert not (here / "out").exists()
+
+
+def test_of_two_half_turns_the_one_that_lies_off_the_skin_is_not_named(case, capfd):
+    """The body lies higher in the image, so y and z negated is in the air: it was named where its rms was less."""
+    command = ["register", on_couch(case, ON_FRONT, (0.0, 0.0, 40.0), (-1, -1, 1))]
+    assert "y and z negated" not in refused_command(command, capfd, "other_axes", BEHIND, "with x and y negated")
+
+
+def test_markers_on_the_front_are_not_doubted_for_readings_behind_the_couch(case):
+    """Of the three half turns the one that stays on the front is left."""
+    found = of_readings(on_couch(case, ON_FRONT))
+    assert len(found) == 1 and "markers_ct with x and z negated" in found[0]
+
+
+def test_markers_on_the_back_that_no_half_turn_explains_are_a_warning(case):
+    """A patient who was turned over: said, not refused, since nothing is certain."""
+    found = of_readings(on_couch(case, ON_FRONT * [1, -1, 1], (40.0, -45.0, 30.0)))
+    assert [one[:8] for one in found if BEHIND in one] == ["marker A", "marker C", "marker D"]  # B lies at the side
+    assert len(found) == 3

@@ -27,7 +27,7 @@ def markers(seed, noise_mm=0.4, moved=None, by_mm=0.0):
 
 
 def odd(pairs, fle_mm=None):
-    return outlier_marker(fit_rigid, pairs.names, pairs.points_ct, pairs.points_base, fle_mm)
+    return outlier_marker(pairs, fle_mm)
 
 
 @pytest.mark.parametrize("moved", range(6))
@@ -63,7 +63,7 @@ def test_tiny_residuals_and_few_markers_name_nobody():
     pairs = markers(1, moved=1, by_mm=8.0)
     assert odd(MarkerPairs(NAMES[:3], pairs.points_ct[:3], pairs.points_base[:3])) is None
     row = np.array([[0.0, 0, 0], [50, 0, 0], [100, 0, 0], [40, 80, 0]])
-    assert outlier_marker(fit_rigid, NAMES[:4], row, row + [0, 0, 1.0], None) is None
+    assert outlier_marker(MarkerPairs(NAMES[:4], row, row + [0, 0, 1.0]), None) is None
 
 
 def test_a_refusal_names_it_too():

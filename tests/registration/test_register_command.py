@@ -33,13 +33,11 @@ def test_two_lists_register_without_a_case(capfd):
     ]
     ras = printed(capfd, *LISTS, "--target=90,10,60", "--space", "RAS")
     assert not np.allclose(ras["T_base_ct"], found["T_base_ct"])  # the CT's list is in the stated space too
-
-
-def test_two_lists_print_no_empty_row_and_no_empty_section(capfd):
-    """A row of empty brackets and a heading without a line stood there."""
     assert main(["register", *LISTS, TARGET]) == OK
     said = capfd.readouterr().out
-    assert "FRE" in said and "()" not in said and "error budget" not in said
+    assert (
+        "FRE" in said and "()" not in said and "error budget" not in said
+    )  # no row of empty brackets, no heading alone
 
 
 @pytest.mark.parametrize("fle", [None, 0.5])

@@ -85,8 +85,10 @@ def test_small_residuals_do_not_mean_a_small_error():
     assert np.linalg.norm(apply(found.T_base_ct, TARGET) - TABLE_4["M"]) > 2.4
 
 
-@pytest.mark.parametrize(("method", "code"), [("affine", "method_bends"), ("triad", "wrong_count")])
-def test_no_affine_fit_and_no_triad_of_four(method, code):
+@pytest.mark.parametrize(
+    ("method", "code"), [("affine", "method_bends"), ("triad", "wrong_count"), ("weighted", "method_without_errors")]
+)
+def test_no_affine_fit_no_triad_of_four_and_no_weights_without_a_declaration(method, code):
     with refused(code):
         register(pairs(MARKERS, MARKERS), method=method, target_ct=TARGET)
 

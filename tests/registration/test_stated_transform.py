@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import SimpleITK
-from case_world import CASE, MARKERS, changed, registration_section, write_case
+from case_world import CASE, changed, registration_section, write_case
 from refusals import refused
 
 from puncture_twin.planning.anatomy.anatomy import load_skin
@@ -137,16 +137,3 @@ def test_keys_of_a_transform_need_one(tmp_path):
     write_case(tmp_path, text=changed(CASE, (registration_section(), registration_section('base_axes = "LPS"'))))
     with refused("key_not_of_it"):
         load_case(tmp_path)
-
-
-def test_the_same_place_gives_the_same_answers(tmp_path):
-    """By markers without error and by the transform between both, the search says the same of every direction."""
-    base = apply(T_BASE_CT, POINTS)
-    rows = [f"{name},{x!r},{y!r},{z!r}" for name, (x, y, z) in zip("ABCD", base.tolist(), strict=True)]
-    write_case(tmp_path)
-    (tmp_path / "touch.csv").write_text("\n".join(["name,x_mm,y_mm,z_mm", *rows, ""]))
-    assert MARKERS.count("\n") == len(rows) + 1
-    by_markers = load_placement(load_case(tmp_path)).T_base_ct
-    itk_file(tmp_path, T_BASE_CT)
-    stated = load_placement(load_case(stating(tmp_path))).T_base_ct
-    assert by_markers == pytest.approx(stated, abs=1e-9)

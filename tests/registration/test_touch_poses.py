@@ -5,7 +5,8 @@ import numpy as np
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import singularity
 from puncture_twin.planning.arm.ur import ur_model
-from puncture_twin.planning.registration.fit_uncertainty import touching_configuration, touching_poses
+from puncture_twin.planning.geometry.rigid import frame_about, pose
+from puncture_twin.planning.registration.fit_uncertainty import touching_configuration
 
 UR3 = ur_model("ur3")
 NEEDLE_MM = 200.0
@@ -32,16 +33,11 @@ def test_no_other_configuration_of_the_least_tilt_is_farther_from_singular():
     equals = 0
     for point in points(20, seed=2):
         q = touching_configuration(UR3, NEEDLE_MM, point, DOWN)
-        [T] = touching_poses(NEEDLE_MM, point, DOWN, 0.0)
-        every = inverse_within(T)
+        every = inverse(UR3, pose(frame_about(DOWN), point - NEEDLE_MM * DOWN))[0]
+        every = every[UR3.within_limits(every)]
         if not len(every) or singularity(UR3, every).least().max() < 0.05:
             continue
         least = singularity(UR3, every).least()
         assert singularity(UR3, q).least() >= least.max() - 1e-9
         equals += np.sum(least > least.max() - 1e-9) > 1
     assert equals > 5
-
-
-def inverse_within(T):
-    q = inverse(UR3, T)[0]
-    return q[UR3.within_limits(q)]

@@ -1,7 +1,5 @@
 """Where the patient truly lies: from a file of true positions, drawn from marker errors, or as believed."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from bare_case import bare_case
@@ -10,7 +8,7 @@ from refusals import refused
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.base.provenance import InputFiles
-from puncture_twin.planning.case.case import Case, load_case
+from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.settings import RobotSettings
 from puncture_twin.planning.case.tables import MarkerSection, RehearsalSection
 from puncture_twin.planning.geometry.rigid import apply
@@ -25,7 +23,7 @@ NAMES = ("A", "B", "C", "D", "E")
 TARGET = np.array([50.0, 130, 63])
 
 
-def pose(seed: int) -> np.ndarray:
+def pose(seed):
     rng = np.random.default_rng(seed)
     T = np.eye(4)
     T[:3, :3] = Rotation.random(rng=rng).as_matrix()
@@ -33,19 +31,19 @@ def pose(seed: int) -> np.ndarray:
     return T
 
 
-def write_points(path: Path, names: tuple[str, ...], points: np.ndarray) -> None:
+def write_points(path, names, points):
     rows = [f"{name},{x:.9f},{y:.9f},{z:.9f}" for name, (x, y, z) in zip(names, points, strict=True)]
     path.write_text("\n".join(["name,x_mm,y_mm,z_mm", *rows]) + "\n")
 
 
-def files_in(folder: Path) -> InputFiles:
+def files_in(folder):
     files = InputFiles(folder)
     for path in sorted(folder.glob("*.csv")):
         files.add(path.stem, path.name, path.read_bytes())
     return files
 
 
-def case(folder: Path, *, markers: bool = True, method: str = "rigid", **rehearsal: object) -> Case:
+def case(folder, *, markers=True, method="rigid", **rehearsal):
     """A case with the carton's markers; target M."""
     registration = None
     if markers:

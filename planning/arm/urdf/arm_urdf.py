@@ -66,13 +66,10 @@ def _mesh(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> Tr
     if shape.kind == "mesh":
         return _file(shape, document, here, read)
     if shape.kind == "box":
-        corners = np.array(list(product((-0.5, 0.5), repeat=3))) * shape.size
-    elif shape.kind == "cylinder":
-        radius, length = shape.size
-        corners = _about(radius, length)
-    else:
-        corners = _about(shape.size[0], 2.0 * shape.size[0])
-    return _hull(corners)
+        return hull(np.array(list(product((-0.5, 0.5), repeat=3))) * shape.size)
+    # of a sphere the prism is that about its cylinder
+    radius, half = shape.size[0], shape.size[1] / 2.0 if shape.kind == "cylinder" else shape.size[0]
+    return hull(ring_corners(radius / math.cos(math.pi / ROUND_SIDES), ROUND_SIDES, (-half, half)))
 
 
 def _file(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> TriangleMesh:
@@ -88,18 +85,19 @@ def _file(shape: UrdfShape, document: UrdfDocument, here: str, read: Read) -> Tr
         raise InputError(what, where=here, allowed=allowed, code=error.code) from error
 
 
-def _about(radius: float, length: float) -> Floats:
-    """Corners of the prism about a cylinder along z, mm; the one about a sphere is that of its cylinder."""
-    turn = np.linspace(0.0, 2.0 * np.pi, ROUND_SIDES, endpoint=False)
-    ring = radius / math.cos(math.pi / ROUND_SIDES) * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-length / 2.0, length / 2.0)])
+def ring_corners(radius_mm: float, sides: int, heights_mm: tuple[float, float]) -> Floats:
+    """Corners of a prism of a regular polygon about z, between two heights: shape (2 ``sides``, 3), mm."""
+    turn = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
+    ring = radius_mm * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return np.concatenate([np.insert(ring, 2, z, axis=1) for z in heights_mm])
 
 
-def _hull(corners: Floats) -> TriangleMesh:
+def hull(points: Floats) -> TriangleMesh:
+    """The convex hull of points (n, 3) that do not lie in one plane, mm."""
     import trimesh  # here: it costs a third of a second, and few need it
 
-    hull = trimesh.convex.convex_hull(corners)
-    return TriangleMesh(np.asarray(hull.vertices), np.asarray(hull.faces))
+    found = trimesh.convex.convex_hull(points)
+    return TriangleMesh(np.asarray(found.vertices), np.asarray(found.faces))
 
 
 FLANGE = "tool0"
@@ -108,21 +106,18 @@ FLANGE = "tool0"
 
 @dataclass(frozen=True, eq=False)
 class ArmUrdf:
-    """A URDF that was found to be of an arm built as a UR.
-
-    Attributes:
-        chain: The document's six joints and seven bodies.
-        lengths_mm: d1, a2, a3, d4, d5, d6.
-        T_base_root: Shape (4, 4), mm: the URDF's root in the controller's base frame.
-        shapes: Of each of the seven bodies, in its own frame.
-    """
+    """A URDF that was found to be of an arm built as a UR."""
 
     text: bytes
     document: UrdfDocument
     chain: ArmChain
+    """The document's six joints and seven bodies."""
     lengths_mm: tuple[float, ...]
+    """d1, a2, a3, d4, d5, d6."""
     T_base_root: Floats
+    """Shape (4, 4), mm: the URDF's root in the controller's base frame."""
     shapes: tuple[tuple[BodyShape, ...], ...]
+    """Of each of the seven bodies, in its own frame."""
 
     @property
     def where(self) -> Path:
@@ -133,11 +128,6 @@ class ArmUrdf:
     def root(self) -> str:
         """Name of the root link."""
         return self.chain.bodies[0][0].link.name
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the six joints, as ROS has them."""
-        return tuple(joint.name for joint in self.chain.joints)
 
     def body_poses(self, q: Floats) -> Floats:
         """T_base_body of the seven bodies at a configuration (6,), rad, shape (7, 4, 4), mm, by the URDF's chain."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -53,70 +53,58 @@ Named = TypeVar("Named", bound="UrdfLink | UrdfJoint")
 
 @dataclass(frozen=True, eq=False)
 class UrdfShape:
-    """One collision shape of a link.
-
-    Attributes:
-        kind: One of ``SHAPES``.
-        T_link_shape: Shape (4, 4), mm.
-        address: Of a mesh, as the URDF states it; else "".
-        size: Factors of a mesh's axes (3,); a box's edges (3,), a cylinder's radius and length (2,), a sphere's radius
-            (1,), mm.
-    """
+    """One collision shape of a link."""
 
     kind: str
+    """One of ``SHAPES``."""
     T_link_shape: Floats
+    """Shape (4, 4), mm."""
     address: str
+    """Of a mesh, as the URDF states it; else ""."""
     size: Floats
+    """Factors of a mesh's axes (3,); a box's edges (3,), a cylinder's radius and length (2,), a sphere's radius (1,),
+    mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class UrdfLink:
-    """One link.
-
-    Attributes:
-        collisions: What it is made of for contacts.
-        drawn: Whether it has a visual shape.
-        weighs: Whether it states a mass and a tensor of inertia that physics can use.
-    """
+    """One link."""
 
     name: str
     collisions: tuple[UrdfShape, ...]
+    """What it is made of for contacts."""
     drawn: bool
+    """Whether it has a visual shape."""
     weighs: bool
+    """Whether it states a mass and a tensor of inertia that physics can use."""
 
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """One joint.
-
-    Attributes:
-        kind: One of ``JOINTS``.
-        T_parent_child: Shape (4, 4), mm, at the angle zero.
-        axis: Shape (3,), unit, in the child's frame.
-        limits: Those of ``LIMITS`` that are stated: rad, rad/s, N m.
-    """
+    """One joint."""
 
     name: str
     kind: str
+    """One of ``JOINTS``."""
     parent: str
     child: str
     T_parent_child: Floats
+    """Shape (4, 4), mm, at the angle zero."""
     axis: Floats
+    """Shape (3,), unit, in the child's frame."""
     limits: Mapping[str, float]
+    """Those of ``LIMITS`` that are stated: rad, rad/s, N m."""
 
 
 @dataclass(frozen=True, eq=False)
 class UrdfDocument:
-    """A whole URDF.
-
-    Attributes:
-        links: By name, in the file's order.
-        joints: In the file's order.
-    """
+    """A whole URDF."""
 
     name: str
     links: Mapping[str, UrdfLink]
+    """By name, in the file's order."""
     joints: tuple[UrdfJoint, ...]
+    """In the file's order."""
     where: Path
 
 
@@ -191,20 +179,21 @@ def _shape(element: Element, here: str) -> UrdfShape:
             refuse(f"<{kind}> without {key}", here, ", ".join(SHAPES[kind]), "missing_key")
     T = _origin(element, here)
     if kind == "mesh":
-        return UrdfShape(kind, T, shape.get("filename", ""), _scale(shape, here))
+        scale = _numbers(shape, "scale", 3, here) if "scale" in shape.attrib else np.ones(3)
+        if not (scale > 0.0).all():
+            what = f'scale="{shape.get("scale")}" mirrors or flattens the mesh'
+            refuse(what, here, "three factors above 0", "mirrored")
+        return UrdfShape(kind, T, shape.get("filename", ""), scale)
     counts = {"size": 3}
     size = MM_PER_M * np.concatenate([_numbers(shape, key, counts.get(key, 1), here) for key in SHAPES[kind]])
     if not ((size > 0.0) & (size <= MOST_SIZE_MM)).all():
-        refuse(f"<{kind}> of {_listed(size)} mm", here, f"above 0, at most {MOST_SIZE_MM:g} mm", "out_of_range")
+        refuse(
+            f"<{kind}> of {', '.join(f'{value:g}' for value in size)} mm",
+            here,
+            f"above 0, at most {MOST_SIZE_MM:g} mm",
+            "out_of_range",
+        )
     return UrdfShape(kind, T, "", size)
-
-
-def _scale(mesh: Element, here: str) -> Floats:
-    """The factors (3,) by which a mesh is stretched."""
-    scale = _numbers(mesh, "scale", 3, here) if "scale" in mesh.attrib else np.ones(3)
-    if not (scale > 0.0).all():
-        refuse(f'scale="{mesh.get("scale")}" mirrors or flattens the mesh', here, "three factors above 0", "mirrored")
-    return scale
 
 
 def _joint(element: Element, where: Path) -> UrdfJoint:
@@ -215,22 +204,15 @@ def _joint(element: Element, where: Path) -> UrdfJoint:
     if element.find("mimic") is not None:
         refuse("it mimics another joint", here, "independent joints", "mimic_joint")
     parent, child = (_only(element, end, here).get("link", "") for end in ("parent", "child"))
-    axis = _axis(element, here)
-    limit = element.find("limit")
-    stated = (
-        {} if limit is None else {key: float(_numbers(limit, key, 1, here)[0]) for key in LIMITS if key in limit.attrib}
-    )
-    return UrdfJoint(name, kind, parent, child, _origin(element, here), axis, stated)
-
-
-def _axis(element: Element, here: str) -> Floats:
-    """The unit axis (3,) of a joint: x where none is stated, as URDF has it."""
-    stated = element.find("axis")
-    axis = np.array([1.0, 0.0, 0.0]) if stated is None else _numbers(stated, "xyz", 3, here)
+    stated_axis, limit = element.find("axis"), element.find("limit")
+    axis = np.array([1.0, 0.0, 0.0]) if stated_axis is None else _numbers(stated_axis, "xyz", 3, here)
     length = float(np.linalg.norm(axis))
     if length == 0.0:
         refuse("its axis is zero", here, "a direction", "zero_direction")
-    return np.asarray(axis / length)
+    stated = (
+        {} if limit is None else {key: float(_numbers(limit, key, 1, here)[0]) for key in LIMITS if key in limit.attrib}
+    )
+    return UrdfJoint(name, kind, parent, child, _origin(element, here), axis / length, stated)
 
 
 def _origin(element: Element, here: str) -> Floats:
@@ -267,25 +249,11 @@ def _only(element: Element, tag: str, here: str) -> Element:
 def _numbers(element: Element, key: str, count: int, here: str) -> Floats:
     """The finite numbers of an attribute, shape (count,); refused where there are more or fewer."""
     text = element.get(key, "")
-    values = _parsed(text.split(), _number)
-    if values is None or len(values) != count or not all(map(math.isfinite, values)):
+    try:
+        values = [] if "_" in text else [float(word) for word in text.split()]  # Python alone takes 1_000 for a number
+    except ValueError:
+        values = []
+    if len(values) != count or not all(map(math.isfinite, values)):
         allowed = "a finite number" if count == 1 else f"{count} finite numbers"
         refuse(f'<{element.tag} {key}="{text}">', here, allowed, "not_a_number")
     return np.array(values)
-
-
-def _parsed(words: Sequence[str], parse: Callable[[str], float]) -> list[float] | None:
-    try:
-        return [parse(word) for word in words]
-    except ValueError:
-        return None
-
-
-def _number(word: str) -> float:
-    if "_" in word:  # Python takes 1_000 for a number; nobody else does
-        raise ValueError(word)
-    return float(word)
-
-
-def _listed(values: Floats) -> str:
-    return ", ".join(f"{value:g}" for value in values)

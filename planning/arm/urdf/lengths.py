@@ -83,7 +83,12 @@ def ur_lengths(chain: ArmChain, document: UrdfDocument, T_base_root: Floats | No
     axes = _axes(chain)
     T_base_root = _base(chain, axes, document) if T_base_root is None else T_base_root
     axes = axes.moved(T_base_root)
-    _check_directions(chain, axes, document)
+    for joint, (direction, wanted) in enumerate(zip(axes.directions, DIRECTIONS, strict=True)):
+        if np.linalg.norm(direction - wanted) > SQUARE_RAD:
+            x, y, z = np.round(direction, 4) + 0.0
+            as_ur = ", ".join(f"{value:g}" for value in wanted)
+            what = f"points along ({x:g}, {y:g}, {z:g}) of the base at angle zero; a UR's points along ({as_ur})"
+            raise _other(chain, joint, what, document)
     p, flange = axes.points, axes.T_flange
     d1, d4, fifth = p[1, 2], -p[4, 1], p[5, 2]
     a2, a3, d5, d6 = p[2, 0], p[3, 0] - p[2, 0], d1 - fifth, -flange[1, 3] - d4
@@ -127,16 +132,6 @@ def _base(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> Floats:
     return T
 
 
-def _check_directions(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
-    """Refuse an axis that points otherwise than a UR's at the angle zero."""
-    for joint, (direction, wanted) in enumerate(zip(axes.directions, DIRECTIONS, strict=True)):
-        if np.linalg.norm(direction - wanted) > SQUARE_RAD:
-            x, y, z = np.round(direction, 4) + 0.0
-            as_ur = ", ".join(f"{value:g}" for value in wanted)
-            what = f"points along ({x:g}, {y:g}, {z:g}) of the base at angle zero; a UR's points along ({as_ur})"
-            raise _other(chain, joint, what, document)
-
-
 def _check_places(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
     """Refuse an axis that passes elsewhere than a UR's of these lengths; along itself it may begin anywhere."""
     p, T = axes.points, axes.T_flange
@@ -145,7 +140,8 @@ def _check_places(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
     for joint, place in wanted.items():
         off = [0.0 if want is None else float(at - want) for at, want in zip(p[joint], place, strict=True)]
         if np.linalg.norm(off) > OFF_MM:
-            what = f"passes {np.linalg.norm(off):.4g} mm away from a UR's axis, by ({_mm(off)}) mm in the base"
+            by = ", ".join(f"{value:.4g}" for value in off)
+            what = f"passes {np.linalg.norm(off):.4g} mm away from a UR's axis, by ({by}) mm in the base"
             raise _other(chain, joint, what, document)
     off = [float(T[0, 3] - p[3, 0]), 0.0, float(T[2, 3] - p[5, 2])]
     off_angle = rotation_angle(R_BASE_FLANGE.T @ T[:3, :3])
@@ -157,17 +153,9 @@ def _check_places(chain: ArmChain, axes: _Axes, document: UrdfDocument) -> None:
         refuse(what, document.where, f"a link like a UR's tool0; {AS_UR}", "arm_not_as_ur")
 
 
-def _mm(off: list[float]) -> str:
-    return ", ".join(f"{value:.4g}" for value in off)
-
-
 def _other(chain: ArmChain, joint: int, what: str, document: UrdfDocument) -> InputError:
-    return InputError(
-        f"axis {joint + 1} ('{chain.joints[joint].name}') {what}",
-        where=document.where,
-        allowed=AS_UR,
-        code="arm_not_as_ur",
-    )
+    said = f"axis {joint + 1} ('{chain.joints[joint].name}') {what}"
+    return InputError(said, where=document.where, allowed=AS_UR, code="arm_not_as_ur")
 
 
 MOST_RAD = 4.0 * math.pi
@@ -212,7 +200,8 @@ def urdf_limits(joints: tuple[UrdfJoint, ...], stated: StatedLimits, where: Path
     angles, speeds, torques = np.empty((6, 2)), np.empty(6), np.empty(6)
     for row, joint in enumerate(joints):
         here = f"{where}: joint '{joint.name}'"
-        angles[row] = (-MOST_RAD, MOST_RAD) if _unlimited(joint, stated) else _angles(joint, here)
+        lacking = joint.kind == "continuous" or not {"lower", "upper"} <= set(joint.limits)
+        angles[row] = (-MOST_RAD, MOST_RAD) if stated.angles is not None and lacking else _angles(joint, here)
         speeds[row] = _above_zero(joint, "velocity", here, "rad/s", MOST_RAD_S)
         torques[row] = _above_zero(joint, "effort", here, "N m", math.inf)
     return JointLimits(angles, speeds, torques)
@@ -245,11 +234,6 @@ def narrowed(known: JointLimits, stated: StatedLimits, where: str) -> JointLimit
     return JointLimits(angles, speeds, known.torques)
 
 
-def _unlimited(joint: UrdfJoint, stated: StatedLimits) -> bool:
-    """Whether a joint's limits come from the case alone."""
-    return stated.angles is not None and (joint.kind == "continuous" or not {"lower", "upper"} <= set(joint.limits))
-
-
 def _angles(joint: UrdfJoint, here: str) -> tuple[float, float]:
     if joint.kind == "continuous":
         refuse("it is continuous, without limits", here, "revolute, or [robot.limits]", "missing_limits")
@@ -280,35 +264,29 @@ TURNING = ("revolute", "continuous")
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """A link of one of the arm's seven rigid bodies, with what is fixed to it.
-
-    Attributes:
-        T_body_link: Shape (4, 4), mm, in the frame of the body's first link.
-    """
+    """A link of one of the arm's seven rigid bodies, with what is fixed to it."""
 
     link: UrdfLink
     T_body_link: Floats
+    """Shape (4, 4), mm, in the frame of the body's first link."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArmChain:
-    """An arm as a chain of seven rigid bodies.
-
-    Attributes:
-        joints: The six joints, from the base on.
-        T_body_joint: Shape (6, 4, 4), mm: each joint's frame at the angle zero, in that of the body before it.
-        bodies: For each of the seven bodies its links: the one that the joint moves (or the root) first.
-        flange: The link in whose frame the needle is mounted.
-        T_body_flange: Shape (4, 4), mm, in the frame of the last body.
-        beyond: Names of links that are fixed to the flange.
-    """
+    """An arm as a chain of seven rigid bodies."""
 
     joints: tuple[UrdfJoint, ...]
+    """The six joints, from the base on."""
     T_body_joint: Floats
+    """Shape (6, 4, 4), mm: each joint's frame at the angle zero, in that of the body before it."""
     bodies: tuple[tuple[Member, ...], ...]
+    """For each of the seven bodies its links: the one that the joint moves (or the root) first."""
     flange: str
+    """The link in whose frame the needle is mounted."""
     T_body_flange: Floats
+    """Shape (4, 4), mm, in the frame of the last body."""
     beyond: frozenset[str]
+    """Names of links that are fixed to the flange."""
 
     def body_poses(self, T_base_root: Floats, q: Floats) -> Floats:
         """T_base_body of the seven bodies at a configuration (6,), rad, shape (7, 4, 4), mm."""
@@ -329,8 +307,8 @@ def arm_chain(document: UrdfDocument, flange: str) -> ArmChain:
         allowed = f"[robot] flange, one of {', '.join(document.links)}"
         refuse(f"there is no link '{flange}' to be the flange", where, allowed, "unknown_link")
     above = _parents(document)
-    path = _path(above, flange, document)
-    turning = [joint for joint in path if joint.kind != "fixed"]
+    links = reversed([flange, *_ancestors(above, flange)])
+    turning = [above[name] for name in links if name in above and above[name].kind != "fixed"]
     for joint in document.joints:
         if joint.kind != "fixed" and joint not in turning:
             what = f"joint '{joint.name}' ({joint.kind}) moves a part outside the chain to the flange '{flange}'"
@@ -366,12 +344,6 @@ def _ancestors(above: Mapping[str, UrdfJoint], name: str) -> list[str]:
         name = above[name].parent
         found.append(name)
     return found
-
-
-def _path(above: Mapping[str, UrdfJoint], flange: str, document: UrdfDocument) -> list[UrdfJoint]:
-    """The joints from the root to the flange."""
-    links = [flange, *_ancestors(above, flange)]
-    return [above[name] for name in reversed(links) if name in above]
 
 
 def _bodies(

@@ -26,20 +26,18 @@ class Blocks:
 
     A node is a thick disc: for every point p of its triangles |(p - c) . n| <= h, and p is within rho of the axis
     through c along n. Level 0 holds the blocks; node j of a level holds nodes 16 j to 16 j + 15 of the level below.
-
-    Attributes:
-        triangles: Shape (16 b, 9), corners in block order, mm; the last block is filled up with its last triangle.
-        local: Shape (b, 9, 16), float32, the same corners relative to their block's centre.
-        center: Shape (nodes, 3), c, all levels one after the other, mm.
-        disc: Shape (5, nodes), float32, the normal n, rho and h, rounded outward.
-        base: Shape (levels,), the group of 16 with which each level starts; levels fill whole groups.
     """
 
     triangles: Floats
+    """Shape (16 b, 9), corners in block order, mm; the last block is filled up with its last triangle."""
     local: NDArray[np.float32]
+    """Shape (b, 9, 16), float32, the same corners relative to their block's centre."""
     center: Floats
+    """Shape (nodes, 3), c, all levels one after the other, mm."""
     disc: NDArray[np.float32]
+    """Shape (5, nodes), float32, the normal n, rho and h, rounded outward."""
     base: NDArray[np.int64]
+    """Shape (levels,), the group of 16 with which each level starts; levels fill whole groups."""
 
     @property
     def nbytes(self) -> int:
@@ -128,7 +126,6 @@ def block_discs(triangles, local, center, disc):  # type: ignore[no-untyped-def]
 
 @allocation_free(nogil=True)
 def _middle_of_box(corners):  # type: ignore[no-untyped-def]  # numba infers
-    """Middle of the box about a block's corners."""
     return _middle_of(corners, 0), _middle_of(corners, 1), _middle_of(corners, 2)
 
 
@@ -178,7 +175,6 @@ def _mean_normal(corners):  # type: ignore[no-untyped-def]  # numba infers
 
 @allocation_free(nogil=True)
 def _normal(a):  # type: ignore[no-untyped-def]  # numba infers
-    """Normal of a triangle, twice its area long."""
     dx, dy, dz, ex, ey, ez = a[3] - a[0], a[4] - a[1], a[5] - a[2], a[6] - a[0], a[7] - a[1], a[8] - a[2]
     return dy * ez - dz * ey, dz * ex - dx * ez, dx * ey - dy * ex
 

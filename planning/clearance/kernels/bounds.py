@@ -209,14 +209,12 @@ def tighten_upper_bounds(frames, lanes, corners, length, error, upper):  # type:
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def _clamped(t, length):  # type: ignore[no-untyped-def]  # numba infers
-    """A depth, clamped to 0..length."""
     t = t if t > ZERO else ZERO
     return t if t < length else length
 
 
 @nb.njit(cache=True, fastmath=FAST, error_model="numpy", forceinline=True)
 def _square(px, py, qx, qy):  # type: ignore[no-untyped-def]  # numba infers
-    """Squared distance of the origin from a segment of the plane."""
     dx, dy = qx - px, qy - py
     t = -(px * dx + py * dy) / (dx * dx + dy * dy + TINY)
     t = t if t > ZERO else ZERO

@@ -178,7 +178,6 @@ def nearest_triangle(triangles, nodes, base, target, slack):  # type: ignore[no-
 
 @nb.njit(cache=True, error_model="numpy")
 def _distance(triangles, row, target):  # type: ignore[no-untyped-def]  # numba infers
-    """Distance of a point from one triangle, as an axis of length 0, mm."""
     t, (x, y, z) = triangles[row], (target[0], target[1], target[2])
     a, b, c = (t[0] - x, t[1] - y, t[2] - z), (t[3] - x, t[4] - y, t[5] - z), (t[6] - x, t[7] - y, t[8] - z)
     return np.sqrt(axis_triangle((0.0, 0.0, 1.0), 0.0, a, b, c)[0])

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.clearance.kernels.lanes import LANES
-from puncture_twin.planning.clearance.kernels.segment_triangle import CONTACT_MM, LEAST, STACK, axis_triangle
+from puncture_twin.planning.clearance.kernels.segment_triangle import CONTACT_MM, LEAST, axis_triangle
 
 ROWS = 12
 """Rows of a buffer of pairs: nine coordinates, squared distance, depth, length of the axis."""
@@ -111,7 +110,6 @@ def _origin_triangle(a, b, c):  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _origin_edge(p, q):  # type: ignore[no-untyped-def]  # numba infers
-    """Squared distance of the origin from an edge."""
     d = _minus(q, p)
     t = -_inner(p, d) / (_inner(d, d) + LEAST)
     t = min(max(t, 0.0), 1.0)
@@ -145,37 +143,34 @@ APART = 8
 
 
 class Scratch(NamedTuple):
-    """Scratch arrays for one bundle of at most 16 directions.
-
-    Attributes:
-        blocks: Shape (r,), the blocks that may come near to some member of the bundle.
-        chosen: Shape (g, 10, 16), float32, the nodes of these blocks, in groups.
-        bounds: Shape (16 g, 16), float32, their bounds: of member m and group j in row m g' + j, g' groups being used.
-        stack: Shape (512, 2), groups of the tree that are still to visit, and their level.
-        frames: Shape (9, 16), each member's direction u, and e and f that complete it to a frame.
-        frames32: ``frames`` as float32.
-        upper: Shape (16,), float32, upper bound of each member's distance, mm.
-        pairs: Shape (64, 2), members, and rows of ``blocks``.
-        squares: Shape (64, 16), float32, squared distances of each pair's axis from its 16 triangles, mm^2.
-        least: Shape (64,), float32, the least of each pair's ``squares``.
-        errors: Shape (64,), float32, how much the root of a pair's ``squares`` may err, mm.
-        tried: Shape (1024, 2), members, and rows of triangles.
-        corners: Shape (12, 1032), see `measure_lateral`.
-    """
+    """Scratch arrays for one bundle of at most 16 directions."""
 
     blocks: NDArray[np.int64]
+    """Shape (r,), the blocks that may come near to some member of the bundle."""
     chosen: NDArray[np.float32]
+    """Shape (g, 10, 16), float32, the nodes of these blocks, in groups."""
     bounds: NDArray[np.float32]
+    """Shape (16 g, 16), float32, their bounds: of member m and group j in row m g' + j, g' groups being used."""
     stack: NDArray[np.int64]
+    """Shape (512, 2), groups of the tree that are still to visit, and their level."""
     frames: NDArray[np.float64]
+    """Shape (9, 16), each member's direction u, and e and f that complete it to a frame."""
     frames32: NDArray[np.float32]
+    """``frames`` as float32."""
     upper: NDArray[np.float32]
+    """Shape (16,), float32, upper bound of each member's distance, mm."""
     pairs: NDArray[np.int64]
+    """Shape (64, 2), members, and rows of ``blocks``."""
     squares: NDArray[np.float32]
+    """Shape (64, 16), float32, squared distances of each pair's axis from its 16 triangles, mm^2."""
     least: NDArray[np.float32]
+    """Shape (64,), float32, the least of each pair's ``squares``."""
     errors: NDArray[np.float32]
+    """Shape (64,), float32, how much the root of a pair's ``squares`` may err, mm."""
     tried: NDArray[np.int64]
+    """Shape (1024, 2), members, and rows of triangles."""
     corners: NDArray[np.float64]
+    """Shape (12, 1032), see `measure_lateral`."""
 
 
 class SearchOutput(NamedTuple):
@@ -188,36 +183,13 @@ class SearchOutput(NamedTuple):
 
 
 class NeedleAxes(NamedTuple):
-    """Start and length of the axes of a search.
-
-    Attributes:
-        target: Three numbers, where all start, mm.
-        length: Shape (n,), of each axis, in the bundles' order, mm.
-        longest: Length of the longest axis of the bundle, float32, mm.
-        slack: Rounding of a node's coordinate, float32, mm.
-    """
+    """Start and length of the axes of a search."""
 
     target: Any
+    """Three numbers, where all start, mm."""
     length: Any
+    """Shape (n,), of each axis, in the bundles' order, mm."""
     longest: Any
+    """Length of the longest axis of the bundle, float32, mm."""
     slack: Any
-
-
-def scratch_for(groups: int) -> Scratch:
-    """Scratch arrays for bundles that may have to test all of ``groups`` groups of blocks."""
-    size = groups + 1
-    return Scratch(
-        blocks=np.empty(size * LANES, np.int64),
-        chosen=np.empty((size, NODE_ROWS, LANES), np.float32),
-        bounds=np.empty((size * LANES, LANES), np.float32),
-        stack=np.empty((STACK, 2), np.int64),
-        frames=np.empty((9, LANES)),
-        frames32=np.empty((9, LANES), np.float32),
-        upper=np.empty(LANES, np.float32),
-        pairs=np.empty((PAIRS, 2), np.int64),
-        squares=np.empty((PAIRS, LANES), np.float32),
-        least=np.empty(PAIRS, np.float32),
-        errors=np.empty(PAIRS, np.float32),
-        tried=np.empty((PAIRS * LANES, 2), np.int64),
-        corners=np.empty((ROWS, PAIRS * LANES + APART)),
-    )
+    """Rounding of a node's coordinate, float32, mm."""

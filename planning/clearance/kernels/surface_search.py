@@ -12,13 +12,42 @@ from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.clearance.kernels.bounds import ZERO, disc_bounds, tighten_upper_bounds
 from puncture_twin.planning.clearance.kernels.bundle_search import FOUR, GROWN, direction, measure_bundle
 from puncture_twin.planning.clearance.kernels.lanes import LANES, bare, lanes_at_most, lowest_bit
-from puncture_twin.planning.clearance.kernels.side_by_side import NODE_ROWS, NeedleAxes, Scratch, SearchOutput
+from puncture_twin.planning.clearance.kernels.segment_triangle import STACK
+from puncture_twin.planning.clearance.kernels.side_by_side import (
+    APART,
+    NODE_ROWS,
+    PAIRS,
+    ROWS,
+    NeedleAxes,
+    Scratch,
+    SearchOutput,
+)
 
 BEHIND = np.float32(-1e6)
 """Radius of the lanes that only fill up the last group of blocks: `disc_bounds` takes them as behind the target, mm."""
 
 COUNTED = ("bundles", "nodes", "blocks found", "axes", "filters", "block tests", "triangle tests")
 """What `search_bundles` counts: how often it does each of its steps; a node and a filter are 16 discs."""
+
+
+def scratch_for(groups: int) -> Scratch:
+    """Scratch arrays for bundles that may have to test all of ``groups`` groups of blocks."""
+    size = groups + 1
+    return Scratch(
+        blocks=np.empty(size * LANES, np.int64),
+        chosen=np.empty((size, NODE_ROWS, LANES), np.float32),
+        bounds=np.empty((size * LANES, LANES), np.float32),
+        stack=np.empty((STACK, 2), np.int64),
+        frames=np.empty((9, LANES)),
+        frames32=np.empty((9, LANES), np.float32),
+        upper=np.empty(LANES, np.float32),
+        pairs=np.empty((PAIRS, 2), np.int64),
+        squares=np.empty((PAIRS, LANES), np.float32),
+        least=np.empty(PAIRS, np.float32),
+        errors=np.empty(PAIRS, np.float32),
+        tried=np.empty((PAIRS * LANES, 2), np.int64),
+        corners=np.empty((ROWS, PAIRS * LANES + APART)),
+    )
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -69,7 +98,6 @@ def search_bundles(  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _bare_scratch(s):  # type: ignore[no-untyped-def]  # numba infers
-    """The scratch arrays without their reference counts."""
     return Scratch(
         bare(s.blocks), bare(s.chosen), bare(s.bounds), bare(s.stack), bare(s.frames), bare(s.frames32), bare(s.upper),
         bare(s.pairs), bare(s.squares), bare(s.least), bare(s.errors), bare(s.tried), bare(s.corners),
@@ -78,13 +106,11 @@ def _bare_scratch(s):  # type: ignore[no-untyped-def]  # numba infers
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _bare_found(f):  # type: ignore[no-untyped-def]  # numba infers
-    """The output arrays without their reference counts."""
     return SearchOutput(bare(f.square), bare(f.depth), bare(f.triangle), bare(f.counts))
 
 
 @nb.njit(cache=True, error_model="numpy", forceinline=True)
 def _single(u):  # type: ignore[no-untyped-def]  # numba infers
-    """Three numbers as float32."""
     return np.float32(u[0]), np.float32(u[1]), np.float32(u[2])
 
 

@@ -110,7 +110,6 @@ def _beyond_plane(t, line, reach):
 
 @allocation_free()
 def _mean(corners, begin, end):
-    """The mean of some rows of corners (n, 3), as three numbers."""
     x, y, z, count = 0.0, 0.0, 0.0, end - begin
     for row in range(begin, end):
         x, y, z = x + corners[row, 0] / count, y + corners[row, 1] / count, z + corners[row, 2] / count

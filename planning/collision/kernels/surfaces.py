@@ -29,7 +29,6 @@ STACK = 64
 
 @allocation_free(inline="always")
 def _to_box(low, high, x, y, z):
-    """Squared distance of a point to an axis-aligned box."""
     dx = max(low[0] - x, 0.0, x - high[0])
     dy = max(low[1] - y, 0.0, y - high[1])
     dz = max(low[2] - z, 0.0, z - high[2])

@@ -1,6 +1,1 @@
-"""Errors of markers that residuals cannot show: permuted names, slipped axes, markers off the skin.
-
-And what a stated transform, which has no residuals, is held against.
-
-It doubts a registration and never changes one.
-"""
+"""Errors of markers and of stated transforms that residuals cannot show; a registration is doubted, never changed."""

@@ -49,21 +49,18 @@ ALLOWED = "a transform between this CT and this robot's base, with transform_map
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """The transform that the file would state under some of its keys.
-
-    Attributes:
-        keys: Those that differ from the case's; empty as stated.
-        T_base_ct: Shape (4, 4), mm.
-        rests_on: The obstacle of frame ``base`` that the patient lies on, or empty.
-        tilt: Between the robot's z axis and up, rad.
-    """
+    """The transform that the file would state under some of its keys."""
 
     keys: str
+    """Those that differ from the case's; empty as stated."""
     T_base_ct: Floats
+    """Shape (4, 4), mm."""
     impossible: str
     unlikely: str
     rests_on: str
+    """The obstacle of frame ``base`` that the patient lies on, or empty."""
     tilt: float
+    """Between the robot's z axis and up, rad."""
 
     @property
     def plausible(self) -> bool:
@@ -71,14 +68,9 @@ class Reading:
         return not self.impossible and not self.unlikely
 
     @property
-    def upright(self) -> bool:
-        """Whether the arm is mounted upright, not hanging or on a wall."""
-        return self.tilt <= UPRIGHT
-
-    @property
     def usual(self) -> tuple[bool, bool]:
         """Whether it is usual: the patient lies on something, and the arm is mounted upright."""
-        return bool(self.rests_on), self.upright
+        return bool(self.rests_on), self.tilt <= UPRIGHT
 
     def better_than(self, other: Reading) -> bool:
         """Whether something speaks for it that does not for the other."""
@@ -117,19 +109,23 @@ def check_transform(
     if given.impossible:
         _refuse(case, f"{given.impossible}: {CAUSES}{_better(others)}")
     if registration is None:
-        yield from _unmeasured(case, given, others)
+        doubts, alike = _doubts(case, given, others)
+        as_plausible = "".join(f"; {one.sentence.removeprefix('registration: ')}" for one in alike)
+        said = f"registration: {NO_RESIDUALS.format(file=case.robot.transform)}{MARKERS_TELL}{as_plausible}"
+        yield from (Finding("transform_not_measured", Severity.WARNING, said), *doubts)
         return
     distinct = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
-    yield _held_against_markers(case, registration, given, others)
-    yield from (*_doubts(case, given, distinct), *_alike(case, given, distinct))
+    yield _held_against_markers(case, registration, given, distinct)
+    doubts, alike = _doubts(case, given, distinct)
+    yield from (*doubts, *alike)
 
 
 def _reading(case: Case, skin: TriangleMesh, keys: str, T_base_ct: Floats) -> Reading:
-    return Reading(keys, T_base_ct, *places.base_place(case, skin, T_base_ct), places.off_upright(case, T_base_ct))
+    tilt = float(np.arccos(np.clip(places.up_base(case, T_base_ct)[2], -1.0, 1.0)))  # pi for an arm that hangs
+    return Reading(keys, T_base_ct, *places.base_place(case, skin, T_base_ct), tilt)
 
 
 def _better(others: Sequence[Reading]) -> str:
-    """Which other readings nothing speaks against, as the end of a sentence."""
     plausible = [one for one in others if one.plausible]
     return f"; alternatives: {_named(plausible)}" if plausible else "; no other reading of these keys is plausible"
 
@@ -140,49 +136,31 @@ def _named(readings: Sequence[Reading]) -> str:
     return ", or ".join(f"{one.keys} ({one.text()})" for one in usual_first)
 
 
-def _unmeasured(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[Finding]:
-    """Warning of a transform without markers, which nothing measures; then the reasons to doubt it."""
-    alike = "".join(f"; {one.sentence.removeprefix('registration: ')}" for one in _alike(case, given, others))
-    said = f"registration: {NO_RESIDUALS.format(file=case.robot.transform)}{MARKERS_TELL}{alike}"
-    yield Finding("transform_not_measured", Severity.WARNING, said)
-    yield from _doubts(case, given, others)
-
-
-def _doubts(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[Finding]:
-    """What hardly is so as stated; else the other readings that are more usual."""
+def _doubts(case: Case, given: Reading, others: Sequence[Reading]) -> tuple[list[Finding], list[Finding]]:
+    """What hardly is so as stated, or the other readings that are more usual; else, apart, those as plausible."""
     if given.unlikely:
         said = f"registration: by the stated transform {given.unlikely}: {CAUSES}{_better(others)}"
-        yield Finding("transform_unlikely", Severity.WARNING, said)
-    elif better := [one for one in _rivals(given, others) if one.better_than(given) and not given.better_than(one)]:
+        return [Finding("transform_unlikely", Severity.WARNING, said)], []
+    rivals = [one for one in others if one.plausible and not np.allclose(one.T_base_ct, given.T_base_ct, atol=1e-6)]
+    if better := [one for one in rivals if one.better_than(given) and not given.better_than(one)]:
         said = (
             f"registration: {_named(better)} would be more usual than the stated keys ({given.text()}; place.up sets "
             f"which way is up): {CAUSES}"
         )
-        yield Finding("transform_unlikely", Severity.WARNING, said)
+        return [Finding("transform_unlikely", Severity.WARNING, said)], []
+    alike = [one for one in rivals if one.better_than(given) == given.better_than(one)]
+    away = [np.linalg.norm(apply(one.T_base_ct - given.T_base_ct, case.target_ct)) for one in alike]
+    named = ", ".join(f"{one.keys} ({mm:.0f} mm away)" for one, mm in zip(alike, away, strict=True))
+    said = (
+        "registration: the stated transform cannot be distinguished from other readings, which place the target "
+        f"elsewhere: {named}{BOX_TELLS}"
+    )
+    return [], [Finding("transform_alike", Severity.WARNING, said)] if alike else []
 
 
-def _alike(case: Case, given: Reading, others: Sequence[Reading]) -> Iterator[Finding]:
-    """The other readings that are as plausible as what is stated, where no other is more so."""
-    rivals = _rivals(given, others)
-    if given.unlikely or any(one.better_than(given) and not given.better_than(one) for one in rivals):
-        return
-    if alike := [one for one in rivals if one.better_than(given) == given.better_than(one)]:
-        away = [np.linalg.norm(apply(one.T_base_ct - given.T_base_ct, case.target_ct)) for one in alike]
-        named = ", ".join(f"{one.keys} ({mm:.0f} mm away)" for one, mm in zip(alike, away, strict=True))
-        said = (
-            "registration: the stated transform cannot be distinguished from other readings, which place the target "
-            "elsewhere: "
-            f"{named}{BOX_TELLS}"
-        )
-        yield Finding("transform_alike", Severity.WARNING, said)
-
-
-def _rivals(given: Reading, others: Sequence[Reading]) -> list[Reading]:
-    """Other readings that nothing speaks against, and that put the base elsewhere."""
-    return [one for one in others if one.plausible and not np.allclose(one.T_base_ct, given.T_base_ct, atol=1e-6)]
-
-
-def _held_against_markers(case: Case, registration: Registration, given: Reading, others: Sequence[Reading]) -> Finding:
+def _held_against_markers(
+    case: Case, registration: Registration, given: Reading, fitting: Sequence[Reading]
+) -> Finding:
     """How far the transform is from what the markers say: a warning where their errors do not explain it."""
     found = _apart(case, registration, given.T_base_ct)
     said = (
@@ -190,33 +168,23 @@ def _held_against_markers(case: Case, registration: Registration, given: Reading
         f"from the markers there: {found.expected_mm:.1f} mm (rms)"
     )
     if found.contradicts:
-        fitting = [one for one in others if not _apart(case, registration, one.T_base_ct).contradicts]
-        better = "".join(f"; with {one.keys} they agree" for one in fitting)
-        _refuse(case, f"{said}: {CAUSES}{better}")
-    doubt = ", more than their errors explain" if found.unexplained else ""
+        _refuse(case, f"{said}: {CAUSES}{''.join(f'; with {one.keys} they agree' for one in fitting)}")
+    unexplained = found.apart_mm > EXPLAINED * found.expected_mm
+    doubt = ", more than their errors explain" if unexplained else ""
     said = f"registration: stated transform: {said}{doubt}; the transform's own expected error is unknown"
-    severity = Severity.WARNING if found.unexplained else Severity.NOTE
+    severity = Severity.WARNING if unexplained else Severity.NOTE
     return Finding("transform_and_markers", severity, said, {"apart_mm": found.apart_mm})
 
 
-@dataclass(frozen=True)
-class Apart:
-    """Where markers and a stated transform differ most, over the error expected of the markers there.
-
-    Attributes:
-        expected_mm: The expected (rms) error of the markers there.
-        contradicts: Whether some point differs by more than both errors explain, and by more than `MAX_APART_MM`.
-    """
+class Apart(NamedTuple):
+    """Where markers and a stated transform differ most, over the error expected of the markers there."""
 
     where: str
     apart_mm: float
     expected_mm: float
+    """The expected (rms) error of the markers there."""
     contradicts: bool
-
-    @property
-    def unexplained(self) -> bool:
-        """Whether the markers' errors alone do not explain it."""
-        return self.apart_mm > EXPLAINED * self.expected_mm
+    """Whether some point differs by more than both errors explain, and by more than `MAX_APART_MM`."""
 
 
 def _apart(case: Case, registration: Registration, T_base_ct: Floats) -> Apart:

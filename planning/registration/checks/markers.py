@@ -42,15 +42,12 @@ MARKER_ON_SKIN_MM = 30.0
 
 @dataclass(frozen=True, eq=False)
 class SkinFit:
-    """Markers against the skin.
-
-    Attributes:
-        gaps_mm: Shape (n,), distance from the skin, negative inside the body (of an open skin that is not known).
-        normals_ct: Shape (n, 3), unit vectors out of the skin at its nearest triangle.
-    """
+    """Markers against the skin."""
 
     gaps_mm: Floats
+    """Shape (n,), distance from the skin, negative inside the body (of an open skin that is not known)."""
     normals_ct: Floats
+    """Shape (n, 3), unit vectors out of the skin at its nearest triangle."""
 
     @property
     def on_skin(self) -> bool:
@@ -65,15 +62,12 @@ class SkinFit:
 
 
 def skin_fit(points_ct: Floats, skin: Skin) -> SkinFit:
-    """Measure markers from the skin; where the body was cut there is none.
-
-    Args:
-        points_ct: Shape (n, 3), mm.
-    """
+    """Measure markers from the skin; where the body was cut there is none; ``points_ct`` (n, 3), mm."""
     triangles = skin.mesh.triangles[~skin.cut_faces]
     centres = triangles.mean(axis=1)
     reach = np.linalg.norm(triangles - centres[:, None], axis=2).max()
-    outward = _orientation(skin)
+    a, b, c = np.moveaxis(skin.mesh.triangles - skin.mesh.bounds.mean(axis=0), 1, 0)
+    outward = 1.0 if np.einsum("ij,ij->", a, np.cross(b, c)) >= 0 else -1.0
     gaps, normals = np.empty(len(points_ct)), np.empty((len(points_ct), 3))
     for row, point in enumerate(points_ct):
         from_centres = np.linalg.norm(centres - point, axis=1)
@@ -83,20 +77,6 @@ def skin_fit(points_ct: Floats, skin: Skin) -> SkinFit:
         gaps[row] = np.sqrt(squares.min()) * (-1.0 if inside else 1.0)
         normals[row] = outward * _normal(near[int(np.argmin(squares))])
     return SkinFit(gaps, normals)
-
-
-def kept_skin_fit(points_ct: Floats, skin: Skin, cache: Cache) -> SkinFit:
-    """`skin_fit`, from the cache where it is there; no target decides it."""
-    cut = hashlib.sha256(skin.cut_faces.tobytes()).hexdigest()
-    made_from = {"what": "skin fit", "skin": skin.mesh.digest, "cut": cut, "points": points_ct.tolist()}
-    stored = cache.arrays(made_from, lambda: vars(skin_fit(points_ct, skin)), by=__name__)
-    return SkinFit(**stored)
-
-
-def _orientation(skin: Skin) -> float:
-    """1 where the triangles' normals point out of the body, -1 where they point into it."""
-    a, b, c = np.moveaxis(skin.mesh.triangles - skin.mesh.bounds.mean(axis=0), 1, 0)
-    return 1.0 if np.einsum("ij,ij->", a, np.cross(b, c)) >= 0 else -1.0
 
 
 def _normal(triangle: Floats) -> Floats:
@@ -118,18 +98,15 @@ class Surroundings(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MarkerList:
-    """One reading of the CT markers.
-
-    Attributes:
-        behind: Rows of markers that no needle can have touched, and what is before each, in words.
-        excluded: Why the robot cannot stand where this list puts it, or empty.
-        target_mm: How far this list puts the target from where the given one puts it.
-    """
+    """One reading of the CT markers."""
 
     fit: SkinFit
     behind: tuple[tuple[int, str], ...]
+    """Rows of markers that no needle can have touched, and what is before each, in words."""
     excluded: str
+    """Why the robot cannot stand where this list puts it, or empty."""
     target_mm: float
+    """How far this list puts the target from where the given one puts it."""
 
     @property
     def plausible(self) -> bool:
@@ -144,16 +121,22 @@ def marker_list(
     signs: Signs = (1.0, 1.0, 1.0),
     cache: Cache = NO_CACHE,
 ) -> MarkerList:
-    """The CT markers with some axes negated, compared with skin, couch and the robot's place."""
+    """The CT markers with some axes negated, compared with skin, couch and the robot's place.
+
+    How they lie on the skin depends on no target: ``cache`` keeps it.
+    """
     points = registration.markers.points_ct * np.array(signs)
-    fit = kept_skin_fit(points, around.skin, cache)
+    skin = around.skin
+    cut = hashlib.sha256(skin.cut_faces.tobytes()).hexdigest()
+    made_from = {"what": "skin fit", "skin": skin.mesh.digest, "cut": cut, "points": points.tolist()}
+    fit = SkinFit(**cache.arrays(made_from, lambda: vars(skin_fit(points, skin)), by=__name__))
     T_base_ct = fit_rigid(points, registration.markers.points_base)
     moved = apply(T_base_ct, case.target_ct) - apply(registration.T_base_ct, case.target_ct)
     couch = None if around.couch is None else around.couch.digest
     key = (__name__, points.tobytes(), fit.normals_ct.tobytes(), couch, box_keys(boxes_ct(case)), case.needle.length_mm)
     find = partial(untouchable, case, points, fit.normals_ct, around.couch)
     behind = cache.memory.get(key, find, lambda found: 100 * len(found))
-    return MarkerList(fit, behind, place_excluded(case, around.skin.mesh, T_base_ct), float(np.linalg.norm(moved)))
+    return MarkerList(fit, behind, place_excluded(case, skin.mesh, T_base_ct), float(np.linalg.norm(moved)))
 
 
 ALLOWED_NAMES = (
@@ -181,7 +164,8 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> Iterator[
         refuse(what, where, "the names in the order of the touches", "markers_permuted")
     excluded = [place_excluded(case, skin.mesh, one.T_base_ct) for one in found]
     possible = [one for one, why in zip(found, excluded, strict=True) if not why]
-    if possible and not _accepted(case):
+    stated = case.registration or case.robot.stated
+    if possible and not (stated is not None and stated.accept_symmetry):
         what = f"swapped marker names would go unnoticed: {_worst(possible)}; {given}"
         refuse(what, where, ALLOWED_NAMES, "markers_ambiguous")
     if not complete:
@@ -193,11 +177,6 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> Iterator[
     elif found:
         said = f"marker names: {_worst(found)}; excluded only because then {excluded[0]}"
         yield Finding("marker_names_alike", Severity.WARNING, said)
-
-
-def _accepted(case: Case) -> bool:
-    stated = case.registration or case.robot.stated
-    return stated is not None and stated.accept_symmetry
 
 
 def _worst(found: Sequence[Renaming]) -> str:
@@ -231,21 +210,25 @@ EXCLUDING_LEVEL = 0.001
 def check_axes(
     case: Case, around: Surroundings, registration: Registration, given: MarkerList, cache: Cache = NO_CACHE
 ) -> Iterator[Finding]:
-    """Compare the given list with its half turns.
-
-    Yields:
-        Warnings.
-    """
+    """Compare the given list with its half turns; yields warnings."""
     slips = {name: marker_list(case, around, registration, signs, cache) for name, signs in HALF_TURNS.items()}
-    likely = {name: slip for name, slip in slips.items() if _explains(slip, given)}
+    likely = {}  # the given list is the other one, slipped: off the skin, or on it where no needle touches it
+    for name, slip in slips.items():
+        hidden = bool(given.behind) and not _worse(slip.fit, given.fit, level=REFUSING_LEVEL)
+        if slip.plausible and (hidden or _worse(given.fit, slip.fit, level=REFUSING_LEVEL)):
+            likely[name] = slip
     if likely:
         best = min(likely.values(), key=lambda slip: slip.fit.scatter_mm)
         alike = {name: one for name, one in likely.items() if not _excluded(one, best)}
         fits = ", or ".join(
             f"with {name} they lie on the skin to {one.fit.scatter_mm:.1f} mm (rms)" for name, one in alike.items()
         )
+        as_given = f"to {given.fit.scatter_mm:.1f} mm"
+        if not _worse(given.fit, best.fit, level=REFUSING_LEVEL):
+            row, before = given.behind[0]
+            as_given = f"{registration.markers.names[row]} lies behind {before}, where no needle can touch it"
         refuse(
-            f"markers_ct look like coordinates of other axes: {fits}, as given {_as_given(registration, given, best)}",
+            f"markers_ct look like coordinates of other axes: {fits}, as given {as_given}",
             f"{case.path}: registration",
             "markers_ct in the axes (LPS, RAS) that the case or their file states",
             "other_axes",
@@ -255,18 +238,9 @@ def check_axes(
             said = (
                 f"markers_ct with {name} would lie on the skin to {slip.fit.scatter_mm:.1f} mm rms, as given to "
                 f"{given.fit.scatter_mm:.1f} mm: too similar to decide, and the target would be {slip.target_mm:.0f} "
-                "mm "
-                "away; check the axes of their file"
+                "mm away; check the axes of their file"
             )
             yield Finding("marker_axes_alike", Severity.WARNING, said, {"target_mm": slip.target_mm})
-
-
-def _explains(slip: MarkerList, given: MarkerList) -> bool:
-    """Whether the given list is likely the other one, slipped: off the skin, or on it where no needle touches it."""
-    if not slip.plausible:
-        return False
-    hidden = bool(given.behind) and not _worse(slip.fit, given.fit, level=REFUSING_LEVEL)
-    return hidden or _worse(given.fit, slip.fit, level=REFUSING_LEVEL)
 
 
 def _excluded(slip: MarkerList, given: MarkerList) -> bool:
@@ -280,13 +254,6 @@ def _worse(fit: SkinFit, other: SkinFit, *, level: float) -> bool:
     freedom = len(fit.gaps_mm) - 1
     limit = float(np.sqrt(fdtri(freedom, freedom, 1 - level)))
     return fit.scatter_mm > limit * max(other.scatter_mm, SCATTER_MM)
-
-
-def _as_given(registration: Registration, given: MarkerList, slip: MarkerList) -> str:
-    if _worse(given.fit, slip.fit, level=REFUSING_LEVEL):
-        return f"to {given.fit.scatter_mm:.1f} mm"
-    row, before = given.behind[0]
-    return f"{registration.markers.names[row]} lies behind {before}, where no needle can touch it"
 
 
 def off_the_skin(registration: Registration, given: MarkerList) -> Iterator[Finding]:
@@ -319,8 +286,6 @@ def check_markers(
     case: Case, around: Surroundings, registration: Registration, cache: Cache = NO_CACHE
 ) -> Iterator[Finding]:
     """Check a registration's markers against permuted names, half turns, skin and couch.
-
-    How the markers lie on the skin depends on no target: ``cache`` keeps it.
 
     Yields:
         What these markers leave open, warnings; and what no markers can show, notes.

@@ -38,15 +38,6 @@ FAR_MM = 400.0
 """What lies farther below is a floor, what lies farther above a ceiling."""
 
 
-class Lying(NamedTuple):
-    """How the patient lies to the boxes of the robot's frame."""
-
-    on: str
-    """The obstacle under the patient, no farther away than `REST_MM`; empty for none."""
-    off: str
-    """That an obstacle is below or above the patient, with its distance, where they lie on none; empty for none."""
-
-
 def in_box(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
     """The obstacle of frame ``base`` in which the patient would lie deeper than `ALLOWANCE_MM`; empty for none.
 
@@ -57,61 +48,59 @@ def in_box(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
         skin: CT frame.
         T_base_ct: Shape (4, 4), mm.
     """
-    points = apply(T_base_ct, skin.vertices)
-    return next((box.name for box in _base_boxes(case) if _deep_in(box, points, skin, T_base_ct)), "")
+    points_base = apply(T_base_ct, skin.vertices)
+    for box in _boxes(case, "base"):
+        half = box.size_mm / 2
+        core = np.maximum(half - ALLOWANCE_MM, THIN * half)
+        local = points_base - box.center_mm
+        corners = local[skin.faces]
+        near = np.all((corners.min(axis=1) <= core) & (corners.max(axis=1) >= -core), axis=1)
+        if near.any():
+            part = fcl.CollisionObject(surface(TriangleMesh(local, skin.faces[near])))
+            if touch(part, fcl.CollisionObject(fcl.Box(*(2 * core)))):
+                return box.name
+        if side_of(skin, apply(np.linalg.inv(T_base_ct), box.center_mm)) is Side.INSIDE:
+            return box.name
+    return ""
 
 
-def _deep_in(box: Obstacle, points_base: Floats, skin: TriangleMesh, T_base_ct: Floats) -> bool:
-    half = box.size_mm / 2
-    core = np.maximum(half - ALLOWANCE_MM, THIN * half)
-    local = points_base - box.center_mm
-    corners = local[skin.faces]
-    near = np.all((corners.min(axis=1) <= core) & (corners.max(axis=1) >= -core), axis=1)
-    if near.any():
-        part = fcl.CollisionObject(surface(TriangleMesh(local, skin.faces[near])))
-        if touch(part, fcl.CollisionObject(fcl.Box(*(2 * core)))):
-            return True
-    return side_of(skin, apply(np.linalg.inv(T_base_ct), box.center_mm)) is Side.INSIDE
-
-
-def lying(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Lying:
+def lying(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> tuple[str, str]:
     """How the patient lies to the boxes of the robot's frame, by the skin's vertices; arguments as of `in_box`.
+
+    The obstacle under the patient, no farther away than `REST_MM`, or empty; and where they lie on none, that an
+    obstacle is below or above them, with its distance, or empty.
 
     Up is the axis of the robot's frame that is nearest to it, within 45 degrees: an arm may stand, hang or reach out of
     a wall.
     """
-    up = _up_base(case, T_base_ct)
+    up = up_base(case, T_base_ct)
     axis = int(np.argmax(np.abs(up)))
     if abs(up[axis]) < np.cos(np.pi / 4):
-        return Lying("", "")
+        return "", ""
     points, level, off = apply(T_base_ct, skin.vertices), np.arange(3) != axis, ""
-    for box in _base_boxes(case):
+    for box in _boxes(case, "base"):
         away, half = points - box.center_mm, box.size_mm / 2
         height = np.sign(up[axis]) * away[np.all(np.abs(away[:, level]) <= half[level], axis=1), axis]
         if not len(height):
             continue
         over, under = height.min() - half[axis], -half[axis] - height.max()
         if -ALLOWANCE_MM <= over <= REST_MM:
-            return Lying(box.name, "")
+            return box.name, ""
         if REST_MM < over <= FAR_MM:
             off = f"the patient would float {over:.0f} mm above obstacle '{box.name}'"
         elif 0.0 <= under <= FAR_MM:
             off = f"the patient would lie {under:.0f} mm under obstacle '{box.name}'"
-    return Lying("", off)
+    return "", off
 
 
-def off_upright(case: Case, T_base_ct: Floats) -> float:
-    """Between the base's z axis and up, as the case states it or a patient usually lies; pi for an arm that hangs."""
-    return float(np.arccos(np.clip(_up_base(case, T_base_ct)[2], -1.0, 1.0)))
-
-
-def _up_base(case: Case, T_base_ct: Floats) -> Floats:
+def up_base(case: Case, T_base_ct: Floats) -> Floats:
+    """Up in the base frame, shape (3,), unit, as the case states it or a patient usually lies."""
     up = np.asarray(up_axis(case))
     return np.asarray(T_base_ct[:3, :3] @ (up / np.linalg.norm(up)))
 
 
-def _base_boxes(case: Case) -> tuple[Obstacle, ...]:
-    return tuple(box for box in case.obstacles if box.frame == "base")
+def _boxes(case: Case, frame: str) -> tuple[Obstacle, ...]:
+    return tuple(box for box in case.obstacles if box.frame == frame)
 
 
 SKIN_POINTS = 2000
@@ -153,13 +142,6 @@ def out_of_reach(case: Case, T_base_ct: Floats) -> bool:
     model = case.robot.model
     span = abs(model.a2) + abs(model.a3) + model.d4 + model.d5 + model.d6 + case.needle.length_mm
     return bool(np.linalg.norm(case.target_ct - _column_ct(case, T_base_ct)[1]) > span)
-
-
-def shoulder_within(case: Case, T_base_ct: Floats) -> str:
-    """Name of the obstacle of frame ``ct`` that contains the shoulder, or ""; a base on top of one is in none."""
-    shoulder = _column_ct(case, T_base_ct)[1]
-    boxes = (box for box in boxes_ct(case) if np.all(np.abs(shoulder - box.center_mm) < box.size_mm / 2))
-    return next((box.name for box in boxes), "")
 
 
 def _column_ct(case: Case, T_base_ct: Floats) -> Floats:
@@ -225,7 +207,7 @@ def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Float
 
 def boxes_ct(case: Case) -> tuple[Obstacle, ...]:
     """The obstacles of the CT frame."""
-    return tuple(box for box in case.obstacles if box.frame == "ct")
+    return _boxes(case, "ct")
 
 
 def box_keys(boxes: tuple[Obstacle, ...]) -> tuple[tuple[str, bytes, bytes], ...]:
@@ -245,12 +227,7 @@ def _cones(axes: Floats) -> Floats:
 
 
 def _intersects(box: Obstacle, points: Floats, directions: Floats, length_mm: float) -> NDArray[np.bool_]:
-    """Which segments from points intersect a box with axes parallel to the frame's (slabs).
-
-    Args:
-        points: Shape (..., 3), mm.
-        directions: Shape (..., 3), unit.
-    """
+    """Which segments from points (..., 3) along unit vectors (..., 3) intersect a box (slabs)."""
     with np.errstate(divide="ignore", invalid="ignore"):  # along a slab: from -inf to inf, or nowhere
         one, other = ((box.center_mm + side * box.size_mm / 2 - points) / directions for side in (-1.0, 1.0))
     into, out = np.fmin(one, other).max(axis=-1), np.fmax(one, other).min(axis=-1)
@@ -287,20 +264,22 @@ def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats, memory: Memory
         memory: Keeps how the skin lies to the boxes, which depends on no target.
     """
 
-    def lies() -> tuple[str, Lying]:
-        return in_box(case, skin, T_base_ct), lying(case, skin, T_base_ct)
+    def lies() -> tuple[str, str, str]:
+        return in_box(case, skin, T_base_ct), *lying(case, skin, T_base_ct)
 
-    placed = _up_base(case, T_base_ct).tobytes(), np.ascontiguousarray(T_base_ct).tobytes()
-    box, bed = memory.get((__name__, skin.digest, *placed, box_keys(_base_boxes(case))), lies, lambda _: 1000)
+    placed = up_base(case, T_base_ct).tobytes(), np.ascontiguousarray(T_base_ct).tobytes()
+    box, bed, off = memory.get((__name__, skin.digest, *placed, box_keys(_boxes(case, "base"))), lies, lambda _: 1000)
     impossible = ""
     if base_in_patient(case, skin, T_base_ct):
         impossible = "the robot's base would be in the patient"
     elif box:
         impossible = f"the patient would lie more than {ALLOWANCE_MM:g} mm deep in obstacle '{box}' or through it"
     far = "the target would be out of the arm's reach" if out_of_reach(case, T_base_ct) else ""
-    within = shoulder_within(case, T_base_ct)
-    shoulder = f"the robot's shoulder would be in obstacle '{within}'" if within else ""
-    return BasePlace(impossible, " and ".join(filter(None, (far, shoulder, bed.off))), bed.on)
+    at, shoulder = _column_ct(case, T_base_ct)[1], ""
+    for one in boxes_ct(case):  # a base on top of one is in none
+        if not shoulder and np.all(np.abs(at - one.center_mm) < one.size_mm / 2):
+            shoulder = f"the robot's shoulder would be in obstacle '{one.name}'"
+    return BasePlace(impossible, " and ".join(filter(None, (far, shoulder, off))), bed)
 
 
 def place_warnings(
@@ -310,10 +289,6 @@ def place_warnings(
 
     They say in words where the base is, and have no other reading that could be meant, so they are not refused: without
     an arm the verdicts are about the organs alone, and with one nothing is reached from there.
-
-    Args:
-        skin: CT frame.
-        T_base_ct: Shape (4, 4), mm.
     """
     place = base_place(case, skin, T_base_ct, memory)
     if what := place.impossible or place.unlikely:
