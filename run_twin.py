@@ -576,7 +576,7 @@ def selfcal(
 ) -> None:
     """Calibrate two arms by ultrasound, AXP = YBQ. Then send the needle to targets in the image."""
     require_extra("twin", "selfcal")
-    from puncture_twin.twin.jobs.selfcal.report import run_selfcal, selfcal_facts, selfcal_text
+    from puncture_twin.twin.jobs.selfcal.selfcal import run_selfcal, selfcal_facts, selfcal_text
 
     case = meshes_folder() / "selfcal" if case is None and recording is None else case
     with progress_display() as progress:

@@ -16,12 +16,10 @@ from time import process_time
 import numpy as np
 
 from benchmarks.shared import versions
-from puncture_twin.twin.guidance.stereo.ball.tracker import DetectedBall, LostBall, find_ball
-from puncture_twin.twin.guidance.stereo.cameras.calibration import calibrate
-from puncture_twin.twin.guidance.stereo.cameras.camera import stereo_pair
-from puncture_twin.twin.guidance.stereo.cameras.triangulation import triangulate
-from puncture_twin.twin.guidance.ultrasound.image.imager import Imager, NeedleEcho
-from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, detect
+from puncture_twin.twin.guidance.stereo.ball import DetectedBall, LostBall, find_ball
+from puncture_twin.twin.guidance.stereo.camera import stereo_pair
+from puncture_twin.twin.guidance.stereo.camera_calibration import calibrate, triangulate
+from puncture_twin.twin.guidance.ultrasound.needle_detector import Detection, Imager, NeedleEcho, detect
 from puncture_twin.twin.plant.ball_image import BallScene, render as render_ball
 from puncture_twin.twin.plant.bmode_image import NeedleInImage, render
 

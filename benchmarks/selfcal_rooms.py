@@ -25,14 +25,11 @@ from scipy.stats import chi2
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.twin.guidance.ultrasound.acquisition import ProbeDevices, acquire, choose
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, ShotByShot, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
-from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, find_candidates
+from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, TwoArms, find_candidates
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
-from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 from puncture_twin.twin.plant.bmode_image import NeedleInImage
 from puncture_twin.twin.plant.ultrasound_workcell import UltrasoundPlant, WorkcellTruth, draw_workcell, jog_into_slice
 

@@ -29,12 +29,24 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.processes import process_pool
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
-from puncture_twin.twin.guidance.stereo.detection import Detection, Detector, Search
-from puncture_twin.twin.guidance.stereo.joint.joint_model import Adjusted, Guess, Observed, adjust
-from puncture_twin.twin.guidance.stereo.joint.needle_error import open_loop_error, servoed_error
-from puncture_twin.twin.guidance.stereo.planned import calibrating_rod, carried_rod, grid_points, planned_cameras
-from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
+from puncture_twin.twin.guidance.stereo.ball import Detection, Detector, Search
+from puncture_twin.twin.guidance.stereo.joint_model import (
+    Adjusted,
+    Guess,
+    Observed,
+    adjust,
+    open_loop_error,
+    servoed_error,
+)
+from puncture_twin.twin.guidance.stereo.servo_case import (
+    ServoCase,
+    ServoErrors,
+    calibrating_rod,
+    carried_rod,
+    grid_points,
+    load_servo_case,
+    planned_cameras,
+)
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, ball_jacobian, flange_poses
 from puncture_twin.twin.plant.stereo_workcell import StereoPlant, StereoWorkcell, draw_workcell
 from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome, needle_outcome, needle_statistics

@@ -36,9 +36,8 @@ if TYPE_CHECKING:
     from puncture_twin.planning.search.safe_map import BestTarget, SafeMap
     from puncture_twin.planning.visibility.cameras import CameraView
     from puncture_twin.planning.visibility.probe import ProbeView
-    from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, ShotByShot
     from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-    from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
     from puncture_twin.twin.jobs.batch.jobs import Merged
     from puncture_twin.twin.jobs.choosing.compare_job import Comparison
     from puncture_twin.twin.jobs.experiment.dynamics_job import Dynamics
@@ -495,7 +494,7 @@ def calibrate(recording: Recording, *, needle_length_mm: float | None = None) ->
     Raises:
         InputError: Too few poses, poses that cannot show every unknown, or more than half of them disagree.
     """
-    from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
 
     return calibrate(recording, needle_length_mm=needle_length_mm)
 
@@ -567,7 +566,7 @@ def shot_by_shot(calibration: Calibration) -> ShotByShot:
     Raises:
         InputError: The calibration holds a needle length; state it to ``calibration()`` instead.
     """
-    from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
+    from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import ShotByShot
 
     return ShotByShot.of(calibration)
 

@@ -3,8 +3,7 @@
 import numpy as np
 
 from puncture_twin.planning.geometry.rigid import exp_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import tip_residuals
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import Estimate, tip_residuals
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import OPTIONAL, Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import needle_orientations
 from puncture_twin.twin.plant.simulated_recording import (

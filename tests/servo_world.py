@@ -8,9 +8,14 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
-from puncture_twin.twin.guidance.stereo.joint.joint_model import N_ROD, Guess, Observed, Unknowns
-from puncture_twin.twin.guidance.stereo.planned import calibration_frame, grid_points, head_pose, planned_cameras
-from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
+from puncture_twin.twin.guidance.stereo.joint_model import N_ROD, Guess, Observed, Unknowns
+from puncture_twin.twin.guidance.stereo.servo_case import (
+    calibration_frame,
+    grid_points,
+    head_pose,
+    load_servo_case,
+    planned_cameras,
+)
 from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, ball_base, configurations, rod_orientation
 from puncture_twin.twin.plant.stereo_workcell import draw_workcell
 

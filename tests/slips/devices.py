@@ -12,7 +12,7 @@ from puncture_twin.planning.formats.points import parse_joint_recording
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration
+from puncture_twin.twin.guidance.ultrasound.recording_file import checked_calibration
 from puncture_twin.twin.plant.simulated_recording import simulate_recording
 from slips.kinds import RIGHT, SILENT, WARNED, Answer, Kind, answer
 

@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.twin.devices import GreyImage
-from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, distortion_slope, tangent_axes, undistort
+from puncture_twin.twin.guidance.stereo.camera import Camera, distortion_slope, tangent_axes, undistort
 
 CELLS = 4
 """Cells per pixel and axis."""

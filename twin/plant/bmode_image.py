@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import refuse
-from puncture_twin.twin.guidance.ultrasound.image.imager import Imager, NeedleEcho, PointSpread
+from puncture_twin.twin.guidance.ultrasound.needle_detector import Imager, NeedleEcho, PointSpread
 
 Complexes = NDArray[np.complexfloating]
 """Single precision inside: the display has 256 greys."""

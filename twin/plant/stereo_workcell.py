@@ -1,6 +1,6 @@
 """The ground truth of a stereo workcell: an arm off its nominal model, two cameras, a head; drawn once for each seed.
 
-`StereoPlant` answers as its devices do; frames are those of `twin.guidance.stereo.planned`.
+`StereoPlant` answers as its devices do; frames are those of `twin.guidance.stereo.servo_case`.
 """
 
 from __future__ import annotations
@@ -17,10 +17,15 @@ from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rotated_about
 from puncture_twin.twin.devices import GreyImage
-from puncture_twin.twin.guidance.stereo.cameras.camera import Camera, tangent_axes
-from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors
-from puncture_twin.twin.guidance.stereo.planned import calibration_frame, head_pose, planned_cameras
-from puncture_twin.twin.guidance.stereo.servo_case import CamerasSection, ServoCase
+from puncture_twin.twin.guidance.stereo.camera import Camera, tangent_axes
+from puncture_twin.twin.guidance.stereo.servo_case import (
+    CamerasSection,
+    ServoCase,
+    ServoErrors,
+    calibration_frame,
+    head_pose,
+    planned_cameras,
+)
 from puncture_twin.twin.plant.ball_image import BallScene, render
 from puncture_twin.twin.plant.truth import Gears, PlantArm, TrueArm, draw_true_arm
 

@@ -12,11 +12,9 @@ import numpy as np
 from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.geometry.rigid import exp_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import tangent_basis
-from puncture_twin.twin.guidance.ultrasound.pose_choice import needle_flange
-from puncture_twin.twin.guidance.ultrasound.puncture import nearest_configuration
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import tangent_basis
+from puncture_twin.twin.guidance.ultrasound.pose_choice import between_arms, nearest_configuration, needle_flange
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.two_arms import between_arms
 from puncture_twin.twin.plant.bmode_image import NeedleInImage, render
 from puncture_twin.twin.plant.truth import PlantArm, TrueArm, draw_true_arm
 

@@ -15,12 +15,17 @@ from puncture_twin.planning.base.arrays import Floats, Pixels, rms
 from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeDevices, ProbeShot, acquire
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection
-from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses
-from puncture_twin.twin.guidance.ultrasound.puncture import aim, expected_error_mm, predicted_tre, recorded_pose
+from puncture_twin.twin.guidance.ultrasound.needle_detector import Detection
+from puncture_twin.twin.guidance.ultrasound.pose_choice import (
+    CandidatePoses,
+    TwoArms,
+    aim,
+    expected_error_mm,
+    predicted_tre,
+    recorded_pose,
+)
+from puncture_twin.twin.guidance.ultrasound.recording_file import calibrate_case
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.slips import calibrate_case
-from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 from puncture_twin.twin.plant.bmode_image import Lesion, NeedleInImage, render
 from puncture_twin.twin.plant.ultrasound_workcell import ShownNeedle, UltrasoundPlant, WorkcellTruth, draw_workcell
 

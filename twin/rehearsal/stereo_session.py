@@ -19,20 +19,22 @@ from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
 from puncture_twin.twin.devices import Arm
-from puncture_twin.twin.guidance.stereo.detection import Detector, image_detector, in_space, look_at, searches_of
-from puncture_twin.twin.guidance.stereo.guide import Guide
-from puncture_twin.twin.guidance.stereo.joint.needle_error import REGION, NeedleError
-from puncture_twin.twin.guidance.stereo.planned import carried_rod, grid_points, workcell_checker
-from puncture_twin.twin.guidance.stereo.recording import Recorder, StereoDevices
-from puncture_twin.twin.guidance.stereo.robot_calibration import (
+from puncture_twin.twin.guidance.stereo.ball import Detector, image_detector, in_space, look_at, searches_of
+from puncture_twin.twin.guidance.stereo.joint_model import REGION, NeedleError
+from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, carried_rod, grid_points, workcell_checker
+from puncture_twin.twin.guidance.stereo.servo_law import Lost, Mapping, Servoed, ServoStop
+from puncture_twin.twin.guidance.stereo.session import (
+    Aims,
+    Guide,
+    ImageReading,
+    Recorder,
     RobotCalibration,
+    StereoDevices,
+    aims_of,
     calibrate_by_robot,
     calibration_commands,
+    map_markers,
 )
-from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
-from puncture_twin.twin.guidance.stereo.servo_law import Mapping, ServoStop
-from puncture_twin.twin.guidance.stereo.servo_loop import Lost, Servoed
-from puncture_twin.twin.guidance.stereo.session import Aims, ImageReading, aims_of, map_markers
 from puncture_twin.twin.plant.stereo_workcell import ShownBall, StereoPlant, StereoWorkcell, TrueNeedle, draw_workcell
 
 TEST_POINTS = 10

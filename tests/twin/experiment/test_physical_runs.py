@@ -7,8 +7,7 @@ import pytest
 from refusals import refused
 
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.twin.jobs.experiment import physical_runs as module
-from puncture_twin.twin.jobs.experiment.touch_job import TouchedOnce
+from puncture_twin.twin.jobs.experiment import touch_job as module
 from puncture_twin.twin.plant.touching import ExecutedTouches
 
 CONTEXT = SimpleNamespace(
@@ -28,8 +27,8 @@ def test_the_rms_is_over_the_runs_that_ended_and_refusals_are_named(monkeypatch)
     """Errors of 3 and 4 mm; drawn truths of which one in four does not register are beside them."""
     monkeypatch.setattr(module, "plan_tour", lambda *_, **__: TOUR)
     monkeypatch.setattr(module, "physical_run", one_run)
-    drawn = lambda context, tour, seed: float("nan") if seed % 4 == 1 else 2.0  # noqa: E731
-    monkeypatch.setattr(module, "drawn_error_mm", drawn)
+    drawn = lambda context, tour, seed: "no" if seed % 4 == 1 else SimpleNamespace(tip_error_mm=2.0)  # noqa: E731
+    monkeypatch.setattr(module, "drawn_once", drawn)
     facts = module.physical_runs(CONTEXT, 3)
     assert facts["realised_mm"] == pytest.approx(12.5**0.5)
     assert facts["refused"] == {2: "marker A was not felt"}
@@ -45,7 +44,7 @@ def test_runs_none_of_which_ended_give_no_figure(monkeypatch):
     """No mean of nothing, and the reason."""
     monkeypatch.setattr(module, "plan_tour", lambda *_, **__: TOUR)
     monkeypatch.setattr(module, "physical_run", lambda *_: one_run(None, None, 2))
-    monkeypatch.setattr(module, "drawn_error_mm", lambda *_: 2.0)
+    monkeypatch.setattr(module, "drawn_once", lambda *_: SimpleNamespace(tip_error_mm=2.0))
     facts = module.physical_runs(CONTEXT, 1)
     assert facts["realised_mm"] is None
     assert facts["seconds_per_touch"] is None
@@ -67,6 +66,6 @@ def test_a_contact_on_the_way_to_the_target_refuses_its_run(monkeypatch):
 def test_a_marker_that_is_not_touched_refuses_its_run(monkeypatch):
     """The prediction is of all markers."""
     touched = ExecutedTouches((), {"A": "no contact"}, 1.0, {})
-    monkeypatch.setattr(module, "touch_once", lambda *_: TouchedOnce(touched, "2 of 3 markers were touched"))
+    monkeypatch.setattr(module, "touch_once", lambda *_: (touched, "2 of 3 markers were touched"))
     with refused("no_touch", "marker A: no contact", by=NoAnswerError):
         module.physical_run(CONTEXT, None, 7)

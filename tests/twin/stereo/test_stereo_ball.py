@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from puncture_twin.twin.devices import GreyImage
-from puncture_twin.twin.guidance.stereo.ball.ball_edges import Circle, cone, consensus, refit
-from puncture_twin.twin.guidance.stereo.ball.tracker import DetectedBall, LostBall, find_ball
-from puncture_twin.twin.guidance.stereo.cameras.camera import stereo_pair, tangent_axes
+from puncture_twin.twin.guidance.stereo.ball import Circle, DetectedBall, LostBall, cone, consensus, find_ball, refit
+from puncture_twin.twin.guidance.stereo.camera import stereo_pair, tangent_axes
 from puncture_twin.twin.plant.ball_image import BallScene, _paint, render
 
 LENS = (-0.2, 0.05, 5e-4, -5e-4)
 CAMERA = stereo_pair(1280, 960, 2560, 500, 1000, LENS)[0]
 SPHERE_MM = 4.0
+ANY = {"no_circle", "few_inliers", "wrong_radius", "low_contrast"}
 
 
 def scene(rng, **changes):
@@ -112,6 +112,8 @@ def test_a_window_is_a_part_of_the_whole_picture(rng):
     whole = render(CAMERA, ball, rng=rng, noise=0.0)
     part = render(CAMERA, ball, rng=rng, noise=0.0, half_px=30)
     column, row = part.offset
+    one, other = (find_ball(image, CAMERA, ball.center_c, 4.0, search_px=12) for image in (whole, whole.grey))
+    np.testing.assert_array_equal(one.pixel, other.pixel)
     assert whole.grey.shape == (960, 1280)
     np.testing.assert_array_equal(whole.grey[row : row + 61, column : column + 61], part.grey)
     behind = render(CAMERA, BallScene(np.array([0, 0, -3000.0]), rod=False), rng=rng, noise=0.0)
@@ -152,24 +154,13 @@ def test_the_covariance_is_honest(clean):
     [
         ({"ball": False}, {"no_circle", "few_inliers", "low_contrast"}),
         ({"ball": False, "rod": False}, {"low_contrast"}),
-        ({"ball": False, "texture_grey": 25.0}, {"no_circle", "few_inliers", "wrong_radius", "low_contrast"}),
+        ({"ball": False, "texture_grey": 25.0}, ANY),
         ({"ball_grey": 66.0, "diffuse": 1.0, "rod": False}, {"low_contrast"}),
-        (
-            {"ball_grey": 66.0, "diffuse": 1.0, "texture_grey": 15.0},
-            {"no_circle", "few_inliers", "wrong_radius", "low_contrast"},
-        ),
-        ({"hidden_fraction": 0.65}, {"no_circle", "few_inliers", "wrong_radius", "low_contrast"}),
+        ({"ball_grey": 66.0, "diffuse": 1.0, "texture_grey": 15.0}, ANY),
+        ({"hidden_fraction": 0.65}, ANY),
         ({"radius_mm": 4.6}, {"wrong_radius"}),
     ],
-    ids=[
-        "missing",
-        "nothing at all",
-        "missing, texture",
-        "like its background",
-        "like its texture",
-        "hidden",
-        "larger",
-    ],
+    ids=["missing", "nothing at all", "missing, texture", "faint", "like its texture", "hidden", "larger"],
 )
 def test_a_ball_that_cannot_be_believed_is_lost(rng, changes, reasons):
     answers, _ = tracked(rng, 6, **changes)
@@ -184,13 +175,6 @@ def test_a_prediction_out_of_view_is_named(rng):
         assert find_ball(picture, CAMERA, np.array(predicted), 4.0, search_px=12).reason == "not_in_view"
     part = GreyImage(picture.grey[:50, :50], (0, 0))
     assert find_ball(part, CAMERA, np.zeros(3), 4.0, search_px=12).reason == "not_in_view"
-
-
-def test_a_plain_array_is_a_whole_picture(rng):
-    ball = scene(rng)
-    whole = render(CAMERA, ball, rng=rng)
-    one, other = (find_ball(image, CAMERA, ball.center_c, 4.0, search_px=12) for image in (whole, whole.grey))
-    np.testing.assert_array_equal(one.pixel, other.pixel)
 
 
 def test_the_consensus_ignores_what_is_not_on_the_circle(rng):

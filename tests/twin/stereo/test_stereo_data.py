@@ -10,8 +10,8 @@ import places
 import pytest
 
 from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
-from puncture_twin.twin.guidance.stereo.cameras.triangulation import fit_matrix, project, reconstruct
+from puncture_twin.twin.guidance.stereo.camera import Camera
+from puncture_twin.twin.guidance.stereo.camera_calibration import fit_matrix, project, reconstruct
 
 DATA = places.DATA
 CUBE = DATA / "dlt_cube_kwon_duarte" / "dlt_cube.json"

@@ -9,7 +9,7 @@ from refusals import refused
 from servo_world import CASE, NoContacts
 
 from puncture_twin.planning.base.files import new_folder
-from puncture_twin.twin.guidance.stereo.recording import read_recording
+from puncture_twin.twin.guidance.stereo.session import read_recording
 from puncture_twin.twin.jobs.servo.job import follow_recording
 from puncture_twin.twin.rehearsal.stereo_session import run_session
 
@@ -49,18 +49,18 @@ def edited(table, old, new):
     return change
 
 
-def in_colour(folder):
-    cv2.imwrite(str(folder / "points_001_1_1.png"), np.zeros((960, 1280, 3), np.uint8))
+def other_picture(change):
+    """On the first picture: its bytes."""
+
+    def apply(folder):
+        path = folder / "points_001_1_1.png"
+        path.write_bytes(change(path.read_bytes()))
+
+    return apply
 
 
-def smaller(folder):
-    cv2.imwrite(str(folder / "markers_001_1_1.png"), np.zeros((480, 640), np.uint8))
-
-
-def cut(folder):
-    """A picture without its lower half, which a picture library fills with black."""
-    path = folder / "points_001_1_1.png"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+def of_cells(*shape):
+    return other_picture(lambda _: cv2.imencode(".png", np.zeros(shape, np.uint8))[1].tobytes())
 
 
 WRONG = {
@@ -71,11 +71,11 @@ WRONG = {
     "another marker": (edited("markers.csv", CASE.markers.names[0], "Q"), "no_marker"),
     "other names": (edited("markers_image.csv", CASE.markers.names[0], "Q"), "names_differ"),
     "no picture": (lambda folder: (folder / "points_004_2_1.png").unlink(), "no_such_file"),
-    "a picture in colour": (in_colour, "not_grey"),
-    "a picture of another size": (smaller, "wrong_size"),
+    "a picture in colour": (of_cells(960, 1280, 3), "not_grey"),
+    "a picture of another size": (of_cells(480, 640), "wrong_size"),
     "a marker twice": (edited("markers.csv", CASE.markers.names[1], CASE.markers.names[0]), "duplicate_name"),
-    "no picture at all": (lambda folder: (folder / "points_001_1_1.png").write_bytes(b"\x89PNG"), "wrong_format"),
-    "a picture cut short": (cut, "file_cut"),
+    "no picture at all": (other_picture(lambda _: b"\x89PNG"), "wrong_format"),
+    "a picture without its lower half": (other_picture(lambda data: data[: len(data) // 2]), "file_cut"),
 }
 
 

@@ -24,6 +24,12 @@ count = 20
 """
 
 
+def answer(capsys, *arguments):
+    """What ``selfcal --json`` prints."""
+    assert main(["selfcal", *map(str, arguments), "--json"]) == OK
+    return json.loads(capsys.readouterr().out)
+
+
 @pytest.fixture(scope="module")
 def case_folder(tmp_path_factory):
     here = tmp_path_factory.mktemp("selfcal")
@@ -39,38 +45,10 @@ def done(case_folder, tmp_path_factory):
     return out
 
 
-def test_every_file_is_written(done):
+def test_every_file_is_written_and_the_page_says_what_matters(done):
     names = {"calibration.json", "recording.csv", "bmode.png", "room.png", "report.html"}
     assert {path.name for path in done.iterdir()} == {*names, "manifest.json", "timings.json"}
     assert all((done / name).stat().st_size > 1000 for name in names)
-
-
-def test_the_calibration_is_the_truth_within_what_it_claims(case_folder, done):
-    """Against the truth drawn anew from the seed: X, Y and tip within 99.9 % of what their covariance lets expect."""
-    found = json.loads((done / "calibration.json").read_text())
-    truth = draw_workcell(load_selfcal_case(case_folder), np.random.default_rng(3))
-    names, covariance = found["parameters"], np.array(found["covariance"])
-    drawn = {"t_X": truth.X[:3, 3], "t_Y": truth.Y[:3, 3], "t_Q": truth.tip_end2}
-    ours = {
-        "t_X": np.array(found["T_end1_image"])[:3, 3],
-        "t_Y": np.array(found["T_base1_base2"])[:3, 3],
-        "t_Q": np.array(found["tip_end2_mm"]),
-    }
-    case = load_selfcal_case(case_folder)
-    assert np.linalg.norm(case.T_base1_base2[:3, 3] - drawn["t_Y"]) > 1.0  # the drawing was wrong
-    rows = [names.index(f"{part}_{axis}_mm") for part in drawn for axis in "xyz"]
-    e = np.concatenate([ours[part] - value for part, value in drawn.items()])
-    assert e @ np.linalg.solve(covariance[np.ix_(rows, rows)], e) < f.ppf(0.999, 9, 30) * 9
-    assert chi2.ppf(0.95, len(names)) < found["region_limit_95"] < 1.5 * chi2.ppf(0.95, len(names))
-    assert np.array(found["needle_direction_end2"]) @ truth.V > np.cos(np.radians(0.3))
-    assert found["version"] == 2
-    assert found["seed"] == 3
-    assert len(found["residuals_mm"]) == 20
-    assert [(one["role"], one["path"]) for one in found["inputs"]] == [("case", "selfcal.toml")]
-    assert any("along the shaft" in line for line in found["cannot_show"])
-
-
-def test_the_page_says_what_matters(done):
     page = (done / "report.html").read_text()
     for words in ("tip to target, true", "expected error of the calibration", "cannot determine", "along the shaft"):
         assert words in page
@@ -79,11 +57,27 @@ def test_the_page_says_what_matters(done):
     assert 'src="http' not in page
 
 
+def test_the_calibration_is_the_truth_within_what_it_claims(case_folder, done):
+    """Against the truth drawn anew from the seed: X, Y and tip within 99.9 % of what their covariance lets expect."""
+    found, case = json.loads((done / "calibration.json").read_text()), load_selfcal_case(case_folder)
+    truth = draw_workcell(case, np.random.default_rng(3))
+    names, covariance = found["parameters"], np.array(found["covariance"])
+    drawn = np.concatenate([truth.X[:3, 3], truth.Y[:3, 3], truth.tip_end2])
+    X, Y = (np.array(found[key])[:3, 3] for key in ("T_end1_image", "T_base1_base2"))
+    assert np.linalg.norm(case.T_base1_base2[:3, 3] - truth.Y[:3, 3]) > 1.0  # the drawing was wrong
+    rows = [names.index(f"{part}_{axis}_mm") for part in ("t_X", "t_Y", "t_Q") for axis in "xyz"]
+    e = np.concatenate([X, Y, found["tip_end2_mm"]]) - drawn
+    assert e @ np.linalg.solve(covariance[np.ix_(rows, rows)], e) < f.ppf(0.999, 9, 30) * 9
+    assert chi2.ppf(0.95, len(names)) < found["region_limit_95"] < 1.5 * chi2.ppf(0.95, len(names))
+    assert np.array(found["needle_direction_end2"]) @ truth.V > np.cos(np.radians(0.3))
+    assert (found["version"], found["seed"], len(found["residuals_mm"])) == (2, 3, 20)
+    assert [(one["role"], one["path"]) for one in found["inputs"]] == [("case", "selfcal.toml")]
+    assert any("along the shaft" in line for line in found["cannot_show"])
+
+
 def test_a_recording_gives_the_same_calibration(case_folder, done, tmp_path, capsys):
     """The CSV that was written, read again beside the case that declares the arms; as one JSON object."""
-    arguments = ["selfcal", str(case_folder), "--recording", str(done), "--out", str(tmp_path), "--json"]
-    assert main(arguments) == OK
-    summary = json.loads(capsys.readouterr().out)
+    summary = answer(capsys, case_folder, "--recording", done, "--out", tmp_path)
     found = json.loads((done / "calibration.json").read_text())
     assert summary["T_end1_image"] == pytest.approx(np.array(found["T_end1_image"]), abs=1e-6)
     assert summary["predicted_tre_mm"] == pytest.approx(found["predicted_tre_mm"], rel=1e-4)
@@ -94,10 +88,8 @@ def test_a_recording_gives_the_same_calibration(case_folder, done, tmp_path, cap
 
 def test_the_kept_pictures_give_the_same_calibration(case_folder, done, tmp_path, capsys):
     """Read, detected and calibrated again, with the joints alone; every picture is an input, and none is written."""
-    kept = done.with_name("kept")
-    arguments = ["selfcal", str(case_folder), "--recording", str(kept), "--out", str(tmp_path), "--json"]
-    assert main(arguments) == OK
-    summary, found = json.loads(capsys.readouterr().out), json.loads((done / "calibration.json").read_text())
+    kept, found = done.with_name("kept"), json.loads((done / "calibration.json").read_text())
+    summary = answer(capsys, case_folder, "--recording", kept, "--out", tmp_path)
     for key in ("T_end1_image", "T_base1_base2", "tip_end2_mm", "predicted_tre_mm"):
         assert summary[key] == pytest.approx(np.array(found[key]), abs=1e-6)
     assert summary["without_needle"] == found["without_needle"]
@@ -120,20 +112,13 @@ def test_a_recording_without_joints_says_what_it_cannot_count(case_folder, done,
     lines = [line.split(",") for line in (done / "recording.csv").read_text().splitlines()]
     assert lines[0][-1] == "B_q6_deg"
     (tmp_path / "bare.csv").write_text("\n".join(",".join(line[:-12]) for line in lines) + "\n")
-    arguments = [str(case_folder), "--recording", str(tmp_path / "bare.csv"), "--out", str(tmp_path / "out"), "--json"]
-    assert main(["selfcal", *arguments]) == OK
-    summary = json.loads(capsys.readouterr().out)
+    summary = answer(capsys, case_folder, "--recording", tmp_path / "bare.csv", "--out", tmp_path / "out")
     assert summary["arms"] is None
     assert any("no joints" in warning for warning in summary["warnings"])
     assert any("errors of the arms" in line for line in summary["cannot_show"])
     counted = json.loads((done / "calibration.json").read_text())
     assert summary["predicted_tre_mm"] < counted["predicted_tre_mm"]
-
-
-def test_joints_of_another_arm_are_refused(case_folder, done, tmp_path, capsys):
-    """The first joint 20 deg off: the flange is not where a ur3 with these joints has it."""
-    lines = [line.split(",") for line in (done / "recording.csv").read_text().splitlines()]
-    lines[3][-12] = repr(float(lines[3][-12]) + 20.0)
+    lines[3][-12] = repr(float(lines[3][-12]) + 20.0)  # the flange is not where a ur3 with these joints has it
     (tmp_path / "other.csv").write_text("\n".join(",".join(line) for line in lines) + "\n")
     command = ["selfcal", case_folder, "--recording", tmp_path / "other.csv", "--out", tmp_path / "out"]
     refused_command(command, capsys, "joints_of_another_arm", "A in pose 3")
@@ -143,9 +128,7 @@ def test_a_declaration_that_is_too_small_is_a_warning(done, tmp_path, capsys):
     """Told a third of the noise, the residuals' chi-squared is far above its freedom."""
     noise = "[noise]\nrobot_mm = 0.0\nrobot_deg = 0.0\nimage_mm = 0.02\ndirection_deg = 0.05\noff_plane_mm = 0.05\n"
     (tmp_path / "selfcal.toml").write_text(CASE + noise)
-    arguments = ["selfcal", str(tmp_path), "--recording", str(done), "--out", str(tmp_path / "out"), "--json"]
-    assert main(arguments) == OK
-    summary = json.loads(capsys.readouterr().out)
+    summary = answer(capsys, tmp_path, "--recording", done, "--out", tmp_path / "out")
     assert summary["arms"]["chi2_per_freedom"] > 1.5
     assert any("probably too small" in warning for warning in summary["warnings"])
 
@@ -153,10 +136,8 @@ def test_a_declaration_that_is_too_small_is_a_warning(done, tmp_path, capsys):
 def test_a_recording_that_ends_within_a_line_is_a_warning(done, tmp_path, capsys):
     """Cut within its last number a recording is whole CSV with another number; JSON says that its end is missing."""
     (tmp_path / "cut.csv").write_text((done / "recording.csv").read_text().rstrip("\n"))
-    arguments = ["selfcal", "--recording", str(tmp_path / "cut.csv"), "--out", str(tmp_path / "out"), "--json"]
-    assert main(arguments) == OK
     said = "cut.csv: its last line has no line break at its end; was the file cut?"
-    assert json.loads(capsys.readouterr().out)["warnings"] == [said]
+    assert answer(capsys, "--recording", tmp_path / "cut.csv", "--out", tmp_path / "out")["warnings"] == [said]
 
 
 def test_poses_of_constant_insertion_are_refused(tmp_path, capsys):

@@ -12,12 +12,10 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.arm.ur import ur_model
 from puncture_twin.planning.case.errors import ArmErrors
 from puncture_twin.run_twin import main
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArm, DeclaredArms
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, linear_model
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import ShotByShot, calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import DeclaredArm, DeclaredArms, Problem, linear_model
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import whitener
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import whitener
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import ShotByShot
 from puncture_twin.twin.guidance.ultrasound.recording_file import write_recording
 from puncture_twin.twin.jobs.exit_codes import OK
 from puncture_twin.twin.plant.simulated_recording import (
@@ -72,21 +70,16 @@ def test_shots_are_the_calibration_of_all_poses(taken):
     With directions the batch finds how far needles lean from more of them, and weighs them otherwise: no oracle.
     """
     truth, _, recording = taken
-    tips = Recording(recording.A, recording.B, recording.P)
+    tips, rng = Recording(recording.A, recording.B, recording.P), np.random.default_rng(9)
     found, batch = (calibrate(some, noise=SPEC_NOISE) for some in (tips.subset(slice(0, FIRST)), tips))
     followed = after(ShotByShot.of(found), tips, range(FIRST, ALL)).calibration()
     sd = np.sqrt(np.diag(batch.covariance))
     assert np.abs(followed.parameter_error(batch.estimate) / sd).max() < 0.02
     assert np.abs(found.parameter_error(batch.estimate) / sd).max() > 0.5  # the shots moved it
     np.testing.assert_allclose(np.diag(followed.covariance), np.diag(batch.covariance), rtol=0.02)
-    unseen = exact_recording(truth, draw_probe_poses(np.random.default_rng(9), truth, 200), many(truth, 9))
+    unseen, _ = simulate_recording(rng, 200, truth, noise=None)
     before, since = (np.sqrt(np.mean(tre(one, unseen.A, unseen.B, unseen.P) ** 2)) for one in (found, followed))
     assert since < before
-
-
-def many(truth, seed):
-    """Needles in 200 images."""
-    return draw_image_poses(np.random.default_rng(seed), 200)
 
 
 def test_the_order_of_shots_does_not_matter(taken):
@@ -180,15 +173,11 @@ def test_declared_arms_are_followed_too(with_arms):
 
 def test_what_cannot_be_followed_is_refused(taken):
     _, found, recording = taken
-    held = calibrate(recording, noise=SPEC_NOISE, needle_length_mm=170.0)
     with refused("conflicting_options"):
-        ShotByShot.of(held)
+        ShotByShot.of(calibrate(recording, noise=SPEC_NOISE, needle_length_mm=170.0))
     with refused("wrong_shape"):
         ShotByShot.of(found).with_shot(recording.subset(slice(0, 2)))
-    ended = after(
-        ShotByShot.of(calibrate(recording.subset(slice(0, FIRST)), noise=SPEC_NOISE)), recording, range(FIRST, ALL)
-    )
-    length = ended.calibration(needle_length_mm=170.0)
+    length = after(ShotByShot.of(found), recording, range(FIRST, ALL)).calibration(needle_length_mm=170.0)
     assert length.needle_direction_end2 @ length.tip_end2 == pytest.approx(170.0)
 
 

@@ -1,31 +1,147 @@
-"""The TOML schema, version 1, of a servo case, and the case read from it. See docs/reference/servo-case.md."""
+"""A servo case: its TOML schema, version 1, and the workcell as it plans it. See docs/reference/servo-case.md.
+
+Declared errors say what may be off, and by how much: the belief computes with them, the twin's truth is drawn from
+them. What is not declared (a rod that bends, cameras that move after the calibration, tissue) is not modelled, which is
+something else than 0.
+
+Two frames matter: the base's, in which the arm is commanded, and C, which the measuring arm defines at the calibration
+and in which the cameras are known. How C lies in the base only a calibration tells.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import Field, Strict, model_validator
+from scipy.spatial.transform import Rotation
 
+from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel, ur_model
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import SchemaError, refuse
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, InputFiles
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
+from puncture_twin.planning.case.errors import ARM_KINDS, ArmErrors
 from puncture_twin.planning.case.tables import Coordinate, Length, Name, Number, Section, Vector
+from puncture_twin.planning.collision.fast_checker import FastChecker
 from puncture_twin.planning.formats import points
 from puncture_twin.planning.formats.meshes import mesh_files as meshes
 from puncture_twin.planning.formats.meshes.mesh_files import parse_mesh
 from puncture_twin.planning.formats.points import NamedPoints, parse_points
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import frame_yz, pose
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
-from puncture_twin.twin.guidance.stereo.declared_errors import ServoErrors, ServoRehearsalSection
+from puncture_twin.twin.guidance.stereo.camera import Camera, stereo_pair
+from puncture_twin.twin.guidance.stereo.servo_law import CarriedRod, rod_orientation
+
+Millimetres = Annotated[Number, Field(ge=0, le=50)]
+SmallAngle = Annotated[Number, Field(ge=0, le=10)]
+PixelDeviation = Annotated[Number, Field(ge=0, le=200)]
+DetectionDeviation = Annotated[Number, Field(ge=1e-4, le=50)]
+Part = Annotated[Number, Field(ge=0, le=0.2)]
+"""A fraction, 0 to 1."""
+DEFAULT_MEASURING_MM = 0.01
+"""Deviation of a coordinate measuring arm."""
+DEFAULT_MARKER_MM = 0.3
+"""Deviation of a marker's centre in an image with voxels of a millimetre: 1 / sqrt(12)."""
+
+
+class ServoErrors(ArmErrors):
+    """Standard deviations per axis.
+
+    Attributes:
+        arm: Whose numbers link, twist and joint take where none are stated.
+        gear_deg: Amplitude of each gear's error, a sine over its joint.
+        gear_cycles: Periods of that sine per turn of the joint: 200 of a harmonic drive of 1:100, twice a turn of its
+            motor (Tuttle, "Understanding and modeling the behavior of a harmonic drive gear transmission", MIT
+            AITR-1365, 1992).
+        ball_offset_mm: Of the ball's centre against where the controller has it on the flange; the cameras see it.
+        tip_offset_mm: Of the needle's tip against the ball's centre, flange axes; no camera sees it.
+        needle_direction_deg: Of the needle, about each of the flange's x and y axes.
+        camera_focal: Of the focal length, as a part of it; ``lens`` of k1, k2, p1, p2.
+        ball_px: Of the centre of a ball or marker in one look; None takes what the tracker states of each image.
+        target_mm: Of the target in the image; as a marker where it is not stated.
+        head_shift_mm: By which the head moves after its markers were seen; it turns about their middle.
+    """
+
+    arm: Literal["calibrated", "nominal"] = "calibrated"
+    gear_deg: SmallAngle = 0.0
+    gear_cycles: Annotated[int, Strict(), Field(ge=1, le=1000)] = 200
+    ball_offset_mm: Millimetres = 0.3
+    tip_offset_mm: Millimetres = 0.3
+    needle_direction_deg: SmallAngle = 0.2
+    camera_turn_deg: SmallAngle = 0.23
+    camera_shift_mm: Millimetres = 3.0
+    camera_axis_px: PixelDeviation = 8.0
+    camera_focal: Part = 0.01
+    lens: tuple[Part, Part, Part, Part] = (0.02, 0.02, 0.0005, 0.0005)
+    ball_px: DetectionDeviation | None = None
+    measuring_arm_mm: Millimetres = DEFAULT_MEASURING_MM
+    marker_mm: Millimetres = DEFAULT_MARKER_MM
+    target_mm: Millimetres = DEFAULT_MARKER_MM
+    head_shift_mm: Millimetres = 0.0
+    head_turn_deg: SmallAngle = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_kind_and_marker(cls, stated: Any) -> Any:
+        if not isinstance(stated, dict):
+            return stated
+        kind = ARM_KINDS["nominal" if stated.get("arm") == "nominal" else "calibrated"]
+        return {**kind._asdict(), "target_mm": stated.get("marker_mm", DEFAULT_MARKER_MM), **stated}
+
+    @property
+    def needle_direction(self) -> float:
+        """Of the needle, rad."""
+        return float(np.radians(self.needle_direction_deg))
+
+    @property
+    def camera_turn(self) -> float:
+        """Of each camera about each axis, rad."""
+        return float(np.radians(self.camera_turn_deg))
+
+    @property
+    def head_turn(self) -> float:
+        """Of the head after its markers were seen, rad."""
+        return float(np.radians(self.head_turn_deg))
+
+    @property
+    def arrival(self) -> float:
+        """Deviation of every joint at one arrival, rad.
+
+        Play leaves a joint at either edge, so half of it counts. A gear's error is a sine of the joint, of which no two
+        arrivals have the same phase: it is as good as drawn anew.
+        """
+        return float(np.linalg.norm([self.repeatability, self.backlash / 2, np.radians(self.gear_deg) / np.sqrt(2.0)]))
+
+    def arm_deviations(self) -> Floats:
+        """Deviations of the 26 parameters that move the ball, shape (26,), ordered as `error_jacobian`; mm, rad."""
+        return np.repeat([self.link_mm, self.twist, self.joint, self.ball_offset_mm], [11, 6, 6, 3])
+
+    def camera_deviations(self) -> Floats:
+        """Deviations of a camera's 13 parameters: focal length (part), axis (px), lens, rotation (rad), shift (mm)."""
+        lens, axes = (self.camera_focal, *[self.camera_axis_px] * 2, *self.lens), [self.camera_turn] * 3
+        return np.array([*lens, *axes, *[self.camera_shift_mm] * 3])
+
+    def stated(self) -> dict[str, Any]:
+        """The deviations by the keys of ``[errors]``, mm, degrees and px."""
+        return self.model_dump(exclude={"arm"})
+
+
+class ServoRehearsalSection(Section):
+    """Errors from which a workcell's truth is drawn, where they are not those that the belief declares."""
+
+    errors: ServoErrors | None = None
+
 
 CASE_NAME = "servo.toml"
 ALLOWED_CASE = "a TOML servo case with schema = 1, or a folder with servo.toml"
-
 Pixels = Annotated[int, Strict(), Field(ge=64, le=8192)]
 Count = Annotated[int, Strict(), Field(ge=1, le=1000)]
 Degrees = Annotated[Number, Field(ge=-90, le=90)]
@@ -159,11 +275,7 @@ class ServoFile(Section):
 class ServoCase:
     """A servo case, read and checked.
 
-    Attributes:
-        skin: The head's surface, image frame, mm.
-        markers: The markers' centres, image frame, in truth.
-        targets: The targets, image frame, in truth.
-        inputs: Every file, with role and hash.
+    ``skin``: the head's surface, ``markers`` and ``targets``: their centres in truth; image frame, mm.
     """
 
     path: Path
@@ -223,3 +335,61 @@ def load_servo_case(path: Path | str) -> ServoCase:
 
 def _read(files: InputFiles, head: HeadSection, role: str, max_bytes: int, path: Path) -> bytes:
     return files.read(role, getattr(head, role), max_bytes=max_bytes, key=f"head.{role}", where=path)
+
+
+GRID = (3, 2, 2)
+"""Points of the calibration along the base's x, y and z."""
+
+
+def planned_cameras(case: ServoCase) -> tuple[Camera, ...]:
+    """The cameras as the case plans them; only a calibration tells where they are."""
+    plan = case.file.cameras
+    return stereo_pair(*plan.size_px, plan.focal_px, plan.baseline_mm, plan.distance_mm, plan.distortion)
+
+
+def calibration_frame(case: ServoCase) -> Floats:
+    """T_base_c, shape (4, 4), mm: C at the calibrated volume's middle, z along the cameras' view, y down.
+
+    The cameras stand on the far side of the head, seen from the arm, and look back and down at it.
+    """
+    down = np.radians(case.file.cameras.elevation_deg)
+    z, y = np.array([-np.cos(down), 0.0, -np.sin(down)]), np.array([np.sin(down), 0.0, -np.cos(down)])
+    return pose(frame_yz(y, z), case.file.calibration.center_mm)
+
+
+def head_pose(case: ServoCase) -> Floats:
+    """T_base_m, shape (4, 4), mm: the head's z up, its face (-y) along the base's x at yaw 0."""
+    head = case.file.head
+    return pose(Rotation.from_euler("z", 90.0 + head.yaw_deg, degrees=True).as_matrix(), head.position_mm)
+
+
+def workcell_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
+    """The planner's collision checker; T_base_m (4, 4), mm: where the head is believed to be, None without it.
+
+    The rod is as thick as its ball, and reaches to the ball's far side.
+    """
+    boxes = [Box(box.name, pose(np.eye(3), box.center_mm), box.size_mm) for box in case.file.box]
+    skin, tool = None if T_base_m is None else case.skin.transformed(T_base_m), case.file.tool
+    length = tool.rod_mm + tool.ball_diameter_mm / 2
+    rod = Tool(length, length - tool.holder_mm, tool.ball_diameter_mm, tool.holder_diameter_mm)
+    return FastChecker(case.model, rod, boxes, skin, padding_mm=case.file.servo.padding_mm)
+
+
+def carried_rod(case: ServoCase) -> CarriedRod:
+    """The nominal arm with the case's rod, in the orientation of the targets."""
+    tool = case.file.tool
+    return CarriedRod(case.model, tool.rod_mm, rod_orientation(float(np.radians(tool.tilt_deg))))
+
+
+def calibrating_rod(case: ServoCase) -> CarriedRod:
+    """The nominal arm with the case's rod, in the orientation of the calibration."""
+    tilt = case.file.calibration.tilt_deg
+    rod = carried_rod(case)
+    return rod if tilt is None else rod._replace(R_base_flange=rod_orientation(float(np.radians(tilt))))
+
+
+def grid_points(case: ServoCase) -> Floats:
+    """The calibration's points, base frame, shape (12, 3), mm: neighbours in the order of the arm's path."""
+    cal = case.file.calibration
+    steps = np.array(list(product(*(np.linspace(-0.5, 0.5, count) for count in GRID))))
+    return np.asarray(cal.center_mm + steps * cal.size_mm)

@@ -1,11 +1,12 @@
-"""One servo step: a joint path from where the ball is to where it should be; the mapping of the head; the posture.
+"""The visual servo: look, move a step, look again; the mapping of the head; the posture.
 
     dX = R_base_c (target_c - ball_c),    dq = J^+ [dX; da]                             (Liu 2007, section 1)
 
 J is the nominal Jacobian at the ball, da the needle's orientation error from forward kinematics. The path is cut into
 short pieces with a Jacobian each, so that it is straight and can be checked for contacts. Near a singularity the
 orientation is given up first: damped steps of the position alone (Nakamura and Hanafusa 1986), as long as the needle
-rotates by no more than a limit.
+rotates by no more than a limit. The robot's own accuracy does not enter the error that is moved to zero. Where the ball
+is not seen the arm does not move, and every path is checked for contacts before it is moved along.
 
 `map_head` estimates c_T_m, from the image to the calibration frame, by markers that both cameras see. Each marker errs
 in the image and in the cameras, and the cameras err most along their view. The fit weighs each marker by both
@@ -18,8 +19,10 @@ target may be off. With equal round errors both agree with the plain fit and Fit
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,22 +41,21 @@ from puncture_twin.planning.arm.kinematics import (
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.collision.state_checker import StateChecker
+from puncture_twin.planning.collision.state_checker import Contact, StateChecker
 from puncture_twin.planning.geometry.gauss_newton import System, gauss_newton
 from puncture_twin.planning.geometry.rigid import apply, frame_yz, log_rotation, pose, rotated_about
+from puncture_twin.planning.motion.path_check import FINER, RESOLUTION_RAD, dense_states, first_contact
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residuals import Conditioning
+from puncture_twin.twin.devices import Arm
 
 CHARACTERISTIC_MM = 300.0
 """Length by which millimetres are made comparable with radians: about half of a UR3's reach."""
-
 MIN_SIGMA = 0.1
 """Smallest singular value of the scaled Jacobian from which on position and orientation are controlled together."""
-
 DAMPING = 0.05
 """Damping of a position-only step where the position itself is singular; none where it is not."""
-
 PIECE_MM = 1.0
 """A step's path is cut into pieces no longer than this: over 1 mm the Jacobian of a UR3 errs by 2 or 3 micrometres."""
 
@@ -71,35 +73,35 @@ class ServoStop(StrEnum):
 
 
 class StepLimits(NamedTuple):
-    """Limits of one step."""
+    """Limits of one step: its length, the largest rotation of any joint, and how far the needle may rotate away.
+
+    It may while only the position is controlled. Of 5 joints that move, the sixth, which turns the rod about itself, is
+    held.
+    """
 
     step_mm: float = 10.0
     joint_step_rad: float = math.radians(10.0)
-    """The largest rotation of any joint."""
     drift_rad: float = math.radians(1.0)
-    """How far the needle may rotate away while only the position is controlled."""
     joints: int = 6
-    """That move: of 5, the sixth, which turns the rod about itself, is held."""
 
 
 class Step(NamedTuple):
-    """The joint path of one step."""
+    """The joint path (m, 6), rad, of one step, from the arm's configuration; one row where it may not move, and why.
+
+    ``position_only``: whether some piece gave the orientation up.
+    """
 
     q_path: Floats
-    """Shape (m, 6), rad: from the arm's configuration; one row where it may not move."""
     stop: ServoStop | None
-    """Why the arm may not move; None where it may."""
     position_only: bool
-    """Whether some piece gave the orientation up."""
 
 
 class CarriedRod(NamedTuple):
-    """The rod on the arm, and the orientation to keep."""
+    """The rod on the arm, and the orientation (3, 3) to keep."""
 
     model: UrModel
     rod_mm: float
     R_base_flange: Floats
-    """Shape (3, 3): the orientation to keep."""
 
 
 def ball_base(rod: CarriedRod, q: Floats) -> Floats:
@@ -128,12 +130,9 @@ def smallest_sigma(J: Floats) -> float:
 
 
 def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits) -> Step:
-    """The joint path that moves the ball by a vector and keeps the needle's orientation.
+    """The joint path from joints (6,), rad, that moves the ball by a vector (3,), mm, and keeps its orientation.
 
-    Args:
-        q: Shape (6,), rad: the arm's commanded configuration.
-        move_base: Shape (3,), mm.
-        limits: A longer move is cut short; the next look sees what is left.
+    A longer move than the limits allow is cut short: the next look sees what is left.
     """
     length = float(np.linalg.norm(move_base))
     move = move_base * min(1.0, limits.step_mm / max(length, 1e-12))
@@ -147,9 +146,10 @@ def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits
         fraction = min(1.0, max(slack, 0.0) / max(float(np.abs(dq).max()), 1e-12))
         q_next = q_now + fraction * dq
         position_only = position_only or without_orientation
-        stop = _refusal(rod, q_next, without_orientation, limits)
-        if stop is not None:
-            return Step(np.array(path[:1]), stop, position_only)
+        if not rod.model.within_limits(q_next):
+            return Step(np.array(path[:1]), ServoStop.JOINT_LIMIT, position_only)
+        if without_orientation and np.linalg.norm(orientation_error(rod, q_next)) > limits.drift_rad:
+            return Step(np.array(path[:1]), ServoStop.SINGULAR, position_only)
         path.append(q_next)
         if fraction < 1.0:
             break
@@ -171,23 +171,10 @@ def _piece(rod: CarriedRod, q: Floats, move: Floats, joints: int) -> tuple[Float
 
 
 def damped(J: Floats, goal: Floats) -> Floats:
-    """Damped least squares J^T (J J^T + lambda^2 I)^-1 goal; lambda grows from 0 where sigma_min falls below its limit.
-
-    Args:
-        J: Shape (m, n), m <= n, scaled.
-        goal: Shape (m,).
-    """
+    """Damped least squares J^T (J J^T + lambda^2 I)^-1 goal; lambda grows from 0 where sigma_min is below its limit."""
     sigma = float(np.linalg.svd(J, compute_uv=False)[-1])
     squared = DAMPING**2 * max(0.0, 1.0 - (sigma / MIN_SIGMA) ** 2)  # lambda^2
     return np.asarray(J.T @ np.linalg.solve(J @ J.T + squared * np.eye(len(J)), goal))
-
-
-def _refusal(rod: CarriedRod, q: Floats, position_only: bool, limits: StepLimits) -> ServoStop | None:
-    if not rod.model.within_limits(q):
-        return ServoStop.JOINT_LIMIT
-    if position_only and np.linalg.norm(orientation_error(rod, q)) > limits.drift_rad:
-        return ServoStop.SINGULAR
-    return None
 
 
 def _scaled(J: Floats) -> Floats:
@@ -200,24 +187,18 @@ CONVERGED = 1e-12
 
 
 class SeenMarkers(NamedTuple):
-    """Markers as triangulated by the cameras."""
+    """Markers as triangulated by the cameras: points (n, 3), mm, covariances (n, 3, 3), mm^2."""
 
     points_c: Floats
-    """Shape (n, 3), mm."""
     covariances: Floats
-    """Shape (n, 3, 3), mm^2."""
 
 
 @dataclass(frozen=True, eq=False)
 class Mapping:
-    """c_T_m with its covariance.
+    """c_T_m (4, 4), mm, with its covariance (6, 6), of a turn (rad) about the markers' centre and a shift (mm), in C.
 
-    Attributes:
-        T_c_m: Shape (4, 4), rigid, mm.
-        covariance: Shape (6, 6), of a turn (rad) about ``center_c`` and a shift (mm), axes of C.
-        center_c: Shape (3,), the markers' centre, mm.
-        residuals: Shape (n, 3), T_c_m markers_m - markers_c, mm.
-        conditioning: The flags of an ill-conditioned marker set, at the middle of the targets.
+    ``residuals`` (n, 3): T_c_m markers_m - markers_c, mm. ``conditioning``: the flags of an ill-conditioned marker set,
+    at the middle of the targets.
     """
 
     T_c_m: Floats
@@ -241,14 +222,8 @@ class Mapping:
         return np.asarray(slope @ self.covariance @ slope.transpose(0, 2, 1))
 
     def expected_tre_mm(self, points_m: Floats, target_mm: float = 0.0) -> Floats:
-        """Expected (rms) error at points (n, 3) of the image frame, shape (n,), mm.
-
-        Args:
-            points_m: Where.
-            target_mm: Standard deviation per axis with which the image has a target itself.
-        """
-        variance = np.trace(self.covariance_at(points_m), axis1=1, axis2=2) + 3 * target_mm**2
-        return np.asarray(np.sqrt(variance))
+        """Expected (rms) error at points (n, 3) that the image has to within ``target_mm`` per axis, shape (n,), mm."""
+        return np.asarray(np.sqrt(np.trace(self.covariance_at(points_m), axis1=1, axis2=2) + 3 * target_mm**2))
 
 
 def map_head(
@@ -260,13 +235,9 @@ def map_head(
     *,
     where: str | Path = "mapping",
 ) -> Mapping:
-    """Fit c_T_m to markers in the image and in C, weighted by both covariances.
+    """Fit c_T_m to markers in the image (n, 3), n at least 3, and in C, weighted by both covariances; mm.
 
-    Args:
-        names: The markers, n at least 3.
-        markers_m: Shape (n, 3), mm: what the image has.
-        image_mm: Standard deviation per axis of ``markers_m``.
-        targets_m: Shape (k, 3), mm: where the error matters.
+    ``image_mm`` is the standard deviation of ``markers_m`` per axis; at targets (k, 3) the error matters.
 
     Raises:
         InputError: Fewer than three markers, collinear, mirrored, a unit slip, or a marker far off.
@@ -281,17 +252,16 @@ def map_head(
         slopes = roots @ turn_and_shift_slopes(fitted - center)
         return System((roots @ (fitted - seen.points_c)[:, :, None]).ravel(), slopes.reshape(-1, 6))
 
-    def moved(T: Floats, step: Floats) -> Floats:
-        return rotated_about(T, center, step)
-
-    fit = gauss_newton(plain.T_base_ct, linearised, moved, _arrived, MAX_ITERATIONS)
+    fit = gauss_newton(
+        plain.T_base_ct,
+        linearised,
+        lambda T, step: rotated_about(T, center, step),
+        lambda _, step: bool(np.abs(step).max() < CONVERGED),
+        MAX_ITERATIONS,
+    )
     residuals = apply(fit.estimate, pairs.points_ct) - seen.points_c
     covariance = np.asarray(np.linalg.inv(fit.system.information), dtype=np.float64)
     return Mapping(fit.estimate, covariance, center, residuals, plain.conditioning)
-
-
-def _arrived(_: System[Floats], step: Floats) -> bool:
-    return bool(np.abs(step).max() < CONVERGED)
 
 
 def turn_and_shift_slopes(offsets: Floats) -> Floats:
@@ -304,7 +274,6 @@ def turn_and_shift_slopes(offsets: Floats) -> Floats:
 
 LEAST_SINGULARITY = 0.05
 """A branch that comes nearer to a singularity (of 0..1) at some point is not used."""
-
 REFERENCE_RAD = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 """Whole turns are chosen nearest to this: arm up, elbow bent, flange down."""
 
@@ -322,25 +291,20 @@ def flange_poses(rod: CarriedRod, points_base: Floats) -> Floats:
 
 
 class Posture(NamedTuple):
-    """Joint angles that reach a set of points on one branch."""
+    """Joint angles (n, 6), rad, that reach a set of points on one branch of the inverse kinematics.
+
+    An arm's errors differ from branch to branch by millimetres, so what was calibrated on one is to be used on it.
+    """
 
     q: Floats
-    """Shape (n, 6), rad."""
     branch: int
-    """The inverse-kinematics branch of all of them. An arm's errors differ from branch to branch by millimetres, so
-    what was calibrated on one is to be used on it."""
 
 
 def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, *, first: int | None = None) -> Posture:
-    """Joint angles that put the ball on every point, all on one branch, free of contacts.
+    """Joint angles that put the ball on every point (n, 3), mm, all on one branch, free of contacts.
 
-    Of the branches the one that stays farthest from every singularity is taken; of equals, which mirrored ones are, the
-    one whose elbow is on the rod's side.
-
-    Args:
-        rod: The arm, its rod and its orientation.
-        points_base: Shape (n, 3), mm.
-        first: Try this branch before the others.
+    The branch ``first`` is tried first, then the one that stays farthest from every singularity; of equals, which
+    mirrored ones are, the one whose elbow is on the rod's side.
 
     Raises:
         NoAnswerError: No branch holds all points freely; says what the best one lacks.
@@ -365,3 +329,131 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
 def path_upward(rod: CarriedRod, points_base: Floats, up_mm: float) -> Floats:
     """Points (n, 3) farther back along the rod by a distance, mm: where the arm hovers."""
     return np.asarray(points_base - up_mm * rod.R_base_flange[:, 2])
+
+
+DIVERGING_RATIO = 1.5
+"""A step diverges if it leaves more than this times the error before it."""
+DIVERGING_STEPS = 2
+"""Diverging steps in a row that end the servo: a single one may be the play of the gears."""
+NOISE_TOLERANCES = 3.0
+"""Errors below this many tolerances are noise, and end no servo as diverging."""
+
+
+class Seen(NamedTuple):
+    """Ball and target as one look measures them, (3,), mm, in C, and the covariance (3, 3), mm^2, of the ball."""
+
+    ball_c: Floats
+    target_c: Floats
+    covariance: Floats
+
+
+class Lost(NamedTuple):
+    """A ball that was not found."""
+
+    reason: str
+
+
+Look = Callable[[Floats], Seen | Lost]
+"""Function of the commanded joints (6,), rad: a measurement."""
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Target, limits and devices of one servo: the rod, and T_base_c as calibrated (Liu's r_T_c).
+
+    It has converged when a look sees no error above the tolerance; a ball counts as lost after so many looks; the
+    checker has the head where it is believed to be.
+    """
+
+    rod: CarriedRod
+    T_base_c: Floats
+    tolerance_mm: float
+    max_steps: int
+    looks: int
+    limits: StepLimits
+    checker: StateChecker
+
+
+class Visit(NamedTuple):
+    """One stop of the arm: commanded joints, what was seen, and how far the ball seen is from the target believed."""
+
+    q_command: Floats
+    seen: Seen
+    error_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Servoed:
+    """Result of a servo: every stop at which the ball was seen, in order, and the last command (6,), rad.
+
+    ``detail``: what was touched or missing, for people. ``position_only``: whether some step gave the orientation up.
+    """
+
+    stop: ServoStop
+    visits: tuple[Visit, ...]
+    q_command: Floats
+    detail: str = ""
+    position_only: bool = False
+
+    @property
+    def ended_in_sight(self) -> bool:
+        """Whether the ball was seen where the arm ended."""
+        return bool(self.visits) and self.visits[-1].q_command is self.q_command
+
+    @property
+    def steps(self) -> int:
+        """Number of corrections that were executed."""
+        return max(0, len(self.visits) - 1)
+
+    @property
+    def errors_mm(self) -> Floats:
+        """Measured error at each stop, shape (n,), mm."""
+        return np.array([visit.error_mm for visit in self.visits])
+
+
+def servo(task: Task, q_command: Floats, look: Look, arm: Arm) -> Servoed:
+    """Move the ball onto the target: look, measure the error, move a step; until it converges or must stop."""
+    visits: list[Visit] = []
+    position_only = False
+
+    def ended(stop: ServoStop, detail: str = "") -> Servoed:
+        return Servoed(stop, tuple(visits), q_command, detail, position_only)
+
+    while True:
+        seen = look_again(look, q_command, task.looks)
+        if isinstance(seen, Lost):
+            return ended(ServoStop.LOST_BALL, seen.reason)
+        error_c = seen.target_c - seen.ball_c
+        visits.append(Visit(q_command, seen, float(np.linalg.norm(error_c))))
+        errors = [visit.error_mm for visit in visits]
+        if errors[-1] <= task.tolerance_mm:
+            return ended(ServoStop.CONVERGED)
+        worse = [b > DIVERGING_RATIO * a for a, b in pairwise(errors[-DIVERGING_STEPS - 1 :])]
+        if len(worse) == DIVERGING_STEPS and all(worse) and errors[-1] > NOISE_TOLERANCES * task.tolerance_mm:
+            return ended(ServoStop.DIVERGING)
+        if len(visits) > task.max_steps:
+            return ended(ServoStop.TOLERANCE_NOT_REACHED)
+        step = servo_step(task.rod, q_command, task.T_base_c[:3, :3] @ error_c, task.limits)
+        position_only = position_only or step.position_only
+        if step.stop is not None:
+            return ended(step.stop)
+        contact = path_contact(task.checker, step.q_path)
+        if contact is not None:
+            return ended(ServoStop.CONTACT, f"{contact.body} and {contact.other}")
+        q_command = step.q_path[-1]
+        arm.move_jp(q_command)
+
+
+def path_contact(checker: StateChecker, q_path: Floats) -> Contact | None:
+    """First contact along waypoints (m, 6), rad, checked as finely as any motion; None if free."""
+    return first_contact(checker, dense_states(checker, q_path, RESOLUTION_RAD / FINER))
+
+
+def look_again(look: Look, q_command: Floats, looks: int) -> Seen | Lost:
+    """Look, and look again where the ball was not found, without moving the arm."""
+    found = look(q_command)
+    for _ in range(looks - 1):
+        if isinstance(found, Seen):
+            break
+        found = look(q_command)
+    return found

@@ -5,23 +5,21 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.base.arrays import Floats, Pixels
+from puncture_twin.planning.base.arrays import Floats, Ints, Pixels
 from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.planning.formats.pose_table import table_text
 from puncture_twin.twin.devices import Arm, JogOperator, Probe
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection, Missed, detect
-from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, choose_poses, drawing
+from puncture_twin.twin.guidance.ultrasound.needle_detector import Detection, Missed, detect
+from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, TwoArms, choose_poses, drawing
 from puncture_twin.twin.guidance.ultrasound.recording_file import FILE_NAME, GROUPS
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
 from puncture_twin.twin.pictures import png_bytes
 
 JOG_FAILED = "jog out of reach"
@@ -38,40 +36,36 @@ class ProbeDevices(NamedTuple):
 
 
 class ProbeShot(NamedTuple):
-    """One image with all that belongs to it."""
+    """One image, of a number from 0, with all that belongs to it; arrays of shape (6,).
+
+    ``q_probe``, ``q_needle``: commanded joints, rad, the needle's after the jog. ``turn_probe``, ``turn_needle``:
+    direction in which each joint last rotated: 1, -1, or 0.
+    """
 
     number: int
-    """Of the image, from 0."""
     candidate: int
     q_probe: Floats
-    """Commanded joints of the probe's arm, shape (6,), rad."""
     q_needle: Floats
-    """Commanded joints of the needle's arm after the jog, shape (6,), rad."""
     turn_probe: Floats
-    """Direction in which each of its joints last rotated, shape (6,): 1, -1, or 0."""
     turn_needle: Floats
-    """Directions of the needle arm's joints, shape (6,)."""
     image: Pixels
     found: Detection | Missed
 
 
 @dataclass(frozen=True, eq=False)
 class Acquisition:
-    """A recording, and how it was made.
+    """A recording, its poses as the controllers print them, and how it was made.
 
-    Attributes:
-        recording: Poses as the controllers print them, tips and directions as detected.
-        shots: The images behind it, in the same order.
-        missed: Pictures in which no needle was found, by reason, and poses that were given up.
-        missed_shots: Those images.
-        left: Indices of candidates that were never gone to.
+    ``shots`` are the images behind it, in the same order; ``missed`` counts pictures without a needle, by reason, and
+    poses that were given up; ``missed_shots`` are those images; ``left`` are indices of candidates that were never gone
+    to.
     """
 
     recording: Recording
     shots: tuple[ProbeShot, ...]
     missed: dict[str, int]
     missed_shots: tuple[ProbeShot, ...]
-    left: NDArray[np.int_]
+    left: Ints
 
 
 class _SentArm:
@@ -115,7 +109,10 @@ def acquire(
     left = np.arange(len(candidates.q_probe))
     while len(shots) < wanted:
         if wanted - len(shots) > len(left):
-            what = _too_few(case, candidates, shots, missed, given_up)
+            what = (
+                f"{len(shots)} of {wanted} poses show the needle. Of {len(candidates.q_probe)} candidates, "
+                f"{len(missed)} did not show it and {given_up.total()} were given up. More [poses] samples would help"
+            )
             raise NoAnswerError(what, counts=candidates.counts, code="too_few_poses")
         chosen = choose(case, candidates, left, wanted - len(shots), rng, shots)
         left = np.setdiff1d(left, chosen)
@@ -123,47 +120,38 @@ def acquire(
             taken = _shot(case, workcell, candidates, devices, arms, int(row), len(shots) + len(missed))
             if isinstance(taken, str):
                 given_up[taken] += 1
-            elif isinstance(taken.found, Missed):
-                missed.append(taken)
             else:
-                shots.append(taken)
+                (missed if isinstance(taken.found, Missed) else shots).append(taken)
             tried = len(missed) + given_up.total()
             count(len(shots) + tried, wanted + tried)
     play = any(arm.errors.backlash_deg > 0.0 for arm in (case.content.probe_arm, case.content.needle_arm))
-    reasons = Counter(shot.found.value for shot in missed if isinstance(shot.found, Missed)) + given_up
-    recording = _recording(workcell, shots, missed, play=play)
+    reasons = Counter(str(shot.found) for shot in missed) + given_up
+    recording = _recording(case, shots, missed, play=play)
     return Acquisition(recording, tuple(shots), dict(reasons), tuple(missed), left)
 
 
 def keep_pictures(taken: Acquisition, pixel_mm: float, folder: Path) -> None:
-    """Write a recording with its pictures, found or not, into an empty folder: the tips are to be read from them.
-
-    Args:
-        pixel_mm: Edge of a pixel.
-    """
-    shots = sorted((*taken.shots, *taken.missed_shots), key=lambda shot: shot.number)
+    """Write a recording with its pictures, found or not, into an empty folder: the tips are to be read from them."""
     play = taken.recording.turn_probe is not None
-    q, turns = (
-        [(getattr(shot, f"{key}_probe"), getattr(shot, f"{key}_needle")) for shot in shots] for key in ("q", "turn")
-    )
     header = ("name", *GROUPS["picture"], *GROUPS["pixel"], *GROUPS["q"], *(GROUPS["turn"] if play else ()))
     rows = []
-    for shot, joints, turn in zip(shots, q, turns, strict=True):
+    for shot in sorted((*taken.shots, *taken.missed_shots), key=lambda shot: shot.number):
         name = f"{shot.number + 1:03d}.png"
         (folder / name).write_bytes(png_bytes(shot.image))
-        behind = [*np.degrees(np.concatenate(joints)).tolist(), *(np.concatenate(turn).tolist() if play else [])]
-        rows.append((str(shot.number + 1), name, pixel_mm, *behind))
+        turns = [*shot.turn_probe.tolist(), *shot.turn_needle.tolist()] if play else []
+        joints = np.degrees(np.concatenate([shot.q_probe, shot.q_needle])).tolist()
+        rows.append((str(shot.number + 1), name, pixel_mm, *joints, *turns))
     (folder / FILE_NAME).write_text(table_text(header, rows), encoding="utf-8")
 
 
 def choose(
     case: SelfcalCase,
     candidates: CandidatePoses,
-    left: NDArray[np.int_],
+    left: Ints,
     n: int,
     rng: np.random.Generator,
     shots: list[ProbeShot],
-) -> NDArray[np.int_]:
+) -> Ints:
     """The next n candidates of those left: the most informative given what is recorded, or at random."""
     if case.content.poses.choose == "random":
         return np.sort(rng.choice(left, n, replace=False))
@@ -187,7 +175,6 @@ def _shot(
     row: int,
     number: int,
 ) -> ProbeShot | str:
-    """Go to one candidate and take its image, the one of this number, or return why it was given up."""
     q_probe, poses = candidates.q_probe[row], candidates.poses
     assert poses.v is not None  # candidates are made with directions
     turn_probe = arms[0].move(q_probe)
@@ -203,35 +190,18 @@ def _shot(
     return ProbeShot(number, row, q_probe, q_needle, turn_probe, turn_needle, image, found)
 
 
-def _recording(workcell: TwoArms, shots: list[ProbeShot], missed: list[ProbeShot], *, play: bool) -> Recording:
-    """The recording of images and controllers; with the joints' directions of rotation, where these matter."""
+def _recording(case: SelfcalCase, shots: list[ProbeShot], missed: list[ProbeShot], *, play: bool) -> Recording:
     found = [shot.found for shot in shots if isinstance(shot.found, Detection)]
-    q_probe, q_needle = (np.array([getattr(shot, key) for shot in shots]) for key in ("q_probe", "q_needle"))
-    turns = (np.array([getattr(shot, key) for shot in shots]) for key in ("turn_probe", "turn_needle"))
-    turn_probe, turn_needle = turns if play else (None, None)
+    keys = ("q_probe", "q_needle", *(("turn_probe", "turn_needle") if play else ()))
+    joints: dict[str, Any] = {key: np.array([getattr(shot, key) for shot in shots]) for key in keys}
+    A, B = (flange_pose(model, joints[key]) for model, key in zip(case.models, keys[:2], strict=True))
     return Recording(
-        flange_pose(workcell.probe_model, q_probe),
-        flange_pose(workcell.needle_model, q_needle),
+        A,
+        B,
         np.array([one.tip_image for one in found]),
         np.array([one.direction_image for one in found]),
         tuple(str(shot.number + 1) for shot in shots),
-        q_probe=q_probe,
-        q_needle=q_needle,
-        turn_probe=turn_probe,
-        turn_needle=turn_needle,
         shaft_mm=np.array([one.shaft_mm for one in found]),
         missed=tuple((str(shot.number + 1), str(shot.found)) for shot in missed),
-    )
-
-
-def _too_few(
-    case: SelfcalCase,
-    candidates: CandidatePoses,
-    shots: list[ProbeShot],
-    missed: list[ProbeShot],
-    given_up: Counter[str],
-) -> str:
-    return (
-        f"{len(shots)} of {case.content.poses.count} poses show the needle. Of {len(candidates.q_probe)} candidates, "
-        f"{len(missed)} did not show it and {given_up.total()} were given up. More [poses] samples would help"
+        **joints,
     )

@@ -1,4 +1,8 @@
-"""Poses that both arms can take with the needle in the image, and the choice of those to record.
+"""Poses that both arms can take with the needle in the image, the choice of those to record, and aims by a calibration.
+
+Each arm alone is checked as everywhere (:class:`planning.collision.fast_checker.FastChecker`: itself, the table, the
+phantom); the two arms against each other as in :mod:`planning.collision.two_arms`. Everything is placed where the
+*drawing* has it; the clearance covers what the truth differs by.
 
 The geometry of the image is drawn first (where the tip shows, how steep the needle is, how the probe is tilted); the
 arms follow by inverse kinematics. Every draw that cannot be taken falls to a reason, and the reasons are counted.
@@ -12,34 +16,159 @@ noise holds the truth less often than it says.
 from __future__ import annotations
 
 from collections import Counter
+from enum import StrEnum
+from functools import cache
+from itertools import product
 from typing import NamedTuple
 
+import fcl
 import numpy as np
-from numpy.typing import NDArray
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.inverse_kinematics import inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import flange_pose
+from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints, rms
 from puncture_twin.planning.base.errors import NoAnswerError, refuse
-from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about, frame_yz
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors
+from puncture_twin.planning.collision.bodies import surface, touch
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.two_arms import BetweenArms, handle_tool, head_body
+from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.rigid import exp_rotation, frame_about, frame_yz, pose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate, active_columns, parameter_units
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, linear_model
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
+    DeclaredArms,
+    Estimate,
+    Problem,
+    active_columns,
+    arm_errors,
+    linear_model,
+    parameter_units,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import whitener
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import whitener
-from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.two_arms import Touching, TwoArms, inside_phantom
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import PhantomSection, SelfcalCase
+
+TABLE_MM = (1800.0, 1200.0, 40.0)
+TABLE_GAP_MM = 0.5
+"""The table ends so far below the bases' plane: the bases stand on it, and nothing else should."""
+
+
+class Touching(StrEnum):
+    """Contact because of which a pair of configurations is refused."""
+
+    PROBE_ARM = "probe_arm_collision"
+    NEEDLE_ARM = "needle_arm_collision"
+    BOTH = "arms_collide"
+
+
+def between_arms(case: SelfcalCase, T_end1_image: Floats, T_base1_base2: Floats, clearance_mm: float) -> BetweenArms:
+    """Both arms of a case, with the probe's head and the needle's arm where they are, to stay a clearance apart."""
+    head = head_body(head_pose(case, T_end1_image), np.array(case.content.probe.head_mm), clearance_mm)
+    tools = (probe_tool(case), needle_tool(case))
+    return BetweenArms(case.models, tools, head, T_base1_base2, clearance_mm)
+
+
+class TwoArms:
+    """FCL's verdict on both arms. Not for several threads at once: FCL's objects are moved for each question."""
+
+    def __init__(self, case: SelfcalCase) -> None:
+        content = case.content
+        self.probe_model, self.needle_model = case.models
+        clearance = content.poses.clearance_mm
+        phantom, table = phantom_mesh(content.phantom), table_box(content.phantom)
+        T_base2_base1 = np.asarray(np.linalg.inv(case.T_base1_base2), dtype=np.float64)
+        moved = Box(table.name, T_base2_base1 @ table.T_base_box, table.size_mm)
+        tools = (probe_tool(case), needle_tool(case))
+        self._probe = FastChecker(self.probe_model, tools[0], [table], phantom, padding_mm=clearance)
+        self._needle = FastChecker(
+            self.needle_model, tools[1], [moved], phantom.transformed(T_base2_base1), padding_mm=clearance
+        )
+        self._between = between_arms(case, case.T_end1_image, case.T_base1_base2, clearance)
+        self._phantom = fcl.CollisionObject(surface(phantom))
+        self._table = fcl.CollisionObject(
+            fcl.Box(*table.size_mm), fcl.Transform(table.T_base_box[:3, :3], table.T_base_box[:3, 3])
+        )
+
+    def probe_free(self, q: Floats) -> bool:
+        """Whether the probe's arm touches neither itself, table nor phantom at ``q`` (6,), rad."""
+        if self._probe.contact(q, needle_may_touch_patient=False) is not None:
+            return False
+        self._between.place_probe(q)
+        head = self._between.probe_bodies[-1]
+        if touch(head.bare.surface.made, self._phantom) or touch(head.full.surface.made, self._table):
+            return False
+        return not self._between.head_touches_own_arm(q)
+
+    def needle_free(self, q: Floats) -> bool:
+        """Whether the needle's arm touches neither itself, table nor, but for the needle, the phantom."""
+        return self._needle.contact(q, needle_may_touch_patient=True) is None
+
+    def apart(self, q_probe: Floats, q_needle: Floats) -> bool:
+        """Whether the two arms keep their clearance from each other."""
+        return self._between.apart(q_probe, q_needle)
+
+    def verdict(self, q_probe: Floats, q_needle: Floats) -> Touching | None:
+        """The contact, or None."""
+        if not self.probe_free(q_probe):
+            return Touching.PROBE_ARM
+        if not self.needle_free(q_needle):
+            return Touching.NEEDLE_ARM
+        return None if self.apart(q_probe, q_needle) else Touching.BOTH
+
+
+def probe_tool(case: SelfcalCase) -> Tool:
+    """The probe's handle, as a tool of the arm: to the head's back."""
+    probe = case.content.probe
+    return handle_tool(probe.length_mm - probe.head_mm[1], probe.handle_diameter_mm)
+
+
+def needle_tool(case: SelfcalCase) -> Tool:
+    """The needle and its holder."""
+    needle = case.content.needle
+    return Tool(needle.length_mm, needle.shaft_mm, needle.diameter_mm, needle.holder_diameter_mm)
+
+
+def head_pose(case: SelfcalCase, T_end1_image: Floats) -> Floats:
+    """T_end1_head: the head's middle; x along the face, y into the depth, z across the slice; shape (4, 4), mm."""
+    width, _ = case.content.image.imager().size_mm
+    T = np.array(T_end1_image)
+    T[:3, 3] += T[:3, :3] @ [0.5 * width, -0.5 * case.content.probe.head_mm[1], 0.0]
+    return T
+
+
+def table_box(phantom: PhantomSection) -> Box:
+    """The table under both arms, base1."""
+    center = [phantom.top_mm[0], phantom.top_mm[1], -TABLE_GAP_MM - TABLE_MM[2] / 2.0]
+    return Box("table", pose(np.eye(3), center), TABLE_MM)
+
+
+@cache
+def phantom_mesh(phantom: PhantomSection) -> TriangleMesh:
+    """A block with rounded edges, base1, mm, closed: the sum of a smaller block and a ball."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=phantom.round_mm)
+    inner = np.array(phantom.size_mm) - 2.0 * phantom.round_mm
+    corners = np.array(list(product((-0.5, 0.5), repeat=3))) * inner
+    hull = trimesh.convex.convex_hull((corners[:, None] + ball.vertices).reshape(-1, 3))
+    middle = np.array(phantom.top_mm) - [0.0, 0.0, phantom.size_mm[2] / 2.0]
+    return TriangleMesh(np.asarray(hull.vertices) + middle, np.asarray(hull.faces))
+
+
+def inside_phantom(phantom: PhantomSection, points: Floats) -> Bools:
+    """Whether points (n, 3), base1, lie in the block; exact, from its definition."""
+    half = np.array(phantom.size_mm) / 2.0 - phantom.round_mm
+    middle = np.array(phantom.top_mm) - [0.0, 0.0, phantom.size_mm[2] / 2.0]
+    beyond = np.maximum(np.abs(points - middle) - half, 0.0)
+    return np.asarray(np.linalg.norm(beyond, axis=1) < phantom.round_mm)
+
 
 EDGE_MM = 6.0
 """The tip is drawn no nearer to the image's sides, nor above 12 mm: the drawing may be wrong by a few mm."""
-
 LEAST_DEPTH_MM = 12.0
-
 PHANTOM_FRACTION = 0.3
 """The face's middle is drawn within this fraction of the phantom's width from its middle."""
-
 TIP_OUTSIDE = "tip_outside_phantom"
 PROBE_REACH = "probe_out_of_reach"
 NEEDLE_REACH = "needle_out_of_reach"
@@ -48,31 +177,30 @@ REASONS = (TIP_OUTSIDE, PROBE_REACH, NEEDLE_REACH, *(reason.value for reason in 
 
 
 class ImageGeometry(NamedTuple):
-    """n drawn geometries: pose of the probe, and the needle in its image."""
+    """n drawn geometries: the probe's T_base1_image (n, 4, 4), mm, and the needle in its image.
+
+    ``tip_mm`` (n, 2), ``direction_image`` (n, 2), unit, toward the tip; ``roll`` (n,), rad, of the needle about itself.
+    """
 
     T_base1_image: Floats
-    """Shape (n, 4, 4), mm."""
     tip_mm: Floats
-    """Shape (n, 2), in the image."""
     direction_image: Floats
-    """Shape (n, 2), unit, toward the tip."""
     roll: Floats
-    """The needle about itself, shape (n,), rad."""
 
 
 class CandidatePoses(NamedTuple):
-    """Poses that can be recorded, by the drawing, and the reasons of the other draws."""
+    """n poses that can be recorded, by joints (n, 6), rad, and the draws by reason; ``ok`` for those that are here.
+
+    ``poses``: A and B by the drawing's kinematics; the tip and the direction as they should show. ``roll`` (n,), rad:
+        the
+    needle about itself.
+    """
 
     q_probe: Floats
-    """Shape (n, 6), rad."""
     q_needle: Floats
-    """Shape (n, 6), rad."""
     poses: Recording
-    """A and B by the drawing's kinematics; the tip and the direction as they should show."""
     roll: Floats
-    """The needle about itself, shape (n,), rad."""
     counts: dict[str, int]
-    """Draws by reason; ``ok`` for those that are here."""
 
 
 def drawing(case: SelfcalCase) -> Estimate:
@@ -84,7 +212,7 @@ def drawing(case: SelfcalCase) -> Estimate:
 
 def draw_geometry(case: SelfcalCase, n: int, rng: np.random.Generator) -> ImageGeometry:
     """Probe poses on the phantom and needles in their images."""
-    poses, phantom = case.content.poses, case.content.phantom
+    poses, phantom, head = case.content.poses, case.content.phantom, case.content.probe.head_mm
     yaw = rng.uniform(-poses.yaw_deg, poses.yaw_deg, n) + case.content.needle_arm.yaw_deg - 180.0
     tilts = rng.uniform(-poses.tilt_deg, poses.tilt_deg, (n, 2))
     turn = Rotation.from_euler("ZXY", np.column_stack([yaw, tilts]), degrees=True)
@@ -95,23 +223,15 @@ def draw_geometry(case: SelfcalCase, n: int, rng: np.random.Generator) -> ImageG
     face = np.column_stack([rng.uniform(-half, half, (n, 2)) + phantom.top_mm[:2], np.zeros(n)])
     width, depth = case.content.image.imager().size_mm
     T[:, :3, 3] = face - 0.5 * width * T[:, :3, 0]
-    T[:, 2, 3] += phantom.top_mm[2] + phantom.gel_mm - _lowest_corner(case, T)
+    u = 0.5 * width + 0.5 * head[0] * np.array([-1.0, -1.0, 1.0, 1.0])
+    corners = np.stack([u, np.zeros(4), 0.5 * head[2] * np.array([-1.0, 1.0, -1.0, 1.0])])  # of the probe's face
+    heights = T[:, 2, :3] @ corners + T[:, 2, 3:4]
+    T[:, 2, 3] += phantom.top_mm[2] + phantom.gel_mm - heights.min(axis=1)
     tip = np.column_stack([rng.uniform(EDGE_MM, width - EDGE_MM, n), rng.uniform(LEAST_DEPTH_MM, depth - EDGE_MM, n)])
     steep = np.radians(rng.uniform(*poses.insertion_deg, n))
     side = rng.choice([-1.0, 1.0], n)  # from the image's right or left
     direction = np.column_stack([side * np.cos(steep), np.sin(steep)])
     return ImageGeometry(T, tip, direction, rng.uniform(-np.pi, np.pi, n))
-
-
-def _lowest_corner(case: SelfcalCase, T_base1_image: Floats) -> Floats:
-    """Height of the lowest corner of the probe's face, base1, shape (n,)."""
-    width, _ = case.content.image.imager().size_mm
-    head = case.content.probe.head_mm
-    u = 0.5 * width + 0.5 * head[0] * np.array([-1.0, -1.0, 1.0, 1.0])
-    z = 0.5 * head[2] * np.array([-1.0, 1.0, -1.0, 1.0])
-    corners = np.stack([u, np.zeros(4), z])
-    heights = T_base1_image[:, 2, :3] @ corners + T_base1_image[:, 2, 3:4]
-    return np.asarray(heights.min(axis=1))
 
 
 def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generator) -> CandidatePoses:
@@ -120,57 +240,36 @@ def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generat
     Raises:
         NoAnswerError: No draw can be taken; it holds the counts.
     """
-    n = case.content.poses.samples
-    seen = draw_geometry(case, n, rng)
-    belief = drawing(case)
-    goals = _flange_goals(case, belief, seen)
-    homes = [np.radians(arm.home_deg) for arm in (case.content.probe_arm, case.content.needle_arm)]
-    branches = [
-        configurations(model, goal, home)
-        for model, goal, home in zip((workcell.probe_model, workcell.needle_model), goals, homes, strict=True)
-    ]
-    tips = np.einsum("nij,nj->ni", seen.T_base1_image[:, :3, :2], seen.tip_mm) + seen.T_base1_image[:, :3, 3]
+    n, belief = case.content.poses.samples, drawing(case)
+    T_base1_image, tip_mm, direction_image, roll = draw_geometry(case, n, rng)
+    A = T_base1_image @ np.linalg.inv(case.T_end1_image)
+    T_base2_image = np.linalg.inv(case.T_base1_base2) @ T_base1_image
+    tip, along = (np.column_stack([one, np.zeros(n)]) for one in (tip_mm, direction_image))
+    B = needle_flange(T_base2_image, tip, along, roll, belief.t_Q, belief.V)
+    probe, needle = (
+        configurations(model, goal, np.radians(arm.home_deg))
+        for model, goal, arm in zip(case.models, (A, B), (case.content.probe_arm, case.content.needle_arm), strict=True)
+    )
+    tips = np.einsum("nij,nj->ni", T_base1_image[:, :3, :2], tip_mm) + T_base1_image[:, :3, 3]
     inside = inside_phantom(case.content.phantom, tips)
-    answers = [_checked_pose(workcell, bool(inside[i]), branches[0][i], branches[1][i]) for i in range(n)]
-    taken = np.array([i for i, answer in enumerate(answers) if not isinstance(answer, str)], dtype=np.int64)
+    answers = [_checked_pose(workcell, bool(inside[i]), probe[i], needle[i]) for i in range(n)]
     counted = Counter(answer if isinstance(answer, str) else "ok" for answer in answers)
     counts = {reason: counted.get(reason, 0) for reason in ("ok", *REASONS)}
-    pairs = [answer for answer in answers if not isinstance(answer, str)]
-    q = np.array(pairs, dtype=np.float64).reshape(-1, 2, 6)
+    taken = np.array([i for i, answer in enumerate(answers) if not isinstance(answer, str)], dtype=np.int64)
     if len(taken) == 0:
         raise NoAnswerError(f"no pose of {n} can be taken: {counts}", counts=counts, code="no_pose")
-    poses = Recording(
-        goals[0][taken],
-        goals[1][taken],
-        seen.tip_mm[taken],
-        seen.direction_image[taken],
-        q_probe=q[:, 0],
-        q_needle=q[:, 1],
-    )
-    return CandidatePoses(q[:, 0], q[:, 1], poses, seen.roll[taken], counts)
-
-
-def _flange_goals(case: SelfcalCase, belief: Estimate, seen: ImageGeometry) -> tuple[Floats, Floats]:
-    """T_base1_end1 and T_base2_end2 that make the image, by the drawing; each (n, 4, 4)."""
-    A = seen.T_base1_image @ np.linalg.inv(case.T_end1_image)
-    T_base2_image = np.linalg.inv(case.T_base1_base2) @ seen.T_base1_image
-    along = np.column_stack([seen.direction_image, np.zeros(len(seen.roll))])
-    tip = np.column_stack([seen.tip_mm, np.zeros(len(seen.roll))])
-    return A, needle_flange(T_base2_image, tip, along, seen.roll, belief.t_Q, belief.V)
+    q = np.array([answer for answer in answers if not isinstance(answer, str)], dtype=np.float64).reshape(-1, 2, 6)
+    poses = Recording(A[taken], B[taken], tip_mm[taken], direction_image[taken], q_probe=q[:, 0], q_needle=q[:, 1])
+    return CandidatePoses(q[:, 0], q[:, 1], poses, roll[taken], counts)
 
 
 def needle_flange(
     T_base2_image: Floats, tip_image: Floats, along_image: Floats, roll: Floats, tip_end2: Floats, V: Floats
 ) -> Floats:
-    """T_base2_end2 with the needle's tip at points of the image and the needle along directions there.
+    """T_base2_end2 (n, 4, 4), mm: the needle's tip at points (n, 3) of the image, the needle along directions (n, 3).
 
-    Args:
-        T_base2_image: Shape (n, 4, 4), mm.
-        tip_image: Shape (n, 3), mm.
-        along_image: Shape (n, 3), unit, toward the tip, not along the image's normal.
-        roll: Shape (n,), rad, about the needle.
-        tip_end2: Shape (3,), mm.
-        V: The needle's direction in end2, shape (3,), unit.
+    Directions are unit, toward the tip, not along the image's normal; ``roll`` (n,), rad, is about the needle. The tip
+    (3,), mm, and the needle's direction V (3,), unit, are in end2.
     """
     T = np.tile(np.eye(4), (len(roll), 1, 1))
     T[:, :3, :3] = T_base2_image[:, :3, :3] @ needle_orientations(along_image, V, roll)
@@ -199,51 +298,40 @@ def configurations(model: UrModel, T_base_flange: Floats, q_home: Floats) -> lis
 
 def _checked_pose(workcell: TwoArms, inside: bool, probe: Floats, needle: Floats) -> str | tuple[Floats, Floats]:
     """The first pair of configurations that is free, or the reason why none is."""
-    if not inside:
-        return TIP_OUTSIDE
-    if len(probe) == 0:
-        return PROBE_REACH
-    if len(needle) == 0:
-        return NEEDLE_REACH
+    for stops, reason in ((not inside, TIP_OUTSIDE), (not len(probe), PROBE_REACH), (not len(needle), NEEDLE_REACH)):
+        if stops:
+            return reason
     free_probe = [q for q in probe if workcell.probe_free(q)]
     if not free_probe:
         return Touching.PROBE_ARM.value
     free_needle = [q for q in needle if workcell.needle_free(q)]
     if not free_needle:
         return Touching.NEEDLE_ARM.value
-    for q_probe in free_probe:
-        for q_needle in free_needle:
-            if workcell.apart(q_probe, q_needle):
-                return q_probe, q_needle
-    return Touching.BOTH.value
+    pairs = (pair for pair in product(free_probe, free_needle) if workcell.apart(*pair))
+    return next(pairs, Touching.BOTH.value)
 
 
 PRIOR_WEIGHT = 1e-6
 """Information that every parameter is taken to have beforehand, as a fraction of a candidate's; for the first picks."""
-
 NO_INFORMATION = 1e-13
 """Least over largest eigenvalue of an information matrix below which nothing but rounding is left."""
-
-N_FREE = len(active_columns(tip=True, scale=False, direction=False))
+N_FREE = len(active_columns(scale=False, direction=False))
 """Parameters of the calibration; the arms' errors stand behind them."""
-
 MAX_SWEEPS = 20
 """How often all chosen poses are looked at for a better exchange."""
-
 WORTH = 1e-4
 """An exchange must lower the mean squared error by this fraction."""
 
 
 class _Design(NamedTuple):
-    """Information of every candidate, and the quantity to be known."""
+    """Information of every candidate, and the quantity to be known; p parameters and arms' errors.
+
+    ``rows`` (n, 3, p): Jacobian of each candidate over its residuals' spread: its information is rows^T rows.
+    ``wanted`` (p, p): mean of J^T J over the workspace: trace(C wanted) is the mean squared error at the tip.
+    """
 
     rows: Floats
-    """Jacobian of each candidate over its residuals' spread, shape (n, 3, p), p of parameters and arms' errors: its
-    information is rows^T rows."""
     wanted: Floats
-    """Mean of J^T J over the workspace, shape (p, p): trace(C wanted) is the mean squared error at the tip."""
-    base: Floats
-    """Information held beforehand, shape (p, p)."""
 
     def information(self, index: int) -> Floats:
         """Information of one candidate, shape (p, p)."""
@@ -251,35 +339,32 @@ class _Design(NamedTuple):
 
 
 def choose_poses(
-    candidates: Recording,
-    n: int,
-    noise: Noise,
-    prior: Calibration | Estimate,
-    *,
-    recorded: Recording | None = None,
-) -> NDArray[np.int_]:
+    candidates: Recording, n: int, noise: Noise, prior: Calibration | Estimate, *, recorded: Recording | None = None
+) -> Ints:
     """Choose poses by Fisher information: greedily, then by exchange until no single exchange helps.
 
     What is minimised is the mean squared error at the tip over all candidates: A-optimal for that error.
 
     Args:
         candidates: Poses that could be recorded, with the tip where it would show.
-        n: How many to choose.
         prior: A rough calibration, such as the drawing's: 10 deg and 20 mm off will do.
         recorded: Poses that are recorded already and count.
 
     Returns:
-        Indices into the candidates, ascending.
+        Indices of n candidates, ascending.
 
     Raises:
         InputError: More poses wanted than there are candidates, or none.
     """
     if not 0 < n <= len(candidates):
         refuse(f"{n} poses of {len(candidates)} candidates", "pose choice", "1 to all of them", "out_of_range")
-    prior = prior.estimate if isinstance(prior, Calibration) else prior
-    design = _design(candidates, _Belief(noise, prior, None), recorded)
-    chosen: list[int] = []
-    H = design.base
+    belief = _Belief(noise, prior.estimate if isinstance(prior, Calibration) else prior, None)
+    rows = _whitened(candidates, belief)
+    H = _with_prior(PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0)))  # makes H invertible
+    if recorded is not None:
+        known = _whitened(recorded, belief).reshape(-1, rows.shape[2])
+        H = H + known.T @ known
+    design, chosen = _Design(rows, _wanted(candidates, belief)), list[int]()
     for _ in range(n):
         chosen.append(_best(design, H, chosen))  # greedy: the next one that lowers the error most
         H = H + design.information(chosen[-1])
@@ -318,7 +403,7 @@ def _with_prior(H: Floats) -> Floats:
 
 def _slopes(recording: Recording, belief: _Belief) -> tuple[Floats, Floats]:
     """Residuals by parameters in their units and by the arms' errors, (n, 3, p), and their own noise, (n, 3, 3)."""
-    active = active_columns(tip=True, scale=False, direction=False)
+    active = active_columns(scale=False, direction=False)
     errors = None if belief.arms is None else arm_errors(belief.arms, recording)
     model = linear_model(Problem(recording, belief.noise, active, arms=errors), belief.prior)
     J = model.jacobian * parameter_units(active, belief.prior.scale)
@@ -335,37 +420,22 @@ def _wanted(workspace: Recording, belief: _Belief) -> Floats:
     return np.asarray((J.transpose(0, 2, 1) @ J).mean(axis=0))
 
 
-def _design(candidates: Recording, belief: _Belief, recorded: Recording | None) -> _Design:
-    rows = _whitened(candidates, belief)
-    base = _with_prior(PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0)))  # makes H invertible
-    if recorded is not None:
-        known = _whitened(recorded, belief).reshape(-1, rows.shape[2])
-        base = base + known.T @ known
-    return _Design(rows, _wanted(candidates, belief), base)
-
-
 def _value(design: _Design, H: Floats) -> float:
     """Mean squared error at the tip, mm^2."""
     return float(np.trace(np.linalg.solve(H, design.wanted)))
 
 
-def _values_with(design: _Design, H: Floats) -> Floats:
-    """The value with each candidate added, shape (n,), by Woodbury's identity: only 3 x 3 systems are solved."""
-    C = np.linalg.inv(H)
-    GC = design.rows @ C
+def _best(design: _Design, H: Floats, without: list[int]) -> int:
+    """The candidate whose addition leaves the least value; by Woodbury's identity only 3 x 3 systems are solved."""
+    GC = design.rows @ np.linalg.inv(H)
     S = np.eye(3) + GC @ design.rows.transpose(0, 2, 1)
     gained = np.linalg.solve(S, GC @ design.wanted @ GC.transpose(0, 2, 1))
-    return np.asarray(_value(design, H) - np.trace(gained, axis1=1, axis2=2))
-
-
-def _best(design: _Design, H: Floats, without: list[int]) -> int:
-    """The candidate whose addition leaves the least value."""
-    values = _values_with(design, H)
+    values = np.asarray(_value(design, H) - np.trace(gained, axis1=1, axis2=2))
     values[without] = np.inf
     return int(np.argmin(values))
 
 
-def _exchanged(design: _Design, H: Floats, chosen: list[int]) -> NDArray[np.int_]:
+def _exchanged(design: _Design, H: Floats, chosen: list[int]) -> Ints:
     """Give each chosen pose up for the best other one, until none is worth it (Fedorov 1972)."""
     for _ in range(MAX_SWEEPS):
         changed = False
@@ -378,3 +448,61 @@ def _exchanged(design: _Design, H: Floats, chosen: list[int]) -> NDArray[np.int_
         if not changed:
             break
     return np.array(chosen)
+
+
+AIM_STEPS = 3
+"""Iterations of the command that counts the needle arm's errors: each leaves a thousandth of what was left before."""
+
+
+def aim(
+    candidates: CandidatePoses, row: int, target_mm: Floats, calibration: Calibration, models: tuple[UrModel, UrModel]
+) -> Floats:
+    """Commanded joints of the needle's arm by its nominal kinematics and the calibration: (6,), rad; NaN out of reach.
+
+    Args:
+        row: The candidate whose probe pose, insertion and roll are used.
+        target_mm: In the image, shape (2,).
+        models: The probe's and the needle's arm, as they are drawn.
+    """
+    poses = candidates.poses
+    assert poses.v is not None  # candidates are made with directions
+    q = candidates.q_needle[row]
+    A, _ = calibration.corrected(poses.subset(slice(row, row + 1)))
+    T_base2_image = np.linalg.inv(calibration.Y) @ A[0] @ calibration.X
+    tip, along = np.array([[*target_mm, 0.0]]), np.array([[*poses.v[row], 0.0]])
+    roll = candidates.roll[row : row + 1]
+    V, Q = calibration.needle_direction_end2, calibration.tip_end2
+    goal = needle_flange(T_base2_image[None], tip, along, roll, Q, V)[0]
+    command = goal
+    for _ in range(AIM_STEPS):
+        q = nearest_configuration(models[1], command, q)
+        if calibration.arms is None or np.isnan(q).any():
+            break
+        recorded = recorded_pose(models, candidates.q_probe[row], q, target_mm)
+        command = recorded.B[0] @ np.linalg.inv(calibration.corrected(recorded)[1][0]) @ goal
+    return q
+
+
+def expected_error_mm(calibration: Calibration, poses: Recording) -> float:
+    """Expected (rms) distance of the tip from where the image has it, over poses with joints."""
+    return float(np.sqrt(np.mean(np.trace(calibration.tip_covariances(poses), axis1=1, axis2=2))))
+
+
+def predicted_tre(found: Calibration, recording: Recording) -> float:
+    """Expected (rms) error at the recorded tips, mm: from the calibration, the declared arms, an image that errs."""
+    known = rms(found.predicted_tre_mm(recording.P, recording.A)) if found.arms is None else None
+    image_mm = found.image.rms_mm if found.image is not None and found.image.significant else 0.0
+    return float(np.hypot(expected_error_mm(found, recording) if known is None else known, image_mm))
+
+
+def recorded_pose(models: tuple[UrModel, UrModel], q_probe: Floats, q_needle: Floats, tip_mm: Floats) -> Recording:
+    """One pose as both controllers print it, with the tip at a point of the image."""
+    A, B = flange_pose(models[0], q_probe), flange_pose(models[1], q_needle)
+    return Recording(A[None], B[None], tip_mm[None, :2], q_probe=q_probe[None], q_needle=q_needle[None])
+
+
+def nearest_configuration(model: UrModel, T_base_flange: Floats, q_near: Floats) -> Floats:
+    """The nominal arm's configuration for a flange pose that is nearest to another, shape (6,), rad; NaN for none."""
+    q = nearest_within_limits(model, inverse(model, T_base_flange)[0], q_near)
+    away = np.linalg.norm(q - q_near, axis=1)
+    return np.array(q[int(np.argmin(np.where(np.isnan(away), np.inf, away)))])

@@ -1,11 +1,17 @@
-"""Recordings of the self-calibration as files: a CSV with a row per pose, its tips read already or still in pictures.
+"""Recordings of the self-calibration from outside: files, needles in pictures, and a calibration that refuses slips.
 
-Frames and letters are those of :class:`axp_ybq.recording.Recording`. Pictures lie beside the CSV; the needle is
-detected in each, and one that does not show it is left out and named.
+Frames and letters are those of :class:`axp_ybq.recording.Recording`. A CSV has a row per pose; pictures lie beside it.
+The needle is detected in each, and one that does not show it is left out and named.
+
+A recording that was written in another reading (inverse poses, swapped arms, metres) still has a best fit, with
+residuals of centimetres, and no pose stands out because all are wrong. So where the reading as given does not fit, the
+slips that people make are undone one by one; the one that then fits is named. A recording that fits in no reading is
+refused too: its calibration would send the needle anywhere.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -29,13 +35,15 @@ from puncture_twin.planning.formats.pose_table import (
     poses_of,
     table_text,
 )
+from puncture_twin.planning.geometry.rigid import inverse, pose
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import OPTIONAL, Recording
-from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
-from puncture_twin.twin.guidance.ultrasound.image.needle_detector import (
+from puncture_twin.twin.guidance.ultrasound.needle_detector import (
     ENDS_AGREE_MM,
     RIDGE_MM,
     SHAFT_MM,
     Detection,
+    Imager,
     detect,
 )
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
@@ -43,7 +51,6 @@ from puncture_twin.twin.pictures import SAME_SIZE, read_frames
 
 FILE_NAME = "recording.csv"
 """Name of the file that a folder is searched for."""
-
 MAX_BYTES = 50_000_000
 """More than 50,000 poses: no calibration needs so many, and a larger file is likely something else."""
 
@@ -70,9 +77,7 @@ NEEDS = MappingProxyType(
     {"P_w": "P_mm", "v_z": "v", "shaft": "v", "frame": "picture", "pixel": "picture", "turn": "q", "A": "B", "B": "A"}
 )
 """A group that only stands beside another one."""
-
 COVERED = "something coloured covers the needle's tip"
-
 PIXEL_MM = (0.01, 2.0)
 """Least and largest size of a pixel."""
 
@@ -98,10 +103,8 @@ def read_recording(path: Path) -> Recording:
 def open_recording(path: Path, case: SelfcalCase | None) -> ReadRecording:
     """Read a recording from its CSV, or from ``recording.csv`` in a folder; see docs/reference/selfcal-recording.md.
 
-    Args:
-        path: The CSV or its folder.
-        case: Whose arms turn joints into flanges, and whose image is that of the pictures; None where the file says
-            all by itself.
+    The case's arms turn joints into flanges, and its image is that of the pictures; None where the file says all by
+    itself.
 
     Raises:
         InputError: Another header, a field that is no finite number, a matrix that is no rigid motion, a picture that
@@ -127,21 +130,16 @@ def _fits(found: frozenset[str]) -> bool:
 
 
 class _Seen(NamedTuple):
-    """What pictures show of the needle; NaN in those without it."""
+    """What pictures show of the needle: P, v (n, 2), shaft (n,), mm, NaN where there is none; and why."""
 
     P: Floats
-    """Shape (n, 2), mm."""
     v: Floats
-    """Shape (n, 2)."""
     shaft_mm: Floats
-    """Shape (n,)."""
     missed: tuple[str, ...]
-    """Why there is no needle; empty where there is one."""
     warnings: tuple[str, ...]
 
 
 def _recording(table: GroupedTable, seen: _Seen | None, case: SelfcalCase | None) -> Recording:
-    """The recording of a table and its pictures, without the rows that show no needle."""
     numbers, names = dict(table.numbers), pose_names(table.names, len(table.names))
     if seen is not None:
         numbers |= {"P_mm": seen.P, "v": seen.v, "shaft": seen.shaft_mm[:, None]}
@@ -197,41 +195,36 @@ def _seen(table: GroupedTable, file: Path, case: SelfcalCase | None, inputs: lis
             colour = None if read.coloured is None else np.argwhere(read.coloured[shown])[:, ::-1] * np.array(size)
             if colour is not None and len(colour):
                 coloured[table.names[row]] = len(colour) / read.grey[shown].size
-            own = _imager(case, grey, min(size))
+            machine = Imager() if case is None else case.content.image.imager()
+            own = replace(machine, rows=grey.shape[0], columns=grey.shape[1], pixel_mm=min(size))
             if imager is not None and own != imager:
                 what = f"{own.columns} x {own.rows} pixels of {own.pixel_mm:g} mm"
                 first = f"{imager.columns} x {imager.rows} of {imager.pixel_mm:g} mm, as {files[0]}"
                 refuse(what, path, first, "wrong_size")
             imager, found = own, detect(grey, own)
-            if isinstance(found, Detection) and colour is not None and _covers(colour, found):
+            covered = False
+            if isinstance(found, Detection) and colour is not None:
+                offset, (along_u, along_v) = colour - found.tip_image, found.direction_image
+                along, across = offset @ found.direction_image, offset @ np.array([-along_v, along_u])
+                at_tip = (np.abs(across) < RIDGE_MM) & (along > -SHAFT_MM) & (along < ENDS_AGREE_MM)
+                covered = bool(at_tip.any())
+            if covered:
                 missed[row] = COVERED
             elif isinstance(found, Detection):
                 P[row], v[row], shaft[row] = found.tip_image, found.direction_image, found.shaft_mm
             else:
                 missed[row] = found.value
-    return _Seen(P, v, shaft, tuple(missed), _colour_warning(coloured))
-
-
-def _covers(colour: Floats, found: Detection) -> bool:
-    """Whether something coloured lies at the needle's tip; pixels (n, 2), mm."""
-    offset, (along_u, along_v) = colour - found.tip_image, found.direction_image
-    along, across = offset @ found.direction_image, offset @ np.array([-along_v, along_u])
-    return bool(np.any((np.abs(across) < RIDGE_MM) & (along > -SHAFT_MM) & (along < ENDS_AGREE_MM)))
-
-
-def _colour_warning(coloured: dict[str, float]) -> tuple[str, ...]:
-    """One line for all pictures in which something coloured was drawn."""
     if not coloured:
-        return ()
+        return _Seen(P, v, shaft, tuple(missed), ())
     most = max(coloured, key=lambda name: coloured[name])
     covered = f"at most {100 * coloured[most]:.1f} % of one, {most}"
-    return (f"colour in {len(coloured)} pictures ({covered}): not searched for the needle",)
+    warning = f"colour in {len(coloured)} pictures ({covered}): not searched for the needle"
+    return _Seen(P, v, shaft, tuple(missed), (warning,))
 
 
 def _pixel_mm(
     table: GroupedTable, row: int, stated: tuple[float, float] | None, case: SelfcalCase | None, path: Path
 ) -> tuple[float, float]:
-    """Width and height of a picture's pixel, mm, by its file, its row and the case, which must not differ."""
     sizes = [] if stated is None else [stated]
     if "pixel" in table.numbers:
         sizes.append((float(table.numbers["pixel"][row, 0]),) * 2)
@@ -259,12 +252,6 @@ def _squared(grey: Pixels, size: tuple[float, float]) -> Pixels:
     return np.asarray(sampled, dtype=np.uint8)
 
 
-def _imager(case: SelfcalCase | None, grey: Pixels, pixel_mm: float) -> Imager:
-    """The case's machine, or the usual one, with pictures of this size."""
-    own = Imager() if case is None else case.content.image.imager()
-    return replace(own, rows=grey.shape[0], columns=grey.shape[1], pixel_mm=pixel_mm)
-
-
 def write_recording(recording: Recording, path: Path) -> None:
     """Write a recording as CSV, every number in full, whole or not at all.
 
@@ -288,3 +275,116 @@ def write_recording(recording: Recording, path: Path) -> None:
     rows = [(name, *row) for name, row in zip(recording.names, values, strict=True)]
     with atomic(path) as temporary:
         temporary.write_text(table_text(header, rows), encoding="utf-8")
+
+
+def held_length_mm(case: SelfcalCase | None) -> float | None:
+    """The needle's length where the case holds it."""
+    return case.content.needle.length_mm if case is not None and case.content.hold_needle_length else None
+
+
+def calibrate_case(recording: Recording, case: SelfcalCase | None, *, hold: bool = True) -> Calibration:
+    """Calibrate with the case's noise and, where it is to be held, the needle's length.
+
+    Pixels are solved for where the recording has them.
+    """
+    noise = None if case is None or case.content.noise is None else case.content.noise.noise()
+    length = held_length_mm(case) if hold else None
+    arms = None if case is None or recording.q_probe is None else case.declared_arms
+    return calibrate(recording, noise=noise, needle_length_mm=length, scale=recording.pixels, arms=arms)
+
+
+Reading = Callable[[Recording], Recording]
+SUSPECT_MM = 1.5
+"""Residuals (rms) from which on other readings are tried: three times the usual ones."""
+SOUND_MM = 5.0
+"""Residuals (rms) beyond which nothing was calibrated, whatever the reason."""
+BETTER = 1 / 3
+"""A reading whose residuals are below this part of the given one's, and are not suspect, is the right one."""
+LEAST_REACH_MM = 20.0
+"""An arm whose flange never leaves this distance of its base was written in metres."""
+ALLOWED = "A = T_base1_end1 and B = T_base2_end2 in mm, rotations by rows, P in mm"
+
+
+def checked_calibration(
+    recording: Recording, case: SelfcalCase | None, where: Path, *, hold: bool = True
+) -> Calibration:
+    """Calibration of a recording from outside, by `calibrate_case`; one that was read otherwise than meant is refused.
+
+    Raises:
+        InputError: Another reading fits and this one does not, or none does; or what `calibrate_case` refuses.
+    """
+    for name, T in (("A", recording.A), ("B", recording.B)):
+        farthest = float(np.linalg.norm(T[:, :3, 3], axis=1).max())
+        if farthest < LEAST_REACH_MM:
+            what = f"the flange of {name} is never farther than {farthest:.3g} mm from its base: metres?"
+            refuse(what, where, ALLOWED, "wrong_unit")
+    try:
+        found = calibrate_case(recording, case, hold=hold)
+    except InputError as error:
+        rms_mm = _residual_mm(lambda r: _read(r, r.A, r.B, r.P), recording)
+        if rms_mm > SUSPECT_MM:
+            _refuse_slip(recording, rms_mm, where)
+        raise error.at(where) from error
+    if found.rms_mm > SUSPECT_MM:
+        _refuse_slip(recording, found.rms_mm, where)
+    if found.rms_mm > SOUND_MM:
+        what = f"residuals of {found.rms_mm:.3g} mm (rms): the poses and the image do not belong together"
+        refuse(what, where, f"residuals up to {SOUND_MM:g} mm; {ALLOWED}", "residuals_too_large")
+    return found
+
+
+def _refuse_slip(recording: Recording, rms_mm: float, where: Path) -> None:
+    for slip, undo in SLIPS.items():
+        other = _residual_mm(undo, recording)
+        if other < SUSPECT_MM and other < BETTER * rms_mm:
+            as_given = f"residuals {rms_mm:.3g} mm" if np.isfinite(rms_mm) else "no fit"
+            what = f"it does not fit as given ({as_given}), but it fits ({other:.2g} mm rms) if {slip}"
+            refuse(what, where, ALLOWED, "recording_slip")
+
+
+def _residual_mm(undo: Reading, recording: Recording) -> float:
+    """Residuals (rms) of the other reading over all poses, mm; infinite where it cannot be calibrated."""
+    try:
+        return calibrate(undo(recording), scale=recording.pixels, direction=False).rms_mm
+    except InputError:
+        return float("inf")
+
+
+def _read(recording: Recording, A: Floats, B: Floats, P: Floats) -> Recording:
+    return Recording(A, B, P, None, recording.names, recording.pixels)
+
+
+def _later(recording: Recording, rows: int) -> Recording:
+    """The poses with the tip of the row that follows so many rows later."""
+    first, last = (slice(0, -rows), slice(rows, None)) if rows > 0 else (slice(-rows, None), slice(0, rows))
+    names = recording.names[first]
+    return Recording(recording.A[first], recording.B[first], recording.P[last], None, names, recording.pixels)
+
+
+def _transposed(T: Floats) -> Floats:
+    return pose(T[:, :3, :3].transpose(0, 2, 1), T[:, :3, 3])
+
+
+def _longer(T: Floats, factor: float) -> Floats:
+    return pose(T[:, :3, :3], factor * T[:, :3, 3])
+
+
+SLIPS: Mapping[str, Reading] = MappingProxyType(
+    {
+        "A and B are inverse (base in flange)": lambda r: _read(r, inverse(r.A), inverse(r.B), r.P),
+        "A is inverse (base in flange)": lambda r: _read(r, inverse(r.A), r.B, r.P),
+        "B is inverse (base in flange)": lambda r: _read(r, r.A, inverse(r.B), r.P),
+        "the arms A and B are swapped": lambda r: _read(r, r.B, r.A, r.P),
+        "the arms are swapped and inverse": lambda r: _read(r, inverse(r.B), inverse(r.A), r.P),
+        "the rotations of A and B are written by columns": lambda r: _read(r, _transposed(r.A), _transposed(r.B), r.P),
+        "the rotations of A are written by columns": lambda r: _read(r, _transposed(r.A), r.B, r.P),
+        "the rotations of B are written by columns": lambda r: _read(r, r.A, _transposed(r.B), r.P),
+        "A and B are in cm": lambda r: _read(r, _longer(r.A, 10), _longer(r.B, 10), r.P),
+        "P is in metres": lambda r: _read(r, r.A, r.B, r.P * 1000),
+        "P is in cm": lambda r: _read(r, r.A, r.B, r.P * 10),
+        "P_w has the other sign": lambda r: _read(r, r.A, r.B, r.P * np.array([1, 1, -1])[: r.P.shape[1]]),
+        "each picture belongs to the row before it": lambda r: _later(r, 1),
+        "each picture belongs to the row behind it": lambda r: _later(r, -1),
+    }
+)
+"""What people write instead of `ALLOWED`, in words, and how it is undone."""

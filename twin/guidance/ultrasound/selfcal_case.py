@@ -18,22 +18,17 @@ from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_to
 from puncture_twin.planning.case.errors import ArmErrors
 from puncture_twin.planning.case.tables import Length, Name, Number, Section, Sextuple, Vector
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArm, DeclaredArms
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import DeclaredArm, DeclaredArms
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise
-from puncture_twin.twin.guidance.ultrasound.image.imager import Imager, NeedleEcho
+from puncture_twin.twin.guidance.ultrasound.needle_detector import Imager, NeedleEcho
 
 CASE_NAME = "selfcal.toml"
 """What a folder is searched for."""
-
-
 ALLOWED_CASE = "a TOML self-calibration case with schema = 1, or a folder with selfcal.toml"
-
 ARMS_WITH_MESHES = ("ur3", "ur5", "ur10")
 """Collision needs link meshes, and these ship."""
-
 Deviation = Annotated[Number, Field(ge=0, le=100)]
 """A standard deviation."""
-
 Degrees = Annotated[Number, Field(ge=-180, le=180)]
 Steep = Annotated[Number, Field(ge=5, le=85)]
 Count = Annotated[int, Strict(), Field(ge=1, le=5000)]
@@ -177,8 +172,7 @@ class NoiseSection(Section):
 
     def noise(self) -> Noise:
         """The stated noise in mm and rad."""
-        angles = (float(np.radians(angle)) for angle in (self.robot_deg, self.direction_deg))
-        robot_rad, direction_rad = angles
+        robot_rad, direction_rad = np.radians([self.robot_deg, self.direction_deg]).tolist()
         return Noise(self.robot_mm, robot_rad, self.image_mm, direction_rad, self.off_plane_mm)
 
 
@@ -209,15 +203,10 @@ class SelfcalFile(Section):
 
 @dataclass(frozen=True, eq=False)
 class SelfcalCase:
-    """A validated case.
+    """A validated case: what it says, its file with role and hash, and both arms' models, the probe's first.
 
-    Attributes:
-        content: What it says.
-        inputs: The case file, with role and hash.
-        models: The probe's arm and the needle's.
-        T_end1_image: The drawing's X, shape (4, 4), mm: the face's middle on the flange's z axis, the depth along it.
-        T_base1_base2: The drawing's Y, shape (4, 4), mm.
-        tip_end2: The drawing's tip, shape (3,), mm.
+    Its drawing, mm: ``T_end1_image`` is X, the face's middle on the flange's z axis, the depth along it;
+    ``T_base1_base2`` is Y; ``tip_end2`` (3,).
     """
 
     path: Path
@@ -235,28 +224,21 @@ class SelfcalCase:
         return DeclaredArms(*(DeclaredArm(model, arm.errors) for arm, model in zip(arms, self.models, strict=True)))
 
     def __post_init__(self) -> None:
-        content = self.content
+        content, (width, _) = self.content, self.content.image.imager().size_mm
         models = ur_model(content.probe_arm.model), ur_model(content.needle_arm.model)
         object.__setattr__(self, "models", models)
-        width, _ = content.image.imager().size_mm
+        probe, arm = content.probe, content.needle_arm
+        c, s = np.cos(np.radians(probe.yaw_deg)), np.sin(np.radians(probe.yaw_deg))
+        R = np.array([[c, 0.0, s], [s, 0.0, -c], [0.0, 1.0, 0.0]])
+        R_base1_base2 = Rotation.from_euler("z", arm.yaw_deg, degrees=True).as_matrix()
         drawn = {
-            "T_end1_image": _probe_mount(content.probe, width),
-            "T_base1_base2": _base_mount(content.needle_arm),
+            "T_end1_image": pose(R, [0.0, 0.0, probe.length_mm] - 0.5 * width * R[:, 0]),
+            "T_base1_base2": pose(R_base1_base2, arm.position_mm),
             "tip_end2": np.array([0.0, 0.0, content.needle.length_mm]),
         }
         for name, value in drawn.items():
             value.setflags(write=False)
             object.__setattr__(self, name, value)
-
-
-def _probe_mount(probe: ProbeSection, width_mm: float) -> Floats:
-    c, s = np.cos(np.radians(probe.yaw_deg)), np.sin(np.radians(probe.yaw_deg))
-    R = np.array([[c, 0.0, s], [s, 0.0, -c], [0.0, 1.0, 0.0]])
-    return pose(R, [0.0, 0.0, probe.length_mm] - 0.5 * width_mm * R[:, 0])
-
-
-def _base_mount(arm: NeedleArmSection) -> Floats:
-    return pose(Rotation.from_euler("z", arm.yaw_deg, degrees=True).as_matrix(), arm.position_mm)
 
 
 def load_selfcal_case(path: Path | str) -> SelfcalCase:

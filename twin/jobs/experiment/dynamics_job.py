@@ -54,9 +54,8 @@ STEP_RAD = 0.02
 class Dynamics(Shown):
     """Identified dynamics, and the tip that is controlled by them.
 
-    Attributes:
-        tip_cov: Shape (m, 3, 3), mm^2, of the tip about its path along an insertion, base frame, a row a sample.
-        budget: Of the declared errors, rms by source, mm; None where none are declared.
+    ``tip_cov`` (m, 3, 3), mm^2, is of the tip about its path along an insertion, base frame, a row a sample; ``budget``
+    of the declared errors, rms by source, mm, None where none are declared.
     """
 
     identified: Identified
@@ -177,15 +176,11 @@ def insertion_to(case: Case, q_end: Floats) -> Trajectory:
     )
 
 
-def _mass_matrix(model: UrModel, found: Identified, q: Floats, down_base: Floats) -> Floats:
-    """M(q), shape (6, 6), kg m^2, drives included: torques of unit accelerations less those of none."""
+def _loop(model: UrModel, found: Identified, q: Floats, J: Floats, down_base: Floats) -> tuple[Floats, Floats]:
+    """A (18, 18) and B (18, 6) of a sample's step of e, e' and int e, under a wrench, about the joints q (6,), rad."""
     motion = JointMotion(np.tile(q, (7, 1)), np.zeros((7, 6)), np.eye(7, 6))
     torque = regressor(model, motion, down_base)[:, :, found.base.columns] @ found.values
-    return np.asarray((torque[:6] - torque[6]).T)
-
-
-def _loop(J: Floats, M: Floats) -> tuple[Floats, Floats]:
-    """A (18, 18) and B (18, 6) of a sample's step of e, e' and int e, under a wrench."""
+    M = np.asarray((torque[:6] - torque[6]).T)  # kg m^2, drives included: of unit accelerations less those of none
     stiffness, inverse_mass = Stiffness(), J @ np.linalg.solve(M, J.T)
     K, D = np.diag(stiffness.diagonal), damping(stiffness, J, M)
     spring = [-inverse_mass @ part for part in (K, D, stiffness.integral_per_s * K)]
@@ -208,7 +203,7 @@ def tip_covariances(case: Case, found: Identified, insertion: Trajectory, down_b
     J = tips(model, tip_m, reference.q).J
     wrench = np.linalg.solve(J.transpose(0, 2, 1), Y)
     half = len(J) // 2
-    A, B = _loop(J[half], _mass_matrix(model, found, reference.q[half], down_base))
+    A, B = _loop(model, found, reference.q[half], J[half], down_base)
     state, G = np.zeros((18, len(found.values))), np.empty((len(J), 3, len(found.values)))
     for row, push in enumerate(wrench - wrench[0]):
         G[row] = to_mm(state[:3])
@@ -217,11 +212,7 @@ def tip_covariances(case: Case, found: Identified, insertion: Trajectory, down_b
 
 
 def recorded_or_given(context: CaseContext, recording: Path | None, record: Path | None, seed: int) -> Path:
-    """The recording that is named, or a new one; see `record_dynamics`.
-
-    Raises:
-        InputError: Both are named, or neither.
-    """
+    """The recording that is named, or a new one, of `record_dynamics`; not both, nor neither."""
     if recording is not None and record is None:
         return recording
     if record is None or recording is not None:

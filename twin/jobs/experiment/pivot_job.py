@@ -34,14 +34,12 @@ from puncture_twin.planning.touch.touch_planner import (
     approach_checkers,
     plan_pivot,
 )
-from puncture_twin.planning.touch.tour_motions import TouchTour
 from puncture_twin.twin.guidance.ct.pivot import LARGE, Pivot, arm_covariance, check_one_place, pivot_calibration
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.report.present import Section, footer, text, vector
 
 if TYPE_CHECKING:  # a list is read where the simulator is not installed
     from puncture_twin.twin.guidance.ct.touching import Touched
-    from puncture_twin.twin.plant.true_needle import TouchTruth
 
 STANDS_OUT = 2.0
 """A touch that misses by so many times the others' root mean square is named."""
@@ -82,10 +80,7 @@ def refuse_of_twin(*options: object) -> None:
 
 
 def pivot_case(case: Case, joints: Path) -> PivotRun:
-    """Calibrate the tip from a list of touches of one place.
-
-    Args:
-        joints: CSV, a line a pose, with q1_deg to q6_deg alone or among other columns, as `pivot CASE` writes it.
+    """Calibrate the tip from a CSV of touches of one place, a line a pose, with q1_deg to q6_deg among its columns.
 
     Raises:
         InputError: The case declares no errors, or the list has no joints, too few, too much alike, or of several
@@ -149,13 +144,7 @@ PIVOT, SUMMARY = "pivot.csv", "pivot.json"
 
 @dataclass(frozen=True, eq=False)
 class PivotTourRun:
-    """An executed pivot calibration.
-
-    Attributes:
-        found: The tip that its joints give.
-        place_base: Shape (3,), mm: the place as it was planned.
-        true_tip_flange: Shape (3,), mm.
-    """
+    """An executed pivot calibration: the tip that its joints give, and the true one (3,); the place planned; mm."""
 
     found: PivotRun
     seed: int
@@ -169,20 +158,15 @@ class PivotTourRun:
         """Found tip against the true one."""
         return float(np.linalg.norm(self.found.pivot.tip_flange - self.true_tip_flange))
 
-    @property
-    def expected_error_mm(self) -> float:
-        """Expected error of the tip on the flange (rms), by the declared errors, mm."""
-        return float(np.sqrt(np.trace(self.found.pivot.cov_tip)))
-
     def summary(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Plain values for JSON; the expected error is the rms by the declared errors."""
         return {
             **self.found.summary(),
             "seed": self.seed,
             "place_mm": self.place_base.tolist(),
             "true_tip_flange_mm": self.true_tip_flange.tolist(),
             "tip_error_mm": self.error_mm,
-            "expected_tip_error_mm": self.expected_error_mm,
+            "expected_tip_error_mm": float(np.sqrt(np.trace(self.found.pivot.cov_tip))),
             "failed": dict(self.touched.failed),
             "seconds": self.touched.seconds,
             "files": [str(path) for path in self.files],
@@ -190,25 +174,20 @@ class PivotTourRun:
 
 
 def parse_place(text: str | None) -> Floats | None:
-    """A place in the base frame, mm, as it is typed.
-
-    Raises:
-        InputError: Not three numbers.
-    """
+    """A place in the base frame, mm, as it is typed; refused where it is not three numbers."""
     return None if text is None else np.array(parse_triple(text, "--at", "X,Y,Z in mm, in the robot's base frame"))
 
 
 def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats | None, seed: int) -> PivotTourRun:
-    """Plan a pivot calibration, execute it in the twin, write what was read.
-
-    Args:
-        context: Of a case with declared errors and an arm.
-        place_base: Shape (3,), mm, where; None for a place that is found.
+    """Plan a pivot calibration about a place (3,), mm, or one that is found, execute it in the twin, write its result.
 
     Raises:
         InputError: The case declares no errors or has no arm, or so many poses are not planned.
         NoAnswerError: No place can be touched in so many poses, or too few were touched.
     """
+    from puncture_twin.twin.plant.touching import execute_touches
+    from puncture_twin.twin.plant.true_needle import draw_pivot_truth
+
     case = context.case
     if not LEAST_POSES <= poses <= MOST_POSES:
         refuse(f"{poses} poses", "--poses", f"{LEAST_POSES} to {MOST_POSES}", "out_of_range")
@@ -218,46 +197,34 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
         with context.stages.time("pivot plan"):
             count = partial(context.watcher.count, "motions")
             tour = plan_pivot(context, poses, place_base=place_base, seed=seed, progress=count)
-        truth = _truth(context, tour, seed)
-        touched = _executed(context, tour, truth)
+        errors, place = case.truth_errors or case.errors, tour.touches[0].point_base
+        truth = draw_pivot_truth(
+            context.require_arm().T_base_ct, tuple(f"P{k + 1}" for k in range(len(tour.touches))), place, errors, seed
+        )
+        checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
+        with context.stages.time("touches"):
+            touched = execute_touches(tour, case, context.anatomy, checkers, truth, count)
+        if len(touched.readings) < LEAST_POSES:
+            why = "; ".join(f"{name}: {reason}" for name, reason in touched.failed.items())
+            what = f"{len(touched.readings)} of {len(tour.touches)} poses were touched; {LEAST_POSES} are needed: {why}"
+            raise NoAnswerError(what, code="too_few_poses")
         names, joints = tuple(one.name for one in touched.readings), np.array([one.q for one in touched.readings])
         found = PivotRun(case, calibrated(case, names, joints, where=str(case.path)), names, case.inputs)
         true_tip = truth.eta[PARAMETERS["tip_offset"]] + np.array([0.0, 0.0, tour.tip_mm])
         files = draft.final((draft.folder / PIVOT, draft.folder / SUMMARY))
-        run = PivotTourRun(found, seed, tour.touches[0].point_base, true_tip, touched, files)
+        run = PivotTourRun(found, seed, place, true_tip, touched, files)
         points = np.array([one.point_base for one in touched.readings])
         write_points(draft.folder / PIVOT, NamedPoints(names, points, None, joints=joints))
         write_result(run.summary(), draft.folder / SUMMARY, out)
     return run
 
 
-def _truth(context: CaseContext, tour: TouchTour, seed: int) -> TouchTruth:
-    from puncture_twin.twin.plant.true_needle import draw_pivot_truth
-
-    errors = context.case.truth_errors or context.case.errors
-    assert errors is not None and context.reach is not None
-    names = tuple(f"P{number + 1}" for number in range(len(tour.touches)))
-    return draw_pivot_truth(context.reach.T_base_ct, names, tour.touches[0].point_base, errors, seed)
-
-
-def _executed(context: CaseContext, tour: TouchTour, truth: TouchTruth) -> Touched:
-    from puncture_twin.twin.plant.touching import execute_touches
-
-    checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
-    with context.stages.time("touches"):
-        touched = execute_touches(tour, context.case, context.anatomy, checkers, truth, count)
-    if len(touched.readings) < LEAST_POSES:
-        why = "; ".join(f"{name}: {reason}" for name, reason in touched.failed.items())
-        poses = f"{len(touched.readings)} of {len(tour.touches)} poses were touched"
-        raise NoAnswerError(f"{poses}; {LEAST_POSES} are needed: {why}", code="too_few_poses")
-    return touched
-
-
 def pivot_tour_text(run: PivotTourRun) -> str:
     """For the terminal."""
+    expected = float(np.sqrt(np.trace(run.found.pivot.cov_tip)))
     at, count, seconds = vector(run.place_base, 0, "mm"), len(run.touched.readings), run.touched.seconds
     failed = [f"{name} not touched: {why}" for name, why in run.touched.failed.items()]
-    off = f"error {run.error_mm:.3f} mm, expected {run.expected_error_mm:.3f} mm (rms)"
+    off = f"error {run.error_mm:.3f} mm, expected {expected:.3f} mm (rms)"
     true = f"the true tip (seed {run.seed}) is {vector(run.true_tip_flange, 3, 'mm')}: {off}"
     head = Section(f"{count} poses touched about {at} (base) in {seconds:.0f} s", failed)
     return text([head, *_pivot_said(run.found), Section(true, []), *footer(run.files)])

@@ -24,6 +24,7 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.strict_json import array, fitting, parse_json
 from puncture_twin.planning.formats.points import write_points
+from puncture_twin.planning.formats.pose_table import table_text
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.context import CaseContext
@@ -57,11 +58,7 @@ SUB_VOXEL_SD = 0.03
 
 
 class ScanRequest(NamedTuple):
-    """What the user asks for.
-
-    Attributes:
-        beside: Places what lies outside of the patient; nothing where None.
-    """
+    """What the user asks for; ``beside`` places what lies outside of the patient, nothing where None."""
 
     settings: ScanSettings
     marker: MarkerKind = "disc"
@@ -70,11 +67,7 @@ class ScanRequest(NamedTuple):
 
 
 def parse_marker(text: str) -> MarkerKind:
-    """What stands at the markers' places.
-
-    Raises:
-        InputError: Nothing that is known.
-    """
+    """What stands at the markers' places; refused where nothing is known by that name."""
     for kind in get_args(MarkerKind):
         if text == kind:
             return kind
@@ -123,7 +116,11 @@ class ScanRun:
             "voxels": list(grid.shape),
             "T_scan_case": self.scene.T_scan_ct.tolist(),
             "target_mm": self.scene.target.tolist(),
-            "theory_mm": theory(settings),
+            "theory_mm": {  # standard deviations: of the rule uniform in its cell, of the drawn marker as held to
+                "rule_along_bed": settings.spacing_mm / np.sqrt(12),
+                "rule_in_plane": READING_MM / np.sqrt(12),
+                "middle_along_bed": SUB_VOXEL_SD * settings.spacing_mm,
+            },
             "markers": list(self._markers()),
             "lesion": {"true_mm": true.tolist(), "found_mm": found.tolist(), "error_mm": (found - true).tolist()},
             "needle": None if self.control is None else control_summary(self.control),
@@ -135,29 +132,11 @@ class ScanRun:
     def _markers(self) -> Iterator[dict[str, Any]]:
         if self.markers is None or self.scene.markers is None:
             return
-        rows = zip(
-            self.markers.fine.names,
-            self.scene.markers.points,
-            self.markers.rule.points,
-            self.markers.fine.points,
-            strict=True,
-        )
-        for name, true, rule, fine in rows:
-            yield {
-                "name": name,
-                "true_mm": true.tolist(),
-                "rule_error_mm": (rule - true).tolist(),
-                "error_mm": (fine - true).tolist(),
-            }
-
-
-def theory(settings: ScanSettings) -> dict[str, float]:
-    """Standard deviations of a reading, mm: of the rule uniform in its cell, of the drawn marker as held to."""
-    return {
-        "rule_along_bed": settings.spacing_mm / np.sqrt(12),
-        "rule_in_plane": READING_MM / np.sqrt(12),
-        "middle_along_bed": SUB_VOXEL_SD * settings.spacing_mm,
-    }
+        fine, rule = self.markers.fine, self.markers.rule
+        true = self.scene.markers.points
+        for row, name in enumerate(fine.names):
+            errors = {"rule_error_mm": rule.points[row] - true[row], "error_mm": fine.points[row] - true[row]}
+            yield {"name": name, "true_mm": true[row].tolist(), **{key: one.tolist() for key, one in errors.items()}}
 
 
 def control_summary(control: Control) -> dict[str, Any]:
@@ -204,7 +183,13 @@ def _scanned(context: CaseContext, request: ScanRequest) -> ScanRun:
     volume = Volume(image.hu, image.grid.T_ct_index, case.path)
     markers = None if scene.listed is None else find_markers(volume, scene.listed)
     lesion = _lesion(context, scene, image, volume)
-    control = None if needle is None else _control(scene, volume, case.needle.diameter_mm, *needle)
+    control, T = None, scene.T_scan_ct
+    if needle is not None:
+        true, target = TrueRod(apply(T, needle[0].tip_ct), T[:3, :3] @ needle[0].forward_ct), apply(T, needle[1])
+        try:
+            control = Control(true, find_needle(volume, target, case.needle.diameter_mm), target)
+        except InputError as error:
+            control = Control(true, None, target, error.what)
     return ScanRun(context, request, scene, image, markers, lesion, control, (*read, *case.inputs))
 
 
@@ -239,20 +224,11 @@ def _rehearsed(path: Path | None) -> tuple[tuple[TrueRod, Floats] | None, tuple[
     return (TrueRod(tip, forward / np.linalg.norm(forward)), target), (read.input("rehearsal"),)
 
 
-def _control(scene: CaseScene, volume: Volume, diameter_mm: float, true: TrueRod, target_ct: Floats) -> Control:
-    T = scene.T_scan_ct
-    target = apply(T, target_ct)
-    moved = TrueRod(apply(T, true.tip_ct), T[:3, :3] @ true.forward_ct)
-    try:
-        return Control(moved, find_needle(volume, target, diameter_mm), target)
-    except InputError as error:
-        return Control(moved, None, target, error.what)
-
-
 def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
-    """Everything but the report."""
     image, case = run.image, run.context.case
-    yield from write_series(folder / SERIES, image, run.request.settings, _identity(run), case.name)
+    made_from = "\n".join([*map(str, run.inputs), str(run.request)])
+    identity = hashlib.sha256(made_from.encode()).hexdigest()
+    yield from write_series(folder / SERIES, image, run.request.settings, identity, case.name)
     yield write_nifti(folder / CT, image.hu, image.grid.T_ct_index)
     layers = label_layers(case, run.context.anatomy)
     for file, names, labels in zip((LABELS, CROSSED), layers, image.labels, strict=False):
@@ -286,19 +262,9 @@ def _write_labels(folder: Path, file: str, names: Sequence[str], run: ScanRun, l
     alone = names[0].replace("/", "_") if len(names) == 1 else None
     yield write_nifti(folder / f"{alone or file}.nii.gz", labels, run.image.grid.T_ct_index)
     if alone is None:
-        rows = [f"{number},{_quoted(name)}" for number, name in enumerate(names, start=1)]
-        (folder / f"{file}.csv").write_text("\n".join(["label,name", *rows]) + "\n", encoding="utf-8")
+        rows = [(str(number), name) for number, name in enumerate(names, start=1)]
+        (folder / f"{file}.csv").write_text(table_text(("label", "name"), rows), encoding="utf-8")
         yield folder / f"{file}.csv"
-
-
-def _quoted(name: str) -> str:
-    return f'"{name.replace(chr(34), 2 * chr(34))}"' if any(sign in name for sign in ',"') else name
-
-
-def _identity(run: ScanRun) -> str:
-    """What the scan was made from, hashed."""
-    made_from = [*map(str, run.inputs), str(run.request)]
-    return hashlib.sha256("\n".join(made_from).encode()).hexdigest()
 
 
 def scan_text(run: ScanRun) -> str:
@@ -326,7 +292,8 @@ def _marker_blocks(found: dict[str, Any]) -> list[Block]:
     markers, theory = found["markers"], found["theory_mm"]
     if not markers:
         return []
-    rms = {key: np.sqrt(np.mean(np.square([one[key] for one in markers]), axis=0)).tolist() for key in _KEYS}
+    keys = ("rule_error_mm", "error_mm")
+    rms = {key: np.sqrt(np.mean(np.square([one[key] for one in markers]), axis=0)).tolist() for key in keys}
     fields = (
         Field("errors, mm", "name"),
         Field("slice and millimetre", lambda one: _vector(one["rule_error_mm"])),
@@ -335,9 +302,6 @@ def _marker_blocks(found: dict[str, Any]) -> list[Block]:
     expected = "standard dev.  {rule_in_plane:.2f} in the plane, {rule_along_bed:.2f} along the bed; the drawn marker"
     held = ": limit {middle_along_bed:.2f} along the bed"
     return [grid(fields, [*markers, {"name": "rms", **rms}]), (expected + held).format(**theory)]
-
-
-_KEYS = ("rule_error_mm", "error_mm")
 
 
 def _needle_rows(needle: dict[str, Any] | None) -> list[tuple[str, str]]:

@@ -22,7 +22,6 @@ from puncture_twin.twin.rehearsal.rehearsal import Swept, execute_sweep
 from puncture_twin.twin.report.present import Section, footer, text
 
 SWEEP = "sweep.json"
-
 Angles = tuple[float, float]
 
 
@@ -63,10 +62,9 @@ class SweepRun:
 
 
 def sweep_case(context: CaseContext, out: Path, choice: Choice, to: Angles | None) -> SweepRun:
-    """Plan a sweep, execute it in the twin, write what was measured.
+    """Plan a sweep to theta and beta, rad, execute it in the twin, write what was measured.
 
-    Args:
-        to: Theta and beta, rad, where it ends; None for the farthest direction of the start's window.
+    None goes to the farthest direction of the start's window.
 
     Raises:
         InputError: The case does not say where the robot stands.
@@ -87,16 +85,7 @@ def sweep_case(context: CaseContext, out: Path, choice: Choice, to: Angles | Non
 
 
 def sweep_end(source: Path, to: str | None, *, sweep: bool, alone: bool) -> Angles | None:
-    """Where a sweep shall end; None leaves it open.
-
-    Args:
-        to: "THETA,BETA" in degrees.
-        sweep: Whether a sweep is wanted: without one nothing ends.
-        alone: Whether nothing else is asked of the source.
-
-    Raises:
-        InputError: No sweep, or none of one case.
-    """
+    """Where a sweep shall end, of "THETA,BETA" in degrees; refused without a sweep, or of more than one case."""
     if not sweep:
         refuse("--to needs --sweep", "--to", "--sweep --to THETA,BETA", "conflicting_options")
     if is_plan(source) or not alone:

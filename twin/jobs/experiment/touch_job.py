@@ -1,7 +1,12 @@
-"""Markers touched in the twin: planned, executed where everything truly is, written as `registration` reads them."""
+"""Markers touched in the twin: planned, executed where everything truly is, written as `registration` reads them.
+
+A reading of the simulator lies some hundredths of a millimetre from the joints that put the true tip on the true
+marker, so a physical run and its drawn twin err alike; and drawn ones cost milliseconds.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -9,17 +14,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.base.text import Shown
+from puncture_twin.planning.base.strict_json import or_null
+from puncture_twin.planning.base.text import Shown, plural
 from puncture_twin.planning.case.errors import ErrorModel
 from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.registration.registration import Registration
-from puncture_twin.planning.search.choice import Choice, choose
+from puncture_twin.planning.search.choice import BEST, Choice, choose
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.touch_planner import (
     TOUCHING_PADDING_MM,
@@ -28,55 +34,29 @@ from puncture_twin.planning.touch.touch_planner import (
     plan_touches,
     registered,
 )
-from puncture_twin.planning.touch.tour_motions import TouchPlan, registered_joints
+from puncture_twin.planning.touch.tour_motions import TouchPlan, plan_puncture, registered_joints
 from puncture_twin.twin.guidance.ct.touching import Touched, nominal_tip
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.plant.touching import ExecutedTouches, execute_touches
-from puncture_twin.twin.plant.true_needle import (
-    AtTarget,
-    TouchTruth,
-    draw_at_target,
-    draw_touch_truth,
-    true_needle,
-)
+from puncture_twin.twin.plant.true_needle import AtTarget, TouchTruth, draw_at_target, draw_touch_truth, true_needle
 from puncture_twin.twin.rehearsal.distribution import misregistered
+from puncture_twin.twin.rehearsal.plan_truth import rehearse_touched
 from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 
 TOUCH, SUMMARY = "touch.csv", "touch.json"
 
 
 class Use(NamedTuple):
-    """What readings are good for."""
+    """What readings are good for: the tip's expected error (rms) at the target, and that of the erring arm in truth."""
 
     registration: Registration
     expected_mm: float
-    """Of the tip at the target (rms)."""
     tip_error_mm: float
-    """Where the erring arm, sent to the target by that registration, puts its tip."""
-
-    def summary(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return {
-            "why_not": "",
-            "expected_tip_error_mm": self.expected_mm,
-            "tip_error_mm": self.tip_error_mm,
-            "fre_mm": self.registration.fre_mm,
-            "flags": [flag.sentence for flag in self.registration.flags],
-        }
-
-
-def _no_use(why: str) -> dict[str, Any]:
-    """The use of readings that register nothing, with the reason."""
-    return {"why_not": why, "expected_tip_error_mm": None, "tip_error_mm": None, "fre_mm": None, "flags": []}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TouchRun(Shown):
-    """What was planned, what was read, and what it is good for.
-
-    Attributes:
-        use: What the readings are good for; in words why not, where they do not suffice for a registration.
-    """
+    """What was planned, what was read, and what it is good for; in words why not, where it does not register."""
 
     case_name: str
     inputs: tuple[Input, ...]
@@ -98,6 +78,7 @@ class TouchRun(Shown):
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
+        use = None if isinstance(self.use, str) else self.use
         return {
             "case": self.case_name,
             "seed": self.seed,
@@ -120,7 +101,11 @@ class TouchRun(Shown):
             "seconds_per_touch": _per_touch(self.touched),
             "expected_of_best_poses_mm": self.plan.expected_mm,
             "expected_of_worst_poses_mm": self.plan.worst_mm,
-            **(_no_use(self.use) if isinstance(self.use, str) else self.use.summary()),
+            "why_not": self.use if use is None else "",
+            "expected_tip_error_mm": use and use.expected_mm,
+            "tip_error_mm": use and use.tip_error_mm,
+            "fre_mm": use and use.registration.fre_mm,
+            "flags": [] if use is None else [flag.sentence for flag in use.registration.flags],
             "inputs": inputs_document(self.inputs),
             "files": [str(path) for path in self.files],
         }
@@ -128,9 +113,6 @@ class TouchRun(Shown):
 
 def touch_case(context: CaseContext, out: Path, choice: Choice, seed: int) -> TouchRun:
     """Plan the touches of a case's markers for a chosen puncture, execute them in the twin, write what they read.
-
-    Args:
-        context: Of a case with declared errors, markers and an arm.
 
     Raises:
         InputError: The case declares no errors, or has no markers.
@@ -161,13 +143,6 @@ class Tour(NamedTuple):
     outward_ct: Floats
 
 
-class TouchedOnce(NamedTuple):
-    """One executed tour, and what its readings are good for, or why not."""
-
-    touched: ExecutedTouches
-    use: Use | str
-
-
 def plan_tour(context: CaseContext, choice: Choice, seed: int) -> Tour:
     """Plan the touches for a chosen puncture."""
     context.require_arm()
@@ -177,13 +152,13 @@ def plan_tour(context: CaseContext, choice: Choice, seed: int) -> Tour:
     return Tour(plan, q_insertion, outward_ct)
 
 
-def touch_once(context: CaseContext, tour: Tour, seed: int) -> TouchedOnce:
-    """Execute a tour where everything truly is, by one draw of the declared errors."""
+def touch_once(context: CaseContext, tour: Tour, seed: int) -> tuple[ExecutedTouches, Use | str]:
+    """Execute a tour where everything truly is, by one draw of the errors; and what its readings are good for."""
     truth = true_touches(context, tour, seed)
     checkers, count = approach_checkers(context, TOUCHING_PADDING_MM), partial(context.watcher.count, "touches")
     with context.stages.time("touches"):
         touched = execute_touches(tour.plan, context.case, context.anatomy, checkers, truth, count)
-    return TouchedOnce(touched, _use(context, tour, truth, _points(touched)))
+    return touched, _use(context, tour, truth, _points(touched))
 
 
 def drawn_once(context: CaseContext, tour: Tour, seed: int) -> Use | str:
@@ -199,14 +174,20 @@ def _use(context: CaseContext, tour: Tour, truth: TouchTruth, read: NamedPoints)
     """What readings are good for; in words why they do not suffice."""
     if len(read.names) < MIN_MARKERS:
         return f"{len(read.names)} of {len(tour.plan.touches)} markers were touched; {MIN_MARKERS} are needed"
+    assert context.placement is not None
+    plan, target_ct, at_target = tour.plan, context.case.target_ct, true_at_target(context, truth.seed)
     try:
         fitted = registered(context, read)
         expected = expected_of_touches(context, tour.q_insertion, read)
-        return Use(fitted, expected, _tip_error(context, tour.plan, truth, fitted, tour.q_insertion))
+        beliefs = (context.placement.T_base_ct, fitted.T_base_ct)  # the arm is sent to where the new one has the target
+        q = registered_joints(plan.model, plan.tip_mm, tour.q_insertion, target_ct, beliefs)
     except InputError as error:
         return error.what
     except NoAnswerError as error:
         return str(error)
+    tip = true_needle(plan.model, q + at_target.arrival, truth.eta, plan.tip_mm).tip_base
+    missed = tip - apply(truth.T_base_ct, at_target.target_ct)
+    return Use(fitted, expected, float(np.linalg.norm(missed)))
 
 
 def _puncture(context: CaseContext, choice: Choice) -> tuple[Floats, Floats]:
@@ -231,23 +212,10 @@ def true_touches(context: CaseContext, tour: Tour, seed: int) -> TouchTruth:
 
 
 def _points(touched: Touched) -> NamedPoints:
-    """The readings in the order in which they were made."""
     readings = touched.readings
     points = np.array([one.point_base for one in readings]).reshape(-1, 3)
     joints = np.array([one.q for one in readings]).reshape(-1, 6)
     return NamedPoints(tuple(one.name for one in readings), points, None, joints=joints)
-
-
-def _tip_error(
-    context: CaseContext, plan: TouchPlan, truth: TouchTruth, fitted: Registration, q_insertion: Floats
-) -> float:
-    """Tip to true target of the erring arm, sent to where the new registration puts the target, mm."""
-    assert context.placement is not None
-    target_ct, beliefs = context.case.target_ct, (context.placement.T_base_ct, fitted.T_base_ct)
-    q = registered_joints(plan.model, plan.tip_mm, q_insertion, target_ct, beliefs)
-    at_target = true_at_target(context, truth.seed)
-    tip = true_needle(plan.model, q + at_target.arrival, truth.eta, plan.tip_mm).tip_base
-    return float(np.linalg.norm(tip - apply(truth.T_base_ct, at_target.target_ct)))
 
 
 def true_at_target(context: CaseContext, seed: int) -> AtTarget:
@@ -256,7 +224,6 @@ def true_at_target(context: CaseContext, seed: int) -> AtTarget:
 
 
 def _true_errors(context: CaseContext) -> ErrorModel:
-    """What the truth is drawn from."""
     errors = context.case.truth_errors or context.case.errors
     assert errors is not None
     return errors
@@ -274,25 +241,107 @@ TOUCHED = (
 
 def touch_text(run: TouchRun) -> str:
     """For the terminal."""
-    plan, touched = run.plan, run.touched
+    plan, touched, use = run.plan, run.touched, run.use
     each = f", {_per_touch(touched):.1f} s each" if touched.readings else ""
     of = f" of {len(touched.readings) + len(touched.failed)}" if touched.failed else ""
     left = (f"{name} not touched: {why}" for name, why in (*plan.left_out.items(), *touched.failed.items()))
     head = f"{len(touched.readings)}{of} markers touched in {touched.seconds:.0f} s{each}"
-    return text([Section(head, [grid(TOUCHED, run.summary()["touches"]), *left]), *_use_said(run), *footer(run.files)])
-
-
-def _use_said(run: TouchRun) -> list[Section]:
-    plan, use = run.plan, run.use
     if isinstance(use, str):
-        return [Section(f"no registration: {use}", [])]
-    failed = ", ".join(run.touched.failed)
-    without = f" without {failed}, {plan.expected_mm:.2f} with them" if failed else ""
-    expected = f"expected tip error: {use.expected_mm:.2f} mm rms{without}; with the worst poses {plan.worst_mm:.2f} mm"
-    truth = f"error in this trial (seed {run.seed}): {use.tip_error_mm:.2f} mm; FRE {use.registration.fre_mm:.2f} mm"
-    return [Section(expected, []), Section(truth, [flag.sentence for flag in use.registration.flags])]
+        said = [Section(f"no registration: {use}", [])]
+    else:
+        failed, worst = ", ".join(touched.failed), f"with the worst poses {plan.worst_mm:.2f} mm"
+        without = f" without {failed}, {plan.expected_mm:.2f} with them" if failed else ""
+        truth = f"error in this trial (seed {run.seed}): {use.tip_error_mm:.2f} mm"
+        said = [
+            Section(f"expected tip error: {use.expected_mm:.2f} mm rms{without}; {worst}", []),
+            Section(
+                f"{truth}; FRE {use.registration.fre_mm:.2f} mm", [flag.sentence for flag in use.registration.flags]
+            ),
+        ]
+    return text([Section(head, [grid(TOUCHED, run.summary()["touches"]), *left]), *said, *footer(run.files)])
 
 
 def _per_touch(touched: Touched) -> float | None:
     """Seconds for each that was read."""
     return touched.seconds / len(touched.readings) if touched.readings else None
+
+
+DRAWS = 400
+"""Where one axis errs most their rms is known to 3.5 %."""
+
+
+def physical_runs(context: CaseContext, runs: int) -> dict[str, Any]:
+    """Run the experiment of a case's best candidate, each run with a truth of its own; returns plain values.
+
+    They are the tip's rms error that the declaration predicts for these touches and that of the runs that ended, each
+    of these, why others were refused, and the errors of truths without physics, the same and many.
+
+    Raises:
+        InputError: The case declares no errors, or has no markers.
+        NoAnswerError: Nothing is safe, or too few markers can be touched.
+    """
+    tour, ended, refused = plan_tour(context, BEST, seed=0), [], {}
+    for seed in range(runs):
+        try:
+            ended.append(physical_run(context, tour, seed))
+        except NoAnswerError as error:
+            refused[seed] = str(error)
+        context.watcher.count("runs", seed + 1, runs)
+    uses = {seed: drawn_once(context, tour, seed) for seed in range(max(DRAWS, runs))}
+    drawn = {seed: float("nan") if isinstance(use, str) else use.tip_error_mm for seed, use in uses.items()}
+    alike = [drawn[one["seed"]] for one in ended if np.isfinite(drawn[one["seed"]])]
+    return {
+        "expected_mm": tour.plan.expected_mm,
+        "realised_mm": or_null(rms([one["tip_error_mm"] for one in ended])),
+        "seconds_per_touch": float(np.mean([one["seconds_per_touch"] for one in ended])) if ended else None,
+        "drawn": {
+            "realised_mm": rms([drawn[seed] for seed in range(DRAWS) if np.isfinite(drawn[seed])]),
+            "draws": DRAWS,
+            "realised_in_the_same_truths_mm": or_null(rms(alike)),
+        },
+        "refused": refused,
+        "runs": ended,
+    }
+
+
+def physical_run(context: CaseContext, tour: Tour, seed: int) -> dict[str, Any]:
+    """One run."""
+    touched, use = touch_once(context, tour, seed)
+    if touched.failed or isinstance(use, str):
+        why = "; ".join(f"marker {name}: {reason}" for name, reason in touched.failed.items())
+        raise NoAnswerError(why or str(use), code="no_touch")
+    with context.stages.time("puncture"):  # planned by what was touched, and executed where everything truly is
+        plan = plan_puncture(context, tour.outward_ct, tour.q_insertion, use.registration)
+        truth, at_target = true_touches(context, tour, seed), true_at_target(context, seed)
+        inserted = rehearse_touched(context, plan, truth, at_target)
+    for contact in inserted.contacts:
+        what = f"the arm stopped before the target: {contact.link} touches {contact.body}"
+        raise NoAnswerError(what, code="motion_touches")
+    return {
+        "seed": seed,
+        "tip_error_mm": inserted.tip_error_mm,
+        "fre_mm": use.registration.fre_mm,
+        "seconds_per_touch": touched.seconds / len(touched.readings),
+        "off_path_mm": inserted.off_path_mm,
+        "refused": "",
+    }
+
+
+def physical_text(facts: Mapping[str, Any]) -> str:
+    """For a person; where one axis errs most, an rms is known to one over the root of twice their number."""
+    ended, drawn = facts["runs"], facts["drawn"]
+    refused = [f"seed {seed}: {why}" for seed, why in facts["refused"].items()]
+    if not ended:
+        return text([Section(f"none of {plural(len(refused), 'physical run')} ended", refused)])
+    known, draws = (100.0 / np.sqrt(2.0 * count) for count in (len(ended), drawn["draws"]))
+    head = (
+        f"{plural(len(ended), 'physical run')} ({facts['seconds_per_touch']:.1f} s per touch): the tip misses the "
+        f"target by {facts['realised_mm']:.2f} mm rms (known to {known:.0f} %), {facts['expected_mm']:.2f} predicted"
+    )
+    off_mm = max(run["off_path_mm"] for run in ended)
+    said = [
+        f"touched and inserted in the simulator, the tip at most {off_mm:.3f} mm off its commanded path",
+        f"without physics, the same {plural(len(ended), 'trial')} give {drawn['realised_in_the_same_truths_mm']:.2f} "
+        f"mm, all {drawn['draws']} trials {drawn['realised_mm']:.2f} (known to {draws:.1f} %)",
+    ]
+    return text([Section(head, [*said, *refused])])

@@ -16,11 +16,17 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import log_rotation
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibrate import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import Estimate, active_columns, closed_form
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import mean_direction, tip_residuals
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.outliers import plain_fit
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import UNWEIGHTED, Problem
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
+    UNWEIGHTED,
+    Estimate,
+    Problem,
+    active_columns,
+    closed_form,
+    mean_direction,
+    tip_residuals,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
 from puncture_twin.twin.jobs.terminal import Answer
@@ -148,7 +154,7 @@ def _run(rng: np.random.Generator, n: int) -> _Run:
     recording, truth = simulate_recording(rng, n)
     unseen, _ = simulate_recording(rng, UNSEEN, truth, noise=None)
     start = closed_form(recording)
-    active = active_columns(tip=True, scale=False, direction=False)
+    active = active_columns(scale=False, direction=False)
     plain = plain_fit(Problem(recording, UNWEIGHTED, active), start)
     weighted = plain_fit(Problem(recording, SPEC_NOISE, active), start)
     squared = [_squared(estimate, unseen) for estimate in (start, plain.estimate, weighted.estimate)]
@@ -169,7 +175,7 @@ def _outliers(runs: int) -> list[dict[str, Any]]:
         recording, truth = simulate_recording(rng, 30)
         unseen, _ = simulate_recording(rng, UNSEEN, truth, noise=None)
         broken = with_outliers(rng, recording, OUTLIER_FRACTION, OUTLIER_MM)
-        active = active_columns(tip=True, scale=False, direction=False)
+        active = active_columns(scale=False, direction=False)
         plain = plain_fit(Problem(broken, UNWEIGHTED, active), closed_form(broken))
         unweighted, weighted = (calibrate(broken, noise=noise, direction=False) for noise in (None, SPEC_NOISE))
         return [_squared(found.estimate, unseen) for found in (plain, unweighted, weighted)]

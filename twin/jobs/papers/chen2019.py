@@ -199,7 +199,7 @@ def experiment(draws: int | None, runs: int, watcher: Watcher) -> Answer:
     shown = experiment_text(facts)
     if runs:
         from puncture_twin.planning.search.context import prepare
-        from puncture_twin.twin.jobs.experiment.physical_runs import physical_runs, physical_text
+        from puncture_twin.twin.jobs.experiment.touch_job import physical_runs, physical_text
 
         facts["physical"] = physical_runs(prepare(folder() / SETUP_2, watcher=watcher), runs)
         shown = f"{shown}\n{physical_text(facts['physical'])}"

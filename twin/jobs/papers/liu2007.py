@@ -20,8 +20,15 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.text import plural
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
-from puncture_twin.twin.jobs.servo.job import NAMES, Sessions, hold_sessions, session_files
-from puncture_twin.twin.jobs.servo.report import TARGET, servo_facts, servo_text
+from puncture_twin.twin.jobs.servo.job import (
+    NAMES,
+    TARGET,
+    Sessions,
+    hold_sessions,
+    servo_facts,
+    servo_text,
+    session_files,
+)
 from puncture_twin.twin.jobs.terminal import Answer
 from puncture_twin.twin.rehearsal.stereo_session import ServoTrial, TargetRow
 from puncture_twin.twin.report.present import Field, Section, Table, grid, number

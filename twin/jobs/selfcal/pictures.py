@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,15 +13,19 @@ from PIL import Image, ImageDraw
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import visual_links
-from puncture_twin.planning.arm.tool import Tool
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
-from puncture_twin.twin.guidance.ultrasound.image.needle_detector import Detection
+from puncture_twin.twin.guidance.ultrasound.needle_detector import Detection, Imager
+from puncture_twin.twin.guidance.ultrasound.pose_choice import (
+    head_pose,
+    needle_tool,
+    phantom_mesh,
+    probe_tool,
+    table_box,
+)
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.two_arms import head_pose, needle_tool, phantom_mesh, probe_tool, table_box
 from puncture_twin.twin.plant.bmode_image import NeedleInImage
 from puncture_twin.twin.rehearsal.selfcal_trial import Puncture, SelfcalTrial, puncture_image
 from puncture_twin.twin.report import palette
@@ -34,22 +37,17 @@ from puncture_twin.twin.report.scene.scene_parts import bar
 
 PX_PER_MM = 8
 """Of the sheet."""
-
 MARGIN, CAPTION, LEGEND, COLUMNS = 14, 58, 40, 3
 """Pixels about a picture, below it and below all; pictures side by side."""
-
 MARKED_MM = 14.0
 """Of the detected shaft that is marked."""
-
 TARGET_MM = 2.0
 """Radius of the ring about a target."""
-
 DETECTED: Rgb = (86, 220, 255)
 TRUE: Rgb = (255, 214, 64)
 TARGET: Rgb = (255, 96, 96)
 DARK = ("#0082af", "#be8c00", "#c82828")
 """The same on white."""
-
 WORKCELL_SIZE = (1180, 720)
 OPACITY = 0.45
 """Opacity of the phantom, so that the needle shows in it."""
@@ -91,24 +89,20 @@ def detection_sheet(case: SelfcalCase, trial: SelfcalTrial, path: Path) -> Path:
 
 
 def _recorded_panels(trial: SelfcalTrial) -> list[Panel]:
-    taken = trial.acquisition
+    taken, panels = trial.acquisition, []
     errors = np.linalg.norm(trial.detection_errors()[:, :2], axis=1)
     order = np.argsort(errors)
-    chosen = [(order[0], "best detection"), (order[len(order) // 2], "median"), (order[-1], "worst")]
-    panels = [_shot_panel(trial, int(i), f"{what}: tip {errors[i]:.2f} mm off") for i, what in chosen]
+    for i, what in ((order[0], "best detection"), (order[len(order) // 2], "median"), (order[-1], "worst")):
+        shot = taken.shots[i]
+        needle = trial.shown[shot.number].needle
+        assert isinstance(shot.found, Detection)  # only those are kept as shots
+        steep = np.degrees(np.arcsin(abs(needle.direction_image[1])))
+        text = f"insertion {steep:.0f}°, off the plane {needle.tip_image[2]:+.2f} mm".replace("-", "−")
+        panels.append(Panel(shot.image, f"{what}: tip {errors[i]:.2f} mm off", text, shot.found, needle))
     if taken.missed_shots:
         shot = taken.missed_shots[0]
         panels.append(Panel(shot.image, "not used", str(shot.found), None, trial.shown[shot.number].needle))
     return panels
-
-
-def _shot_panel(trial: SelfcalTrial, index: int, title: str) -> Panel:
-    shot = trial.acquisition.shots[index]
-    needle = trial.shown[shot.number].needle
-    assert isinstance(shot.found, Detection)  # only those are kept as shots
-    steep = np.degrees(np.arcsin(abs(needle.direction_image[1])))
-    text = f"insertion {steep:.0f}°, off the plane {needle.tip_image[2]:+.2f} mm"
-    return Panel(shot.image, title, text.replace("-", "−"), shot.found, needle)
 
 
 def _puncture_panels(case: SelfcalCase, trial: SelfcalTrial, rng: np.random.Generator) -> list[Panel]:
@@ -123,21 +117,12 @@ def _puncture_panels(case: SelfcalCase, trial: SelfcalTrial, rng: np.random.Gene
 
 
 def _draw_panel(axes: Axes, panel: Panel, imager: Imager) -> None:
-    """The picture in mm, its marks, its scale, and its title and text below."""
+    """The picture in mm, its marks (what lies beyond it is cut off), its scale, and its title and text below."""
     (wide, deep), half = imager.size_mm, 0.5 * imager.pixel_mm
     axes.set_axis_off()
     extent = (-half, wide + half, deep + half, -half)
     axes.imshow(panel.picture, cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="bicubic", aspect="auto")
     axes.set_autoscale_on(False)
-    _draw_marks(axes, panel)
-    axes.plot((1.0, 11.0), (deep - 1.5, deep - 1.5), color="white", linewidth=3)
-    axes.text(12.0, deep - 1.5, "10 mm", color="white", fontsize=13, va="center")
-    for text, below, look in ((panel.title, 6, {"fontsize": 18, "weight": "bold"}), (panel.text, 30, {"fontsize": 15})):
-        axes.annotate(text, (0, 0), (0, -below), "axes fraction", textcoords="offset points", va="top", **look)
-
-
-def _draw_marks(axes: Axes, panel: Panel) -> None:
-    """Detected shaft and tip, true tip, target; what lies beyond the picture is cut off."""
     if panel.found is not None:
         tip, direction = panel.found.tip_image, panel.found.direction_image
         for side in (-1.2, 1.2):  # beside the shaft, so that it stays visible
@@ -148,6 +133,10 @@ def _draw_marks(axes: Axes, panel: Panel) -> None:
     if panel.target is not None:
         u, v = panel.target[:2].tolist()
         axes.add_patch(Circle((u, v), TARGET_MM, fill=False, color=css(TARGET), linewidth=2))
+    axes.plot((1.0, 11.0), (deep - 1.5, deep - 1.5), color="white", linewidth=3)
+    axes.text(12.0, deep - 1.5, "10 mm", color="white", fontsize=13, va="center")
+    for text, below, look in ((panel.title, 6, {"fontsize": 18, "weight": "bold"}), (panel.text, 30, {"fontsize": 15})):
+        axes.annotate(text, (0, 0), (0, -below), "axes fraction", textcoords="offset points", va="top", **look)
 
 
 def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path: Path) -> Path:
@@ -172,29 +161,25 @@ def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path:
 
 def workcell_surfaces(case: SelfcalCase, q_probe: Floats, q_needle: Floats) -> tuple[list[Surface], list[Surface]]:
     """Table, arms, probe and needle; and, see-through, the phantom and the slice. base1, mm."""
-    table = table_box(case.content.phantom)
-    T1 = link_poses(case.models[0], q_probe)
-    T2 = case.T_base1_base2 @ link_poses(case.models[1], q_needle)
+    table, (width, depth) = table_box(case.content.phantom), case.content.image.imager().size_mm
+    T1, T2 = link_poses(case.models[0], q_probe), case.T_base1_base2 @ link_poses(case.models[1], q_needle)
     opaque = [Surface(box(table.T_base_box, table.size_mm), palette.TABLE)]
     for model, poses in zip(case.models, (T1, T2), strict=True):
         opaque += [Surface(link.mesh.transformed(poses[link.frame]), palette.ARM) for link in visual_links(model)]
-    handle, needle = probe_tool(case), needle_tool(case)
-    opaque.append(Surface(_cylinder(T1[6], 0.0, handle.needle_length_mm, handle.holder_diameter_mm), (235, 236, 240)))
-    opaque.append(Surface(box(T1[6] @ head_pose(case, case.T_end1_image), case.content.probe.head_mm), (90, 110, 150)))
-    opaque += _needle_surfaces(T2[6], needle)
-    width, depth = case.content.image.imager().size_mm
+    handle, tool, end2 = probe_tool(case), needle_tool(case), T2[6]
+    shaft = _cylinder(end2, tool.holder_length_mm, tool.needle_length_mm, max(tool.needle_diameter_mm, 3.0))
+    opaque += [
+        Surface(_cylinder(T1[6], 0.0, handle.needle_length_mm, handle.holder_diameter_mm), (235, 236, 240)),
+        Surface(box(T1[6] @ head_pose(case, case.T_end1_image), case.content.probe.head_mm), (90, 110, 150)),
+        Surface(_cylinder(end2, 0.0, tool.holder_length_mm, tool.holder_diameter_mm), palette.HOLDER),
+        Surface(shaft, palette.NEEDLE),
+    ]
     T_slice = pose(np.eye(3), [width / 2.0, depth / 2.0, 0.0])
     slab = box(T1[6] @ case.T_end1_image @ T_slice, (width, depth, 0.6))
     return opaque, [
         Surface(phantom_mesh(case.content.phantom), palette.SKIN, OPACITY),
         Surface(slab, (86, 180, 233), 0.55, 0.0),
     ]
-
-
-def _needle_surfaces(T_base1_end2: Floats, tool: Tool) -> Sequence[Surface]:
-    holder = _cylinder(T_base1_end2, 0.0, tool.holder_length_mm, tool.holder_diameter_mm)
-    shaft = _cylinder(T_base1_end2, tool.holder_length_mm, tool.needle_length_mm, max(tool.needle_diameter_mm, 3.0))
-    return [Surface(holder, palette.HOLDER), Surface(shaft, palette.NEEDLE)]
 
 
 def _cylinder(T: Floats, low: float, high: float, diameter_mm: float) -> TriangleMesh:

@@ -1,32 +1,72 @@
-"""The self-calibration from end to end: in the twin (truth, poses, pictures, detection) or from a recording."""
+"""The command ``selfcal``: in the twin, or from a recording, to files and the sections that show what was found."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from markupsafe import Markup
+from matplotlib.figure import Figure
 
+from puncture_twin.planning.base.errors import PlanningError, refuse
+from puncture_twin.planning.base.files import new_folder
+from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.progress import Stages, Watcher
-from puncture_twin.planning.base.provenance import Input
-from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, choice_noise
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
+from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, choice_noise, keep_pictures
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, Shot, ShotByShot
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.shots import Shot, ShotByShot
-from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, drawing, expected_tre_mm, find_candidates
-from puncture_twin.twin.guidance.ultrasound.puncture import predicted_tre
-from puncture_twin.twin.guidance.ultrasound.recording_file import open_recording, recording_file
-from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
-from puncture_twin.twin.guidance.ultrasound.slips import checked_calibration, held_length_mm
-from puncture_twin.twin.guidance.ultrasound.two_arms import TwoArms
-from puncture_twin.twin.rehearsal.selfcal_trial import Puncture, SelfcalTrial, run_trial
+from puncture_twin.twin.guidance.ultrasound.pose_choice import (
+    CandidatePoses,
+    TwoArms,
+    drawing,
+    expected_tre_mm,
+    find_candidates,
+    predicted_tre,
+)
+from puncture_twin.twin.guidance.ultrasound.recording_file import (
+    FILE_NAME,
+    checked_calibration,
+    held_length_mm,
+    open_recording,
+    recording_file,
+    write_recording,
+)
+from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
+from puncture_twin.twin.jobs.selfcal.pictures import detection_sheet, workcell_picture
+from puncture_twin.twin.jobs.terminal import write_json
+from puncture_twin.twin.rehearsal.selfcal_trial import (
+    Puncture,
+    SelfcalTrial,
+    puncture_summary,
+    run_trial,
+    trial_summary,
+)
+from puncture_twin.twin.report.figures import png
+from puncture_twin.twin.report.page.template import Card
+from puncture_twin.twin.report.present import (
+    Block,
+    Field,
+    Section,
+    Table,
+    Warn,
+    facts as facts_table,
+    footer,
+    grid,
+    number,
+    origin_section,
+    picture,
+    text,
+    vector,
+    write_page as write_job_page,
+)
 
 NO_JOINTS = "{file}: no joints (columns A_q1_deg to B_q6_deg): the declared arm errors of the case are not counted"
-
 MOST_MISSED = "{file}: no needle in {missed} pictures, and one in {shown}: is the display that of the case's machine?"
-
 RANDOM_SETS = 50
 """Random choices that the informative one is compared with."""
 
@@ -59,10 +99,6 @@ class SelfcalRun:
         """Of all seeds."""
         return tuple(one for trial in self.trials for one in trial.punctures)
 
-    def with_files(self, *files: Path) -> SelfcalRun:
-        """This run with the files that were written."""
-        return replace(self, files=(*self.files, *files))
-
 
 def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
     """Draw ``seeds`` rooms from the case's seed on; record, calibrate and puncture in each.
@@ -71,23 +107,21 @@ def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
         Degenerate: The poses cannot show every unknown.
         NoAnswerError: Not enough poses can be taken or show the needle.
     """
-    stages = Stages()
+    stages, seed = Stages(), case.content.seed
     with stages.time("room"):
         workcell = TwoArms(case)
     with stages.time("candidates"):
-        candidates = find_candidates(case, workcell, np.random.default_rng(case.content.seed))
-    trials = []
-    for seed in range(case.content.seed, case.content.seed + seeds):
-        trials.append(run_trial(case, workcell, candidates, seed, stages, watcher))
-    with stages.time("comparison with random choice"):
-        choice = compare_choice(case, candidates, trials[0].acquisition)
+        candidates = find_candidates(case, workcell, np.random.default_rng(seed))
+    trials = tuple(run_trial(case, workcell, candidates, seed + k, stages, watcher) for k in range(seeds))
     first = trials[0]
+    with stages.time("comparison with random choice"):
+        choice = compare_choice(case, candidates, first.acquisition)
     return SelfcalRun(
         case.content.name,
         first.calibration,
         first.acquisition.recording,
         case.inputs,
-        tuple(trials),
+        trials,
         case,
         candidates,
         choice,
@@ -99,8 +133,7 @@ def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
 def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None = None) -> SelfcalRun:
     """Calibrate from a recording's CSV, or a folder with ``recording.csv``; a case says noise and needle length.
 
-    Args:
-        shots: A recording of what was seen afterwards: each of its poses updates the calibration; None for none.
+    Each pose of ``shots``, what was seen afterwards, updates the calibration.
 
     Raises:
         InputError: A recording that cannot be used, or that fits only in another reading (inverse, swapped, metres).
@@ -134,15 +167,13 @@ def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None =
 
 def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisition) -> dict[str, Any]:
     """The gain by choosing poses: Cramer-Rao bounds over all candidates of those recorded and of random ones, mm."""
-    noise, belief, poses = choice_noise(case), drawing(case), candidates.poses
+    poses, rows = candidates.poses, [shot.candidate for shot in taken.shots]
     rng = np.random.default_rng(case.content.seed)
-    rows = np.array([shot.candidate for shot in taken.shots])
-
-    def expected(some: NDArray[np.int_]) -> float:
-        return expected_tre_mm(poses.subset(some), noise, belief, poses, case.declared_arms)
-
-    sets = [rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS)]
-    chosen, drawn = expected(rows), [expected(some) for some in sets]
+    sets = [np.array(rows), *(rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS))]
+    chosen, *drawn = (
+        expected_tre_mm(poses.subset(some), choice_noise(case), drawing(case), poses, case.declared_arms)
+        for some in sets
+    )
     return {
         "chosen_bound_mm": chosen,
         "random_bound_median_mm": float(np.median(drawn)),
@@ -152,7 +183,15 @@ def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisi
 
 
 def calibration_summary(found: Calibration, recording: Recording) -> dict[str, Any]:
-    """A calibration's main values, mm and degrees."""
+    """A calibration's main values, mm and degrees: with the stated noise, or the estimated spread; arms if declared."""
+    names, arms = {"inside_mm": "inside_image_mm", "across_mm": "across_image_mm"}, None
+    noise = {names.get(key, key): value for key, value in found.noise._asdict().items()}
+    if found.arms is not None:
+        arms = {
+            "found_sd": found.arm_errors.tolist(),
+            "chi2_per_freedom": found.chi_squared_ratio,
+            "chi2_chance": found.chi_squared_chance(),
+        }
     return {
         "T_end1_image": found.X.tolist(),
         "T_base1_base2": found.Y.tolist(),
@@ -166,29 +205,343 @@ def calibration_summary(found: Calibration, recording: Recording) -> dict[str, A
         "findings": [one.document() for one in found.findings],
         "iterations": found.iterations,
         "condition": found.condition,
-        "noise": noise_summary(found),
+        "noise": in_degrees(noise),
         "predicted_tre_mm": predicted_tre(found, recording),
         "tip_bias_mm": found.tip_bias_mm,
-        "arms": arms_summary(found),
+        "arms": arms,
         "cannot_show": list(found.cannot_show),
     }
 
 
-def noise_summary(found: Calibration) -> dict[str, float]:
-    """The stated noise, or the estimated spread."""
-    names = {"inside_mm": "inside_image_mm", "across_mm": "across_image_mm"}
+def in_degrees(values: Mapping[str, float]) -> dict[str, float]:
+    """The values by their names, those in rad as degrees."""
     return {
-        names.get(key, key.replace("_rad", "_deg")): float(np.degrees(value)) if key.endswith("_rad") else value
-        for key, value in found.noise._asdict().items()
+        key.replace("_rad", "_deg"): float(np.degrees(value)) if key.endswith("_rad") else value
+        for key, value in values.items()
     }
 
 
-def arms_summary(found: Calibration) -> dict[str, Any] | None:
-    """Estimated errors of the declared arms, and whether the residuals agree; None where none were declared."""
-    if found.arms is None:
-        return None
-    return {
-        "found_sd": found.arm_errors.tolist(),
-        "chi2_per_freedom": found.chi_squared_ratio,
-        "chi2_chance": found.chi_squared_chance(),
+Facts = Mapping[str, Any]
+"""What `selfcal_facts` returns: mm and degrees."""
+
+REASON_TEXT = MappingProxyType(
+    {
+        "ok": "can be taken",
+        "tip_outside_phantom": "tip outside the phantom",
+        "probe_out_of_reach": "probe arm cannot reach",
+        "needle_out_of_reach": "needle arm cannot reach",
+        "probe_arm_collision": "probe arm would touch itself, the table or the phantom",
+        "needle_arm_collision": "needle arm would touch itself, the table or (except with the needle) the phantom",
+        "arms_collide": "the arms, or probe and needle, would touch",
     }
+)
+"""Of the reasons for which a drawn pose is not taken."""
+
+NOISE_TEXT = MappingProxyType(
+    {
+        "robot_mm": "stated noise of each flange, mm per axis",
+        "robot_deg": "stated noise of each flange, ° per axis",
+        "image_mm": "stated noise of the tip in the image, mm per axis",
+        "off_plane_mm": "stated deviation of the tip from the slice, mm",
+        "direction_deg": "noise of the direction in the image, °",
+        "inside_image_mm": "spread of the residuals in the image, mm per axis",
+        "across_image_mm": "spread of the residuals across the slice, mm",
+    }
+)
+HELD_OUT = "Held-out: predicted minus true tip at poses that were not recorded, with the remaining errors of the arms."
+COMMAND = "selfcal"
+ANSWERS = ("calibration.json", "report.html")
+PICTURES = ("bmode.png", "room.png")
+VERSION = 2
+"""Of ``calibration.json``. 2: ``inputs`` lists each file with its role."""
+
+
+def run_selfcal(
+    case_path: Path | None,
+    recording: Path | None,
+    seeds: int,
+    out: Path,
+    watcher: Watcher,
+    record: Path | None = None,
+    shots: Path | None = None,
+) -> SelfcalRun:
+    """Simulate a case, or calibrate a recording, and write everything into a folder.
+
+    The first seed's pictures and joints go into the folder ``record``, which is not there yet.
+
+    Raises:
+        InputError: Something that cannot be used, or poses that cannot show every unknown.
+        NoAnswerError: Not enough poses can be taken or show the needle.
+    """
+    if (recording is not None and record is not None) or (recording is None and shots is not None):
+        allowed = "--record without --recording, and --shots with it"
+        refuse("--record or --shots", "selfcal", allowed, "conflicting_options")
+    case = None if case_path is None else load_selfcal_case(case_path)
+    names = ANSWERS if recording is not None else (*ANSWERS, *PICTURES, FILE_NAME)
+    try:
+        with new_folder(record) as kept, writing(out, COMMAND, names=names, note=watcher.note) as draft:
+            if recording is not None:
+                run = selfcal_recording(recording, case, shots)
+                draft.keep(FILE_NAME)  # one that an earlier run wrote into the folder may be this one
+                files = [write_json(calibration_file(run), draft.folder / ANSWERS[0])]
+            else:
+                assert case is not None  # the command line gives one of the two
+                run = selfcal_twin(case, seeds, watcher)
+                files = [write_json(calibration_file(run), draft.folder / ANSWERS[0]), draft.folder / FILE_NAME]
+                write_recording(run.recording, files[1])
+                with run.stages.time("pictures"):
+                    files += _pictures(case, run.trials[0], draft.folder)
+                if kept is not None:
+                    keep_pictures(run.trials[0].acquisition, case.content.image.pixel_mm, kept)
+            files.append(write_page(run, files[2:], draft.folder / ANSWERS[1]))
+            draft.inputs, draft.seconds = run.inputs, run.stages.seconds
+    except PlanningError:
+        withdraw(out, COMMAND, keep=(FILE_NAME,))
+        raise
+    return replace(run, files=draft.final(files))
+
+
+def _pictures(case: SelfcalCase, trial: SelfcalTrial, folder: Path) -> list[Path]:
+    sheet, shot = detection_sheet(case, trial, folder / PICTURES[0]), trial.acquisition.shots[0]
+    return [sheet, workcell_picture(case, shot.q_probe, shot.q_needle, folder / PICTURES[1])]
+
+
+def calibration_file(run: SelfcalRun) -> dict[str, Any]:
+    """What ``calibration.json`` holds."""
+    found = run.calibration
+    return {
+        "version": VERSION,
+        "name": run.name,
+        "seed": run.trials[0].seed if run.trials else None,
+        "inputs": inputs_document(run.inputs),
+        **calibration_summary(found, run.recording),
+        "residuals_mm": dict(zip(run.recording.names, found.residuals.tolist(), strict=True)),
+        "parameters": list(found.parameters),
+        "covariance": found.covariance_counts.tolist(),
+        "region_limit_95": found.region_limit(),
+        "shots": [shot._asdict() for shot in run.shots],
+    }
+
+
+def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
+    """Poses, calibration, trials, punctures, and what was written."""
+    return {
+        **calibration_summary(run.calibration, run.recording),
+        "name": run.name,
+        "inputs": inputs_document(run.inputs),
+        "candidates": None if run.candidates is None else run.candidates.counts,
+        "choice": run.choice,
+        "shots": [shot._asdict() for shot in run.shots],
+        "trials": [trial_summary(trial) for trial in run.trials],
+        "punctures": puncture_summary(run.punctures),
+        "seconds": {stage: round(seconds, 3) for stage, seconds in run.stages.seconds.items()},
+        "files": [str(path) for path in run.files],
+        "warnings": list(run.warnings),
+    }
+
+
+def selfcal_text(found: Facts) -> str:
+    """The sections for a terminal, then the files."""
+    notes = tuple(f"note: {one['sentence']}" for one in found["findings"] if one["severity"] == "note")
+    head = Section(f"{'case' if found['trials'] else 'recording'} {found['name']}", [Warn(notes)] if notes else [])
+    return text([head, *sections(found), *footer(found["files"], found["warnings"], found["seconds"])])
+
+
+def write_page(run: SelfcalRun, pictures: Sequence[Path], path: Path) -> Path:
+    """Write the page, with the sheet of pictures and the workcell where the twin drew them."""
+    found, seed = selfcal_facts(run), run.trials[0].seed if run.trials else None
+    residuals = picture(residual_picture(run.calibration, run.recording), "Residual of each pose, and v over u")
+    shown = [*sections(found)]
+    shown[2:2] = [_numbers(run.calibration), Section("residuals", [RESIDUALS, residuals])]
+    if pictures:
+        if run.punctures:
+            errors = picture(puncture_picture(run.punctures), "Error of every target, and the expected error")
+            shown.insert(5, Section("", [errors]))
+        sheet = picture(pictures[0], "B-mode pictures with detected and true tips")
+        words = "One recorded pose. The needle is drawn 3 mm thick; blue: the slice in the image."
+        shown += [
+            Section("B-mode pictures", [f"Seed {seed}. The detector sees only the grey picture.", sheet]),
+            Section("the workcell", [picture(pictures[1], "Both arms about the phantom"), words]),
+        ]
+    title, origin = f"{run.name}: ultrasound self-calibration", origin_section(seed)
+    return write_job_page(path, title, EQUATION, _cards(found), shown, run.inputs, origin=origin)
+
+
+EQUATION = "A X p = Y B q: X probe flange to image, Y base 1 to base 2, q the tip in the needle's flange frame."
+RESIDUALS = (
+    "Y B q − A X p of every pose, in the axes of the image. Small residuals do not prove a small error at a target."
+)
+
+
+def sections(found: Facts) -> list[Section]:
+    """What the terminal and the page both show."""
+    arms, known = found["arms"], [(NOISE_TEXT[key], number(value, 3)) for key, value in found["noise"].items()]
+    if arms is not None:
+        known.insert(0, ("χ² of the residuals per degree of freedom", number(arms["chi2_per_freedom"], 2)))
+    shown = [
+        Section("what the data cannot determine", [Warn(tuple(found["cannot_show"]))]),
+        Section("calibration", [facts_table([*CALIBRATION, *known], found)]),
+    ]
+    if found["shots"]:
+        words = "Each updated the calibration where it fits; residuals above are those of the recording."
+        shown.append(Section("shots after the recording", [words, grid(SHOT, found["shots"])]))
+    if found["trials"]:
+        reached: list[Block] = ["No target could be reached without contact."]
+        if found["punctures"] is not None:
+            reached = [PUNCTURED, facts_table(PUNCTURES, found["punctures"])]
+        shown += [
+            Section("insertions to targets in the image", reached),
+            Section("seeds, each its own trial", [grid(TRIAL, found["trials"]), HELD_OUT]),
+            Section("poses", _poses(found)),
+        ]
+    return shown
+
+
+PUNCTURED = (
+    "In the twin, with the true arms: the target is read in the image (with reading error) and the needle arm "
+    "moves there by the calibration. These targets were not recorded before."
+)
+
+
+CALIBRATION = (
+    Field("poses used", lambda one: f"{one['poses'] - len(one['set_aside'])} of {one['poses']}"),
+    Field("set aside", lambda one: ", ".join(one["set_aside"]) or "none"),
+    Field("pictures without a needle", lambda one: _named(one["without_needle"])),
+    Field("residuals, rms", "residual_rms_mm", 3, "mm"),
+    Field("expected tip error, rms", lambda one: f"{one['predicted_tre_mm']:.3f} mm, {counted(one)}"),
+    Field("tip in the needle's flange frame", lambda one: vector(one["tip_end2_mm"], 3, "mm")),
+    Field("needle direction there", lambda one: vector(one["needle_direction_end2"], 5)),
+    Field("iterations", "iterations"),
+    Field("condition σ_min/σ_max, lengths in 100 mm", lambda one: f"{one['condition']:.2e}"),
+)
+TRIAL = (
+    Field("seed", lambda one: str(one["seed"])),
+    Field("residual rms", "residual_rms_mm", 3, "mm"),
+    Field("expected error", "predicted_tre_mm", 3, "mm"),
+    Field("held-out tip error rms", "held_out_error_rms_mm", 3, "mm"),
+    Field("tip found: mean along", lambda one: one["detected_tip_along_mm"][0], 2, "mm"),
+    Field("sd", lambda one: one["detected_tip_along_mm"][1], 2, "mm"),
+    Field("angle sd", lambda one: one["detected_angle_deg"][1], 2, "°"),
+    Field("tip to target rms", lambda one: one["punctures"] and one["punctures"]["error_rms_mm"], 2, "mm"),
+    Field("true contacts", "true_contacts"),
+    Field("not used", lambda one: "; ".join(f"{count} {why}" for why, count in one["missed"].items()) or "none"),
+    Field("set aside", lambda one: ", ".join(one["set_aside"]) or "none"),
+)
+SHOT = (
+    Field("shot", "name"),
+    Field("χ²", "chi_squared", 1),
+    Field("fits below", "limit", 1),
+    Field("", lambda one: "used" if one["used"] else "does not fit: left out"),
+)
+PUNCTURES = (
+    Field("targets", "targets"),
+    Field("true tip to true target, rms", "error_rms_mm", 2, "mm"),
+    Field("median", "error_median_mm", 2, "mm"),
+    Field("worst", "error_worst_mm", 2, "mm"),
+    Field("across the needle, rms", "lateral_rms_mm", 2, "mm"),
+    Field("along the needle, mean (+ is too deep)", "depth_mean_mm", 2, "mm"),
+    Field("along the needle, rms", "depth_rms_mm", 2, "mm"),
+    Field("expected (rms): calibration and arms", "predicted_rms_mm", 2, "mm"),
+    Field("expected (rms): with the target's reading", "predicted_with_reading_rms_mm", 2, "mm"),
+)
+
+
+def _named(some: Facts) -> str:
+    return f"{len(some)}: {', '.join(some)}" if some else "none"
+
+
+def counted(found: Facts) -> str:
+    """What the expected error holds."""
+    return "noise alone" if found["arms"] is None else "noise and declared errors of the arms"
+
+
+def _poses(found: Facts) -> list[Block]:
+    choice, recorded = found["choice"], found["poses"]
+    counts = [(REASON_TEXT[key], f"{value:,}") for key, value in found["candidates"].items() if value]
+    bounds = (
+        Field(f"expected error with the {recorded} recorded poses", "chosen_bound_mm", 3, "mm"),
+        Field(f"{recorded} at random, median of {choice['random_sets']} choices", "random_bound_median_mm", 3, "mm"),
+        Field("at random, the best of them", "random_bound_best_mm", 3, "mm"),
+    )
+    drawn = Table(("outcome of the drawn poses", "draws"), tuple(counts))
+    return [(drawn, facts_table(bounds, choice)), "Cramér-Rao bounds over all candidates, with the usual noise."]
+
+
+def _numbers(found: Calibration) -> Section:
+    """Both transforms, and how well each number is known."""
+    matrices = facts_table([("T_end1_image (X), mm", _matrix(found.X)), ("T_base1_base2 (Y), mm", _matrix(found.Y))])
+    known = Table(("parameter", "sd"), tuple((name, f"{value:.4f}") for name, value in deviations(found).items()))
+    note = "w: a small rotation, R exp([w]×); t: a shift; V: the needle’s direction."
+    return Section("uncertainty of each parameter", [matrices, known, note])
+
+
+def _matrix(T: Any) -> Markup:
+    lines = ["  ".join(f"{value:10.5f}" for value in row[:3]) + f"  {row[3]:9.3f}" for row in T[:3]]
+    return Markup("<pre>{}</pre>").format("\n".join(lines))
+
+
+def deviations(found: Calibration) -> dict[str, float]:
+    """Standard deviation of every parameter, by name; rotations in degrees."""
+    sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0)).tolist()
+    return in_degrees(dict(zip(found.parameters, sigma, strict=True)))
+
+
+def _cards(found: Facts) -> list[Card]:
+    aside, poses, reached = found["set_aside"], found["poses"], found["punctures"]
+    expected = number(found["predicted_tre_mm"], 2, "mm")
+    cards = [
+        Card("expected error of the calibration", expected, f"rms at the tip: {counted(found)}"),
+        Card("residuals", number(found["residual_rms_mm"], 2, "mm"), "rms over the poses used"),
+        Card("poses", f"{poses - len(aside)} of {poses}", f"set aside: {', '.join(aside) or 'none'}"),
+    ]
+    if reached is not None:
+        detail = (
+            f"rms over {reached['targets']} targets, worst {number(reached['error_worst_mm'], 2, 'mm')}; expected "
+            f"from calibration, arms and reading: {number(reached['predicted_with_reading_rms_mm'], 2, 'mm')}"
+        )
+        cards.insert(0, Card("tip to target, true", number(reached["error_rms_mm"], 2, "mm"), detail))
+    return cards
+
+
+COLOURS = ("#0072b2", "#e69f00", "#009e73")
+"""Okabe and Ito's blue, orange, green."""
+SET_ASIDE = "#d6001e"
+
+
+def residual_picture(found: Calibration, recording: Recording) -> bytes:
+    """A PNG of each pose's residual in the image frame: its three components, and v over u; set aside by name."""
+    rotated = np.einsum("nji,nj->ni", recording.A[:, :3, :3] @ found.X[:3, :3], found.residuals)
+    aside = np.isin(recording.names, found.outliers)
+    figure = Figure(figsize=(12.0, 4.0), dpi=110, layout="constrained")
+    by_pose, in_image = figure.subplots(1, 2)
+    for axis, label in enumerate(("u, along the face", "v, into the depth", "across the slice")):
+        by_pose.plot(np.flatnonzero(~aside), rotated[~aside, axis], "o", ms=4, color=COLOURS[axis], label=label)
+        by_pose.plot(np.flatnonzero(aside), rotated[aside, axis], "x", color=SET_ASIDE)
+    in_image.plot(*rotated[~aside, :2].T, "o", ms=4, color=COLOURS[0], label="used")
+    in_image.plot(*rotated[aside, :2].T, "x", color=SET_ASIDE, label="set aside")
+    for row in np.flatnonzero(aside):
+        in_image.annotate(recording.names[row], rotated[row, :2], (5, 3), textcoords="offset points", fontsize=8)
+    by_pose.set(xlabel="pose", ylabel="residual, mm")
+    in_image.set(xlabel="residual along u, mm", ylabel="residual along v, mm", aspect="equal", adjustable="datalim")
+    return _finished(figure)
+
+
+def puncture_picture(reached: Sequence[Puncture]) -> bytes:
+    """A PNG of every target's error, in the order reached, beside what calibration and reading let expect."""
+    x = np.arange(1, len(reached) + 1)
+    figure = Figure(figsize=(12.0, 3.6), dpi=110, layout="constrained")
+    axes = figure.add_subplot()
+    axes.plot(x, [one.error_mm for one in reached], "o", color=COLOURS[0], label="distance")
+    axes.plot(x, [one.lateral_mm for one in reached], "o", color=COLOURS[2], label="across the needle")
+    expected = [one.expected_mm for one in reached]
+    axes.plot(x, expected, "--", color="#5b616b", label="expected (rms): calibration and reading")
+    axes.set(xlabel="target", ylabel="true tip to true target, mm", ylim=(0, None))
+    return _finished(figure)
+
+
+def _finished(figure: Figure) -> bytes:
+    for axes in figure.axes:
+        axes.grid(color="0.9")
+        axes.set_axisbelow(True)
+        axes.legend(fontsize=8)
+    return png(figure)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from puncture_twin.planning.arm.tool import Box, Tool
 from puncture_twin.planning.base.reasons import css
 from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.twin.guidance.stereo.cameras.camera import Camera
+from puncture_twin.twin.guidance.stereo.camera import Camera
 from puncture_twin.twin.plant.ball_image import render
 from puncture_twin.twin.plant.stereo_workcell import ShownBall, ball_scene
 from puncture_twin.twin.rehearsal.stereo_session import Reached, Session
@@ -25,14 +25,11 @@ from puncture_twin.twin.world.workcell import load_ball, open_workcell, pinhole_
 
 BALL, TARGET, MARKER = (214, 96, 0), (0, 120, 60), (30, 80, 200)
 """Colours of what is drawn over the picture."""
-
 WIDTH_PX = 1280
 """Of the pictures that are written, whatever the camera's size."""
-
 INSET_HALF_PX = 24
 INSET_SCALE = 6
 """The inset shows so many camera pixels to each side of the ball, so many times enlarged."""
-
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
@@ -83,10 +80,7 @@ def _annotate(axes: Axes, session: Session, reached: Reached, number: int) -> No
         ring(axes, believed.project(reached.servoed.visits[-1].seen.ball_c), 18, BALL, width=3)
         _inset(axes, session, reached, number)
     lines = (
-        (
-            f"camera {number + 1}: {workcell.case.name}, {at}",
-            INK,
-        ),
+        (f"camera {number + 1}: {workcell.case.name}, {at}", INK),
         ("orange ring: ball as measured", BALL),
         ("green cross: true targets, the large one served now", TARGET),
         ("blue rings: marker positions by the mapping", MARKER),
@@ -138,11 +132,6 @@ def draw_convergence(session: Session, path: Path) -> None:
         longest = max(longest, len(visits) - 1)
         (line,) = axes.plot(looks, true, "-", linewidth=1.2, label=one.row.target)
         axes.plot(looks, one.servoed.errors_mm, "o", color=line.get_color(), markersize=4)
-    _finish(axes, session, longest)
-    write_png(figure, path)
-
-
-def _finish(axes: Axes, session: Session, longest: int) -> None:
     tolerance = session.workcell.case.file.servo.tolerance_mm
     axes.axhline(tolerance, color="#d6001e", linewidth=1)
     text, look = f"tolerance {tolerance:g} mm", {"ha": "right", "va": "bottom"}
@@ -151,8 +140,8 @@ def _finish(axes: Axes, session: Session, longest: int) -> None:
     for axis_format in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
         axis_format("{x:g}")
     axes.set_xticks(range(longest + 1))
-    axes.set_xlabel("corrections (0: the robot alone)")
-    axes.set_ylabel("ball to estimated target, mm")
+    axes.set(xlabel="corrections (0: the robot alone)", ylabel="ball to estimated target, mm")
     axes.set_title("lines: true distance; dots: as measured by the cameras")
     axes.grid(visible=True, which="both", color="#e4e6ea", linewidth=0.6)
     axes.legend(fontsize=8, title="target", loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    write_png(figure, path)

@@ -1,41 +1,72 @@
-"""The result of a self-calibration, with its covariance."""
+"""From a recording to a calibration of A X P = Y B Q: checks, closed form, robust fit, noise; and further shots.
+
+It is refused where the poses cannot determine every unknown. Letters and frames: docs/concepts/selfcalibration.md.
+
+Further pictures update it one by one. The unknowns x are the step from the calibration (parameters, and the arms'
+errors where they are declared), linearised there once. A shot has the residuals r + H x, their covariance S (3 of the
+tip, 2 of the direction). With the information L and its vector l (the information filter: Maybeck, Stochastic Models,
+1979, section 5.7)
+
+    L <- L + H^T S^-1 H,    l <- l - H^T S^-1 r,    x = L^-1 l,
+
+so shots commute, and n of them are the batch solution, to linearisation. Before a shot counts, e = r + H x is tested:
+e^T (S + H L^-1 H^T)^-1 e is chi-squared where the shot belongs to the others; one that does not fit changes nothing.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import gammaincinv
 from scipy.stats import chi2, f
 
-from puncture_twin.planning.base.arrays import Floats, read_only
-from puncture_twin.planning.base.errors import Finding, Severity
-from puncture_twin.planning.base.text import Shown, brief
+from puncture_twin.planning.base.arrays import Floats, Ints, read_only
+from puncture_twin.planning.base.errors import Finding, InputError, Severity, refuse
+from puncture_twin.planning.base.text import Shown, brief, plural
 from puncture_twin.planning.geometry.rigid import log_rotation, pose
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.arm_errors import DeclaredArms, arm_errors, corrected
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.closed_form import (
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
     DIRECTION,
+    LEAST_POSES,
+    N_PARAMETERS,
     PARAMETERS,
     T_Q,
+    UNWEIGHTED,
+    DeclaredArms,
     Estimate,
-    tangent_basis,
-)
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.direction import (
+    Problem,
     SeenDirection,
+    Spread,
+    active_columns,
+    arm_errors,
+    closed_form,
+    corrected,
     direction_findings,
+    linear_model,
     linearised_tip,
+    needle_direction,
     needle_in_image,
+    tangent_basis,
     tip_points,
+    without_play,
 )
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.noise import SmallSample, small_sample
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.problem import Problem, Spread, linear_model
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import (
+    ImageErrors,
+    RobustFit,
+    SmallSample,
+    image_errors,
+    refitted,
+    robust_fit,
+    small_sample,
+    weighed,
+)
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.observability import Observability, require_observable
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.refine import ImageErrors, RobustFit, image_errors, weighed
 
 LARGEST_RATIO = 1.1
 """Chi-squared over its freedom from which on a declaration is doubted: arms declared half as large as they are give
 1.1 to 1.2. Too large does no harm: the region is wider than it need be."""
-
 NO_NOISE = Noise(0.0, 0.0, 0.0, 0.0)
 """What is queried is where the tip is, not where it would be seen."""
 
@@ -45,21 +76,18 @@ class Calibration(Shown):
     """X, Y and the needle in its flange frame, from A X P = Y B Q.
 
     Attributes:
-        X: T_end1_image, shape (4, 4), mm.
-        Y: T_base1_base2, shape (4, 4), mm.
+        X: T_end1_image, shape (4, 4), mm; Y: T_base1_base2.
         tip_end2: t_Q, the needle's tip, shape (3,), mm, frame end2.
         needle_direction_end2: V, unit, toward the tip, shape (3,), frame end2.
         scale: mm per unit of P along u and v, shape (2,); ones where it was not wanted.
         residuals: Y B Q - A X P, shape (n, 3), mm, base1, of every pose.
         rms_mm: Root mean square length of the residuals of the poses that were used.
-        weights: One per pose, shape (n,): 1 used, 0 set aside.
-        outliers: Names of the poses set aside.
+        weights: One per pose, shape (n,): 1 used, 0 set aside; the latter's names are the ``outliers``.
         image: What errors of the image the residuals show, significant or not; None where the poses cannot show them.
         findings: What the recording says against itself.
         iterations: Steps of the refinement, all rounds together.
         condition: Least over largest singular value of the Jacobian, lengths in 100 mm.
-        covariance: Shape (p, p), of the parameters named below.
-        parameters: Names with their units; rotations are small turns on the right, R exp([w]x).
+        covariance: Shape (p, p), of the ``parameters``, whose names hold their units; rotations are R exp([w]x).
         freedom: Residuals minus unknowns.
         noise: What the weights were made from: given, or found from the residuals (``Spread``).
         shaft_unit: Root mean square of the directions' spreads by their shafts' lengths; 1 where those were not read.
@@ -136,11 +164,7 @@ class Calibration(Shown):
         return self.covariance if self.small_sample is None else self.small_sample.covariance
 
     def corrected(self, poses: Recording) -> tuple[Floats, Floats]:
-        """Poses A and B of both flanges, corrected by the estimated errors of the arms, each (n, 4, 4), mm.
-
-        Args:
-            poses: Nominal flanges, with joints where arms are declared.
-        """
+        """Poses A and B of both flanges, corrected by the estimated errors of the arms, each (n, 4, 4), mm."""
         if self.arms is None:
             return poses.A, poses.B
         errors = arm_errors(self.arms, poses)
@@ -151,16 +175,11 @@ class Calibration(Shown):
     def tip_covariances(self, poses: Recording) -> Floats:
         """Covariance of where the tip is against where the image has it, shape (n, 3, 3), mm^2, base1.
 
-        With declared arms it counts parameters and arms together, and how differently the joints stop.
-
-        Args:
-            poses: Flanges and the tip in the image; with joints where arms are declared.
+        With declared arms, whose joints the poses then hold, it counts how differently they stop too.
         """
         errors = None if self.arms is None else arm_errors(self.arms, poses)
-        tip_names = [name for name in self.parameters if not name.startswith("V")]
-        active = np.array([PARAMETERS.index(name) for name in tip_names])
-        problem = Problem(poses, NO_NOISE, active, arms=errors)
-        model = linear_model(problem, self.estimate)
+        active = self.active[self.active < DIRECTION.start]
+        model = linear_model(Problem(poses, NO_NOISE, active, arms=errors), self.estimate)
         J, rows = model.jacobian, np.arange(len(active))
         if model.shared is not None:
             J = np.concatenate([J, model.shared], axis=2)
@@ -169,38 +188,28 @@ class Calibration(Shown):
         return np.asarray(J @ C @ J.transpose(0, 2, 1) + model.sigma)
 
     def predicted_tre_mm(self, points_image: Floats, A: Floats) -> Floats:
-        """Expected (rms) distance of the tip from a target seen in the image, from the covariance alone.
+        """Expected (rms) distance of the tip from targets in the image, from the covariance alone, shape (m,), mm.
 
         The needle is taken to stand in the image as it did in the recording, one orientation as likely as the other.
-
-        Args:
-            points_image: Shape (m, 2), in the recording's unit, or (m, 3), mm.
-            A: T_base1_end1, shape (4, 4) or (m, 4, 4), mm.
-
-        Returns:
-            Shape (m,), mm.
+        Targets (m, 2) are in the recording's unit, or (m, 3), mm; T_base1_end1 is (4, 4) or (m, 4, 4), mm.
         """
         points = np.atleast_2d(np.asarray(points_image, dtype=np.float64))[:, :3]
-        A = np.broadcast_to(A, (len(points), 4, 4))
-        mean = self.orientations.mean(axis=0)
-        J = linearised_tip(self.estimate, self._aimed(points, A)).jacobian
-        J[:, :, T_Q] = A[:, :3, :3] @ self.X[:3, :3] @ mean
-        names = np.array(self.parameters)
-        J = J[:, :, [PARAMETERS.index(name) for name in names]]
-        squared = np.einsum("nip,pq,niq->n", J, self.covariance, J)
-        tip = np.flatnonzero(np.char.startswith(names, "t_Q"))
-        if len(tip):  # what the mean orientation leaves out of E[R_B C R_B^T]
-            squared = squared + np.trace(self.covariance[np.ix_(tip, tip)] @ (np.eye(3) - mean.T @ mean))
-        return np.asarray(np.sqrt(squared))
-
-    def _aimed(self, points: Floats, A: Floats) -> Recording:
-        """Poses of the needle's arm that bring the tip to image points."""
-        estimate = self.estimate
-        B = np.tile(np.eye(4), (len(points), 1, 1))
+        A, estimate = np.broadcast_to(A, (len(points), 4, 4)), self.estimate
+        B = np.tile(np.eye(4), (len(points), 1, 1))  # brings the tip to the points
         in_end1, _ = tip_points(estimate, Recording(A, B, points))
         target = np.einsum("nij,nj->ni", A[:, :3, :3], in_end1) + A[:, :3, 3]
         B[:, :3, 3] = (target - estimate.t_Y) @ estimate.R_Y - estimate.t_Q
-        return Recording(A, B, points)
+        J, mean = linearised_tip(estimate, Recording(A, B, points)).jacobian, self.orientations.mean(axis=0)
+        J[:, :, T_Q] = A[:, :3, :3] @ self.X[:3, :3] @ mean
+        J = J[:, :, self.active]
+        squared = np.einsum("nip,pq,niq->n", J, self.covariance, J)
+        left = np.trace(self.covariance[T_Q, T_Q] @ (np.eye(3) - mean.T @ mean))  # by it, of E[R_B C R_B^T]
+        return np.asarray(np.sqrt(squared + left))
+
+    @property
+    def active(self) -> Ints:
+        """The parameters' columns among all that may be estimated, shape (p,)."""
+        return np.array([PARAMETERS.index(name) for name in self.parameters])
 
     @property
     def estimate(self) -> Estimate:
@@ -221,7 +230,7 @@ class Calibration(Shown):
             other.scale - own.scale,
             tangent_basis(own.V).T @ other.V,
         ]
-        return np.concatenate(parts)[[PARAMETERS.index(name) for name in self.parameters]]
+        return np.concatenate(parts)[self.active]
 
     def region_limit(self, level: float = 0.95) -> float:
         """Largest e^T C^-1 e inside the confidence region, e as in ``parameter_error``.
@@ -247,17 +256,13 @@ def calibration_of(
     cannot_show: tuple[str, ...],
     arms: DeclaredArms | None,
 ) -> Calibration:
-    """The calibration at a fit, under the estimated or declared noise; its arrays are read-only.
-
-    Args:
-        seen: The needle's direction before it took part.
-        cannot_show: What the poses cannot show, one sentence each.
-        arms: As declared.
-    """
+    """The calibration at a fit, with the needle's direction before it took part and what the poses cannot show."""
     at_fit, estimate, kept, p = weighed(problem, fit), fit.estimate, fit.tip_kept, len(problem.active)
     freedom = 3 * int(kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction - p
     residuals, names = at_fit.residuals[:, :3], problem.recording.names
-    image, directions = image_errors(problem, fit), direction_findings(names, kept & ~fit.direction_kept, seen)
+    image, findings = image_errors(problem, fit), [*direction_findings(names, kept & ~fit.direction_kept, seen)]
+    if image is not None and image.significant:
+        findings.append(image.finding())
     return Calibration(
         X=read_only(pose(estimate.R_X, estimate.t_X)),
         Y=read_only(pose(estimate.R_Y, estimate.t_Y)),
@@ -269,7 +274,7 @@ def calibration_of(
         weights=read_only(1.0 * kept),
         outliers=tuple(name for name, used in zip(names, kept, strict=True) if not used),
         image=image,
-        findings=directions if image is None or not image.significant else (*directions, image.finding()),
+        findings=tuple(findings),
         iterations=fit.iterations,
         condition=observability.ratio,
         covariance=read_only(at_fit.covariance[:p, :p]),
@@ -296,9 +301,8 @@ def with_length(found: Calibration, length_mm: float) -> Calibration:
     full = np.eye(len(PARAMETERS))
     full[T_Q, T_Q] -= np.outer(V, V)
     full[T_Q, DIRECTION] = -(bias * np.eye(3) + np.outer(V, t_Q)) @ tangent_basis(V)
-    active = [PARAMETERS.index(name) for name in found.parameters]
     whole = np.eye(len(found.joint_covariance))
-    whole[:p, :p] = change = full[np.ix_(active, active)]
+    whole[:p, :p] = change = full[np.ix_(found.active, found.active)]
     joint, region = np.asarray(whole @ found.joint_covariance @ whole.T), found.small_sample
     return replace(
         found,
@@ -308,3 +312,216 @@ def with_length(found: Calibration, length_mm: float) -> Calibration:
         joint_covariance=read_only(joint),
         small_sample=None if region is None else region._replace(covariance=change @ region.covariance @ change.T),
     )
+
+
+SHAFT_BIAS = (
+    "a constant error of the detected tip along the shaft shifts the tip in the needle's flange frame but changes no "
+    "residual; a known needle length would fix it"
+)
+
+ARMS_TAKEN = (
+    "errors of the arms that repeat from pose to pose (lengths, joint zeros): none were declared together with the "
+    "joints, so the stated errors count only noise and are too small"
+)
+
+PLAY_SIGN = (
+    "on which side of their backlash the joints were: the recording does not state how they rotated, so backlash "
+    "counts as noise, and the region is too narrow where the noise was estimated"
+)
+
+DIRECTION_SIGN = (
+    "no directions were measured: the needle's axis comes from the image plane alone, pointing from flange to tip"
+)
+
+ADVISED_POSES = 20
+"""From 20 poses on the closed form is well conditioned (median 5e2; 6e3 at 16)."""
+
+
+def calibrate(
+    recording: Recording,
+    *,
+    noise: Noise | None = None,
+    needle_length_mm: float | None = None,
+    scale: bool = False,
+    direction: bool = True,
+    arms: DeclaredArms | None = None,
+) -> Calibration:
+    """Solve A X P = Y B Q: closed form, then weighted least squares over the poses that agree.
+
+    A: T_base1_end1, B: T_base2_end2, of every pose; P: the tip in the image; X: T_end1_image; Y: T_base1_base2; Q: the
+    tip in end2.
+
+    Args:
+        recording: At least 16 poses (20 are better); one more where P has three coordinates.
+        noise: Of both arms and the image; None estimates the residuals' spread, inside and across the image.
+        needle_length_mm: Distance along the shaft from the flange's origin to the tip: determines a constant error of
+            the detected tip along the shaft, which nothing else does.
+        scale: Whether mm per unit of P, along both axes of the image, is estimated.
+        direction: Whether measured needle directions take part, where the recording has them.
+        arms: Declared errors of both arms that repeat from pose to pose; the recording then needs joints. None takes
+            all errors of the flanges for noise.
+
+    Raises:
+        InputError: Too few poses, or more than half of them disagree; joints that are missing or of another arm.
+        Degenerate: The poses cannot show every unknown. It names the motion and proposes further poses.
+    """
+    if needle_length_mm is not None and not 0 < needle_length_mm < np.inf:
+        refuse(f"needle length {needle_length_mm}", "needle_length_mm", "a positive number, mm", "not_positive")
+    _check(recording, scale)
+    # 1. Where to begin.
+    errors = None if arms is None else arm_errors(arms, recording)
+    poses = recording if errors is None else without_play(recording, errors)
+    estimate = closed_form(poses, scale=scale)
+    # 2. The fit: outliers, observability, directions, noise.
+    active = active_columns(scale=scale, direction=False)
+    problem = Problem(poses, noise or UNWEIGHTED, active, arms=errors)
+    solved = _solve(problem, estimate, direction=direction and recording.v is not None)
+    # 3. What the recording cannot show, and the result with its covariance.
+    cannot = [SHAFT_BIAS] * (needle_length_mm is None)
+    cannot += [DIRECTION_SIGN] * (recording.v is None) + [ARMS_TAKEN] * (arms is None)
+    if arms is not None and recording.turn_probe is None and any(arm.errors.backlash > 0.0 for arm in arms):
+        cannot.append(PLAY_SIGN)
+    found = calibration_of(*solved, tuple(cannot), arms)
+    return found if needle_length_mm is None else with_length(found, needle_length_mm)
+
+
+def _check(recording: Recording, scale: bool) -> None:
+    if recording.pixels and not scale:
+        refuse("the tip is in pixels", "recording", "mm, or scale to estimate mm per pixel", "wrong_unit")
+    if scale and recording.P.shape[1] == 3:
+        refuse("three coordinates and scale", "recording", "three coordinates in mm", "wrong_unit")
+    least = LEAST_POSES + (recording.P.shape[1] == 3)
+    if len(recording) < least:
+        missed = f" (and {plural(len(recording.missed), 'picture')} without a needle)" if recording.missed else ""
+        allowed = f"{least} or more, preferably {ADVISED_POSES}"
+        refuse(plural(len(recording), "pose") + missed, "recording", allowed, "too_few_poses")
+
+
+def _solve(
+    problem: Problem, start: Estimate, *, direction: bool
+) -> tuple[Problem, RobustFit, Observability, SeenDirection]:
+    """Fit the tips, require that all unknowns are observable, then fit again with directions and estimated noise.
+
+    Raises:
+        InputError: Most poses disagree, or the directions contradict them.
+        Degenerate: The poses cannot show every unknown.
+    """
+    recording = problem.recording
+    fit = robust_fit(problem, start)
+    try:
+        seen = needle_direction(fit.estimate, recording, fit.tip_kept)
+    except InputError:  # directions say little of poses that show too little
+        require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+        raise
+    fit = fit._replace(estimate=fit.estimate._replace(V=seen.V), direction_kept=seen.agrees)
+    observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+    if direction:
+        active = np.append(problem.active, [DIRECTION.start, DIRECTION.start + 1])
+        problem = problem._replace(active=active, lean_rad=seen.lean_rad)
+    if isinstance(problem.noise, Spread) or problem.with_direction:
+        before = fit.tip_kept
+        problem, fit = refitted(problem, fit, seen)
+        if not np.array_equal(before, fit.tip_kept):
+            observability = require_observable(fit.estimate, recording.subset(fit.tip_kept), problem.active)
+    return problem, fit, observability, seen
+
+
+FALSE_ALARM = 1e-3
+"""Chance that a shot which belongs to the others is refused."""
+
+
+class Shot(NamedTuple):
+    """What came of one shot: its residuals' chi-squared, and the limit beyond which it does not fit and is left out."""
+
+    name: str
+    used: bool
+    chi_squared: float
+    limit: float
+
+
+@dataclass(frozen=True, eq=False)
+class ShotByShot(Shown):
+    """A calibration, where everything is linearised, with the shots since, used or not.
+
+    ``information`` (p + m, p + m) is that of parameters and arms' errors, ``vector`` (p + m,) times the step from the
+    start.
+    """
+
+    start: Calibration
+    information: Floats
+    vector: Floats
+    shots: tuple[Shot, ...] = ()
+
+    @brief
+    def __repr__(self) -> str:
+        return f"{len(self.shots)} shots, {sum(not one.used for one in self.shots)} of them did not fit"
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> ShotByShot:
+        """From a calibration of a recording, with no shot yet.
+
+        Raises:
+            InputError: It holds a needle length, so that its tip is not the one that pictures show.
+        """
+        if calibration.tip_bias_mm is not None:
+            what = "a calibration that holds the needle's length"
+            refuse(what, "shots", "one without; the length is stated to `calibration`", "conflicting_options")
+        C = calibration.joint_covariance
+        return cls(calibration, read_only(np.linalg.inv(C)), read_only(np.zeros(len(C))))
+
+    def with_shot(self, pose: Recording) -> ShotByShot:
+        """After one more shot of one pose, used where it fits; ``shots[-1]`` says so.
+
+        Raises:
+            InputError: More than one pose, or no joints where the start declares arms.
+        """
+        if len(pose) != 1:
+            refuse(f"{len(pose)} poses", "shot", "one pose", "wrong_shape")
+        start, name = self.start, pose.names[0]
+        errors = None if start.arms is None else arm_errors(start.arms, pose)
+        if errors is not None:
+            pose = without_play(pose, errors)
+        active = start.active if pose.v is not None else start.active[start.active < DIRECTION.start]
+        model = linear_model(Problem(pose, start.noise, active, start.lean_rad, errors), start.estimate)
+        r, S, H = model.residuals[0], model.sigma[0], np.zeros((len(model.residuals[0]), len(self.vector)))
+        if pose.v is not None and len(r) == 5:  # against the start's directions, not against itself
+            longer = (pose.shaft_unit / start.shaft_unit) ** 2
+            S[3, 3] += (longer - 1.0) * start.noise.direction_rad**2
+        H[:, : len(active)] = model.jacobian[0]
+        if model.shared is not None:
+            H[:, len(start.parameters) :] = model.shared[0]
+            r = r + model.shared[0] @ start.arm_errors
+        factor = np.linalg.cholesky(self.information)
+        back = np.linalg.solve(factor, H.T)  # H L^-1 H^T = back^T back
+        e = r + back.T @ np.linalg.solve(factor, self.vector)
+        chi_squared = float(e @ np.linalg.solve(S + back.T @ back, e))
+        limit = float(2 * gammaincinv(len(r) / 2, 1 - FALSE_ALARM))
+        shot = Shot(name, chi_squared <= limit, chi_squared, limit)
+        if not shot.used:
+            return replace(self, shots=(*self.shots, shot))
+        pulled = np.linalg.solve(S, H)
+        information, vector = self.information + H.T @ pulled, self.vector - pulled.T @ r
+        return ShotByShot(self.start, read_only(information), read_only(vector), (*self.shots, shot))
+
+    def calibration(self, *, needle_length_mm: float | None = None) -> Calibration:
+        """The calibration after all shots that fit, the flange to tip along the shaft held where its length is given.
+
+        Its residuals, weights and findings are those of the recording at the start.
+        """
+        C, start = np.linalg.inv(self.information), self.start
+        step, p, full = C @ self.vector, len(start.parameters), np.zeros(N_PARAMETERS)
+        full[start.active] = step[:p]
+        after = start.estimate.moved(full)
+        found = replace(
+            start,
+            X=read_only(pose(after.R_X, after.t_X)),
+            Y=read_only(pose(after.R_Y, after.t_Y)),
+            tip_end2=read_only(after.t_Q),
+            needle_direction_end2=read_only(after.V),
+            scale=read_only(after.scale),
+            covariance=read_only(C[:p, :p]),
+            joint_covariance=read_only(C),
+            arm_errors=read_only(start.arm_errors + step[p:]),
+            small_sample=None,
+        )
+        return found if needle_length_mm is None else with_length(found, needle_length_mm)

@@ -6,7 +6,7 @@ Frames: ``base1`` and ``end1`` of the arm with the probe, ``image`` (mm, the sli
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,31 +20,26 @@ from puncture_twin.planning.formats.pose_table import finite_rows, pose_names, r
 
 OPTIONAL = ("v", "shaft_mm", "q_probe", "q_needle", "turn_probe", "turn_needle")
 """Optional arrays of a recording besides both flanges and the tip, with one row per pose."""
-
 SHAFT_POWER = 1.5
 """A line's angle errs with the power -3/2 of its length: the variance of a least squares slope through n evenly spaced
 points is 12 sigma^2 / (n length^2), n as the length. Detected in images: .17 deg at 10 mm, .11 at 15, .03 at 32."""
-
 LEAST_SHAFT_MM = 1.0
 """Nothing shorter shows a direction."""
-
 LEAST_IN_PLANE = 0.5
 """Least fraction of a needle direction that must lie in the image: a needle that leans more does not show as a line."""
 
 
 class Noise(NamedTuple):
-    """Standard deviations per axis of a recording's data, normal errors."""
+    """Standard deviations per axis: of each flange's place and small turn, the tip and the direction in the image.
+
+    ``off_plane_mm``: how far the tip lies off the slice and still shows.
+    """
 
     robot_mm: float
-    """Position of each flange."""
     robot_rad: float
-    """Orientation of each flange, per axis of a small turn."""
     image_mm: float
-    """The tip in the image, per axis of the image."""
     direction_rad: float
-    """The needle's direction in the image."""
     off_plane_mm: float = 0.0
-    """How far the tip lies off the slice and still shows."""
 
 
 SPEC_NOISE = Noise(robot_mm=0.1, robot_rad=np.radians(0.03), image_mm=0.3, direction_rad=np.radians(0.5))
@@ -56,22 +51,19 @@ class Recording(Shown):
     """Poses of both arms with the needle seen in the image. Checked when made; the arrays are read-only.
 
     Attributes:
-        A: T_base1_end1, shape (n, 4, 4), mm: flange of the probe's arm.
-        B: T_base2_end2, shape (n, 4, 4), mm: flange of the needle's arm.
-        P: The tip in the image, shape (n, 2), mm (pixels where ``pixels`` is set); shape (n, 3), mm, where a volume or
-            a camera measures it out of a plane too.
+        A: T_base1_end1, shape (n, 4, 4), mm: flange of the probe's arm; B: T_base2_end2, flange of the needle's arm.
+        P: The tip in the image, shape (n, 2), mm (pixels where ``pixels`` is set: mm per pixel is to be found); shape
+            (n, 3), mm, where a volume or a camera measures it out of a plane too.
         v: Direction of the needle toward its tip, in the image, made unit. Shape (n, 2) where the image alone says it,
             (n, 3) where the part across the image is measured too; None where it was not measured.
         names: One per pose; numbers where nothing is given.
-        pixels: P counts pixels, and mm per pixel is to be found.
-        q_probe: Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; None where they were not
-            recorded. Without them errors of the arms cannot be identified from noise.
-        q_needle: Joints of the needle's arm, shape (n, 6), rad; given if and only if the probe's are.
-        turn_probe: Direction of each probe joint's last rotation before it stopped, shape (n, 6): 1, -1, or 0
-            where nobody knows. None where it was not recorded: the play's sign is then unknown.
-        turn_needle: As ``turn_probe``, of the needle's arm; both only with joints.
-        shaft_mm: How much of the shaft shows, shape (n,): the more, the better its direction is known. Only with
-            directions; None where it was not measured: all directions then count the same.
+        q_probe: Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; those of the needle's arm
+            in ``q_needle``; None where they were not recorded: errors of the arms are then not told from noise.
+        turn_probe: Direction of each probe joint's last rotation before it stopped, shape (n, 6): 1, -1, or 0 where
+            nobody knows; the needle's in ``turn_needle``. None where they were not recorded: the play's sign is then
+            unknown.
+        shaft_mm: How much of the shaft shows, shape (n,): the more, the better its direction is known; None where it
+            was not measured: all directions then count the same.
         missed: Name and reason of each picture in which no needle was found.
 
     Raises:
@@ -98,26 +90,22 @@ class Recording(Shown):
 
     def __post_init__(self) -> None:
         names = pose_names(self.names, len(np.atleast_1d(self.A)))
-        object.__setattr__(self, "names", names)
-        object.__setattr__(self, "A", rigid_poses(self.A, "A", names))
-        object.__setattr__(self, "B", rigid_poses(self.B, "B", names))
-        object.__setattr__(self, "P", finite_rows(self.P, "P", names, widths=(2, 3)))
-        if self.pixels and self.P.shape[1] == 3:
+        checked: dict[str, Any] = {key: rigid_poses(getattr(self, key), key, names) for key in "AB"}
+        checked |= {"names": names, "P": finite_rows(self.P, "P", names, widths=(2, 3))}
+        if self.pixels and checked["P"].shape[1] == 3:
             refuse("three coordinates in pixels", "recording", "mm", "wrong_unit")
         if self.v is not None:
-            object.__setattr__(self, "v", _directions(self.v, names))
+            checked["v"] = _directions(self.v, names)
         if self.shaft_mm is not None:
-            object.__setattr__(self, "shaft_mm", _lengths(self.shaft_mm, self.v, names))
+            checked["shaft_mm"] = _lengths(self.shaft_mm, self.v, names)
         if (self.q_probe is None) != (self.q_needle is None):
             refuse("joints of only one arm", "recording", "joints of both arms, or of none", "joints_of_one_arm")
-        for key in ("q_probe", "q_needle"):
-            if getattr(self, key) is not None:
-                object.__setattr__(self, key, _angles(getattr(self, key), key, names))
         if (self.turn_probe is None) != (self.turn_needle is None) or (self.turn_probe is not None and not self.joints):
             refuse("turns without joints, or of only one arm", "recording", "both, with joints", "joints_of_one_arm")
-        for key in ("turn_probe", "turn_needle"):
-            if getattr(self, key) is not None:
-                object.__setattr__(self, key, _signs(getattr(self, key), key, names))
+        for check, keys in ((_angles, ("q_probe", "q_needle")), (_signs, ("turn_probe", "turn_needle"))):
+            checked |= {key: check(getattr(self, key), key, names) for key in keys if getattr(self, key) is not None}
+        for key, value in checked.items():
+            object.__setattr__(self, key, value)
 
     @property
     def joints(self) -> bool:
@@ -148,13 +136,9 @@ class Recording(Shown):
 
     def subset(self, rows: NDArray[np.int_] | NDArray[np.bool_] | slice) -> Recording:
         """The recording with these poses only."""
-        names = tuple(np.array(self.names)[rows].tolist())
-        parts: dict[str, Any] = {
-            key: None if getattr(self, key) is None else getattr(self, key)[rows] for key in OPTIONAL
-        }
-        return Recording(
-            self.A[rows], self.B[rows], self.P[rows], names=names, pixels=self.pixels, missed=self.missed, **parts
-        )
+        parts = {key: getattr(self, key) for key in ("A", "B", "P", *OPTIONAL)}
+        kept: dict[str, Any] = {key: None if one is None else one[rows] for key, one in parts.items()}
+        return replace(self, names=tuple(np.array(self.names)[rows].tolist()), **kept)
 
 
 def _angles(values: Floats, what: str, names: tuple[str, ...]) -> Floats:

@@ -1,4 +1,7 @@
-"""Needle detection in a B-mode image: its tip, its direction, and whether to believe either.
+"""Probe and machine as a case states them, and needle detection in their B-mode images.
+
+The frame ``image``: its origin is the middle of the upper left pixel, x (u) runs along the probe's face to the right,
+y (v) into the depth, z out of the plane; mm.
 
 Every line of a grid of angles and offsets is sampled (a Radon transform that may begin and end anywhere); along it the
 segment with the largest sum is found in one pass (Kadane's maximum subarray, Bentley, Commun. ACM 27, 1984). What a
@@ -18,35 +21,128 @@ a needle that is tilted against the image plane the end that shows need not be t
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.twin.guidance.ultrasound.image.imager import Imager
+
+FWHM_PER_SIGMA = float(2.0 * np.sqrt(2.0 * np.log(2.0)))
+"""Full width at half maximum of a Gaussian, over its standard deviation."""
+WHITE = 255
+"""The brightest grey level."""
+
+
+class PointSpread(NamedTuple):
+    """The pulse's two-way amplitude: Gaussian along the beam and across it; widths are FWHM at the probe's face, mm.
+
+    Both grow with depth, mm per mm: high frequencies fade first, and the aperture does not grow for ever.
+    """
+
+    axial_mm: float = 0.5
+    axial_growth: float = 0.004
+    lateral_mm: float = 0.7
+    lateral_growth: float = 0.015
+
+    def axial_sigma(self, depth_mm: Floats) -> Floats:
+        """Standard deviation along the beam, mm, any shape."""
+        return np.asarray((self.axial_mm + self.axial_growth * depth_mm) / FWHM_PER_SIGMA)
+
+    def lateral_sigma(self, depth_mm: Floats) -> Floats:
+        """Standard deviation across the beam, mm, any shape."""
+        return np.asarray((self.lateral_mm + self.lateral_growth * depth_mm) / FWHM_PER_SIGMA)
+
+
+@dataclass(frozen=True)
+class Imager:
+    """Probe and machine: pixels along the face and in depth, their edge, and the point spread; lengths in mm.
+
+    ``slice_fwhm_mm``: full width of the slice's amplitude profile across the plane. ``range_db``: this many dB from
+        black to
+    white; ``speckle_db``: grey of mean speckle power, dB below white; ``noise_db``: electronic noise, dB below mean
+    speckle.
+    """
+
+    columns: int = 250
+    rows: int = 300
+    pixel_mm: float = 0.2
+    slice_fwhm_mm: float = 1.2
+    range_db: float = 60.0
+    speckle_db: float = 34.0
+    noise_db: float = 25.0
+    spread: PointSpread = field(default_factory=PointSpread)
+
+    @property
+    def size_mm(self) -> tuple[float, float]:
+        """Width and depth: (u, v) of the last pixel's middle."""
+        return ((self.columns - 1) * self.pixel_mm, (self.rows - 1) * self.pixel_mm)
+
+    @property
+    def slice_sigma(self) -> float:
+        """Standard deviation of the slice's profile, mm."""
+        return self.slice_fwhm_mm / FWHM_PER_SIGMA
+
+    def slice_gain(self, off_plane_mm: Floats) -> Floats:
+        """Amplitude of an echo off the plane over that in it; any shape."""
+        return np.asarray(np.exp(-0.5 * (off_plane_mm / self.slice_sigma) ** 2))
+
+    def grey(self, amplitude: Floats) -> Pixels:
+        """Log compression: amplitude 1 is mean speckle."""
+        level = 20.0 * np.log10(np.maximum(amplitude, 1e-12)) - self.speckle_db
+        return np.clip(np.round(WHITE * (1.0 + level / self.range_db)), 0, WHITE).astype(np.uint8)
+
+    def amplitude(self, grey: NDArray[np.generic]) -> Floats:
+        """Amplitude from greys, the inverse of :meth:`grey` where a pixel is neither black nor white."""
+        level = self.range_db * (np.asarray(grey, dtype=np.float64) / WHITE - 1.0)
+        return np.asarray(10.0 ** ((level + self.speckle_db) / 20.0))
+
+
+@dataclass(frozen=True)
+class NeedleEcho:
+    """Echo of the needle's steel. Amplitudes against mean speckle.
+
+    ``contrast_db`` is that of the shaft in the plane and parallel to the face, at the middle depth; straight down it is
+    fainter by ``steep_loss_db``: less comes back to the face. ``roughness``: random part of the shaft's amplitude. The
+    tip is brighter, by ``tip_gain`` over ``tip_length_mm``. Reverberations are echoes between the walls, below the
+    shaft, each fainter than the one before, parallel to the face by ``reverberation_gain``, else by the squared cosine
+    of the inclination
+    too: what bounces between tilted walls is mirrored away. ``shadow``: how much of the sound the needle keeps from
+        what lies
+    below it, 0..1.
+    """
+
+    contrast_db: float = 28.0
+    steep_loss_db: float = 8.0
+    roughness: float = 0.35
+    tip_gain: float = 1.8
+    tip_length_mm: float = 0.6
+    reverberations: int = 2
+    reverberation_mm: float = 1.6
+    reverberation_gain: float = 0.3
+    shadow: float = 0.5
 
 
 class Segment(NamedTuple):
-    """A straight segment, in pixels of the image that was searched."""
+    """A straight segment, in pixels of the image that was searched: (column, row) of its shallower and its deeper end.
+
+    ``score``: sum of the samples along it, one per pixel of length.
+    """
 
     start: Floats
-    """(column, row) of the shallower end."""
     end: Floats
-    """(column, row) of the deeper end."""
     score: float
-    """Sum of the samples along it, one per pixel of length."""
 
 
 def brightest_segment(field: Floats, inclinations: Floats) -> Segment:
-    """The segment of the largest sum.
+    """The segment of the largest sum of what samples add (rows, columns); below zero on average where there is nothing.
 
-    Args:
-        field: Shape (rows, columns): what a sample adds; below zero on average where there is nothing.
-        inclinations: Shape (n,), rad: directions of lines to try, atan2(dv, du), in (0, pi): from shallow to deep.
+    Inclinations (n,), rad, are of lines to try, atan2(dv, du), in (0, pi): from shallow to deep.
     """
     best = _search(np.ascontiguousarray(field), np.ascontiguousarray(inclinations))
     return Segment(np.array(best[1:3]), np.array(best[3:5]), float(best[0]))
@@ -81,57 +177,40 @@ def _search(field, inclinations):  # type: ignore[no-untyped-def]
 
 MEAN_OVER_MEDIAN = float(np.sqrt(np.pi / 2.0) / np.sqrt(2.0 * np.log(2.0)))
 """Mean over median of a Rayleigh amplitude."""
-
 COARSE = 2
 """The background is taken, and the segment searched, in an image this many times smaller."""
-
 ANGLE_STEP = float(np.radians(1.5))
 """Between the directions that are tried: 0.3 mm at the end of 20 mm, well inside the ridge."""
-
 BACKGROUND_MM = 12.0
 """Edge of the window whose median is the background: wide enough that a needle fills a small part of it, and narrow
 enough to follow its shadow."""
-
 BRIGHTEST = 3.0
 """Amplitude over background above which a pixel counts no more: one bright cell makes no needle."""
-
 EXPECTED = 0.4
 """What a sample must exceed the background by to lengthen a segment."""
-
 STEP_MM = 0.1
 """Step of the samples along and across the line."""
-
 ACROSS_MM = 2.0
 """How far across the line the ridge is looked for."""
-
 WINDOWS_MM = (0.8, 0.5, 0.4, 0.4)
 """Standard deviations of the window about the line, one per iteration; the first holds the search's own error."""
-
 SHAFT_MM = 8.0
 """Length of shaft before the tip whose median is its level."""
-
 NEAR_TIP_MM = 1.0
 """Length of shaft that is left out of its level: the tip is brighter."""
-
 TIP_MM = 1.5
 """Length before the shaft's end whose brightest sample is the level of its last piece."""
-
 SURE_SHAFT = 2.5
 """Amplitude over background that counts as shaft, however bright the rest is; the root of the shaft's where that is
 less: half way to it in greys."""
-
 MOST_LOST, MOST_GAINED = 0.5, 1.2
 """Logarithms of amplitude that one sample at most takes away and adds."""
-
 TIP_ROUNDS = 3
 """Rounds of the shaft's level and end in turn."""
-
 ENDS_AGREE_MM = 3.0
 """A faint shaft has gaps: where the search ends farther from the tip than this, nobody knows which is the end."""
-
 RIDGE_MM = 0.8
 """Width of the ridge that a profile along the line averages."""
-
 SHAFT_PERCENTILE = 70.0
 """Percentile of the profile along a segment: the shaft's level, though a part of the segment may be no shaft."""
 
@@ -147,45 +226,34 @@ class Missed(StrEnum):
 
 LEAST_SCORE_MM = 9.0
 """Sum along the segment, amplitude over background times mm, that makes a needle."""
-
 LEAST_LENGTH_MM = 6.0
 """Of the segment."""
-
 EDGE_MM = 1.5
 """The tip is no nearer to the image's sides."""
-
 LEAST_STEP, SURE_STEP = 0.8, 2.0
 """Falls of the amplitude at the tip, over background: what makes an end, and below what the search's own must agree."""
-
 TIP_BIAS = 0.4
 """How far the detected tip lies beyond the real one along the shaft, on average, over the standard deviation of the
 point spread in that direction. It comes from the tip's brightness: a property of a needle in a machine, measured in the
 twin (benchmarks/detectors.py), to be measured anew elsewhere."""
-
 INCLINATIONS = (float(np.radians(8.0)), float(np.radians(82.0)))
 """Directions that are tried: angle to the probe's face, on either side."""
 
 
 class Detection(NamedTuple):
-    """A detected needle."""
+    """A detected needle: its tip, (u, v), mm, corrected for the bias; its direction toward the tip, unit.
+
+    ``contrast_db``: amplitude of the last piece of shaft over the background. ``shaft_mm``: how much of it shows.
+    """
 
     tip_image: Floats
-    """Shape (2,), mm: (u, v), corrected for the bias."""
     direction_image: Floats
-    """Unit, shape (2,): toward the tip."""
     contrast_db: float
-    """Amplitude of the last piece of shaft over the background."""
     shaft_mm: float
-    """Length of shaft that shows: the more, the better its direction is known."""
 
 
 def detect(image: Pixels, imager: Imager, *, tip_bias: float = TIP_BIAS) -> Detection | Missed:
-    """Detect the needle, or return why not.
-
-    Args:
-        image: Grey levels, shape (rows, columns).
-        imager: Pixel, display range and point spread of the machine.
-        tip_bias: What is taken off along the shaft, in point spreads.
+    """Detect the needle in grey levels (rows, columns), or return why not; the bias is taken off, in point spreads.
 
     Raises:
         InputError: An image of another size than the imager's.
@@ -195,22 +263,22 @@ def detect(image: Pixels, imager: Imager, *, tip_bias: float = TIP_BIAS) -> Dete
         refuse(f"picture of shape {image.shape}", "needle detector", f"{size}, the imager's", "wrong_shape")
     relative = over_background(image, imager)
     segment = _segment(relative, imager)
-    length = float(np.linalg.norm(segment.end - segment.start))
     if segment.score < LEAST_SCORE_MM:
         return Missed.NO_NEEDLE
-    if length < LEAST_LENGTH_MM:
+    if np.linalg.norm(segment.end - segment.start) < LEAST_LENGTH_MM:
         return Missed.TOO_SHORT
     line = _shaft_only(relative, imager, _ridge(relative, imager, segment))
-    tip = _tip(relative, imager, line)
-    disagree = abs(float((segment.end - line.point) @ line.direction) - tip.s)
-    if tip.step < LEAST_STEP or (tip.step < SURE_STEP and disagree > ENDS_AGREE_MM):
+    end, step = _tip(relative, imager, line)
+    disagree = abs(float((segment.end - line.point) @ line.direction) - end)
+    if step < LEAST_STEP or (step < SURE_STEP and disagree > ENDS_AGREE_MM):
         return Missed.NO_END
-    found = line.point + (tip.s - tip_bias * _blur_along(imager, line)) * line.direction
-    width, depth = imager.size_mm
-    high = np.array([width, depth]) - EDGE_MM
-    if np.any(found < EDGE_MM) or np.any(found > high):
+    depth = np.array(max(float(line.point[1]), 0.0))
+    lateral, axial = imager.spread.lateral_sigma(depth), imager.spread.axial_sigma(depth)
+    blur = float(np.hypot(lateral * line.direction[0], axial * line.direction[1]))  # along the line at its end
+    found = line.point + (end - tip_bias * blur) * line.direction
+    if np.any(found < EDGE_MM) or np.any(found > np.array(imager.size_mm) - EDGE_MM):
         return Missed.TIP_AT_EDGE
-    contrast = 20.0 * float(np.log10(max(1.0 + tip.step, 1e-6)))
+    contrast = 20.0 * float(np.log10(max(1.0 + step, 1e-6)))
     return Detection(found, line.direction, contrast, -line.start)
 
 
@@ -233,19 +301,11 @@ def _segment(relative: Floats, imager: Imager) -> Segment:
 
 
 class _Line(NamedTuple):
-    """A line in the image, mm: s = 0 at its point, growing toward the tip."""
+    """A line in the image, mm: s = 0 at its point, the deep end, growing toward the tip; s at the other end."""
 
     point: Floats
     direction: Floats
     start: float
-    """s of the segment's shallow end; the deep end is 0."""
-
-
-class _Tip(NamedTuple):
-    """End of the shaft on its line, and how much the amplitude falls there."""
-
-    s: float
-    step: float
 
 
 def _samples(relative: Floats, imager: Imager, line: _Line, s: Floats, t: Floats) -> Floats:
@@ -259,27 +319,21 @@ def _samples(relative: Floats, imager: Imager, line: _Line, s: Floats, t: Floats
 
 
 def _ridge(relative: Floats, imager: Imager, segment: Segment) -> _Line:
-    """The line along the middle of the bright ridge."""
-    direction = (segment.end - segment.start) / np.linalg.norm(segment.end - segment.start)
-    line = _Line(segment.end, direction, -float(np.linalg.norm(segment.end - segment.start)))
-    t = np.arange(-ACROSS_MM, ACROSS_MM + STEP_MM / 2.0, STEP_MM)
-    s = np.arange(line.start, 0.0, STEP_MM)
+    """The line along the middle of the bright ridge: t = a + b s by weighted least squares."""
+    length = float(np.linalg.norm(segment.end - segment.start))
+    line = _Line(segment.end, (segment.end - segment.start) / length, -length)
+    t, s = np.arange(-ACROSS_MM, ACROSS_MM + STEP_MM / 2.0, STEP_MM), np.arange(line.start, 0.0, STEP_MM)
     for window in WINDOWS_MM:
         bright = np.maximum(_samples(relative, imager, line, s, t) - 1.0 - EXPECTED, 0.0)
         bright = np.minimum(bright, 2.0 * np.median(bright.max(axis=1)) + 1e-9)
         weight = bright**2 * np.exp(-0.5 * (t / window) ** 2)  # squared: half the error of the angle (measured)
-        line = _moved(line, s, t, weight)
+        total, across = weight.sum(axis=1), weight @ t
+        moments = np.array([[total.sum(), total @ s], [total @ s, total @ s**2]])
+        a, b = np.linalg.solve(moments + 1e-9 * np.eye(2), np.array([across.sum(), across @ s]))
+        normal = np.array([-line.direction[1], line.direction[0]])
+        direction = line.direction + b * normal
+        line = _Line(line.point + a * normal, direction / np.linalg.norm(direction), line.start)
     return line
-
-
-def _moved(line: _Line, s: Floats, t: Floats, weight: Floats) -> _Line:
-    """The line through the weighted samples: t = a + b s by least squares."""
-    total, across = weight.sum(axis=1), weight @ t
-    moments = np.array([[total.sum(), total @ s], [total @ s, total @ s**2]])
-    a, b = np.linalg.solve(moments + 1e-9 * np.eye(2), np.array([across.sum(), across @ s]))
-    normal = np.array([-line.direction[1], line.direction[0]])
-    direction = line.direction + b * normal
-    return _Line(line.point + a * normal, direction / np.linalg.norm(direction), line.start)
 
 
 def _profile(relative: Floats, imager: Imager, line: _Line, s: Floats) -> Floats:
@@ -304,8 +358,8 @@ def _shaft_only(relative: Floats, imager: Imager, line: _Line) -> _Line:
     return _Line(line.point + s[end] * line.direction, line.direction, min(s[begin] - s[end], -STEP_MM))
 
 
-def _tip(relative: Floats, imager: Imager, line: _Line) -> _Tip:
-    """The end of the shaft: the last place where its amplitude falls half way to the background's.
+def _tip(relative: Floats, imager: Imager, line: _Line) -> tuple[float, float]:
+    """S of the shaft's end, and the amplitude's fall there: the last place half way to the background's.
 
     A blurred step passes its half at the step. Half way from the level of the shaft, or of its last piece where that is
     fainter.
@@ -316,20 +370,13 @@ def _tip(relative: Floats, imager: Imager, line: _Line) -> _Tip:
     for _ in range(TIP_ROUNDS):
         last = (s > max(end - SHAFT_MM, line.start)) & (s < end - NEAR_TIP_MM)
         if not last.any():
-            return _Tip(end, 0.0)
+            return end, 0.0
         shaft = float(np.median(profile[last]))
         half = 0.5 * (1.0 + min(shaft, float(profile[s > end - TIP_MM].max())))
         bright = np.flatnonzero(profile[:-1] > half)
         if not len(bright):
-            return _Tip(end, 0.0)
+            return end, 0.0
         at = int(bright[-1])
         fall = max(profile[at] - profile[at + 1], 1e-9)
         end = float(s[at] + STEP_MM * np.clip((profile[at] - half) / fall, 0.0, 1.0))
-    return _Tip(end, shaft - 1.0)
-
-
-def _blur_along(imager: Imager, line: _Line) -> float:
-    """Standard deviation of the point spread along the line at its end, mm."""
-    depth = np.array(max(float(line.point[1]), 0.0))
-    lateral, axial = imager.spread.lateral_sigma(depth), imager.spread.axial_sigma(depth)
-    return float(np.hypot(lateral * line.direction[0], axial * line.direction[1]))
+    return end, shaft - 1.0

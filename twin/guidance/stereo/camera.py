@@ -27,17 +27,9 @@ ROTATION_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated camera in the calibration frame C.
+    """A calibrated camera in the calibration frame C: size, focal lengths and principal point in px, column before row.
 
-    Attributes:
-        width: Pixels.
-        height: Pixels.
-        fx: Focal length along the rows, px.
-        fy: Focal length along the columns, px.
-        cx: Principal point, px, column.
-        cy: Principal point, px, row.
-        distortion: Shape (4,), k1, k2, p1, p2.
-        T_camera_c: Shape (4, 4), mm, rigid: frame C to the camera's frame.
+    ``distortion``: k1, k2, p1, p2. ``T_camera_c``: shape (4, 4), mm, rigid: frame C to the camera's frame.
     """
 
     width: int
@@ -113,10 +105,6 @@ class Camera:
         """Radius of the circle as large as a ball's outline: sqrt of the two half axes' product, px.
 
         A ball of radius R at distance D fills a cone of half angle asin(R / D); the local scale takes it to pixels.
-
-        Args:
-            point_c: The ball's centre, shape (3,), mm.
-            radius_mm: The ball's radius.
         """
         toward = np.asarray(point_c, dtype=np.float64) - self.center_c
         distance = float(np.linalg.norm(toward))
@@ -127,10 +115,7 @@ class Camera:
         return float(np.sqrt(abs(np.linalg.det(self.angle_slope(direction_c)))))
 
     def angle_slope(self, direction_c: Floats) -> Floats:
-        """Derivative of the pixel by a rotation of the ray about a unit direction, shape (2, 2), px/rad.
-
-        Its columns belong to the two axes of ``tangent_axes``.
-        """
+        """Derivative of the pixel by a rotation of the ray about each of the ``tangent_axes``, shape (2, 2), px/rad."""
         return np.asarray(self.jacobian(self.center_c + direction_c) @ tangent_axes(direction_c))
 
     def moved(self, T_c_other: Floats) -> Camera:
@@ -159,20 +144,10 @@ def looking_at(
     *,
     distortion: Floats | Sequence[float] = (0.0, 0.0, 0.0, 0.0),
 ) -> Camera:
-    """A camera at a place in C with a point in the middle of its image.
-
-    Args:
-        centre_c: Shape (3,), mm.
-        target_c: Shape (3,), mm.
-        size: Width and height, px.
-        focal_px: Focal length, px.
-        distortion: k1, k2, p1, p2.
-    """
+    """A camera at a place (3,), mm, in C with a point (3,) in the middle of its image; size in px, columns first."""
     z = np.asarray(target_c, dtype=np.float64) - centre_c
-    z = z / np.linalg.norm(z)
-    R = np.ascontiguousarray(frame_along(z, np.array(DOWN_C)).T)
-    T = pose(R, -R @ np.asarray(centre_c, dtype=np.float64))
-    width, height = size
+    R = np.ascontiguousarray(frame_along(z / np.linalg.norm(z), np.array(DOWN_C)).T)
+    T, (width, height) = pose(R, -R @ np.asarray(centre_c, dtype=np.float64)), size
     middle = (width - 1) / 2, (height - 1) / 2
     return Camera(width, height, focal_px, focal_px, *middle, np.asarray(distortion, dtype=np.float64), T)
 
@@ -190,22 +165,14 @@ def stereo_pair(
     The centre is C's origin; x runs from the left camera to the right one, y down, z away from them. The cameras stand
     at (-+ baseline / 2, 0, -distance). Use ``Camera.moved`` to know them in a frame that lies otherwise.
 
-    Args:
-        width: Pixels.
-        height: Pixels.
-        focal_px: Pixels; 2560 shows 500 mm at 1 m on 1280 px.
-        baseline_mm: Between the two centres.
-        distance_mm: From the middle of the baseline to the workcell's centre.
-        distortion: k1, k2, p1, p2 of both.
-
     Raises:
         InputError: A size, length or distance that is not above 0.
     """
     if not (np.isfinite([baseline_mm, distance_mm]).all() and min(baseline_mm, distance_mm) > 0):
         refuse(f"baseline {baseline_mm:g} mm, distance {distance_mm:g} mm", "stereo pair", "above 0", "not_positive")
-    positions = [np.array([side * baseline_mm / 2, 0.0, -distance_mm]) for side in (-1, 1)]
     left, right = (
-        looking_at(centre, np.zeros(3), (width, height), focal_px, distortion=distortion) for centre in positions
+        looking_at(np.array([x, 0.0, -distance_mm]), np.zeros(3), (width, height), focal_px, distortion=distortion)
+        for x in (-baseline_mm / 2, baseline_mm / 2)
     )
     return left, right
 

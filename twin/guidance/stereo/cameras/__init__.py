@@ -1,1 +1,0 @@
-"""Cameras: pinhole with lens distortion, calibration from known points, bundle adjustment, triangulation."""

@@ -1,1 +1,0 @@
-"""B-mode images: speckle and needle as a probe shows them, and the needle detected in them."""
