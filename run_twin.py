@@ -471,7 +471,7 @@ def mirror(
         print(f"warning: {warning}", file=sys.stderr)
     shown = []
     with ended_by_ctrl_c():
-        for one in Mirror.of(followed).follow(read.states):
+        for one in map(Mirror.of(followed).show, read.states):
             shown.append(one.summary()) if as_json else print(mirror_text(one), flush=True)
     if as_json:
         summary = {"case": str(case), "inputs": inputs_document(read.inputs), "states": shown}

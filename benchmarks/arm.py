@@ -6,7 +6,6 @@ Compared with ur-analytic-ik (per pose, all branches) and with FCL alone (states
 process, so that other work on the machine counts little. Every comparison also counts the answers that differ.
 """
 
-import argparse
 import shutil
 import tempfile
 from collections import Counter
@@ -17,7 +16,7 @@ from time import process_time
 import numpy as np
 import ur_analytic_ik
 
-from benchmarks.shared import real_ct, versions
+from benchmarks.shared import options, real_ct, versions
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.inverse_kinematics import inverse, wrap_to_pi
 from puncture_twin.planning.arm.kinematics import flange_pose
@@ -38,9 +37,7 @@ SAME_ANGLE = 1e-5
 
 def main() -> None:
     """Run all of it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="fewer poses and states, 6 degrees instead of 2")
-    arguments = parser.parse_args()
+    arguments = options(__doc__, quick=False)
     print(versions("numpy", "numba", "python-fcl", "ur-analytic-ik"))
     for name in UR_MODELS:
         kinematics(name, 2_000 if arguments.quick else 20_000)

@@ -6,14 +6,13 @@ python -m benchmarks.certify --million   a million random directions into certif
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.shared import least_seconds, real_ct, versions
+from benchmarks.shared import least_seconds, options, real_ct, versions
 from puncture_twin.meshes import folder
 from puncture_twin.planning.case.entry import Directions, grid, outward
 from puncture_twin.planning.certify.certificate import Certificate
@@ -136,12 +135,7 @@ def _areas(name: str, found: Certificate) -> None:
 
 def main() -> int:
     """Parse, run, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--size", type=float, default=0.25, help="angular size, degrees")
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--million", action="store_true", help="throw random directions into certified cells")
-    parser.add_argument("--directions", type=int, default=1_000_000, help="how many for each anatomy")
-    arguments = parser.parse_args()
+    arguments = options(__doc__, size=0.25, repeats=5, million=False, directions=1_000_000)
     if arguments.million:
         return 1 if million(arguments.directions, arguments.size) else 0
     times(arguments.size, arguments.repeats)

@@ -8,16 +8,14 @@ python -m benchmarks.clearance --curves   how the cost grows, as docs/pictures/s
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
-from collections.abc import Sequence
 
 import fcl
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks.shared import REPOSITORY, Scene, dense, least_seconds, scenes, took, versions
+from benchmarks.shared import REPOSITORY, Scene, dense, least_seconds, options, scenes, took, versions
 from puncture_twin.planning.clearance.engine import NEAR_THRESHOLD_MM, too_near
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
@@ -72,12 +70,7 @@ def ask_hits(scene: Scene, directions: np.ndarray, objects: list[fcl.CollisionOb
 
 
 def rounds(scene: Scene, directions: np.ndarray, sample: int) -> dict[str, float]:
-    """Seconds of everybody for all directions, means over rounds in which all take their turn.
-
-    FCL is asked for another part of a random sample in each round, and its time scaled to all directions. So a
-    neighbour who comes or goes in between slows both sides alike. Only `FclEngine` is asked once for all of it: each of
-    its calls prepares the depths of crossings for whole surfaces.
-    """
+    """Seconds of everybody for all directions, means over rounds in which all take their turn."""
     chosen = np.random.default_rng(1).choice(len(directions), min(sample, len(directions)), replace=False)
     engine, judge, objects = FastEngine(scene.meshes, threads=1), FclEngine(scene.meshes), trees(scene)
     ask = (scene.target, directions, scene.length)
@@ -116,10 +109,7 @@ def measure_scene(scene: Scene, sample: int, step_deg: float) -> None:
 
 
 def prove(scene: Scene, step_deg: float) -> bool:
-    """Print how many verdicts differ from FCL's and how far distances are from brute force; whether all is well.
-
-    The scene's own target with every direction of the grid, then other targets with random directions.
-    """
+    """Print how many verdicts differ from FCL's and how far distances are from brute force; whether all is well."""
     directions, start, rng = scene.hemisphere(step_deg), time.perf_counter(), np.random.default_rng(11)
     engine, objects = FastEngine(scene.meshes), trees(scene)
     asked, wrong = verdicts_unlike_fcl(scene, engine, objects, scene.target, directions)
@@ -201,10 +191,8 @@ def cost(rows: int, count: int) -> tuple[float, float]:
     """Seconds to build and to search the dense scene, so many directions spread evenly over a hemisphere."""
     scene, z = dense(rows), 1 - (np.arange(count) + 0.5) / count
     beta, aside = np.pi * (1 + np.sqrt(5)) * np.arange(count), np.sqrt(1 - z * z)
-    rays, engine = (
-        np.stack([aside * np.cos(beta), aside * np.sin(beta), z], axis=1),
-        FastEngine(scene.meshes, threads=1),
-    )
+    rays = np.stack([aside * np.cos(beta), aside * np.sin(beta), z], axis=1)
+    engine = FastEngine(scene.meshes, threads=1)
     build = least_seconds(lambda: FastEngine(scene.meshes, threads=1), 3)
     return build, least_seconds(lambda: engine.measure(scene.target, rays, scene.length), 3)
 
@@ -231,15 +219,9 @@ def curves() -> None:
     figure.savefig(REPOSITORY / "docs" / "pictures" / "search-cost.png", dpi=110)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> int:
     """Parse, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a coarser grid and fewer FCL queries")
-    parser.add_argument("--proof", action="store_true", help="every verdict of the grid against FCL instead")
-    parser.add_argument("--curves", action="store_true", help="how the cost grows instead")
-    parser.add_argument("--scene", default="", help="only scenes whose name holds this")
-    parser.add_argument("--step", type=float, default=1.0, help="of the grid, degrees")
-    chosen = parser.parse_args(arguments)
+    chosen = options(__doc__, quick=False, proof=False, curves=False, scene="", step=1.0)
     print(versions("numpy", "numba", "python-fcl"))
     if chosen.curves:
         curves()

@@ -46,15 +46,7 @@ MUST_REFUSE = frozenset({"second", "no needle", "cut", "bolt"})
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """A control scan whose truth is known; LPS mm of the case, but for the volume.
-
-    Attributes:
-        tip: Shape (3,), and the direction of its end, as the case's frame has them.
-        sagitta_mm: Of the needle, over its length.
-        T_scan_ct: Shape (4, 4), where the patient lies now.
-        skin: And bones, as the case knows them.
-        extra: Of `EXTRAS`.
-    """
+    """A control scan whose truth is known; LPS mm of the case, but for the volume. ``T_scan_ct`` is where they lie."""
 
     volume: Volume
     tip: Floats
@@ -99,15 +91,7 @@ def _tube(points: Floats, diameter: float) -> TriangleMesh:
 
 def control(rng: np.random.Generator, *, extra: str | None = None, bent: bool | None = None,
             spacing: float | None = None, moved: bool = True) -> Control:  # fmt: skip
-    """Draw a scan.
-
-    Args:
-        rng: Draws what is not stated.
-        extra: Of `EXTRAS`.
-        bent: Whether the needle is.
-        spacing: Of the slices, mm.
-        moved: Whether the patient lies elsewhere than in the case's CT.
-    """
+    """Draw a scan; `rng` draws what is not stated. One who has moved lies elsewhere than in the case's CT."""
     extra = str(rng.choice(EXTRAS)) if extra is None else extra
     bent = bool(rng.random() < 0.3) if bent is None else bent
     spacing = float(rng.choice(SLICES_MM)) if spacing is None else spacing
@@ -121,10 +105,8 @@ def control(rng: np.random.Generator, *, extra: str | None = None, bent: bool | 
     length = 95.0
     places = np.array([(x, 0.0, z) for x, z in ((-38.0, -30.0), (34.0, -24.0), (2.0, 38.0))])
     places[:, 1] = [_front(skin, x, z) for x, _, z in places]
-    solids = [
-        Solid("skin", skin, 20.0),
-        *(Solid("bone", one, hu) for one, hu in zip(bones, (350.0, 550.0, 550.0), strict=True)),
-    ]
+    solids = [Solid("skin", skin, 20.0)]
+    solids += [Solid("bone", one, hu) for one, hu in zip(bones, (350.0, 550.0, 550.0), strict=True)]
     solids += [Solid("marker", ball(p - [0.0, 2.0, 0.0], 5.0), METAL_HU) for p in places]
     if extra != "no needle":
         solids += [Solid("needle", one, METAL_HU) for one in needle_rods(tip, forward, aside, sagitta, length)]
@@ -254,12 +236,8 @@ def main() -> None:
         for seed in range(stated.first, stated.first + stated.scans):
             one = control(np.random.default_rng(seed))
             found = read(one)
-            row = {
-                "seed": seed,
-                "extra": one.extra,
-                "true_sagitta_mm": one.sagitta_mm,
-                "spacing_mm": float(spacing_mm(one.volume)[2]),
-            }
+            row = {"seed": seed, "extra": one.extra, "true_sagitta_mm": one.sagitta_mm}
+            row["spacing_mm"] = float(spacing_mm(one.volume)[2])
             rows.append({**row, **({"refused": found} if isinstance(found, str) else errors(one, found))})
             if file is not None:
                 print(json.dumps(rows[-1]), file=file, flush=True)
@@ -279,18 +257,12 @@ def summary(rows: list[dict[str, Any]]) -> list[str]:
         f"| {len(rows)} scans | read | tip, voxels (rms) | along an axis of the plane, across it, mm | axis, ° "
         "| tip in its 95 % region | axis in its region | called bent |",
         "|---|---|---|---|---|---|---|---|",
-        *(
-            _line(
-                name,
-                [
-                    row
-                    for row in right
-                    if bent == (row["true_sagitta_mm"] > 0) and low - 0.1 < row["spacing_mm"] < high + 0.1
-                ],
-            )
-            for name, bent, low, high in _kinds()
-        ),
+        *(_line(name, [row for row in right if _is_of(row, *kind)]) for name, *kind in _kinds()),
     ]
+
+
+def _is_of(row: dict[str, Any], bent: bool, low: float, high: float) -> bool:
+    return bent == (row["true_sagitta_mm"] > 0) and low - 0.1 < row["spacing_mm"] < high + 0.1
 
 
 def is_wrong(row: dict[str, Any]) -> bool:

@@ -148,9 +148,8 @@ def in_space(
     for _ in range(int(np.ceil(count / POINTS_PER_CALIBRATION))):
         held = [(point, balls) for point in GRID if not any_lost(balls := seen(point, planned))]
         known = np.array([point for point, _ in held]) + rng.normal(0, point_mm, (len(held), 3))
-        fits = [
-            calibrate(known, np.array([balls[k].pixel for _, balls in held]), SIZE, distortion=modelled) for k in (0, 1)
-        ]
+        pixels = np.array([[ball.pixel for ball in balls] for _, balls in held])
+        fits = [calibrate(known, pixels[:, k], SIZE, distortion=modelled) for k in (0, 1)]
         cameras = [fit.camera for fit in fits]
         reprojection += [fit.rms_px for fit in fits]
         for _ in range(POINTS_PER_CALIBRATION):

@@ -6,11 +6,9 @@ Each draw is one recording of a UR3's exciting motion at the carton (20 s at 20 
 masses, with friction and noise as ``calibrate dynamics --record`` has them.
 """
 
-import argparse
-
 import numpy as np
 
-from benchmarks.shared import versions
+from benchmarks.shared import options, versions
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.dynamics import TorqueRecording, identify
 from puncture_twin.planning.arm.kinematics import slowed
@@ -34,10 +32,7 @@ class Silent:
 
 def main():
     """Print the fractions."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--draws", type=int, default=2000)
-    parser.add_argument("--seed", type=int, default=1)
-    stated = parser.parse_args()
+    stated = options(__doc__, draws=2000, seed=1)
     case = load_case(folder() / "carton" / "case_m.toml")
     model, down = case.robot.model, gravity(case, load_placement(case).T_base_ct)
     series = exciting_motion(

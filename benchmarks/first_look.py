@@ -12,7 +12,6 @@ with a seed: ellipsoids, ribs and a table, of 512 x 512 x 133 voxels with 89 lab
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -33,6 +32,7 @@ from numpy.typing import NDArray
 from skimage.measure import marching_cubes
 
 from benchmarks import wait_probe
+from benchmarks.shared import options
 from puncture_twin.planning.formats.labels.labelmaps import labelmap_of
 from puncture_twin.planning.formats.labels.naming import V2
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
@@ -50,18 +50,13 @@ STAGES = {
     "planning.anatomy.skin": {"skin_of_image": "skin", "skin_from_label": "skin"},
     "planning.formats.labels.labelmaps": {"label_mesh": "label surfaces"},
     "planning.init.segmentation": {"carved_notes": "what goes round"},
-    "planning.anatomy.scan": {
-        "Scan.outside": "outside",
-        "Scan.attached_limbs": "limbs",
-        "Scan.unnamed": "unnamed",
-    },
+    "planning.anatomy.scan": {"Scan.outside": "outside", "Scan.attached_limbs": "limbs", "Scan.unnamed": "unnamed"},
     "planning.anatomy.unseen": {"beyond_labels": "beyond labels"},
     "planning.evidence.checks": {"findings": "evidence"},
     "planning.clearance.fast_engine": {"_packed": "engine's blocks", "_remembered": "engine's blocks"},
     "planning.search.search": {"search": "search"},
 }
 """By module: what of it is timed under which row; a name that a checkout lacks is left out."""
-
 WIDE_MM, ACROSS = 400.0, 512
 TRUNK_MM = (165.0, 112.0)
 AIR_HU, FAT_HU, SOFT_HU, BONE_HU, LUNG_HU, TABLE_HU, NOISE_HU = -1000, -95, 45, 420, -860, -250, 12
@@ -81,15 +76,7 @@ class Scan:
 
 
 class Drawn(NamedTuple):
-    """A scan that is drawn here.
-
-    Attributes:
-        slices: How many, ``step_mm`` apart.
-        step_mm: From slice to slice.
-        labels: How many.
-        size: Of the small organs, as a multiple of the usual: triangles grow with its square.
-        across: Voxels along the two other axes.
-    """
+    """A scan that is drawn here; `size` is a multiple of the usual of small organs: triangles grow with its square."""
 
     slices: int
     step_mm: float
@@ -183,13 +170,9 @@ def parts_of(name: str, scan: Drawn, rng: np.random.Generator) -> Iterator[Ellip
 
 
 def draw(
-    part: Ellipsoid,
-    axes: tuple[NDArray[np.float64], ...],
-    hu: NDArray[Any],
-    labels: NDArray[Any],
-    number: int,
+    part: Ellipsoid, axes: tuple[NDArray[np.float64], ...], hu: NDArray[Any], labels: NDArray[Any], number: int,
     within: NDArray[np.bool_],
-) -> None:
+) -> None:  # fmt: skip
     """Fill the voxels of a part, in its box, as far as it lies within the trunk; axes run z, y, x."""
     middle, half = part.middle[::-1], part.half[::-1]
     box = tuple(slice(*np.searchsorted(a, (m - h, m + h))) for a, m, h in zip(axes, middle, half, strict=True))
@@ -238,9 +221,8 @@ def run(words: tuple[str, ...], kept: Path, answer: Path) -> Run:
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "PUNCTURE_TWIN_CACHE": str(kept)}
     start = time.perf_counter()
     with answer.with_suffix(".err").open("w+") as errors:
-        child = subprocess.Popen(
-            [sys.executable, "-c", code, str(REPOSITORY), str(answer), *words], env=environment, stderr=errors
-        )
+        command = [sys.executable, "-c", code, str(REPOSITORY), str(answer), *words]
+        child = subprocess.Popen(command, env=environment, stderr=errors)
         _, status, used = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)
         errors.seek(0)
@@ -263,9 +245,8 @@ def print_table(name: str, scan: Scan, folder: Path) -> None:
     first, then = looked(scan, folder / f"kept_{name}")
     assert then is not None  # it was asked for
     least = floor(scan)
-    print(
-        f"\n{name}, {least['triangles'] / 1e6:.2f} million triangles\n\n| processor, s | init | search |\n|---|---|---|"
-    )
+    print(f"\n{name}, {least['triangles'] / 1e6:.2f} million triangles\n")
+    print("| processor, s | init | search |\n|---|---|---|")
     for stage in dict.fromkeys((*first.seconds, *then.seconds)):
         values = [one.seconds.get(stage, 0.0) for one in (first, then)]
         if max(values) >= 0.05:
@@ -315,11 +296,7 @@ def cohort(scan: Scan, targets: list[list[float]], kept: Path, out: Path) -> flo
 
 def main() -> None:
     """Parse, run, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", help=f"some of abdomen_fine,{','.join(DRAWN)}")
-    parser.add_argument("--growth", action="store_true", help="how the time grows with voxels, labels and triangles")
-    parser.add_argument("--batch", action="store_true", help="what ten targets in one CT take beside one")
-    chosen = parser.parse_args()
+    chosen = options(__doc__, only=str, growth=False, batch=False)
     only = None if chosen.only is None else set(chosen.only.split(","))
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

@@ -10,7 +10,6 @@ marker, and as the needle is inserted later. The last column has rooms whose arm
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
+from benchmarks.shared import options
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
@@ -41,7 +41,6 @@ from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 ROLLS = np.radians(np.arange(0.0, 360.0, 2.0))
 APART = np.radians(60.0)
 """By how much the needle is rolled from one marker to the next."""
-
 NOMINAL = {"arm": "nominal", "tip_offset_mm": 1.0, "needle_direction_deg": 0.5, "joint_drift_deg": 0.0}
 FINE = {"ct_in_plane_mm": 0.2, "ct_slice_mm": 0.2, "touch_mm": 0.1, "joint_drift_deg": 0.0}
 SLICES = {"ct_pixel_mm": 1.0, "ct_spacing_mm": 5.0, "bed_axis": (1.0, 0.0, 0.0)}
@@ -51,7 +50,6 @@ ROWS = (
     ("carton, nominal arm", "carton/case_m.toml", (18.0, 232.0), SLICES | NOMINAL),
 )
 """Name, case, direction (degrees) and declaration; a nominal arm has its tip known to 1 mm and 0.5 degrees."""
-
 SVD: Method = "rigid"
 
 
@@ -131,7 +129,8 @@ def cell(of: Stand, errors: ErrorModel, q_touch: np.ndarray, method: Method, roo
     if rooms == 0:
         return Cell(predicted, np.nan, np.nan)
     truth = replace(errors, arm=errors.arm.scaled(arm))
-    drawn = draw_trials(puncture, truth, rooms, np.random.default_rng(0)).reached_alone()
+    drawn = draw_trials(puncture, truth, rooms, np.random.default_rng(0))
+    drawn = drawn.of(drawn.reached)
     off = drawn.tip_ct - drawn.target_ct
     inside = np.einsum("na,ab,nb->n", off, np.linalg.inv(cov), off) <= chdtri(3, 0.05)
     return Cell(predicted, float(np.sqrt(np.mean(np.sum(off**2, axis=1)))), float(inside.mean()))
@@ -139,9 +138,7 @@ def cell(of: Stand, errors: ErrorModel, q_touch: np.ndarray, method: Method, roo
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rooms", type=int, default=20_000)
-    rooms = parser.parse_args().rooms
+    rooms = options(__doc__, rooms=20_000).rooms
     print("| | markers touched | least squares | weighted | corrected | weighted, twice | corrected, twice |")
     print("|" + "---|" * 7)
     regions = []
@@ -151,13 +148,7 @@ def main() -> None:
     print(f"95 % regions where the declaration is right: {min(regions):.3f} to {max(regions):.3f}")
 
 
-FITS: tuple[tuple[Method, float], ...] = (
-    (SVD, 1),
-    ("weighted", 1),
-    ("joint", 1),
-    ("weighted", 2),
-    ("joint", 2),
-)
+FITS: tuple[tuple[Method, float], ...] = ((SVD, 1), ("weighted", 1), ("joint", 1), ("weighted", 2), ("joint", 2))
 """Of each column: how it is fitted, and by how much more than is declared the true arm errs."""
 
 

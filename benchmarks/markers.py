@@ -8,7 +8,6 @@ list holds that is no marker; and whether the errors are as large as their covar
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ import numpy as np
 import trimesh
 from scipy.stats import chi2
 
+from benchmarks.shared import options
 from puncture_twin.planning.anatomy.body.body_mask import ct_image
 from puncture_twin.planning.anatomy.metal import spacing_mm
 from puncture_twin.planning.anatomy.skin import Skin, skin_of_image
@@ -212,13 +212,7 @@ TROUBLES = ("none", "none", "none", "touching", "leads", "cut")
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A scan whose truth is known.
-
-    Attributes:
-        true: Shape (n, 3), centres of the markers, LPS mm.
-        others: Name and middle of what is none.
-        troubled: Markers of which something is the matter.
-    """
+    """A scan whose truth is known, and of which markers something is the matter."""
 
     markers: Markers
     true: Floats
@@ -245,12 +239,9 @@ def drawn_markers(rng: np.random.Generator) -> Markers:
 
 
 def scene(
-    rng: np.random.Generator,
-    markers: Markers | None = None,
-    spacing: float | None = None,
-    extras: tuple[str, ...] | None = None,
-    trouble: str | None = None,
-) -> Scene:
+    rng: np.random.Generator, markers: Markers | None = None, spacing: float | None = None,
+    extras: tuple[str, ...] | None = None, trouble: str | None = None,
+) -> Scene:  # fmt: skip
     """Draw a scan; what is not stated is drawn too."""
     markers = drawn_markers(rng) if markers is None else markers
     spacing = float(rng.choice([1.0, 1.5, 2.0, 2.5, 3.0, 5.0])) if spacing is None else spacing
@@ -271,13 +262,11 @@ def scene(
         solids += [Solid("lead", one, 3000.0) for one in line(list(ends), 1.5)]
         middles, taken = [*middles, ends.mean(axis=0)], [*taken, solids[-1]]
         troubled = {0}
-    solids += [
-        Solid("marker", marker_mesh(markers.kind, point, normal, markers.diameter, markers.thick), markers.hu)
-        for point, normal in zip(true, normals, strict=True)
-    ]
-    settings = ScanSettings(
-        spacing, float(rng.uniform(0.6, 1.1)), float(rng.uniform(8.0, 40.0)), blur_mm=float(rng.uniform(0.8, 1.5))
-    )
+    for point, normal in zip(true, normals, strict=True):
+        mesh = marker_mesh(markers.kind, point, normal, markers.diameter, markers.thick)
+        solids.append(Solid("marker", mesh, markers.hu))
+    pixel, noise, blur = (float(rng.uniform(*ends)) for ends in ((0.6, 1.1), (8.0, 40.0), (0.8, 1.5)))
+    settings = ScanSettings(spacing, pixel, noise, blur_mm=blur)
     tilt = np.radians(rng.uniform(-15, 15)) if rng.random() < 0.4 else 0.0
     volume = scanned([*table(), body(), *ribs(), *taken, *solids], settings, rng, exp_rotation([tilt, 0.0, 0.0]))
     if trouble == "cut":
@@ -375,11 +364,7 @@ def _false(one: Scene, found: tuple[Fiducial, ...]) -> list[str]:
 
 def main() -> None:
     """Parse, draw, look, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scans", type=int, default=1000)
-    parser.add_argument("--first", type=int, default=0, help="seed of the first")
-    parser.add_argument("--json", type=Path)
-    stated = parser.parse_args()
+    stated = options(__doc__, scans=1000, first=0, json=Path)
     rows = []
     with nullcontext() if stated.json is None else stated.json.open("w", encoding="utf-8") as file:
         for seed in range(stated.first, stated.first + stated.scans):

@@ -9,7 +9,6 @@ shifts of max(6 mm, 1.5 voxels) and more, scales of 5 and 10 %, mirror images, h
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections import defaultdict
@@ -20,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from benchmarks.shared import options
 from puncture_twin.planning.evidence.edges import edge_image
 from puncture_twin.planning.evidence.label_placement import Source, assess
 from puncture_twin.planning.formats.labels.labelmaps import mask_surface
@@ -125,13 +125,9 @@ def changed(patient: Patient, change: str, rng: np.random.Generator) -> Patient:
     if change == "every third slice" and T[2, 2] < 5:
         thick = T.copy()
         thick[:3, 2] *= 3
-        return Patient(hu[:, :, 1::3], labels[:, :, 1::3], _from(thick, T[:3, 2]))
+        thick[:3, 3] += T[:3, 2]
+        return Patient(hu[:, :, 1::3], labels[:, :, 1::3], thick)
     return patient
-
-
-def _from(T, offset):
-    T[:3, 3] += offset
-    return T
 
 
 def meshes_of(patient: Patient) -> dict[str, object]:
@@ -160,9 +156,8 @@ def wrong(source: Source, rng: np.random.Generator) -> tuple[str, np.ndarray]:
     T, middle = np.eye(4), source.middles[0]
     if kind == "shift":
         axis = int(rng.integers(3))
-        T[:3, 3] = (
-            source.axes[:, axis] * max(6.0, 1.5 * source.voxel_mm[axis]) * rng.uniform(1, 4) * rng.choice([-1, 1])
-        )
+        least = source.axes[:, axis] * max(6.0, 1.5 * source.voxel_mm[axis])
+        T[:3, 3] = least * rng.uniform(1, 4) * rng.choice([-1, 1])
     elif kind == "scale":
         T[:3, :3] *= rng.choice([0.9, 0.95, 1.05, 1.1])
         about = (middle, source.first)[int(rng.integers(2))]
@@ -215,12 +210,7 @@ def _row(name, change, count, kind, found):
 
 def main() -> None:
     """Print the table of z, and write every draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--real", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--draws", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    arguments = parser.parse_args()
+    arguments = options(__doc__, real=Path("../shared/data"), draws=20, seed=0, json=Path)
     start = time.perf_counter()
     found = list(rows([*real(arguments.real), *phantoms()], arguments.draws, np.random.default_rng(arguments.seed)))
     print(f"{len(found)} assessed in {time.perf_counter() - start:.0f} s")

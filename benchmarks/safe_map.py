@@ -10,7 +10,6 @@ machine, each organ alone, from random targets.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.shared import REPOSITORY, least_seconds, real_ct, versions
+from benchmarks.shared import REPOSITORY, least_seconds, options, real_ct, versions
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.case.entry import Directions, grid
 from puncture_twin.planning.clearance.engine import measure
@@ -33,7 +32,6 @@ from tools.hostile_scenes import KINDS, make_scene
 OFFSETS_MM = (0.0, 1e-12, 3e-10, 3e-9, 1e-7, 5e-5, 2e-4, 0.05)
 """By which a limit is off a direction's own distance, to either side. None is where the rule itself changes
 (`ROUNDING_MM`, `NEAR_THRESHOLD_MM`): there the last bit of a distance decides."""
-
 LIMITS, STEPS_DEG = 4, (2.0, 3.0, 5.0, 7.5)
 TARGETS = 8
 
@@ -122,9 +120,7 @@ def times(name: str, context: CaseContext) -> None:
 
 def main() -> int:
     """Compare, then time."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--verdicts", type=int, default=10_000_000)
-    wanted = parser.parse_args().verdicts
+    wanted = options(__doc__, verdicts=10_000_000).verdicts
     print(versions("numpy", "numba", "python-fcl"))
     asked, wrong, seed, rng = 0, 0, 0, np.random.default_rng(3)
     with tempfile.TemporaryDirectory() as folder:

@@ -21,10 +21,8 @@ from pathlib import Path
 
 TIMES = ("timings.json",)
 """Files that hold wall times."""
-
 REFUSED = (b"exit code 2", b"exit code 3")
 """A command that neither side carries out compares nothing."""
-
 EMBEDDED = ("abdomen", "carton", "head", "selfcal")
 REAL = Path(__file__).parents[1] / "tests" / "real"
 

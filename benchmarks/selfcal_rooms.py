@@ -11,7 +11,6 @@ predicted and compared with the truth.
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 from functools import cache
@@ -22,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from benchmarks.shared import options
 from puncture_twin.planning.arm.kinematics import flange_pose
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.twin.guidance.ultrasound.acquisition import ProbeDevices, acquire, choose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, ShotByShot, calibrate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import Estimate
@@ -159,14 +159,9 @@ def with_play(truth: WorkcellTruth, factor: float) -> WorkcellTruth:
 
 
 def recorded(
-    case: SelfcalCase,
-    candidates: CandidatePoses,
-    truth: WorkcellTruth,
-    rows: NDArray[np.int_],
-    rng: np.random.Generator,
-    *,
-    noise: bool,
-) -> tuple[Recording, Floats]:
+    case: SelfcalCase, candidates: CandidatePoses, truth: WorkcellTruth, rows: NDArray[np.int_],
+    rng: np.random.Generator, *, noise: bool,
+) -> tuple[Recording, Floats]:  # fmt: skip
     """Poses as the controllers print them with the tips as they are read, and the true tips, (n, 3), image.
 
     With noise the needle is jogged into the slice first, as for a picture; without, it stands as the candidate has it.
@@ -221,29 +216,17 @@ def compared(found: Calibration, truth: WorkcellTruth, standing: Recording, tips
     seen_base1 = (T_base1_image @ np.column_stack([tips, np.ones(len(tips))])[:, :, None])[:, :3, 0]
     errors, C = in_base1 - seen_base1, found.tip_covariances(standing)
     inside = np.einsum("ni,ni->n", errors, np.linalg.solve(C, errors[:, :, None])[:, :, 0]) <= chi2.ppf(0.95, 3)
-    return Outcome(
-        squared <= found.region_limit(),
-        squared / len(e),
-        np.linalg.norm(errors, axis=1),
-        np.sqrt(np.trace(C, axis1=1, axis2=2)),
-        float(inside.mean()),
-        found.chi_squared_ratio,
-        len(found.outliers),
-    )
+    off, predicted = np.linalg.norm(errors, axis=1), np.sqrt(np.trace(C, axis1=1, axis2=2))
+    share, ratio = float(inside.mean()), found.chi_squared_ratio
+    return Outcome(squared <= found.region_limit(), squared / len(e), off, predicted, share, ratio, len(found.outliers))
 
 
 def row_text(name: str, outcomes: list[Outcome]) -> str:
     """One line of the table."""
-    rms = [
-        float(np.sqrt(np.mean(np.concatenate([getattr(o, key) for o in outcomes]) ** 2)))
-        for key in Outcome._fields[2:4]
-    ]
-    means = [float(np.mean([getattr(o, key) for o in outcomes])) for key in ("inside", "mahalanobis", "held")]
-    last = [float(np.mean([getattr(o, key) for o in outcomes])) for key in ("chi2_per_freedom", "lost")]
-    return (
-        f"{name:42s} {len(outcomes):5d} {means[0]:7.3f} {means[1]:8.2f} {rms[0]:7.3f} {rms[1]:7.3f} {means[2]:8.3f} "
-        f"{last[0]:8.2f} {last[1]:6.2f}"
-    )
+    inside, squared, errors, predicted, held, ratio, lost = zip(*outcomes, strict=True)
+    first = f"{name:42s} {len(outcomes):5d} {np.mean(inside):7.3f} {np.mean(squared):8.2f}"
+    sizes = f"{rms(np.concatenate(errors)):7.3f} {rms(np.concatenate(predicted)):7.3f}"
+    return f"{first} {sizes} {np.mean(held):8.3f} {np.mean(ratio):8.2f} {np.mean(lost):6.2f}"
 
 
 def shot_ms(kind: Kind) -> float:
@@ -264,25 +247,10 @@ def shot_ms(kind: Kind) -> float:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rooms", type=int, default=150)
-    parser.add_argument("--rendered", type=int, default=20, help="Rooms of rendered pictures.")
-    parser.add_argument("--first", type=int, default=0, help="Number of the first room.")
-    parser.add_argument("--only", default="", help="Rows whose name contains this.")
-    arguments = parser.parse_args()
-    head = (
-        ("rooms", 5),
-        ("region", 7),
-        ("eCe/p", 8),
-        ("real", 7),
-        ("told", 7),
-        ("within", 8),
-        ("chi2/f", 8),
-        ("lost", 6),
-    )
+    arguments = options(__doc__, rooms=150, rendered=20, first=0, only="")
     for words, kind in (("arms not declared", Kind(arms=0.0)), ("arms declared", Kind())):
         print(f"one shot, {words}: {shot_ms(kind):.2f} ms")
-    print(" " * 41, *(name.rjust(width) for name, width in head))
+    print(" " * 42 + "rooms  region    eCe/p    real    told   within   chi2/f   lost")
     for name, kind in ROWS.items():
         if arguments.only in name:
             rooms = arguments.rendered if kind.rendered else arguments.rooms

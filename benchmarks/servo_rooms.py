@@ -10,7 +10,6 @@ play's memory: each arrival errs by itself.
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
-from benchmarks.shared import versions
+from benchmarks.shared import options, versions
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.base.arrays import Floats
@@ -53,10 +52,8 @@ from puncture_twin.twin.rehearsal.stereo_session import NeedleOutcome, needle_ou
 
 PIXEL_PX = 0.03
 """Of a centre by edges, per axis; declared here, since there are no pictures of which a tracker could tell it."""
-
 BRANCH = 6
 """Of the inverse kinematics, as a session chooses it."""
-
 DOUBTED = 0.01
 """Chance of residuals so large below which a declaration is doubted."""
 
@@ -83,12 +80,7 @@ def pixel_detector(plant: StereoPlant, sigma_px: float) -> Detector:
 
 
 def varied(case: ServoCase, **sections: dict[str, Any]) -> ServoCase:
-    """The case with some keys of its sections changed, checked as when read.
-
-    Args:
-        case: The case.
-        sections: Such as ``cameras={"noise_grey": 6.0}``.
-    """
+    """The case with some keys of its sections changed, such as ``cameras={"noise_grey": 6.0}``."""
     content = case.file.model_dump(by_alias=True)
     for section, keys in sections.items():
         content[section] = (content[section] or {}) | keys
@@ -122,9 +114,8 @@ class Room:
         self.q_true = [self.arrived(q) for q in self.q]
         self.pixels = [self.seen(self.workcell.ball_c(q)) for q in self.q_true]
         truth = case.truth_errors
-        self.measured_c = self.workcell.ball_c(np.array(self.q_true)) + self.rng.normal(
-            0.0, truth.measuring_arm_mm, (12, 3)
-        )
+        read = self.rng.normal(0.0, truth.measuring_arm_mm, (12, 3))
+        self.measured_c = self.workcell.ball_c(np.array(self.q_true)) + read
         self.markers = np.array([self.seen(point) for point in self.workcell.markers_c])
         self.markers_m = case.markers.points + self.rng.normal(0.0, truth.marker_mm, case.markers.points.shape)
         self.T_base_c = fit_rigid(self.measured_c, ball_base(calibrating_rod(case), np.array(self.q)))
@@ -203,23 +194,19 @@ def rows() -> dict[str, ServoCase]:
     """What is drawn and declared in each row."""
     head = told_of_pixels(load_servo_case(folder() / "head"))
     plain = replace(head, file=head.file.model_copy(update={"errors": ServoErrors()}))
+    moved = {"ball_px": 0.3, "head_shift_mm": 0.2, "head_turn_deg": 0.1}
     return {
         "meshes/head as declared": head,
         "the defaults of [errors]": told_of_pixels(varied(plain, errors={}), target_mm=0.3),
         "arm nominal, no play": told_of_pixels(varied(plain, errors=ServoErrors(arm="nominal").model_dump())),
-        "cameras of .3 px, head moves .2 mm, .1 deg": told_of_pixels(
-            head, ball_px=0.3, head_shift_mm=0.2, head_turn_deg=0.1
-        ),
+        "cameras of .3 px, head moves .2 mm, .1 deg": told_of_pixels(head, **moved),
         "liu2007": told_of_pixels(load_servo_case(folder() / "head" / "liu2007.toml")),
         "declared half of the truth": drawn_from(head, 2.0),
         "declared twice the truth": drawn_from(head, 0.5),
     }
 
 
-HEAD = (
-    f"{'':52s} {'tip, mm':>15s} {'ratio':>6s} {'in 95 %':>7s} {'direction, deg':>15s} {'pose':>6s} {'hit, %':>13s}"
-    + "  doubted"
-)
+HEAD = " " * 53 + "        tip, mm  ratio in 95 %  direction, deg   pose        hit, %  doubted"
 
 
 def line(name: str, outcomes: Sequence[NeedleOutcome], doubted: float) -> str:
@@ -228,9 +215,8 @@ def line(name: str, outcomes: Sequence[NeedleOutcome], doubted: float) -> str:
     assert ours is not None
     pose = np.mean([one.square_of_pose <= chdtri(6, 0.05) for one in outcomes])
     ratio = ours["realised_rms_mm"] / ours["predicted_rms_mm"]
-    hit = (
-        "" if ours["hit_share"] is None else f"{100 * ours['hit_share']:5.1f} {100 * (ours['mean_p_hit'] or 0.0):5.1f}"
-    )
+    hits = [100 * (ours[key] or 0.0) for key in ("hit_share", "mean_p_hit")]
+    hit = "" if ours["hit_share"] is None else f"{hits[0]:5.1f} {hits[1]:5.1f}"
     figures = "{realised_rms_mm:7.3f} {predicted_rms_mm:7.3f} {ratio:6.3f} {coverage_95:7.3f} "
     figures += "{realised_direction_deg:7.3f} {predicted_direction_deg:7.3f}"
     return f"{name:52s} {figures.format(ratio=ratio, **ours)} {pose:6.3f} {hit:>13s} {100 * doubted:6.1f} %"
@@ -247,11 +233,7 @@ def fast_rooms(name: str, case: ServoCase, count: int, jobs: int) -> None:
 
 def main() -> None:
     """Parse, run, print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rooms", type=int, default=2000)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--only", default="", help="rows whose name contains a word")
-    asked = parser.parse_args()
+    asked = options(__doc__, rooms=2000, jobs=2, only="")
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # for the processes that are started: one thread each
     start = time.perf_counter()

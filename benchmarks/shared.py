@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import platform
 import shutil
 import tempfile
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -22,6 +24,15 @@ from puncture_twin.planning.search.context import prepare
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = REPOSITORY.parent / "shared" / "data"
 REAL_CT = DATA / "totalseg_abdomen_3mm"
+
+
+def options(doc: str | None, **defaults: Any) -> argparse.Namespace:
+    """Options of the command line by their defaults: False for a switch, a type for what has none."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, default in defaults.items():
+        how = {"type": default} if isinstance(default, type) else {"type": type(default), "default": default}
+        parser.add_argument(f"--{name}", **({"action": "store_true"} if default is False else how))
+    return parser.parse_args()
 
 
 def real_ct(folder: Path) -> bool:
@@ -62,12 +73,7 @@ def least_seconds(work: Callable[[], object], repeats: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Surfaces and a target amid them; mm.
-
-    Attributes:
-        R_ct_entry: Shape (3, 3), the entry frame, for the grid of directions.
-        thresholds: Shape (k,), needle radius plus margin.
-    """
+    """Surfaces and a target amid them, mm; thresholds (k,) are the needle's radius plus a margin."""
 
     name: str
     meshes: tuple[TriangleMesh, ...]

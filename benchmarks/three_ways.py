@@ -12,15 +12,13 @@ chance and realised fraction over radii from .25 to 4 mm.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.shared import REPOSITORY
+from benchmarks.shared import REPOSITORY, options
 from puncture_twin import api as pt
 from puncture_twin.meshes import folder
 from puncture_twin.planning.budget.guidance import sight_of
@@ -40,7 +38,6 @@ from puncture_twin.twin.report.error_pictures import draw_clouds
 
 HIT_MM = 2.0
 """Radius of a hit."""
-
 DIRECTION_DEG = (64.0, 98.0)
 RADII_MM = np.geomspace(0.25, 4.0, 9)
 SLICES = np.diag([0.7**2, 0.7**2, 5.0**2]) / 12.0
@@ -138,26 +135,22 @@ def stepwise(context: CaseContext, plan: Plan, rooms: int, seed: int = 7) -> Ite
 
 def main() -> None:
     """Rehearse, print, draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rooms", type=int, default=200)
-    parser.add_argument("--picture", type=Path, default=REPOSITORY / "docs" / "pictures" / "three_ways.png")
-    parser.add_argument("--steps", action="store_true")
-    options = parser.parse_args()
+    stated = options(__doc__, rooms=200, picture=REPOSITORY / "docs" / "pictures" / "three_ways.png", steps=False)
     context = pt.prepare(folder() / "abdomen" / "case.toml")
     probe = Ultrasound(context.case.robot.model, None, (0.3, 0.5), (0.08, 0.5), 0.07, 150.0, 40.0)
     case = replace(context.case, hit_radius_mm=HIT_MM, stereo=Stereo(None, (80.0, 160.0), 0.03), ultrasound=probe)
     context = prepared(context, case)
     theta, beta = DIRECTION_DEG
     plan = pt.plan(context, theta_deg=theta, beta_deg=beta)
-    if options.steps:
-        for line in stepwise(context, plan, options.rooms):
+    if stated.steps:
+        for line in stepwise(context, plan, stated.rooms):
             print(line, flush=True)
         return
     shown: dict[str, Distribution] = {}
     last = ""
-    for row in rows(context, plan, options.rooms):
+    for row in rows(context, plan, stated.rooms):
         if row.situation != last:
-            print(f"\n{row.situation}, {options.rooms} rooms a way\n{'':10s} {HEAD}")
+            print(f"\n{row.situation}, {stated.rooms} rooms a way\n{'':10s} {HEAD}")
             last = row.situation
         print(f"{row.way:10s} {row}", flush=True)
         if row.situation == SHOWN:
@@ -169,7 +162,7 @@ def main() -> None:
         for lost in found.hidden:
             print(f"{'':10s} {lost}")
     drawn = [(one.found, one.rating, COLOURS[one.rating]) for one in rated(list(shown.values()))]
-    draw_clouds(drawn, plan.outward_ct, options.picture, HIT_MM, columns=4)
+    draw_clouds(drawn, plan.outward_ct, stated.picture, HIT_MM, columns=4)
 
 
 if __name__ == "__main__":

@@ -13,10 +13,9 @@ rooms with s between 1/8 and 2 of the declaration.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +23,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.special import chdtri, fdtri
 
-from benchmarks.shared import real_ct
+from benchmarks.shared import options, real_ct
 from puncture_twin.meshes import folder
 from puncture_twin.planning.arm.insertion import flange_poses
 from puncture_twin.planning.arm.inverse_kinematics import inverse
@@ -55,22 +54,16 @@ SEED = 20191104
 BINS = 10
 RADII = (0.4, 0.7, 1.0, 1.4)
 """Of balls about the target, over the tip's predicted rms: a lesion that is hit for certain shows no calibration."""
-
 FOUND = (1 / 8, 2.0)
 """Errors' size by the residuals over the declared one: rooms in which it lies outside are not counted."""
-
 STEPS = 24
 """Of the errors' true size, evenly on a logarithmic scale as far out as residuals within `FOUND` may come from."""
-
 RARELY = 1e-3
 """Part of the rooms with residuals at an end of `FOUND` whose true size is left out there."""
-
 SIZES = np.geomspace(*FOUND, 12)
 """At which chances to touch are computed, those to hit at eight times as many; between them interpolated."""
-
 PARTS = (0.5, 0.9, 0.99, 1.0)
 """Of the rooms by how far the tip is off: those that are less far are asked about fewer faces."""
-
 RATIO, COVERAGE, ECE = (0.97, 1.03), (0.94, 0.96), 0.01
 TARGETS = f"ratio {RATIO[0]} to {RATIO[1]}, region {COVERAGE[0]} to {COVERAGE[1]}, ECE at most {ECE}"
 
@@ -80,10 +73,6 @@ class Tally:
     """Predictions beside what came, over all directions of one row of the table.
 
     Attributes:
-        ratio: Realised over predicted rms of the tip's error, all directions together.
-        coverage: Of the predicted 95 % regions.
-        ece_hit: Expected calibration error of p_hit over ten bins.
-        ece_touch: Of p_touch, all structures that may be touched.
         noticed: Share of rooms whose residuals break the declaration's test at its 1 %, were it taken at its word; None
             where the noise is found.
     """
@@ -109,14 +98,7 @@ class Tally:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One anatomy, the errors declared of it, and directions that a UR3 reaches.
-
-    Attributes:
-        outward_ct: Shape (d, 3), unit; half of them those that pass nearest to what must not be touched.
-        q: Shape (d, 6), rad.
-        points_ct: Shape (6, 3), markers, mm.
-        T_base_ct: Shape (4, 4).
-    """
+    """One anatomy, its declared errors, directions of a UR3; half of these pass nearest to what must not be touched."""
 
     name: str
     context: CaseContext
@@ -188,34 +170,21 @@ def punctures(of: Scene, markers: int, *, corrected: bool = False) -> Iterator[t
 
 
 def tally(
-    of: Scene,
-    markers: int,
-    rooms: int,
-    *,
-    truth: float = 1.0,
-    found: bool = True,
-    seed: int = SEED,
+    of: Scene, markers: int, rooms: int, *, truth: float = 1.0, found: bool = True, seed: int = SEED,
     corrected: bool = False,
-) -> dict[str, Tally]:
+) -> dict[str, Tally]:  # fmt: skip
     """Rooms of one anatomy and set of markers, by what is known of the noise.
 
     ``known``: the declaration is taken at its word. ``found``: the residuals give the size, whatever it is (`FOUND`).
     ``found, size 1``: likewise, but the true size is always the declared one, which a chance that follows from the
-    residuals alone cannot know.
-
-    Args:
-        of: The anatomy.
-        markers: How many of its markers are used.
-        rooms: In all, divided among the directions.
-        truth: The true errors over the declared ones.
-        found: Whether rooms of found noise are drawn too.
-        seed: Of all draws.
-        corrected: Whether each direction's aim is corrected by what the residuals tell of the arm.
+    residuals alone cannot know. ``truth`` is the true errors over the declared ones; where it is ``corrected``, each
+    direction's aim is, by what the residuals tell of the arm.
     """
     rng, each, freedom = np.random.default_rng(seed), max(rooms // len(of.q), 1), 3 * markers - 6
-    sums = {"known": _Sums.empty(), "found": _Sums.empty(), "found, size 1": _Sums.empty()}
+    sums = {"known": _Sums(), "found": _Sums(), "found, size 1": _Sums()}
     for puncture, error in punctures(of, markers, corrected=corrected):
-        drawn = draw_trials(puncture, of.errors.scaled(truth), each, rng).reached_alone()
+        drawn = draw_trials(puncture, of.errors.scaled(truth), each, rng)
+        drawn = drawn.of(drawn.reached)
         came, sizes = _came(of, puncture, error, drawn), np.sqrt(drawn.chi_squared / freedom)
         sums["known"].add(_predicted(of, error, puncture, None), np.ones(len(sizes)), drawn, came)
         if not found:
@@ -225,7 +194,8 @@ def tally(
         true_sizes = _true_sizes(freedom)
         many = each * np.log(true_sizes[-1] / true_sizes[0]) / np.log(FOUND[1] / FOUND[0]) / len(true_sizes)
         for true_size in true_sizes:
-            drawn = draw_trials(puncture, of.errors.scaled(truth * true_size), int(np.ceil(many)), rng).reached_alone()
+            drawn = draw_trials(puncture, of.errors.scaled(truth * true_size), int(np.ceil(many)), rng)
+            drawn = drawn.of(drawn.reached)
             sizes = np.sqrt(drawn.chi_squared / freedom)
             if FOUND[0] <= true_size <= FOUND[1]:
                 sums["found"].add_error(told, sizes / true_size, drawn, true_size)
@@ -245,13 +215,7 @@ def _true_sizes(freedom: int) -> np.ndarray:
 
 
 class Told(NamedTuple):
-    """What is predicted of one puncture.
-
-    Attributes:
-        cov_ct: Shape (3, 3), of the tip, the errors' size 1.
-        hit: Shape (m, 5), chances to hit lesion and balls at m sizes.
-        touch: Shape (t, k), chances to touch at t sizes.
-    """
+    """What is predicted of one puncture: chances to hit lesion and balls (m, 5), and to touch, at m sizes."""
 
     cov_ct: np.ndarray
     hit: np.ndarray
@@ -337,15 +301,11 @@ def _touched(of: Scene, puncture: Puncture, rooms: Trials, shift: float) -> np.n
 class _Sums:
     """What is collected over the directions of one row of the table."""
 
-    squares: list[np.ndarray]
-    errors: list[tuple[float, float]]
-    hits: list[np.ndarray]
-    touches: list[np.ndarray]
-    tests: list[np.ndarray]
-
-    @classmethod
-    def empty(cls) -> _Sums:
-        return cls([], [], [], [], [])
+    squares: list[np.ndarray] = field(default_factory=list)
+    errors: list[tuple[float, float]] = field(default_factory=list)
+    hits: list[np.ndarray] = field(default_factory=list)
+    touches: list[np.ndarray] = field(default_factory=list)
+    tests: list[np.ndarray] = field(default_factory=list)
 
     def add(self, told: Told, sizes: np.ndarray, rooms: Trials, came: tuple[np.ndarray, np.ndarray]) -> None:
         """One direction: what was predicted, each room's own size, and what came."""
@@ -398,11 +358,8 @@ def scenes(directions: int, temporary: Path) -> Iterator[Scene]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rooms", type=int, default=100_000, help="of each anatomy and set of markers")
-    parser.add_argument("--quick", action="store_true", help="fewer directions, 4,000 rooms")
-    options = parser.parse_args()
-    rooms, directions = (4_000, 4) if options.quick else (options.rooms, 10)
+    stated = options(__doc__, rooms=100_000, quick=False)
+    rooms, directions = (4_000, 4) if stated.quick else (stated.rooms, 10)
     head = "anatomy | markers | noise | realised / predicted rms | 95 % region | ECE hit | ECE touch | warned | holds"
     print(f"{rooms} rooms a row; targets: {TARGETS}\n| {head} |\n|" + "---|" * 9, flush=True)
     with tempfile.TemporaryDirectory() as temporary:

@@ -5,11 +5,11 @@ Pixels of 0.7 mm, noise of 20 HU; 240 markers a row (six a scan), and a needle a
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.shared import options
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
@@ -69,9 +69,7 @@ def needles(spacing: float, scans: int) -> str:
 
 def main() -> None:
     """Parse, measure, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scans", type=int, default=40, help="of each row")
-    scans = parser.parse_args().scans
+    scans = options(__doc__, scans=40).scans
     print("| marker, slices | rule, sd along the bed, mm | metal: along the bed, in the plane | largest bias |")
     print("|---|---|---|---|")
     for kind in ("disc", "ball"):

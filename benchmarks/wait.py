@@ -28,14 +28,11 @@ from typing import Any
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = REPOSITORY.parent / "shared" / "data" / "totalseg_abdomen_3mm"
 PROBE = Path(__file__).with_name("wait_probe.py")
-
 BARE = """import sys; sys.path.insert(0, sys.argv.pop(1))
 import puncture_twin.run_twin as run
 getattr(run, "program", lambda: sys.exit(run.main()))()"""
 """For Python: a checkout's command, as a person runs it; older ones have no ``program``."""
-
 Seconds = dict[str, float]
-
 END, ALL, CLOCK = "Python's end", "all", "by the clock"
 """The last rows: processor seconds after the answer was there and of everything, and seconds of the clock."""
 
@@ -90,16 +87,13 @@ class Side:
         answer = self.folder / "answer.json"
         begin = ["-c", BARE, str(self.checkout)] if self.bare else [str(PROBE), str(self.checkout), str(answer)]
         start, before = perf_counter(), _used_by_others()
-        done = subprocess.run(
-            [sys.executable, *begin, *command.words],
-            env=self._environment(),
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        words, environment = [sys.executable, *begin, *command.words], self._environment()
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
         passed, used = perf_counter() - start, _used_by_others() - before
         bare: dict[str, Any] = {"exit_code": done.returncode, "seconds": {ALL: used}}
-        found = bare if self.bare else _read(answer, done)
+        if not self.bare and done.returncode:
+            raise SystemExit(done.stderr)
+        found = bare if self.bare else json.loads(answer.read_text())
         if found["exit_code"] > 1 or "Traceback" in done.stderr:
             raise SystemExit(f"{self.name}: {command.name} ended with {found['exit_code']}\n{done.stderr}")
         return {**found["seconds"], END: used - found["seconds"][ALL], ALL: used, CLOCK: passed}
@@ -114,14 +108,6 @@ class Side:
         environment = {key: value for key, value in os.environ.items() if key not in unset}
         kernels = {"NUMBA_CACHE_DIR": str(self.folder / "kernels")} if self.alone else {}
         return {**environment, "PUNCTURE_TWIN_CACHE": str(self.folder / "kept"), **kernels}
-
-
-def _read(answer: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
-    """What the probe has written."""
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    found: dict[str, Any] = json.loads(answer.read_text())
-    return found
 
 
 def _used_by_others() -> float:

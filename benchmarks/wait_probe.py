@@ -43,7 +43,6 @@ FUNCTIONS = {
     "planning.search.uncertainty_breakdown": {"uncertainty_breakdown": "chances"},
 }
 """By module: what of it is timed under which name."""
-
 STAGES = {"map": "pictures", "scene": "pictures", "page": "pictures", "film": "film", "table": "table", "plan": "plan"}
 """What a command announces, under the table's names; others go to where they are called from."""
 

@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-from control_world import TIP_M, UR3, Position, impedance, press
+from control_world import TIP_M, UR3, impedance, press
 
-from puncture_twin.twin.world.control import Admittance, VirtualMass
+from puncture_twin.twin.world.control import Admittance, Motors, VirtualMass
 
 PICTURE = Path(__file__).parent / "pictures" / "control.png"
 BLUE, ORANGE, GREEN, RED, GREY = "#1f4e8c", "#b9770e", "#1e8449", "#c0392b", "#8a8a8a"
@@ -16,7 +16,7 @@ def main():
     """Two panels: every control on a wall of 1e5 N/m, and admittance on a rigid one."""
     stiff = {K: press(lambda world, K=K: impedance(world, K, K_i=0.0), WALL_N_M) for K in (1e4, 1e3)}
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2))
-    motors = press(lambda world: Position(), WALL_N_M)
+    motors = press(lambda world: Motors(), WALL_N_M)
     soft, rigid = (press(lambda world: Admittance(UR3, TIP_M, VirtualMass(), 1e-3), wall) for wall in (WALL_N_M, None))
     curves = (
         (motors, RED, "position motors"),

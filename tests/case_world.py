@@ -77,10 +77,8 @@ CASE = case_text(
     structure("rib", "avoid", margin_mm=3.0),
     structure("vessel", "avoid", {"labelmap": "labels.nrrd", "label": 3}, margin_mm=3.0),
 )
-
 BALLS = {"skin": (90.0, (0, 0, 0)), "organ": (20.0, (0, 0, 0)), "rib": (5.0, (40, 0, 40))}
 """Radius and centre of the usual patient's meshes, mm."""
-
 MARKERS = "name,x_mm,y_mm,z_mm\nA,0,0,80\nB,50,0,75\nC,0,60,70\nD,-40,-30,72\n"
 
 

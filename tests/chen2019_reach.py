@@ -16,7 +16,6 @@ from puncture_twin.planning.place.mounts import Region, Site
 
 Floats = NDArray[np.float64]
 Window = tuple[int, int]
-
 MODEL = "ur3"
 CAP_DIRECTIONS = 4000
 LENGTH_MM, STANDOFF_MM = 401.0, 150.0
@@ -83,12 +82,8 @@ def held_share(
 ) -> float:
     """The share of directions that `place` counts as within reach at one distance, no collisions asked."""
     distances = np.full((len(outward_base), 1), distance_mm)
-    return float(
-        insertion_branches(ur_model(MODEL), target_base, outward_base, distances, at_least)
-        .margin.max(axis=1)
-        .astype(bool)
-        .mean()
-    )
+    found = insertion_branches(ur_model(MODEL), target_base, outward_base, distances, at_least)
+    return float((found.margin.max(axis=1) != 0).mean())
 
 
 def our_share(row: PublishedShare) -> float:
@@ -110,6 +105,5 @@ def our_windows(T_base_ct: Floats, target_ct: Floats, theta_deg: int) -> tuple[W
 
 
 def runs(flags: NDArray[np.bool_]) -> tuple[Window, ...]:
-    """First and last index of each run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
     return tuple((int(a), int(b) - 1) for a, b in edges.reshape(-1, 2))

@@ -16,7 +16,6 @@ settings.load_profile("shared machine")
 
 LONG_S = 1e6
 """No test takes so long."""
-
 LOOK_EVERY = 50_000
 """Objects after which Python looks for circles of them. Thousands of tests and their modules stay until the end; to
 look through them after every 700 took a sixth of the time to collect them."""

@@ -15,17 +15,7 @@ from puncture_twin.planning.motion.trajectory import SAMPLE_S, Trajectory
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.twin.world.arm import load_arm
 from puncture_twin.twin.world.client import physics_client, pybullet, step
-from puncture_twin.twin.world.control import (
-    Goals,
-    Impedance,
-    Push,
-    Stiffness,
-    Surroundings,
-    reference_of,
-    rigid_model,
-    run,
-    tips,
-)
+from puncture_twin.twin.world.control import Impedance, Motors, Push, Stiffness, reference_of, rigid_model, run, tips
 from puncture_twin.twin.world.workcell import load_box
 
 UR3 = ur_model("ur3")
@@ -57,16 +47,6 @@ def along_needle(start_mm, length_mm, speed_mm_s):
     for distance in start_mm - law.travelled(times):
         q.append(nearest(flange_poses(TARGET, OUTWARD, TIP_M * 1e3 + distance)[0], q[-1]))
     return Trajectory(times, np.array(q[1:]))
-
-
-class Position:
-    """PyBullet's own position motors, beside the controllers of the tip."""
-
-    dt = 1 / 240
-
-    def act(self, measured, reference, row):
-        del measured
-        return Goals(reference.q[row], reference.speed[row])
 
 
 class WithFriction:
@@ -106,14 +86,13 @@ def true_tip(q):
 
 def follow(bench, controller, trajectory, *, settle_s=0.0, hold_s=0.5, resistance=None, place=True):
     """Rest at the trajectory's start, then run it; the run, and the tip's error of every row after the rest, mm."""
-    around = Surroundings(EXACT, resistance)
     if place:
         bench.arm.place(trajectory.q[0])
     if settle_s > 0:
         rest = reference_of(UR3, TIP_M, Trajectory(np.zeros(1), trajectory.q[:1]), controller.dt, settle_s)
-        run(bench.arm, controller, rest, true_tip, around)
+        run(bench.arm, controller, rest, EXACT, resistance=resistance)
     reference = reference_of(UR3, TIP_M, trajectory, controller.dt, hold_s)
-    done = run(bench.arm, controller, reference, true_tip, around)
+    done = run(bench.arm, controller, reference, EXACT, resistance=resistance)
     return done, 1e3 * np.linalg.norm(done.tip_m - reference.position_m[: len(done.tip_m)], axis=1)
 
 
@@ -152,7 +131,6 @@ def press(controller_of, wall_n_m=None, *, ahead_mm=2.0, over_mm=3.0, speed_mm_s
 
 
 def pressed_by(force_n):
-    """A force (3,), N, on the tip, wherever it is."""
     return lambda tip: [Push(force_n, tip.position_m[0])]
 
 
@@ -162,11 +140,8 @@ def release(down, count=20, seed=1):
     with bench(np.array(down, dtype=float)) as world:
         world.arm.release()
         for q in rng.uniform(-3.0, 3.0, (count, 6)):
-            own = np.array(
-                pybullet.calculateInverseDynamics(
-                    world.arm.body, q.tolist(), [0.0] * 6, [0.0] * 6, physicsClientId=world.client
-                )
-            )
+            rest = q.tolist(), [0.0] * 6, [0.0] * 6
+            own = np.array(pybullet.calculateInverseDynamics(world.arm.body, *rest, physicsClientId=world.client))
             for which, torque in enumerate((world.model.inverse_dynamics(q, np.zeros(6), np.zeros(6)), own)):
                 world.arm.place(q)
                 world.arm.torque(torque)
@@ -176,7 +151,6 @@ def release(down, count=20, seed=1):
 
 
 def free_space(speed_mm_s, friction=None, seed=1, length_mm=20.0):
-    """Mean and largest tip error of an insertion with true masses 10 % off, mm."""
     factors = np.random.default_rng(seed).uniform(0.9, 1.1, 20)
     with bench(factors=factors) as world:
         controller = impedance(world)
@@ -199,6 +173,6 @@ def hand_over():
     """How far the tip moves when torques take over from motors at rest, mm."""
     trajectory = along_needle(60.0, 1e-3, 1.0)
     with bench() as world:
-        held, _ = follow(world, Position(), trajectory, hold_s=0.5)
+        held, _ = follow(world, Motors(), trajectory, hold_s=0.5)
         taken, _ = follow(world, impedance(world), trajectory, hold_s=0.3, place=False)
     return 1e3 * float(np.linalg.norm(taken.tip_m - held.tip_m[-1], axis=1).max())

@@ -18,7 +18,6 @@ ULTRASOUND_CLASS = "1.2.840.10008.5.1.4.1.1.3.1"
 CAPTURE_CLASS = "1.2.840.10008.5.1.4.1.1.7"
 ROOT = "1.2.826.0.1.3680043.8.498.7."
 STUDY, SERIES, FRAME = ROOT + "1", ROOT + "2", ROOT + "3"
-
 SHAPE = (7, 5, 4)
 """Columns, rows, slices of the phantom."""
 SPACING = (0.7, 0.9)

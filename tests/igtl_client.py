@@ -25,7 +25,6 @@ class Received(NamedTuple):
 
     @property
     def document(self):
-        """Of a STRING with JSON."""
         encoding, size = struct.unpack(">HH", self.content[:4])
         assert encoding in (3, 106) and size == len(self.content) - 4
         return json.loads(self.content[4:])
@@ -49,22 +48,18 @@ def message(kind, name, content=b"", *, version=1, stamp=(0, 0), number=0, crc=N
 
 
 def transform(matrix):
-    """The content of a TRANSFORM, from a 4x4."""
     return np.asarray(matrix, float)[:3].T.astype(">f4").tobytes()
 
 
 def point(*places):
-    """The content of a POINT."""
     return b"".join(struct.pack(">64s32s4B3ff20s", b"P", b"", 1, 2, 3, 4, *place, 0.0, b"") for place in places)
 
 
 def tools(**matrices):
-    """The content of a TDATA."""
     return b"".join(struct.pack(">20sBB", name.encode(), 2, 0) + transform(T) for name, T in matrices.items())
 
 
 def text(words):
-    """The content of a STRING."""
     return struct.pack(">HH", 3, len(words)) + words.encode()
 
 
@@ -81,11 +76,9 @@ class Talk:
         self.socket.close()
 
     def send(self, *parts, **named):
-        """A message, or bytes as they are."""
         self.socket.sendall(parts[0] if isinstance(parts[0], bytes) else message(*parts, **named))
 
     def exactly(self, count):
-        """So many bytes; an error where the other end hangs up."""
         data = bytearray()
         while len(data) < count:
             more = self.socket.recv(count - len(data))
@@ -95,7 +88,6 @@ class Talk:
         return bytes(data)
 
     def receive(self):
-        """The next message."""
         version, kind, name, *stamp, size, crc = HEADER.unpack(self.exactly(58))
         body = self.exactly(size)
         assert size > 10_000 or crc64(body) == crc  # of long ones the library's client verifies it
@@ -107,7 +99,6 @@ class Talk:
         return Received(version, *words, tuple(stamp), number, body)
 
     def until(self, name):
-        """The next message of this name."""
         while (found := self.receive()).name != name:
             pass
         return found

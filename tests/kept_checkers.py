@@ -7,7 +7,6 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.fast_checker import FastChecker
 
 Kind = TypeVar("Kind", bound=CellChecker)
-
 ENCLOSURES = Cache(None, memory=Memory(10**9))
 
 

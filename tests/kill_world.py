@@ -24,7 +24,6 @@ from puncture_twin.planning.base.output.output_set import DRAFT_PREFIX, LOCK_NAM
 
 REPOSITORY = ROOT
 RUN_TIMEOUT_S = 600.0
-
 SELFCAL = 'schema = 1\nname = "small"\nseed = 3\n[poses]\nsamples = 240\ncount = 20\n'
 PLACE = """
 [place]

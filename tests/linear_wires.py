@@ -14,26 +14,17 @@ from numpy.typing import NDArray
 from puncture_twin.planning.base.errors import refuse
 
 Floats = NDArray[np.float64]
-
 LEAST_FRAMES = 3
 """Fewer frames of one probe orientation could not tell the nine numbers apart."""
-
 LEAST_RATIO = 1e-4
 """Least over largest singular value of the system (pixels in hundreds) below which the fit is refused."""
-
 PIXELS = 100.0
 """Pixels are counted in this unit, so that the columns of the system are of one size."""
 
 
 @dataclass(frozen=True, eq=False)
 class Wires:
-    """Straight wires in the reference frame.
-
-    Attributes:
-        names: One per wire.
-        points: A point on each, shape (k, 3), mm.
-        directions: Unit, shape (k, 3).
-    """
+    """Straight wires in the reference frame; directions (k, 3), unit."""
 
     names: tuple[str, ...]
     points: Floats
@@ -42,25 +33,14 @@ class Wires:
 
 @dataclass(frozen=True, eq=False)
 class WireFrames:
-    """Images of the wires.
-
-    Attributes:
-        T_reference_probe: Shape (n, 4, 4), mm.
-        points_px: Where each wire was seen, shape (n, k, 2), pixels.
-    """
+    """Images of the wires, and where each wire was seen, (n, k, 2), pixels."""
 
     T_reference_probe: Floats
     points_px: Floats
 
 
 def point_to_wire_mm(T_probe_image: Floats, frames: WireFrames, wires: Wires) -> Floats:
-    """Distance of every seen point from its wire, shape (n, k), mm.
-
-    Args:
-        T_probe_image: Shape (4, 4), affine: pixels of the image to mm on the probe; its third column is not used.
-        frames: The images.
-        wires: What they show.
-    """
+    """Distance of every seen point from its wire, shape (n, k), mm."""
     in_probe = frames.points_px @ T_probe_image[:3, :2].T + T_probe_image[:3, 3]
     T = frames.T_reference_probe
     offset = np.einsum("nij,nkj->nki", T[:, :3, :3], in_probe) + T[:, None, :3, 3] - wires.points
@@ -69,11 +49,7 @@ def point_to_wire_mm(T_probe_image: Floats, frames: WireFrames, wires: Wires) ->
 
 
 def fit_image(frames: WireFrames, wires: Wires) -> Floats:
-    """T_probe_image of least squared distances, shape (4, 4); its third column is the normal, as long as a mean pixel.
-
-    Raises:
-        InputError: Too few frames, or a probe that hardly moved.
-    """
+    """T_probe_image of least squared distances, (4, 4); its third column is the normal, as long as a mean pixel."""
     if len(frames.points_px) < LEAST_FRAMES:
         refuse(f"{len(frames.points_px)} frames", "wires", f"{LEAST_FRAMES} or more", "too_few_points")
     across = np.eye(3) - wires.directions[:, :, None] * wires.directions[:, None, :]

@@ -28,14 +28,7 @@ def picture(
     """One picture, 8-bit grey.
 
     Args:
-        rng: Draws scatterers and facets.
-        tip_mm: Shape (2,), mm, from the middle of the first pixel.
-        direction: Shape (2,), unit, toward the tip.
         off_mm: How far the needle lies off the plane; the slice is 1.1 mm thick at half its amplitude.
-        size: Rows and columns.
-        pixel_mm: Edge of a pixel.
-        display: Grey of an amplitude.
-        needle: Whether there is one.
         beaded: Its echo is a row of beads on facets of unequal brightness, not one tube.
     """
     deep, wide = size[0] * pixel_mm, size[1] * pixel_mm
@@ -103,7 +96,6 @@ def _add(field, points, strength):
 
 
 def _interpolated(values, at):
-    """Rows of values at fractional indices, linearly."""
     low = np.clip(np.floor(at).astype(int), 0, len(values) - 2)
     part = (at - low)[:, None]
     return (1 - part) * values[low] + part * values[low + 1]

@@ -17,10 +17,8 @@ from PIL import Image
 from puncture_twin.twin.report.slices.panel import PIXELS
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: make install brings it")
-
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 """The machine's own; without one, Playwright's, which ``playwright install chromium`` brings."""
-
 PATIENCE_MS = 120_000
 FLAGS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
 SERIOUS = {"serious", "critical"}

@@ -50,7 +50,6 @@ def write_trunk(folder, T_slip, more="", region="abdomen"):
 
 
 def moved(x=0.0, y=0.0, z=0.0):
-    """A shift (4, 4), mm."""
     T = np.eye(4)
     T[:3, 3] = (x, y, z)
     return T

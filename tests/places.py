@@ -6,5 +6,4 @@ TESTS = Path(__file__).parent
 ROOT = TESTS.parent
 DATA = ROOT.parent / "shared" / "data"
 """Real data beside the repository; a test that needs it skips, saying so, where it is absent."""
-
 REAL_CT = DATA / "totalseg_abdomen_3mm"

@@ -17,14 +17,11 @@ from contextlib import contextmanager
 PORT = 30004
 OTHER_PORTS = (29999, 30001, 30002, 30003, 30011, 30012, 30013)
 """On which a controller takes commands or programs: the dashboard, the primary, secondary and real-time interfaces."""
-
 PERIOD_S = 1.0 / 125.0
 START_S = 1000.0
 """The controller's clock at its first package."""
-
 TYPES = {"timestamp": ("DOUBLE", ">d"), "actual_q": ("VECTOR6D", ">6d")}
 """The two variables that are served: the guide's type, and how it is packed."""
-
 RECIPE = 1
 CB3 = (3, 15, 8, 106339)
 """The version of a controller that speaks at 125 Hz."""
@@ -67,7 +64,6 @@ class Controller:
 
     @staticmethod
     def report(line: str) -> None:
-        """Tell whoever started this process."""
         sys.stdout.write(line + "\n")
         sys.stdout.flush()
 
@@ -89,14 +85,12 @@ class Controller:
         self.selector.register(caller, selectors.EVENT_READ, "reader")
 
     def leave(self) -> None:
-        """The line to the reader ends."""
         if self.reader is not None:
             self.selector.unregister(self.reader)
             self.reader.close()
         self.reader, self.waiting, self.sending = None, b"", False
 
     def listen(self) -> None:
-        """Answer every whole package that has come."""
         try:
             some = self.reader.recv(4096)
         except ConnectionError:
@@ -111,7 +105,6 @@ class Controller:
             self.say(kind, self.reply(kind, content))
 
     def reply(self, kind: str, content: bytes) -> bytes:
-        """The guide's answer to a package."""
         if kind == "V":
             return struct.pack(">B", content == struct.pack(">H", 2))
         if kind == "v":
@@ -125,14 +118,12 @@ class Controller:
         return b"\0"  # anything else is refused
 
     def package(self) -> bytes:
-        """The next state."""
         row = self.rows[min(self.sent, len(self.rows) - 1)]
         values = {"timestamp": [START_S + self.sent * PERIOD_S], "actual_q": row}
         self.sent += 1
         return struct.pack(">B", RECIPE) + b"".join(struct.pack(TYPES[n][1], *values[n]) for n in self.names)
 
     def say(self, kind: str, content: bytes) -> None:
-        """Send one package."""
         try:
             self.reader.sendall(struct.pack(">HB", 3 + len(content), ord(kind)) + content)
         except ConnectionError:

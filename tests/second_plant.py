@@ -15,7 +15,6 @@ from puncture_twin.twin.plant.true_needle import TrueNeedle
 
 PIXEL_MM = 0.1
 """Of a picture by the probe."""
-
 FOCAL_PX, BASELINE_MM, DISTANCE_MM = 9000.0, 1200.0, 3000.0
 """Of the pinholes, and how far from them the robot's base is."""
 
@@ -27,15 +26,12 @@ class Uniform:
         self._rng = np.random.default_rng(seed)
 
     def normal(self, loc=0.0, scale=1.0, size=None):
-        """Uniform within sqrt(3) deviations."""
         return loc + scale * self._rng.uniform(-np.sqrt(3.0), np.sqrt(3.0), size)
 
     def uniform(self, *args, **kwargs):
-        """As NumPy's."""
         return self._rng.uniform(*args, **kwargs)
 
     def spawn(self, count):
-        """Others like this one."""
         return [Uniform(seed) for seed in self._rng.integers(2**32, size=count)]
 
 
@@ -79,7 +75,6 @@ class PinholePair:
 
     @classmethod
     def placed(cls, device, count, rng):
-        """Looking at the robot from anywhere around."""
         return cls(device, Rotation.random(count, random_state=0), rng)
 
     def read(self, points_base):
@@ -115,7 +110,6 @@ class PicturingProbe:
 
     @classmethod
     def placed(cls, device, across, count, rng):
-        """Probes whose pictures have this normal."""
         first = np.cross(across, [1.0, 0.0, 0.0] if abs(across[0]) < 0.9 else [0.0, 1.0, 0.0])
         first /= np.linalg.norm(first)
         axes = np.array([first, np.cross(across, first), across])
@@ -124,11 +118,9 @@ class PicturingProbe:
         return cls(axes, rng.normal(0.0, device.calibration_sd_mm, (count, 3)), read)
 
     def target(self, points_base):
-        """Targets as the pictures show them, mm, base axes."""
         return self._shown(points_base, "target")
 
     def tip(self, points_base):
-        """Tips likewise."""
         return self._shown(points_base, "tip")
 
     def _shown(self, points_base, what):

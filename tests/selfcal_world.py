@@ -35,7 +35,6 @@ def as_estimate(truth):
 
 
 def degenerate_set(name, seed=3, n=24):
-    """Poses of a set that shows too little: truth, A and the needle in the image."""
     rng = np.random.default_rng(seed)
     truth = draw_truth(rng)
     A, seen = np.array(draw_probe_poses(rng, truth, n)), draw_image_poses(rng, n)

@@ -48,7 +48,6 @@ class Simulated(NamedTuple):
 
 
 def start_configurations():
-    """Commands for the twelve calibration points and the sixteen targets."""
     targets = apply(head_pose(CASE), CASE.targets.points)
     return configurations(HELD, np.concatenate([grid_points(CASE), targets]), NoContacts()).q
 

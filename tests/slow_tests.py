@@ -15,7 +15,6 @@ import pytest
 LIST = Path(__file__).with_name("slow_tests.txt")
 SLOW_S = 0.07
 """Of one case, without the fixtures that it shares."""
-
 SLOW_FIXTURE_S = 1.5
 """Of a shared fixture, without others below it: whatever uses it is slow, since one test alone pays for all of it."""
 

@@ -34,7 +34,6 @@ NO_ARM = {
 }
 SLICES = {"ct_pixel_mm": 1.0, "ct_spacing_mm": 5.0, "bed_axis": (1.0, 0.0, 0.0)}
 """Of the carton (Chen 2019): pixels of 1 mm, slices of 5 mm."""
-
 DIRECTIONS = {"abdomen/case.toml": (62.0, 96.0), "carton/case_m.toml": (18.0, 232.0)}
 """Of each case, one that a UR3 reaches, degrees."""
 

@@ -1,7 +1,6 @@
 """The devices that guidance speaks to: commands in, readings out, named as the CRTK convention names them.
 
-``jp`` are joint positions, ``cp`` is a place in space; `measured` is what a device reads, `move` ends at rest. Nothing
-here holds a true pose or an error that was drawn: the simulated plant answers like this, and so can real devices.
+``jp`` are joint positions, ``cp`` is a place in space; `measured` is what a device reads, `move` ends at rest.
 """
 
 from __future__ import annotations
@@ -42,12 +41,7 @@ class Cameras(Protocol):
     """Cameras that are read one at a time."""
 
     def measured_image(self, number: int, about_px: Floats, reach_px: float) -> GreyImage:
-        """A new image.
-
-        Args:
-            number: Of the camera, from 0.
-            about_px: Shape (2,), a pixel; the image shows at least what is within reach of it.
-        """
+        """A new image of a camera, from 0, that shows at least what is within reach of a pixel (2,)."""
 
 
 class MeasuringArm(Protocol):
@@ -75,17 +69,7 @@ class JogOperator(Protocol):
     """A person who jogs the needle's arm until the needle shows in the image, or a servo that does."""
 
     def jogged_jp(self, tip_mm: Floats, direction: Floats, roll: float, q: Floats) -> Floats:
-        """Joints at which the needle shows as wished.
-
-        Args:
-            tip_mm: Shape (2,), where its tip is wished in the image.
-            direction: Shape (2,), unit, along it toward the tip, in the image.
-            roll: Of the needle about itself, rad.
-            q: Shape (6,), rad, from where it is jogged.
-
-        Returns:
-            Shape (6,), rad, not moved to yet; NaN out of reach.
-        """
+        """Joints (6,), rad, at which tip (2,) and direction (2,) show as wished, not moved to yet; NaN out of reach."""
 
 
 class ControlScan(NamedTuple):

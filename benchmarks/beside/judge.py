@@ -14,14 +14,7 @@ PER_MM2 = 1.5
 
 
 class Passed(NamedTuple):
-    """What the axis of one needle passes.
-
-    Attributes:
-        part: Its name.
-        row: Of the needle.
-        deepest_mm: How deep within the part, and beyond the trunk's skin, the axis runs.
-        long_mm: How far.
-    """
+    """What the axis of one needle passes: how deep within a part, and beyond the trunk's skin, and how far."""
 
     part: str
     row: int
@@ -31,16 +24,13 @@ class Passed(NamedTuple):
 
 def crossings(mesh, origin, directions):
     """Where rays from one point cross a surface, shape (rows, triangles), NaN elsewhere; + where they leave it."""
-    a, b, c = np.moveaxis(np.asarray(mesh.vertices)[np.asarray(mesh.faces)], 1, 0)
-    normal, off = np.cross(b - a, c - a), a - origin
+    a, b, c = np.moveaxis(np.asarray(mesh.vertices)[np.asarray(mesh.faces)] - origin, 1, 0)
+    normal = np.cross(b - a, c - a)
     leaves = directions @ normal.T
     with np.errstate(divide="ignore", invalid="ignore"):
-        at = np.sum(off * normal, axis=1) / leaves
-        hit = origin + at[..., None] * directions[:, None]
-        inside = np.ones(at.shape, bool)
-        for p, q in ((a, b), (b, c), (c, a)):
-            inside &= np.einsum("rti,ti->rt", np.cross(q - p, hit - p), normal) >= 0
-    return np.where(inside & (at > 0), at, np.nan), np.sign(leaves)
+        at, way = np.sum(a * normal, axis=1) / leaves, np.sign(leaves)
+    sides = [way * (directions @ np.cross(p, q).T) for p, q in ((a, b), (b, c), (c, a))]  # of each edge's plane
+    return np.where((np.minimum.reduce(sides) >= 0) & (at > 0), at, np.nan), way
 
 
 def inside(mesh, origin, directions, depths):
@@ -64,32 +54,23 @@ class Distances:
         count = int(np.clip(PER_MM2 * one.area, 1000, 400_000))
         self.tree = cKDTree(np.concatenate([trimesh.sample.sample_surface(one, count, seed=0)[0], mesh.vertices]))
 
-    def __call__(self, points):
-        """Of points (..., 3)."""
-        return self.tree.query(points)[0]
+    def __call__(self, points, most_mm=np.inf):
+        """Of points (..., 3); infinite where it is more than is asked for."""
+        return self.tree.query(points, distance_upper_bound=most_mm)[0]
 
 
 def passed(parts, skin, origin, directions, lengths):
-    """What needles pass outside of the trunk.
-
-    Args:
-        parts: Name to closed surface.
-        skin: The trunk's.
-        origin: The target.
-        directions: Outward, shape (n, 3).
-        lengths: Of the axes, from the target on, shape (n,).
-    """
+    """What needles from an origin pass outside of the trunk, of parts by name; lengths (n,) along directions (n, 3)."""
     found = []
     if not len(directions):
         return found
     depths = np.arange(0.0, lengths.max(), STEP_MM)
     outside = ~inside(skin, origin, directions, depths) & (depths <= lengths[:, None])
+    to_skin = Distances(skin)
     for name, mesh in parts.items():
         within = inside(mesh, origin, directions, depths) & outside
         rows = np.flatnonzero(within.any(axis=1))
-        if not len(rows):
-            continue
-        to_part, to_skin = Distances(mesh), Distances(skin)
+        to_part = Distances(mesh) if len(rows) else None
         for row in rows:
             points = origin + depths[within[row], None] * directions[row]
             deepest = np.minimum(to_part(points), to_skin(points)).max()
@@ -99,12 +80,9 @@ def passed(parts, skin, origin, directions, lengths):
 
 def lacks(mesh, origin, directions, lengths, wanted_mm):
     """By how much needles from the target to the skin lack clearance, mm, shape (n,); 0 where they do not."""
-    to = Distances(mesh)
-    found = np.zeros(len(directions))
-    for row, (direction, length) in enumerate(zip(directions, lengths, strict=True)):
-        depths = np.arange(0.0, length, STEP_MM)
-        near = to(origin + depths[:, None] * direction).min()
-        if inside(mesh, origin, direction[None], depths).any():
-            near = 0.0
-        found[row] = max(0.0, wanted_mm - near)
-    return found
+    to, depths = Distances(mesh), np.arange(0.0, lengths.max(initial=0.0), STEP_MM)
+    on = depths < lengths[:, None]
+    within = (inside(mesh, origin, directions, depths) & on).any(axis=1)
+    points = (origin + depths[row, None] * way for row, way in zip(on, directions, strict=True))
+    near = np.array([to(some, wanted_mm).min() for some in points])
+    return np.where(within, wanted_mm, np.maximum(0.0, wanted_mm - near))

@@ -38,9 +38,6 @@ class Judged:
     """What a search on the scan said, and what is true.
 
     Attributes:
-        asked: The scene.
-        context: Of the scanned case.
-        found: Its candidates.
         passed: What safe needles truly pass outside of the trunk.
         blind: What those pass that are safe for the meshes alone, which know of nothing beside the patient.
         lacks: Name of a structure to the clearance that its safe needles lack at most, mm.

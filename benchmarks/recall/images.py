@@ -41,11 +41,8 @@ class Image(NamedTuple):
     """One image.
 
     Attributes:
-        name: As in the table.
         make: Writes CT, labels and case into a folder, given that of the real data, and gives what is true.
-        ambiguous: Whether a person could not tell either.
         fine: Finer than 2 mm: asked for by `--fine`.
-        real: Whether it needs the real data.
         arms: What a person who looks at it states of ``[ct] arms``; None where the region says it.
     """
 
@@ -75,9 +72,8 @@ def declare(folder: Path, arms: str) -> None:
 def start(folder: Path, target, region=None) -> None:
     """The case as `init` makes it."""
     text = ",".join(f"{one:.3f}" for one in target)
-    init_case(
-        Request(folder, text, None, region, Wanted(Space.LPS, None, None, None, None)), force=True, watcher=Silent()
-    )
+    wanted = Wanted(Space.LPS, None, None, None, None)
+    init_case(Request(folder, text, None, region, wanted), force=True, watcher=Silent())
     asked_alike(folder)
 
 
@@ -122,22 +118,17 @@ def phantom(name: str, table: bool, step: float = 2.0) -> Callable[[Path, Path |
     def make(folder: Path, data: Path | None) -> Scene:
         block, image = BLOCKS[name], Grid.of((-150, -120, -160), (150, 120, 160), step)
         truth = Grid.of((-300, -300, -300), (300, 300, 300), 3.0)
-        hu, labels, names = (
-            np.full(image.shape, AIR),
-            np.zeros(image.shape, np.uint8),
-            ["lesion", "vessel", *block.others],
-        )
+        hu, labels = np.full(image.shape, AIR), np.zeros(image.shape, np.uint8)
+        names = ["lesion", "vessel", *block.others]
         scenes = []
         for grid in (image, truth):
             x, y, z = grid.axes()
             inside = block.depth(x, y, z) >= 0
             masks = {"lesion": x**2 + y**2 + z**2 <= 8**2}
-            masks["vessel"] = (x - VESSEL[0][0]) ** 2 + (y - VESSEL[0][1]) ** 2 + (z - VESSEL[0][2]) ** 2 <= VESSEL[
-                1
-            ] ** 2
-            masks |= {
-                one: np.broadcast_to(where(x, y, z), grid.shape) & inside for one, (_, where) in block.others.items()
-            }
+            (a, b, c), radius = VESSEL
+            masks["vessel"] = (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2 <= radius**2
+            for one, (_, where) in block.others.items():
+                masks[one] = np.broadcast_to(where(x, y, z), grid.shape) & inside
             below = y - block.bottom
             bed = np.broadcast_to((below > 0) & (below <= 24) & (abs(x) < 140) & (table & (abs(z) < 1e3)), grid.shape)
             plate = bed & (below > 20)
@@ -160,10 +151,8 @@ def write_lab(folder: Path, image: Grid, hu, labels, names, target=(0.0, 0.0, 0.
     write_nifti(folder / "ct.nii.gz", np.round(hu).astype(np.int16), _matrix(image))
     write_nifti(folder / "labels.nii.gz", labels, _matrix(image))
     text = f'schema = 2\nregion = "{region}"\nname = "lab"\nspace = "LPS"\n\n[target]\n'
-    text += f"position_mm = {list(map(float, target))}\n"
-    text += (
-        f'structure = "lesion"\n\n{NEEDLE}\n{SEARCH}\n[[structure]]\nname = "skin"\nct = "ct.nii.gz"\nrole = "skin"\n'
-    )
+    text += f'position_mm = {list(map(float, target))}\nstructure = "lesion"\n\n{NEEDLE}\n{SEARCH}\n'
+    text += '[[structure]]\nname = "skin"\nct = "ct.nii.gz"\nrole = "skin"\n'
     for number, name in enumerate(names, start=1):
         role = 'role = "target"' if name == "lesion" else 'role = "avoid"\nmargin_mm = 2.0'
         text += f'\n[[structure]]\nname = "{name}"\nlabelmap = "labels.nii.gz"\nlabel = {number}\n{role}\n'
@@ -230,11 +219,8 @@ def abdomen(target, low=None, high=None, step=None) -> Callable[[Path, Path | No
         if step is not None:
             factor = grid.step / step
             hu = ndimage.zoom(hu.astype(np.float32), factor, order=1, grid_mode=False)
-            index = [
-                np.clip(np.round(np.linspace(0, n - 1, m)).astype(int), 0, n - 1)
-                for n, m in zip(labels.shape, hu.shape, strict=True)
-            ]
-            labels = labels[np.ix_(*index)]
+            sizes = zip(labels.shape, hu.shape, strict=True)
+            labels = labels[np.ix_(*(np.round(np.linspace(0, n - 1, m)).astype(int) for n, m in sizes))]
             real = grid.step * (np.array(grid.shape) - 1) / (np.array(hu.shape) - 1)
             grid = Grid(grid.low, real, hu.shape)
         z = grid.low[2] + grid.step[2] * np.arange(grid.shape[2])
@@ -253,15 +239,8 @@ def abdomen(target, low=None, high=None, step=None) -> Callable[[Path, Path | No
 
 
 GASES = ("lung", "stomach", "bowel", "colon", "duodenum", "esophagus", "trachea")
-CHEST = {
-    "ribs": 1,
-    "cervical vertebral column": 2,
-    "thoracic vertebral column": 3,
-    "lumbar vertebral column": 4,
-    "right lung": 5,
-    "left lung": 6,
-    "tissue": 7,
-}
+COLUMNS = ("cervical vertebral column", "thoracic vertebral column", "lumbar vertebral column")
+CHEST = {name: number for number, name in enumerate(("ribs", *COLUMNS, "right lung", "left lung", "tissue"), start=1)}
 CHEST_CASE = """schema = 2
 region = "chest"
 name = "chest"
@@ -296,9 +275,8 @@ def chest(target, holds: str) -> Callable[[Path, Path | None], Scene]:
             (folder / name).write_bytes((source / name).read_bytes())
         lungs = ", ".join(f'"{one}" = 2' for one in ("right lung", "left lung") if one != holds)
         crossed = "" if holds == "tissue" else 'traverse = ["tissue"]\n'
-        text = CHEST_CASE.format(
-            target=list(target), holds=holds, crossed=crossed, lungs=lungs, asked=NEEDLE + "\n" + SEARCH
-        )
+        named = {"target": list(target), "holds": holds, "crossed": crossed, "lungs": lungs}
+        text = CHEST_CASE.format(**named, asked=NEEDLE + "\n" + SEARCH)
         (folder / "case.toml").write_text(text, encoding="utf-8")
         hu, labels, grid = _pair(source / "CTChest4.nrrd", source / "Segmentation.seg.nrrd")
         return _real(hu, labels, CHEST, grid, np.array(target), ("lung",))
@@ -320,15 +298,8 @@ def _pair(ct: Path, labels: Path):
 def _real(hu, labels, names, grid: Grid, target, gases) -> Scene:
     """What can be known of a real image, by the simple means of the module's first lines."""
     ball = np.ceil(6.0 / grid.step).astype(int)
-    rod = (
-        np.linalg.norm(
-            np.stack(
-                np.meshgrid(*(np.arange(-n, n + 1) * s for n, s in zip(ball, grid.step, strict=True)), indexing="ij")
-            ),
-            axis=0,
-        )
-        <= 6.0
-    )
+    axes = (np.arange(-n, n + 1) * s for n, s in zip(ball, grid.step, strict=True))
+    rod = np.linalg.norm(np.stack(np.meshgrid(*axes, indexing="ij")), axis=0) <= 6.0
     dense = np.pad(hu > -300, [(n, n) for n in ball], mode="edge")
     opened = ndimage.binary_opening(dense, rod)[tuple(slice(n, -n) for n in ball)] | (labels > 0)
     parts, _ = ndimage.label(opened)
@@ -393,12 +364,7 @@ IMAGES = (
         arms="present",
     ),
     Image("trunk2_up_none", drawn(2, "none", "none", 2, _scan(3.0, 2.5, 20.0, 4))),
-    Image(
-        "trunk2_across_pad",
-        drawn(2, "across", "pad", 0, _scan(4.0, 3.0, 20.0, 5)),
-        ambiguous=True,
-        arms="present",
-    ),
+    Image("trunk2_across_pad", drawn(2, "across", "pad", 0, _scan(4.0, 3.0, 20.0, 5)), ambiguous=True, arms="present"),
     Image("trunk3_up_narrow", drawn(3, "none", "curved", 0, _scan(3.0, 2.0, 20.0, 6, fov=300.0)), ambiguous=True),
     Image("trunk3_beside_flat", drawn(3, "beside", "flat", 2, _scan(seed=7)), arms="present"),
     Image("abdomen_fine_liver", abdomen(LIVER_SIDE, step=(0.78, 0.78, 1.0)), fine=True, real=True),

@@ -53,18 +53,12 @@ class Scene:
     """What is true.
 
     Attributes:
-        grid: Of the masks.
-        image: Of what was scanned.
-        body: Mask of the trunk, or of the phantom.
         foreign: What lies beside it: arms, table, lines.
         limbs: Those of the foreign that are the person's: a face that cuts them cuts the person.
-        structures: Name to mask.
         doubtful: What keeps a direction from being free and makes none wrong: dense and gas that no label names.
         unscanned: What the scanner did not measure.
         real: Nothing is known beyond the image.
         lies_unseen: A patient, whose image does not show for sure what they lie on: what is beyond its back is unseen.
-        margins: Of the structures that demand one, mm.
-        target: Shape (3,), mm.
     """
 
     grid: Grid

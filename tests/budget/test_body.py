@@ -74,7 +74,8 @@ def test_rooms_with_bevel_and_breath_err_as_predicted(chain, gate):
         chain.target_ct, outward_ct, chain.q_insertion, Path.bend,
     )  # fmt: skip
     rng = np.random.default_rng(11)
-    rooms = draw_trials(puncture, chain.errors, ROOMS, rng).reached_alone()
+    rooms = draw_trials(puncture, chain.errors, ROOMS, rng)
+    rooms = rooms.of(rooms.reached)
     one = both.breathing
     s = drawn_positions(one, len(rooms.tip_ct), rng)
     target = rooms.target_ct[: len(s)] + (s - one.scanned_at)[:, None] * one.amplitude_mm * one.direction_ct

@@ -86,7 +86,8 @@ def test_rooms_drawn_with_one_source_err_as_it_costs(name, source):
         one.model, one.tip_mm, one.method, noise, one.points_ct, one.q_touch, one.T_base_ct, one.target_ct, outward_ct,
         one.q_insertion,
     )  # fmt: skip
-    rooms = draw_trials(puncture, _alone(one.errors, source), 4000, np.random.default_rng(6)).reached_alone()
+    rooms = draw_trials(puncture, _alone(one.errors, source), 4000, np.random.default_rng(6))
+    rooms = rooms.of(rooms.reached)
     realised = np.sqrt(np.mean(np.sum((rooms.tip_ct - rooms.target_ct) ** 2, axis=1)))
     predicted = {cost.source: cost.alone_mm for cost in source_costs(one)}[source]
     assert realised == pytest.approx(predicted, rel=0.03)

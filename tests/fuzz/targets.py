@@ -27,7 +27,7 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.guidance.stereo.servo_case import load_servo_case
 from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import load_selfcal_case
-from puncture_twin.twin.jobs.live.mirror import RecordedJoints
+from puncture_twin.twin.jobs.live.mirror import recorded
 from puncture_twin.twin.pictures import read_frames
 
 
@@ -209,6 +209,6 @@ TARGETS = [
     Target("output set", {"set.json": "tree"}, rewritten_set, whole_set),
     Target("recording", {"recording.csv": "table"}, read_recording, whole_recording),
     Target("pictures", {"seen.png": "text", "seen.dcm": "dicom", "clip.dcm": "dicom"}, read_frames, whole_frames),
-    Target("joints", {"joints.csv": "table"}, lambda path: list(RecordedJoints.read(path).states()), whole_states),
+    Target("joints", {"joints.csv": "table"}, lambda path: list(recorded(path).states), whole_states),
     Target("times", {"times.csv": "table"}, read_times, whole_motion),
 ]

@@ -21,15 +21,15 @@ OUTWARD = np.array([-0.89, -0.437, -0.126]) / np.linalg.norm([-0.89, -0.437, -0.
 
 
 def scanner(off, *, needle=True):
-    """A scanner with the patient in, rotated by 3 degrees, the tip ``off`` the target: its slices are coarse."""
+    """140 mm of a patient, rotated by 3 degrees, the tip ``off`` the target: slices are coarse."""
     context = prepare(CASE, arm=False)
-    settings, rng = ScanSettings(3.0, 1.2, 15.0, turn=np.radians(3.0)), np.random.default_rng(1)
+    settings = ScanSettings(3.0, 1.2, 15.0, length_mm=140.0, turn=np.radians(3.0))
+    rng = np.random.default_rng(1)
     rod = TrueRod(context.case.target_ct + np.array(off), -OUTWARD) if needle else None
     return VirtualScanner(case_scene(context.case, context.anatomy, settings, rng, needle=rod), settings, rng)
 
 
 def scanned(place, off, *, needle=True, series=False):
-    """A scan of it; the file, and T_scan_ct."""
     device = scanner(off, needle=needle)
     image, T = device.image(), device.scene.T_scan_ct
     if series:
@@ -40,21 +40,22 @@ def scanned(place, off, *, needle=True, series=False):
 
 @pytest.fixture(scope="module")
 def control(tmp_path_factory):
-    """A scan whose tip is 4 mm short."""
     place = tmp_path_factory.mktemp("control")
     return place, *scanned(place, 4.0 * OUTWARD)
 
 
-def answered(arguments, capfd):
-    """Exit code and JSON of a command."""
-    code = main([*map(str, arguments), "--json"])
-    return code, json.loads(capfd.readouterr().out)
-
-
-def test_a_needle_is_read_in_the_cases_frame(control, capfd):
-    """Where it truly is, tied by markers over a rotation; its line safe as `check` has it; the next aim is deeper."""
+@pytest.fixture(scope="module")
+def confirmed(control):
+    """What the command says of its files, its exit code, and the names of what it wrote."""
     place, file, _ = control
-    code, found = answered(["confirm", CASE, "--scan", file, "--out", place / "out"], capfd)
+    code = main(["confirm", str(CASE), "--scan", str(file), "--out", str(place / "out"), "--json"])
+    written = {one.name for one in (place / "out").iterdir()}
+    return code, json.loads((place / "out" / "confirm.json").read_text()), written
+
+
+def test_a_needle_is_read_in_the_cases_frame(confirmed):
+    """Where it truly is, tied by markers over a rotation; its line safe as `check` has it; the next aim is deeper."""
+    code, found, written = confirmed
     context = prepare(CASE, arm=False)
     assert found["frames"]["tied_by"] == "markers"
     off = np.array(found["tip_ct_mm"]) - context.case.target_ct - 4.0 * OUTWARD
@@ -63,20 +64,18 @@ def test_a_needle_is_read_in_the_cases_frame(control, capfd):
     assert found["depth_mm"] == pytest.approx(-4.0, abs=0.8) and found["lateral_mm"] < 0.9
     assert (found["bent"], found["angle_deg"], found["in_predicted_region"]) == (False, None, None)
     assert found["verdict"] == "safe" and code == (found["next_aim"]["kind"] != "accept")
-    assert {"confirm.html", "confirm.png", "confirm.json"} <= {one.name for one in (place / "out").iterdir()}
-    listed = {one["role"] for one in found["inputs"]}
-    assert "control ct" in listed
+    assert {"confirm.html", "confirm.png", "confirm.json"} <= written
+    assert "control ct" in {one["role"] for one in found["inputs"]}
 
 
-def test_a_scan_is_read_off_the_scanner_as_off_its_files(control):
+def test_a_scan_is_read_off_the_scanner_as_off_its_files(control, confirmed):
     """Two devices of one protocol: the needle and what is to be done are the same; files are inputs, a scanner none."""
-    _, file, _ = control
-    context = prepare(CASE, arm=False)
-    live, kept = (confirm_needle(context, one) for one in (scanner(4.0 * OUTWARD), ScanFiles(file)))
-    np.testing.assert_allclose(live.needle.tip_ct, kept.needle.tip_ct, atol=1e-4)
-    np.testing.assert_allclose(live.needle.cov_ct, kept.needle.cov_ct, rtol=1e-3)
-    assert [one.kind for one in live.aims] == [one.kind for one in kept.aims]
-    assert not live.read and [one.role for one in kept.read] == ["control ct"]
+    live, found = confirm_needle(prepare(CASE, arm=False), scanner(4.0 * OUTWARD)), confirmed[1]
+    np.testing.assert_allclose(live.needle.tip_ct, found["tip_ct_mm"], atol=1e-4)
+    np.testing.assert_allclose(live.needle.cov_ct[:3, :3], found["tip_cov_mm2"], rtol=1e-3)
+    np.testing.assert_allclose(live.needle.cov_ct[3:, 3:], found["axis_cov_rad2"], rtol=1e-3)
+    assert [one.kind for one in live.aims] == [one["kind"] for one in found["aims"]]
+    assert not live.read and [one.role for one in ScanFiles(control[1]).measured_scan().inputs] == ["control ct"]
 
 
 def test_every_bone_ties_the_frames():
@@ -135,9 +134,9 @@ def confirmations(folder, scale, count, seed=0):
 
 def test_needles_tell_the_size_of_the_errors(tmp_path, capfd):
     """Twice as large as declared, in 40 needles: the interval holds 2 and not 1; in three it says that they are few."""
-    code, found = answered(["confirm", *confirmations(tmp_path, 2.0, 40)], capfd)
-    assert code == 0 and found["needles"] == 40
-    assert 1.0 < found["low"] < 2.0 < found["high"]
+    assert main(["confirm", *map(str, confirmations(tmp_path, 2.0, 40)), "--json"]) == 0
+    found = json.loads(capfd.readouterr().out)
+    assert found["needles"] == 40 and 1.0 < found["low"] < 2.0 < found["high"]
     assert main(["confirm", *map(str, confirmations(tmp_path, 1.0, 3))]) == 0
     assert "say little" in capfd.readouterr().out
 

@@ -265,21 +265,13 @@ def refusal(code):
     return pt.InputError("damaged", where="here", allowed="none", code=code)
 
 
-@pytest.mark.parametrize(
-    ("matrix", "code"),
-    [
-        (np.diag([1.0, 1.0, -1.0, 1.0]), "not_rigid"),
-        (np.diag([2.0, 2.0, 2.0, 1.0]), "not_rigid"),
-        (np.zeros((4, 4)), "not_rigid"),
-        (np.full((4, 4), np.inf), "not_finite"),
-        (np.full((4, 4), 3e38), "not_rigid"),
-    ],
-    ids=["mirrored", "scaled", "zero", "infinite", "huge"],
-)
-def test_a_pose_that_no_needle_has_is_refused(planner, matrix, code):
-    found = asked(planner, "TRANSFORM", "Needle", transform(matrix))
-    said = document(found, "Verdict")
-    assert (said["verdict"], said["error"]["code"], found["POINT Entry"]) == ("refused", code, b"")
+def test_a_pose_that_no_needle_has_is_refused(planner):
+    """Mirrored, scaled, zero, huge; infinite."""
+    wrong = np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([2.0, 2.0, 2.0, 1.0]), np.zeros((4, 4)), np.full((4, 4), 3e38)
+    for matrix, code in (*((one, "not_rigid") for one in wrong), (np.full((4, 4), np.inf), "not_finite")):
+        found = asked(planner, "TRANSFORM", "Needle", transform(matrix))
+        said = document(found, "Verdict")
+        assert (said["verdict"], said["error"]["code"], found["POINT Entry"]) == ("refused", code, b"")
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -301,15 +293,12 @@ def test_a_case_in_a_frame_of_its_own_is_refused():
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory):
-    """A client that was made with the OpenIGTLink library, in C++."""
     compiler, out = shutil.which("g++"), tmp_path_factory.mktemp("client") / "live_client"
     headers = Path("/usr/include/openigtlink")
     if compiler is None or not headers.is_dir():
         pytest.skip("no C++ compiler, or no OpenIGTLink library: apt-get install g++ libopenigtlink-dev")
-    source = str(ROOT / "tests" / "live_client.cpp")
-    subprocess.run(
-        [compiler, "-O1", "-I", str(headers), source, "-o", str(out), "-lOpenIGTLink", "-lpthread"], check=True
-    )
+    words = ["-O1", "-I", headers, ROOT / "tests" / "live_client.cpp", "-o", out, "-lOpenIGTLink", "-lpthread"]
+    subprocess.run([compiler, *map(str, words)], check=True)
     return out
 
 
@@ -339,15 +328,11 @@ def test_a_client_of_other_construction_reads_every_answer(compiled, served):
     """The OpenIGTLink library finds the checksums right, and in the messages what the API says."""
     context = pt.prepare(served.case)
     x, y, z = RAS * context.case.target_ct
-    done = subprocess.run(
-        [compiled, str(served.port), "2", str(x), str(y), str(z)], capture_output=True, text=True, timeout=60
-    )
+    command = [compiled, *map(str, (served.port, 2, x, y, z))]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
-    lines = [line.split(" ") for line in done.stdout.splitlines()]
-    assert [line[0] for line in lines] == [
-        *("map", "grid", "info", "verdict", "entry"),
-        *("map", "grid", "info", "verdict", "entry", "verdict", "entry", "tracked"),
-    ]
+    lines, answer = [line.split(" ") for line in done.stdout.splitlines()], ["map", "grid", "info", "verdict", "entry"]
+    assert [line[0] for line in lines] == [*answer, *answer, "verdict", "entry", "tracked"]
     expected, n = pt.safe_map(context), len(context.case.directions())
     assert [float(one) for one in lines[0][2:]] == [4 * n, n, expected.blocked.sum(), -1, 0]
     verdicts = [(line[2], json.loads(" ".join(line[3:]))) for line in lines if line[0] == "verdict"]

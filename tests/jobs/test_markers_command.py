@@ -18,7 +18,6 @@ from puncture_twin.twin.plant.scanner.writers import write_nifti
 
 @pytest.fixture(scope="module")
 def patient(tmp_path_factory):
-    """True centres, and a folder with a CT and masks of two organs."""
     here, rng = tmp_path_factory.mktemp("patient"), np.random.default_rng(3)
     true, solids = scene(Markers(count=5), rng, others=False)
     volume = scanned(solids, ScanSettings(2.5, 1.0), rng)

@@ -5,6 +5,7 @@ import itertools
 import json
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,10 +30,9 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.jobs.live import led_touches, mirror, rtde
 
 ABDOMEN = folder() / "abdomen"
-
 HOST = "127.0.0.47"
 """A loopback address of its own, so that a controller's ports are free there."""
-
+COLUMNS = "time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"
 needs_the_extra = pytest.mark.skipif(
     importlib.util.find_spec("rtde_receive") is None, reason="ur-rtde is not installed: pip install '.[mirror]'"
 )
@@ -90,10 +90,10 @@ def test_a_live_arm_is_read_until_its_time_is_over(drive):
     assert [state.time_s for state in states] == [100.5, 101.0, 101.5, 102.0]
 
 
-@pytest.mark.parametrize("rows", [[[0.0] * 5], [[0.0] * 5 + [np.nan]]])
-def test_joint_angles_that_are_none_are_refused(rows):
-    with refused("joints"):
-        next(rtde.live_states(FakeArm(rows), period_s=0.0, seconds=None))
+def test_joint_angles_that_are_none_are_refused():
+    for row in ([0.0] * 5, [0.0] * 5 + [np.nan]):
+        with refused("joints"):
+            next(rtde.live_states(FakeArm([row]), period_s=0.0, seconds=None))
 
 
 class SilentArm(FakeArm):
@@ -141,7 +141,7 @@ def test_a_controller_is_mirrored_as_its_recording_is(rows, tmp_path, capfd):
     """Through ur-rtde itself: the same tips. The controller is sent four packages that set up the reading, no more."""
     recording = tmp_path / "joints.csv"
     lines = [f"{START_S + i * PERIOD_S!r},{','.join(map(repr, map(float, q)))}" for i, q in enumerate(rows)]
-    recording.write_text("\n".join(["time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad", *lines]))
+    recording.write_text("\n".join([COLUMNS, *lines]))
     assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(recording), "--json"]) == 0
     recorded = json.loads(capfd.readouterr().out)["states"]
     with rtde_server(HOST, rows) as controller:
@@ -181,7 +181,7 @@ def test_a_recording_is_mirrored(drive, tmp_path, capsys):
     """As `export --format csv` writes it, comments and other columns and all; text a line a state, JSON one object."""
     path = tmp_path / "joints.csv"
     rows = [f"insertion,{i * 0.1},{','.join(map(repr, map(float, q)))}" for i, q in enumerate(drive.insertion_q[-3:])]
-    path.write_text("\n".join(["# a comment", "phase,time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad", *rows]))
+    path.write_text("\n".join(["# a comment", f"phase,{COLUMNS}", *rows]))
     assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(path)]) == 0
     captured = capsys.readouterr()
     assert "joints.csv: its last line has no line break at its end; was the file cut?" in captured.err
@@ -197,20 +197,15 @@ def test_a_recording_is_mirrored(drive, tmp_path, capsys):
     np.testing.assert_allclose(np.radians(said[-1]["q_deg"]), drive.insertion_q[-1], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("text", "match"),
-    [
-        ("time_s,q1_rad\n0,0\n", "missing_column q2_rad"),
-        ("time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n0,0,0,x,0,0,0\n", "not_a_number"),
-    ],
-)
-def test_recordings_that_cannot_be_read_are_refused(tmp_path, text, match):
+def test_recordings_that_cannot_be_read_are_refused(tmp_path):
+    wrong = {"time_s,q1_rad\n0,0\n": "missing_column q2_rad", f"{COLUMNS}\n0,0,0,x,0,0,0\n": "not_a_number"}
     path = tmp_path / "joints.csv"
-    path.write_text(text)
-    with refused(*match.split()):
-        list(mirror.RecordedJoints.read(path).states())
     with refused("no_such_file"):
-        list(mirror.RecordedJoints.read(tmp_path / "none.csv").states())
+        mirror.recorded(path)
+    for text, said in wrong.items():
+        path.write_text(text)
+        with refused(*said.split()):
+            mirror.recorded(path)
 
 
 @pytest.mark.parametrize(("model", "exits"), [("ur3", 0), ("ur3e", 2)])
@@ -280,7 +275,6 @@ def test_an_arm_that_nobody_leads_is_not_waited_for_without_end(monkeypatch):
 
 @pytest.fixture(scope="module")
 def touched_q():
-    """Joints with the abdomen's needle on each of its markers, (n, 6) rad, and the case."""
     case = load_case(ABDOMEN)
     placement = load_placement(case)
     markers = placement.registration.markers
@@ -320,28 +314,15 @@ def test_markers_are_read_off_a_controller(touched_q, tmp_path, capfd, monkeypat
     assert "".join(kind for kind, _ in controller.received) == "VvOS"
 
 
-class AtMarkers:
-    """An arm that is led to each marker in turn."""
-
-    def __init__(self, q):
-        self.q = list(q)
-
-    def measured_jp(self):
-        return self.q.pop(0)
-
-
-@pytest.mark.parametrize("count", [0, 2])
-def test_too_few_touches_by_hand(touched_q, count, tmp_path):
+def test_too_few_touches_by_hand(touched_q, tmp_path):
     """None is refused; two are kept, and do not register: the rest is named."""
     case, markers, q = touched_q
-    answers = iter([True] * count + [False])
-    if not count:
-        with refused("empty"):
-            led_touches.touch_by_hand(case, AtMarkers(q), lambda _: next(answers), tmp_path)
-        assert not list(tmp_path.iterdir())
-        return
-    read = led_touches.touch_by_hand(case, AtMarkers(q), lambda _: next(answers), tmp_path)
-    assert not read.suffices and read.residuals_mm is None and len(read.left_out) == len(markers.names) - 2
+    arm, answers = SimpleNamespace(measured_jp=iter(q).__next__), iter([True, True, False])
+    with refused("empty"):
+        led_touches.touch_by_hand(case, arm, lambda _: False, tmp_path)
+    assert not list(tmp_path.iterdir())
+    read = led_touches.touch_by_hand(case, arm, lambda _: next(answers), tmp_path)
+    assert not read.suffices and len(read.left_out) == len(markers.names) - 2
     assert read.summary()["fre_mm"] is None and f"not touched: {read.left_out[0]}" in led_touches.led_text(read)
 
 

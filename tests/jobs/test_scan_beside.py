@@ -23,7 +23,6 @@ THICK = ("arm_", "table", "mattress", "pad")
 
 
 def settings(seed, spacing, pixel, noise, fov=None):
-    """A scan of 140 mm about the target."""
     return ScanSettings(spacing, pixel, noise_hu=noise, seed=seed, length_mm=140.0, fov_mm=fov)
 
 

@@ -62,7 +62,6 @@ def meshes():
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory):
-    """The case of meshes: its folder, its context and its answers."""
     folder = tmp_path_factory.mktemp("small")
     text = CASE
     for name, mesh in meshes().items():
@@ -70,16 +69,15 @@ def truth(tmp_path_factory):
         text += f'[[structure]]\nname = "{name}"\nmesh = "{name}.ply"\nunit = "mm"\n{ROLES[name]}\n'
     (folder / "case.toml").write_text(whole(text))
     context = prepare(folder, arm=False)
-    return folder, context, _answers(context, context.case.T_ct_entry[:3, :3])
+    return folder, context, answers(context, context.case.T_ct_entry[:3, :3])
 
 
-def _answers(context, R):
+def answers(context, R):
     directions = grid((0.0, np.pi / 2), (0.0, 2 * np.pi), np.radians(STEP_DEG), R)
     return search(context.case, context.anatomy, context.engine, directions)
 
 
 def started(out, report):
-    """What `init` makes of a scan, with the needle of the case of meshes."""
     target = ",".join(str(round(one, 3)) for one in report["target_mm"])
     assert main(["init", str(out), "--ct", "dicom", f"--target={target}"]) == 0
     text = (out / "case.toml").read_text()
@@ -100,9 +98,7 @@ def clearances(context, found):
     return found.clearance.distance[:, order]
 
 
-@pytest.mark.parametrize(
-    ("spacing", "turn", "noise"), [("5", 0, "20"), ("2.5", 35, "40")], ids=["thick", "turned, noise"]
-)
+@pytest.mark.parametrize(("spacing", "turn", "noise"), [("5", 0, "20"), ("2.5", 35, "40")])
 def test_a_scanned_case_has_the_verdicts_of_its_meshes(truth, tmp_path, capsys, spacing, turn, noise):
     """Whatever has a voxel's diagonal to spare keeps its verdict, and no safe direction is wrong by more than that."""
     folder, context, wanted = truth
@@ -112,11 +108,9 @@ def test_a_scanned_case_has_the_verdicts_of_its_meshes(truth, tmp_path, capsys, 
     report = json.loads(capsys.readouterr().out)
     T = np.array(report["T_scan_case"])
     scanned = started(out, report)
-    found = _answers(scanned, T[:3, :3] @ context.case.T_ct_entry[:3, :3])
-
-    assert {s.name: s.margin_mm for s in scanned.anatomy.structures} == {
-        s.name: s.margin_mm for s in context.anatomy.structures
-    }
+    found = answers(scanned, T[:3, :3] @ context.case.T_ct_entry[:3, :3])
+    margins = ({one.name: one.margin_mm for one in of.anatomy.structures} for of in (scanned, context))
+    assert next(margins) == next(margins)
     voxel = np.linalg.norm([PIXEL, PIXEL, float(spacing)])
     apart = clearances(scanned, found) - clearances(context, wanted)
     assert np.abs(apart).max() < voxel
@@ -147,13 +141,13 @@ def test_what_is_thinner_than_a_voxel_is_not_lost(tmp_path, capsys):
         text += f'[[structure]]\nname = "{name}"\nmesh = "{name}.ply"\nunit = "mm"\n{role}\n'
     (tmp_path / "case.toml").write_text(whole(text))
     context = prepare(tmp_path, arm=False)
-    wanted = _answers(context, context.case.T_ct_entry[:3, :3])
+    wanted = answers(context, context.case.T_ct_entry[:3, :3])
     out = tmp_path / "ct"
     assert main(["scan", str(tmp_path), "--out", str(out), "--spacing", "2.5", "--pixel", "1.5", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["thin_voxels"]["colon"] > 50 and report["thin_voxels"]["ganglion"] >= 1
     scanned = started(out, report)
-    found = _answers(scanned, context.case.T_ct_entry[:3, :3])
+    found = answers(scanned, context.case.T_ct_entry[:3, :3])
     names = [one.name for one in scanned.anatomy.structures]
     margin = {one.name: one.margin_mm for one in scanned.anatomy.structures}
     voxel = np.linalg.norm([1.5, 1.5, 2.5])

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +22,8 @@ BYTES_AT_MOST = 15_000_000
 
 
 def test_every_made_file_is_listed_and_every_listed_file_is_there():
-    """Meshes and point lists are all in the manifest, and nothing else is."""
+    """Meshes and point lists are all in the manifest, and nothing else is; the cases are where the package says."""
+    assert [path.stem for path in CASES] == ["case", "case_h", "case_l", "case_m", "case_m_setup2"]
     made = {path.relative_to(FOLDER).as_posix() for kind in ("ply", "csv") for path in FOLDER.glob(f"*/*.{kind}")}
     assert made == set(FILES)
 
@@ -32,12 +32,9 @@ def test_every_made_file_is_listed_and_every_listed_file_is_there():
 def test_file_has_the_stated_hash_unit_and_licence(path):
     """The hash is that of the file's bytes; unit, space, maker and licence are stated."""
     entry, data = FILES[path], (FOLDER / path).read_bytes()
-    assert hashlib.sha256(data).hexdigest() == entry["sha256"]
-    assert len(data) == entry["bytes"]
-    assert entry["unit"] == "mm"
-    assert entry["space"] in {"LPS", "local", "base"}
-    assert entry["made_by"].startswith("tools.phantoms.")
-    assert entry["licence"] == "Apache-2.0"
+    assert hashlib.sha256(data).hexdigest() == entry["sha256"] and len(data) == entry["bytes"]
+    assert entry["unit"] == "mm" and entry["space"] in {"LPS", "local", "base"}
+    assert entry["made_by"].startswith("tools.phantoms.") and entry["licence"] == "Apache-2.0"
 
 
 @pytest.mark.parametrize("path", MESH_PATHS)
@@ -53,7 +50,12 @@ def test_mesh_is_binary_float32_with_the_stated_triangles(path):
 
 
 def test_the_abdomen_is_large_enough_and_the_whole_small_enough():
-    """At least 12 structures and 200,000 triangles, at most 330,000; all files together at most 15 MB."""
+    """At least 12 structures and 200,000 triangles, at most 330,000; all files together at most 15 MB.
+
+    No structure of the phantom is left out of its case: a forgotten organ would look like free space.
+    """
+    content = tomllib.loads((FOLDER / "abdomen/case.toml").read_text(encoding="utf-8"))
+    assert {structure["name"] for structure in content["structure"]} == set(STRUCTURES)
     counts = [FILES[f"abdomen/{name}.ply"]["triangles"] for name in STRUCTURES]
     assert len(counts) >= 12
     assert 200_000 <= sum(counts) <= 330_000
@@ -75,12 +77,6 @@ def test_case_names_only_files_of_the_manifest(case):
     assert FILES[f"{folder}/{content['rehearsal']['truth_base']}"]["space"] == "base"
 
 
-def test_the_abdomen_case_uses_every_structure():
-    """No structure of the phantom is left out of its case: a forgotten organ would look like free space."""
-    content = tomllib.loads((FOLDER / "abdomen/case.toml").read_text(encoding="utf-8"))
-    assert {structure["name"] for structure in content["structure"]} == set(STRUCTURES)
-
-
 def test_ply_reads_back_as_written():
     """Another reader finds the same triangles, to float32."""
     mesh = carton_meshes()["bolt_l"]
@@ -92,9 +88,3 @@ def test_ply_reads_back_as_written():
 def test_points_are_written_with_names_and_fixed_decimals():
     """The point lists have one header and one row for each name."""
     assert points_csv({"A": np.array([1.0, -2.5, 3.0])}, 3) == b"name,x_mm,y_mm,z_mm\nA,1.000,-2.500,3.000\n"
-
-
-def test_package_folder_is_where_the_cases_are():
-    """The package knows its own folder, however it was installed."""
-    assert isinstance(FOLDER, Path)
-    assert [path.stem for path in CASES] == ["case", "case_h", "case_l", "case_m", "case_m_setup2"]

@@ -13,7 +13,7 @@ from puncture_twin import meshes
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from tests.carton_truth import carton_field
 from tools.phantoms import bones, carton
-from tools.phantoms.abdomen import LESION_CENTRE_LPS_MM, STRUCTURES, abdomen_field, abdomen_mesh
+from tools.phantoms.abdomen import STRUCTURES, abdomen_field, abdomen_mesh
 from tools.phantoms.carton import carton_meshes
 from tools.phantoms.guidance import (
     GUIDANCE_SEED,
@@ -28,6 +28,7 @@ from tools.phantoms.implicit import capsule, ellipsoid, smooth_max
 from tools.phantoms.manifest import ply_bytes
 from tools.phantoms.mesher import SamplingBox, mesh_field
 from tools.phantoms.sweep import tube
+from tools.phantoms.viscera import LESION_CENTRE_LPS_MM
 
 FOLDER = meshes.folder()
 INSIDE_THE_LIVER = ("lesion", "portal_vein", "hepatic_veins")
@@ -41,64 +42,44 @@ SLIVER_DEG = 4.0
 
 @cache
 def abdomen(name: str) -> trimesh.Trimesh:
-    """The committed mesh of one structure."""
     return trimesh.load(FOLDER / f"abdomen/{name}.ply", process=False)
 
 
 def vertices(name: str) -> np.ndarray:
-    """Its vertices, shape (n, 3), mm."""
     return np.asarray(abdomen(name).vertices, dtype=float)
 
 
 def rows(path: str) -> dict[str, np.ndarray]:
-    """A point list, by name."""
     with (FOLDER / path).open(encoding="ascii") as file:
         return {row["name"]: np.array([float(row[f"{axis}_mm"]) for axis in "xyz"]) for row in csv.DictReader(file)}
 
 
 @pytest.fixture(scope="module")
 def inside() -> dict[str, np.ndarray]:
-    """Which nodes of a 10 mm grid over the trunk lie in which structure."""
-    axes = [np.arange(low, high, 10.0) for low, high in ((-170, 171), (-118, 119), (-195, 262))]
+    """Which nodes of a 14 mm grid over the trunk lie in which structure."""
+    axes = [np.arange(low, high, 14.0) for low, high in ((-170, 171), (-118, 119), (-195, 262))]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     return {name: abdomen_field(name)(nodes) < 0 for name in STRUCTURES}
-
-
-# ---- meshes of the abdomen ----
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_mesh_is_closed_oriented_outward_and_without_slivers(name):
     """Watertight by trimesh's and by our own measure, triangles outward, none flat or degenerate."""
     mesh = abdomen(name)
-    assert mesh.is_watertight
-    assert mesh.is_winding_consistent
-    assert mesh.volume > 0
-    assert TriangleMesh(mesh.vertices, mesh.faces).closed
-    assert mesh.area_faces.min() > 0.01
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+    assert TriangleMesh(mesh.vertices, mesh.faces).closed and mesh.area_faces.min() > 0.01
     assert np.degrees(mesh.face_angles.min()) > SLIVER_DEG
     assert np.degrees(np.percentile(mesh.face_angles.min(axis=1), 1)) > 25.0
 
 
 @pytest.mark.parametrize("name", STRUCTURES)
-def test_volume_is_plausible(name):
-    """The volume lies in the range that the phantom states for the structure."""
+def test_a_structure_is_as_large_and_where_it_should_be(name):
+    """A plausible volume; vertices on the true surface (0.2 mm, 99.5 % 1e-3 mm), of organs 2 mm under the skin."""
     low, high = STRUCTURES[name].volume_ml
     assert low <= abdomen(name).volume / 1000 <= high
-
-
-@pytest.mark.parametrize("name", STRUCTURES)
-def test_vertices_lie_on_the_true_surface(name):
-    """Field values at the vertices are within 0.2 mm of 0, and within 1e-3 mm for 99.5 % of them."""
     error = np.abs(abdomen_field(name)(vertices(name)))
-    assert error.max() < SURFACE_MM
-    assert np.percentile(error, 99.5) < 1e-3
-
-
-@pytest.mark.parametrize("name", ORGANS)
-def test_structure_lies_under_the_skin(name):
-    """Every vertex is at least 2 mm under the skin."""
-    assert abdomen_field("skin")(vertices(name)).max() < -UNDER_SKIN_MM
+    assert error.max() < SURFACE_MM and np.percentile(error, 99.5) < 1e-3
+    assert name == "skin" or abdomen_field("skin")(vertices(name)).max() < -UNDER_SKIN_MM
 
 
 @pytest.mark.parametrize("name", ["lesion", "gallbladder"])
@@ -107,9 +88,6 @@ def test_generator_makes_the_committed_mesh(name):
     made = abdomen_mesh(name)
     assert np.array_equal(made.faces, abdomen(name).faces)
     assert np.abs(made.vertices - vertices(name)).max() < 1e-3
-
-
-# ---- truth of the abdomen ----
 
 
 def test_structures_are_disjoint_on_a_grid(inside):
@@ -122,10 +100,10 @@ def test_structures_are_disjoint_on_a_grid(inside):
 
 
 def test_no_vertex_lies_in_another_structure():
-    """Also between the nodes of the grid: every third vertex is outside every other structure."""
+    """Also between the nodes of the grid: every sixth vertex is outside every other structure."""
     for b in ORGANS:
         own = {b, *INSIDE_THE_LIVER} if b == "liver" else {b, "liver"} if b in INSIDE_THE_LIVER else {b}
-        points = np.concatenate([vertices(a)[::3] for a in ORGANS if a not in own])
+        points = np.concatenate([vertices(a)[::6] for a in ORGANS if a not in own])
         low, high = abdomen(b).bounds
         close = points[np.all((points > low) & (points < high), axis=1)]  # all at once: a body has hundreds of parts
         assert not len(close) or abdomen_field(b)(close).min() > 0, b
@@ -142,21 +120,16 @@ def test_field_and_mesh_agree_on_inside(name):
     assert 20 < np.sum(value[clear] < 0) < clear.sum()
 
 
-def test_lesion_is_in_the_liver_and_clear_of_its_vessels():
-    """All of the lesion is at least 10 mm inside the liver and at least 5 mm from portal and hepatic veins."""
+def test_target_is_the_middle_of_the_lesion():
+    """Of 21 to 24 mm, at least 10 mm inside the liver and 5 mm from its vessels; the case's and the stated place."""
     surface = vertices("lesion")
     assert abdomen_field("liver")(surface).max() < -10.0
     for vessel in ("portal_vein", "hepatic_veins"):
-        distance = np.linalg.norm(vertices(vessel)[:, None] - surface[None, ::4], axis=2)
-        assert distance.min() > 5.0
-
-
-def test_target_is_the_middle_of_the_lesion():
-    """The case's target, the stated centre and the mesh's centre of mass are one point; the lesion is 21 to 24 mm."""
+        assert np.linalg.norm(vertices(vessel)[:, None] - surface[None, ::4], axis=2).min() > 5.0
     case = tomllib.loads((FOLDER / "abdomen/case.toml").read_text(encoding="utf-8"))
     assert np.array_equal(case["target"]["position_mm"], LESION_CENTRE_LPS_MM)
     assert np.linalg.norm(abdomen("lesion").center_mass - LESION_CENTRE_LPS_MM) < 0.01
-    across = 2 * np.linalg.norm(vertices("lesion") - LESION_CENTRE_LPS_MM, axis=1)
+    across = 2 * np.linalg.norm(surface - LESION_CENTRE_LPS_MM, axis=1)
     assert 20.9 < across.min() < across.max() < 24.1
 
 
@@ -190,20 +163,10 @@ def test_aorta_is_as_wide_as_an_adults():
     assert 18.0 < 2 * np.sqrt(area / np.pi) < 24.0
 
 
-def test_unknown_structure_is_refused_with_the_known_names():
-    """A misspelled name lists the right ones."""
-    with pytest.raises(KeyError, match=r"no structure 'livr'.*liver"):
-        abdomen_field("livr")
-
-
-# ---- guidance of the abdomen ----
-
-
 def test_markers_lie_on_the_skin_and_far_apart():
     """Six markers, on the skin to 1e-9 mm, at least 60 mm from each other."""
     points = np.stack(list(skin_markers_ct().values()))
-    assert points.shape == (6, 3)
-    assert np.abs(abdomen_field("skin")(points)).max() < 1e-9
+    assert points.shape == (6, 3) and np.abs(abdomen_field("skin")(points)).max() < 1e-9
     assert min(np.linalg.norm(a - b) for a, b in combinations(points, 2)) > 60.0
 
 
@@ -211,8 +174,7 @@ def test_placement_is_a_rigid_motion_with_the_arm_clear_of_the_patient():
     """Proper rotation; a 150 mm wide base, and its axis, stay outside the skin by 150 mm or more."""
     T_base_ct = patient_placement()
     R = T_base_ct[:3, :3]
-    assert np.allclose(R @ R.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(R) == pytest.approx(1.0, abs=1e-12)
+    assert np.allclose(R @ R.T, np.eye(3), atol=1e-12) and np.linalg.det(R) == pytest.approx(1.0, abs=1e-12)
     skin_base = vertices("skin") @ R.T + T_base_ct[:3, 3]
     beside_base = skin_base[np.abs(skin_base[:, 2]) < 160.0]
     assert np.linalg.norm(beside_base[:, :2], axis=1).min() > 75.0 + 150.0
@@ -235,49 +197,32 @@ def test_point_lists_are_the_simulated_ones_and_keep_their_bounds():
     assert max(np.linalg.norm(read[name] - exact[name]) for name in read) > 0.2
 
 
-# ---- the carton ----
-
-
 @pytest.mark.parametrize("name", ["skin", "bolt_l", "bolt_m", "bolt_h"])
 def test_carton_mesh_is_made_again_byte_for_byte(name):
     """The committed file is what the generator writes, closed, outward, corners on the true surface."""
     mesh = carton_meshes()[name]
     assert (FOLDER / f"carton/{name}.ply").read_bytes() == ply_bytes(mesh)
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    assert mesh.closed
-    assert shape.is_watertight
-    assert shape.is_winding_consistent
-    assert shape.volume > 0
-    on_rim_or_axis = np.abs(carton_field(name)(mesh.vertices))
-    assert on_rim_or_axis.max() < 1e-9
-
-
-def test_carton_volumes_are_those_of_box_and_cylinders():
-    """The box by its edges; a bolt is a prism of 64 sides, 0.16 % smaller than the cylinder."""
-    solid = {name: trimesh.Trimesh(mesh.vertices, mesh.faces).volume for name, mesh in carton_meshes().items()}
-    assert solid["skin"] == pytest.approx(170.0 * 220.0 * 157.0, rel=1e-12)
-    prism = 64 / 2 * np.sin(2 * np.pi / 64) * 4.0**2
-    for letter, end in carton.LESIONS_CT_MM.items():
-        assert solid[f"bolt_{letter.lower()}"] == pytest.approx(prism * end[2], rel=1e-12)
+    assert mesh.closed and shape.is_watertight and shape.is_winding_consistent and shape.volume > 0
+    assert np.abs(carton_field(name)(mesh.vertices)).max() < 1e-9
 
 
 def test_carton_bolts_end_at_the_lesions_and_stay_apart():
-    """A lesion is the middle of its bolt's upper end; bolts are apart and inside the box."""
+    """A lesion is the middle of its bolt's upper end; bolts, prisms of 64 sides, are apart and inside the box."""
     made = carton_meshes()
+    solid = {name: trimesh.Trimesh(mesh.vertices, mesh.faces).volume for name, mesh in made.items()}
+    assert solid["skin"] == pytest.approx(170.0 * 220.0 * 157.0, rel=1e-12)
     for letter, end in carton.LESIONS_CT_MM.items():
         mesh = made[f"bolt_{letter.lower()}"]
+        prism = 64 / 2 * np.sin(2 * np.pi / 64) * 4.0**2 * end[2]
+        assert solid[f"bolt_{letter.lower()}"] == pytest.approx(prism, rel=1e-12)
         upper = mesh.vertices[mesh.vertices[:, 2] == end[2]]
         assert np.allclose(upper.mean(axis=0), end, atol=1e-12)
         assert mesh.vertices[:, 2].max() == end[2]
         assert carton_field("skin")(mesh.vertices).max() < -5.0
         for other in set(made) - {"skin", f"bolt_{letter.lower()}"}:
             assert carton_field(other)(mesh.vertices).min() > 1.9
-
-
-def test_carton_markers_lie_on_the_box():
-    """A and B on the lid, C on the side, all on the outer surface."""
-    points = np.array(list(carton.MARKERS_CT_MM.values()))
-    assert np.abs(carton_field("skin")(points)).max() == 0.0
+    assert np.abs(carton_field("skin")(np.array(list(carton.MARKERS_CT_MM.values())))).max() == 0.0
 
 
 @pytest.mark.parametrize("letter", ["L", "M", "H"])
@@ -291,20 +236,13 @@ def test_carton_case_has_the_papers_lesion(letter):
     assert letter in rows("carton/truth.csv")
 
 
-# ---- the tools ----
-
-
 def test_mesher_meets_a_sphere():
-    """A sphere's mesh: vertices on it to 1e-5 mm, Euler number 2, volume of the inscribed polyhedron."""
+    """Vertices on it to 1e-4 mm, Euler number 2, volume of the inscribed polyhedron; out of its box it is refused."""
     mesh = mesh_field(ellipsoid((1.0, 2.0, 3.0), (10.0, 10.0, 10.0)), SamplingBox((-12, -11, -10), (14, 15, 16), 1.0))
     solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert np.abs(np.linalg.norm(mesh.vertices - [1.0, 2.0, 3.0], axis=1) - 10.0).max() < 1e-4
     assert solid.euler_number == 2
     assert 0.99 < solid.volume / (4 / 3 * np.pi * 1000) < 1.0
-
-
-def test_mesher_refuses_a_body_that_leaves_its_box():
-    """A cut body would be an open or capped one: refused."""
     with pytest.raises(ValueError, match="must lie inside the box"):
         mesh_field(ellipsoid((0, 0, 0), (10.0, 10.0, 10.0)), SamplingBox((-8, -12, -12), (12, 12, 12), 1.0))
 
@@ -320,5 +258,4 @@ def test_smooth_maximum_is_never_below_the_maximum():
     """What makes carved bodies disjoint: the blend only takes away."""
     a, b = np.random.default_rng(6).normal(0, 5, (2, 1000))
     blended = smooth_max(a, b, 4.0)
-    assert np.all(blended >= np.maximum(a, b))
-    assert np.all(blended <= np.maximum(a, b) + 1.0)
+    assert np.all(blended >= np.maximum(a, b)) and np.all(blended <= np.maximum(a, b) + 1.0)

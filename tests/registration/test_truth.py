@@ -15,7 +15,7 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.registration.residuals import leverage
-from puncture_twin.twin.plant.truth import MarkerNoise, draw_truth, registration_error
+from puncture_twin.twin.plant.truth import draw_truth, registration_error
 
 MESHES = ROOT / "meshes"
 MARKERS = np.array([[10.0, 20, 147], [110, 120, 147], [60, -10, 80], [90, -10, 20], [20, 150, 147]])
@@ -105,7 +105,7 @@ def test_drawn_errors_are_those_that_fitzpatrick_expects(ct_mm, touch_mm):
     rng, T = np.random.default_rng(11), pose(3)
     squares = []
     for _ in range(2000):
-        error = registration_error(MARKERS, T, fit_rigid, MarkerNoise(ct_mm, touch_mm), rng)
+        error = registration_error(MARKERS, T, fit_rigid, (ct_mm, touch_mm), rng)
         T_true = T @ np.linalg.inv(error)
         squares.append(np.sum((apply(T, TARGET) - apply(T_true, TARGET)) ** 2))
     fle = np.sqrt(3 * (ct_mm**2 + touch_mm**2))
@@ -116,7 +116,7 @@ def test_drawn_errors_are_those_that_fitzpatrick_expects(ct_mm, touch_mm):
 def test_believing_the_truth_with_its_error_is_the_belief():
     """T_believed = T_true E, by construction of the truth, for the triad as well."""
     T = pose(4)
-    E = registration_error(MARKERS[:3], T, fit_triad, MarkerNoise(0.5, 0.1), np.random.default_rng(1))
+    E = registration_error(MARKERS[:3], T, fit_triad, (0.5, 0.1), np.random.default_rng(1))
     np.testing.assert_allclose((T @ np.linalg.inv(E)) @ E, T, atol=1e-9)
     assert np.linalg.norm(E - np.eye(4)) > 1e-3
 

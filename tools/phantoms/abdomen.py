@@ -14,9 +14,6 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from tools.phantoms import bones, torso, vessels, viscera
 from tools.phantoms.implicit import Field
 from tools.phantoms.mesher import SamplingBox, mesh_field
-from tools.phantoms.viscera import LESION_CENTRE_LPS_MM
-
-__all__ = ["LESION_CENTRE_LPS_MM", "STRUCTURES", "Part", "abdomen_field", "abdomen_mesh"]
 
 _SEARCH_STEP_MM = 10.0
 """Step of the search for a body's extent."""
@@ -26,14 +23,7 @@ _SEARCH_LOW, _SEARCH_HIGH = (-190.0, -140.0, -210.0), (190.0, 140.0, 280.0)
 
 
 class Part(NamedTuple):
-    """How one structure is made.
-
-    Attributes:
-        body: Builds the field.
-        spacing_mm: Grid spacing of its mesh; triangles are about as wide.
-        volume_ml: Plausible range of the volume.
-        basis: Where the range comes from.
-    """
+    """How one structure is made: the spacing of its grid, about as wide as triangles, and a plausible volume."""
 
     body: Callable[[], Field]
     spacing_mm: float
@@ -80,13 +70,7 @@ STRUCTURES: dict[str, Part] = {
 
 
 def abdomen_field(name: str) -> Field:
-    """The field of one structure: takes points_ct (n, 3), LPS mm; negative inside, 0 on the surface.
-
-    Raises:
-        KeyError: If there is no such structure; the message lists those there are.
-    """
-    if name not in STRUCTURES:
-        raise KeyError(f"no structure {name!r} in the abdomen; there are: {', '.join(STRUCTURES)}")
+    """The field of one structure: takes points_ct (n, 3), LPS mm; negative inside, 0 on the surface."""
     return STRUCTURES[name].body()
 
 

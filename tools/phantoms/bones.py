@@ -8,17 +8,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from tools.phantoms import torso
-from tools.phantoms.implicit import (
-    Field,
-    above,
-    below,
-    capsule,
-    carve,
-    mirrored,
-    smooth_min,
-    union,
-    within,
-)
+from tools.phantoms.implicit import Field, above, below, capsule, carve, mirrored, smooth_min, union, within
 from tools.phantoms.sweep import ribbon
 
 RIBS = (4, 5, 6, 7, 8, 9, 10, 11, 12)

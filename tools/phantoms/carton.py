@@ -17,15 +17,6 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.experiment.chen2019 import TABLE_1, TABLE_2, TABLE_4
 
-__all__ = [
-    "LESIONS_CT_MM",
-    "MARKERS_CT_MM",
-    "SETUP_2_MARKERS",
-    "TOUCHED_BASE_MM",
-    "TOUCHED_SETUP_2_BASE_MM",
-    "carton_meshes",
-]
-
 LESIONS_CT_MM = MappingProxyType({name: TABLE_1[name] for name in "LMH"})
 """Table 1: the lesions, the middles of the bolts' upper ends."""
 MARKERS_CT_MM = MappingProxyType({name: TABLE_1[name] for name in "ABC"})
@@ -80,10 +71,7 @@ def _bolt(end: Floats) -> TriangleMesh:
     faces = []
     for ring in range(rings - 1):
         a, b = ring * _BOLT_SIDES + here, ring * _BOLT_SIDES + following
-        faces += [
-            np.stack([a, b, b + _BOLT_SIDES], axis=1),
-            np.stack([a, b + _BOLT_SIDES, a + _BOLT_SIDES], axis=1),
-        ]
+        faces += [np.stack([a, b, b + _BOLT_SIDES], axis=1), np.stack([a, b + _BOLT_SIDES, a + _BOLT_SIDES], axis=1)]
     foot = rings * _BOLT_SIDES
     top = (rings - 1) * _BOLT_SIDES
     faces.append(np.stack([np.full(_BOLT_SIDES, foot), following, here], axis=1))

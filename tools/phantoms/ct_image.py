@@ -15,13 +15,7 @@ AIR_HU = -1000.0
 
 
 class ScannedPart(NamedTuple):
-    """One material in a scene; a later part fills the place of an earlier one.
-
-    Attributes:
-        name: What it is.
-        field: Negative inside, mm.
-        hu: Its Hounsfield units.
-    """
+    """One material in a scene; a later part fills the place of an earlier one."""
 
     name: str
     field: Field
@@ -30,13 +24,7 @@ class ScannedPart(NamedTuple):
 
 @dataclass(frozen=True)
 class Grid:
-    """Voxels of a scan, axes along LPS.
-
-    Attributes:
-        low_mm: Centre of the first voxel, LPS.
-        spacing_mm: Along each axis.
-        shape: Voxels along each axis.
-    """
+    """Voxels of a scan, axes along LPS; the first one's centre, their spacing and count along each axis."""
 
     low_mm: tuple[float, float, float]
     spacing_mm: tuple[float, float, float]
@@ -59,13 +47,7 @@ def rendered(parts: Sequence[ScannedPart], grid: Grid, *, noise_hu: float, rng: 
     """Hounsfield units of a scene, shape ``grid.shape``.
 
     A body's field grows by about 1 per mm, so a voxel as wide as w whose centre has the value d is filled by about
-    1/2 - d/w of it.
-
-    Args:
-        parts: The scene, air around it.
-        grid: The voxels.
-        noise_hu: Standard deviation of a voxel.
-        rng: Draws the noise.
+    1/2 - d/w of it. Around the parts is air.
     """
     points = grid.centres()
     width = float(np.prod(grid.spacing_mm)) ** (1 / 3)

@@ -20,8 +20,6 @@ from puncture_twin.planning.uncertainty.touch_choice import choose_touches
 from tools.phantoms import torso
 from tools.phantoms.viscera import LESION_CENTRE_LPS_MM
 
-__all__ = ["GUIDANCE_SEED", "Guidance", "abdomen_guidance", "patient_placement", "skin_markers_ct"]
-
 BASE_AXES_CT = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 """The base's x, y and z axes in the CT frame (LPS). The base hangs above the belly with its z axis toward the
 patient's head; the target lies along the base's -x."""
@@ -52,7 +50,6 @@ class Guidance:
     Attributes:
         markers_ct: Markers as read from the scan.
         touched_base: Markers as touched by the robot.
-        joints_deg: How the robot stood at each touch, shape (6,), degrees.
         truth_base: Markers and ``target`` where they really are, in the base frame.
     """
 

@@ -14,18 +14,13 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from tools.phantoms.implicit import Field, above, below, capsule, carve, ellipsoid, union, within
 from tools.phantoms.mesher import SamplingBox, mesh_field
 
-__all__ = ["MARKERS_MM", "RIM_MM", "head_field", "head_mesh", "head_targets"]
-
 RIM_MM = 22.0
 """Height at which the cap is cut off."""
-
 FOOT_MM = -105.0
 """Where the neck stands on the table."""
-
 SKULL_RADII_MM = (76.0, 94.0, 88.0)
 WALL_MM = 9.0
 """Skull and skin together."""
-
 FLOOR_MM = -42.0
 """Depth of the hollow."""
 
@@ -39,7 +34,6 @@ MARKERS_MM = {
     "M7": (0.0, -101.0, -12.0),
 }
 """Centres of the marker balls: six about the rim, and one on the forehead, lower, that keeps them from one plane."""
-
 SPACING_MM = 3.8
 _ROUNDING_MM = 4.0
 
@@ -51,9 +45,8 @@ def head_field() -> Field:
     nose = capsule((0.0, -84.0, -36.0), (0.0, -98.0, -56.0), 7.0, 9.0)
     neck = capsule((0.0, 18.0, -60.0), (0.0, 18.0, -130.0), 52.0)
     outside = union([skull, face, nose, neck], 14.0)
-    hollow = within(
-        ellipsoid((0.0, 0.0, 0.0), [radius - WALL_MM for radius in SKULL_RADII_MM]), [above(2, FLOOR_MM)], 10.0
-    )
+    inner = ellipsoid((0.0, 0.0, 0.0), [radius - WALL_MM for radius in SKULL_RADII_MM])
+    hollow = within(inner, [above(2, FLOOR_MM)], 10.0)
     return carve(within(outside, [below(2, RIM_MM), above(2, FOOT_MM)], _ROUNDING_MM), [hollow], 1e-3, _ROUNDING_MM)
 
 

@@ -12,7 +12,6 @@ from puncture_twin.planning.base.arrays import Floats
 
 Field = Callable[[Floats], Floats]
 """Takes points (n, 3), mm, and returns (n,) values, mm: < 0 inside, 0 on the surface, > 0 outside."""
-
 _EVALUATE_WITHIN_MM = 12.0
 """Farther outside than this a body's neighbours cannot touch its surface, so they are not evaluated."""
 _NEAR_CENTRE = 1e-9
@@ -78,8 +77,6 @@ def ellipsoid(centre: ArrayLike, radii: ArrayLike, turn: Rotation | None = None)
     """An ellipsoid; its field is the first-order distance estimate k (k - 1) / |grad k**2| * 2.
 
     Args:
-        centre: Shape (3,), mm.
-        radii: Half axes, shape (3,), mm.
         turn: Rotation from the ellipsoid's axes to the frame of the points; none when absent.
     """
     middle, half = np.asarray(centre, dtype=float), np.asarray(radii, dtype=float)

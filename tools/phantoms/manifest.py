@@ -36,16 +36,12 @@ def write_phantoms(folder: Path, report: Callable[[str], None] = lambda _: None)
     """Write every mesh and point list below ``folder``, and the manifest last; case files are left alone.
 
     Everything is made in a folder beside it first, so that a failure leaves what was there.
-
-    Args:
-        folder: Made if it is not there.
-        report: Called with one line per file.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".phantoms-", dir=folder.resolve().parent) as scratch:
         staging = Path(scratch)
         entries = []
-        for entry, data in _files():
+        for entry, data in (*_carton_files(), *_abdomen_files(), *_head_files()):
             target = staging / str(entry["path"])
             target.parent.mkdir(exist_ok=True)
             target.write_bytes(data)
@@ -69,19 +65,9 @@ def points_csv(points: dict[str, Floats], decimals: int, joints_deg: dict[str, F
     return ("\n".join([",".join(header), *rows]) + "\n").encode("ascii")
 
 
-def _files() -> list[tuple[dict[str, Any], bytes]]:
-    return [*_carton_files(), *_abdomen_files(), *_head_files()]
-
-
 def _entry(path: str, space: str, made_by: str, parameters: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "path": path,
-        "unit": "mm",
-        "space": space,
-        "licence": _LICENCE,
-        "made_by": made_by,
-        "parameters": parameters,
-    }
+    where = {"path": path, "unit": "mm", "space": space}
+    return {**where, "licence": _LICENCE, "made_by": made_by, "parameters": parameters}
 
 
 def _carton_files() -> list[tuple[dict[str, Any], bytes]]:
@@ -129,15 +115,9 @@ def _head_files() -> list[tuple[dict[str, Any], bytes]]:
     mesh = head.head_mesh()
     parameters = {"structure": "head", "spacing_mm": head.SPACING_MM}
     entry = _entry("head/head.ply", "local", "tools.phantoms.head.head_mesh", parameters)
+    files = [({**entry, "triangles": len(mesh.faces)}, ply_bytes(mesh))]
     markers = {name: np.array(point) for name, point in head.MARKERS_MM.items()}
-    return [
-        ({**entry, "triangles": len(mesh.faces)}, ply_bytes(mesh)),
-        (
-            _entry("head/markers.csv", "local", "tools.phantoms.head.MARKERS_MM", {}),
-            points_csv(markers, 3),
-        ),
-        (
-            _entry("head/targets.csv", "local", "tools.phantoms.head.head_targets", {}),
-            points_csv(head.head_targets(), 3),
-        ),
-    ]
+    for file, source, points in (("markers", "MARKERS_MM", markers), ("targets", "head_targets", head.head_targets())):
+        entry = _entry(f"head/{file}.csv", "local", f"tools.phantoms.head.{source}", {})
+        files.append((entry, points_csv(points, 3)))
+    return files

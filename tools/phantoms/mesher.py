@@ -39,15 +39,7 @@ class SamplingBox:
 
 
 def mesh_field(field: Field, box: SamplingBox) -> TriangleMesh:
-    """The zero set of a field as a closed mesh, triangles outward.
-
-    Args:
-        field: The body, in the frame of the box, mm.
-        box: Must hold the whole body with at least one spacing around it.
-
-    Raises:
-        ValueError: If the body touches the box or the box holds none.
-    """
+    """The zero set of a field as a closed mesh, triangles outward; a body that touches the box is a ValueError."""
     surface = marched(field, box)
     return TriangleMesh(_relax(field, surface.vertices, surface.faces, box.spacing_mm), surface.faces)
 
@@ -61,7 +53,7 @@ def marched(field: Field, box: SamplingBox) -> TriangleMesh:
         raise ValueError(f"the body must lie inside the box {box} and not touch it")
     vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(box.spacing_mm,) * 3)
     vertices = vertices.astype(float) + np.asarray(box.low)
-    return TriangleMesh(vertices, _outward(vertices, faces.astype(np.int32)))
+    return outward(vertices, faces.astype(np.int32))
 
 
 def _sample(field: Field, box: SamplingBox) -> Floats:
@@ -78,10 +70,10 @@ def _sample(field: Field, box: SamplingBox) -> Floats:
     return np.asarray(values)
 
 
-def _outward(vertices: Floats, faces: Faces) -> Faces:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    volume = np.sum(a * np.cross(b, c))
-    return faces if volume > 0 else np.ascontiguousarray(faces[:, ::-1])
+def outward(vertices: Floats, faces: Faces) -> TriangleMesh:
+    """The mesh with all of its triangles turned where its volume has a sign."""
+    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
+    return TriangleMesh(vertices, faces if np.sum(a * np.cross(b, c)) > 0 else np.ascontiguousarray(faces[:, ::-1]))
 
 
 def _relax(field: Field, vertices: Floats, faces: Faces, spacing_mm: float) -> Floats:
@@ -141,8 +133,6 @@ def _neighbour_mean(faces: Faces, count: int) -> csr_matrix:
 def _vertex_normals(vertices: Floats, faces: Faces) -> Floats:
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     area = np.cross(b - a, c - a)
-    normals = np.stack(
-        [np.bincount(faces.ravel(), weights=np.repeat(area[:, axis], 3), minlength=len(vertices)) for axis in range(3)],
-        axis=1,
-    )
+    corners, shares = faces.ravel(), np.repeat(area, 3, axis=0).T
+    normals = np.stack([np.bincount(corners, weights=share, minlength=len(vertices)) for share in shares], axis=1)
     return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))

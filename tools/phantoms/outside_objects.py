@@ -16,46 +16,28 @@ import numpy as np
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.plant.scanner.case_scene import Part
+from tools.phantoms.mesher import outward
 
 SHEATH_HU, WATER_HU, CORE_HU = 100.0, 0.0, 3000.0
 """Hounsfield units of plastic, of what flows in it, and of thin wires of copper with the plastic between; ours."""
 
 
 class OutsideObjects(NamedTuple):
-    """Choice of objects outside of the patient.
-
-    Attributes:
-        arms: Where both arms lie; ``none``: over the head, outside of the image.
-        bed: What the patient lies on.
-        lines: How many lines lie on the skin.
-    """
+    """Choice of objects outside of the patient; arms that are ``none`` lie over the head, outside of the image."""
 
     arms: Arms = "none"
     bed: Bed = "none"
     lines: int = 0
 
     def placed(self, skin: TriangleMesh, at_mm: float, rng: np.random.Generator) -> tuple[Part, ...]:
-        """Objects about a skin: the bed first, then arms, then lines.
-
-        Args:
-            skin: In the scanner's frame, LPS mm: y to the back, z to the head.
-            at_mm: The height along the bed that the image is about.
-            rng: Draws them.
-        """
+        """Objects about a skin, LPS mm, y to the back, z to the head: the bed first, then arms, then lines."""
         outline = Outline(skin)
         found = [*bed(outline, self.bed, rng), *arms(outline, self.arms, at_mm, rng)]
         return (*found, *lines(outline, self.lines, at_mm, rng))
 
 
 def lines(outline: Outline, count: int, at_mm: float, rng: np.random.Generator) -> Iterator[Part]:
-    """Draw lines, tubes and cables in turn, each over front or flank.
-
-    Args:
-        outline: Of the trunk.
-        count: How many.
-        at_mm: The height along the bed near which they lie.
-        rng: Draws course, thickness, and how far each stands off the skin.
-    """
+    """Draw lines, tubes and cables in turn, each over front or flank."""
     for number in range(1, count + 1):
         cable = number % 2 == 0
         radius = rng.uniform(2.0, 3.5)
@@ -83,14 +65,7 @@ SIDES = (("left", 1.0), ("right", -1.0))
 
 
 def arms(outline: Outline, kind: Arms, at_mm: float, rng: np.random.Generator) -> Iterator[Part]:
-    """Solids of a patient's both arms: flesh with skin, and bones.
-
-    Args:
-        outline: Of the trunk.
-        kind: ``beside`` with air between; ``pressed`` against the flanks; ``across`` belly or chest.
-        at_mm: The height along the bed near which they lie.
-        rng: Draws sizes and places.
-    """
+    """Both arms, flesh and bones: ``beside`` with air between, ``pressed`` to the flanks, ``across`` belly or chest."""
     for name, side in () if kind == "none" else SIDES:
         elbow = rng.uniform(32.0, 46.0)
         radii = elbow * np.array([rng.uniform(1.0, 1.25), 1.0, rng.uniform(0.6, 0.75)])
@@ -180,7 +155,7 @@ def _flesh(name: str, line: _Line, radii: Floats, hand: Floats, hu: float) -> It
     thick = np.interp(line.along, lengths[:3], radii)
     yield Part(name, tube(line.points[limb], thick[limb]), hu)
     from_wrist = line.points[line.along >= lengths[2] - 20.0]
-    halves = np.stack([np.full(len(from_wrist), hand[0]), np.full(len(from_wrist), hand[1])], axis=1)
+    halves = np.tile(hand, (len(from_wrist), 1))
     yield Part(f"{name}_hand", tube(from_wrist, halves, np.cross(_forward(line, 2), line.outward)), hu)
 
 
@@ -238,13 +213,7 @@ COVER_MM, CURVED_MM = 2.0, 30.0
 
 
 def bed(outline: Outline, kind: Bed, rng: np.random.Generator) -> Iterator[Part]:
-    """The bed beneath a patient.
-
-    Args:
-        outline: Of the trunk; its back sinks into mattress and pad by some millimetres.
-        kind: ``flat``: a mattress of foam on a table; ``curved``: a shell about foam, bent; ``pad``: gel on a table.
-        rng: Draws sizes.
-    """
+    """A bed: ``flat``, a mattress of foam on a table; ``curved``, a bent shell of foam; ``pad``, gel on a table."""
     low, high = outline.skin.bounds[:, 2] + np.array([-BEYOND_MM, BEYOND_MM])
     middle = float(outline.skin.bounds[:, 0].mean()) + rng.uniform(-10.0, 10.0)
     top = outline.back(low, high) - rng.uniform(0.0, 8.0)
@@ -268,12 +237,10 @@ def bed(outline: Outline, kind: Bed, rng: np.random.Generator) -> Iterator[Part]
 
 
 def _box(middle: float, half: float, top: float, bottom: float) -> Floats:
-    """Corners of an upright box, shape (4, 2)."""
     return np.array([[middle - half, top], [middle + half, top], [middle + half, bottom], [middle - half, bottom]])
 
 
 def _curved(at: tuple[float, float], radius: float, half: float, shell: float, ends: Ends) -> Iterator[Part]:
-    """A bent table whose upper side has its lowest place at a point; it rises to both edges."""
     for name, inset, hu in (("table", 0.0, SHELL_HU), ("table_foam", shell, FOAM_HU)):
         turn = np.linspace(-1.0, 1.0, 25) * (np.arcsin(half / radius) - inset / radius)
         rim = np.stack([np.sin(turn), np.cos(turn)], axis=1)
@@ -292,7 +259,6 @@ def tube(points: Floats, radii: Floats, wide: Floats | None = None) -> TriangleM
     """A limb along a line, with round ends.
 
     Args:
-        points: Shape (m, 3), m >= 2, mm.
         radii: Shape (m,), mm; or (m, 2), half widths along ``wide`` and across it.
         wide: Shape (3,): where the first half width of a flat section points, roughly; any where None.
     """
@@ -319,17 +285,14 @@ def drawn(section: Floats, low_mm: float, high_mm: float) -> TriangleMesh:
     Args:
         section: Shape (n, 2), the corners in x and y around it, mm: two rows that face each other, so that
             its ends are strips between them, however it is bent.
-        low_mm: Where it begins along z.
-        high_mm: Where it ends.
     """
     half = len(section) // 2
     rows = [np.column_stack([section, np.full(len(section), z)]) for z in (low_mm, high_mm)]
     sides = _sides(2, len(section))
     i = np.arange(half - 1)
-    strip = np.concatenate(
-        [np.stack([i, i + 1, 2 * half - 2 - i], axis=1), np.stack([i, 2 * half - 2 - i, 2 * half - 1 - i], axis=1)]
-    )
-    return _outward(np.concatenate(rows), np.concatenate([sides, strip[:, ::-1], strip + len(section)]))
+    facing = 2 * half - 1 - i
+    strip = np.concatenate([np.stack([i, i + 1, facing - 1], axis=1), np.stack([i, facing - 1, facing], axis=1)])
+    return outward(np.concatenate(rows), np.concatenate([sides, strip[:, ::-1], strip + len(section)], dtype=np.int32))
 
 
 def loft(rings: Floats) -> TriangleMesh:
@@ -344,19 +307,13 @@ def loft(rings: Floats) -> TriangleMesh:
     low = np.stack([np.full(around, last), j, i], axis=1)
     high = np.stack([np.full(around, last + 1), i + last - around, j + last - around], axis=1)
     vertices = np.concatenate([rings.reshape(-1, 3), tops])
-    return _outward(vertices, np.concatenate([_sides(count, around), low, high]))
+    return outward(vertices, np.concatenate([_sides(count, around), low, high], dtype=np.int32))
 
 
 def _sides(count: int, around: int) -> np.ndarray:
     i, j = np.arange(around), np.roll(np.arange(around), -1)
     band = np.concatenate([np.stack([i, j, j + around], axis=1), np.stack([i, j + around, i + around], axis=1)])
     return np.concatenate([band + k * around for k in range(count - 1)])
-
-
-def _outward(vertices: Floats, faces: np.ndarray) -> TriangleMesh:
-    a, b, c = np.moveaxis((vertices - vertices.mean(axis=0))[faces], 1, 0)
-    inward = float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0.0  # six times the signed volume
-    return TriangleMesh(vertices, np.asarray(faces[:, ::-1] if inward else faces, dtype=np.int32))
 
 
 def _tangents(points: Floats) -> Floats:
@@ -384,11 +341,7 @@ PER_SEGMENT = np.linspace(0.0, 1.0, 5)
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """A patient's skin in the scanner: x to the left, y to the back, z to the head.
-
-    Attributes:
-        skin: Closed, mm.
-    """
+    """A patient's skin in the scanner: x to the left, y to the back, z to the head."""
 
     skin: TriangleMesh
 

@@ -30,12 +30,10 @@ BELLY_MM, WAVE_MM = 8.0, 90.0
 which no patient is, and a table that touches a patient is known by being one."""
 LINE_GAP_MM = 14.0
 """How far the line runs in front of the trunk, mm."""
-
 LOOK_MM, SURFACE_MM, FINE_MM, THIN_MM = 8.0, 5.0, 2.0, 160.0
 """Spacings at which surfaces are looked for and sampled, and of parts whose box is no thicker than the last."""
 ROOM_MM = (330.0, 262.0, 132.0)
 """Half the edges of the box in which surfaces are looked for."""
-
 Arms = Literal["down", "up", "none"]
 
 
@@ -96,11 +94,7 @@ def cradle_parts(
 ) -> list[ScannedPart]:
     """A cradle as dense as the body, bent about the bed's direction, into which the back is pressed; air beneath.
 
-    Args:
-        radius_mm: Of its upper side.
-        thick_mm: How thick it is.
-        half_width_mm: From its middle to its edges.
-        slope: How much it descends to the head, mm per mm, as a bed does in the images of a tilted gantry.
+    By its slope it descends to the head, mm per mm, as a bed does in the images of a tilted gantry.
     """
 
     def beneath(points: Floats) -> Floats:
@@ -138,20 +132,15 @@ def grid(spacing_mm: float = 4.0, slice_mm: float = 4.0) -> Grid:
 
 
 def solids(parts: Sequence[ScannedPart]) -> list[Solid]:
-    """The same parts as surfaces, for the scanner; what is beyond the longest field of view is cut off.
-
-    Args:
-        parts: The scene; all of them lie within 320 mm beside the middle of the bed.
-    """
+    """The same parts as surfaces, for the scanner; what is beyond the longest field of view is cut off."""
     ends = slab((-318.0, -250.0, -120.0), (318.0, 250.0, 120.0))
     return [Solid(part.name, _surface(within(part.field, [ends], 0.5)), part.hu) for part in parts]
 
 
 def _surface(field: Field) -> TriangleMesh:
     """The zero set by marching cubes in the box about it, finer where that box is thin."""
-    nodes = np.stack(
-        np.meshgrid(*(np.arange(-half, half + LOOK_MM, LOOK_MM) for half in ROOM_MM), indexing="ij"), axis=-1
-    )
+    axes = (np.arange(-half, half + LOOK_MM, LOOK_MM) for half in ROOM_MM)
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     near = nodes[field(nodes.reshape(-1, 3)).reshape(nodes.shape[:3]) < LOOK_MM]
     low, high = near.min(axis=0) - LOOK_MM, near.max(axis=0) + LOOK_MM
     spacing = FINE_MM if np.min(high - low) < THIN_MM else SURFACE_MM

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,21 +16,14 @@ _SAMPLE_MM = 1.5
 """Step of the polyline along the curve; with the spans beside the nearest node the distance errs below 0.01 mm."""
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """A polyline along a spline, dense enough to stand for it.
-
-    Attributes:
-        points: Shape (n, 3), mm.
-        parameter: Shape (n,), the control points' running number at each node (0 at the first, m - 1 at the last).
-    """
+class Curve(NamedTuple):
+    """A polyline (n, 3), mm, along a spline, dense enough to stand for it."""
 
     points: Floats
     parameter: Floats
 
 
-@dataclass(frozen=True, eq=False)
-class Foot:
+class Foot(NamedTuple):
     """Nearest places on a curve: ``place`` (n, 3), mm; ``node`` (n,), fractional index into the curve's nodes."""
 
     place: Floats
@@ -47,7 +40,7 @@ def smooth_curve(controls: ArrayLike) -> Curve:
         points = knots[0] + (at / chord[-1])[:, None] * (knots[1] - knots[0])
     else:
         points = CubicSpline(chord, knots)(at)
-    return Curve(points=points, parameter=np.interp(at, chord, np.arange(len(knots))))
+    return Curve(points, np.interp(at, chord, np.arange(len(knots))))
 
 
 def nearest(curve: Curve, tree: cKDTree, points: Floats) -> Foot:
@@ -63,14 +56,13 @@ def nearest(curve: Curve, tree: cKDTree, points: Floats) -> Foot:
         squared = np.sum((points - foot) ** 2, axis=1)
         closer = squared < best
         best[closer], place[closer], node[closer] = squared[closer], foot[closer], (first + along)[closer]
-    return Foot(place=place, node=node)
+    return Foot(place, node)
 
 
 def tube(controls: ArrayLike, radii_mm: ArrayLike, folds_mm: float = 0.0, fold_length_mm: float = 30.0) -> Field:
     """A round tube through control points.
 
     Args:
-        controls: Shape (m, 3), mm.
         radii_mm: Radius at each control point, shape (m,), or one for all.
         folds_mm: Height of regular constrictions along the tube (haustra of the colon).
         fold_length_mm: Distance between two constrictions.
@@ -93,16 +85,12 @@ def ribbon(controls: ArrayLike, outward: ArrayLike, half_height_mm: float, half_
     """A flat bar with round edges that follows a curve, as a rib does.
 
     Args:
-        controls: Shape (m, 3), mm.
         outward: Direction of the thin side at each control point, shape (m, 3).
-        half_height_mm: Half of the section's long side.
-        half_thickness_mm: Half of its short side.
     """
     curve = smooth_curve(controls)
     knots = np.arange(len(np.asarray(controls)))
-    thin = np.stack(
-        [np.interp(curve.parameter, knots, column) for column in np.asarray(outward, dtype=float).T], axis=1
-    )
+    columns = np.asarray(outward, dtype=float).T
+    thin = np.stack([np.interp(curve.parameter, knots, column) for column in columns], axis=1)
     tangent = np.gradient(curve.points, axis=0)
     height = np.cross(tangent, thin)
     height /= np.linalg.norm(height, axis=1, keepdims=True)

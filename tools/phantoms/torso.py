@@ -18,53 +18,22 @@ CONTENT_TOP_MM, CONTENT_BOTTOM_MM = 236.0, -170.0
 """Organs that go on beyond the trunk (lungs, ribs, great vessels, spine) end here."""
 _ROUNDNESS = 2.3
 """Exponent of the section: 2 is an ellipse, larger is more square."""
-
 _Z = (-230.0, -150.0, -90.0, -40.0, 0.0, 40.0, 80.0, 130.0, 180.0, 230.0, 290.0)
 _HALF_WIDTH = PchipInterpolator(_Z, (142, 138, 132, 130, 132, 135, 137, 133, 125, 115, 98))
 _HALF_DEPTH = PchipInterpolator(_Z, (82, 82, 81, 82, 84, 87, 90, 90, 87, 82, 72))
 _CENTRE_Y = PchipInterpolator(_Z, (0, 0, -1, -2, -2, -2, -1, 1, 4, 8, 12))
 _FAT = PchipInterpolator(_Z, (26, 26, 24, 23, 22, 21, 20, 20, 21, 22, 22))
 
-VERTEBRA_Z = (
-    -140.0,
-    -108.0,
-    -73.0,
-    -36.0,
-    0.0,
-    35.0,
-    67.0,
-    97.0,
-    125.0,
-    152.0,
-    178.0,
-    203.0,
-    228.0,
-    252.0,
-    275.0,
-)
+VERTEBRA_Z = (-140.0, -108.0, -73.0, -36.0, 0.0, 35.0, 67.0, 97.0, 125.0, 152.0, 178.0, 203.0, 228.0, 252.0, 275.0)
 """Middles of S1, L5 ... L1, T12 ... T4, mm."""
-_SPINE_Y = PchipInterpolator(
+spine_y = PchipInterpolator(
     (-180, -140, -108, -73, -36, 0, 35, 97, 152, 203, 280), (64, 50, 41, 36, 34, 35, 39, 49, 56, 58, 56)
 )
-_BODY_WIDTH = PchipInterpolator(
+"""Where the vertebral bodies' middle lies in y at height z, mm; then their half width and half depth there."""
+body_half_width = PchipInterpolator(
     (-180, -150, -125, -100, -36, 35, 97, 152, 203, 280), (50, 43, 30, 26, 24.5, 22.5, 19.5, 17.5, 16, 15)
 )
-_BODY_DEPTH = PchipInterpolator((-180, -125, -73, 0, 97, 203, 280), (17, 18, 17.5, 17, 16, 14.5, 13.5))
-
-
-def spine_y(z: Floats) -> Floats:
-    """Where the vertebral bodies' middle lies in y at height z, mm."""
-    return np.asarray(_SPINE_Y(z))
-
-
-def body_half_width(z: Floats) -> Floats:
-    """Half width of the vertebral bodies at height z, mm."""
-    return np.asarray(_BODY_WIDTH(z))
-
-
-def body_half_depth(z: Floats) -> Floats:
-    """Half depth of the vertebral bodies at height z, mm."""
-    return np.asarray(_BODY_DEPTH(z))
+body_half_depth = PchipInterpolator((-180, -125, -73, 0, 97, 203, 280), (17, 18, 17.5, 17, 16, 14.5, 13.5))
 
 
 def cage(points: Floats) -> Floats:
@@ -74,15 +43,7 @@ def cage(points: Floats) -> Floats:
 
 
 def on_cage(angle_rad: Floats, z: Floats) -> Floats:
-    """Points of the cage surface, right side.
-
-    Args:
-        angle_rad: Angle about the body axis from the back (0) over the right side to the front (pi), shape (n,).
-        z: Height, mm, shape (n,).
-
-    Returns:
-        Shape (n, 3), mm.
-    """
+    """Points of the cage (n, 3), mm, at angles (n,) from the back (0) over the right side to the front (pi)."""
     sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
     radius = 1.0 / _superellipse(sine / _HALF_WIDTH(z), cosine / _HALF_DEPTH(z))
     return np.stack([-radius * sine, _CENTRE_Y(z) + radius * cosine, z], axis=1)
@@ -118,9 +79,9 @@ def spinal_mass(points: Floats) -> Floats:
     """Field of the spine with the muscles and crura around it: no organ of the belly or chest enters it."""
     x, y, z = points.T
     height = np.clip(z, -180.0, 280.0)
-    middle = _SPINE_Y(height)
+    middle = spine_y(height)
     psoas = 14.0 / (1.0 + np.exp((z + 5.0) / 22.0))
-    bodies = _section(x, y - middle, _BODY_WIDTH(height) + 7.0 + psoas, _BODY_DEPTH(height) + 6.0)
+    bodies = _section(x, y - middle, body_half_width(height) + 7.0 + psoas, body_half_depth(height) + 6.0)
     back = _section(x, y - middle - 45.0, np.full(len(x), 48.0), np.full(len(x), 37.0))
     return smooth_min(bodies, back, 12.0)
 

@@ -87,24 +87,9 @@ def spleen() -> Field:
 @cache
 def pancreas() -> Field:
     """Head in the bend of the duodenum, body before the spine, tail toward the spleen."""
-    path = [
-        (-26, -14, -8),
-        (-24, -20, 10),
-        (-6, -27, 24),
-        (16, -25, 36),
-        (42, -9, 46),
-        (68, 12, 62),
-        (80, 20, 72),
-    ]
+    path = [(-26, -14, -8), (-24, -20, 10), (-6, -27, 24), (16, -25, 36), (42, -9, 46), (68, 12, 62), (80, 20, 72)]
     organ = tube(path, [13.0, 15.5, 11.5, 11.0, 11.0, 10.5, 8.5], folds_mm=0.8, fold_length_mm=11.0)
-    others = [
-        vessels.portal_vein(),
-        vessels.vena_cava_inferior(),
-        vessels.aorta(),
-        liver(),
-        spleen(),
-        kidney_left(),
-    ]
+    others = [vessels.portal_vein(), vessels.vena_cava_inferior(), vessels.aorta(), liver(), spleen(), kidney_left()]
     return carve(organ, others, 1.0, 3.0)
 
 
@@ -112,8 +97,7 @@ def pancreas() -> Field:
 def oesophagus() -> Field:
     """From behind the heart through the diaphragm to the stomach."""
     path = tube(
-        [(4, 22, 262), (4, 19, 215), (5, 12, 170), (10, 4, 140), (20, 1, 124), (30, 3, 113)],
-        [8, 8, 8, 7.5, 7.5, 7],
+        [(4, 22, 262), (4, 19, 215), (5, 12, 170), (10, 4, 140), (20, 1, 124), (30, 3, 113)], [8, 8, 8, 7.5, 7.5, 7]
     )
     cut = within(path, [below(2, torso.CONTENT_TOP_MM)], 3.0)
     return carve(cut, [vessels.aorta(), torso.spinal_mass, vessels.vena_cava_inferior()], 1.0, 3.0)
@@ -123,26 +107,12 @@ def oesophagus() -> Field:
 def stomach() -> Field:
     """Fundus under the left dome, body in front, antrum across the middle."""
     path = [
-        (60, 20, 106),
-        (66, 4, 92),
-        (66, -20, 68),
-        (57, -42, 42),
-        (40, -55, 20),
-        (16, -58, 8),
-        (-8, -52, 8),
+        (60, 20, 106), (66, 4, 92), (66, -20, 68), (57, -42, 42), (40, -55, 20), (16, -58, 8), (-8, -52, 8),
         (-26, -42, 14),
-    ]
+    ]  # fmt: skip
     body = tube(path, [33.0, 35.0, 33.0, 29.0, 25.0, 20.0, 16.0, 11.0])
     space = within(body, [torso.inside_cage(9.0), offset(torso.diaphragm, -2.0)], 6.0)
-    others = [
-        liver(),
-        spleen(),
-        pancreas(),
-        kidney_left(),
-        oesophagus(),
-        gallbladder(),
-        vessels.portal_vein(),
-    ]
+    others = [liver(), spleen(), pancreas(), kidney_left(), oesophagus(), gallbladder(), vessels.portal_vein()]
     return carve(space, [*others, torso.spinal_mass], _GAP_MM, _BLEND_MM)
 
 
@@ -150,15 +120,9 @@ def stomach() -> Field:
 def duodenum() -> Field:
     """The C about the pancreas' head, crossing before the great vessels."""
     path = [
-        (-34, -38, 16),
-        (-44, -28, 22),
-        (-50, -12, 12),
-        (-50, -4, -12),
-        (-44, -6, -36),
-        (-20, -14, -46),
-        (10, -14, -44),
-        (30, -14, -30),
-    ]
+        (-34, -38, 16), (-44, -28, 22), (-50, -12, 12), (-50, -4, -12), (-44, -6, -36), (-20, -14, -46),
+        (10, -14, -44), (30, -14, -30),
+    ]  # fmt: skip
     organ = tube(path, [10.0, 12.0, 12.5, 12.5, 12.5, 11.5, 11.5, 11.0], folds_mm=1.0, fold_length_mm=9.0)
     solid = [liver(), pancreas(), stomach(), gallbladder(), kidney_right()]
     near = [vessels.aorta(), vessels.vena_cava_inferior(), vessels.portal_vein(), torso.spinal_mass]
@@ -176,16 +140,7 @@ def colon() -> Field:
     radii = [27, 28, 26, 24, 22, 21, 20.5, 20, 20, 19.5, 19, 18.5, 17, 16, 15.5, 15.5, 15.5]
     organ = tube(path, radii, folds_mm=2.6, fold_length_mm=27.0)
     space = within(organ, [torso.inside_cage(11.0), offset(torso.diaphragm, -2.0)], 6.0)
-    solid = [
-        liver(),
-        stomach(),
-        spleen(),
-        kidney_right(),
-        kidney_left(),
-        pancreas(),
-        duodenum(),
-        gallbladder(),
-    ]
+    solid = [liver(), stomach(), spleen(), kidney_right(), kidney_left(), pancreas(), duodenum(), gallbladder()]
     return carve(space, [*solid, bones.hip_right(), bones.hip_left(), torso.spinal_mass], _GAP_MM, 3.0)
 
 
@@ -193,9 +148,8 @@ def colon() -> Field:
 def small_bowel() -> Field:
     """Loops in the frame of the colon."""
     rows = [_loop_row(row, z) for row, z in enumerate((-86.0, -107.0, -128.0, -149.0))]
-    links = [
-        np.stack([upper[-1], (upper[-1] + lower[0]) / 2 + [0.0, 6.0, 0.0], lower[0]]) for upper, lower in pairwise(rows)
-    ]
+    turns = ((upper[-1], lower[0]) for upper, lower in pairwise(rows))
+    links = [np.stack([a, (a + b) / 2 + [0.0, 6.0, 0.0], b]) for a, b in turns]
     organ = union([tube(path, 11.0) for path in [*rows, *links]], 5.0)
     space = within(organ, [torso.inside_cage(11.0), above(2, torso.CONTENT_BOTTOM_MM)], 4.0)
     near = [vessels.aorta(), vessels.vena_cava_inferior(), vessels.portal_vein(), torso.spinal_mass]

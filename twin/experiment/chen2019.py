@@ -1,20 +1,14 @@
 """Chen et al. 2019 in numbers: the paper's measurements, its printed errors, and whether a declaration explains them.
 
 Chen G. et al., "Robot-Assisted Puncture Positioning Methods under CT Navigation", J. Xi'an Jiaotong Univ. 53(4),
-2019, DOI 10.7652/xjtuxb201904013: Tables 1, 2 and 4 as measured (mm), errors of Tables 3, 5, 6, 7 computed from touches
-of either setup, many at once.
-
-`run_draws` draws many experiments from a declaration and ranks the paper's own one among them. Touches err alike in all
-directions, so that the carton's pose does not matter and they are drawn in the CT's axes. `find_skew` tests the one
-number that the paper's own points show: a skew of the CT's y against z, found from markers, tried on lesions.
+2019, DOI 10.7652/xjtuxb201904013. Touches err alike in all directions: they are drawn in the CT's axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -28,58 +22,31 @@ from puncture_twin.planning.registration.fits import design, fit_affine, fit_rig
 
 Point = tuple[float, float, float]
 
-TABLE_1: Mapping[str, Point] = MappingProxyType(
-    {
-        "A": (10, 20, 147),
-        "B": (110, 120, 147),
-        "C": (60, -10, 80),
-        "D": (90, -10, 20),
-        "E": (20, 150, 147),
-        "L": (50, 150, 39),
-        "M": (50, 130, 63),
-        "H": (50, 120, 76),
-    }
-)
+TABLE_1: Mapping[str, Point] = {
+    "A": (10, 20, 147), "B": (110, 120, 147), "C": (60, -10, 80), "D": (90, -10, 20), "E": (20, 150, 147),
+    "L": (50, 150, 39), "M": (50, 130, 63), "H": (50, 120, 76),
+}  # fmt: skip
 """Markers A-E and lesions L, M, H in the CT frame."""
-
-TABLE_2: Mapping[str, Point] = MappingProxyType(
-    {
-        "A": (417.67, -291.23, 534.59),
-        "B": (557.74, -272.83, 534.57),
-        "C": (423.48, -231.41, 604.06),
-        "L": (543.02, -336.48, 641.60),
-        "M": (527.05, -324.48, 617.63),
-        "H": (519.10, -318.38, 604.58),
-    }
-)
+TABLE_2: Mapping[str, Point] = {
+    "A": (417.67, -291.23, 534.59), "B": (557.74, -272.83, 534.57), "C": (423.48, -231.41, 604.06),
+    "L": (543.02, -336.48, 641.60), "M": (527.05, -324.48, 617.63), "H": (519.10, -318.38, 604.58),
+}  # fmt: skip
 """The same, touched by the robot, first placement of the box (setup 1), base frame."""
-
-TABLE_4: Mapping[str, Point] = MappingProxyType(
-    {
-        "A": (465.15, -298.26, 533.71),
-        "B": (602.02, -332.68, 533.97),
-        "C": (492.55, -244.10, 602.28),
-        "D": (518.62, -227.75, 661.64),
-        "E": (540.74, -404.60, 533.96),
-        "M": (554.23, -370.12, 617.50),
-    }
-)
+TABLE_4: Mapping[str, Point] = {
+    "A": (465.15, -298.26, 533.71), "B": (602.02, -332.68, 533.97), "C": (492.55, -244.10, 602.28),
+    "D": (518.62, -227.75, 661.64), "E": (540.74, -404.60, 533.96), "M": (554.23, -370.12, 617.50),
+}  # fmt: skip
 """Second placement (setup 2), base frame."""
-
-
 NAMES = tuple(TABLE_1)
 """Names of all points, in the order of the rows below."""
-
 READ: Floats = np.array(list(TABLE_1.values()), dtype=np.float64)
 """Table 1, shape (8, 3): what was read in the CT."""
 READ.setflags(write=False)
 
 SETUPS: tuple[Mapping[str, Point], ...] = (TABLE_2, TABLE_4)
 """Points that were touched in either setup."""
-
 TRIADS = ((0, "ABC", "L"), (0, "ABC", "M"), (0, "ABC", "H"), (1, "ABC", "M"), (1, "ABE", "M"), (1, "ACD", "M"))
 """Setup, markers and lesion of Tables 3 and 5."""
-
 AFFINE = ((1, "ABCE", "M"), (1, "ABCDE", "M"))
 """Numbers of Table 6, where least squares of twelve parameters are meant."""
 
@@ -91,20 +58,13 @@ def rows_of(names: str) -> list[int]:
 
 def measured() -> tuple[Floats, ...]:
     """Touches of the paper in each setup, shape (1, 8, 3), mm, base frame; NaN where a point was not touched."""
-    return tuple(
-        np.array([[touched.get(name, (np.nan, np.nan, np.nan)) for name in NAMES]], dtype=np.float64)
-        for touched in SETUPS
-    )
+    return tuple(np.array([[touched.get(name, (np.nan,) * 3) for name in NAMES]]) for touched in SETUPS)
 
 
 def printed_errors(touched: tuple[Floats, ...]) -> dict[str, Floats]:
-    """Every printed error of n experiments, by name, each of shape (n,), mm.
-
-    Args:
-        touched: Of each setup, shape (n, 8, 3), rows as `NAMES`, mm.
-    """
+    """Every printed error of n experiments, by name, each of shape (n,), mm."""
     by_triad = list(triad_errors(touched, READ).items())
-    residuals = _misses(_triad(touched[0], READ, "ABC"), touched[0], READ, "ABC")
+    residuals = _misses(_fitted(fit_triad, touched[0], READ, "ABC"), touched[0], READ, "ABC")
     found = dict([*by_triad[:2], ("mean residual of A-B-C, setup 1", residuals.mean(axis=1)), *by_triad[2:]])
     for setup, markers, lesion in AFFINE:
         T = np.array([fit_affine(READ[rows_of(markers)], one[rows_of(markers)]) for one in touched[setup]])
@@ -115,41 +75,37 @@ def printed_errors(touched: tuple[Floats, ...]) -> dict[str, Floats]:
 
 def triad_errors(touched: tuple[Floats, ...], read: Floats) -> dict[str, Floats]:
     """The errors of Tables 3 and 5 of n experiments, (n,) each, mm, of points ``read`` (8, 3) in the CT."""
-    return {
-        f"{lesion} by {'-'.join(markers)}, setup {setup + 1}": _misses(
-            _triad(touched[setup], read, markers), touched[setup], read, lesion
-        )[:, 0]
-        for setup, markers, lesion in TRIADS
-    }
+    found = {}
+    for setup, markers, lesion in TRIADS:
+        T = _fitted(fit_triad, touched[setup], read, markers)
+        found[f"{lesion} by {'-'.join(markers)}, setup {setup + 1}"] = _misses(T, touched[setup], read, lesion)[:, 0]
+    return found
 
 
-def _triad(touched: Floats, read: Floats, markers: str) -> Floats:
-    rows = rows_of(markers)
-    return fit_triad(np.broadcast_to(read[rows], (len(touched), 3, 3)), touched[:, rows])
+def _fitted(fit: Callable[[Floats, Floats], Floats], touched: Floats, read: Floats, names: str) -> Floats:
+    rows = rows_of(names)
+    return fit(np.broadcast_to(read[rows], (len(touched), len(rows), 3)), touched[:, rows])
 
 
 def _misses(T: Floats, touched: Floats, read: Floats, names: str) -> Floats:
+    return np.asarray(np.linalg.norm(_residuals(T, touched, read, names), axis=2))
+
+
+def _residuals(T: Floats, touched: Floats, read: Floats, names: str) -> Floats:
+    """Touched minus fitted, shape (n, k, 3), base frame."""
     rows = rows_of(names)
-    fitted = read[rows] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-    return np.asarray(np.linalg.norm(fitted - touched[:, rows], axis=2))
+    return np.asarray(touched[:, rows] - (read[rows] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]))
 
 
 POINTS = tuple("".join(touched) for touched in SETUPS)
 """Names of the points of each setup."""
-
 FREEDOM = sum(3 * len(names) - 6 for names in POINTS)
 """24: of both setups together."""
 
-STRAINS: Mapping[str, tuple[int, int]] = MappingProxyType(
-    {
-        "scale of x": (0, 0),
-        "scale of y": (1, 1),
-        "scale of z": (2, 2),
-        "x against y": (0, 1),
-        "x against z": (0, 2),
-        "y against z": (1, 2),
-    }
-)
+STRAINS: Mapping[str, tuple[int, int]] = {
+    "scale of x": (0, 0), "scale of y": (1, 1), "scale of z": (2, 2),
+    "x against y": (0, 1), "x against z": (0, 2), "y against z": (1, 2),
+}  # fmt: skip
 """What one number may be wrong with a CT's frame: an axis that moves along another, or along itself."""
 
 
@@ -157,10 +113,8 @@ def rigid_residuals(touched: tuple[Floats, ...]) -> tuple[Floats, ...]:
     """Residuals of each setup: touched minus fitted by its points, CT axes, (n, p, 3), from touches (n, 8, 3), mm."""
     found = []
     for names, points in zip(POINTS, touched, strict=True):
-        rows = rows_of(names)
-        T = fit_rigid(np.broadcast_to(READ[rows], (len(points), len(rows), 3)), points[:, rows])
-        fitted = READ[rows] @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-        found.append((points[:, rows] - fitted) @ T[:, :3, :3])  # R^T r: into CT axes
+        T = _fitted(fit_rigid, points, READ, names)
+        found.append(_residuals(T, points, READ, names) @ T[:, :3, :3])  # R^T r: into CT axes
     return tuple(found)
 
 
@@ -176,7 +130,7 @@ def chi_squared(residuals: tuple[Floats, ...], declaration: Declaration) -> Floa
 
         chi^2 = z' P z,   P = C^-1 - C^-1 A (A' C^-1 A)^-1 A' C^-1,   3 p - 6 degrees of freedom for p points.
     """
-    rows = np.array([row for names in POINTS for row in rows_of(names)])
+    rows = np.array(rows_of("".join(POINTS)))
     axes = (3 * rows[:, None] + np.arange(3)).ravel()
     cov = declaration.carton_covariance(READ)[np.ix_(axes, axes)] + declaration.touch_mm**2 * np.eye(len(axes))
     A, weights = block_diag(*(_design(names) for names in POINTS)), np.linalg.inv(cov)
@@ -201,10 +155,9 @@ def strain_gains(residuals: tuple[Floats, ...]) -> dict[str, Floats]:
         # one number for both setups: numerator and denominator add up before the square
         dot, norm = np.zeros(len(whole)), 0.0
         for names, one in zip(POINTS, residuals, strict=True):
-            points = READ[rows_of(names)] - READ[rows_of(names)].mean(axis=0)
+            points, A = READ[rows_of(names)], _design(names)
             b = np.zeros(points.shape)
-            b[:, moved] = points[:, along]
-            A = design(points, np.zeros(3))
+            b[:, moved] = (points - points.mean(axis=0))[:, along]
             left = b.ravel() - A @ np.linalg.lstsq(A, b.ravel(), rcond=None)[0]  # M b
             dot, norm = dot + one.reshape(len(one), -1) @ left, norm + float(left @ left)
         gains[name] = dot**2 / norm / whole
@@ -213,7 +166,6 @@ def strain_gains(residuals: tuple[Floats, ...]) -> dict[str, Floats]:
 
 REJECTED = 1e-6
 """A declaration under which the paper's residuals are less likely is not its."""
-
 MARGINAL = (5.0, 95.0)
 JOINT = (2.5, 97.5)
 """Percentiles between which a printed error, and a joint statistic, lies where a declaration is right."""
@@ -221,14 +173,7 @@ JOINT = (2.5, 97.5)
 
 @dataclass(frozen=True)
 class DrawnRank:
-    """Percentile of a number of the paper among draws of it.
-
-    Attributes:
-        paper: The paper's, by its own points.
-        percentile: Of the draws below it, 0 to 100.
-        low: 5th percentile of the draws.
-        high: 95th percentile of the draws.
-    """
+    """Percentile of a number of the paper among draws of it, 0 to 100, and percentiles of the draws."""
 
     name: str
     paper: float
@@ -247,11 +192,9 @@ class Experiment:
     """The paper's experiment under one declaration.
 
     Attributes:
-        printed: Each printed error, mm.
-        joint: Sums of squares per axis of the CT (mm^2), and chi-squared, over all points of both setups.
         probability: Of a chi-squared as large as the paper's, by the law with 24 degrees.
         best_strain: Fraction of draws in which some strain takes away as much as the paper's best one does.
-        several: Errors by several triads, mm, see `several_triads`: by the paper's own points, and rms of the draws.
+        several: See `several_triads`: mm by the paper's own points, and rms of the draws.
     """
 
     declaration: Declaration
@@ -279,6 +222,7 @@ def run_draws(declaration: Declaration, draws: int, rng: np.random.Generator) ->
     touched = tuple(declaration.draw_touches(carton, rng) for _ in SETUPS)
     paper, drawn = rigid_residuals(measured()), rigid_residuals(touched)
     chi = float(chi_squared(paper, declaration)[0])
+    several, drawn_several = several_triads(measured()[SETUP]), several_triads(touched[SETUP])
     return Experiment(
         declaration,
         draws,
@@ -286,18 +230,13 @@ def run_draws(declaration: Declaration, draws: int, rng: np.random.Generator) ->
         _ranks(_joint(paper, declaration), _joint(drawn, declaration)),
         float(chdtrc(FREEDOM, chi)),
         float(np.mean(_best(drawn) >= _best(paper)[0])),
-        {
-            name: (float(off[0]), rms(drawn_off))
-            for (name, off), drawn_off in zip(
-                several_triads(measured()[SETUP]).items(), several_triads(touched[SETUP]).values(), strict=True
-            )
-        },
+        {name: (float(off[0]), rms(drawn_several[name])) for name, off in several.items()},
     )
 
 
 def paper_strains() -> Mapping[str, float]:
     """Fraction of the paper's sum of squares that each strain of the CT's frame alone takes away."""
-    return MappingProxyType({name: float(gain[0]) for name, gain in strain_gains(rigid_residuals(measured())).items()})
+    return {name: float(gain[0]) for name, gain in strain_gains(rigid_residuals(measured())).items()}
 
 
 def _joint(residuals: tuple[Floats, ...], declaration: Declaration) -> dict[str, Floats]:
@@ -321,18 +260,15 @@ def _ranks(paper: Mapping[str, Floats], drawn: Mapping[str, Floats]) -> tuple[Dr
 
 MARKERS, SETUP = "ABCDE", 1
 """From which the skew is found: the markers of the second setup, no lesion among them."""
-
 WIDEST = 0.3
 """tan of 17 degrees: no scanner is farther out of square."""
 
 
 class Skew(NamedTuple):
-    """The skew, and its effect on the errors of the paper's triads at lesions."""
+    """The skew of y against z, rad; and each triad's error at a lesion as printed, and with it taken off, mm."""
 
     angle: float
-    """rad, of y against z."""
     lesions: Mapping[str, tuple[float, float]]
-    """Error as the paper prints it, and with the skew taken off the CT's readings, by triad and lesion; mm."""
 
 
 def find_skew() -> Skew:
@@ -360,25 +296,18 @@ TRIPLES = tuple("".join(one) for one in combinations(MARKERS, 3))
 
 
 def several_triads(touched: Floats, read: Floats = READ, lesion: str = "M") -> dict[str, Floats]:
-    """Errors of a lesion by several triads of the markers of the second setup, of n experiments, (n,) each, mm.
-
-    Args:
-        touched: Shape (n, 8, 3), rows as `NAMES`, mm.
-        read: Shape (8, 3), mm, in the CT.
-    """
-    rows, at = rows_of(MARKERS), read[rows_of(lesion)]
-    poses = np.array([_triad(touched, read, names) for names in TRIPLES])
-    points = poses[..., :3, :3] @ at[0] + poses[..., :3, 3]
-    off = np.linalg.norm(points - touched[:, rows_of(lesion)[0]], axis=2)
+    """Errors of a lesion by several triads of the markers of the second setup, of n experiments, (n,) each, mm."""
+    at = read[rows_of(lesion)]
+    poses = np.array([_fitted(fit_triad, touched, read, names) for names in TRIPLES])
+    points, there = poses[..., :3, :3] @ at[0] + poses[..., :3, 3], touched[:, rows_of(lesion)[0]]
+    off = np.linalg.norm(points - there, axis=2)
     best, *_, worst = sorted(TRIPLES, key=lambda names: spread_of(read[rows_of(names)], at))
-    every = fit_rigid(np.broadcast_to(read[rows], (len(touched), len(rows), 3)), touched[:, rows])
+    every = _fitted(fit_rigid, touched, read, MARKERS)
     return {
         f"the best-placed triad, {'-'.join(best)}": off[TRIPLES.index(best)],
         f"the worst-placed triad, {'-'.join(worst)}": off[TRIPLES.index(worst)],
         f"one of all {len(TRIPLES)} triads, rms": np.sqrt(np.mean(off**2, axis=0)),
-        "mean of the points of all triads": np.linalg.norm(
-            points.mean(axis=0) - touched[:, rows_of(lesion)[0]], axis=1
-        ),
+        "mean of the points of all triads": np.linalg.norm(points.mean(axis=0) - there, axis=1),
         "rigid fit of all five markers": _misses(every, touched, read, lesion)[:, 0],
     }
 
@@ -394,21 +323,16 @@ def spread_of(markers: Floats, at: Floats) -> float:
 
 BED = 0
 """The CT's axis along the bed: the slices lie across it."""
-
 PLANES = ((0, 1), (0, 2), (1, 2))
 """Pairs of CT axes that may be askew: the first along the second."""
 
 
 @dataclass(frozen=True)
 class Declaration:
-    """Declared errors of one experiment.
+    """Declared errors of one experiment: uniform in slices and pixels, normal readings and touches per axis, mm.
 
     Attributes:
-        slice_mm: Slice spacing: a uniform error of half of it each way along the bed.
-        pixel_mm: The same across the bed.
-        reading_mm: Standard deviation of a reading in the CT, per axis, besides.
         skew: Standard deviation of each plane's angle, rad: one draw for the whole CT.
-        touch_mm: Standard deviation of a touch, per axis.
     """
 
     name: str
@@ -448,6 +372,5 @@ class Declaration:
 
 AS_STATED = Declaration("as the paper states", slice_mm=5.0, pixel_mm=1.0, touch_mm=0.1)
 """Slices of 5 mm, pixels read to 1 mm, a control error of 0.1 mm."""
-
 AS_FOUND = Declaration("as its touches show", reading_mm=0.5, skew=float(np.radians(2.0)), touch_mm=0.35)
 """A CT out of square, readings and touches as the distances between its points show (docs/reference/validation.md)."""

@@ -1,10 +1,8 @@
 """Image of the ball on its rod, computed per pixel instead of rasterised, so that it is truer than what measures it.
 
-Each pixel is cut into 4 x 4 cells. A cell's ray is intersected with ball, rod and occluder in closed form: the outline
-is that of the sphere itself (an ellipse, bent by the lens), not of a disc. Along an outline a cell is covered by the
-fraction that a straight edge at the outline's distance would cover. The ball's centre errs by less than 1e-3 px and a
-pixel by less than one grey level of 140, which the tests compare with 40 x 40 plain rays per pixel. Then the lens's
-blur (a Gaussian), the sensor's noise (normal) and rounding to 8 bits follow.
+Each pixel is cut into 4 x 4 cells, whose rays are intersected with ball, rod and occluder in closed form; along an
+outline a cell is covered as by a straight edge. The ball's centre errs by less than 1e-3 px, a pixel by less than one
+grey level of 140. The lens's blur (a Gaussian), the sensor's noise (normal) and rounding to 8 bits follow.
 """
 
 from __future__ import annotations
@@ -32,26 +30,12 @@ OCCLUDER_SIZE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class BallScene:
-    """A ball on its rod as a camera may see it. Directions need not be unit; greys are levels from 0 to 255.
+    """A ball on its rod as a camera may see it, frame C, mm. Directions need not be unit; greys are from 0 to 255.
 
     Attributes:
-        center_c: The ball's centre, shape (3,), mm, frame C.
-        radius_mm: Half of the ball's diameter of 8 mm.
-        rod_c: Shape (3,): from the ball along the rod to the flange.
-        rod_radius_mm: The rod is a cylinder with round ends.
-        rod_length_mm: From the ball's centre.
-        light_c: Shape (3,): toward the light.
         diffuse: Fraction of the light that comes from everywhere, 0 to 1; directed light obeys Lambert's law.
-        ball_grey: Of the ball where the light shines straight on it.
-        rod_grey: The rod's.
-        background_grey: What is behind.
-        texture_grey: Standard deviation of the background's pattern.
-        texture_px: Size of the pattern's spots (standard deviation of the smoothing).
         hidden_fraction: Fraction of the ball's disc that an occluder covers, 0 to 1.
         hidden_from: Angle in the tangent plane from which it comes, rad.
-        occluder_grey: The occluder's.
-        ball: False takes the ball away.
-        rod: False takes the rod away.
     """
 
     center_c: Floats
@@ -74,33 +58,18 @@ class BallScene:
 
 
 class _Layer(NamedTuple):
-    """A body as the cells see it, each (h, w)."""
+    """A body as the cells see it, each (h, w): covered fraction, depth along the ray in mm, and grey."""
 
     cover: Floats
-    """0 to 1."""
     depth: Floats
-    """mm along the ray."""
     grey: Floats
 
 
 def render(
-    camera: Camera,
-    scene: BallScene,
-    *,
-    rng: np.random.Generator,
-    noise: float = 2.0,
-    blur_px: float = 0.7,
-    half_px: int | None = None,
-) -> GreyImage:
-    """The camera's image of a scene.
-
-    Args:
-        camera: The true camera.
-        rng: Draws the noise and the pattern of the background.
-        noise: Standard deviation of the sensor's noise, grey levels.
-        blur_px: Standard deviation of the lens's blur.
-        half_px: None takes the whole image; a number only the window that far around the ball's centre.
-    """
+    camera: Camera, scene: BallScene, *, rng: np.random.Generator,
+    noise: float = 2.0, blur_px: float = 0.7, half_px: int | None = None,
+) -> GreyImage:  # fmt: skip
+    """The camera's image of a scene: whole, or only the window of `half_px` around the ball's centre."""
     low, high = _window(camera, scene, half_px)
     shape = (max(high[1] - low[1], 0), max(high[0] - low[0], 0))
     grey = np.full(shape, scene.background_grey, dtype=np.float64)
@@ -124,7 +93,6 @@ def _window(camera: Camera, scene: BallScene, half_px: int | None) -> tuple[NDAr
 
 
 def _paint(grey: Floats, low: NDArray[np.int64], camera: Camera, scene: BallScene, blur_px: float) -> None:
-    """Add the bodies to a part of the image that starts at ``low``; changes ``grey``."""
     pad = int(np.ceil(BLUR_REACH * blur_px)) + 1
     size = np.array(grey.shape[::-1])
     box_low, box_high = (box - low for box in _bounds(camera, scene, pad))
@@ -134,8 +102,8 @@ def _paint(grey: Floats, low: NDArray[np.int64], camera: Camera, scene: BallScen
     first = low + box_low - pad
     shape = box_high - box_low + 2 * pad
     ink, clear = _composite(_layers(_cell_rays(camera, first, shape), camera, scene))
-    sigma = blur_px * CELLS
-    ink, clear = (_to_pixels(gaussian_filter(cells, sigma, truncate=BLUR_REACH)) for cells in (ink, clear))
+    blurred = (gaussian_filter(cells, blur_px * CELLS, truncate=BLUR_REACH) for cells in (ink, clear))
+    ink, clear = (cells.reshape(shape[1], CELLS, shape[0], CELLS).mean(axis=(1, 3)) for cells in blurred)
     inner = (slice(pad, shape[1] - pad), slice(pad, shape[0] - pad))
     part = (slice(box_low[1], box_high[1]), slice(box_low[0], box_high[0]))
     grey[part] = ink[inner] + clear[inner] * grey[part]
@@ -151,14 +119,12 @@ def _bounds(camera: Camera, scene: BallScene, pad: int) -> tuple[NDArray[np.int6
     lows, highs = [], []
     for point, radius in ends:
         pixel = camera.project(point)
-        if not np.isfinite(pixel).all():
-            continue
-        margin = 1.2 * camera.ball_radius_px(point, radius) + pad
-        lows.append(np.floor(pixel - margin))
-        highs.append(np.ceil(pixel + margin) + 1)
-    if not lows:
-        return np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64)
-    return np.min(lows, axis=0).astype(np.int64), np.max(highs, axis=0).astype(np.int64)
+        if np.isfinite(pixel).all():
+            margin = 1.2 * camera.ball_radius_px(point, radius) + pad
+            lows.append(np.floor(pixel - margin))
+            highs.append(np.ceil(pixel + margin) + 1)
+    none = [np.zeros(2)]
+    return np.min(lows or none, axis=0).astype(np.int64), np.max(highs or none, axis=0).astype(np.int64)
 
 
 def _cell_rays(camera: Camera, first: NDArray[np.int64], shape: NDArray[np.int64]) -> Floats:
@@ -272,11 +238,6 @@ def _composite(layers: list[_Layer]) -> tuple[Floats, Floats]:
         ink += clear * cover * grey
         clear *= 1 - cover
     return ink, clear
-
-
-def _to_pixels(cells: Floats) -> Floats:
-    h, w = cells.shape[0] // CELLS, cells.shape[1] // CELLS
-    return np.asarray(cells.reshape(h, CELLS, w, CELLS).mean(axis=(1, 3)))
 
 
 def _length(vectors: Floats) -> Floats:

@@ -19,11 +19,7 @@ FAR_MM = 1500.0
 
 @dataclass(frozen=True, eq=False)
 class RoomCameras:
-    """Two cameras, calibrated to each other, anywhere in each of n rooms.
-
-    Attributes:
-        T_cameras_base: Shape (n, 4, 4), mm.
-    """
+    """Two cameras, calibrated to each other, anywhere in each of n rooms."""
 
     device: Stereo
     T_cameras_base: Floats
@@ -43,12 +39,7 @@ class RoomCameras:
 
 @dataclass(frozen=True, eq=False)
 class RoomProbe:
-    """A probe on its arm in each of n rooms; errors of calibration and of reading a picture last all the way in.
-
-    Attributes:
-        target_off: Shape (n, 3), mm, base axes: what target readings are off by.
-        tip_off: Shape (n, 3), those of the tip.
-    """
+    """A probe in each of n rooms; `target_off` and `tip_off` (n, 3), mm, base axes, last all the way in."""
 
     target_off: Floats
     tip_off: Floats
@@ -79,7 +70,6 @@ class RoomScanner:
 
     Attributes:
         T_ct_base: Shape (4, 4), mm: where the couch really is.
-        tip_root: Shape (3, 3), mm, CT axes: S with S S' the covariance of a tip's reading.
         target_off: Shape (n, 3), mm: what target readings are off by.
     """
 

@@ -41,32 +41,29 @@ class PoseRanges(NamedTuple):
         return np.where(rng.random(size) < self.at_ends, ends, values)
 
 
+USUAL = PoseRanges()
+
+
 class SimulatedTruth(NamedTuple):
-    """The truth that a calibration is to find."""
+    """What a calibration is to find: T_end1_image X, T_base1_base2 Y, tip (3,), mm, direction (3,), unit, to the tip.
+
+    About `A_mean`, T_base1_end1 (4, 4), mm, the probe's poses are drawn.
+    """
 
     X: Floats
-    """T_end1_image, shape (4, 4), mm."""
     Y: Floats
-    """T_base1_base2, shape (4, 4), mm."""
     tip_end2: Floats
-    """Shape (3,), mm."""
     direction_end2: Floats
-    """Shape (3,), unit, toward the tip."""
     A_mean: Floats
-    """T_base1_end1 about which the poses are drawn, shape (4, 4), mm."""
 
 
 class ImagePose(NamedTuple):
-    """The needle in the image, for n poses."""
+    """The needle in the image at n poses: the tip (n, 2); angles (n,), rad, ``lean`` out of the slice."""
 
     tip_mm: Floats
-    """Shape (n, 2)."""
     insertion: Floats
-    """Shape (n,), rad."""
     roll: Floats
-    """Shape (n,), rad."""
     lean: Floats
-    """Shape (n,), rad: out of the slice."""
 
 
 def draw_truth(rng: np.random.Generator) -> SimulatedTruth:
@@ -76,36 +73,25 @@ def draw_truth(rng: np.random.Generator) -> SimulatedTruth:
     Y = pose(R_Y, np.array([900.0, 0.0, 0.0]) + rng.uniform(-60, 60, 3))
     direction = exp_rotation(rng.uniform(-0.3, 0.3, 3))[:, 2]
     tip = rng.uniform(140.0, 200.0) * direction + np.append(rng.uniform(-15, 15, 2), 0.0)
-    A_mean = pose(
-        exp_rotation(np.array([np.pi, 0.0, 0.0])) @ exp_rotation(rng.uniform(-0.3, 0.3, 3)),
-        np.array([450.0, 0.0, 300.0]),
-    )
-    return SimulatedTruth(X, Y, tip, direction, A_mean)
+    R_mean = exp_rotation(np.array([np.pi, 0.0, 0.0])) @ exp_rotation(rng.uniform(-0.3, 0.3, 3))
+    return SimulatedTruth(X, Y, tip, direction, pose(R_mean, np.array([450.0, 0.0, 300.0])))
 
 
-def draw_probe_poses(
-    rng: np.random.Generator, truth: SimulatedTruth, n: int, ranges: PoseRanges | None = None
-) -> Floats:
+def draw_probe_poses(rng: np.random.Generator, truth: SimulatedTruth, n: int, ranges: PoseRanges = USUAL) -> Floats:
     """A within the ranges, shape (n, 4, 4)."""
-    ranges = ranges or PoseRanges()
     R = truth.A_mean[:3, :3] @ exp_rotation(ranges.draw(rng, -ranges.tilt, ranges.tilt, (n, 3)))
     return pose(R, truth.A_mean[:3, 3] + ranges.draw(rng, -ranges.shift_mm, ranges.shift_mm, (n, 3)))
 
 
-def draw_image_poses(rng: np.random.Generator, n: int, ranges: PoseRanges | None = None) -> ImagePose:
+def draw_image_poses(rng: np.random.Generator, n: int, ranges: PoseRanges = USUAL) -> ImagePose:
     """The needle in the image within the ranges."""
-    ranges = ranges or PoseRanges()
     tip = np.column_stack([ranges.draw(rng, *ranges.u_mm, n), ranges.draw(rng, *ranges.v_mm, n)])
     angles = ranges.draw(rng, *ranges.insertion, n), rng.uniform(-ranges.roll, ranges.roll, n)
     return ImagePose(tip, *angles, rng.normal(0.0, ranges.lean, n) if ranges.lean else np.zeros(n))
 
 
 def exact_recording(truth: SimulatedTruth, A: Floats, seen: ImagePose) -> Recording:
-    """The recording without noise: B such that the needle shows in the image as wished.
-
-    Args:
-        A: Shape (n, 4, 4).
-    """
+    """The recording without noise: B such that the needle shows in the image as wished."""
     n = len(A)
     shown = np.column_stack([np.cos(seen.insertion), np.sin(seen.insertion)])
     along = np.column_stack([shown * np.cos(seen.lean)[:, None], np.sin(seen.lean)])
@@ -131,13 +117,9 @@ def with_noise(rng: np.random.Generator, exact: Recording, noise: Noise) -> Reco
 
 
 def simulate_recording(
-    rng: np.random.Generator,
-    n: int,
-    truth: SimulatedTruth | None = None,
-    *,
-    noise: Noise | None = SPEC_NOISE,
-    ranges: PoseRanges | None = None,
-) -> tuple[Recording, SimulatedTruth]:
+    rng: np.random.Generator, n: int, truth: SimulatedTruth | None = None, *,
+    noise: Noise | None = SPEC_NOISE, ranges: PoseRanges = USUAL,
+) -> tuple[Recording, SimulatedTruth]:  # fmt: skip
     """Draw a recording of n poses, and the truth where none is given; ``noise=None`` leaves it exact."""
     truth = draw_truth(rng) if truth is None else truth
     exact = exact_recording(truth, draw_probe_poses(rng, truth, n, ranges), draw_image_poses(rng, n, ranges))

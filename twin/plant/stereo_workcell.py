@@ -1,7 +1,4 @@
-"""The ground truth of a stereo workcell: an arm off its nominal model, two cameras, a head; drawn once for each seed.
-
-`StereoPlant` answers as its devices do; frames are those of `twin.guidance.stereo.servo_case`.
-"""
+"""The ground truth of a stereo workcell: arm, cameras, head; frames are those of `twin.guidance.stereo.servo_case`."""
 
 from __future__ import annotations
 
@@ -31,58 +28,40 @@ from puncture_twin.twin.plant.truth import Gears, PlantArm, TrueArm, draw_true_a
 
 LINE_OF_SIGHT_RINGS = ((0.0, 1), (0.55, 6), (0.95, 12))
 """Where on the ball's disc a line of sight ends: fraction of the radius, and how many around."""
-
-
 DIFFUSE = {"diffuse": 0.8, "lamp": 0.4}
 """Fraction of diffuse light; the rest is from one direction."""
-
 WINDOW_MARGIN_PX = 24
 """An image, and the rod in it, are drawn this far beyond the region that is queried: the rest is never looked at."""
-
 POINTED_MM = 3.0
 """Deviation of an operator's pointing at a marker in the images, per axis."""
 
 
 class TrueNeedle(NamedTuple):
-    """The true needle against the anatomy, image axes."""
+    """True tip minus true target (3,), mm, image axes; and the needle's axes as columns (3, 3), z to the tip."""
 
     error_m: Floats
-    """Shape (3,), mm: true tip minus true target."""
     R_m_needle: Floats
-    """Shape (3, 3): its axes as columns, z to the tip."""
 
 
 class ShownBall(NamedTuple):
-    """A true ball or marker, C, mm."""
+    """A true ball or marker, C, mm, and the direction (3,) along its rod; a marker has none."""
 
     center_c: Floats
-    """Shape (3,)."""
     radius_mm: float
     rod_c: Floats | None
-    """Shape (3,): along the rod; None for a marker, which has none."""
 
 
 class TrueTool(NamedTuple):
-    """Errors of rod and needle, flange axes."""
+    """Errors (3,) of rod and needle, flange axes: ball against belief, tip against ball, mm; lean about x, y, rad."""
 
     ball_offset: Floats
-    """Shape (3,), mm: the ball's centre against where the controller has it."""
     tip_offset: Floats
-    """Shape (3,), mm: the needle's tip against the ball's centre."""
     lean: Floats
-    """Shape (3,), rad: the needle's rotation against the flange, about x and y."""
 
 
 @dataclass(frozen=True, eq=False)
 class StereoWorkcell:
-    """The ground truth of one workcell.
-
-    Attributes:
-        T_c_base: Shape (4, 4), mm: the true arm's base in C.
-        cameras: The true cameras.
-        T_c_m: Shape (4, 4), mm: true pose of the head when its markers are seen.
-        T_c_m_after: Shape (4, 4), mm: where it is from then on.
-    """
+    """The ground truth of one workcell; T_c_m (4, 4), mm: the head when its markers are seen, and from then on."""
 
     case: ServoCase
     arm: TrueArm
@@ -154,24 +133,14 @@ class StereoWorkcell:
 
 
 class StereoPlant(PlantArm):
-    """A workcell in time: where the arm is, whether the head is there; it answers as arm, cameras and touch do.
-
-    Args:
-        pictures: Draws what differs from image to image.
-        arm: Draws the arm's repeatability, and the measuring arm's readings.
-        operator: Draws where the operator points.
-    """
+    """A workcell in time; it answers as arm, cameras and touch do. Each of them draws by a generator of its own."""
 
     def __init__(
-        self,
-        workcell: StereoWorkcell,
-        pictures: np.random.Generator,
-        arm: np.random.Generator,
+        self, workcell: StereoWorkcell, pictures: np.random.Generator, arm: np.random.Generator,
         operator: np.random.Generator,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(workcell.arm, arm)
-        self.workcell, self.pictures, self._operator = workcell, pictures, operator
-        self._head_there = False
+        self.workcell, self.pictures, self._operator, self._head_there = workcell, pictures, operator, False
         self._shown: ShownBall | None = None
 
     def bring_head(self) -> None:
@@ -223,35 +192,24 @@ class StereoPlant(PlantArm):
 
 def ball_scene(plan: CamerasSection, ball: ShownBall, hidden: float, rng: np.random.Generator) -> BallScene:
     """The scene of a ball; an occluder that the case demands comes from any side."""
-    fraction = min(max(plan.occlusion if ball.rod_c is not None else 0.0, hidden), 0.99)
-    return BallScene(
-        ball.center_c,
-        radius_mm=ball.radius_mm,
-        rod_c=(0.0, -1.0, 0.0) if ball.rod_c is None else ball.rod_c,
-        rod=ball.rod_c is not None,
-        diffuse=DIFFUSE[plan.light],
-        hidden_fraction=fraction,
-        hidden_from=float(rng.uniform(-np.pi, np.pi)),
-    )
+    from_side, diffuse = float(rng.uniform(-np.pi, np.pi)), DIFFUSE[plan.light]
+    if ball.rod_c is None:
+        return BallScene(ball.center_c, ball.radius_mm, rod=False, diffuse=diffuse,
+                         hidden_fraction=min(hidden, 0.99), hidden_from=from_side)  # fmt: skip
+    fraction = min(max(plan.occlusion, hidden), 0.99)
+    return BallScene(ball.center_c, ball.radius_mm, ball.rod_c, diffuse=diffuse, hidden_fraction=fraction,
+                     hidden_from=from_side)  # fmt: skip
 
 
 def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
-    """A workcell with its errors drawn from what the case declares, or from what it states as its truth.
-
-    Raises:
-        InputError: Cameras or arm that cannot be.
-    """
+    """A workcell with its errors drawn from what the case declares, or from what it states as its truth."""
     errors = case.truth_errors
     arm = draw_true_arm(case.model, errors, rng)
-    T_base_c = calibration_frame(case)
-    T_c_base = np.asarray(np.linalg.inv(T_base_c), dtype=np.float64)
+    T_c_base = np.asarray(np.linalg.inv(calibration_frame(case)), dtype=np.float64)
     cameras = tuple(_misplaced(camera, errors, rng) for camera in planned_cameras(case))
     cameras = tuple(replace(one, distortion=one.distortion + rng.normal(0.0, errors.lens)) for one in cameras)
-    tool = TrueTool(
-        rng.normal(0.0, errors.ball_offset_mm, 3),
-        rng.normal(0.0, errors.tip_offset_mm, 3),
-        np.append(rng.normal(0.0, errors.needle_direction, 2), 0.0),
-    )
+    ball, tip = (rng.normal(0.0, mm, 3) for mm in (errors.ball_offset_mm, errors.tip_offset_mm))
+    tool = TrueTool(ball, tip, np.append(rng.normal(0.0, errors.needle_direction, 2), 0.0))
     T_c_m = T_c_base @ head_pose(case)
     moved = np.concatenate([rng.normal(0.0, errors.head_turn, 3), rng.normal(0.0, errors.head_shift_mm, 3)])
     after = rotated_about(T_c_m, apply(T_c_m, case.markers.points.mean(axis=0)), moved)
@@ -261,7 +219,6 @@ def draw_workcell(case: ServoCase, rng: np.random.Generator) -> StereoWorkcell:
 
 
 def _misplaced(camera: Camera, errors: ServoErrors, rng: np.random.Generator) -> Camera:
-    """A camera as it is in truth: rotated, shifted, its lens off its focal length and axis."""
     T = pose(exp_rotation(rng.normal(0.0, errors.camera_turn, 3)), rng.normal(0.0, errors.camera_shift_mm, 3))
     cx, cy = np.array([camera.cx, camera.cy]) + rng.normal(0.0, errors.camera_axis_px, 2)
     focal = camera.fx * (1.0 + rng.normal(0.0, errors.camera_focal))

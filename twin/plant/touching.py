@@ -1,8 +1,7 @@
 """An arm that touches markers in the simulator, and an executed tour of them.
 
-The declared errors of arm and markers are in where each marker is touched: the simulated arm is the nominal one, so a
-pad stands on its line where the erring arm's tip would be on the true marker. The tip is a point: the pad is square to
-the needle.
+The simulated arm is the nominal one: a pad, square to the needle, stands where an erring arm's tip would be on the true
+marker.
 """
 
 from __future__ import annotations
@@ -36,7 +35,6 @@ from puncture_twin.twin.world.control import (
     Run,
     Stiffness,
     Stop,
-    Surroundings,
     allowed_step,
     reference_of,
     rigid_model,
@@ -48,36 +46,27 @@ from puncture_twin.twin.world.workcell import SimulatedWorkcell, load_box, open_
 
 CONTACT_N = 0.5
 """Force along the needle, N, that counts as contact."""
-
 CONTACT_STEPS = 3
 """In a row: a sensor's noise alone does not reach it so often."""
-
 FORCE_NOISE_N = 0.1
 """Standard deviation of the force sensor, per reading."""
-
 SPRING = Stiffness(translation_n_m=1e3, rotation_nm_rad=100.0, integral_per_s=5.0)
 """Spring at the tip while it approaches a marker. The integral, which stands still in contact, takes away what the
 arm's masses err by: with a tenth of them wrong the tip would come down .6 mm aside."""
-
 PAD_N_M = 1e5
 """Stiffness of a marker on skin; a rigid one's first peak would be momentum over the time step."""
-
 PAD_MM = (12.0, 12.0, 4.0)
-
 LOOK_EVERY = 8
 """Steps of the motors between two looks at where the needle is: 30 a second."""
-
 PAUSE_S = 0.25
 """Before motors and torques take over from one another."""
 
 
 class TrueContact(NamedTuple):
-    """What was true when a touch was read."""
+    """What was true when a touch was read: how deep in the marker the tip was, and its speed."""
 
     bias_mm: float
-    """How deep in the marker the tip was."""
     speed_mm_s: float
-    """Tip speed at contact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +79,7 @@ class ExecutedTouches(Touched):
 def execute_touches(
     tour: TouchTour, case: Case, anatomy: Anatomy, checkers: ApproachCheckers, truth: TouchTruth, progress: Count
 ) -> ExecutedTouches:
-    """Touch the markers at their true places. The same tour and truth give the same numbers.
-
-    Args:
-        tour: Where, in which order, by which motions.
-        case: For tool, boxes and gravity.
-        checkers: Of the workcell as it is believed.
-        truth: All randomness but the force sensor's is in it, and that comes from its seed.
-    """
+    """Touch the markers at their true places. The same tour and truth give the same numbers."""
     tool, T = case_tool(case), truth.T_base_ct
     down_ct = -bed_frame(case)[:3, 2]
     with (
@@ -112,13 +94,7 @@ def execute_touches(
 
 
 class TouchingPlant:
-    """The simulated arm at the true markers, as a `TouchingArm`.
-
-    Args:
-        rigid: The arm's masses as its controller knows them.
-        tour: For arm and needle.
-        patient: Checker of the needle against the patient at their true pose.
-    """
+    """The simulated arm at the true markers, as a `TouchingArm`."""
 
     def __init__(
         self, workcell: SimulatedWorkcell, rigid: RigidModel, tour: TouchTour, truth: TouchTruth, patient: CellChecker
@@ -149,10 +125,8 @@ class TouchingPlant:
     def move(self, motion: Trajectory, *, in_air: bool = False) -> Moved:
         """By the position motors; the physics lets the needle pass the skin, so another checker looks after it."""
         done = self._run(Motors(), motion)
-        found = in_air and self._patient.first_contact(
-            done.q[::LOOK_EVERY] + self._arrival, needle_may_touch_patient=False
-        )
-        if found:
+        seen = done.q[::LOOK_EVERY] + self._arrival
+        if in_air and (found := self._patient.first_contact(seen, needle_may_touch_patient=False)):
             what = f"{found.contact.body} touched {found.contact.other}"
             raise StoppedError(f"on the way {what}: the patient is not at the believed position")
         return _moved(done)
@@ -180,15 +154,11 @@ class TouchingPlant:
 
     def _run(self, controller: Controller, motion: Trajectory, stop: Stop | None = None, pause_s: float = 0.0) -> Run:
         reference = reference_of(self._model, self._rigid.tip_m, motion, controller.dt, pause_s)
-        around = Surroundings(self._arrival, stop=stop, watch=lambda row: self._refuse_contacts())
-        tip = lambda q: tips(self._model, self._rigid.tip_m, q[None])  # noqa: E731
-        return run(self._workcell.arm, controller, reference, tip, around)
+        return run(self._workcell.arm, controller, reference, self._arrival, stop=stop, watch=self._refuse_contacts)
 
-    def _refuse_contacts(self) -> None:
-        """Stop where the arm touches what it should not; the markers' pads have no name."""
-        for one in touches(self._workcell.arm):
-            if one.body in self._workcell.bodies:
-                raise StoppedError(f"{one.link} touches {self._workcell.bodies[one.body]}")
+    def _refuse_contacts(self, _: int) -> None:
+        for one in touches(self._workcell):
+            raise StoppedError(f"{one.link} touches {one.body}")
 
 
 def _moved(done: Run) -> Moved:

@@ -31,21 +31,15 @@ class TrueNeedle(NamedTuple):
 
 
 def true_needle(model: UrModel, q_true: Floats, eta: Floats, tip_mm: float) -> TrueNeedle:
-    """The needle of arms whose 28 parameters err.
-
-    Args:
-        q_true: Shape (..., 6), rad: true joints, but for the error of their zeros.
-        eta: Shape (..., 28), the errors in the order of `error_jacobian`'s columns, mm and rad.
-        tip_mm: Flange to tip by the controller's number.
-    """
+    """The needle of arms whose parameters err by (..., 28), mm and rad, columns as of `error_jacobian`."""
     eta = np.broadcast_to(eta, (*q_true.shape[:-1], N_PARAMETERS))
     a = np.array(model.a) + eta[..., 0:6]
     d = np.broadcast_to(np.array(model.d), a.shape).copy()
     d[..., list(FREE_D)] += eta[..., 6:11]
     alpha = np.array(model.alpha) + eta[..., PARAMETERS["twist"]]
     q = q_true + eta[..., PARAMETERS["joint"]]
-    T = dh_step(q[..., 0], d[..., 0], a[..., 0], alpha[..., 0])
-    for joint in range(1, 6):
+    T = np.eye(4)
+    for joint in range(6):
         T = T @ dh_step(q[..., joint], d[..., joint], a[..., joint], alpha[..., joint])
     R = T[..., :3, :3]
     offset = eta[..., PARAMETERS["tip_offset"]] + np.array([0.0, 0.0, tip_mm])
@@ -54,14 +48,7 @@ def true_needle(model: UrModel, q_true: Floats, eta: Floats, tip_mm: float) -> T
 
 
 def joints_at_points(model: UrModel, points_base: Floats, q_start: Floats, eta: Floats, tip_mm: float) -> Floats:
-    """True joints that put each true tip on its point, shape (..., 6), rad, nearest to where they start.
-
-    Args:
-        points_base: Shape (..., 3), mm.
-        q_start: Shape (..., 6), rad: such as what would do for the nominal arm.
-        eta: Shape (..., 28).
-        tip_mm: Flange to tip by the controller's number.
-    """
+    """True joints (..., 6), rad, nearest to a start, that put each true tip on its point (..., 3), mm."""
     q = np.array(np.broadcast_to(q_start, (*points_base.shape[:-1], 6)))
     Jq = error_jacobian(model, q_start, tip_mm)[..., :3, PARAMETERS["joint"]]  # Newton's with the nominal arm's slope
     back = np.linalg.pinv(Jq)  # of the 6 joints the smallest change
@@ -75,33 +62,21 @@ SHIFT_MM = 0.1
 """mm by which friction gives way elastically before it slides: the samples of the force are as far apart."""
 
 
-class StraightPath(NamedTuple):
-    """The line of an insertion: its entry (3,), mm, and its unit direction inward (3,), base frame."""
-
-    entry_base: Floats
-    into_base: Floats
-
-
 class TrueTissue:
     """Tissue that presses on a needle: keeps how deep the tip has been, and where friction holds it.
 
-    Along the shaft: capsules, cutting and friction over depth (`planning.needle.insertion_force`). A capsule pushes out
-    whatever the tip does; friction and cutting work against the motion. At rest friction resists the
-    pull on the needle: Dahl's solid friction, elastic up to a shift (Dahl 1968, "A solid friction model"), in place of
-    a sign of the speed.
-
-    Across it: the beam in its foundation (`planning.needle.deflection`) loads its holder with a force and a moment.
-    The simulated needle is rigid, so both act on it as two forces, at the tip and where the shaft is clamped.
-
-    Args:
-        insertion: What the needle passes, from the skin on.
-        side: Whereto the bevel points about the needle's z, rad.
-        shaft_mm: From the holder to the tip.
+    Along the shaft: capsules, cutting and friction over depth (`planning.needle.insertion_force`). Friction and
+    cutting work against the motion; at rest friction resists the pull: Dahl's solid friction, elastic up to a shift
+    (Dahl 1968, "A solid friction model"). Across it: the beam in its foundation (`planning.needle.deflection`) loads
+    its holder with a force and a moment; on the rigid needle both act as two forces, at the tip and where the shaft is
+    clamped. The bevel points to `side` about the needle's z, rad.
     """
 
-    def __init__(self, insertion: Insertion, path: StraightPath, side: float, shaft_mm: float) -> None:
-        self._force, self._bent = insertion.force, insertion.path
-        self._path, self._side, self._shaft_mm = path, np.array([np.cos(side), np.sin(side), 0.0]), shaft_mm
+    def __init__(
+        self, insertion: Insertion, entry_base: Floats, into_base: Floats, side: float, shaft_mm: float
+    ) -> None:
+        self._force, self._bent, self._entry_base, self._into = insertion.force, insertion.path, entry_base, into_base
+        self._side, self._shaft_mm = np.array([np.cos(side), np.sin(side), 0.0]), shaft_mm
         self._deepest, self._held, self._greatest = 0.0, 0.0, TissueForce(0.0, 0.0)
 
     @property
@@ -112,18 +87,14 @@ class TrueTissue:
     def __call__(self, tip: Tip) -> tuple[Push, ...]:
         """Forces of the tissue on the needle now."""
         R, at_m = tip.R_base_tip[0], tip.position_m[0]
-        depth = float((to_mm(at_m) - self._path.entry_base) @ self._path.into_base)
-        along = self._along(depth)
-        at_tip, at_holder = self._across(depth)
-        self._greatest = TissueForce(
-            max(self._greatest.along_n, along), max(self._greatest.across_n, abs(at_tip + at_holder))
-        )
-        holder_m = at_m - to_m(self._shaft_mm) * R[:, 2]
-        side = R @ self._side
-        return Push(at_tip * side - along * self._path.into_base, at_m), Push(at_holder * side, holder_m)
+        depth = float((to_mm(at_m) - self._entry_base) @ self._into)
+        along, (at_tip, at_holder) = self._along(depth), self._across(depth)
+        across = abs(at_tip + at_holder)
+        self._greatest = TissueForce(max(self._greatest.along_n, along), max(self._greatest.across_n, across))
+        holder_m, side = at_m - to_m(self._shaft_mm) * R[:, 2], R @ self._side
+        return Push(at_tip * side - along * self._into, at_m), Push(at_holder * side, holder_m)
 
     def _along(self, depth: float) -> float:
-        """Force along the shaft, N, against the insertion."""
         if depth <= 0.0:
             self._held = 0.0
             return 0.0
@@ -154,7 +125,7 @@ class TissueForce(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The forces in words, for a person."""
+        """The forces in words."""
         if self.along_n == self.across_n == 0.0:
             return "no force of tissue: the needle reached none"
         return f"tissue force up to {self.along_n:.2f} N along the needle, {self.across_n:.2f} N across it"
@@ -166,13 +137,9 @@ NO_TISSUE_FORCE = "no force of tissue: the case declares no [tissue]"
 
 @dataclass(frozen=True, eq=False)
 class TouchTruth:
-    """Ground truth of touches, one draw of the declared errors: patient, markers, and the arm's errors.
+    """Ground truth of touches, one draw of the declared errors; eta (28,) of the arm's parameters, mm and rad.
 
-    Attributes:
-        T_base_ct: Shape (4, 4), mm: true pose of the patient.
-        eta: Shape (28,): what is wrong with the arm's parameters, mm and rad.
-        aim_ct: Marker to shape (3,), mm: where the tip comes to on the marker, its touch noise included.
-        arrival: Marker to shape (6,), rad: true joints minus what the encoders say there.
+    By marker: where the tip comes to on it, its touch noise included, and true joints minus the encoders' there.
     """
 
     seed: int
@@ -191,13 +158,7 @@ class TouchTruth:
 def draw_touch_truth(
     T_base_ct: Floats, names: tuple[str, ...], points_ct: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw the true patient, markers and arm of touches.
-
-    Args:
-        T_base_ct: Shape (4, 4), mm: where the patient lies.
-        names: The N markers.
-        points_ct: Shape (N, 3), mm, as read.
-    """
+    """Draw the true patient, markers and arm of touches."""
     rng = np.random.default_rng(seed)
     eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
     values, axes = np.linalg.eigh(errors.marker_cov_ct)
@@ -210,13 +171,7 @@ def draw_touch_truth(
 def draw_pivot_truth(
     T_base_ct: Floats, names: tuple[str, ...], place_base: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw the errors of an arm that sets its tip onto one place n times; the patient lies as believed.
-
-    Args:
-        T_base_ct: Shape (4, 4), mm.
-        names: Of the touches.
-        place_base: Shape (3,), mm.
-    """
+    """Draw the errors of an arm that sets its tip onto one place n times; the patient lies as believed."""
     rng = np.random.default_rng(seed)
     eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
     aim_base = place_base + rng.normal(0.0, errors.touch_mm, (len(names), 3))
@@ -233,12 +188,7 @@ class AtTarget(NamedTuple):
 
 
 def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget:
-    """Draw the arrival: joints drifted since the touches with an error of their own; the target's reading error.
-
-    Args:
-        target_ct: Shape (3,), mm, as read.
-        seed: Of the truth.
-    """
+    """Draw the arrival: joints drifted since the touches with an error of their own; the target's reading error."""
     rng = np.random.default_rng([seed, 2])
     arrival = rng.normal(size=6) * np.hypot(errors.arm.arriving, errors.arm.drift)
     values, axes = np.linalg.eigh(errors.target_cov_ct)

@@ -1,10 +1,7 @@
-"""The ground truth of a rehearsal: where the patient lies and what the joints do, drawn or from a file.
+"""The ground truth of a rehearsal (where the patient lies, what the joints do) and of an arm off its nominal values.
 
-The ground truth of an arm: links and joints off their nominal values, play in the gears, joints that miss.
-
-What planning believes is a :class:`planning.arm.ur.UrModel`. A commanded configuration
-becomes a true one in three steps: the gears stop at the edge of their play (:func:`settle`), the joints miss by their
-repeatability, and the true Denavit-Hartenberg numbers carry the flange somewhere near where the nominal ones say.
+A commanded configuration becomes a true one in three steps: gears stop at the edge of their play, joints miss by their
+repeatability, and true Denavit-Hartenberg numbers carry the flange.
 """
 
 from __future__ import annotations
@@ -32,30 +29,14 @@ COLLINEAR = 0.01
 """s2/s1 of the true points below which they leave a rotation free."""
 
 
-Fit = Callable[[Floats, Floats], Floats]
-
-
-class MarkerNoise(NamedTuple):
-    """Standard deviations per axis of markers in CT and by touch, normal errors."""
-
-    ct_mm: float
-    """Where a marker is found in the CT."""
-    touch_mm: float
-    """Position of the touch that the robot reports."""
-
-
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Ground truth of a rehearsal.
+    """Ground truth of a rehearsal; the bevel of a needle that bends points to its side about the needle's z, rad.
 
     Attributes:
-        T_base_ct_true: Shape (4, 4), mm: the patient in the true base frame.
         joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says. They stand for all that changed
             or was not seen since the markers were touched.
-        seed: What the random part was drawn from.
-        source: How it was found, in words for the report.
         target_ct: Shape (3,), mm: true target in the CT; None where it was read without error.
-        bevel_side: Whereto the bevel points about the needle's z, rad; of a needle that bends.
     """
 
     T_base_ct_true: Floats
@@ -77,11 +58,6 @@ def draw_truth(case: Case, T_base_ct: Floats, *, seed: int | None = None) -> Tru
 
     Where the case names a file of true positions, the patient lies where that file says. Otherwise marker errors are
     drawn such that the belief is a plausible registration of this truth. Without markers belief and truth agree.
-
-    Args:
-        case: The case; its ``[rehearsal]`` table says how large the errors are.
-        T_base_ct: The belief, shape (4, 4), mm.
-        seed: Instead of the case's own.
 
     Raises:
         InputError: The file of true positions cannot be used.
@@ -105,28 +81,25 @@ def draw_truth(case: Case, T_base_ct: Floats, *, seed: int | None = None) -> Tru
 
 
 def registration_error(
-    points_ct: Floats, T_base_ct: Floats, fit: Fit, noise: MarkerNoise, rng: np.random.Generator
-) -> Floats:
+    points_ct: Floats, T_base_ct: Floats, fit: Callable[[Floats, Floats], Floats], noise_mm: tuple[float, float],
+    rng: np.random.Generator,
+) -> Floats:  # fmt: skip
     """E with T_believed = T_true E: one registration of noisy markers, shape (4, 4), mm, CT frame.
 
     Args:
-        points_ct: The markers, shape (n, 3), mm.
         T_base_ct: Shape (4, 4): where they are touched, without error.
-        noise: How far off the markers are found.
+        noise_mm: Standard deviations per axis of a marker in the CT and of a touch.
     """
-    read_ct = points_ct + rng.normal(0.0, noise.ct_mm, points_ct.shape)
-    touched_base = apply(T_base_ct, points_ct) + rng.normal(0.0, noise.touch_mm, points_ct.shape)
+    read_ct = points_ct + rng.normal(0.0, noise_mm[0], points_ct.shape)
+    touched_base = apply(T_base_ct, points_ct) + rng.normal(0.0, noise_mm[1], points_ct.shape)
     return np.asarray(np.linalg.inv(T_base_ct) @ fit(read_ct, touched_base))
 
 
 def _drawn(case: Case, registration: MarkerSection, T_base_ct: Floats, rng: np.random.Generator) -> Floats:
-    markers = match(
-        _read(case, registration.markers_ct, case.space),
-        _read(case, registration.markers_base, None),
-        use=registration.use,
-    )
+    in_ct = read_points(case, registration.markers_ct, case.space)
+    markers = match(in_ct, read_points(case, registration.markers_base, None), use=registration.use)
     fit = fit_triad if registration.method == "triad" else fit_rigid
-    noise = MarkerNoise(case.rehearsal.fle_ct_mm, case.rehearsal.fle_touch_mm)
+    noise = case.rehearsal.fle_ct_mm, case.rehearsal.fle_touch_mm
     error = registration_error(markers.points_ct, T_base_ct, fit, noise, rng)
     return np.asarray(T_base_ct @ np.linalg.inv(error))
 
@@ -136,12 +109,6 @@ def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "
 
     The rotation is the rigid least-squares fit of all points. Where the target is among them, the translation puts
     it exactly on its true place: what the twin measures is the distance from there.
-
-    Args:
-        points: Markers and target by name, in the CT and at their true positions in the base frame.
-
-    Returns:
-        T_base_ct, shape (4, 4), mm.
     """
     allowed = "3 or more points, named as the markers and the target, not on a line"
     named = ", ".join(points.names) or "none"
@@ -159,10 +126,10 @@ def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "
 
 
 def _from_file(case: Case, name: str) -> Floats:
-    true_base = _read(case, name, None)
+    true_base = read_points(case, name, None)
     in_ct = {case.target_name: case.target_ct}
     if case.registration is not None:
-        markers = _read(case, case.registration.markers_ct, case.space)
+        markers = read_points(case, case.registration.markers_ct, case.space)
         in_ct = dict(zip(markers.names, markers.points, strict=True)) | in_ct
     rows = [row for row, point in enumerate(true_base.names) if point in in_ct]
     names = tuple(true_base.names[row] for row in rows)
@@ -171,19 +138,17 @@ def _from_file(case: Case, name: str) -> Floats:
     return pose_of_true_points(pairs, case.target_name, where=f"{case.path}: rehearsal.truth_base")
 
 
-def _read(case: Case, name: str, space: Space | None) -> NamedPoints:
+def read_points(case: Case, name: str, space: Space | None) -> NamedPoints:
+    """The points of one of a case's files."""
     return parse_points(case.files.content(name), case.folder / name, default_space=space)
 
 
 class Gears(NamedTuple):
-    """Repeatable errors of a true arm's gears."""
+    """Repeatable errors of a true arm's gears: rad at the output, periods per turn of the joint, phases (6,), rad."""
 
     amplitude: float
-    """rad, at the output; 0 for none."""
     cycles: float
-    """Periods per turn of the joint."""
     phase: Floats
-    """Shape (6,), rad."""
 
     def off(self, q: Floats) -> Floats:
         """By how much each joint of (..., 6), rad, is turned too far."""
@@ -194,14 +159,12 @@ NO_GEARS = Gears(0.0, 0.0, np.zeros(6))
 
 
 class TrueArm(NamedTuple):
-    """One arm, drawn."""
+    """One arm, drawn: with every joint's full play, and its deviation drawn anew at each arrival, rad."""
 
     nominal: UrModel
     true: ErringArm
     backlash: float
-    """Full width of every joint's play, rad."""
     repeatability: float
-    """Deviation of every joint, drawn anew at each arrival, rad."""
     gears: Gears = NO_GEARS
 
     def flange_pose(self, q_true: Floats) -> Floats:
@@ -209,14 +172,10 @@ class TrueArm(NamedTuple):
         return np.ascontiguousarray(self.true.link_poses(q_true + self.gears.off(q_true))[..., 6, :, :])
 
     def settle(self, q_command: Floats, q_before: Floats, rng: np.random.Generator) -> Floats:
-        """Joints at rest, shape (6,), rad.
+        """Joints at rest (6,), rad, for a command, and what this gave for the arrival before, or the first command.
 
         The play operator: a joint moves only when the motor has crossed the play, q = clip(q_before, q_command - b/2,
         q_command + b/2); then its repeatability adds a normal error, which the next arrival draws anew.
-
-        Args:
-            q_command: Shape (6,), what the encoders say on arrival.
-            q_before: Shape (6,), what this function gave for the arrival before, or the first command.
         """
         half = 0.5 * self.backlash
         settled = np.clip(q_before, q_command - half, q_command + half)  # the play operator

@@ -1,7 +1,4 @@
-"""The ground truth of an ultrasound workcell: two arms as they move, the mounts of probe and needle.
-
-`UltrasoundPlant` answers as its devices do.
-"""
+"""The ground truth of an ultrasound workcell: two arms as they move, the mounts of probe and needle."""
 
 from __future__ import annotations
 
@@ -20,18 +17,14 @@ from puncture_twin.twin.plant.truth import PlantArm, TrueArm, draw_true_arm
 
 
 class WorkcellTruth(NamedTuple):
-    """The ground truth of one workcell."""
+    """The ground truth of one workcell: X is T_end1_image, Y is T_base1_base2, both (4, 4), mm; V the needle's axis."""
 
     probe_arm: TrueArm
     needle_arm: TrueArm
     X: Floats
-    """T_end1_image, shape (4, 4), mm."""
     Y: Floats
-    """T_base1_base2, shape (4, 4), mm."""
     tip_end2: Floats
-    """Shape (3,), mm."""
     V: Floats
-    """The needle's direction in end2, shape (3,), unit."""
 
     def image_pose(self, q_probe: Floats) -> Floats:
         """The true T_base1_image, shape (4, 4), mm, of the probe's arm at rest at ``q_probe`` (6,), rad."""
@@ -55,15 +48,6 @@ def jog_into_slice(
 
     It stands for the operator, or a servo on the image, that jogs until the needle shows: what is left is in
     ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
-
-    Args:
-        q_probe: Where the probe's joints rest, shape (6,), rad.
-        q_needle: Where the needle's arm begins, shape (6,), rad.
-        wanted: The needle in the image, after the jog.
-        roll: About the needle, rad.
-
-    Returns:
-        What the arm is commanded, shape (6,), rad; NaN where no configuration reaches it.
     """
     nominal = truth.needle_arm.nominal
     T_base2_image = (np.linalg.inv(truth.Y) @ truth.image_pose(q_probe))[None]
@@ -71,7 +55,7 @@ def jog_into_slice(
     goal = needle_flange(T_base2_image, tip, along, np.array([roll]), truth.tip_end2, truth.V)[0]
     command, q = goal, np.array(q_needle)
     for _ in range(JOG_STEPS):
-        q = nearest_configuration(truth.needle_arm.nominal, command, q)
+        q = nearest_configuration(nominal, command, q)
         if np.isnan(q).any():
             return q
         command = flange_pose(nominal, q) @ np.linalg.inv(truth.needle_arm.flange_pose(q)) @ goal
@@ -79,19 +63,14 @@ def jog_into_slice(
 
 
 class ShownNeedle(NamedTuple):
-    """What was true when an image was taken."""
+    """What was true when an image was taken, and whether the arms touched each other."""
 
     needle: NeedleInImage
     touched: bool
-    """Whether the arms touched each other."""
 
 
 class UltrasoundPlant:
-    """A workcell in time: both arms, the probe, and the operator who jogs.
-
-    Args:
-        rng: Draws the arms' repeatability, what the jog leaves, and the images.
-    """
+    """A workcell in time: both arms, the probe, and the operator who jogs."""
 
     def __init__(self, case: SelfcalCase, truth: WorkcellTruth, rng: np.random.Generator) -> None:
         self._case, self._truth, self._rng = case, truth, rng

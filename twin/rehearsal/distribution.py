@@ -47,26 +47,24 @@ from puncture_twin.twin.rehearsal.trials import Moving, Puncture, Trials, draw_t
 
 CONTACT_MM = 1e-6
 """Distance of an axis from a surface that counts as contact."""
-
 ALLOWED = "a case with [errors] and markers: trials are drawn from them"
 
 
 class Stepwise(NamedTuple):
-    """What control scans on the way in gave and cost, a trial on average; their open loop has the same patients."""
+    """What control scans on the way in gave and cost, a trial on average; their open loop has the same patients.
+
+    `passes` are the corrections that were executed, `correction_mm` the rms of each step's, of trials not stopped. Dose
+    and seconds are those of the scans, to when the needle goes on; `moving_s` are those of approach and insertion.
+    """
 
     steps: int
     passes: float
-    """Corrections that were executed."""
     correction_mm: tuple[float | None, ...]
-    """Rms of each step's, of the trials that were not stopped."""
     scans: float
     dose_msv: float
-    """Of these scans, without the planning CT's."""
     seconds: float
-    """From the beginning of a scan until the needle goes on, all scans."""
     open_loop: Distribution
     moving_s: float = 0.0
-    """Approach and insertion."""
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -86,26 +84,11 @@ class Distribution:
     """n trials of one puncture in which the arm reached the pose; mm.
 
     Attributes:
-        unreached: Further trials, whose registration put the pose out of the arm's reach.
-        cov_ct: Shape (3, 3), predicted of it, mm^2.
-        in_region: Shape (n,), whether it lies in the predicted 95 % ellipsoid, about the mean where one is known.
-        hit: Shape (n,).
+        unreached: Further trials, whose registration put the pose out of the arm's reach; `stopped` by the corridor.
         p_hit: Predicted; of a guided needle that it is not stopped, and hits.
-        structures: The k structures that must not be touched.
-        touched: Shape (n, k).
-        p_touch: Shape (k,), predicted.
         wrong_belief: Whether the truth was drawn from other errors than the belief declares, on purpose.
-        budget: Where the predicted error comes from.
         guessed_touches: Whether it is not stated how the arm touched the markers, so that a posture was assumed.
-        not_modelled: What neither the trials nor the chances contain.
         physics: What `physics_trials` says of some of the trials in the simulator, if any.
-        guidance: The way of guidance that led the needle, None where none was asked for.
-        stopped: Further trials, whose correction would have left the corridor: they do not hit.
-        p_stop: Predicted.
-        hidden: What was out of sight, a sentence each.
-        looks: How often the way reads each kind of device.
-        assumed: Devices of the way that the case does not declare, a sentence each.
-        stepwise: What control scans gave and cost, where there are some.
     """
 
     seed: int
@@ -153,12 +136,12 @@ class Distribution:
 
     @property
     def realised_rms_mm(self) -> float:
-        """Realised rms of the tip's error, mm."""
+        """Of the tip's error."""
         return rms(self.tip_error_mm)
 
     @property
     def predicted_rms_mm(self) -> float:
-        """Predicted rms of the tip's error, mm."""
+        """Of the tip's error."""
         return float(np.sqrt(np.trace(self.cov_ct)))
 
     def summary(self) -> dict[str, Any]:
@@ -176,9 +159,7 @@ class Distribution:
             "mean_p_hit": self.p_hit,
             "touch_share": _fraction(np.asarray(self.touched.any(axis=1))),
             "mean_p_touch": float(min(1.0, self.p_touch.sum())),
-            "touch_share_by_structure": {
-                name: _fraction(self.touched[:, column]) for column, name in enumerate(self.structures)
-            },
+            "touch_share_by_structure": dict(zip(self.structures, map(_fraction, self.touched.T), strict=True)),
             "p_touch_by_structure": dict(zip(self.structures, self.p_touch.tolist(), strict=True)),
             "predicted_share": dict(self.budget.fraction),
             "wrong_belief": self.wrong_belief,
@@ -201,25 +182,15 @@ def _fraction(trials: Bools) -> float | None:
 
 
 def rehearse_trials(
-    context: CaseContext,
-    outward_ct: Floats,
-    q_insertion: Floats,
-    count: int,
-    seed: int,
-    guidance: str | None = None,
-    sight: Sight | None = None,
-    steps: int | None = None,
-) -> Distribution:
+    context: CaseContext, outward_ct: Floats, q_insertion: Floats, count: int, seed: int,
+    guidance: str | None = None, sight: Sight | None = None, steps: int | None = None,
+) -> Distribution:  # fmt: skip
     """Rehearse one direction in many trials, each with a truth of its own.
 
     Args:
-        context: Of a case with declared errors and markers.
-        outward_ct: Shape (3,), unit, from the target along the needle.
         q_insertion: Shape (6,), rad, the tip on the target.
-        count: Trials, at least 1.
         guidance: One of `WAYS`, in bodies that move as the case declares: every way has the same patients by a seed.
             None is by registration, in bodies at rest. Devices that the case does not declare are assumed.
-        sight: What its devices see of the insertion; None hides nothing.
         steps: Of ct: after each of so many equal ones, the last at the target, a control scan is read and the needle
             corrected.
 
@@ -240,7 +211,7 @@ def rehearse_trials(
     way, moving = _way(context, query, led, sight, steps)
     truths = draw_truths(query.puncture, query.truth, count, rng, moving)
     done = guided_trials(query.puncture, truths, query.truth, way, np.random.default_rng([seed, 4]))
-    found = replace(_measured(context, query, done.trials, rng, seed, (way, done.stopped)), assumed=assumed)
+    found = replace(_measured(context, query, done.trials, rng, seed, way, done.stopped), assumed=assumed)
     if steps is None:
         return found
     open_loop = rehearse_trials(context, outward_ct, q_insertion, count, seed, guidance, sight)
@@ -248,12 +219,11 @@ def rehearse_trials(
 
 
 def _stepwise(scan: ControlScanSection | None, steps: int, done: GuidedTrials, open_loop: Distribution) -> Stepwise:
-    """Of trials; one that was stopped had its last scan where the correction was refused."""
     assert scan is not None
     went = np.isfinite(done.moved_mm)
     sizes = tuple(rms(column[own]) if own.any() else None for column, own in zip(done.moved_mm.T, went.T, strict=True))
     passes = went.sum(axis=1)
-    scans = float(np.where(done.stopped, passes + 1, steps).mean())
+    scans = float(np.where(done.stopped, passes + 1, steps).mean())  # the last one where a correction was refused
     return Stepwise(steps, float(passes.mean()), sizes, scans, scans * scan.dose_msv, scans * scan.seconds,
                     open_loop)  # fmt: skip
 
@@ -261,13 +231,11 @@ def _stepwise(scan: ControlScanSection | None, steps: int, done: GuidedTrials, o
 def _way(
     context: CaseContext, query: _Query, name: str, sight: Sight | None = None, steps: int | None = None
 ) -> tuple[Way, Moving]:
-    """One way of guidance of a query's puncture, and what moves in the truth."""
     case, puncture = context.case, query.puncture
     assert context.placement is not None and context.placement.registration is not None
     registration = context.placement.registration
-    model = guided_model(
-        case, context.anatomy, query.believed, registration, puncture.outward_ct, puncture.q_insertion, sight, steps
-    )
+    along = puncture.outward_ct, puncture.q_insertion
+    model = guided_model(case, context.anatomy, query.believed, registration, *along, sight, steps)
     chance = chance_model(case, context.anatomy, context.engine, query.believed)
     assert chance is not None
     motion = np.zeros((3, 3)) if case.motion is None else case.motion.target_cov_ct
@@ -286,8 +254,6 @@ def misregistered(context: CaseContext, outward_ct: Floats, q_insertion: Floats,
 
 
 class _Query(NamedTuple):
-    """Belief and truth that trials are drawn of."""
-
     believed: PoseError
     puncture: Puncture
     truth: ErrorModel
@@ -313,34 +279,24 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
 
 
 def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
-    """Deflection along one direction, if the bevel never rotates; None for a straight needle.
-
-    Args:
-        outward_ct: Shape (3,), unit, from the target along the needle.
-    """
+    """Deflection along one direction, if the bevel never rotates; None for a straight needle."""
     path = bent_path(context.case, context.anatomy, outward_ct)
     return None if path is None else path.bend
 
 
 def _measured(
-    context: CaseContext,
-    query: _Query,
-    trials: Trials,
-    rng: np.random.Generator,
-    seed: int,
-    guided: tuple[Way, Bools] | None = None,
-) -> Distribution:
-    """The distribution of trials; of guided ones with their way, and which were stopped."""
+    context: CaseContext, query: _Query, trials: Trials, rng: np.random.Generator, seed: int,
+    way: Way | None = None, stopped: Bools | None = None,
+) -> Distribution:  # fmt: skip
     case, puncture, q = context.case, query.puncture, query.puncture.q_insertion[None]
     off = rng.normal(size=(len(trials.reached), len(context.anatomy.checked)))  # of each surface, in deviations
-    stopped = np.zeros(len(trials.reached), bool) if guided is None else guided[1]
-    went = trials.reached & ~stopped
+    went = trials.reached if stopped is None else trials.reached & ~stopped
     unreached, trials = int((~trials.reached).sum()), trials.of(went)
     believed = about = query.believed
     model, mean_ct = chance_model(case, context.anatomy, context.engine, believed), np.zeros(3)
     assert model is not None
-    if guided is not None:
-        believed = left = guided_error(guided[0].model, guided[0].name)
+    if way is not None:
+        believed = left = guided_error(way.model, way.name)
         about, mean_ct = left.about_breath()
     off_mm = off[went] * _surfaces(model, puncture, query.truth)
     error_ct = trials.tip_ct - trials.target_ct - mean_ct
@@ -348,38 +304,23 @@ def _measured(
     square = np.einsum("na,ab,nb->n", error_ct, inverse, error_ct)
     counted = () if puncture.bend is None else ("bending",)
     distribution = Distribution(
-        seed=seed,
-        unreached=unreached,
-        puncture=puncture,
-        trials=trials,
-        cov_ct=believed.tip_covariance_ct(q)[0],
-        in_region=square <= chdtri(3, 1 - INTERVAL),
-        hit=_hits(context, trials, off_mm),
-        p_hit=float(model.hit_chance(believed.covariance_ct(q))[0]),
-        structures=model.structures,
-        touched=_touches(context, puncture, trials, off_mm),
-        p_touch=_touch_chances(context, puncture, model, None if guided is None else guided[0]),
-        wrong_belief=case.truth_errors is not None,
+        seed=seed, unreached=unreached, puncture=puncture, trials=trials, cov_ct=believed.tip_covariance_ct(q)[0],
+        in_region=square <= chdtri(3, 1 - INTERVAL), hit=_hits(context, trials, off_mm),
+        p_hit=float(model.hit_chance(believed.covariance_ct(q))[0]), structures=model.structures,
+        touched=_touches(context, puncture, trials, off_mm), p_touch=_touch_chances(context, puncture, model, way),
         budget=error_budget(believed, q[0], puncture.T_base_ct[:3, :3] @ puncture.outward_ct),
-        guessed_touches=query.guessed,
+        wrong_belief=case.truth_errors is not None, guessed_touches=query.guessed,
         not_modelled=not_modelled(case, counted=counted),
-    )
-    if guided is None:
+    )  # fmt: skip
+    if way is None:
         return distribution
-    way = guided[0]
-    moving = {"breathing": case.breathing, "motion": case.motion}
-    said = not_modelled(case, counted=(*counted, *(name for name, one in moving.items() if one is not None)))
+    moving = tuple(name for name in ("breathing", "motion") if getattr(case, name) is not None)
     p_hit, p_stop = guided_chances(way.model, way.name, model, way.corridor_mm)
     return replace(
-        distribution,
-        guidance=way.name,
-        stopped=len(went) - unreached - int(went.sum()),
-        p_stop=p_stop,
-        p_hit=p_hit,
-        hidden=lost_sight(way.model, way.name),
-        looks=way.model.looks_of(way.name),
-        not_modelled=said,
-    )
+        distribution, guidance=way.name, stopped=len(went) - unreached - int(went.sum()), p_stop=p_stop, p_hit=p_hit,
+        hidden=lost_sight(way.model, way.name), looks=way.model.looks_of(way.name),
+        not_modelled=not_modelled(case, counted=(*counted, *moving)),
+    )  # fmt: skip
 
 
 def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel, way: Way | None) -> Floats:
@@ -402,9 +343,8 @@ def _touch_chances(context: CaseContext, puncture: Puncture, model: ChanceModel,
 def _surfaces(model: ChanceModel, puncture: Puncture, truth: ErrorModel) -> Floats:
     """Deviation of each structure's surface as a whole where the needle passes it; of the target's anywhere; mm."""
     checked, outward_ct = model.anatomy.checked, puncture.outward_ct[None]
-    axes = model.engine.measure(
-        puncture.target_ct, outward_ct, case_axis_lengths(model.case, model.anatomy, outward_ct)
-    )
+    lengths = case_axis_lengths(model.case, model.anatomy, outward_ct)
+    axes = model.engine.measure(puncture.target_ct, outward_ct, lengths)
     normals = normals_of(model.engine.triangles, puncture.target_ct, outward_ct, axes)[0]
     covs = [truth.surface_cov_ct(one.voxel_ct) for one in checked]
     passed = np.nan_to_num(np.sqrt(np.einsum("ka,kab,kb->k", normals, np.array(covs), normals)))
@@ -451,7 +391,6 @@ def _touches(context: CaseContext, puncture: Puncture, trials: Trials, off_mm: F
         tip_ct = tip_ct + (1 - own.push) * trials.pushed_ct
         shift = np.linalg.norm(tip_ct - case.target_ct, axis=1)
         for row in np.flatnonzero(distance[column] - shift - length * turn <= radius):  # others are surely clear
-            touched[row, place] = context.engine.collides(
-                int(column), tip_ct[row], trials.outward_ct[row], length, float(radius[row])
-            )
+            needle = tip_ct[row], trials.outward_ct[row], length, float(radius[row])
+            touched[row, place] = context.engine.collides(int(column), *needle)
     return touched

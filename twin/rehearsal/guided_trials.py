@@ -1,8 +1,7 @@
 """Trials under guidance: look, correct, go on. The devices are the plant's; the correction knows readings and belief.
 
-The belief is linear (`planning.uncertainty.guided`), the truth is not: an erring arm's kinematics, cameras anywhere in
-the room, a probe whose calibration is off. After each look the needle is moved parallel to itself by what all readings
-so far call for, as long as it stays in the corridor; what would leave it is not executed, and the trial is stopped.
+The belief is linear (`planning.uncertainty.guided`), the truth is not. After each look the needle is moved parallel to
+itself by what all readings so far call for; what would leave the corridor is not executed, and the trial is stopped.
 """
 
 from __future__ import annotations
@@ -47,12 +46,7 @@ Readings = dict[tuple[str, int], Floats]
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """A way of guidance, as it corrects.
-
-    Attributes:
-        name: As in `WAYS`.
-        corridor_mm: How far from its plan a correction may take the needle, by what is believed.
-    """
+    """A way of guidance, as it corrects: by what is believed, a correction stays within the corridor of the plan."""
 
     name: str
     model: GuidedModel
@@ -74,21 +68,14 @@ class GuidedTrials(NamedTuple):
 def guided_trials(
     puncture: Puncture, truths: Truths, errors: ErrorModel, way: Way, rng: np.random.Generator
 ) -> GuidedTrials:
-    """Rehearse the puncture in each trial, by one way of guidance.
-
-    Args:
-        truths: Of the n trials, as every way has them.
-        way: Of guidance.
-        rng: Of the devices, and of the arrivals before the last.
-    """
+    """Rehearse the puncture in each trial by a way of guidance; ``rng`` draws devices, and arrivals before the last."""
     count, model = len(truths.eta), way.model
     if not model.corrects(way.name):
-        return GuidedTrials(
-            open_loop(puncture, truths), np.zeros(count, bool), np.zeros((count, 3)), np.empty((count, 0))
-        )
+        none = np.zeros(count, bool), np.zeros((count, 3)), np.empty((count, 0))
+        return GuidedTrials(open_loop(puncture, truths), *none)
     T_base_ct = registered(puncture, truths)
     turned = T_base_ct[:, :3, :3] @ model.error.fit.R_base_ct.T  # the gain is of the nominal patient's axes
-    room = _Room(puncture, truths, model, T_base_ct, *_devices(puncture, truths, model, rng))
+    room = _Room.of(puncture, truths, model, T_base_ct, rng)
     drift = _drift(errors, truths.arrival, rng)
     moved, aside, moves = np.zeros((count, 3)), np.zeros((count, 3)), list[Floats]()
     stopped, reached = np.zeros(count, bool), np.ones(count, bool)
@@ -96,9 +83,8 @@ def guided_trials(
     for number, look in enumerate(model.looks):
         q, there = commanded(puncture, T_base_ct, moved, look.out_mm, look.q)
         arrival = rng.normal(size=(count, 6)) * errors.arm.arriving
-        found |= room.look(
-            look, number, q, true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
-        )
+        needle = true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
+        found |= room.look(look, number, q, needle)
         reached &= there
         if (known := model.guided(way.name, number)) is not None:
             z = np.hstack([found[one.name, one.look] for one in model.readings if one.look <= number])
@@ -124,24 +110,8 @@ def _drift(errors: ErrorModel, last: Floats, rng: np.random.Generator) -> Floats
     return np.asarray(last * (drift / whole) ** 2 + rng.normal(size=last.shape) * drift * anew / whole)
 
 
-def _devices(
-    puncture: Puncture, truths: Truths, model: GuidedModel, rng: np.random.Generator
-) -> tuple[RoomCameras | None, RoomProbe | None, RoomScanner | None]:
-    """The devices of each trial's room, in their true places."""
-    count, cameras, probe, scanner = len(truths.eta), None, None, None
-    if model.stereo is not None:
-        cameras = RoomCameras.placed(model.stereo, count, rng)
-    if model.ultrasound is not None and model.across is not None:
-        probe = RoomProbe.placed(model.ultrasound, model.across, count, rng)
-    if model.scan is not None:
-        scanner = RoomScanner.placed(model.scan, model.error.errors, puncture.T_base_ct, count, rng)
-    return cameras, probe, scanner
-
-
 @dataclass(frozen=True, eq=False)
 class _Room:
-    """Every trial's patient, arm and devices, and what is believed of them."""
-
     puncture: Puncture
     truths: Truths
     model: GuidedModel
@@ -150,24 +120,29 @@ class _Room:
     probe: RoomProbe | None
     scanner: RoomScanner | None
 
-    def look(self, look: Look, number: int, q: Floats, needle: TrueNeedle) -> Readings:
-        """What the devices read, less what is expected with the arm commanded to q (n, 6).
+    @classmethod
+    def of(
+        cls, puncture: Puncture, truths: Truths, model: GuidedModel, T_base_ct: Floats, rng: np.random.Generator
+    ) -> _Room:
+        count, cameras, probe, scanner = len(truths.eta), None, None, None
+        if model.stereo is not None:
+            cameras = RoomCameras.placed(model.stereo, count, rng)
+        if model.ultrasound is not None and model.across is not None:
+            probe = RoomProbe.placed(model.ultrasound, model.across, count, rng)
+        if model.scan is not None:
+            scanner = RoomScanner.placed(model.scan, model.error.errors, puncture.T_base_ct, count, rng)
+        return cls(puncture, truths, model, T_base_ct, cameras, probe, scanner)
 
-        Args:
-            look: Where.
-            number: Of it.
-            q: Shape (n, 6), rad.
-            needle: The straight needles that are really there.
-        """
-        nominal = flange_pose(self.puncture.model, q)
+    def look(self, look: Look, number: int, q: Floats, needle: TrueNeedle) -> Readings:
+        """What the devices read of the straight needles that are really there, less what is expected of q (n, 6)."""
+        puncture, truths = self.puncture, self.truths
+        nominal = flange_pose(puncture.model, q)
         axis = nominal[:, :3, 2]
-        tip = nominal[:, :3, 3] + self.puncture.tip_mm * axis
+        tip = nominal[:, :3, 3] + puncture.tip_mm * axis
         found = self._by_cameras(look, needle, tip, axis)
-        puncture = self.puncture
         if puncture.bend is not None:
             grown = max(look.inserted, 0.0) ** 2
-            needle = bent(needle, puncture.bend._replace(tip_mm=grown * puncture.bend.tip_mm), self.truths.side)
-        truths = self.truths
+            needle = bent(needle, puncture.bend._replace(tip_mm=grown * puncture.bend.tip_mm), truths.side)
         moved = truths.motion_ct + truths.breath_ct + pushed_by(puncture, truths, needle)
         target_ct = truths.target_ct + moved
         found |= self._by_probe(needle, tip, target_ct) | self._by_scanner(needle, tip, target_ct)

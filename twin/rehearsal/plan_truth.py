@@ -1,13 +1,9 @@
 """The ground truth that a plan is rehearsed with: from a file, or drawn from the declared errors (the median trial).
 
-A trial without physics says where the needle ended in the patient. For the simulator its errors, those of the markers
-and of the arm alike, become one: where the patient lies. Executed by an arm without errors, the same plan then
-ends at the trial's own place, and rotated as there:
+For the simulator the errors of markers and arm become one, where the patient lies: executed by an arm without errors,
+the plan ends at the trial's own place, and rotated as there, exactly so at the target alone:
 
     T_base_ct_true = T_base_tip T_ct_tip^-1,   T_base_tip as planned, T_ct_tip as the trial found it
-
-That is exact at the target; before it the arm's own errors would differ a little from those at its end. The error of
-the joints on arrival stays one of joints. `rehearse_touched` does the same for touches of an erring arm.
 """
 
 from __future__ import annotations
@@ -39,12 +35,7 @@ TRIED = 16
 
 
 def drawn_truth(puncture: Puncture, trials: Trials, row: int, seed: int, source: str) -> Truth:
-    """The truth whose execution ends as one of the trials did.
-
-    Args:
-        seed: Of their draws.
-        source: In words for the report.
-    """
+    """The truth whose execution ends as one of the trials did."""
     T_base_tip = np.array(flange_pose(puncture.model, puncture.q_insertion))
     T_base_tip[:3, 3] += puncture.tip_mm * T_base_tip[:3, 2]
     T_ct_tip = np.eye(4)
@@ -56,16 +47,12 @@ def drawn_truth(puncture: Puncture, trials: Trials, row: int, seed: int, source:
 def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Truth:
     """The truth of one rehearsal: a trial of the declared errors, unless the case states true positions or none.
 
-    Args:
-        seed: Instead of the case's own.
-
     Raises:
         InputError: A file of true positions that cannot be used.
         NoAnswerError: In no trial the arm reaches the pose that its registration demands.
     """
     case = context.case
-    drawn = case.errors is not None and case.registration is not None and case.rehearsal.truth_base is None
-    if not drawn:
+    if case.errors is None or case.registration is None or case.rehearsal.truth_base is not None:
         return bent_truth(context, plan, draw_truth(case, plan.T_base_ct, seed=seed))
     seed = case.rehearsal.seed if seed is None else seed
     found = rehearse_trials(context, plan.outward_ct, plan.insertion.q[-1], TRIED, seed)
@@ -73,12 +60,7 @@ def plan_truth(context: CaseContext, plan: Plan, seed: int | None = None) -> Tru
 
 
 def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
-    """A truth with a needle that bends to a drawn side: the patient moved by what a straight one misses.
-
-    Args:
-        context: The plan's case; where it declares no tissue, nothing bends.
-        truth: Of a straight needle; the side is drawn by its seed.
-    """
+    """A truth with a needle that bends to a drawn side: the patient moved by what a straight one misses."""
     bend = bend_along(context, plan.outward_ct)
     if bend is None:
         return truth
@@ -92,11 +74,7 @@ def bent_truth(context: CaseContext, plan: Plan, truth: Truth) -> Truth:
 
 
 def median_truth(found: Distribution) -> Truth:
-    """The truth of the median trial by tip error.
-
-    Raises:
-        NoAnswerError: As `plan_truth`.
-    """
+    """The truth of the median trial by tip error; errors as of `plan_truth`."""
     count = len(found) + found.unreached + found.stopped
     row = int(spread_rows(found, 1)[0]) if len(found) else 0
     return _of_drawn(found, row, f"the median of {plural(count, 'trial')}, seed {found.seed}, from {_declared(found)}")
@@ -139,38 +117,21 @@ def error_rank(
 
 
 def rehearse_touched(context: CaseContext, plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Rehearsal:
-    """Execute the puncture of touches in their ground truth. The same arguments give the same numbers.
-
-    Args:
-        plan: By the registration of the touches.
-        at_target: What is true on arrival.
-    """
-    hit = bent_truth(context, plan, puncture_truth(plan, truth, at_target))
-    return rehearse(plan, context.case, context.anatomy, hit)
-
-
-def puncture_truth(plan: Plan, truth: TouchTruth, at_target: AtTarget) -> Truth:
-    """The truth of touches for a simulated arm that is nominal but for its joints; arguments as above."""
+    """Execute the puncture of touches in their ground truth, by an arm that is nominal but for its joints."""
     model, q = plan.model, plan.insertion.q[-1] + at_target.arrival
     nominal = np.array(flange_pose(model, q))
     nominal[:3, 3] += plan.needle_length_mm * nominal[:3, 2]
     needle = true_needle(model, q, truth.eta, plan.needle_length_mm)
     T_base_ct = nominal @ np.linalg.inv(pose(needle.R_base_needle, needle.tip_base)) @ truth.T_base_ct
     source = f"as at the touches, drawn with seed {truth.seed}"
-    return Truth(T_base_ct, at_target.arrival, truth.seed, source, at_target.target_ct)
+    hit = Truth(T_base_ct, at_target.arrival, truth.seed, source, at_target.target_ct)
+    return rehearse(plan, context.case, context.anatomy, bent_truth(context, plan, hit))
 
 
 def physics_trials(
     context: CaseContext, plan: Plan, found: Distribution, count: int, progress: Count
 ) -> dict[str, Any]:
-    """Run some of the trials, spread evenly over the order of their tip errors, in the simulator.
-
-    Args:
-        found: The trials; the arm reached the pose in one at least.
-
-    Returns:
-        Plain values: how far each tip ended from that of the kinematics, and in how many the arm touched something.
-    """
+    """Some trials, spread over the order of tip errors, in the simulator: how far tips ended from the kinematics'."""
     rows = spread_rows(found, count)
     apart, contacts = np.empty(len(rows)), 0
     for number, row in enumerate(rows.tolist()):

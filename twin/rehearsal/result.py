@@ -22,7 +22,6 @@ class ErrorRank:
     """Percentile of a rehearsal's tip error among trials, or in the predicted distribution.
 
     Attributes:
-        percentile: 0 to 100; so many of 100 trials end nearer to the target.
         trials: So many trials were drawn, and this is the median one; 0 where the percentile is the prediction's.
     """
 
@@ -37,20 +36,16 @@ class ErrorRank:
     @property
     def text(self) -> str:
         """The rank for headlines and text."""
-        if self.trials == 0:
-            return f"{self.place} of the predicted tip errors"
-        return (
-            f"median of {self.trials:,} trials ({self.place} of their tip errors)"
-            if self.trials > 1
-            else "the only trial"
-        )
+        if self.trials > 1:
+            return f"median of {self.trials:,} trials ({self.place} of their tip errors)"
+        return "the only trial" if self.trials else f"{self.place} of the predicted tip errors"
 
     @property
     def short(self) -> str:
         """The rank for a frame of the film."""
-        if self.trials == 0:
-            return f"{self.place} of the prediction"
-        return f"median of {self.trials:,} trials" if self.trials > 1 else "the only trial"
+        if self.trials > 1:
+            return f"median of {self.trials:,} trials"
+        return "the only trial" if self.trials else f"{self.place} of the prediction"
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -75,14 +70,7 @@ CONTROLS = MappingProxyType(
 
 @dataclass(frozen=True)
 class RehearsalContact:
-    """A body of the arm that touched something.
-
-    Attributes:
-        time_s: When it was first seen.
-        link: The arm's body.
-        body: What it touched: ``patient``, a box, or another body of the arm.
-        depth_mm: Deepest overlap in the physics; NaN where only FCL saw it (it says whether, not how deep).
-    """
+    """A body of the arm that touched something; the depth is NaN where only FCL saw it."""
 
     time_s: float
     link: str
@@ -95,30 +83,11 @@ class Rehearsal(Shown):
     """Measurements of a rehearsal; m records in time, k samples of clearance. Angles in rad, lengths in mm.
 
     Attributes:
-        seed: What the truth was drawn from.
-        T_base_ct_true: Shape (4, 4), true pose of the patient.
-        times_s: Shape (m,), from the start of the approach.
-        q: Shape (m, 6), encoder angles.
-        q_command: Shape (m, 6), commanded joints.
-        phase: Shape (m,), "approach", "settle", "insertion" or "hold".
-        T_base_flange_true: Shape (m, 4, 4), true pose of the flange.
-        tip_true_ct: Shape (m, 3), the needle's true tip in the patient.
-        clearance_times_s: Shape (k,), moments of the insertion and its end.
         clearance_mm: Structure to shape (k,): true needle's axis to true structure, minus the needle's radius.
-        contacts: One for each pair of bodies that touched, in the order of time.
-        max_joint_speed: Shape (6,), rad/s.
-        speed_limits: Shape (6,), rad/s.
-        tip_error_mm: True tip to true target at the end.
-        lateral_mm: Its part across the needle.
-        depth_mm: Its part along the needle, positive when too deep.
-        predicted_error_mm: What the plan expected (rms), NaN without markers.
-        target_true_ct: Shape (3,), true target in the CT.
+        tip_error_mm: True tip to true target at the end; `depth_mm` along the needle, positive when too deep.
         truth_is_belief: Whether the patient lay exactly where it was believed, so that the error says little.
-        control: How the insertion was followed: "impedance", "admittance" or "position".
         off_path_mm: The tip from its commanded path, by the encoders, at most from the insertion on.
-        tissue_force: The greatest forces of the tissue on the needle; None where the case declares none.
         standing: Where the error stands among others; None where the case declares no errors.
-        distribution: Over many rooms; None where the plan was executed in one.
     """
 
     seed: int

@@ -1,7 +1,4 @@
-"""A self-calibration in the twin: recorded, calibrated, and held against what is true; then punctures.
-
-Each puncture sends the needle to a target seen in the image, and looks where the true tip is.
-"""
+"""A self-calibration in the twin: recorded, calibrated, held against what is true; then punctures of seen targets."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Pixels, rms
 from puncture_twin.planning.base.progress import Stages, Watcher
-from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeDevices, ProbeShot, acquire
+from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, ProbeDevices, acquire
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration
 from puncture_twin.twin.guidance.ultrasound.needle_detector import Detection
 from puncture_twin.twin.guidance.ultrasound.pose_choice import (
@@ -31,26 +28,23 @@ from puncture_twin.twin.plant.ultrasound_workcell import ShownNeedle, Ultrasound
 
 TARGETS = 6
 """Punctures per seed."""
-
 UNSEEN = 60
 """Candidates per seed at which prediction and truth are compared."""
-
 LESION_MM = 4.0
 """Radius of the lesion that is drawn about the target in an image."""
 
 
 class Puncture(NamedTuple):
-    """Prediction and ground truth of one puncture."""
+    """Prediction and ground truth of one puncture; target (3,), mm, and needle in the true image.
+
+    Predicted (rms) is the error of calibration and arms; a click is the reading's deviation per axis of the image.
+    """
 
     candidate: int
     target_image: Floats
-    """True target in the true image, shape (3,), mm; it lies in the plane, for it is seen."""
     needle: NeedleInImage
-    """The true needle at its end, in the true image."""
     predicted_mm: float
-    """Expected (rms) error from the calibration and the arms."""
     click_mm: float
-    """Standard deviation of the reading, per axis of the image."""
 
     @property
     def error_image(self) -> Floats:
@@ -79,21 +73,10 @@ class Puncture(NamedTuple):
 
 
 def punctures(
-    case: SelfcalCase,
-    workcell: TwoArms,
-    candidates: CandidatePoses,
-    rows: NDArray[np.int_],
-    truth: WorkcellTruth,
-    calibration: Calibration,
-    rng: np.random.Generator,
-) -> tuple[Puncture, ...]:
-    """Send the needle to the middle of the image's tip, one held-out candidate after the other.
-
-    Args:
-        workcell: Its collision checker; a target at which something would touch is passed over.
-        rows: The candidates to use: none of them was recorded.
-        rng: The reading of the target and the arms' repeatability.
-    """
+    case: SelfcalCase, workcell: TwoArms, candidates: CandidatePoses, rows: NDArray[np.int_], truth: WorkcellTruth,
+    calibration: Calibration, rng: np.random.Generator,
+) -> tuple[Puncture, ...]:  # fmt: skip
+    """Send the needle to the middle of the image's tip, at one held-out candidate after the other."""
     models, click_mm, reached = case.models, case.content.truth.click_mm, []
     for row in rows.tolist():
         q_probe = candidates.q_probe[row]
@@ -110,12 +93,9 @@ def punctures(
 
 
 def unseen_errors_mm(
-    candidates: CandidatePoses,
-    rows: NDArray[np.int_],
-    truth: WorkcellTruth,
-    calibration: Calibration,
+    candidates: CandidatePoses, rows: NDArray[np.int_], truth: WorkcellTruth, calibration: Calibration,
     rng: np.random.Generator,
-) -> Floats:
+) -> Floats:  # fmt: skip
     """Predicted minus true tip at candidates that were not recorded, in the image; shape (n,), mm.
 
     Both arms stand where nominal kinematics put them, and their errors that were found are counted; the
@@ -123,15 +103,10 @@ def unseen_errors_mm(
     """
     errors, models = [], (truth.probe_arm.nominal, truth.needle_arm.nominal)
     for row in rows:
-        rests = [
-            arm.settle(q, q, rng)
-            for arm, q in (
-                (truth.probe_arm, candidates.q_probe[row]),
-                (truth.needle_arm, candidates.q_needle[row]),
-            )
-        ]
-        seen = truth.needle_in_image(*rests).tip_image
-        recorded = recorded_pose(models, candidates.q_probe[row], candidates.q_needle[row], seen)
+        q_probe, q_needle = candidates.q_probe[row], candidates.q_needle[row]
+        rest_probe = truth.probe_arm.settle(q_probe, q_probe, rng)
+        seen = truth.needle_in_image(rest_probe, truth.needle_arm.settle(q_needle, q_needle, rng)).tip_image
+        recorded = recorded_pose(models, q_probe, q_needle, seen)
         A, B = calibration.corrected(recorded)
         T_base1_image, T_base1_end2 = A[0] @ calibration.X, calibration.Y @ B[0]
         tip = T_base1_end2[:3, :3] @ calibration.tip_end2 + T_base1_end2[:3, 3]
@@ -148,14 +123,7 @@ def puncture_image(case: SelfcalCase, puncture: Puncture, rng: np.random.Generat
 
 @dataclass(frozen=True, eq=False)
 class SelfcalTrial:
-    """One seed in the twin: workcell, recording, calibration, and the errors at targets.
-
-    Attributes:
-        acquisition: What was recorded.
-        shown: What was true at each of its images.
-        unseen_mm: Predicted minus true tip at poses that were not recorded, shape (k,).
-        punctures: One per target.
-    """
+    """One seed in the twin; `unseen_mm` (k,) is predicted minus true tip at poses that were not recorded."""
 
     seed: int
     truth: WorkcellTruth
@@ -167,15 +135,14 @@ class SelfcalTrial:
 
     def detection_errors(self) -> Floats:
         """Detected minus true tip, along and across the true shaft, mm, and the angle's error, rad; shape (n, 3)."""
-        return np.array([_detection_error(shot, self.shown[shot.number].needle) for shot in self.acquisition.shots])
-
-
-def _detection_error(shot: ProbeShot, needle: NeedleInImage) -> tuple[float, float, float]:
-    assert isinstance(shot.found, Detection)  # only those are kept as shots
-    d = needle.direction_image[:2] / np.linalg.norm(needle.direction_image[:2])
-    e = shot.found.tip_image - needle.tip_image[:2]
-    v = shot.found.direction_image
-    return float(e @ d), float(d[0] * e[1] - d[1] * e[0]), float(np.arctan2(d[0] * v[1] - d[1] * v[0], d @ v))
+        rows = []
+        for shot in self.acquisition.shots:
+            assert isinstance(shot.found, Detection)  # only those are kept as shots
+            needle, v = self.shown[shot.number].needle, shot.found.direction_image
+            d = needle.direction_image[:2] / np.linalg.norm(needle.direction_image[:2])
+            e = shot.found.tip_image - needle.tip_image[:2]
+            rows.append([e @ d, d[0] * e[1] - d[1] * e[0], np.arctan2(d[0] * v[1] - d[1] * v[0], d @ v)])
+        return np.array(rows, dtype=np.float64)
 
 
 def run_trial(
@@ -185,15 +152,10 @@ def run_trial(
     rng = np.random.default_rng(seed)
     truth = draw_workcell(case, rng)
     plant = UltrasoundPlant(case, truth, rng)
+    devices = ProbeDevices(plant.probe_arm, plant.needle_arm, plant, plant)
     with stages.time("recording"):
-        taken = acquire(
-            case,
-            workcell,
-            candidates,
-            ProbeDevices(plant.probe_arm, plant.needle_arm, plant, plant),
-            rng,
-            lambda done, total: watcher.count(f"seed {seed}: pictures", done, total),
-        )
+        taken = acquire(case, workcell, candidates, devices, rng,
+                        lambda done, total: watcher.count(f"seed {seed}: pictures", done, total))  # fmt: skip
     with stages.time("calibrate"):
         calibration = calibrate_case(taken.recording, case)
     others = rng.permutation(taken.left)
@@ -206,6 +168,8 @@ def run_trial(
 def trial_summary(trial: SelfcalTrial) -> dict[str, Any]:
     """One seed as plain values, mm and degrees."""
     found, truth, errors = trial.calibration, trial.truth, trial.detection_errors()
+    a, b = found.needle_direction_end2, truth.V
+    angle = np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)
     return {
         "seed": trial.seed,
         "residual_rms_mm": found.rms_mm,
@@ -214,7 +178,7 @@ def trial_summary(trial: SelfcalTrial) -> dict[str, Any]:
         "X_error_mm": float(np.linalg.norm(found.X[:3, 3] - truth.X[:3, 3])),
         "Y_error_mm": float(np.linalg.norm(found.Y[:3, 3] - truth.Y[:3, 3])),
         "tip_error_mm": float(np.linalg.norm(found.tip_end2 - truth.tip_end2)),
-        "needle_direction_error_deg": _angle_deg(found.needle_direction_end2, truth.V),
+        "needle_direction_error_deg": float(np.degrees(angle)),
         "detected_tip_along_mm": [float(np.mean(errors[:, 0])), float(np.std(errors[:, 0]))],
         "detected_tip_across_mm": [float(np.mean(errors[:, 1])), float(np.std(errors[:, 1]))],
         "detected_angle_deg": np.degrees([np.mean(errors[:, 2]), np.std(errors[:, 2])]).tolist(),
@@ -229,19 +193,16 @@ def puncture_summary(reached: tuple[Puncture, ...]) -> dict[str, Any] | None:
     """Errors at the targets, mm; None without any."""
     if not reached:
         return None
-    errors = np.array([one.error_mm for one in reached])
+    names = ("error_mm", "lateral_mm", "depth_mm", "predicted_mm", "expected_mm")
+    errors, lateral, depth, predicted, expected = ([getattr(one, name) for one in reached] for name in names)
     return {
         "targets": len(reached),
         "error_rms_mm": rms(errors),
         "error_median_mm": float(np.median(errors)),
-        "error_worst_mm": float(errors.max()),
-        "lateral_rms_mm": rms(np.array([one.lateral_mm for one in reached])),
-        "depth_mean_mm": float(np.mean([one.depth_mm for one in reached])),
-        "depth_rms_mm": rms(np.array([one.depth_mm for one in reached])),
-        "predicted_rms_mm": rms(np.array([one.predicted_mm for one in reached])),
-        "predicted_with_reading_rms_mm": rms(np.array([one.expected_mm for one in reached])),
+        "error_worst_mm": max(errors),
+        "lateral_rms_mm": rms(lateral),
+        "depth_mean_mm": float(np.mean(depth)),
+        "depth_rms_mm": rms(depth),
+        "predicted_rms_mm": rms(predicted),
+        "predicted_with_reading_rms_mm": rms(expected),
     }
-
-
-def _angle_deg(a: Floats, b: Floats) -> float:
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))

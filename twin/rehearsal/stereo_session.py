@@ -1,11 +1,9 @@
-"""Stereo sessions in the twin: guidance by its devices, beside each step what is true of it, and many seeds of a case.
-
-One record is a target of one seed (`TargetRow`), one trial all targets of a seed (`ServoTrial`); both are plain values.
-"""
+"""Stereo sessions in the twin: guidance by its devices, beside each step what is true of it; many seeds of a case."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,74 +37,53 @@ from puncture_twin.twin.plant.stereo_workcell import ShownBall, StereoPlant, Ste
 
 TEST_POINTS = 10
 """Points at which the stereo is tried, as in the paper's Table 1."""
-
 DetectorOf = Callable[[StereoPlant], Detector]
-"""Makes the detector of a plant."""
-
-
 LEAST_VARIANCE = 1e-12
 """mm^2 and rad^2, added to every axis where a covariance is inverted: what cannot err must not divide by zero."""
 
 
 class NeedleOutcome(NamedTuple):
-    """Prediction and truth of one needle; mm and degrees."""
+    """Prediction and truth of one needle; mm and degrees; no hit and no chance of one where the case states no radius.
+
+    The offset is what is known of the error: the tip believed, to the target. The half axes are those of the 95 %
+    ellipsoid about that tip, longest first, which is the region; predicted is the rms angle to where the needle is
+    believed to point. Both squares are errors about what is believed, in deviations: chi-squared of 3 for the tip, of 6
+    with the rotation.
+    """
 
     predicted_rms_mm: float
-    """Expected (rms) distance of tip and target."""
     offset_mm: float
-    """The part of it that is known: the tip believed, to the target."""
     half_axes_mm: tuple[float, float, float]
-    """Half axes of the 95 % ellipsoid about the tip believed, longest first."""
     lateral_mm: float
-    """Deviation across the needle."""
     depth_mm: float
-    """Deviation along it."""
     predicted_direction_deg: float
-    """Expected (rms) angle of the needle and where it is believed to point."""
     p_hit: float | None
-    """Chance that the tip is within the case's radius; None where it states none."""
     realised_mm: float
-    """True tip to true target."""
     realised_direction_deg: float
     square: float
-    """Squared size of the tip's error about what is believed, in deviations: chi-squared of 3."""
     square_of_pose: float
-    """Squared size of the error of tip and rotation together: chi-squared of 6."""
     hit: bool | None
-    """Whether the tip is within the radius."""
     in_region: bool
-    """Whether the 95 % ellipsoid holds the tip."""
 
 
 def needle_outcome(believed: NeedleError, true: TrueNeedle, radius_mm: float | None) -> NeedleOutcome:
-    """Compare a predicted needle with the true one.
-
-    Args:
-        believed: As predicted.
-        radius_mm: Within which of the target the tip hits, where a case states one.
-    """
+    """Compare a predicted needle with the true one."""
     realised = float(np.linalg.norm(true.error_m))
     turn = log_rotation(true.R_m_needle @ believed.R_m_needle.T)
     error = np.concatenate([true.error_m - believed.offset_m, turn])
     covariance = believed.covariance + np.pad(believed.target_covariance, (0, 3))
     cosine = true.R_m_needle[:, 2] @ believed.R_m_needle[:, 2]
-    longest, middle, shortest = (float(mm) for mm in believed.half_axes_mm)
+    longest, middle, shortest = believed.half_axes_mm.tolist()
     square = _square(error[:3], believed.tip_covariance)
     return NeedleOutcome(
-        predicted_rms_mm=believed.rms_mm,
-        offset_mm=float(np.linalg.norm(believed.offset_m)),
-        half_axes_mm=(longest, middle, shortest),
-        lateral_mm=believed.lateral_mm,
-        depth_mm=believed.depth_mm,
+        predicted_rms_mm=believed.rms_mm, offset_mm=float(np.linalg.norm(believed.offset_m)),
+        half_axes_mm=(longest, middle, shortest), lateral_mm=believed.lateral_mm, depth_mm=believed.depth_mm,
         predicted_direction_deg=float(np.degrees(believed.direction_rms)),
-        p_hit=None if radius_mm is None else believed.p_hit(radius_mm),
-        realised_mm=realised,
-        realised_direction_deg=float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))),
-        square=square,
-        square_of_pose=_square(error, covariance),
-        hit=None if radius_mm is None else realised < radius_mm,
+        p_hit=None if radius_mm is None else believed.p_hit(radius_mm), realised_mm=realised,
+        realised_direction_deg=float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), square=square,
+        square_of_pose=_square(error, covariance), hit=None if radius_mm is None else realised < radius_mm,
         in_region=bool(square <= chdtri(3, 1 - REGION)),
-    )
+    )  # fmt: skip
 
 
 def _square(error: Floats, covariance: Floats) -> float:
@@ -114,36 +91,33 @@ def _square(error: Floats, covariance: Floats) -> float:
 
 
 class TargetRow(NamedTuple):
-    """One target of one seed; true errors, mm."""
+    """One target of one seed; true errors, mm, of the true ball against the true target but where it says otherwise."""
 
     seed: int
     target: str
     mapping_mm: float
     """Estimated target to true target."""
     expected_tre_mm: float
-    """What the mapping expects of itself (rms)."""
+    """Of the mapping (rms)."""
     before_mm: float
-    """True ball to true target where the robot alone brought it; the whole distance if it could not start."""
+    """Where the robot alone brought it; the whole distance if it could not start."""
     after_mm: float
-    """True ball to true target at the end."""
     servo_only_mm: float
     """True ball to estimated target at the end: what the servo answers for."""
     steps: int
     stop: str
     needle_open_loop: NeedleOutcome | None = None
-    """The needle where the robot alone brought it; None where it could not start, or nothing can be predicted."""
+    """Where the robot alone brought it; None where it could not start, or nothing can be predicted."""
     needle_servoed: NeedleOutcome | None = None
-    """The needle at the servo's last look, if there was one."""
     calibrated_mm: float | None = None
-    """True ball to true target where the arm, corrected by the joint estimate of its errors, would bring it unseen; its
-    repeatability aside. None where the estimate does not settle."""
+    """Where the arm, corrected by the joint estimate of its errors, would bring it unseen, but for its repeatability;
+    None where the estimate does not settle."""
 
 
 class DeclarationTest(NamedTuple):
-    """Test whether the measurements are as far apart as the declared errors make them."""
+    """Whether the measurements are as far apart as the declared errors make them: by the joint estimate's residuals."""
 
     chi_squared: float
-    """Chi-squared of the joint estimate's residuals."""
     freedom: int
 
     @property
@@ -153,41 +127,34 @@ class DeclarationTest(NamedTuple):
 
 
 class ServoTrial(NamedTuple):
-    """One seed."""
+    """One seed; without targets where the session failed as a whole, and was refused.
+
+    The stereo is tried at points of the calibrated volume; the robot's residual against C is the mean after the rigid
+    fit; there is no test of the declaration where the joint estimate does not settle.
+    """
 
     seed: int
     stereo_mm: tuple[float, ...] = ()
-    """Error of the stereo at points of the calibrated volume."""
     calibration_rms_px: tuple[float, ...] = ()
     fre_mm: float = float("nan")
     robot_residual_mm: float = float("nan")
-    """Robot against C after the rigid fit (mean)."""
     targets: tuple[TargetRow, ...] = ()
     refused: str | None = None
-    """Why the session failed as a whole; None when it did not."""
     declaration: DeclarationTest | None = None
-    """Test of everything that was measured; None where the joint estimate does not settle."""
 
 
 class Reached(NamedTuple):
-    """What a picture shows of one target, beside its row."""
+    """What a picture shows of one target: true joints (6,), rad, at each of the servo's visits, and at the end."""
 
     row: TargetRow
     servoed: Servoed
     rests: tuple[Floats, ...]
-    """True joints, (6,), rad, at each of the servo's visits."""
     q_true: Floats
-    """Shape (6,), rad: true joints at the end."""
 
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Result of a session.
-
-    Attributes:
-        calibration: Result of the robot's points.
-        reached: One for each target.
-    """
+    """Result of a session."""
 
     workcell: StereoWorkcell
     calibration: RobotCalibration
@@ -196,49 +163,31 @@ class Session:
     trial: ServoTrial
 
 
-class _Parts(NamedTuple):
-    """Random generators, one for each part, so that one part's draws do not shift another's."""
-
-    workcell: np.random.Generator
-    pictures: np.random.Generator
-    arm: np.random.Generator
-    image: np.random.Generator
-    tests: np.random.Generator
-
-
 def run_session(
-    case: ServoCase,
-    seed: int,
-    *,
-    targets: tuple[str, ...] | None = None,
-    detector_of: DetectorOf | None = None,
-    empty: StateChecker | None = None,
-    record: Path | None = None,
-) -> Session:
-    """Run a whole session in a workcell drawn from a seed.
-
-    Args:
-        seed: Of all that is drawn.
-        targets: Only these; all when None.
-        detector_of: Makes the detector in place of images; for studies of what is behind them.
-        empty: Checker of the workcell without the head, where one is at hand.
-        record: An empty folder in which all that the devices say is kept.
+    case: ServoCase, seed: int, *, targets: tuple[str, ...] | None = None, detector_of: DetectorOf | None = None,
+    empty: StateChecker | None = None, record: Path | None = None,
+) -> Session:  # fmt: skip
+    """Run a whole session in a workcell drawn from a seed; `record` is an empty folder for all that the devices say.
 
     Raises:
         NoAnswerError: The calibration, the mapping or a start pose could not be done; says what blocked it.
-        InputError: The case contradicts itself.
     """
-    parts = _Parts(*(np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(len(_Parts._fields))))
-    workcell = draw_workcell(case, parts.workcell)
-    plant = StereoPlant(workcell, parts.pictures, parts.arm, parts.tests)
+    # One generator for each part: one part's draws do not shift another's.
+    of_workcell, of_pictures, of_arm, of_image, of_tests = map(
+        np.random.default_rng, np.random.SeedSequence(seed).spawn(5)
+    )
+    workcell = draw_workcell(case, of_workcell)
+    plant = StereoPlant(workcell, of_pictures, of_arm, of_tests)
     recorder = None if record is None else Recorder(plant, record)
     devices: StereoDevices = recorder or plant
     detector = image_detector(devices, hough_only=case.hough_only) if detector_of is None else detector_of(plant)
     commands = calibration_commands(case, empty or workcell_checker(case, None))
     calibration = calibrate_by_robot(case, commands, devices, devices, detector)
     plain = detector if recorder is None else image_detector(plant, hough_only=case.hough_only)
-    stereo_mm = _try_stereo(plant, calibration, plain, parts.tests)
-    reading = _read(case, parts.image)
+    stereo_mm = _try_stereo(plant, calibration, plain, of_tests)
+    listed, sd = (case.markers.points, case.targets.points), (case.truth_errors.marker_mm, case.truth_errors.target_mm)
+    read = (points + of_image.normal(0.0, mm, points.shape) for points, mm in zip(listed, sd, strict=True))
+    reading = ImageReading(*read)  # as somebody reads them in the CT
     plant.bring_head()
     mapping, guide = map_markers(case, calibration, detector, devices, reading)
     aims, reached = aims_of(case, calibration, mapping, reading.targets_m, targets), []
@@ -251,25 +200,14 @@ def run_session(
         devices.move_jp(aims.q_hover[row])
     if recorder is not None:
         recorder.finish((case.markers.names, case.targets.names), reading)
-    residual, declaration = float(np.mean(calibration.robot_residual_mm)), _declaration(guide)
-    rows, stereo = tuple(one.row for one in reached), tuple(stereo_mm.tolist())
+    declaration = None
+    with suppress(NoAnswerError):
+        found = guide.adjusted()
+        declaration = DeclarationTest(found.chi2, found.freedom)
+    rows, residual = tuple(one.row for one in reached), float(np.mean(calibration.robot_residual_mm))
+    stereo = tuple(stereo_mm.tolist())
     figures = ServoTrial(seed, stereo, calibration.rms_px, mapping.fre_mm, residual, rows, None, declaration)
     return Session(workcell, calibration, mapping, tuple(reached), figures)
-
-
-def _declaration(guide: Guide) -> DeclarationTest | None:
-    try:
-        found = guide.adjusted()
-    except NoAnswerError:
-        return None
-    return DeclarationTest(found.chi2, found.freedom)
-
-
-def _read(case: ServoCase, rng: np.random.Generator) -> ImageReading:
-    """Markers and targets as somebody reads them in the CT."""
-    truth = case.truth_errors
-    markers = case.markers.points + rng.normal(0.0, truth.marker_mm, case.markers.points.shape)
-    return ImageReading(markers, case.targets.points + rng.normal(0.0, truth.target_mm, case.targets.points.shape))
 
 
 def _try_stereo(
@@ -293,7 +231,6 @@ def _try_stereo(
 
 
 def _reach(plant: StereoPlant, arm: Arm, guide: Guide, aims: Aims, row: int, seed: int) -> Reached:
-    """Move from the hovering point onto the target by the robot alone, then by the servo."""
     workcell, number = plant.workcell, aims.numbers[row]
     true_target, unseen, seen, calibrated = workcell.targets_c[number], None, None, None
     done = aims.bring(row, arm)
@@ -311,10 +248,9 @@ def _reach(plant: StereoPlant, arm: Arm, guide: Guide, aims: Aims, row: int, see
         float(np.linalg.norm(a - b)) for a, b in ((estimated, true_target), (ball, true_target), (ball, estimated))
     )
     name, expected = workcell.case.targets.names[number], float(aims.expected_tre_mm[row])
-    errors = TargetRow(
-        seed, name, mapping, expected, before, after, only, done.steps, str(done.stop), unseen, seen, calibrated
-    )
-    return Reached(errors, done, tuple(plant.rests[first : first + len(done.visits)]), plant.rests[-1])
+    errors = mapping, expected, before, after, only
+    found = TargetRow(seed, name, *errors, done.steps, str(done.stop), unseen, seen, calibrated)
+    return Reached(found, done, tuple(plant.rests[first : first + len(done.visits)]), plant.rests[-1])
 
 
 def _outcome(plant: StereoPlant, believed: NeedleError | None, target: int) -> NeedleOutcome | None:
@@ -350,11 +286,7 @@ def declaration_test(trials: Sequence[ServoTrial]) -> DeclarationTest | None:
 
 
 def statistics(trials: Sequence[ServoTrial]) -> dict[str, Any]:
-    """Means, roots of mean squares and maxima over all targets of all seeds, mm; fractions 0..1.
-
-    Raises:
-        NoAnswerError: No trial reached a target.
-    """
+    """Means, roots of mean squares and maxima over all targets of all seeds, mm; fractions 0..1."""
     rows = [row for one in trials for row in one.targets]
     if not rows:
         what = "no session was possible: " + "; ".join(sorted({one.refused or "" for one in trials}))
@@ -384,10 +316,7 @@ def statistics(trials: Sequence[ServoTrial]) -> dict[str, Any]:
 
 
 def needle_statistics(outcomes: Sequence[NeedleOutcome | None]) -> dict[str, Any] | None:
-    """Predicted and realised errors of needles, mm and degrees; None where none has a prediction.
-
-    Those of one seed share a workcell.
-    """
+    """Predicted and realised errors of needles, mm and degrees; None where none has a prediction."""
     known = [one for one in outcomes if one is not None]
     if not known:
         return None

@@ -1,9 +1,7 @@
 """Monte Carlo trials without physics, many at once: markers read and touched, registered, the needle at the target.
 
-Every trial draws its truth anew from one declaration of errors: what the CT shows of markers and target, the arm's 28
-parameters, its touches, what drifted since, and one arrival. The arm's motion is exact kinematics, not linearised.
-Under guidance tissue has moved too, and breathes; else it does not. A needle that bends ends off its straight line, its
-bevel pointing to a side drawn in each trial.
+Every trial draws its truth anew from one declaration of errors; the arm's motion is exact kinematics, not linearised.
+Under guidance tissue has moved too, and breathes. A needle that bends ends off its line, its bevel to a drawn side.
 """
 
 from __future__ import annotations
@@ -39,20 +37,9 @@ from puncture_twin.twin.plant.true_needle import TrueNeedle, joints_at_points, t
 
 @dataclass(frozen=True, eq=False)
 class Puncture:
-    """Common part of all trials: the belief, and the commands that follow from it.
+    """Common part of all trials: the belief, and the commands that follow from it, the tip on the target.
 
-    Attributes:
-        tip_mm: Flange to tip.
-        noise: Of the markers, as believed: the weights of ``weighted``.
-        points_ct: Shape (N, 3), mm, the markers.
-        q_touch: Shape (N, 6), rad, how the arm touches them.
-        T_base_ct: Shape (4, 4), mm: where the patient lies.
-        target_ct: Shape (3,), mm.
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        q_insertion: Shape (6,), rad, the tip on the target.
-        bend: Of the needle; None where it is straight.
-        aim: Of the method ``joint``: the insertion that every trial's pose is corrected for; None where it is not.
-        push: By how much the needle pushes the target on; None where it does not.
+    `noise` weighs the method ``weighted``; `aim` is the insertion for which the method ``joint`` corrects every pose.
     """
 
     model: UrModel
@@ -71,21 +58,10 @@ class Puncture:
 
 
 class Trials(NamedTuple):
-    """Results of n trials; CT frame, mm.
+    """Results of n trials; CT frame, mm; outward (n, 3) is away from the tip, R_ct_needle (n, 3, 3) has z to it.
 
-    Attributes:
-        tip_ct: Shape (n, 3), where the tip ended.
-        outward_ct: Shape (n, 3), unit, from there along the needle.
-        target_ct: Shape (n, 3), true target.
-        T_base_ct: Shape (n, 4, 4), what each trial registered.
-        reached: Shape (n,), whether the arm could reach the pose that followed.
-        R_ct_needle: Shape (n, 3, 3), the needle's axes as columns; z points to the tip.
-        chi_squared: Shape (n,), of the weighted residuals of each trial's markers against the believed noise.
-        bevel_side: Shape (n,), rad, whereto the bevel points about the needle's z; 0 where it has none.
-        motion_ct: Shape (n, 3), by how much the body about the target has moved since the scan: positions are
-            relative to it.
-        breath_ct: Shape (n, 3), and by how much the breath has moved the target.
-        pushed_ct: Shape (n, 3), and by how much the needle has.
+    T_base_ct (n, 4, 4) is what each registered, chi-squared that of its weighted residuals. Body, breath and needle
+    have moved the target by the last three, (n, 3); positions are relative to it.
     """
 
     tip_ct: Floats
@@ -104,32 +80,26 @@ class Trials(NamedTuple):
         """The results of some trials."""
         return Trials._make(column[rows] for column in self)
 
-    def reached_alone(self) -> Trials:
-        """The trials in which the arm reached the pose."""
-        return self.of(self.reached)
-
 
 class Moving(NamedTuple):
-    """What moves between scan and insertion."""
+    """What moves between scan and insertion: target and surroundings (3, 3), mm^2; markers by so much of its breath."""
 
     cov_ct: Floats
-    """Shape (3, 3), mm^2, of the target and its surroundings."""
     breathing: Breathing | None
     skin_weight: float
-    """By how much of the target's breath the markers move."""
 
 
 class Truths(NamedTuple):
-    """Ground truth of n trials before the needle goes in, the same for every way of guidance; CT frame, mm, rad."""
+    """Ground truth of n trials before the needle goes in, the same for every way of guidance; CT frame, mm, rad.
+
+    The arm's errors (n, 28); N markers as the CT shows them and as they are touched, (n, N, 3); `arrival` (n, 6) are
+    true joints less the encoders', drift since the touches included.
+    """
 
     eta: Floats
-    """Shape (n, 28), the arm's errors."""
     read_ct: Floats
-    """Shape (n, N, 3), what the CT shows of the markers."""
     touched_base: Floats
-    """Shape (n, N, 3), what the touches read."""
     arrival: Floats
-    """Shape (n, 6), true joints less the encoders', drift since the touches included."""
     target_ct: Floats
     side: Floats
     motion_ct: Floats
@@ -139,11 +109,7 @@ class Truths(NamedTuple):
 def draw_truths(
     puncture: Puncture, errors: ErrorModel, count: int, rng: np.random.Generator, moving: Moving | None = None
 ) -> Truths:
-    """Draw the truth of trials from declared errors; what moves has a generator of its own.
-
-    Args:
-        moving: None moves nothing.
-    """
+    """Draw the truth of trials from declared errors; what moves has a generator of its own."""
     motion, breath, skin = _moved(moving, count, rng)
     eta = rng.normal(size=(count, 28)) * np.sqrt(parameter_variances(errors.arm))  # stays for all touches of a trial
     read_ct, touched = _touched(puncture, errors, eta, skin, rng)
@@ -154,13 +120,13 @@ def draw_truths(
 
 
 def _moved(moving: Moving | None, count: int, rng: np.random.Generator) -> tuple[Floats, Floats, Floats]:
-    """Motion and breath of the target at the insertion, and of the markers at the touches, each (n, 3), CT frame."""
+    still = np.zeros((count, 3))
     if moving is None:
-        return np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3))
+        return still, still, still
     own, breathing = rng.spawn(1)[0], moving.breathing
     motion = _normal(own, moving.cov_ct, (count,))
     if breathing is None:
-        return motion, np.zeros((count, 3)), np.zeros((count, 3))
+        return motion, still, still
     gate = 1.0 if breathing.gate is None else breathing.gate
     s = position_at(own.uniform(size=(2, count, 1)), gate, breathing.exponent)
     inserted, touched = (s - breathing.scanned_at) * breathing.amplitude_mm * breathing.direction_ct
@@ -181,13 +147,7 @@ def open_loop(puncture: Puncture, truths: Truths) -> Trials:
 
 
 def ended(puncture: Puncture, truths: Truths, T_base_ct: Floats, needle: TrueNeedle, reached: Bools) -> Trials:
-    """Trials whose straight needles ended so.
-
-    Args:
-        T_base_ct: Shape (n, 4, 4), as registered.
-        needle: Of each trial; it bends if the puncture's does.
-        reached: Shape (n,), whether the arm could reach what was commanded.
-    """
+    """Trials whose straight needles ended so; `reached` (n,) is whether the arm could reach what was commanded."""
     T_ct_base = np.linalg.inv(puncture.T_base_ct)
     if puncture.bend is not None:
         needle = bent(needle, puncture.bend, truths.side)
@@ -214,13 +174,7 @@ def pushed_by(puncture: Puncture, truths: Truths, needle: TrueNeedle) -> Floats:
 
 
 def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
-    """Bent needles, each rotated about its clamp so that its straight line ends at the tip.
-
-    Args:
-        needle: n straight needles.
-        bend: By how much.
-        side: Shape (n,), rad, whereto the bevel points about each needle's z.
-    """
+    """Bent needles, each rotated about its clamp so that its straight line ends at the tip; bevel sides (n,), rad."""
     x, y = needle.R_base_needle[:, :, 0], needle.R_base_needle[:, :, 1]
     c, s = np.cos(side)[:, None], np.sin(side)[:, None]
     turn = bend.tip_mm / bend.clamped_mm * (c * y - s * x)  # rotation vector: z x the side that it bends to
@@ -228,7 +182,6 @@ def bent(needle: TrueNeedle, bend: Bend, side: Floats) -> TrueNeedle:
 
 
 def _chi_squared(puncture: Puncture, residuals: Floats) -> Floats:
-    """Chi-squared of residuals (n, 3 N) in base axes, by the nominal registration's weights."""
     R, points = puncture.T_base_ct[:3, :3], apply(puncture.T_base_ct, puncture.points_ct)
     A = design(points, points.mean(axis=0))
     weights = np.asarray(np.linalg.inv(puncture.noise.covariance(R).whole), dtype=np.float64)
@@ -239,7 +192,6 @@ def _chi_squared(puncture: Puncture, residuals: Floats) -> Floats:
 def _touched(
     puncture: Puncture, errors: ErrorModel, eta: Floats, moved_ct: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Markers as read in the CT, with errors, and as touched by an arm that errs: each (n, N, 3)."""
     count, markers = len(eta), len(puncture.points_ct)
     eta_of = np.broadcast_to(eta[:, None], (count, markers, 28))
     read_ct = puncture.points_ct + _normal(rng, errors.marker_cov_ct, (count, markers))
@@ -269,25 +221,12 @@ def registered(puncture: Puncture, truths: Truths) -> Floats:
 
 
 def commanded(
-    puncture: Puncture,
-    T_base_ct: Floats,
-    moved_base: Floats | float = 0.0,
-    out_mm: float = 0.0,
+    puncture: Puncture, T_base_ct: Floats, moved_base: Floats | float = 0.0, out_mm: float = 0.0,
     q_near: Floats | None = None,
-) -> tuple[Floats, Bools]:
-    """The joints (n, 6) that the nominal arm takes to the target, in the planned branch and roll, and whether.
-
-    Args:
-        T_base_ct: Shape (n, 4, 4), as registered.
-        moved_base: Shape (n, 3), mm: by how much the needle is corrected.
-        out_mm: How far before the target.
-        q_near: Shape (6,), rad, as planned there; None at the target.
-    """
-    planned, q_near = (
-        flange_pose(puncture.model, puncture.q_insertion),
-        puncture.q_insertion if q_near is None else q_near,
-    )
-    R_ct_flange = puncture.T_base_ct[:3, :3].T @ planned[:3, :3]
+) -> tuple[Floats, Bools]:  # fmt: skip
+    """The joints (n, 6) that bring the nominal arm before the target, in the planned branch and roll, and whether."""
+    q_near = puncture.q_insertion if q_near is None else q_near
+    R_ct_flange = puncture.T_base_ct[:3, :3].T @ flange_pose(puncture.model, puncture.q_insertion)[:3, :3]
     poses = np.zeros((len(T_base_ct), 4, 4))
     poses[:, :3, :3] = T_base_ct[:, :3, :3] @ R_ct_flange
     target_base = T_base_ct[:, :3, :3] @ puncture.target_ct + T_base_ct[:, :3, 3] + moved_base

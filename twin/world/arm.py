@@ -1,7 +1,4 @@
-"""The arm in the workcell: loaded, moved by its joint motors, and read back.
-
-The arm as PyBullet reads it: its URDF with absolute addresses, holder and needle added.
-"""
+"""The arm as PyBullet reads it (its URDF, holder and needle added), moved by its joint motors, and read back."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import LINK_NAMES, address_file, collision_links, model_urdf
 from puncture_twin.planning.arm.tool import Tool, ToolBody
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE, ArmUrdf
+from puncture_twin.planning.arm.urdf.arm_urdf import FLANGE
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.mesh import joined
@@ -29,14 +26,10 @@ from puncture_twin.twin.world.client import pose_to_m, pose_to_mm, pybullet, to_
 
 HOLDER_DENSITY_KG_M3 = 1200.0
 """A printed holder, solid ABS or similar."""
-
 NEEDLE_DENSITY_KG_M3 = 7900.0
 """Stainless steel, taken as solid."""
-
-
 KEPT_TAGS = ("visual", "collision", "inertial")
 """Elements of a link that are kept; other programs' additions would be taken for friction and the like."""
-
 NO_WEIGHT = ET.fromstring(
     '<inertial><mass value="0"/><inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>'
 )
@@ -50,15 +43,17 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
     """
     urdf = model_urdf(model)
     robot, flange = ET.fromstring(urdf.text), urdf.chain.flange
-    _check_weights(urdf)
+    what = "it states no mass and inertia above 0, without which nothing can be simulated"
+    for members in urdf.chain.bodies[1:]:
+        if not any(member.link.weighs for member in members):
+            here = f"{urdf.where}: link '{members[0].link.name}'"
+            refuse(what, here, "an <inertial> of every moving link", "no_inertia")
     _simplify(robot)
     _replace_shapes(robot, model, folder)
-    if tool.holder_length_mm > 0:
-        _add_cylinder(
-            robot, flange, "holder", 0.0, tool.holder_length_mm, tool.holder_diameter_mm, HOLDER_DENSITY_KG_M3
-        )
-    span = tool.holder_length_mm, tool.shaft_mm
-    _add_cylinder(robot, flange, "needle", *span, tool.needle_diameter_mm, NEEDLE_DENSITY_KG_M3)
+    holder_mm = tool.holder_length_mm
+    if holder_mm > 0:
+        _add_cylinder(robot, flange, "holder", 0.0, holder_mm, tool.holder_diameter_mm, HOLDER_DENSITY_KG_M3)
+    _add_cylinder(robot, flange, "needle", holder_mm, tool.shaft_mm, tool.needle_diameter_mm, NEEDLE_DENSITY_KG_M3)
     if tool.body is not None:
         _add_tool(robot, flange, tool.body, folder)
     path = folder / "arm.urdf"
@@ -66,16 +61,7 @@ def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
     return path
 
 
-def _check_weights(urdf: ArmUrdf) -> None:
-    for members in urdf.chain.bodies[1:]:
-        if not any(member.link.weighs for member in members):
-            what = "it states no mass and inertia above 0, without which nothing can be simulated"
-            here = f"{urdf.where}: link '{members[0].link.name}'"
-            refuse(what, here, "an <inertial> of every moving link", "no_inertia")
-
-
 def _simplify(robot: ET.Element) -> None:
-    """Leave links, joints and shapes; what states no weight has none."""
     for element in list(robot):
         if element.tag not in ("link", "joint"):
             robot.remove(element)
@@ -108,7 +94,6 @@ def _replace_shapes(robot: ET.Element, model: UrModel, folder: Path) -> None:
 
 
 def _add_tool(robot: ET.Element, flange: str, body: ToolBody, folder: Path) -> None:
-    """The tool's convex pieces, all of the holder's material."""
     whole = joined(body.pieces)
     solid = trimesh.Trimesh(to_m(whole.vertices), whole.faces, process=False)
     solid.density = HOLDER_DENSITY_KG_M3
@@ -117,21 +102,19 @@ def _add_tool(robot: ET.Element, flange: str, body: ToolBody, folder: Path) -> N
     for number, piece in enumerate(body.pieces):
         path = folder / f"tool_{number}.obj"
         write_obj(piece, path)
-        shapes += [
-            f'<{kind}><geometry><mesh filename="{path}"/></geometry></{kind}>' for kind in ("visual", "collision")
-        ]
+        shape = f'<geometry><mesh filename="{path}"/></geometry>'
+        shapes.append(f"<visual>{shape}</visual><collision>{shape}</collision>")
     xyz = " ".join(str(float(value)) for value in weight.center_mass)
     names = {"ixx": (0, 0), "iyy": (1, 1), "izz": (2, 2), "ixy": (0, 1), "ixz": (0, 2), "iyz": (1, 2)}
     inertia = " ".join(f'{name}="{tensor[at]}"' for name, at in names.items())
-    robot.append(
-        ET.fromstring(
-            f'<link name="tool"><inertial><origin xyz="{xyz}" rpy="0 0 0"/><mass value="{weight.mass}"/>'
-            f"<inertia {inertia}/></inertial>{''.join(shapes)}</link>"
-        )
-    )
-    robot.append(
-        ET.fromstring(f'<joint name="tool_joint" type="fixed"><parent link="{flange}"/><child link="tool"/></joint>')
-    )
+    weighs = f'<origin xyz="{xyz}" rpy="0 0 0"/><mass value="{weight.mass}"/><inertia {inertia}/>'
+    _append(robot, flange, "tool", f"<inertial>{weighs}</inertial>{''.join(shapes)}")
+
+
+def _append(robot: ET.Element, flange: str, name: str, content: str, start: str = "") -> None:
+    ends = f'<parent link="{flange}"/><child link="{name}"/>'
+    robot.append(ET.fromstring(f'<link name="{name}">{content}</link>'))
+    robot.append(ET.fromstring(f'<joint name="{name}_joint" type="fixed">{ends}{start}</joint>'))
 
 
 def _add_cylinder(
@@ -144,46 +127,28 @@ def _add_cylinder(
     middle = f'<origin xyz="0 0 {length / 2}" rpy="0 0 0"/>'
     shape = f'{middle}<geometry><cylinder radius="{radius}" length="{length}"/></geometry>'
     inertia = f'ixx="{across}" iyy="{across}" izz="{along}" ixy="0" ixz="0" iyz="0"'
-    robot.append(
-        ET.fromstring(
-            f'<link name="{name}"><inertial>{middle}<mass value="{mass}"/><inertia {inertia}/></inertial>'
-            f"<visual>{shape}</visual><collision>{shape}</collision></link>"
-        )
-    )
-    robot.append(
-        ET.fromstring(
-            f'<joint name="{name}_joint" type="fixed"><parent link="{flange}"/><child link="{name}"/>'
-            f'<origin xyz="0 0 {to_m(start_mm)}" rpy="0 0 0"/></joint>'
-        )
-    )
+    weighs = f'<inertial>{middle}<mass value="{mass}"/><inertia {inertia}/></inertial>'
+    bodies = f"<visual>{shape}</visual><collision>{shape}</collision>"
+    _append(robot, flange, name, weighs + bodies, f'<origin xyz="0 0 {to_m(start_mm)}" rpy="0 0 0"/>')
 
 
 POSITION_GAIN = 0.1
 """Fraction of a joint's position error that its motor takes back per step, Bullet's default: an error falls to 1/e
 in 9.5 steps (40 ms), slow enough that starts and stops leave a visible trace, as a real controller's do."""
-
 VELOCITY_GAIN = 1.0
 """Fraction of a joint's speed error that its motor takes back per step."""
 
 
 class JointState(NamedTuple):
-    """Angles and speeds of the joints."""
+    """Angles (6,), rad, and speeds (6,), rad/s, of the joints."""
 
     q: Floats
-    """Shape (6,), rad."""
     speed: Floats
-    """Shape (6,), rad/s."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """A loaded arm. Joint angles are the true ones of the simulated body.
-
-    Attributes:
-        joints: Indices of the six joints.
-        links: Name (as in `planning.collision.checker.BODY_NAMES`, and the flange) to index; the base is -1.
-        max_torque: Shape (6,), N m.
-    """
+    """A loaded arm; joint angles are the true ones. Links by the names of `planning.collision.checker.BODY_NAMES`."""
 
     client: int
     body: int
@@ -202,41 +167,26 @@ class Arm:
 
     def command(self, q: Floats, speed: Floats) -> None:
         """Set the motors' goal for the next steps: angles (6,) in rad, speeds (6,) in rad/s."""
-        pybullet.setJointMotorControlArray(
-            self.body,
-            self.joints,
-            pybullet.POSITION_CONTROL,
-            targetPositions=q.tolist(),
-            targetVelocities=speed.tolist(),
-            forces=self.max_torque,
-            positionGains=[POSITION_GAIN] * 6,
-            velocityGains=[VELOCITY_GAIN] * 6,
-            physicsClientId=self.client,
-        )
+        goals = {"targetPositions": q.tolist(), "targetVelocities": speed.tolist(), "forces": self.max_torque}
+        gains = {"positionGains": [POSITION_GAIN] * 6, "velocityGains": [VELOCITY_GAIN] * 6}
+        self._drive(pybullet.POSITION_CONTROL, **goals, **gains)
 
     def release(self) -> None:
         """Switch the motors off, for torques."""
-        pybullet.setJointMotorControlArray(
-            self.body, self.joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 6, physicsClientId=self.client
-        )
+        self._drive(pybullet.VELOCITY_CONTROL, forces=[0.0] * 6)
 
     def torque(self, torque_nm: Floats) -> None:
         """Torques (6,), N m, for the next step alone, cut to what the joints can give."""
         cut = np.clip(torque_nm, -np.array(self.max_torque), self.max_torque)
-        pybullet.setJointMotorControlArray(
-            self.body, self.joints, pybullet.TORQUE_CONTROL, forces=cut.tolist(), physicsClientId=self.client
-        )
+        self._drive(pybullet.TORQUE_CONTROL, forces=cut.tolist())
+
+    def _drive(self, mode: int, **goals: object) -> None:
+        pybullet.setJointMotorControlArray(self.body, self.joints, mode, **goals, physicsClientId=self.client)
 
     def push(self, link: str, force_n: Floats, point_m: Floats) -> None:
         """Push a link in the next step alone: a force (3,), N, at a point (3,), m, both in the world frame."""
-        pybullet.applyExternalForce(
-            self.body,
-            self.links[link],
-            force_n.tolist(),
-            point_m.tolist(),
-            pybullet.WORLD_FRAME,
-            physicsClientId=self.client,
-        )
+        push = force_n.tolist(), point_m.tolist(), pybullet.WORLD_FRAME
+        pybullet.applyExternalForce(self.body, self.links[link], *push, physicsClientId=self.client)
 
     def state(self) -> JointState:
         """Angles and speeds of the joints."""
@@ -245,9 +195,8 @@ class Arm:
 
     def link_pose(self, name: str) -> Floats:
         """T_world_link of a link's URDF frame, shape (4, 4), mm."""
-        state = pybullet.getLinkState(
-            self.body, self.links[name], computeForwardKinematics=1, physicsClientId=self.client
-        )
+        link = self.links[name]
+        state = pybullet.getLinkState(self.body, link, computeForwardKinematics=1, physicsClientId=self.client)
         return pose_to_mm(state[4], state[5])
 
     def flange_pose(self) -> Floats:
@@ -256,27 +205,18 @@ class Arm:
 
 
 def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | None = None) -> Arm:
-    """Load the arm with holder and needle, its base fixed.
-
-    Args:
-        T_world_base: Pose of the controller's base, shape (4, 4), mm; None for the world's origin.
-
-    Raises:
-        InputError: There is no body of that model.
-    """
+    """Load the arm with holder and needle, its base fixed."""
     urdf = model_urdf(model)
     T_world_urdf = urdf.T_base_root if T_world_base is None else T_world_base @ urdf.T_base_root
     position, quaternion = pose_to_m(T_world_urdf)
+    flags = pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER
     with tempfile.TemporaryDirectory() as folder:
-        body = pybullet.loadURDF(
-            str(write_arm_urdf(model, tool, Path(folder))),
-            position,
-            quaternion,
-            useFixedBase=True,
-            flags=pybullet.URDF_USE_INERTIA_FROM_FILE | pybullet.URDF_USE_IMPLICIT_CYLINDER,
-            physicsClientId=client,
-        )
-    joints, links, names = [], {"base": -1}, _names(urdf)
+        place = str(write_arm_urdf(model, tool, Path(folder))), position, quaternion
+        body = pybullet.loadURDF(*place, useFixedBase=True, flags=flags, physicsClientId=client)
+    added, first = ("tool", "holder", "needle"), [members[0].link.name for members in urdf.chain.bodies[1:]]
+    names = dict(zip((*added, *first), (*added, *LINK_NAMES[1:]), strict=True))
+    undamped = dict.fromkeys(("linearDamping", "angularDamping", "jointDamping"), 0.0)
+    joints, links = [], {"base": -1}
     for index in range(pybullet.getNumJoints(body, physicsClientId=client)):
         info = pybullet.getJointInfo(body, index, physicsClientId=client)
         links[names.get(link := info[12].decode(), f"{link} of the URDF")] = index
@@ -284,16 +224,5 @@ def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | Non
             links[FLANGE] = index
         if info[2] == pybullet.JOINT_REVOLUTE:
             joints.append(index)
-        pybullet.changeDynamics(
-            body, index, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, physicsClientId=client
-        )
+        pybullet.changeDynamics(body, index, **undamped, physicsClientId=client)
     return Arm(client, body, tuple(joints), MappingProxyType(links), tuple(model.max_torques.tolist()))
-
-
-def _names(urdf: ArmUrdf) -> dict[str, str]:
-    """Names of the URDF's moving links, and of those that are added to them."""
-    first = [body[0].link.name for body in urdf.chain.bodies]
-    return {
-        **{name: name for name in ("tool", "holder", "needle")},
-        **dict(zip(first[1:], LINK_NAMES[1:], strict=True)),
-    }

@@ -1,7 +1,4 @@
-"""The PyBullet client, headless and repeatable; and the one place where millimetres become PyBullet's metres, and back.
-
-PyBullet is imported without the line that it writes to standard error each time.
-"""
+"""The PyBullet client, headless and repeatable; and the one place where millimetres become PyBullet's metres."""
 
 from __future__ import annotations
 
@@ -22,10 +19,8 @@ from puncture_twin.planning.geometry.rigid import pose
 
 TIME_STEP_S = 1.0 / 240.0
 """Bullet's own default; its contact and motor parameters are tuned for it."""
-
 SOLVER_ITERATIONS = 200
 """Four times Bullet's default: a chain of six motors under gravity converges to below a micrometre at the tip."""
-
 STANDARD_GRAVITY_MM_S2 = 9806.65
 
 
@@ -34,24 +29,13 @@ def physics_client(down: NDArray[np.float64] | None = None) -> Iterator[int]:
     """Open a DIRECT client (no window), yield its id, and disconnect it whatever happens.
 
     Bodies, contacts and solver run in a fixed order, so the same calls give the same numbers.
-
-    Args:
-        down: Shape (3,), unit vector of gravity in the world frame; None for -z.
-
-    Raises:
-        ConnectionError: PyBullet has no client left.
     """
     client = pybullet.connect(pybullet.DIRECT)
     if client < 0:
         raise ConnectionError("PyBullet gave no client: all of its connections are in use")
     try:
-        pybullet.setPhysicsEngineParameter(
-            fixedTimeStep=TIME_STEP_S,
-            numSolverIterations=SOLVER_ITERATIONS,
-            deterministicOverlappingPairs=1,
-            enableFileCaching=0,
-            physicsClientId=client,
-        )
+        fixed = {"numSolverIterations": SOLVER_ITERATIONS, "deterministicOverlappingPairs": 1, "enableFileCaching": 0}
+        pybullet.setPhysicsEngineParameter(fixedTimeStep=TIME_STEP_S, **fixed, physicsClientId=client)
         direction = np.array([0.0, 0.0, -1.0]) if down is None else down / np.linalg.norm(down)
         gravity = to_m(STANDARD_GRAVITY_MM_S2) * direction
         pybullet.setGravity(*gravity.tolist(), physicsClientId=client)
@@ -87,18 +71,14 @@ def _imported() -> Any:
 
 pybullet: Any = _imported()
 """The module; whoever needs it takes it from here."""
-
-
 MM_PER_M = 1000.0
 
 
 class PoseM(NamedTuple):
-    """A pose as PyBullet takes it."""
+    """A pose as PyBullet takes it: x, y, z in m, and a quaternion x, y, z, w."""
 
     position_m: list[float]
-    """x, y, z in m."""
     quaternion: list[float]
-    """x, y, z, w."""
 
 
 def to_m(length_mm: ArrayLike) -> Floats:

@@ -56,12 +56,7 @@ TipControl = Literal["impedance", "admittance", "position"]
 
 @dataclass(frozen=True, eq=False)
 class Insertion:
-    """A straight motion of the tip.
-
-    Attributes:
-        down_base: Shape (3,), unit vector of gravity, base frame.
-        hold_s: How long its end is kept.
-    """
+    """A straight motion of the tip."""
 
     model: UrModel
     tool: Tool
@@ -78,37 +73,21 @@ class Inserted(NamedTuple):
 
 
 def insert(
-    workcell: SimulatedWorkcell,
-    insertion: Insertion,
-    control: TipControl,
-    joint_offsets: Floats,
-    *,
-    start_s: float = 0.0,
-    resistance: Resistance | None = None,
-) -> Inserted:
-    """Run an insertion from where the arm is.
-
-    Args:
-        workcell: An open workcell, its arm at rest at the trajectory's start.
-        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
-        resistance: Of tissue; None for none.
-
-    Raises:
-        InputError: No time step carries the stiffness at some pose of the path.
-    """
+    workcell: SimulatedWorkcell, insertion: Insertion, control: TipControl, joint_offsets: Floats, *,
+    start_s: float = 0.0, resistance: Resistance | None = None,
+) -> Inserted:  # fmt: skip
+    """Run an insertion from where the arm is; refused where no time step carries the stiffness on the path."""
     model, tip_m = insertion.model, float(to_m(insertion.tool.needle_length_mm))
     with rigid_model(model, insertion.tool, insertion.down_base) as rigid:
         controller = _controller(rigid, control, insertion.trajectory.q)
         reference = reference_of(model, tip_m, insertion.trajectory, controller.dt, insertion.hold_s)
         recorder = Recorder(workcell, reference.q, joint_offsets, controller.dt, start_s)
-        around = Surroundings(joint_offsets, resistance, watch=recorder.see)
-        done = run(workcell.arm, controller, reference, lambda q: tips(model, tip_m, q[None]), around)
+        done = run(workcell.arm, controller, reference, joint_offsets, resistance=resistance, watch=recorder.see)
     off_m = np.linalg.norm(tips(model, tip_m, done.q).position_m - reference.position_m, axis=1)
     return Inserted(recorder.execution(), float(to_mm(off_m.max())))
 
 
 def _controller(rigid: RigidModel, control: TipControl, q_path: Floats) -> Controller:
-    """The controller with the longest step that is stable on the whole path."""
     if control == "position":
         return Motors()
     if control == "admittance":
@@ -133,14 +112,7 @@ class VirtualMass:
 
 
 class Admittance:
-    """The controller: it keeps the virtual mass's place and speed, shape (3,) each, m and m/s, base frame.
-
-    Args:
-        dt: Its step, s.
-
-    Raises:
-        InputError: The virtual mass would diverge with this step.
-    """
+    """The controller: it keeps the virtual mass's place and speed, shape (3,) each, m and m/s, base frame."""
 
     def __init__(self, model: UrModel, tip_m: float, virtual: VirtualMass, dt: float) -> None:
         decay = virtual.damping_ns_m * dt / virtual.mass_kg
@@ -152,48 +124,31 @@ class Admittance:
 
     def act(self, measured: Measured, reference: Reference, row: int) -> Goals:
         """Goals of the position motors for the next step."""
-        self._yield(measured.force_n)
+        of = self._virtual
+        pull = measured.force_n - of.damping_ns_m * self._velocity - of.stiffness_n_m * self._place
+        self._velocity = self._velocity + self.dt / of.mass_kg * pull
+        self._place = self._place + self.dt * self._velocity  # semi-implicit: the new speed
         J = tips(self._model, self._tip_m, measured.q[None]).J[0]
         moved = np.linalg.solve(J, np.concatenate([self._place, np.zeros(3)]))  # the tip yields without a rotation
         speed = np.linalg.solve(J, np.concatenate([self._velocity, np.zeros(3)]))
         return Goals(reference.q[row] + moved, reference.speed[row] + speed)
 
-    def _yield(self, force_n: Floats) -> None:
-        of = self._virtual
-        pull = force_n - of.damping_ns_m * self._velocity - of.stiffness_n_m * self._place
-        self._velocity = self._velocity + self.dt / of.mass_kg * pull
-        self._place = self._place + self.dt * self._velocity  # semi-implicit: the new speed
-
 
 REFRESH_STEPS = 5
 """Between two evaluations of the tip's mass and the damping that follows from it: the pose changes slowly."""
-
 CONTACT_N = 0.5
 """A force at the tip above which there is contact."""
 
 
 class Impedance:
-    """The controller: it keeps the integral of its error and the damping of its pose.
-
-    Args:
-        dt: Its step, s.
-        keep_compliance: Whether the integral stops while contact is measured.
-    """
+    """The controller: it keeps the integral of its error (in contact, unless compliance is kept) and its damping."""
 
     def __init__(self, model: RigidModel, stiffness: Stiffness, dt: float, *, keep_compliance: bool = True) -> None:
-        self.dt = dt
-        self._model, self._stiffness = model, stiffness
-        self._keep_compliance = keep_compliance
-        self._K = stiffness.diagonal
-        self._integral, self._D = np.zeros(6), np.zeros((6, 6))
-        self._steps = 0
+        self.dt, self._model, self._stiffness, self._keep_compliance = dt, model, stiffness, keep_compliance
+        self._integral, self._D, self._steps = np.zeros(6), np.zeros((6, 6)), 0
 
     def act(self, measured: Measured, reference: Reference, row: int) -> Torques:
-        """Torques for the next step.
-
-        Raises:
-            InputError: The stiffness would diverge at this pose.
-        """
+        """Torques for the next step; a stiffness that would diverge at this pose is refused."""
         tip = tips(self._model.kinematics, self._model.tip_m, measured.q[None])
         J = tip.J[0]
         if self._steps % REFRESH_STEPS == 0:
@@ -205,7 +160,7 @@ class Impedance:
         error = np.concatenate([reference.position_m[row] - tip.position_m[0], turn])
         if not (self._keep_compliance and np.linalg.norm(measured.force_n) > CONTACT_N):
             self._integral = self._integral + self.dt * error  # of position (m s) and rotation (rad s)
-        spring = self._K * (error + self._stiffness.integral_per_s * self._integral)
+        spring = self._stiffness.diagonal * (error + self._stiffness.integral_per_s * self._integral)
         wrench = spring + self._D @ (reference.twist[row] - J @ measured.speed)  # damps what differs from the motion
         feedforward = self._model.inverse_dynamics(measured.q, measured.speed, reference.acceleration[row])
         return Torques(feedforward + J.T @ wrench)
@@ -222,20 +177,13 @@ def rotation_error(R_reference: Floats, R: Floats) -> Floats:
 
 MOST_RATIO = 0.8
 """Limit of sqrt(K / m) dt over every mode of the tip: five sixths of where the loop diverges."""
-
 STEPS_S = (RECORD_S / 17, RECORD_S / 34, RECORD_S / 68)
 """Time steps of a controller, the longest first: about 1, .5 and .25 ms, and records fall on steps."""
 
 
 @dataclass(frozen=True)
 class Stiffness:
-    """A spring at the tip.
-
-    Attributes:
-        translation_n_m: K across and along the needle, N/m.
-        rotation_nm_rad: Of the needle's direction and roll, N m/rad.
-        integral_per_s: K_i: what is left of an error is gone after so many times 1/K_i; 0 keeps the compliance.
-    """
+    """A spring at the tip; what is left of an error is gone after so many times 1/K_i, and 0 keeps the compliance."""
 
     translation_n_m: float = 2e4
     rotation_nm_rad: float = 300.0
@@ -274,11 +222,7 @@ def stability_ratio(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> fl
 
 
 def allowed_step(stiffness: Stiffness, J: Floats, M: Floats) -> float:
-    """The longest of `STEPS_S` that the stiffness is stable with at a pose; arguments as of `refuse_unstable`.
-
-    Raises:
-        InputError: None is.
-    """
+    """The longest of `STEPS_S` that the stiffness is stable with at a pose; refused where none is."""
     stable = [dt for dt in STEPS_S if stability_ratio(stiffness, J, M, dt) < MOST_RATIO]
     if not stable:
         refuse_unstable(stiffness, J, M, STEPS_S[-1])
@@ -286,35 +230,20 @@ def allowed_step(stiffness: Stiffness, J: Floats, M: Floats) -> float:
 
 
 def refuse_unstable(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> None:
-    """Refuse a stiffness that this time step cannot carry at this pose.
-
-    Args:
-        J: Jacobian of the tip, shape (6, 6).
-        M: Mass matrix of the joints, shape (6, 6).
-        dt: Time step, s.
-    """
+    """Refuse a stiffness that this time step cannot carry at this pose."""
     ratio = stability_ratio(stiffness, J, M, dt)
     if not ratio < MOST_RATIO:
-        what = (
-            f"a stiffness of {stiffness.translation_n_m:g} N/m at steps of {1e3 * dt:g} ms would diverge: "
-            f"sqrt(K/m) dt = {ratio:.2f}"
-        )
-        refuse(what, "impedance", f"below {MOST_RATIO}: less stiffness or a shorter step", "control_unstable")
+        what = f"a stiffness of {stiffness.translation_n_m:g} N/m at steps of {1e3 * dt:g} ms would diverge"
+        allowed = f"below {MOST_RATIO}: less stiffness or a shorter step"
+        refuse(f"{what}: sqrt(K/m) dt = {ratio:.2f}", "impedance", allowed, "control_unstable")
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """One row a step of the controller.
+    """One row a step of the controller: q (n, 6), rad, its derivatives; the tip (n, 3), base frame, its twist."""
 
-    Attributes:
-        q: Shape (n, 6), rad.
-        speed: Shape (n, 6), rad/s.
-        acceleration: Shape (n, 6), rad/s^2.
-        position_m: Shape (n, 3), of the tip, base frame.
-        R_base_tip: Shape (n, 3, 3).
-        twist: Shape (n, 6), m/s and rad/s.
-    """
-
+    model: UrModel
+    tip_m: float
     q: Floats
     speed: Floats
     acceleration: Floats
@@ -322,51 +251,33 @@ class Reference:
     R_base_tip: Floats
     twist: Floats
 
-    def __len__(self) -> int:
-        return len(self.q)
-
 
 def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float, hold_s: float = 0.0) -> Reference:
-    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then constant.
-
-    Args:
-        dt: The controller's step, s.
-    """
+    """A trajectory at every step, smooth between its samples (cubic spline, at rest at both ends), then constant."""
     moving = int(np.ceil(trajectory.duration_s / dt)) + 1
     times = np.minimum(dt * np.arange(moving + round(hold_s / dt)), trajectory.duration_s)
-    if len(trajectory.q) == 1:
-        still = np.zeros((len(times), 6))
-        return _reference(model, tip_m, np.tile(trajectory.q[0], (len(times), 1)), still, still)
-    spline = CubicSpline(trajectory.times_s, trajectory.q, bc_type="clamped")
-    at_rest = (times >= trajectory.duration_s)[:, None]  # the spline's slopes there are rounding
-    return _reference(
-        model, tip_m, spline(times), np.where(at_rest, 0.0, spline(times, 1)), np.where(at_rest, 0.0, spline(times, 2))
-    )
-
-
-def _reference(model: UrModel, tip_m: float, q: Floats, speed: Floats, acceleration: Floats) -> Reference:
+    q, speed = np.tile(trajectory.q[0], (len(times), 1)), np.zeros((len(times), 6))
+    acceleration = speed
+    if len(trajectory.q) > 1:
+        spline = CubicSpline(trajectory.times_s, trajectory.q, bc_type="clamped")
+        at_rest = (times >= trajectory.duration_s)[:, None]  # the spline's slopes there are rounding
+        q, speed, acceleration = spline(times), *(np.where(at_rest, 0.0, spline(times, order)) for order in (1, 2))
     tip = tips(model, tip_m, q)
-    return Reference(q, speed, acceleration, tip.position_m, tip.R_base_tip, (tip.J @ speed[..., None])[..., 0])
+    twist = (tip.J @ speed[..., None])[..., 0]
+    return Reference(model, tip_m, q, speed, acceleration, tip.position_m, tip.R_base_tip, twist)
 
 
 class Tip(NamedTuple):
-    """The tip at n configurations, base frame."""
+    """The tip (n, 3) at n configurations, base frame, and the flange's axes (n, 3, 3), z to the tip."""
 
     position_m: Floats
-    """Shape (n, 3)."""
     R_base_tip: Floats
-    """Shape (n, 3, 3), the flange's axes; z points along the needle to its tip."""
     J: Floats
     """Shape (n, 6, 6): tip velocity (m/s), then angular velocity (rad/s), from joint speeds (rad/s)."""
 
 
 def tips(model: UrModel, tip_m: float, q: Floats) -> Tip:
-    """The tip and its Jacobian.
-
-    Args:
-        tip_m: Flange to tip, along the flange's z.
-        q: Shape (n, 6), rad.
-    """
+    """The tip and its Jacobian."""
     frames, J = np.empty((len(q), 7, 4, 4)), np.empty((len(q), 6, 6))
     link_frames(model.lengths, np.array(q, order="C"), frames)
     jacobians(frames, J)
@@ -381,30 +292,24 @@ TIP_LINK = "needle"
 
 
 class Measured(NamedTuple):
-    """Measurements that a controller gets at one step."""
+    """A controller's measurements at one step: encoders (6,), rad, rad/s; contact force at the tip (3,), base frame."""
 
     q: Floats
-    """Shape (6,), rad, what the encoders say."""
     speed: Floats
-    """Shape (6,), rad/s."""
     force_n: Floats
-    """Shape (3,), of contact at the tip, base frame."""
 
 
 class Torques(NamedTuple):
-    """Joint torques for the next step, the motors off."""
+    """Joint torques (6,), N m, for the next step, the motors off."""
 
     torque_nm: Floats
-    """Shape (6,)."""
 
 
 class Goals(NamedTuple):
-    """Goals of the position motors."""
+    """Goals of the position motors: encoders (6,), rad, and rad/s."""
 
     q: Floats
-    """Shape (6,), rad, encoders."""
     speed: Floats
-    """Shape (6,), rad/s."""
 
 
 class Controller(Protocol):
@@ -417,12 +322,10 @@ class Controller(Protocol):
 
 
 class Push(NamedTuple):
-    """A force on the needle, which is rigid here: where it acts along the shaft decides its moment on the arm."""
+    """A force (3,) on the rigid needle, and the point (3,) of its shaft where it acts, base frame."""
 
     force_n: Floats
-    """Shape (3,), base frame."""
     point_m: Floats
-    """Shape (3,), base frame."""
 
 
 Resistance = Callable[[Tip], Sequence[Push]]
@@ -431,15 +334,7 @@ Resistance = Callable[[Tip], Sequence[Push]]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Records of a run, one row a step: at its start, and the force of the step before.
-
-    Attributes:
-        dt: Between rows, s.
-        q: Shape (n, 6), rad, encoders.
-        tip_m: Shape (n, 3), true tip, base frame.
-        force_n: Shape (n, 3), N, on the tip.
-        stopped: Whether it ended before its reference did.
-    """
+    """Records of a run, a row a step: encoders (n, 6), rad, at its start, and the force (n, 3) of the step before."""
 
     dt: float
     q: Floats
@@ -451,61 +346,36 @@ class Run:
 Stop = Callable[[Measured], bool]
 
 
-@dataclass(frozen=True, eq=False)
-class Surroundings:
-    """Forces on the arm besides its controller.
-
-    Attributes:
-        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
-        resistance: Of tissue; None for none.
-        stop: Ends the run where it says so; None never does.
-    """
-
-    joint_offsets: Floats
-    resistance: Resistance | None = None
-    stop: Stop | None = None
-    watch: Callable[[int], None] | None = None
-
-
 def run(
-    arm: Arm, controller: Controller, reference: Reference, tip_of: Callable[[Floats], Tip], around: Surroundings
-) -> Run:
-    """Follow a reference from where the arm is.
-
-    Args:
-        arm: Of an open workcell whose world is the base frame.
-        controller: Its step becomes that of the physics.
-        reference: The motion to follow, a row a step.
-        around: What else acts.
-    """
+    arm: Arm, controller: Controller, reference: Reference, joint_offsets: Floats, *,
+    resistance: Resistance | None = None, stop: Stop | None = None, watch: Callable[[int], None] | None = None,
+) -> Run:  # fmt: skip
+    """Follow a reference from where the arm is, by the controller's step; ``watch`` is called after each row's step."""
     set_time_step(arm.client, controller.dt)
     arm.release()  # motors that hold on would work against torques; goals switch them on again
     q, places, forces = [], [], []
-    for row in range(len(reference)):
+    for row in range(len(reference.q)):
         state = arm.state()
-        tip = tip_of(state.q)
+        tip = tips(reference.model, reference.tip_m, state.q[None])
         force = contact_force(arm, TIP_LINK)
-        for push in () if around.resistance is None else around.resistance(tip):
+        for push in () if resistance is None else resistance(tip):
             arm.push(TIP_LINK, push.force_n, push.point_m)
             force = force + push.force_n
-        measured = Measured(state.q - around.joint_offsets, state.speed, force)
+        measured = Measured(state.q - joint_offsets, state.speed, force)
         q.append(measured.q)
         places.append(tip.position_m[0])
         forces.append(force)
-        if around.stop is not None and around.stop(measured):
+        if stop is not None and stop(measured):
             break
-        _give(arm, controller.act(measured, reference, row), around.joint_offsets)
+        action = controller.act(measured, reference, row)
+        if isinstance(action, Torques):
+            arm.torque(action.torque_nm)
+        else:
+            arm.command(action.q + joint_offsets, action.speed)  # encoders to true joints
         step(arm.client)
-        if around.watch is not None:
-            around.watch(row)
-    return Run(controller.dt, np.array(q), np.array(places), np.array(forces), len(q) < len(reference))
-
-
-def _give(arm: Arm, action: Torques | Goals, joint_offsets: Floats) -> None:
-    if isinstance(action, Torques):
-        arm.torque(action.torque_nm)
-    else:
-        arm.command(action.q + joint_offsets, action.speed)  # encoders to true joints
+        if watch is not None:
+            watch(row)
+    return Run(controller.dt, np.array(q), np.array(places), np.array(forces), len(q) < len(reference.q))
 
 
 class Motors:
@@ -515,7 +385,6 @@ class Motors:
 
     def act(self, measured: Measured, reference: Reference, row: int) -> Goals:
         """Goals of the next step."""
-        del measured
         return Goals(reference.q[row], reference.speed[row])
 
 
@@ -526,10 +395,6 @@ class RigidModel:
     PyBullet evaluates inverse dynamics as if the body's base were not rotated in the world: gravity enters in world
     axes and leaves in base axes. The model therefore has a world of its own, its URDF base unrotated, under a gravity
     that was rotated instead: g_urdf = R_urdf_base g_base.
-
-    Attributes:
-        tip_m: Flange to tip, along the flange's z.
-        arm: The body that is evaluated, alone in a client of its own.
     """
 
     kinematics: UrModel
@@ -538,12 +403,8 @@ class RigidModel:
 
     def inverse_dynamics(self, q: Floats, speed: Floats, acceleration: Floats) -> Floats:
         """Torques that give accelerations: tau = M(q) qdd + c(q, qd) + g(q); all of shape (6,), rad, s, N m."""
-        client, body = self.arm.client, self.arm.body
-        return np.array(
-            pybullet.calculateInverseDynamics(
-                body, q.tolist(), speed.tolist(), acceleration.tolist(), physicsClientId=client
-            )
-        )
+        motion = q.tolist(), speed.tolist(), acceleration.tolist()
+        return np.array(pybullet.calculateInverseDynamics(self.arm.body, *motion, physicsClientId=self.arm.client))
 
     def mass_matrix(self, q: Floats) -> Floats:
         """M(q), shape (6, 6), kg m^2."""
@@ -552,14 +413,7 @@ class RigidModel:
 
 @contextmanager
 def rigid_model(model: UrModel, tool: Tool, down_base: Floats) -> Iterator[RigidModel]:
-    """Open the model of an arm, and close it again.
-
-    Args:
-        down_base: Shape (3,), unit vector of gravity in the controller's base frame: any mount is a direction.
-
-    Raises:
-        InputError: There is no body of that arm.
-    """
+    """Open the model of an arm, and close it again."""
     T_base_root = model_urdf(model).T_base_root
     with physics_client(down=T_base_root[:3, :3].T @ down_base) as client:
         # T_world_urdf = T_world_base T_base_urdf = identity

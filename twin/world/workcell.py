@@ -1,7 +1,4 @@
-"""The simulated workcell: the arm with its needle, the patient at their true place, boxes, and headless images of it.
-
-The world frame is the controller's base frame. Surfaces may be loaded to be seen only.
-"""
+"""The simulated workcell: arm with needle, patient at their true place, boxes; the world is the controller's base."""
 
 from __future__ import annotations
 
@@ -27,12 +24,7 @@ from puncture_twin.twin.world.client import physics_client, pose_to_m, pybullet,
 
 @dataclass(frozen=True)
 class SimulatedWorkcell:
-    """An open simulated workcell.
-
-    Attributes:
-        arm: The arm; its base frame is the world frame.
-        bodies: Body id to name, the arm not among them.
-    """
+    """An open simulated workcell; other bodies by their ids."""
 
     client: int
     arm: Arm
@@ -46,19 +38,10 @@ def open_workcell(
     """Build the workcell, yield it, and take it down.
 
     The needle's shaft passes the skin without resistance; its holder and the arm collide with it.
-
-    Args:
-        model: A UR3, UR5 or UR10.
-        skin: The patient's surface, CT frame, mm.
-        T_base_ct: Where the patient lies, shape (4, 4), mm.
-        down_ct: Unit vector of gravity in the CT frame, shape (3,).
-
-    Raises:
-        InputError: There is no body of that arm.
     """
     with physics_client(down=T_base_ct[:3, :3] @ down_ct) as client:
         arm = load_arm(client, model, tool)
-        patient = load_surface(client, skin, T_base_ct, solid=True)
+        patient = load_surface(client, skin, T_base_ct)
         let_pass(client, arm.body, arm.links["needle"], patient)
         names = {patient: PATIENT}
         for box in boxes:
@@ -67,49 +50,27 @@ def open_workcell(
 
 
 Rgba = tuple[float, float, float, float]
-
 MAX_PHYSICS_FACES = 20_000
 """Surfaces with more triangles are thinned for physics and images; verdicts come from FCL on the full ones."""
-
 SKIN_RGBA: Rgba = (0.93, 0.78, 0.68, 1.0)
 BOX_RGBA: Rgba = (0.60, 0.63, 0.67, 1.0)
-
 CONTACT_MARGIN_M = 0.0
 """Bullet grows concave shapes by this; contact shall begin at the surface itself."""
-
 CONTACT_DAMPING_NS_M = 100.0
 """Damping of bodies that yield."""
 
 
-def load_surface(
-    client: int, mesh: TriangleMesh, T_world_mesh: Floats, *, solid: bool, max_faces: int = MAX_PHYSICS_FACES
-) -> int:
-    """A surface that does not move: triangle by triangle, hollows included.
-
-    Args:
-        mesh: The surface, mm; thinned to ``max_faces``.
-        T_world_mesh: Its pose, shape (4, 4), mm.
-        solid: Whether bodies collide with it, or it is only seen.
-        max_faces: How many triangles physics and images bear.
-    """
+def load_surface(client: int, mesh: TriangleMesh, T_world_mesh: Floats, max_faces: int = MAX_PHYSICS_FACES) -> int:
+    """A surface that does not move: triangle by triangle, hollows included."""
     position, quaternion = pose_to_m(T_world_mesh)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "surface.obj"
         write_obj(thinned(mesh, max_faces), path)
-        collision = -1
-        if solid:
-            collision = pybullet.createCollisionShape(
-                pybullet.GEOM_MESH,
-                fileName=str(path),
-                flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
-                physicsClientId=client,
-            )
-        visual = pybullet.createVisualShape(
-            pybullet.GEOM_MESH, fileName=str(path), rgbaColor=SKIN_RGBA, physicsClientId=client
-        )
+        shape = {"shapeType": pybullet.GEOM_MESH, "fileName": str(path), "physicsClientId": client}
+        collision = pybullet.createCollisionShape(**shape, flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH)
+        visual = pybullet.createVisualShape(**shape, rgbaColor=SKIN_RGBA)
         body = pybullet.createMultiBody(0.0, collision, visual, position, quaternion, physicsClientId=client)
-    if solid:
-        pybullet.changeDynamics(body, -1, collisionMargin=CONTACT_MARGIN_M, physicsClientId=client)
+    pybullet.changeDynamics(body, -1, collisionMargin=CONTACT_MARGIN_M, physicsClientId=client)
     return int(body)
 
 
@@ -124,9 +85,8 @@ def load_box(client: int, size_mm: Floats, T_world_box: Floats) -> int:
 
 def load_ball(client: int, center_mm: Floats, radius_mm: float, rgba: Rgba) -> int:
     """A ball that is only seen; its centre (3,), world frame. Returns the body id."""
-    visual = pybullet.createVisualShape(
-        pybullet.GEOM_SPHERE, radius=float(to_m(radius_mm)), rgbaColor=rgba, physicsClientId=client
-    )
+    shape = {"radius": float(to_m(radius_mm)), "rgbaColor": rgba}
+    visual = pybullet.createVisualShape(pybullet.GEOM_SPHERE, **shape, physicsClientId=client)
     return int(pybullet.createMultiBody(0.0, -1, visual, to_m(center_mm).tolist(), physicsClientId=client))
 
 
@@ -150,15 +110,12 @@ def thinned(mesh: TriangleMesh, max_faces: int = MAX_PHYSICS_FACES) -> TriangleM
     """The mesh itself where it is small, else a decimated one of about ``max_faces`` triangles."""
     if len(mesh.faces) <= max_faces:
         return mesh
-    vertices, faces = fast_simplification.simplify(
-        np.array(mesh.vertices), np.array(mesh.faces), target_count=max_faces
-    )
-    return TriangleMesh(vertices, faces)
+    writable = np.array(mesh.vertices), np.array(mesh.faces)
+    return TriangleMesh(*fast_simplification.simplify(*writable, target_count=max_faces))
 
 
 NEAR_M = 0.05
 FAR_M = 10.0
-
 LIGHT_UP = 1.5
 """The light is above the camera: its direction is the camera's plus this much of up."""
 
@@ -169,10 +126,6 @@ def pinhole_picture(
     """An image of the workcell by a calibrated camera, without its lens's distortion, (height, width, 3), RGB.
 
     For looking at, not for measuring: the renderer samples pixel corners and has no anti-aliasing.
-
-    Args:
-        K: Intrinsic matrix, shape (3, 3), px; pixel centres at integers.
-        T_camera_world: Shape (4, 4), mm; the camera's x right, y down, z forward.
     """
     width, height = size
     left, right = -(K[0, 2] + 0.5) / K[0, 0], (width - 0.5 - K[0, 2]) / K[0, 0]
@@ -182,23 +135,7 @@ def pinhole_picture(
     view = np.diag([1.0, -1.0, -1.0, 1.0]) @ T_camera_world
     view[:3, 3] = to_m(view[:3, 3])
     light = -T_camera_world[2, :3] + LIGHT_UP * -T_camera_world[1, :3]
-    return _drawn(client, size, view.T.ravel().tolist(), projection, light)
-
-
-def _drawn(
-    client: int, size: tuple[int, int], view: list[float], projection: list[float], light: NDArray[np.float64]
-) -> NDArray[np.uint8]:
-    """An image by PyBullet's software renderer; the light shines from a direction (3,)."""
-    width, height = size
-    image = pybullet.getCameraImage(
-        width,
-        height,
-        view,
-        projection,
-        lightDirection=light.tolist(),
-        shadow=1,
-        renderer=pybullet.ER_TINY_RENDERER,
-        physicsClientId=client,
-    )
+    drawn = {"lightDirection": light.tolist(), "shadow": 1, "renderer": pybullet.ER_TINY_RENDERER}
+    image = pybullet.getCameraImage(width, height, view.T.ravel().tolist(), projection, **drawn, physicsClientId=client)
     rgba = np.asarray(image[2], dtype=np.uint8).reshape(height, width, 4)
     return np.ascontiguousarray(rgba[..., :3])

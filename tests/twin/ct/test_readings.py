@@ -76,8 +76,7 @@ def test_a_soft_lesion_is_found_by_its_values():
     solids = [Solid("liver", BLOCK.mesh, 58.0), Solid("lesion", ball(place, 20.0), 25.0, 1)]
     volume, image = scanned(solids, 2.5, centre=(0.0, 0.0, 0.0), size=(40.0, 40.0, 40.0))
     error = read_lesion(volume, image.labels[0] == 1) - place
-    assert np.abs(error[:2]).max() < 0.12
-    assert abs(error[2]) < 0.2
+    assert np.abs(error[:2]).max() < 0.12 and abs(error[2]) < 0.2
 
 
 @pytest.mark.parametrize("spacing", [1.0, 2.5])
@@ -95,8 +94,7 @@ def test_a_needle_is_found_by_its_image(spacing, direction):
     found = find_needle(volume, np.zeros(3), 1.2)
     assert np.linalg.norm(found.tip_ct - tip) < 0.5
     assert np.arccos(found.forward_ct @ forward) < max(np.radians(1.0), found.axis_sd)
-    assert found.axis_sd < np.radians(1.5)
-    assert found.sagitta_mm == 0
+    assert found.axis_sd < np.radians(1.5) and found.sagitta_mm == 0
     seen, true = needle_error(found.tip_ct, found.forward_ct, np.zeros(3)), needle_error(tip, forward, np.zeros(3))
     assert np.allclose(seen, true, atol=0.4)
     assert seen.tip_to_target_mm == pytest.approx(np.hypot(seen.lateral_mm, seen.depth_mm))

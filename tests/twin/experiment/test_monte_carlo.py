@@ -55,9 +55,7 @@ def test_the_stated_errors_are_rejected_and_those_found_are_not():
     """All printed errors lie within either's range: only all points together tell the two apart."""
     stated, found = (run_draws(one, 1000, np.random.default_rng(4)) for one in (AS_STATED, AS_FOUND))
     assert all(row.within((5, 95)) for row in stated.printed)
-    assert stated.rejected
-    assert not found.rejected
-    assert found.agrees
+    assert stated.rejected and not found.rejected and found.agrees
 
 
 def test_several_triads_are_what_one_after_the_other_gives():
@@ -81,7 +79,6 @@ def test_several_triads_are_what_one_after_the_other_gives():
 
 
 def axes_of(points):
-    """Chen's triad as columns."""
     first = points[1] - points[0]
     third = np.cross(first, points[2] - points[0])
     e1, e3 = first / np.linalg.norm(first), third / np.linalg.norm(third)
@@ -144,8 +141,6 @@ def test_the_skew_of_setup_2_s_markers_brings_setup_1_s_lesions_nearer():
 def test_the_command_prints_the_finding_and_knows_one_experiment():
     """Exit 0 where the declarations come out as they should; other papers are refused in one line."""
     done = CliRunner().invoke(app, ["reproduce", "chen2019", "--experiment", "--seeds", "200"])
-    assert done.exit_code == 0
-    assert "REJECTED" in done.stdout
-    assert "2.99 -> 1.28 mm" in done.stdout
+    assert done.exit_code == 0 and "REJECTED" in done.stdout and "2.99 -> 1.28 mm" in done.stdout
     refused = CliRunner().invoke(app, ["reproduce", "liu2007", "--experiment"])
     assert "has no experiment" in str(refused.exception)

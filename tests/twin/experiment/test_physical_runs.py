@@ -10,14 +10,12 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.twin.jobs.experiment import touch_job as module
 from puncture_twin.twin.plant.touching import ExecutedTouches
 
-CONTEXT = SimpleNamespace(
-    watcher=SimpleNamespace(count=lambda *_: None), stages=SimpleNamespace(time=lambda _: nullcontext())
-)
+STAGES = SimpleNamespace(time=lambda _: nullcontext())
+CONTEXT = SimpleNamespace(watcher=SimpleNamespace(count=lambda *_: None), stages=STAGES)
 TOUR = SimpleNamespace(plan=SimpleNamespace(expected_mm=1.8), outward_ct=None, q_insertion=None)
 
 
 def one_run(context, tour, seed):
-    """Seed 2 stops with a reason."""
     if seed == 2:
         raise NoAnswerError("marker A was not felt", code="no_touch")
     return {"seed": seed, "tip_error_mm": 3.0 + seed, "seconds_per_touch": 14.0 + 2 * seed, "off_path_mm": 0.02}
@@ -46,8 +44,7 @@ def test_runs_none_of_which_ended_give_no_figure(monkeypatch):
     monkeypatch.setattr(module, "physical_run", lambda *_: one_run(None, None, 2))
     monkeypatch.setattr(module, "drawn_once", lambda *_: SimpleNamespace(tip_error_mm=2.0))
     facts = module.physical_runs(CONTEXT, 1)
-    assert facts["realised_mm"] is None
-    assert facts["seconds_per_touch"] is None
+    assert facts["realised_mm"] is None and facts["seconds_per_touch"] is None
     assert "none of 1 physical run ended" in module.physical_text(facts)
 
 

@@ -29,13 +29,11 @@ def quiet(*_):
 
 @pytest.fixture(scope="module")
 def context():
-    """The carton, without a search."""
     return prepare(CASE)
 
 
 @pytest.fixture(scope="module")
 def tour(context):
-    """Eight poses about a place that was found."""
     return plan_pivot(context, 8, place_base=None, seed=0, progress=quiet)
 
 
@@ -68,7 +66,6 @@ def test_a_place_that_cannot_be_touched_is_refused(context):
 
 
 def drawn(context, tour, errors, seed):
-    """The calibration of exact readings in one truth, and the true tip."""
     names = tuple(touch.name for touch in tour.touches)
     T, place = context.placement.T_base_ct, tour.touches[0].point_base
     truth = draw_pivot_truth(T, names, place, errors, seed)
@@ -80,12 +77,14 @@ def drawn(context, tour, errors, seed):
 
 @pytest.mark.parametrize(("link_mm", "joint_deg"), [(0.05, 0.005), (0.5, 0.05)])
 def test_errors_and_residuals_are_those_declared(context, tour, link_mm, joint_deg):
-    """Over 300 arms, calibrated or not: squared errors of the tip are those of its covariance, residuals likewise."""
-    arm = dataclasses.replace(
-        context.case.errors.arm, link_mm=link_mm, joint=np.radians(joint_deg), twist=np.radians(joint_deg)
-    )
+    """Over 150 arms, calibrated or not: squared errors of the tip are those of its covariance, residuals likewise.
+
+    Their mean is known to 9 % where one axis errs most; twice that is allowed.
+    """
+    off = np.radians(joint_deg)
+    arm = dataclasses.replace(context.case.errors.arm, link_mm=link_mm, joint=off, twist=off)
     errors = dataclasses.replace(context.case.errors, arm=arm)
-    found = [drawn(context, tour, errors, seed) for seed in range(300)]
+    found = [drawn(context, tour, errors, seed) for seed in range(150)]
     squared = np.mean([np.sum((pivot.tip_flange - tip) ** 2) for pivot, tip in found])
     assert squared == pytest.approx(np.mean([np.trace(pivot.cov_tip) for pivot, _ in found]), rel=0.2)
     residual = np.mean([pivot.residual_mm**2 for pivot, _ in found])

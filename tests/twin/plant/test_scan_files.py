@@ -24,7 +24,6 @@ SETTINGS = ScanSettings(spacing_mm=2.5, pixel_mm=0.9, noise_hu=3.0)
 
 @pytest.fixture(scope="module", params=[None, (0.2, -0.4, 0.3)], ids=["straight", "oblique"])
 def written(request, tmp_path_factory):
-    """A scan, its folder of DICOM and its NIfTI."""
     R = np.eye(3) if request.param is None else exp_rotation(np.array(request.param))
     T = pose(R, R @ [-31.2507, -20.1, -12.6251]) @ np.diag([0.9, 0.9, 2.5, 1.0])
     solids = [Solid(name, ball(np.array(PLACES[name]), 14.0), VALUES[name], 1) for name in PLACES]
@@ -36,7 +35,6 @@ def written(request, tmp_path_factory):
 
 
 def check_places(values, T_ct_index):
-    """Each ball is where it was put."""
     for name, place in PLACES.items():
         index = np.round(apply(np.linalg.inv(T_ct_index), np.array(place))).astype(int)
         assert values[tuple(index)] == pytest.approx(VALUES[name], abs=20.0), name
@@ -44,7 +42,6 @@ def check_places(values, T_ct_index):
 
 
 def of_itk(image):
-    """Values (i, j, k) and the affine to LPS mm."""
     T = np.eye(4)
     T[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     T[:3, 3] = image.GetOrigin()
@@ -93,9 +90,8 @@ def test_the_series_states_what_it_is(written):
         (uid,) = {getattr(one, keyword) for one in slices}
         assert uid.is_valid
     assert {one.PixelRepresentation for one in slices} == {1}
-    assert {float(one.SliceThickness) for one in slices} == {2.5}
-    assert {float(one.SpacingBetweenSlices) for one in slices} == {2.5}
-    assert {tuple(map(float, one.PixelSpacing)) for one in slices} == {(0.9, 0.9)}
+    apart = {(float(one.SliceThickness), float(one.SpacingBetweenSlices), *one.PixelSpacing) for one in slices}
+    assert apart == {(2.5, 2.5, 0.9, 0.9)}
     normal = np.cross(*np.array(slices[0].ImageOrientationPatient, dtype=float).reshape(2, 3))
     step = np.array(slices[1].ImagePositionPatient, float) - np.array(slices[0].ImagePositionPatient, float)
     assert step @ normal == pytest.approx(2.5)

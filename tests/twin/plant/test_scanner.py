@@ -13,7 +13,7 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
-from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.planning.geometry.mesh import TriangleMesh, joined
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.twin.plant.scanner.case_scene import scan_frame
@@ -33,7 +33,6 @@ STILL = ScanSettings(noise_hu=0.0, blur_mm=1e-3)
 
 
 def cut(meshes, shape, fills=None, labels=None, spacing=(1.0, 1.0, 1.0), empty=0.0):
-    """Meshes in voxels."""
     corners = np.concatenate([mesh.triangles for mesh in meshes])
     owners = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
     fills = np.ones(len(meshes)) if fills is None else np.array(fills, dtype=float)
@@ -42,7 +41,6 @@ def cut(meshes, shape, fills=None, labels=None, spacing=(1.0, 1.0, 1.0), empty=0
 
 
 def grid(shape, spacing=1.0, low=0.0):
-    """Cubic voxels."""
     T = np.diag([spacing, spacing, spacing, 1.0])
     T[:3, 3] = low
     return VolumeGrid(shape, T, {})
@@ -101,10 +99,7 @@ def test_the_way_a_surface_is_wound_does_not_matter():
     """Turned inside out, and in two pieces that overlap, a solid is what it is."""
     one = ball(np.array([4.0, 4.0, 4.0]), 5.0)
     out = TriangleMesh(one.vertices, one.faces[:, ::-1])
-    both = TriangleMesh(
-        np.concatenate([one.vertices, one.vertices + [0.7, 0.0, 0.0]]),
-        np.concatenate([one.faces, one.faces + len(one.vertices)]),
-    )
+    both = joined([one, one.transformed(pose(np.eye(3), [0.7, 0.0, 0.0]))])
     plain = cut([one], (9, 9, 9)).values
     assert np.array_equal(cut([out], (9, 9, 9)).values, plain)
     apart = cut([one, one.transformed(pose(np.eye(3), [0.7, 0.0, 0.0]))], (9, 9, 9)).values
@@ -114,13 +109,9 @@ def test_the_way_a_surface_is_wound_does_not_matter():
 def test_a_hollow_is_empty():
     """A ball with an inner surface that is wound the other way: a shell."""
     outer, inner = ball(np.full(3, 5.0), 8.0), ball(np.full(3, 5.0), 4.0)
-    shell = TriangleMesh(
-        np.concatenate([outer.vertices, inner.vertices]),
-        np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)]),
-    )
+    shell = joined([outer, TriangleMesh(inner.vertices, inner.faces[:, ::-1])])
     found = cut([shell], (11, 11, 11)).values
-    assert found[5, 5, 5] == 0.0
-    assert found[5, 5, 2] == 1.0
+    assert found[5, 5, 5] == 0.0 and found[5, 5, 2] == 1.0
     assert found.sum() == pytest.approx(4 / 3 * np.pi * (4**3 - 2**3), rel=0.01)
 
 
@@ -143,8 +134,7 @@ def test_metal_is_clipped_and_air_is_air():
     """A voxel wholly of metal has what 12 bits hold; noise is as stated, blur keeps the sum."""
     metal = Solid("metal", box(np.full(3, 10.0), np.full(3, 6.0)), 8000.0)
     image = scan_solids([metal], grid((20, 20, 20)), STILL, np.random.default_rng(0))
-    assert image.hu.max() == HIGHEST_HU
-    assert image.hu[0, 0, 0] == -1000
+    assert image.hu.max() == HIGHEST_HU and image.hu[0, 0, 0] == -1000
     water = Solid("water", box(np.full(3, 10.0), np.full(3, 6.0)), 0.0)
     bath = Solid("bath", box(np.full(3, 10.0), np.full(3, 60.0)), 0.0)
     noisy = scan_solids([bath], grid((20, 20, 20)), ScanSettings(noise_hu=15.0), np.random.default_rng(1))
@@ -160,8 +150,7 @@ def test_the_same_seed_gives_the_same_scan():
     first, again, other = (
         scan_solids(solids, grid((12, 12, 12)), ScanSettings(), np.random.default_rng(seed)).hu for seed in (1, 1, 2)
     )
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
 def test_an_open_surface_is_refused():
@@ -174,10 +163,8 @@ def test_an_open_surface_is_refused():
 def test_a_frame_of_its_own_is_laid_on_the_bed_by_a_rotation():
     """The carton's x runs along the bed and its z is up: determinant 1, where the first mapping in mind is a mirror."""
     R = scan_frame(load_case(folder() / "carton" / "case_m.toml"), 0.0)[:3, :3]
-    assert np.allclose(R @ R.T, np.eye(3))
-    assert np.linalg.det(R) == pytest.approx(1.0)
-    assert np.allclose(R @ [1, 0, 0], [0, 0, 1])
-    assert np.allclose(R @ [0, 0, 1], [0, -1, 0])
+    assert np.allclose(R @ R.T, np.eye(3)) and np.linalg.det(R) == pytest.approx(1.0)
+    assert np.allclose(R @ [1, 0, 0], [0, 0, 1]) and np.allclose(R @ [0, 0, 1], [0, -1, 0])
     assert np.allclose(scan_frame(load_case(folder() / "abdomen"), 0.0), np.eye(4))
 
 

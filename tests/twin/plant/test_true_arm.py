@@ -39,18 +39,15 @@ def test_true_arm_against_scipy():
 
 def test_play_follows_only_past_its_edge():
     """A motion smaller than the play moves nothing; turning back costs the whole width."""
-    arm = draw_true_arm(
-        ur_model("ur3"), EXACT.model_copy(update={"backlash_deg": np.degrees(0.02)}), np.random.default_rng(3)
+    errors = EXACT.model_copy(update={"backlash_deg": np.degrees(0.02)})
+    arm, rng, q = (
+        draw_true_arm(ur_model("ur3"), errors, np.random.default_rng(3)),
+        np.random.default_rng(4),
+        np.zeros(6),
     )
-    rng, q = np.random.default_rng(4), np.zeros(6)
-    q = arm.settle(np.full(6, 0.009), q, rng)
-    assert np.array_equal(q, np.zeros(6))
-    q = arm.settle(np.full(6, 0.1), q, rng)
-    assert np.allclose(q, 0.09)
-    q = arm.settle(np.full(6, 0.085), q, rng)
-    assert np.allclose(q, 0.09)
-    q = arm.settle(np.full(6, 0.05), q, rng)
-    assert np.allclose(q, 0.06)
+    for asked, rest in ((0.009, 0.0), (0.1, 0.09), (0.085, 0.09), (0.05, 0.06)):
+        q = arm.settle(np.full(6, asked), q, rng)
+        assert np.abs(q - rest).max() < 1e-15
 
 
 def test_errors_have_the_spread_that_was_asked_for():

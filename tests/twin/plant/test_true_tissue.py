@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from puncture_twin.planning.needle.deflection import Layer, Shaft, Tissue, bevel_path
+from puncture_twin.planning.needle.deflection import Beam, Layer, Shaft, Tissue, bevel_path
 from puncture_twin.planning.needle.insertion_force import insertion_force
 from puncture_twin.planning.search.bending import Insertion
-from puncture_twin.twin.plant.true_needle import SHIFT_MM, StraightPath, TrueTissue
+from puncture_twin.twin.plant.true_needle import SHIFT_MM, TrueTissue
 from puncture_twin.twin.world.control import Tip
 
 SHAFT = Shaft(150.0, 1.27, 0.84)
@@ -17,14 +17,11 @@ X, Y = np.array([0.8, 0.0, 0.6]), np.array([0.0, 1.0, 0.0])
 
 
 def insertion():
-    """Of a bevel that never turns."""
-    return Insertion(
-        bevel_path(SHAFT, np.full(60, 0.1), np.full(60, 0.02), 1.0), insertion_force(LAYERS), np.inf, np.inf
-    )
+    path = bevel_path(SHAFT, np.full(60, 0.1), np.full(60, 0.02), 1.0)
+    return Insertion(path, insertion_force(LAYERS), np.inf, np.inf)
 
 
 def tip(depth):
-    """On the axis."""
     R = np.column_stack([X, np.cross(INTO, X), INTO])
     return Tip((ENTRY + depth * INTO)[None] / 1e3, R[None], np.zeros((1, 6, 6)))
 
@@ -37,8 +34,7 @@ def pressed(tissue, depth):
 
 
 def tissue():
-    """Untouched."""
-    return TrueTissue(insertion(), StraightPath(ENTRY, INTO), SIDE, SHAFT.length_mm)
+    return TrueTissue(insertion(), ENTRY, INTO, SIDE, SHAFT.length_mm)
 
 
 def test_on_the_way_in_it_is_the_declared_force():
@@ -85,8 +81,6 @@ def test_across_it_is_what_the_beams_clamp_bears():
 
 def test_the_beams_clamp_bears_what_presses_on_it():
     """A cantilever's load and its moment; in a foundation the sum of what each length of it presses, by quadrature."""
-    from puncture_twin.planning.needle.deflection import Beam
-
     loaded = Beam(SHAFT.bending_stiffness, 1.0, 150).bent(np.zeros(150), np.zeros(151), tip_load=0.3)
     assert loaded.clamp_force == pytest.approx(0.3) and loaded.clamp_moment == pytest.approx(0.3 * 150)
     x, foundation = np.linspace(0.0, 150.0, 601), np.repeat([0.0, 0.08], [360, 240])

@@ -20,7 +20,6 @@ def needles():
 
 
 def rotation_vectors(R):
-    """Small rotations (n, 3, 3) as vectors."""
     return 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
 
 

@@ -30,7 +30,6 @@ from puncture_twin.twin.rehearsal.guided_trials import guided_trials
 from puncture_twin.twin.rehearsal.trials import draw_truths
 
 ROOMS = 5000
-
 DEVICES = "[motion]\ntarget_sd_mm = [0.4, 0.4, 1.0]\n[stereo]\n[ultrasound]\n"
 BREATH = '[breathing]\namplitude_mm = 4.0\ndirection = [0.0, 0.6, 0.8]\ngate = 0.3\nweights = { "*" = 0.5 }\n'
 
@@ -57,16 +56,25 @@ def prepared(folder, tables, touch_mm=0.2, length_mm=210.0, nearest=False, bevel
     file = ball(folder, errors=f"touch_mm = {touch_mm}\n" + tables)
     needle = "length_mm = {}\nshaft_mm = {}"
     stated = needle.format(210.0, 150.0), needle.format(length_mm, min(150.0, length_mm - 10.0))
-    file.write_text(changed(file.read_text(), stated))
-    if bevel:
-        file.write_text(changed(file.read_text(), ("length_mm = 210.0", "bevel_deg = 0.0\nlength_mm = 210.0")))
+    bevelled = [("length_mm = 210.0", "bevel_deg = 0.0\nlength_mm = 210.0")] if bevel else []
+    file.write_text(changed(file.read_text(), stated, *bevelled))
     context = pt.prepare(file)
     found = context.search()
     rows = np.flatnonzero(found.safe)
-    row = (min if nearest else max)(
-        rows, key=lambda row: corridor_mm(context.case, context.chance, found.outward_ct[row])
-    )
+    wide = [corridor_mm(context.case, context.chance, found.outward_ct[row]) for row in rows]
+    row = rows[np.argmin(wide) if nearest else np.argmax(wide)]
     return context, found.outward_ct[row], found.arm.q_insertion[row]
+
+
+def led(query, way, count, moving, seeds=(0, 1), draws=np.random.default_rng):
+    """So many trials of a way, of truths drawn by the first seed, with devices by the second."""
+    truths = draw_truths(query.puncture, query.truth, count, draws(seeds[0]), moving)
+    return guided_trials(query.puncture, truths, query.truth, way, draws(seeds[1]))
+
+
+def realised_and_predicted(trials, way, q):
+    realised = np.sqrt(np.mean(np.sum((trials.tip_ct - trials.target_ct) ** 2, axis=1)))
+    return realised, np.sqrt(np.trace(guided_error(way.model, way.name).tip_covariance(q[None])[0]))
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -138,9 +146,8 @@ def test_what_is_not_held_is_not_pushed(made):
     shifts = [rehearse_trials(*one, 200, 3, "ct").trials.pushed_ct for one in (firm, twice)]
     np.testing.assert_allclose(shifts[0], 2.0 * shifts[1], rtol=1e-12)
     assert np.linalg.norm(shifts[0], axis=1).min() > 0.5
-    np.testing.assert_array_equal(
-        rehearse_trials(*firm, 200, 3).trials.tip_ct, rehearse_trials(*still, 200, 3).trials.tip_ct
-    )
+    unled = [rehearse_trials(*one, 200, 3).trials.tip_ct for one in (firm, still)]
+    np.testing.assert_array_equal(*unled)
 
 
 def test_the_second_arm_is_the_first_one():
@@ -161,10 +168,8 @@ def test_what_is_predicted_happens_in_another_plant(insertion, way, monkeypatch)
     monkeypatch.setattr(guiding, "RoomProbe", PicturingProbe)
     query = distribution._query(*insertion)
     one, moving = distribution._way(insertion[0], query, way)
-    truths = draw_truths(query.puncture, query.truth, 3000, Uniform(1), moving)
-    found = guided_trials(query.puncture, truths, query.truth, one, Uniform(2)).trials
-    realised = np.sqrt(np.mean(np.sum((found.tip_ct - found.target_ct) ** 2, axis=1)))
-    predicted = np.sqrt(np.trace(guided_error(one.model, way).tip_covariance(insertion[2][None])[0]))
+    found = led(query, one, 3000, moving, (1, 2), Uniform).trials
+    realised, predicted = realised_and_predicted(found, one, insertion[2])
     assert predicted / realised == pytest.approx(1.0, abs=0.05)
 
 
@@ -184,11 +189,10 @@ def test_a_hidden_marker_has_no_say(insertion, monkeypatch):
     way, moving = distribution._way(context, query, "stereo")
     hidden = {f"marker {name}": "the arm is before it" for name in way.model.markers[:2]}
     model = replace(way.model, looks=tuple(look._replace(hidden={**look.hidden, **hidden}) for look in way.model.looks))
-    truths, read = draw_truths(query.puncture, query.truth, 50, np.random.default_rng(0), moving), RoomCameras.read
+    read = RoomCameras.read
 
     def ended():
-        own = replace(way, model=replace(model))
-        return guided_trials(query.puncture, truths, query.truth, own, np.random.default_rng(1)).trials.tip_ct
+        return led(query, replace(way, model=replace(model)), 50, moving).trials.tip_ct
 
     seen = ended()
     monkeypatch.setattr(RoomCameras, "read", lambda self, points: read(self, points) + far(points))
@@ -218,9 +222,8 @@ def test_what_a_case_does_not_declare_is_said_not_to_be_modelled(insertion):
     context, outward, q = insertion
     still = replace(context, case=replace(context.case, motion=None))
     for way in (None, "ct", "us"):
-        assert {"breathing", "tissue motion"} < set(
-            rehearse_trials(still, outward, q, 1, 3, way).not_modelled.split(", ")
-        )
+        said = rehearse_trials(still, outward, q, 1, 3, way).not_modelled.split(", ")
+        assert {"breathing", "tissue motion"} < set(said)
     assert "tissue motion" not in rehearse_trials(context, outward, q, 1, 3, "us").not_modelled
 
 
@@ -284,12 +287,9 @@ def test_a_needle_that_bends_is_seen_by_its_tip_alone(insertion, way):
     """Tissue bends what is in it: balls outside stay on the straight line, the picture shows the bent tip."""
     context, outward, q = insertion
     bend, query = Bend(1.5, 150.0), distribution._query(context, outward, q)
-    believed, puncture = replace(query.believed, bend=bend), replace(query.puncture, bend=bend)
-    one, moving = distribution._way(context, query._replace(believed=believed, puncture=puncture), way)
-    truths = draw_truths(puncture, query.truth, ROOMS, np.random.default_rng(0), moving)
-    found = guided_trials(puncture, truths, query.truth, one, np.random.default_rng(1)).trials
-    realised = np.sqrt(np.mean(np.sum((found.tip_ct - found.target_ct) ** 2, axis=1)))
-    predicted = np.sqrt(np.trace(guided_error(one.model, way).tip_covariance(q[None])[0]))
+    bent = query._replace(believed=replace(query.believed, bend=bend), puncture=replace(query.puncture, bend=bend))
+    one, moving = distribution._way(context, bent, way)
+    realised, predicted = realised_and_predicted(led(bent, one, ROOMS, moving).trials, one, q)
     assert predicted / realised == pytest.approx(1.0, abs=0.03)
     straight = guided_error(replace(one.model, error=query.believed), way).tip_covariance(q[None])[0]
     added = predicted**2 - np.trace(straight)
@@ -306,11 +306,8 @@ def test_what_rests_while_the_target_breathes_is_touched_as_often_as_predicted(m
     context, outward, q = made("arm = 'nominal'\n" + DEVICES + resting, nearest=True)
     query = distribution._query(context, outward, q)
     one, moving = distribution._way(context, query, way)
-    truths = draw_truths(query.puncture, query.truth, ROOMS, np.random.default_rng(0), moving)
-    done = guided_trials(
-        query.puncture, truths, query.truth, replace(one, corridor_mm=np.inf), np.random.default_rng(1)
-    )
-    found = distribution._measured(context, query, done.trials, np.random.default_rng(2), 0, (one, done.stopped))
+    done = led(query, replace(one, corridor_mm=np.inf), ROOMS, moving)
+    found = distribution._measured(context, query, done.trials, np.random.default_rng(2), 0, one, done.stopped)
     assert found.touched.mean(axis=0) == pytest.approx(found.p_touch, abs=0.006)
     assert found.p_touch[0] > 0.01
 
@@ -321,13 +318,10 @@ def test_no_correction_leaves_the_corridor(insertion):
     query = distribution._query(context, outward, q)
     way, moving = distribution._way(context, query, "ct+us")
     narrow = replace(way, corridor_mm=0.8)
-    truths = draw_truths(query.puncture, query.truth, 3000, np.random.default_rng(0), moving)
-    done = guided_trials(query.puncture, truths, query.truth, narrow, np.random.default_rng(1))
+    done = led(query, narrow, 3000, moving)
     assert np.linalg.norm(done.aside_base, axis=1).max() <= narrow.corridor_mm
     assert 0.2 < done.stopped.mean() < 1.0
-    cameras = guided_trials(
-        query.puncture, truths, query.truth, replace(narrow, name="stereo"), np.random.default_rng(1)
-    )
+    cameras = led(query, replace(narrow, name="stereo"), 3000, moving)
     assert cameras.stopped.mean() < 0.05  # they correct what registration and arm had wrong, and go nowhere else
 
 

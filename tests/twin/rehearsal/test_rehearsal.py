@@ -22,7 +22,7 @@ from puncture_twin.planning.case.settings import Needle, Obstacle, RobotSettings
 from puncture_twin.planning.case.tables import RehearsalSection
 from puncture_twin.planning.formats.labels.naming import ByName
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.geometry.rigid import apply
+from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.needle.deflection import Bending, Shaft, Tissue
@@ -38,21 +38,17 @@ from puncture_twin.twin.rehearsal.trials import Puncture, draw_trials
 UR3 = ur_model("ur3")
 APART_MM = 0.003
 """What the motors leave of the asked place."""
-
 MARKERS = np.array([[60.0, 0.0, 70.0], [-50.0, 40.0, 60.0], [0.0, -70.0, 55.0], [-20.0, 0.0, 90.0]])
-
 HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
 NEEDLE = Needle(210.0, 150.0, 1.2, 150.0, 10.0, 30.0)
 TARGET = np.array([10.0, -5.0, 3.0])
 OUTWARD = np.array([-0.3, 0.2, 1.0]) / np.linalg.norm([-0.3, 0.2, 1.0])
 EXACT = np.zeros(6)
-
 TRACKING_MM = 0.05
 """How far from the asked place the motors leave the tip after the hold; 0.003 mm measured, 0.3 mm demanded."""
 
 
 def placed(*position: float) -> np.ndarray:
-    """A pose turned by 30 degrees about z."""
     c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
     return np.array([[c, -s, 0, position[0]], [s, c, 0, position[1]], [0, 0, 1, position[2]], [0, 0, 0, 1]])
 
@@ -66,7 +62,6 @@ def ball(radius: float, *centre: float) -> TriangleMesh:
 
 
 def anatomy(**spheres: TriangleMesh) -> Anatomy:
-    """A round patient with a lesion about the target, and more structures on request."""
     meshes = {"lesion": ball(8.0, *TARGET)} | spheres
     structures = tuple(
         Structure(name, Role.TARGET if name == "lesion" else Role.AVOID, 0.0, mesh, "made here")
@@ -102,26 +97,13 @@ def make_plan() -> Plan:
         line.append(configuration(float(standoff), line[-1]))
     ease = np.linspace(0, 1, 61)[:, None]
     ease = ease**2 * (3 - 2 * ease)
+    approach = Trajectory(np.linspace(0, 3, 61), HOME + (line[0] - HOME) * ease)
     return Plan(
-        case_name="ball",
-        inputs=(),
-        seed=0,
-        model=ur_model("ur3"),
-        T_base_ct=T_BASE_CT,
-        expected_target_error_mm=float("nan"),
-        theta=0.3,
-        beta=0.0,
-        entry_ct=TARGET + 90 * OUTWARD,
-        target_ct=TARGET,
-        outward_ct=OUTWARD,
-        roll=0.0,
-        standoff_mm=150.0,
-        needle_length_mm=NEEDLE.length_mm,
-        approach=Trajectory(np.linspace(0, 3, 61), HOME + (line[0] - HOME) * ease),
-        insertion=Trajectory(np.linspace(0, 3, 101), np.array(line)),
-        clearance_mm={},
-        warnings=(),
-    )
+        case_name="ball", inputs=(), seed=0, model=UR3, T_base_ct=T_BASE_CT, expected_target_error_mm=float("nan"),
+        theta=0.3, beta=0.0, entry_ct=TARGET + 90 * OUTWARD, target_ct=TARGET, outward_ct=OUTWARD, roll=0.0,
+        standoff_mm=150.0, needle_length_mm=NEEDLE.length_mm, approach=approach,
+        insertion=Trajectory(np.linspace(0, 3, 101), np.array(line)), clearance_mm={}, warnings=(),
+    )  # fmt: skip
 
 
 PLAN = make_plan()
@@ -133,11 +115,14 @@ def truth(T_base_ct: np.ndarray = T_BASE_CT, offsets: np.ndarray = EXACT) -> Tru
 
 @pytest.fixture(scope="module")
 def exact():
-    return rehearse(PLAN, case(), anatomy(vessel=ball(10.0, 60.0, 0.0, 0.0)), truth())
+    """With a vessel, and a closed shell about patient and needle."""
+    shell = ball(2000.0, 0.0, 0.0, 0.0)
+    return rehearse(PLAN, case(), anatomy(vessel=ball(10.0, 60.0, 0.0, 0.0), shell=shell), truth())
 
 
 def test_tip_reaches_the_target_when_belief_is_true(exact):
     """What is left is the motors' tracking: it lags, within half a degree all the time; the error's parts are it."""
+    assert exact.truth_is_belief and np.array_equal(exact.target_true_ct, TARGET)
     assert 0 < exact.tip_error_mm < TRACKING_MM
     assert exact.tip_error_mm**2 == pytest.approx(exact.lateral_mm**2 + exact.depth_mm**2, rel=1e-9)
     assert 1e-4 < np.abs(exact.q - exact.q_command).max() < np.radians(0.5)
@@ -155,6 +140,7 @@ def test_phases_come_in_order_and_time_runs(exact):
     assert exact.times_s[-1] == pytest.approx(3 + 0.5 + 3 + 1, abs=0.05)
     records = (exact.q, exact.q_command, exact.phase, exact.tip_true_ct, exact.T_base_flange_true)
     assert {len(a) for a in records} == {len(exact.times_s)}
+    assert not any(array.flags.writeable for array in (*records, exact.clearance_mm["vessel"]))
 
 
 def test_tip_path_is_the_straight_line_of_the_plan(exact):
@@ -234,7 +220,6 @@ def test_a_needle_bends_without_declared_errors_too():
     ("shift_ct", "lateral", "depth"),
     [
         (3.0 * OUTWARD, 0.0, 3.0),
-        (2.5 * np.cross(OUTWARD, [1.0, 0, 0]) / np.linalg.norm(np.cross(OUTWARD, [1.0, 0, 0])), 2.5, 0.0),
         (np.array([0.0, 0.0, -4.0]), 4.0 * np.sqrt(1 - OUTWARD[2] ** 2), -4.0 * OUTWARD[2]),
     ],
 )
@@ -250,10 +235,7 @@ def test_shifted_patient_shifts_the_error(shift_ct, lateral, depth):
 
 def test_turned_patient_is_measured_in_his_own_frame():
     """A patient turned about the target: no error at the target, the needle's direction changes in his frame."""
-    turn = np.eye(4)
-    turn[:3, :3] = placed(0, 0, 0)[:3, :3] @ np.diag([1.0, 1.0, 1.0])
-    about = np.eye(4)
-    about[:3, 3] = TARGET
+    turn, about = placed(0, 0, 0), pose(np.eye(3), TARGET)
     T = T_BASE_CT @ about @ turn @ np.linalg.inv(about)
     done = rehearse(PLAN, case(), anatomy(), truth(T))
     assert done.tip_error_mm < TRACKING_MM
@@ -274,7 +256,8 @@ def test_joint_offsets_move_the_tip_as_the_jacobian_says():
 
 
 def test_clearance_is_that_of_the_true_needle(exact):
-    """Axis to a ball: distance to its centre minus both radii, at every sample; the lesion is entered."""
+    """Axis to a ball: distance to its centre minus both radii; the lesion is entered; in a closed shell it is hit."""
+    np.testing.assert_allclose(exact.clearance_mm["shell"], -0.6)
     tips = np.stack([np.interp(exact.clearance_times_s, exact.times_s, exact.tip_true_ct[:, i]) for i in range(3)], 1)
     centre = np.array([60.0, 0.0, 0.0])
     along = np.clip((centre - tips) @ OUTWARD, 0, NEEDLE.length_mm)
@@ -286,20 +269,13 @@ def test_clearance_is_that_of_the_true_needle(exact):
     assert exact.clearance_times_s[-1] == exact.times_s[-1]
 
 
-def test_needle_hidden_inside_a_closed_surface_is_not_clear():
-    """A closed shell around patient and needle: no surface is near, and the clearance is that of a hit."""
-    done = rehearse(PLAN, case(), anatomy(shell=ball(2000.0, 0.0, 0.0, 0.0)), truth())
-    np.testing.assert_allclose(done.clearance_mm["shell"], -0.6)
-
-
 def test_box_in_the_way_is_reported():
     """A box that the planner did not know, beside the target and in the way of the arm: contacts name it."""
     flange = needle_at(0.0)[:3, 3]
     box = Obstacle("monitor", "base", flange + np.array([0.0, 0.0, 40.0]), np.array([120.0, 120.0, 60.0]))
     done = rehearse(PLAN, case(box), anatomy(), truth())
     boxed = [contact for contact in done.contacts if contact.body == "monitor"]
-    assert boxed
-    assert min(contact.time_s for contact in boxed) > 0.5
+    assert boxed and min(contact.time_s for contact in boxed) > 0.5
     assert max(np.nan_to_num([contact.depth_mm for contact in boxed])) > 0  # the physics felt it as well
 
 
@@ -321,12 +297,6 @@ def test_too_fast_a_plan_breaks_the_speed_limit():
     assert (done.max_joint_speed > done.speed_limits).any()
 
 
-def test_numbers_are_read_only(exact):
-    for array in (exact.q, exact.tip_true_ct, exact.clearance_mm["vessel"]):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 0
-
-
 @pytest.mark.parametrize(
     ("space", "axes", "down"),
     [
@@ -344,46 +314,28 @@ def test_down_is_where_the_bed_is(space, axes, down):
 
 @pytest.fixture(scope="module")
 def rooms():
-    """The plan of a ball, and a thousand rooms with errors of every kind, of an uncalibrated arm."""
-    plan, errors = make_plan(), declared(touch_mm=0.5, arm="nominal", tip_offset_mm=0.5)
-    down = -T_BASE_CT[:3, 2]
-    there = apply(T_BASE_CT, MARKERS)
-    q_touch = np.array([touching_configuration(UR3, NEEDLE.length_mm, point, down) for point in there])
-    noise = reading_noise(errors, UR3, NEEDLE.length_mm, q_touch, known=True)
-    puncture = Puncture(
-        UR3,
-        NEEDLE.length_mm,
-        "rigid",
-        noise,
-        MARKERS,
-        q_touch,
-        T_BASE_CT,
-        TARGET,
-        plan.outward_ct,
-        plan.insertion.q[-1],
-    )
+    """A thousand rooms of the plan with errors of every kind, of an uncalibrated arm."""
+    errors, tip, down = declared(touch_mm=0.5, arm="nominal", tip_offset_mm=0.5), NEEDLE.length_mm, -T_BASE_CT[:3, 2]
+    q_touch = np.array([touching_configuration(UR3, tip, point, down) for point in apply(T_BASE_CT, MARKERS)])
+    noise, q = reading_noise(errors, UR3, tip, q_touch, known=True), PLAN.insertion.q[-1]
+    puncture = Puncture(UR3, tip, "rigid", noise, MARKERS, q_touch, T_BASE_CT, TARGET, PLAN.outward_ct, q)
     drawn = draw_trials(puncture, errors, 1000, np.random.default_rng(3))
     assert drawn.reached.all()
-    return plan, puncture, drawn
+    return puncture, drawn
 
 
 def test_the_simulator_ends_where_the_room_did(rooms):
-    """Tip, direction and error against the true target, from the least error to the greatest."""
-    plan, puncture, drawn = rooms
+    """Tip, direction and error against the true target, of a usual error and of the greatest."""
+    puncture, drawn = rooms
     error = np.linalg.norm(drawn.tip_ct - drawn.target_ct, axis=1)
     order = np.argsort(error)
-    for row in order[[0, 500, 999]]:
-        done = rehearse(plan, case(), anatomy(), drawn_truth(puncture, drawn, int(row), 3, "a room"))
+    for row in order[[500, 999]]:
+        done = rehearse(PLAN, case(), anatomy(), drawn_truth(puncture, drawn, int(row), 3, "a room"))
         assert np.linalg.norm(done.tip_true_ct[-1] - drawn.tip_ct[row]) < APART_MM
         assert done.tip_error_mm == pytest.approx(error[row], abs=APART_MM)
         along = -(np.linalg.inv(done.T_base_ct_true) @ done.T_base_flange_true[-1])[:3, 2]
         assert np.linalg.norm(along - drawn.outward_ct[row]) < 1e-4
         assert np.allclose(done.target_true_ct, drawn.target_ct[row]) and not done.truth_is_belief
-
-
-def test_a_truth_that_equals_the_belief_is_known(rooms):
-    done = rehearse(rooms[0], case(), anatomy(), Truth(T_BASE_CT, np.zeros(6), 0, "exact"))
-    assert done.truth_is_belief and np.array_equal(done.target_true_ct, TARGET)
 
 
 @pytest.mark.parametrize(("count", "wanted"), [(1, [2]), (5, [0, 1, 2, 3, 4]), (2, [0, 3])])

@@ -40,12 +40,10 @@ ALONE = {
     "surface_mm": {"surface_mm": 1.2},
 }
 """What is declared beside `NOTHING`, so large that it decides."""
-
 ALL_OF_IT = {**NOTHING, "touch_mm": 0.8, "needle_direction_deg": 0.5, "surface_mm": 0.9}
 
 
 def lines(keys):
-    """The section's keys; without those that are None."""
     said = {key: f'"{value}"' if isinstance(value, str) else value for key, value in keys.items() if value is not None}
     axis = {} if "bed_axis" in said else {"bed_axis": [0.0, 0.0, 1.0]}
     return "\n".join(f"{key} = {value}" for key, value in (said | axis).items())

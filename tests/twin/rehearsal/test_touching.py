@@ -20,7 +20,7 @@ from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.case.settings import Obstacle
 from puncture_twin.planning.collision.workcell import home_configuration
 from puncture_twin.planning.formats.points import NamedPoints, read_points
-from puncture_twin.planning.geometry.rigid import apply, pose
+from puncture_twin.planning.geometry.rigid import pose
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.planning.plan.plan_check import check_angles, check_geometry
 from puncture_twin.planning.registration.placement import load_placement
@@ -56,7 +56,6 @@ def context():
 
 @pytest.fixture(scope="module")
 def done(context, tmp_path_factory):
-    """Touched as the command does, and where its files are."""
     out = tmp_path_factory.mktemp("touch")
     return touch_case(context, out, CHOICE, 0), out
 
@@ -79,7 +78,6 @@ def exact(context, shift_base=(0.0, 0.0, 0.0)):
 
 
 def toured(context, plan, truth, prepared=None):
-    """The executed tour; the workcell is believed to be that of ``prepared``."""
     checkers = approach_checkers(prepared if prepared is not None else context, TOUCHING_PADDING_MM)
     return execute_touches(plan, context.case, context.anatomy, checkers, truth, quiet)
 
@@ -89,7 +87,8 @@ def executed(context, plan, truth):
 
 
 def test_touches_are_slow_soft_and_exact(done):
-    """TissueForce within .03 mm of the face, at 2 mm/s at most, with 2 N at most."""
+    """Contact within .03 mm of the face, at 2 mm/s at most, with 2 N at most; the best poses are chosen."""
+    assert 0.0 < done[0].plan.expected_mm < done[0].plan.worst_mm
     for one in done[0].summary()["touches"]:
         assert 0.0 <= one["bias_mm"] <= 0.03
         assert one["speed_mm_s"] <= 2.0
@@ -119,21 +118,19 @@ def test_a_case_registers_what_was_written(done, tmp_path):
 
 def test_times_add_up(done):
     run = done[0]
-    assert run.touched.seconds == pytest.approx(
-        sum(one.seconds for one in run.touched.readings) + run.plan.leave.duration_s, abs=0.1
-    )
+    there = sum(one.seconds for one in run.touched.readings)
+    assert run.touched.seconds == pytest.approx(there + run.plan.leave.duration_s, abs=0.1)
     assert f"{len(run.touched.readings)} markers touched" in touch_text(run)
     assert run.summary()["seconds_per_touch"] > 5.0
 
 
-def test_the_best_poses_are_better_than_the_worst(done):
-    assert 0.0 < done[0].plan.expected_mm < done[0].plan.worst_mm
-
-
 def test_without_errors_the_reading_is_the_marker(context, first):
-    reading = executed(context, first, exact(context))[0]
+    """The same truth gives the same numbers."""
+    reading, again = (executed(context, first, exact(context))[0] for _ in range(2))
     assert np.linalg.norm(reading.point_base - first.touches[0].point_base) < 0.03
     assert reading.aside_mm < 1e-6
+    np.testing.assert_array_equal(reading.q, again.q)
+    assert reading.force_n == again.force_n
 
 
 def test_an_erring_arm_reads_what_its_errors_say(context, first):
@@ -146,12 +143,6 @@ def test_an_erring_arm_reads_what_its_errors_say(context, first):
     moved = error_jacobian(first.model, touch.q_touch, first.tip_mm)[:3] @ eta
     assert np.linalg.norm(moved) > 0.2
     np.testing.assert_allclose(reading.point_base - touch.point_base, -moved, atol=0.04)
-
-
-def test_the_same_truth_gives_the_same_numbers(context, first):
-    one, other = (executed(context, first, exact(context))[0] for _ in range(2))
-    np.testing.assert_array_equal(one.q, other.q)
-    assert one.force_n == other.force_n
 
 
 def test_masses_that_err_by_a_tenth_move_no_reading(context, first, monkeypatch):
@@ -225,11 +216,11 @@ def test_a_run_errs_as_its_drawn_twin(context, done):
 
 
 def test_drawn_truths_err_as_the_plan_predicts(context, done):
-    """Their rms is known to 6 % (150 of them, one axis errs most); three of those are allowed."""
+    """Their rms is known to 7 % (100 of them, one axis errs most); less than three of those are allowed."""
     run = done[0]
     q, outward = touch_job._puncture(context, CHOICE)
     tour = touch_job.Tour(run.plan, q, outward)
-    errors = [touch_job.drawn_once(context, tour, seed).tip_error_mm for seed in range(150)]
+    errors = [touch_job.drawn_once(context, tour, seed).tip_error_mm for seed in range(100)]
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(run.plan.expected_mm, rel=0.17)
 
 
@@ -309,15 +300,6 @@ def test_a_box_that_nobody_knew_stops_the_arm(context, first):
     done = toured(other, first, exact(context), prepared=context)
     assert not done.readings
     assert re.fullmatch(r"the tour was stopped: \w+ touches trolley", done.failed[first.touches[0].name])
-
-
-def test_the_true_tip_is_on_the_true_marker(context, done):
-    """The encoders that a truth asks for put the nominal tip where the errors say, and never elsewhere."""
-    plan = done[0].plan
-    for touch in plan.touches:
-        q = exact(context).q_contact(plan.model, plan.tip_mm, touch)
-        there = apply(context.placement.T_base_ct, exact(context).aim_ct[touch.name])
-        np.testing.assert_allclose(nominal_tip(plan.model, plan.tip_mm, q), there, atol=1e-6)
 
 
 def test_a_case_without_declared_errors_is_refused(context):

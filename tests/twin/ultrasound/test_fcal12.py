@@ -12,7 +12,6 @@ from refusals import refused
 DATA = places.DATA / "plus_uscal_fcal12"
 DEVICE_SET = DATA / "PlusDeviceSet_fCal_Sim_SpatialCalibration_1.2.xml"
 RESULTS = DATA / "FreehandCalibration3NWires.results.xml"
-PLACED = '<a><Transform From="Phantom" To="Reference" Matrix="{}"/></a>'
 real = pytest.mark.skipif(not DATA.is_dir(), reason="the real wire calibration is not on this machine")
 
 
@@ -94,22 +93,3 @@ def test_a_probe_that_stands_still_is_refused(rng):
     frames = WireFrames(np.tile(np.eye(4), (3, 1, 1)), np.tile(rng.uniform(0, 500, (1, 2, 2)), (3, 1, 1)))
     with refused("undetermined"):
         fit_image(frames, wires)
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("<a", "xml_damaged"),
-        ("<!DOCTYPE a><a/>", "xml_doctype"),
-        ("<a/>", "missing_key"),
-        (PLACED.format("1 2"), "not_a_number 16"),
-        (PLACED.format("2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"), "not_rigid"),
-        (PLACED.format("1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"), "empty"),
-    ],
-)
-def test_a_broken_file_is_named(tmp_path, text, says):
-    """Every broken device set is bad input, in words."""
-    path = tmp_path / "device.xml"
-    path.write_text(text)
-    with refused(*says.split()):
-        read_wires(path)

@@ -29,7 +29,6 @@ from puncture_twin.twin.world.client import (
 from puncture_twin.twin.world.execution import execute, touches
 from puncture_twin.twin.world.workcell import load_box, load_surface, open_workcell, pinhole_picture, thinned
 
-REPO = ROOT
 TOOL = Tool(210.0, 150.0, 1.2, 30.0)
 HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -38,13 +37,11 @@ FK_TOLERANCE_MM = 1e-3
 
 
 def sphere(radius: float, subdivisions: int = 3) -> TriangleMesh:
-    """A ball about the origin."""
     ball = trimesh.creation.icosphere(subdivisions, radius)
     return TriangleMesh(ball.vertices, ball.faces)
 
 
 def at(x: float, y: float, z: float) -> np.ndarray:
-    """A pose without rotation."""
     T = np.eye(4)
     T[:3, 3] = x, y, z
     return T
@@ -60,19 +57,13 @@ def test_units_convert_and_come_back():
     np.testing.assert_allclose(pose_to_mm(*pose_to_m(T)), T, atol=1e-9)
 
 
-def test_client_is_closed_even_after_an_exception():
-    """Leaving the block disconnects, also when something failed inside."""
-    with pytest.raises(RuntimeError, match="inside"), physics_client() as client:
-        raise RuntimeError("inside")
-    assert not pybullet.isConnected(client)
-
-
-def test_two_clients_are_two_worlds():
-    """A body of one client does not exist in the other."""
-    with physics_client() as first, physics_client() as second:
+def test_clients_are_worlds_of_their_own_and_closed_even_after_an_exception():
+    """A body of one does not exist in the other; leaving the block disconnects, also when something failed inside."""
+    with pytest.raises(RuntimeError, match="inside"), physics_client() as first, physics_client() as second:
         load_box(first, np.array([10.0, 10.0, 10.0]), np.eye(4))
-        assert pybullet.getNumBodies(physicsClientId=first) == 1
-        assert pybullet.getNumBodies(physicsClientId=second) == 0
+        assert [pybullet.getNumBodies(physicsClientId=client) for client in (first, second)] == [1, 0]
+        raise RuntimeError("inside")
+    assert not pybullet.isConnected(first) and not pybullet.isConnected(second)
 
 
 def test_gravity_points_where_it_is_told_and_is_earths():
@@ -89,13 +80,20 @@ def test_gravity_points_where_it_is_told_and_is_earths():
 
 @pytest.mark.parametrize("name", ["ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e"])
 def test_arm_stands_where_the_closed_form_says(name):
-    """Bullet's chain of URDF joints and the DH table give the same flange, base turned by half a turn and all."""
+    """Bullet's chain of URDF joints and the DH table give the same flange, base turned by half a turn and all.
+
+    The flange is a frame: PyBullet gives a link without inertia 1 kg and 1 kg m^2, which no arm carries there. Contacts
+    of physics and of FCL speak of the same bodies.
+    """
     model, rng = ur_model(name), np.random.default_rng(2)
     with physics_client() as client:
         arm = load_arm(client, model, TOOL)
         for q in rng.uniform(-np.pi, np.pi, (40, 6)):
             arm.place(q)
             np.testing.assert_allclose(arm.flange_pose(), flange_pose(model, q), atol=FK_TOLERANCE_MM)
+        mass, _, inertia = pybullet.getDynamicsInfo(arm.body, arm.links["tool0"], physicsClientId=client)[:3]
+    assert mass == 0.0 and inertia == (0.0, 0.0, 0.0)
+    assert all(arm.link_name(arm.links[name]) == name for name in set(BODY_NAMES) - {"tool"})  # carried by none
 
 
 def test_arm_on_a_turned_base_carries_the_whole_chain():
@@ -124,24 +122,6 @@ def test_needle_ends_where_the_tool_says():
     assert abs(nearest - tip[along]) < 5.0  # Bullet's boxes are a few mm larger than the body
 
 
-@pytest.mark.parametrize("name", ["ur3", "ur3e", "ur5", "ur5e", "ur10", "ur10e"])
-def test_the_flange_is_a_frame_and_weighs_nothing(name):
-    """PyBullet gives a link without inertia 1 kg and 1 kg m^2: no arm carries that between wrist and holder."""
-    with physics_client() as client:
-        arm = load_arm(client, ur_model(name), TOOL)
-        mass, _, inertia = pybullet.getDynamicsInfo(arm.body, arm.links["tool0"], physicsClientId=client)[:3]
-    assert mass == 0.0 and inertia == (0.0, 0.0, 0.0)
-
-
-def test_links_have_the_planners_names():
-    """Contacts of physics and of FCL speak of the same bodies."""
-    with physics_client() as client:
-        arm = load_arm(client, ur_model("ur3"), TOOL)
-        names = set(BODY_NAMES) - {"tool"}  # which this arm does not carry
-        assert names <= set(arm.links)
-        assert all(arm.link_name(arm.links[name]) == name for name in names)
-
-
 def test_arm_without_a_body_is_refused():
     """A model that nobody has shapes of; the error lists what there is."""
     nobody = replace(ur_model("ur3e"), name="ur16e")
@@ -159,14 +139,11 @@ def test_arm_sinks_without_motors_and_stays_with_them():
             arm.command(HOME, np.zeros(6))
             step(client)
         held = np.linalg.norm(arm.flange_pose()[:3, 3] - start)
-        pybullet.setJointMotorControlArray(
-            arm.body, arm.joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * 6, physicsClientId=client
-        )
+        arm.release()
         for _ in range(120):
             step(client)
         fallen = start[2] - arm.flange_pose()[2, 3]
-    assert held < 0.02
-    assert fallen > 50.0
+    assert held < 0.02 and fallen > 50.0
 
 
 def test_table_in_the_way_is_felt_and_named():
@@ -192,20 +169,18 @@ def test_needle_goes_through_the_skin_but_the_holder_does_not():
         with open_workcell(model, TOOL, sphere(100.0), at(*centre), down_ct=DOWN) as room:
             room.arm.place(HOME)
             pybullet.performCollisionDetection(physicsClientId=room.client)
-            assert {(t.link, room.bodies[t.body]) for t in touches(room.arm)} == expected
+            assert {(t.link, t.body) for t in touches(room)} == expected
 
 
 def test_concave_skin_is_hollow_where_it_is_hollow():
     """A holder inside a U-shaped surface touches nothing; the convex hull of that surface would be in the way."""
-    walls = [trimesh.creation.box((20, 200, 200), at(x, 0, 0)) for x in (-100, 100)]
-    mesh = trimesh.util.concatenate(walls)
-    T = flange_pose(ur_model("ur3"), HOME)
-    with open_workcell(
-        ur_model("ur3"), TOOL, TriangleMesh(mesh.vertices, mesh.faces), at(*(T[:3, 3] + 90 * T[:3, 2])), down_ct=DOWN
-    ) as room:
+    model, walls = ur_model("ur3"), [trimesh.creation.box((20, 200, 200), at(x, 0, 0)) for x in (-100, 100)]
+    mesh, T = trimesh.util.concatenate(walls), flange_pose(model, HOME)
+    skin, place = TriangleMesh(mesh.vertices, mesh.faces), at(*(T[:3, 3] + 90 * T[:3, 2]))
+    with open_workcell(model, TOOL, skin, place, down_ct=DOWN) as room:
         room.arm.place(HOME)
         pybullet.performCollisionDetection(physicsClientId=room.client)
-        assert touches(room.arm) == ()
+        assert touches(room) == ()
 
 
 def test_large_surfaces_are_thinned_and_stay_in_place():
@@ -223,13 +198,11 @@ def test_picture_shows_what_stands_there():
     T[:3] = [[0.0, 1, 0, 0], [0, 0, -1, 0], [-1, 0, 0, 500.0]]  # from x = 500 mm toward the origin
     with physics_client() as client:
         empty = pinhole_picture(client, (120, 80), K, T)
-        load_surface(client, sphere(60.0), np.eye(4), solid=False)
+        load_surface(client, sphere(60.0), np.eye(4))
         seen = pinhole_picture(client, (120, 80), K, T)
-    assert seen.shape == (80, 120, 3)
-    assert seen.dtype == np.uint8
+    assert seen.shape == (80, 120, 3) and seen.dtype == np.uint8
     red, green, blue = seen[40, 60].astype(int)
-    assert red > green > blue
-    assert (seen[40, 60] != empty[40, 60]).any()
+    assert red > green > blue and (seen[40, 60] != empty[40, 60]).any()
     np.testing.assert_array_equal(seen[0, 0], empty[0, 0])
 
 
@@ -243,11 +216,6 @@ def test_loading_prints_nothing_on_stdout(capfd, name):
 
 def test_importing_the_twin_writes_nothing_anywhere():
     """PyBullet's greeting is not heard: an error of ours stays the one line on standard error."""
-    done = subprocess.run(
-        [sys.executable, "-c", "import puncture_twin.twin.rehearsal.rehearsal"],
-        cwd=REPO,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command = [sys.executable, "-c", "import puncture_twin.twin.world.client"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")

@@ -6,7 +6,6 @@ sizes are drawn in wide ranges of adults, so that what holds for many of them do
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -25,29 +24,15 @@ UNDER_SKIN = 0.86
 
 
 class Organ(NamedTuple):
-    """One structure of a drawn trunk.
-
-    Attributes:
-        role: As in a case.
-        margin_mm: As in a case; 0 for none.
-        mesh: Closed, mm.
-    """
+    """One structure of a drawn trunk: its role and margin as in a case (0 for none), its closed mesh, mm."""
 
     role: str
     margin_mm: float
     mesh: TriangleMesh
 
 
-@dataclass(frozen=True, eq=False)
-class Trunk:
-    """A drawn trunk.
-
-    Attributes:
-        skin: Closed, flat at head and feet.
-        skin_hu: What fills it between the structures.
-        organs: By name.
-        target: Shape (3,), the lesion's middle.
-    """
+class Trunk(NamedTuple):
+    """A drawn trunk: a skin that is flat at head and feet, and filled with so much; the lesion's middle (3,)."""
 
     skin: TriangleMesh
     skin_hu: float
@@ -69,17 +54,12 @@ class _Shape(NamedTuple):
         wide, deep, y = (np.interp(z, self.z, one) for one in (self.wide, self.deep, self.y))
         cosine, sine = np.cos(angle), np.sin(angle)
         radius = (np.abs(cosine / wide) ** self.power + np.abs(sine / deep) ** self.power) ** (-1.0 / self.power)
-        return np.stack(
-            [inside * radius * cosine, y - inside * radius * sine, np.broadcast_to(z, angle.shape)], axis=-1
-        )
+        x, y = inside * radius * cosine, y - inside * radius * sine
+        return np.stack([x, y, np.broadcast_to(z, angle.shape)], axis=-1)
 
 
 def draw_trunk(rng: np.random.Generator) -> Trunk:
-    """A trunk and what is in it.
-
-    Args:
-        rng: Draws everything.
-    """
+    """A trunk and what is in it."""
     shape = _shape(rng)
     angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
     skin = loft(np.stack([shape.at(angle, np.full(AROUND, z)) for z in shape.z]))
@@ -120,12 +100,8 @@ def _waves(z: Floats, height: float, rng: np.random.Generator) -> Floats:
 def _ball(centre: Floats, radius: float) -> TriangleMesh:
     lift = np.linspace(-np.pi / 2, np.pi / 2, 26)[1:-1]
     angle = 2.0 * np.pi * np.arange(48) / 48
-    rings = [
-        centre
-        + radius * np.stack([np.cos(a) * np.cos(angle), np.cos(a) * np.sin(angle), np.full(48, np.sin(a))], axis=1)
-        for a in lift
-    ]
-    return loft(np.array(rings))
+    across, up = np.cos(lift)[:, None], np.broadcast_to(np.sin(lift)[:, None], (len(lift), 48))
+    return loft(centre + radius * np.stack([across * np.cos(angle), across * np.sin(angle), up], axis=-1))
 
 
 def _rod(x: float, y: float, radius: float, rng: np.random.Generator) -> TriangleMesh:

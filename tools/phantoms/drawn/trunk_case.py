@@ -9,7 +9,6 @@ from tools.phantoms.manifest import ply_bytes
 
 HU = {"spine": 350.0, "rib": 500.0}
 """Of what is not made of what its name says: half of a drawn bone is denser than any organ."""
-
 CUT = 'cut = ["feet", "head"]\n'
 """Of the skin: there a drawn trunk goes on beyond its mesh."""
 
@@ -35,13 +34,7 @@ max_skin_angle_deg = 75
 
 
 def write_trunk_case(folder: Path, trunk: Trunk, name: str) -> Path:
-    """Write ``case.toml`` and the meshes.
-
-    Args:
-        folder: Made if it is not there; files of these names are replaced.
-        trunk: What to write.
-        name: Of the case.
-    """
+    """Write ``case.toml`` and the meshes; the folder is made if it is not there, files of these names are replaced."""
     folder.mkdir(parents=True, exist_ok=True)
     text = CASE.format(name=name, target=", ".join(f"{one:.3f}" for one in trunk.target))
     text += _structure("skin", "skin", 0.0, trunk.skin_hu) + CUT

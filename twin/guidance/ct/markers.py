@@ -1,8 +1,7 @@
 """Markers and a lesion found in a CT: by a voxel, as a person reads them, and by less than a voxel.
 
-The rule of Chen 2019, section 3.1, is a voxel's: the number of the slice that shows a marker best, times the spacing,
-and its place in that slice to 1 mm. The finer place is that of the drawn marker that is nearest to the image
-(`puncture_twin.planning.registration.fiducial_reading`).
+The rule of Chen 2019, section 3.1, is a voxel's: the number of the slice that shows a marker best, and its place there
+to 1 mm. The finer place is that of the drawn marker nearest to the image (`planning.registration.fiducial_reading`).
 """
 
 from __future__ import annotations
@@ -33,27 +32,14 @@ LARGEST_MM = 25.0
 
 
 class Markers(NamedTuple):
-    """Markers that were found, in the order of those expected.
-
-    Attributes:
-        fine: By the drawn marker.
-        rule: By slice number and millimetre.
-    """
+    """Markers in the order of those expected: by the drawn marker, and by slice number and millimetre."""
 
     fine: NamedPoints
     rule: NamedPoints
 
 
 def find_markers(volume: Volume, expected: NamedPoints) -> Markers:
-    """Find markers of metal near where they are expected.
-
-    Args:
-        volume: The CT, LPS; its third axis runs across the slices.
-        expected: Roughly where each is, LPS mm: names the pieces of metal.
-
-    Raises:
-        InputError: A marker that no piece of metal is near to.
-    """
+    """Find markers of metal near where they are expected, LPS mm; one that no piece of metal is near to is refused."""
     pieces = [piece for piece in metal_pieces(volume) if piece.size_mm <= LARGEST_MM]
     chosen = _named(pieces, expected, volume)
     ceiling, noise = clipped_at(volume.values), noise_hu(volume.values)
@@ -76,7 +62,6 @@ def _fine(weights: Floats, piece: Metal, volume: Volume, ceiling_hu: float, nois
 
 
 def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[Metal]:
-    """A piece for each name, such that all distances together are least."""
     middles = np.array([piece.middle_ct for piece in pieces]).reshape(-1, 3)
     distance = np.linalg.norm(expected.points[:, None] - middles, axis=2)
     rows, columns = linear_sum_assignment(np.where(distance < FARTHEST_MM, distance, 1e6))
@@ -84,9 +69,8 @@ def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[M
     for row, name in enumerate(expected.names):
         if row not in found or distance[row, found[row]] >= FARTHEST_MM:
             voxels = " x ".join(f"{size:g}" for size in spacing_mm(volume))
-            allowed = (
-                f"metal within {FARTHEST_MM:g} mm of the expected position, and voxels far smaller than the marker"
-            )
+            near = f"metal within {FARTHEST_MM:g} mm of the expected position"
+            allowed = f"{near}, and voxels far smaller than the marker"
             what = f"marker {name} is not seen in the image (voxels of {voxels} mm)"
             refuse(what, volume.path, allowed, "marker_not_seen")
     return [pieces[found[row]] for row in range(len(expected.names))]
@@ -95,15 +79,12 @@ def _named(pieces: list[Metal], expected: NamedPoints, volume: Volume) -> list[M
 def _by_rule(weights: Floats, piece: Metal, volume: Volume) -> Floats:
     """The place by the paper's rule: the slice with most of the metal, and there its middle to a millimetre."""
     k = int(np.argmax(weights.sum(axis=(0, 1))))
-    i, j = (float(line @ np.arange(len(line)) / line.sum()) for line in _sides(weights[:, :, k]))
+    sides = weights[:, :, k].sum(axis=1), weights[:, :, k].sum(axis=0)
+    i, j = (float(line @ np.arange(len(line)) / line.sum()) for line in sides)
     spacing = spacing_mm(volume)
     index = np.array([i, j, k]) + [axis.start for axis in piece.box]
     index[:2] = np.round(index[:2] * spacing[:2] / READING_MM) * READING_MM / spacing[:2]
     return apply(volume.T_ct_index, index)
-
-
-def _sides(slice_weights: Floats) -> tuple[Floats, Floats]:
-    return slice_weights.sum(axis=1), slice_weights.sum(axis=0)
 
 
 RIM_MM = 4.0
@@ -111,15 +92,7 @@ RIM_MM = 4.0
 
 
 def read_lesion(volume: Volume, mask: NDArray[np.bool_]) -> Floats:
-    """The middle of what a segmentation outlines, by the values in and around it, shape (3,), LPS mm.
-
-    Args:
-        volume: The CT.
-        mask: Shape of the CT: the lesion's voxels.
-
-    Raises:
-        InputError: An empty mask.
-    """
+    """The middle of what a mask of the CT outlines, by the values in and around it, shape (3,), LPS mm."""
     found = ndimage.find_objects(mask.astype(np.uint8))
     if not found:
         refuse("no voxel belongs to the lesion", volume.path, "a lesion larger than a voxel", "lesion_not_seen")

@@ -1,7 +1,4 @@
-"""Needles found in a CT: long, thin metal that comes from outside of the body and has the image of a needle.
-
-Which end is the tip, which of several needles is meant, and what hides it. How it is fitted: `needle_fit`.
-"""
+"""Needles found in a CT: long, thin metal that comes from outside of the body and has the image of a needle."""
 
 from __future__ import annotations
 
@@ -73,29 +70,19 @@ MARKER_MM = 6.0
 """So far about a marker's middle its metal shows."""
 UNSURE_MM = 1.5
 """A tip known worse than this is not read: streaks, other metal or thick slices hide where it ends."""
-
 MOST_PARTS, LINES = 4, 300
 """Straight pieces of metal that touch; and lines that are tried for each."""
 THICK_MM, BESIDE_MM = 3.0, 10.0
 """In thicker slices a needle so near beside another, and nearly along it, may show as one with it."""
-
 Inside = Callable[[Floats], Bools]
 """Which of points (n, 3), LPS mm, lie in the body."""
 
 
 def find_needle(volume: Volume, target_ct: Floats, diameter_mm: float | None = None) -> FoundNeedle:
-    """Find the needle, or the wide rod, whose metal is nearest to a point.
+    """Find the needle, or without a diameter the rod, whose metal is nearest to a target (3,), LPS mm.
 
-    Metal that is wider than the needle (bolts, plates) is not looked at, nor what it blurs into: the axis is that of
-    the thin metal next to it. A tip there cannot be distinguished from it and is refused.
-
-    Args:
-        volume: The CT.
-        target_ct: Shape (3,), LPS mm: its tip is the end nearer to this.
-        diameter_mm: Of the needle; None for a rod that is wider than three pixels.
-
-    Raises:
-        InputError: No long piece of metal, or a needle that ends at other metal.
+    Metal that is wider than the needle (bolts, plates) is not looked at, nor what it blurs into; a tip there is
+    refused.
     """
     if diameter_mm is not None:
         found = [one for one in _needles(volume, target_ct, diameter_mm, None) if not one[0].unclear]
@@ -121,15 +108,7 @@ def read_needle(
     planned: tuple[Floats, Floats] | None = None,
     markers: Floats | None = None,
 ) -> tuple[FoundNeedle, tuple[Finding, ...]]:
-    """Read the one needle that enters a body; another is reported, and none is guessed.
-
-    Args:
-        volume: The CT.
-        target_ct: Shape (3,), LPS mm, for what is said of a tip that is not seen.
-        diameter_mm: Of the needle.
-        inside: Which points lie in the body.
-        planned: Tip and unit direction (3,) of the plan, which may tell one needle from another.
-        markers: Shape (n, 3), where markers lie: what is seen there is no needle.
+    """Read the one needle that enters a body; another is reported, and none is guessed. At markers (n, 3) is none.
 
     Raises:
         InputError: No needle, two of which none is plainly the plan's, a tip outside of the image, at other metal, or
@@ -139,10 +118,9 @@ def read_needle(
     if not found:
         _refuse_none(volume, f", that enters the body{_dilution(volume, diameter_mm)}")
     findings: list[Finding] = []
-    chosen = found[0]
+    needle, hidden = found[0]
     if len(found) > 1:
-        chosen, findings = _chosen(volume, found, planned)
-    needle, hidden = chosen
+        (needle, hidden), findings = _chosen(volume, found, planned)
     if len(found) == 1 and not _of_plan(needle, *(planned or (target_ct, needle.forward_ct))):
         said = f"the needle lies more than {OF_PLAN_MM:g} mm or {OF_PLAN_DEG:g} degrees off the planned line"
         said = f"the needle's line passes the target by more than {OF_PLAN_MM:g} mm" if planned is None else said
@@ -151,28 +129,24 @@ def read_needle(
         said = "the needle is in the body as far as it is seen: that it comes through the skin is not; is it a lead?"
         findings.append(Finding("entry_not_seen", Severity.WARNING, said))
     if needle.leaves:
-        refuse(
-            "the needle leaves the image; its tip is outside", volume.path, "a scan with its tip", "tip_outside_image"
-        )
+        what = "the needle leaves the image; its tip is outside"
+        refuse(what, volume.path, "a scan with its tip", "tip_outside_image")
     if needle.unclear:
         at = "({:.0f}, {:.0f}, {:.0f}) mm".format(*needle.tip_ct)
-        what = (
-            f"long metal ends in the body at {at} in the scan, but has not the image of a needle of {diameter_mm:g} mm"
-        )
+        of_none = f"has not the image of a needle of {diameter_mm:g} mm"
+        what = f"long metal ends in the body at {at} in the scan, but {of_none}"
         allowed = f"one needle of the case's diameter, apart from other metal{_dilution(volume, diameter_mm)}"
         refuse(what, volume.path, allowed, "needle_unclear")
     _check_tip(volume, needle, hidden, target_ct)
     if needle.tip_sd_mm > UNSURE_MM:
         sd = f"{needle.tip_sd_mm:.1f} mm (standard deviation)"
         what = f"streaks or thick slices hide the needle's tip: it is known to {sd} only"
-        refuse(
-            what, volume.path, f"a tip known to {UNSURE_MM:g} mm: thinner slices, or another gantry tilt", "tip_hidden"
-        )
+        allowed = f"a tip known to {UNSURE_MM:g} mm: thinner slices, or another gantry tilt"
+        refuse(what, volume.path, allowed, "tip_hidden")
     thick = float(spacing_mm(volume)[2])
     if thick > THICK_MM + 0.01:
-        said = (
-            f"slices of {thick:g} mm: a second needle within {BESIDE_MM:g} mm of this one may not be seen; look for it"
-        )
+        hidden_one = f"a second needle within {BESIDE_MM:g} mm of this one may not be seen; look for it"
+        said = f"slices of {thick:g} mm: {hidden_one}"
         findings.append(Finding("thick_slices", Severity.WARNING, said, {"slice_mm": thick}))
     return needle, tuple(findings)
 
@@ -194,11 +168,6 @@ def _dilution(volume: Volume, diameter_mm: float) -> str:
 def _chosen(
     volume: Volume, found: Sequence[tuple[FoundNeedle, Bools]], planned: tuple[Floats, Floats] | None
 ) -> tuple[tuple[FoundNeedle, Bools], list[Finding]]:
-    """Of several needles the only one near the planned line, and the warning that there are others.
-
-    Raises:
-        InputError: None is, or two are.
-    """
     alike = [] if planned is None else [one for one in found if _of_plan(one[0], *planned)]
     tips = "; ".join("({:.0f}, {:.0f}, {:.0f})".format(*one[0].tip_ct) for one in found)
     said = f"{len(found)} needles enter the body, with tips at {tips} mm in the scan"
@@ -217,16 +186,18 @@ def _of_plan(needle: FoundNeedle, tip_ct: Floats, forward_ct: Floats) -> bool:
 def _needles(
     volume: Volume, target_ct: Floats, diameter_mm: float, inside: Inside | None, markers: Floats | None = None
 ) -> Iterator[tuple[FoundNeedle, Bools]]:
-    """Every needle of the image, with the voxels that wider metal hides."""
-    hidden = wide_metal(volume, diameter_mm)
+    hidden, spacing = wide_metal(volume, diameter_mm), spacing_mm(volume)
     for marker in np.zeros((0, 3)) if markers is None else markers:
-        _hide(volume, marker, hidden)
+        at, reach = apply(np.linalg.inv(volume.T_ct_index), marker), MARKER_MM / spacing
+        low, high = np.maximum(np.ceil(at - reach), 0).astype(int), np.floor(at + reach).astype(int) + 1
+        box = tuple(slice(a, max(a, b)) for a, b in zip(low, np.minimum(high, hidden.shape), strict=True))
+        index = np.moveaxis(np.indices(hidden[box].shape), 0, -1) + low
+        hidden[box] |= np.linalg.norm((index - at) * spacing, axis=-1) <= MARKER_MM
     known: list[FoundNeedle] = []
     for level in LEVELS_HU:
         for metal in metal_pieces(volume, level, hidden | _taken(volume, known)):
-            if any(_same(volume, one, _places(volume, metal)) for one in known):
-                continue
-            if _length(volume, metal, level, hidden, diameter_mm) < SHORTEST_MM:
+            short = _length(volume, metal, level, hidden, diameter_mm) < SHORTEST_MM  # as hundreds of specks are
+            if short or any(_same(volume, one, _places(volume, metal)) for one in known):
                 continue
             for part, beside_it in _parts(volume, metal, level, hidden, diameter_mm):
                 found = _needle(volume, part, level, target_ct, inside, beside_it, diameter_mm)
@@ -247,8 +218,12 @@ def _enters(volume: Volume, needle: FoundNeedle, inside: Inside) -> bool:
     """Whether a needle's line, from where it is seen last, comes out of the body within the image."""
     end, steps = needle.path_ct[-1], np.arange(0.0, FITTED_MM, 1.0)[:, None]
     line = end - steps * (needle.tip_ct - end) / np.linalg.norm(needle.tip_ct - end)
-    at = apply(np.linalg.inv(volume.T_ct_index), line)
-    return not inside(line[((at >= 0) & (at <= np.array(volume.values.shape) - 1)).all(axis=1)]).all()
+    return not inside(line[_in_image(volume, line)]).all()
+
+
+def _in_image(volume: Volume, points: Floats) -> Bools:
+    at = apply(np.linalg.inv(volume.T_ct_index), points)
+    return np.asarray(((at >= 0) & (at <= np.array(volume.values.shape) - 1)).all(axis=1))
 
 
 def _needle(
@@ -265,14 +240,12 @@ def _needle(
     found = fit_needle(volume, part, toward(line, ends[0]), diameter_mm, hidden) if thin else None
     if found is None and level == METAL_HU:  # never passed over in silence
         found = unclear(line, ends[0])
-    return None if found is None else found._replace(leaves=ends[1] and not _ends_in(volume, found))
-
-
-def _ends_in(volume: Volume, needle: FoundNeedle) -> bool:
-    """Whether a needle at the image's border ends between its voxels, however the reading errs along it."""
-    sd = float(np.sqrt(needle.forward_ct @ needle.cov_ct[:3, :3] @ needle.forward_ct))
-    at = apply(np.linalg.inv(volume.T_ct_index), needle.tip_ct + 3.0 * sd * needle.forward_ct)
-    return bool(((at >= 0) & (at <= np.array(volume.values.shape) - 1)).all())
+    if found is None or not ends[1]:
+        return found
+    # one at the border may end between the voxels, however its reading errs along it
+    sd = float(np.sqrt(found.forward_ct @ found.cov_ct[:3, :3] @ found.forward_ct))
+    farthest = found.tip_ct + 3.0 * sd * found.forward_ct
+    return found._replace(leaves=not _in_image(volume, farthest[None])[0])
 
 
 def _thin(volume: Volume, metal: Metal, diameter_mm: float) -> bool:
@@ -291,23 +264,21 @@ def _parts(
         yield metal, hidden
     elif level == METAL_HU:
         straight = list(_straight(volume, metal))
-        at = np.argwhere(metal.voxels) + [axis.start for axis in metal.box]
         for part in straight:
-            others = hidden.copy()
-            others[tuple(at.T)] = True
-            own = np.argwhere(part.voxels) + [axis.start for axis in part.box]
-            others[tuple(own.T)] = False
-            yield part, hidden | _reached(volume, others & ~hidden, metal)
+            others, all_hidden = hidden.copy(), hidden.copy()
+            others[tuple(_index(metal).T)] = True
+            others[tuple(_index(part).T)] = False
+            others &= ~hidden
+            if others.any():  # with what they blur into
+                away = distance_transform_edt(~others[metal.box], spacing_mm(volume))
+                all_hidden[metal.box] |= away <= BLUR_MM
+            yield part, all_hidden
         if not straight:
             yield metal, hidden
 
 
-def _reached(volume: Volume, others: Bools, metal: Metal) -> Bools:
-    """The voxels of metal and those that it blurs into, shape of the image; all in a piece's box."""
-    reached = np.zeros_like(others)
-    away = distance_transform_edt(~others[metal.box], spacing_mm(volume))
-    reached[metal.box] = away <= BLUR_MM if others.any() else False
-    return reached
+def _index(metal: Metal) -> NDArray[np.int64]:
+    return np.argwhere(metal.voxels) + [axis.start for axis in metal.box]
 
 
 def _straight(volume: Volume, metal: Metal) -> Iterator[Metal]:
@@ -315,8 +286,7 @@ def _straight(volume: Volume, metal: Metal) -> Iterator[Metal]:
 
     What lies around a line counts against it: lines through a block of metal have more around than on them.
     """
-    rng = np.random.default_rng(0)
-    at = np.argwhere(metal.voxels) + [axis.start for axis in metal.box]
+    rng, at = np.random.default_rng(0), _index(metal)
     places, left = apply(volume.T_ct_index, at.astype(float)), np.ones(len(at), np.bool_)
     for _ in range(MOST_PARTS):
         best = max(_lines(volume, places, left, rng), key=lambda one: one[0], default=None)
@@ -364,17 +334,7 @@ def _taken(volume: Volume, known: Sequence[FoundNeedle]) -> Bools:
     return taken
 
 
-def _hide(volume: Volume, marker: Floats, hidden: Bools) -> None:
-    """Hide the voxels about a marker (3,), in place."""
-    at, reach = apply(np.linalg.inv(volume.T_ct_index), marker), MARKER_MM / spacing_mm(volume)
-    low, high = np.maximum(np.ceil(at - reach), 0).astype(int), np.floor(at + reach).astype(int) + 1
-    box = tuple(slice(a, max(a, b)) for a, b in zip(low, np.minimum(high, hidden.shape), strict=True))
-    index = np.moveaxis(np.indices(hidden[box].shape), 0, -1) + low
-    hidden[box] |= np.linalg.norm((index - at) * spacing_mm(volume), axis=-1) <= MARKER_MM
-
-
 def _same(volume: Volume, needle: FoundNeedle, places: Floats) -> bool:
-    """Whether places (n, 3) lie along a needle that is known."""
     away = places - needle.tip_ct
     aside = np.linalg.norm(away - np.outer(away @ needle.forward_ct, needle.forward_ct), axis=1)
     near = min(SAME_MM, WIDE_MM + WIDEST_SLICE * float(spacing_mm(volume)[2]))
@@ -382,8 +342,7 @@ def _same(volume: Volume, needle: FoundNeedle, places: Floats) -> bool:
 
 
 def _places(volume: Volume, metal: Metal) -> Floats:
-    """The voxels of a piece, shape (n, 3), LPS mm."""
-    return apply(volume.T_ct_index, (np.argwhere(metal.voxels) + [axis.start for axis in metal.box]).astype(float))
+    return apply(volume.T_ct_index, _index(metal).astype(float))
 
 
 def _width(places: Floats) -> float:
@@ -426,11 +385,6 @@ def _tip_end(
 
 
 def _check_tip(volume: Volume, found: FoundNeedle, hidden: Bools, target_ct: Floats) -> None:
-    """Refuse a tip at other metal: there the other metal begins, and the needle's end is not seen.
-
-    Raises:
-        InputError: It is.
-    """
     beyond = found.tip_ct + np.arange(-SEEN_MM, SEEN_MM + 0.1, 0.25)[:, None] * found.forward_ct
     at = np.rint(apply(np.linalg.inv(volume.T_ct_index), beyond)).astype(int)
     inside = ((at >= 0) & (at < hidden.shape)).all(axis=1)
@@ -466,7 +420,6 @@ def _whole(volume: Volume, metal: Metal, line: Line, hidden: Bools) -> tuple[Met
 
 
 def _piece(volume: Volume, at: NDArray[np.int64]) -> Metal:
-    """Voxels (n, 3) as a piece of metal."""
     spacing = spacing_mm(volume)
     around = np.ceil(AROUND_MM / spacing).astype(int)
     low, high = at.min(axis=0), at.max(axis=0) + 1
@@ -502,11 +455,10 @@ def _tip(volume: Volume, metal: Metal, line: Line) -> Floats:
     end = float(along[parts.ravel() > min(full, typical) / 2].max())
     wide = max(line.width_mm / 2, WIDEST_SLICE * float(spacing_mm(volume).max()))
     near = (across <= wide) & (np.abs(along - end) <= SHAFT_MM)
-    seen, points = np.minimum(parts.ravel()[near], full), points[near]
-    across = np.array([BLUR_SIGMA_MM, BLUR_SIGMA_MM, spacing_mm(volume)[2] / np.sqrt(12.0)])
-    blur = float(
-        np.linalg.norm(across * (np.linalg.solve(volume.T_ct_index[:3, :3], line.forward) * spacing_mm(volume)))
-    )
+    seen = np.minimum(parts.ravel()[near], full)
+    sigmas = np.array([BLUR_SIGMA_MM, BLUR_SIGMA_MM, spacing_mm(volume)[2] / np.sqrt(12.0)])
+    direction = np.linalg.solve(volume.T_ct_index[:3, :3], line.forward) * spacing_mm(volume)
+    blur = float(np.linalg.norm(sigmas * direction))
 
     def misfit(tip: float) -> float:
         return float(np.sum((np.minimum(ndtr((tip - along[near]) / blur), full) - seen) ** 2))

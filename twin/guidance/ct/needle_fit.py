@@ -94,7 +94,6 @@ class FoundNeedle(NamedTuple):
     """A needle in a CT, LPS mm.
 
     Attributes:
-        tip_ct: Shape (3,).
         forward_ct: Shape (3,), unit, the direction in which it ends.
         width_mm: Root mean square distance of its metal from the axis.
         path_ct: Shape (m, 3), from the tip to where it is seen last.
@@ -130,12 +129,7 @@ class FoundNeedle(NamedTuple):
         return float(np.sqrt(np.linalg.eigvalsh(self.cov_ct[3:, 3:])[-1]))
 
     def moved(self, T_b_ct: Floats, cov_T: Floats | None = None) -> FoundNeedle:
-        """The needle in another frame.
-
-        Args:
-            T_b_ct: Shape (4, 4).
-            cov_T: Shape (6, 6), of that motion at the moved tip, shift (mm) and rotation (rad), axes of b.
-        """
+        """The needle in frame b; cov_T (6, 6) is of that motion at the moved tip, shift (mm) and rotation (rad)."""
         R = np.kron(np.eye(2), T_b_ct[:3, :3])
         path = apply(T_b_ct, self.path_ct)
         covs = R @ self.covs_ct @ R.T + (0.0 if cov_T is None else carried_along(path, cov_T))
@@ -153,10 +147,8 @@ class _Seen(NamedTuple):
     Attributes:
         axes: Shape (3, 3), rows: the needle's direction, and two across it.
         local: Shape (n, 3), mm, in these axes from where the needle begins.
-        parts: Shape (n,), of metal.
         slices: Shape (n,), in which slice each lies.
         thick: Shape (3,), from one slice to the next, in these axes.
-        bends: Shape (4, 2), the curve through what is seen, as `_about` has it.
         length: Of the needle, mm.
     """
 

@@ -45,7 +45,6 @@ class CurveImage(NamedTuple):
         axes: Shape (3, 3), rows: nearly the needle's direction, and the two across it.
         plane: Shape (3, 3), mm², in these axes: the assumed blur in the image's plane, which is fitted, and
         fixed: the same, of one layer of a slice and of the needle's own width.
-        layers: Shape (m, 3), mm, in these axes: where a slice's layers lie, once for each half of the needle.
         full: Part of metal from which a voxel is clipped.
     """
 

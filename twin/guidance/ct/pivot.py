@@ -26,34 +26,21 @@ from puncture_twin.planning.registration.fit_uncertainty import reading_noise
 
 MOST_OFF_MM = 50.0
 """mm by which a stated tip may be wrong: more is another needle."""
-
 SLACK_MM = 5.0
 """mm by which an uncalibrated arm may miss one place."""
-
 LEAST_POSES = 3
 """Two leave the tip free along a line."""
-
 LARGE = 2.0
 """Residuals so many times the expected ones are not the declared noise: the arm's own errors, or a tip that slipped."""
-
 WORST_FACTOR = 30.0
 """Magnification of the noise in the worst direction of the tip: poses that turn too little magnify it so."""
 
 
 def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, *, where: str) -> None:
-    """Refuse touches that no tip near the stated one brings to one place.
+    """Refuse touches that no tip near the stated one brings to one place; the flange's axes (n, 3, 3) are columns.
 
     A tip that is wrong by d parts two touches of one place by 2 sin(angle / 2) d at most, with the angle between the
     two needles, and by twice d where the flange turns about them.
-
-    Args:
-        names: Of the n touches.
-        tips_base: Shape (n, 3), mm: where the stated tip was.
-        axes_base: Shape (n, 3, 3): the flange's axes as columns.
-        where: What the error names.
-
-    Raises:
-        InputError: Two of them are farther apart.
     """
     worst, two = 0.0, (0, 0)
     for i, j in combinations(range(len(names)), 2):
@@ -64,25 +51,19 @@ def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, 
             worst, two = beyond, (i, j)
     if worst > 0:
         i, j = two
-        apart = float(np.linalg.norm(tips_base[i] - tips_base[j]))
-        what = (
-            f"touches of different points: {names[i]} and {names[j]} are {apart:.0f} mm apart; a tip offset of "
-            f"{MOST_OFF_MM:g} mm cannot explain that"
-        )
+        apart = np.linalg.norm(tips_base[i] - tips_base[j])
+        why = f"are {apart:.0f} mm apart; a tip offset of {MOST_OFF_MM:g} mm cannot explain that"
+        what = f"touches of different points: {names[i]} and {names[j]} {why}"
         refuse(what, where, "touches of one point, with the needle tilted to several sides", "touches_apart")
 
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """A calibrated tip.
+    """A calibrated tip, flange frame, and its place, base frame; mm.
 
     Attributes:
-        tip_flange: Shape (3,), mm, in the flange frame.
-        place_base: Shape (3,), mm: where it stood.
-        cov_tip: Shape (3, 3), mm^2, of the tip, from all that is declared.
-        misses_mm: Shape (n,): the distance of each tip from their place.
-        expected_mm: Their root mean square as the declared touch noise leaves it.
-        expected_whole_mm: The expectation with the arm's errors too, where they are declared.
+        cov_tip: Shape (3, 3), mm^2, from all that is declared.
+        expected_mm: Rms of the misses as declared touch noise leaves it; `expected_whole_mm` with the arm's errors too.
     """
 
     tip_flange: Floats
@@ -106,16 +87,10 @@ class Pivot:
 def pivot_calibration(
     T_base_flange: Floats, noise_mm: float, *, arm_cov: Floats | None = None, where: str = "pivot"
 ) -> Pivot:
-    """The tip from poses that share its place.
+    """The tip from poses (n, 4, 4), mm, that share its place; three or more, that are rotated enough, or it is refused.
 
     Args:
-        T_base_flange: Shape (n, 4, 4), mm, as the controller computes them.
-        noise_mm: Standard deviation of one touch, per axis.
         arm_cov: Shape (3 n, 3 n), mm^2: of what the arm misses the place by, besides that noise; None for nothing.
-        where: What errors name.
-
-    Raises:
-        InputError: Fewer than three poses, or poses that turn too little about one another.
     """
     count = len(T_base_flange)
     if count < LEAST_POSES:
@@ -137,17 +112,7 @@ def pivot_calibration(
 
 
 def arm_covariance(errors: ErrorModel, model: UrModel, tip_mm: float, q: Floats) -> Floats:
-    """Covariance of n touches of one place by all that is declared but touch noise and the tip itself.
-
-    Args:
-        errors: As declared.
-        model: The arm.
-        tip_mm: Flange to tip.
-        q: Shape (n, 6), rad.
-
-    Returns:
-        Shape (3 n, 3 n), mm^2.
-    """
+    """Covariance (3 n, 3 n), mm^2, of n touches of one place by all that is declared but touch noise and the tip."""
     noise = reading_noise(errors, model, tip_mm, q, known=True)
     variances = noise.eta_variances.copy()
     variances[PARAMETERS["tip_offset"]] = variances[PARAMETERS["needle_direction"]] = 0.0

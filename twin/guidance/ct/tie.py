@@ -24,7 +24,7 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from puncture_twin.planning.anatomy.metal import METAL_HU, centroid, metal_pieces, metal_weights
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import Finding, Severity, refuse
 from puncture_twin.planning.evidence.edges import Placement, Sample, fit_of, sample_surfaces
 from puncture_twin.planning.formats.points import NamedPoints
@@ -88,15 +88,7 @@ target: some have moved, on the skin or with it, and the body ties the frames in
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What a case knows of a patient and a scan shows again; LPS mm of the case.
-
-    Attributes:
-        sample: Points on skin and bones.
-        organs: Points on what is no bone.
-        markers: Those of the registration, or None.
-        marker_cov: Shape (3, 3), mm², of their reading in the case's CT.
-        target_ct: Shape (3,), where the tie must be known.
-    """
+    """What a case knows of a patient and a scan shows again, LPS mm: points on skin and bones, and on other organs."""
 
     sample: Sample
     organs: Sample
@@ -106,13 +98,9 @@ class Body:
 
 
 def body_of(
-    skin: TriangleMesh,
-    bones: Sequence[TriangleMesh],
-    organs: Sequence[TriangleMesh],
-    target_ct: Floats,
-    markers: NamedPoints | None,
-    cov: Floats,
-) -> Body:
+    skin: TriangleMesh, bones: Sequence[TriangleMesh], organs: Sequence[TriangleMesh], target_ct: Floats,
+    markers: NamedPoints | None, cov: Floats,
+) -> Body:  # fmt: skip
     """The body of surfaces and markers; arguments as the attributes of `Body`."""
     return Body(sample_surfaces([skin, *bones], SPREAD), sample_surfaces(organs, SPREAD), markers, cov, target_ct)
 
@@ -122,13 +110,9 @@ class Tie:
     """Where the case's frame lies in a scan.
 
     Attributes:
-        T_scan_ct: Shape (4, 4).
         cov_ct: Shape (6, 6), of its inverse at the target: shift (mm) and rotation (rad), axes of the case.
-        how: ``markers`` or ``body``.
-        residual_mm: Root mean square of the markers, or of the surfaces that were found.
-        found: Fraction of the surfaces in the image that were found.
-        moved_mm: How far the target lies from where one frame would have it, and
-        moved_deg: the rotation; NaN where the scan has a frame of its own.
+        found: Fraction of the surfaces in the image that were found; the residual (rms) is theirs, or the markers'.
+        moved_mm: How far the target lies from where one frame would have it; NaN where the scan has its own.
     """
 
     T_scan_ct: Floats
@@ -153,10 +137,7 @@ class Tie:
 
 
 class _Fit(NamedTuple):
-    """A fit of surfaces.
-
-    `misfit_mm` counts each point in the image, at `NEAR_MM` at most; `cov` is of T at `center`.
-    """
+    """A fit of surfaces. `misfit_mm` counts each point in the image, at `NEAR_MM` at most; `cov` is at `center`."""
 
     T: Floats
     misfit_mm: float
@@ -171,8 +152,6 @@ def tie_frames(volume: Volume, body: Body, *, same_frame: bool) -> Tie:
     """Tie a scan to a case.
 
     Args:
-        volume: The scan, LPS mm.
-        body: Of the case.
         same_frame: Whether the scan states the case's own frame of reference. That is a guess until the body agrees.
 
     Raises:
@@ -180,7 +159,9 @@ def tie_frames(volume: Volume, body: Body, *, same_frame: bool) -> Tie:
     """
     picture = _Picture(volume)
     own = [np.eye(4)] if same_frame else []
-    pieces = _small_metal(volume)
+    small = [piece for piece in metal_pieces(volume) if piece.size_mm <= LARGEST_MM and piece.voxels.sum() > 1]
+    middles = [centroid(metal_weights(volume, piece), piece.box, volume.T_ct_index) for piece in small]
+    pieces = np.array([one for one in middles if np.isfinite(one).all()]).reshape(-1, 3)  # which may be markers
     fits = [_fitted(picture, body.sample, start) for start in (*own, *_by_distances(body.markers, pieces))]
     best = min(fits, key=lambda fit: fit.misfit_mm, default=None)
     if best is None or not _believed(best):
@@ -188,9 +169,8 @@ def tie_frames(volume: Volume, body: Body, *, same_frame: bool) -> Tie:
         best = min(fits, key=lambda fit: fit.misfit_mm, default=None)
     allowed = "a scan of the same patient that shows skin and bone of the case, or three of its markers"
     if best is None or not _believed(best):
-        shown = (
-            "" if best is None else f": {best.found:.0%} of {best.seen} points of skin and bone lie where they should"
-        )
+        of = "points of skin and bone lie where they should"
+        shown = "" if best is None else f": {best.found:.0%} of {best.seen} {of}"
         refuse(f"the scan does not fit the case's body{shown}", volume.path, allowed, "frames_not_tied")
     flipped, T_flipped = _mirrored(picture, body.sample, best.T)
     shift = _organs_moved(picture, body.organs, best.T)
@@ -201,13 +181,15 @@ def tie_frames(volume: Volume, body: Body, *, same_frame: bool) -> Tie:
         if MIRRORED * best.misfit_mm > flipped.misfit_mm or not here * MIRRORED > there:
             said = f"{best.misfit_mm:.2f} mm off, mirrored {flipped.misfit_mm:.2f} mm"
             refuse(f"the body fits the scan mirrored as well ({said})", volume.path, allowed, "mirrored")
-    tie = _checked(_by_markers(volume, body, best, pieces, same_frame), volume, allowed)
+    tie = _by_markers(volume, body, best, pieces, same_frame)
+    if not tie.sd_mm <= UNSURE_MM:
+        what = f"skin and bone in the scan tie it to the case at the target by {tie.sd_mm:.1f} mm (standard deviation)"
+        refuse(what, volume.path, f"{UNSURE_MM:g} mm at most: {allowed}", "frames_not_tied")
     stretch = _stretch(picture, body.sample, best.T) if tie.how == "body" else np.zeros(3)
     if np.abs(stretch).max() > MOST_STRETCH:
         sizes = ", ".join(f"{100 * one:+.0f} %" for one in stretch)
-        refuse(
-            f"the scan's body has another size than the case's ({sizes} along LPS)", volume.path, allowed, "other_body"
-        )
+        what = f"the scan's body has another size than the case's ({sizes} along LPS)"
+        refuse(what, volume.path, allowed, "other_body")
     return _with_organs(tie, shift)
 
 
@@ -228,13 +210,6 @@ def _believed(fit: _Fit) -> bool:
     return fit.found >= LEAST_FOUND and fit.seen >= LEAST_SEEN
 
 
-def _checked(tie: Tie, volume: Volume, allowed: str) -> Tie:
-    if not tie.sd_mm <= UNSURE_MM:
-        what = f"skin and bone in the scan tie it to the case at the target by {tie.sd_mm:.1f} mm (standard deviation)"
-        refuse(what, volume.path, f"{UNSURE_MM:g} mm at most: {allowed}", "frames_not_tied")
-    return tie
-
-
 class _Picture:
     """A scan between its voxels; NaN at metal and outside."""
 
@@ -242,17 +217,19 @@ class _Picture:
         self.values = volume.values
         self.T_index_ct = np.linalg.inv(volume.T_ct_index)
         corners = np.array(list(itertools.product(*((0, n - 1) for n in volume.values.shape))), dtype=float)
-        self.bounds = apply(volume.T_ct_index, corners)
+        bounds = apply(volume.T_ct_index, corners)
+        self.low, self.high, self.middle = bounds.min(axis=0), bounds.max(axis=0), bounds.mean(axis=0)
+
+    def holds(self, points: Floats, beyond_mm: float = 0.0) -> Bools:
+        """Which of points (n, 3) lie in the box about the image."""
+        return np.asarray(((points > self.low - beyond_mm) & (points < self.high + beyond_mm)).all(axis=1))
 
     def shown(self, sample: Sample, T: Floats) -> Sample:
         """About `SAMPLES` of the points that a placement (4, 4) has in the image, or near its border."""
-        points, _ = sample.placed(T)
-        low, high = self.bounds.min(axis=0) - BORDER_MM, self.bounds.max(axis=0) + BORDER_MM
-        rows = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+        rows = np.flatnonzero(self.holds(sample.placed(T)[0], BORDER_MM))
         return sample.rows(rows[:: max(1, len(rows) // SAMPLES)])
 
     def at(self, points: Floats) -> Floats:
-        """Values at points (..., 3), clipped to `SHOWN_HU`."""
         index = np.moveaxis(apply(self.T_index_ct, points.reshape(-1, 3)), 1, 0)
         near = np.clip(np.rint(index).astype(int), 0, np.array(self.values.shape)[:, None] - 1)
         outside = (np.abs(index - near) > 0.51).any(axis=0)
@@ -280,10 +257,9 @@ def _edges(picture: _Picture, points: Floats, normals: Floats, window_mm: float)
 
 
 def _fitted(picture: _Picture, sample: Sample, start: Floats) -> _Fit:
-    """Skin and bone fitted from a start."""
-    some, T = picture.shown(sample, start), start
+    some, T, none = picture.shown(sample, start), start, (np.zeros(3), np.full((6, 6), np.inf))
     if len(some.points_ct) < LEAST_SEEN:
-        return _Fit(T, np.inf, np.inf, 0.0, len(some.points_ct), np.zeros(3), np.full((6, 6), np.inf))
+        return _Fit(T, np.inf, np.inf, 0.0, len(some.points_ct), *none)
     for window in WINDOWS_MM:
         points, normals = some.placed(T)
         off = _edges(picture, points, normals, window)
@@ -297,19 +273,12 @@ def _fitted(picture: _Picture, sample: Sample, start: Floats) -> _Fit:
     off = _edges(picture, points, normals, WINDOWS_MM[-1])
     seen, good = ~np.isposinf(off), np.isfinite(off)
     if good.sum() < LEAST_SEEN or seen.sum() == 0:
-        return _Fit(T, np.inf, np.inf, 0.0, int(seen.sum()), np.zeros(3), np.full((6, 6), np.inf))
+        return _Fit(T, np.inf, np.inf, 0.0, int(seen.sum()), *none)
     capped = np.minimum(np.abs(np.where(good, off, np.inf)[seen]), NEAR_MM)
     inliers = good & (np.abs(off) < NEAR_MM)
+    misfit, residual = (float(np.sqrt(np.mean(one**2))) for one in (capped, off[inliers]))
     _, center, cov = _step(points[good], normals[good], off[good], some.patch[good])
-    return _Fit(
-        T,
-        float(np.sqrt(np.mean(capped**2))),
-        float(np.sqrt(np.mean(off[inliers] ** 2))),
-        float(inliers.sum() / seen.sum()),
-        int(seen.sum()),
-        center,
-        cov,
-    )
+    return _Fit(T, misfit, residual, float(inliers.sum() / seen.sum()), int(seen.sum()), center, cov)
 
 
 def _stretch(picture: _Picture, sample: Sample, T: Floats) -> Floats:
@@ -353,9 +322,7 @@ def _step(points: Floats, normals: Floats, off: Floats, patch: NDArray[np.intp])
 
 def _mirrored(picture: _Picture, sample: Sample, T: Floats) -> tuple[_Fit, Floats]:
     """The best fit of the surfaces mirrored about their middle, and where it puts the case, (4, 4)."""
-    points, _ = sample.placed(T)
-    low, high = picture.bounds.min(axis=0), picture.bounds.max(axis=0)
-    middle = sample.points_ct[((points > low) & (points < high)).all(axis=1)].mean(axis=0)
+    middle = sample.points_ct[picture.holds(sample.placed(T)[0])].mean(axis=0)
     fits = []
     for axis in range(3):
         flip = np.eye(4)
@@ -396,11 +363,7 @@ def _organs_moved(picture: _Picture, organs: Sample, T: Floats) -> Floats:
 
 
 def _evidence(picture: _Picture, body: Body, T: Floats, shift: Floats, pieces: Floats) -> float:
-    """How plainly grey values change at the organs, in standard errors, and markers that are where they should be.
-
-    Args:
-        shift: Shape (3,), of the organs against skin and bone, mm.
-    """
+    """How plainly organs change grey values, in standard errors, and markers that are where they should be."""
     total, step = 0.0, _fall(picture, body.organs, T @ pose(np.eye(3), shift))
     known = np.isfinite(step)
     for number in np.unique(body.organs.structure):
@@ -417,13 +380,12 @@ def _searched(picture: _Picture, body: Body) -> Iterator[Floats]:
     """The shift from which skin and bone show most contrast: about the frame's own, and with the middles together."""
     sample = body.sample.thinned(4 * SAMPLES)
     points, normals = sample.points_ct, sample.normals_ct
-    low, high = picture.bounds.min(axis=0), picture.bounds.max(axis=0)
     steps = np.arange(-SEARCH_MM, SEARCH_MM + 1.0, SEARCH_STEP_MM)
     tried = []
-    for about in (np.zeros(3), picture.bounds.mean(axis=0) - body.target_ct):
+    for about in (np.zeros(3), picture.middle - body.target_ct):
         for shift in itertools.product(steps, repeat=3):
             move = about + shift
-            rows = np.flatnonzero(((points > low - move) & (points < high - move)).all(axis=1))
+            rows = np.flatnonzero(((points > picture.low - move) & (points < picture.high - move)).all(axis=1))
             some = rows[:: max(1, len(rows) // COARSE_SAMPLES)]
             inner, outer = (picture.at(points[some] + move + side * 4.0 * normals[some]) for side in (-1.0, 1.0))
             fall = inner - outer
@@ -432,13 +394,6 @@ def _searched(picture: _Picture, body: Body) -> Iterator[Floats]:
             tried.append((float(score), move))
     tried.sort(key=lambda one: -one[0])
     yield from (pose(np.eye(3), move) for _, move in tried[:3])
-
-
-def _small_metal(volume: Volume) -> Floats:
-    """Middles of the pieces of metal that may be markers, shape (n, 3), LPS mm."""
-    found = [piece for piece in metal_pieces(volume) if piece.size_mm <= LARGEST_MM and piece.voxels.sum() > 1]
-    middles = [centroid(metal_weights(volume, piece), piece.box, volume.T_ct_index) for piece in found]
-    return np.array([one for one in middles if np.isfinite(one).all()]).reshape(-1, 3)
 
 
 def _by_distances(markers: NamedPoints | None, pieces: Floats) -> Iterator[Floats]:
@@ -459,10 +414,6 @@ def _by_distances(markers: NamedPoints | None, pieces: Floats) -> Iterator[Float
     yield from (T for _, T in sorted(found, key=lambda one: one[0])[:3])
 
 
-def _area(corners: Floats) -> float:
-    return float(np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0])))
-
-
 def _by_markers(volume: Volume, body: Body, fit: _Fit, pieces: Floats, same_frame: bool) -> Tie:
     """The tie by three markers or more that the scan shows where the body has them; else by the body."""
     R = fit.T[:3, :3]
@@ -471,9 +422,11 @@ def _by_markers(volume: Volume, body: Body, fit: _Fit, pieces: Floats, same_fram
     cov_body = turn.T @ X @ fit.cov @ X.T @ turn
     by_body = partial(_tie, fit.T, cov_body, body, "body", fit.residual_mm, fit.found, same_frame)
     rows, columns = _paired(body.markers, pieces, fit.T)
-    if body.markers is None or len(rows) < 3 or not _area(body.markers.points[rows][:3]) > 100.0:
+    if body.markers is None or len(rows) < 3:
         return by_body([])
     known, seen = body.markers.points[rows], pieces[columns]
+    if not np.linalg.norm(np.cross(known[1] - known[0], known[2] - known[0])) > 100.0:  # mm², on a line
+        return by_body([])
     T = fit_rigid(known, seen)
     voxel = MARKER_SD_VOXEL * volume.T_ct_index[:3, :3]
     each = body.marker_cov + R.T @ voxel @ voxel.T @ R
@@ -488,11 +441,9 @@ def _by_markers(volume: Volume, body: Body, fit: _Fit, pieces: Floats, same_fram
     if size < LOOSE**2 and apart < APART**2:
         residual = float(np.sqrt(np.mean((left**2).sum(axis=1))))
         return _tie(T, cov, body, "markers", residual, fit.found, same_frame, [])
-    what = (
-        f"lie {np.sqrt(size):.1f} times as far from their places as declared"
-        if size >= LOOSE**2
-        else f"have the target {np.linalg.norm(off):.1f} mm from where skin and bone have it"
-    )
+    what = f"have the target {np.linalg.norm(off):.1f} mm from where skin and bone have it"
+    if size >= LOOSE**2:
+        what = f"lie {np.sqrt(size):.1f} times as far from their places as declared"
     numbers = {"times": float(np.sqrt(size)), "apart_mm": float(np.linalg.norm(off))}
     said = f"markers {what}: skin and bone tie the frames"
     return by_body([Finding("markers_moved", Severity.WARNING, said, numbers)])
@@ -500,9 +451,8 @@ def _by_markers(volume: Volume, body: Body, fit: _Fit, pieces: Floats, same_fram
 
 def _paired(markers: NamedPoints | None, pieces: Floats, T: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of markers and of the pieces of metal that lie where a placement (4, 4) has them."""
-    if markers is None or not len(pieces):
-        return np.zeros(0, np.intp), np.zeros(0, np.intp)
-    distance = np.linalg.norm(apply(T, markers.points)[:, None] - pieces, axis=2)
+    points = np.zeros((0, 3)) if markers is None else apply(T, markers.points)
+    distance = np.linalg.norm(points[:, None] - pieces, axis=2)
     rows, columns = linear_sum_assignment(np.minimum(distance, 10 * MARKER_MM))
     kept = distance[rows, columns] < MARKER_MM
     return rows[kept], columns[kept]
@@ -511,7 +461,6 @@ def _paired(markers: NamedPoints | None, pieces: Floats, T: Floats) -> tuple[NDA
 def _tie(
     T: Floats, cov: Floats, body: Body, how: str, residual: float, found: float, same_frame: bool, said: list[Finding]
 ) -> Tie:
-    """With what one frame of reference says beforehand; a patient who has moved is reported."""
     moved_mm = moved_deg = np.nan
     if same_frame:
         moved_mm = float(np.linalg.norm(apply(T, body.target_ct) - body.target_ct))

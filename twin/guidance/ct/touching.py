@@ -32,34 +32,29 @@ from puncture_twin.twin.devices import StoppedError, TouchingArm
 
 TOUCH_SPEED_MM_S = 2.0
 """Tip speed over the last millimetres."""
-
 NEAR_SPEED_MM_S = 25.0
 """Tip speed on the straight line before them, and back."""
-
 MOST_ASIDE_MM = 10.0
 """A marker that lies farther from its believed place is not the one that was planned to be touched."""
-
 PASSED_MM = 0.1
 """Rows of the line nearer to the tip than this are not returned to."""
-
 SAME_PLACE_MM = 1e-4
 """Rows whose tips are nearer to each other are one."""
 
 
 class TouchReading(NamedTuple):
-    """Reading of one touch."""
+    """Reading of one touch: joints (6,), rad, and the point (3,), mm, that the controller computes from them.
+
+    From the last standoff (or home) to this one it took `seconds`, with the largest force on the needle; at the
+    standoff the line was moved `aside_mm`.
+    """
 
     name: str
     point_base: Floats
-    """Shape (3,), mm: what the controller computes from its joints."""
     q: Floats
-    """Shape (6,), rad: its joints."""
     seconds: float
-    """From the last standoff (or home) to this one after the touch."""
     force_n: float
-    """The largest on the needle."""
     aside_mm: float
-    """By how much the line was moved at the standoff."""
 
 
 class FailedTouch(NamedTuple):
@@ -71,13 +66,7 @@ class FailedTouch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """Readings of all touches, in their order.
-
-    Attributes:
-        readings: One a marker that was touched.
-        failed: Marker to why it was not read, in words.
-        seconds: Home to home; where the arm stopped, of the touches before that.
-    """
+    """Readings of all touches, in their order; seconds from home to home, or up to the last touch before a stop."""
 
     readings: tuple[TouchReading, ...]
     failed: Mapping[str, str]
@@ -85,14 +74,7 @@ class Touched:
 
 
 def touch_tour(tour: TouchTour, arm: TouchingArm, checkers: ApproachCheckers, progress: Count) -> Touched:
-    """Touch every marker, and go home. Where the arm stops, what was not read by then stays unread.
-
-    Args:
-        tour: Where, in which order, by which motions.
-        arm: At home.
-        checkers: Of the workcell as it is believed: a line moved at the standoff is checked again.
-        progress: Called with touches done and all of them.
-    """
+    """Touch every marker, and go home. Where the arm stops, what was not read by then stays unread."""
     readings: list[TouchReading] = []
     failed: dict[str, str] = {}
     seconds = 0.0
@@ -114,12 +96,10 @@ def touch_tour(tour: TouchTour, arm: TouchingArm, checkers: ApproachCheckers, pr
 
 
 class _Line(NamedTuple):
-    """The straight line to a marker, set at the standoff."""
+    """Joints (m, 6), rad, from the standoff to where the slow part begins, and (k, 6) from there past the marker."""
 
     far: Floats
-    """Shape (m, 6), rad: from the standoff to where the slow part begins."""
     near: Floats
-    """Shape (k, 6): from there past the believed marker."""
     aside_mm: float
 
 
@@ -142,7 +122,6 @@ def _line(tour: TouchTour, touch: Touch, q: Floats, checkers: ApproachCheckers) 
 
 
 def _touch(tour: TouchTour, touch: Touch, line: _Line | str, arm: TouchingArm) -> TouchReading | FailedTouch:
-    """Come, approach until contact, read, go back to the standoff."""
     come = arm.move(touch.come, in_air=True)
     if isinstance(line, str):
         return FailedTouch(line, come.seconds)
@@ -168,7 +147,6 @@ def _back(tour: TouchTour, touch: Touch, line: _Line, q: Floats) -> Trajectory:
 
 
 def _slow(tour: TouchTour, q: Floats, speed_mm_s: float = NEAR_SPEED_MM_S) -> Trajectory:
-    """A smooth motion through configurations (m, 6), its tip at most so fast."""
     steps = np.linalg.norm(np.diff(nominal_tip(tour.model, tour.tip_mm, q), axis=0), axis=1)
     kept = np.concatenate([[True], steps > SAME_PLACE_MM])
     depths = np.concatenate([[0.0], np.cumsum(steps[kept[1:]])])

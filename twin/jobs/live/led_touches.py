@@ -16,13 +16,14 @@ from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import inputs_document
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.formats.points import NamedPoints, parse_points, write_points
+from puncture_twin.planning.formats.points import NamedPoints, write_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
 from puncture_twin.planning.search.choice import Choice
 from puncture_twin.twin.devices import Arm
 from puncture_twin.twin.jobs.terminal import write_result
+from puncture_twin.twin.plant.truth import read_points
 from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 
 TOUCH, SUMMARY = "touch.csv", "touch.json"
@@ -30,13 +31,7 @@ TOUCH, SUMMARY = "touch.csv", "touch.json"
 
 @dataclass(frozen=True, eq=False)
 class LedTouches:
-    """Markers as a case's CT shows those k of its n that were touched, and where the arm read them.
-
-    Attributes:
-        ct: LPS mm.
-        base: Base frame, mm, with the joints.
-        left_out: Names of those that were not touched.
-    """
+    """The k markers that were touched of a case's n, in its CT, and where the arm read them, base frame, mm."""
 
     case: Case
     ct: NamedPoints
@@ -49,18 +44,13 @@ class LedTouches:
         """Whether the readings register."""
         return len(self.base.names) >= MIN_MARKERS
 
-    @property
-    def residuals_mm(self) -> Floats | None:
-        """What the rigid fit leaves of each, shape (k,), mm; None of fewer than three."""
-        if not self.suffices:
-            return None
-        T_base_ct = fit_rigid(self.ct.points, self.base.points)
-        return np.asarray(np.linalg.norm(apply(T_base_ct, self.ct.points) - self.base.points, axis=1))
-
     def summary(self) -> dict[str, Any]:
-        """Plain values for JSON: mm and degrees."""
+        """Plain values for JSON: mm and degrees; what the rigid fit leaves of each marker, None of fewer than three."""
         assert self.base.joints is not None
-        left = self.residuals_mm
+        left: Floats | None = None
+        if self.suffices:
+            T_base_ct = fit_rigid(self.ct.points, self.base.points)
+            left = np.linalg.norm(apply(T_base_ct, self.ct.points) - self.base.points, axis=1)
         rows = zip(self.base.names, self.base.points, np.degrees(self.base.joints), strict=True)
         return {
             "case": self.case.name,
@@ -88,7 +78,6 @@ def touch_by_hand(case: Case, arm: Arm, ready: Callable[[str], bool], out: Path)
     """Read the arm at each of a case's markers, by its nominal kinematics; written as `markers_base` is read.
 
     Args:
-        arm: Whose needle somebody leads to the markers, in the order of their list.
         ready: Asks for a marker, and returns when the tip is on it; False where nobody touches any more.
 
     Raises:
@@ -97,8 +86,7 @@ def touch_by_hand(case: Case, arm: Arm, ready: Callable[[str], bool], out: Path)
     """
     if case.registration is None:
         refuse("no list of markers", case.path, "[registration] markers_ct", "no_markers")
-    name = case.registration.markers_ct
-    listed = parse_points(case.files.content(name), case.folder / name, default_space=case.space)
+    listed = read_points(case, case.registration.markers_ct, case.space)
     q = np.array([arm.measured_jp() for _ in takewhile(ready, listed.names)]).reshape(-1, 6)
     if not (count := len(q)):
         refuse("no marker was touched", "touch --host", "a line (Enter) for each, the tip on it", "empty")

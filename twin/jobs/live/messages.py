@@ -1,12 +1,8 @@
 """OpenIGTLink messages as bytes: read strictly, and written. Points and axes are RAS, mm, as they travel.
 
-Source: the OpenIGTLink protocol, versions 1 to 3 (openigtlink.org). All numbers are big-endian. A message is a header
-of 58 bytes (version, type, name, time, size and checksum of the body) and a body. With header version 2 the body is an
-extended header, the content, and metadata. The checksum is the CRC-64 of ECMA-182: most significant bit first, from 0.
-
-No library does this here. pyigtl (0.3.4) verifies no checksum, knows neither TDATA nor STATUS nor the scalars of a
-POLYDATA, and cannot read a POLYDATA; its checksum (crcmod) takes a second for one map where no compiler was at hand
-when it was installed. It is what the example and the tests speak with from the other end.
+Source: the OpenIGTLink protocol, versions 1 to 3 (openigtlink.org). Numbers are big-endian. A header of 58 bytes
+precedes the body; with header version 2 that is an extended header, the content, and metadata. The checksum is the
+CRC-64 of ECMA-182. pyigtl (0.3.4) verifies none, and cannot read a POLYDATA: the tests speak with it.
 """
 
 from __future__ import annotations
@@ -26,28 +22,22 @@ from puncture_twin.planning.base.numba_kernels import nb
 HEADER = struct.Struct(">H12s20sIIQQ")
 EXTENDED = struct.Struct(">HHII")
 """Size of the extended header, of the metadata's index and of the metadata, and the message's number."""
-
 NO_METADATA = b"\0\0"
 VERSIONS = (1, 2)
 MOST_BODY = 1 << 30
 """Bytes that a header may claim: an image that somebody sends by mistake is passed over, nonsense is not waited for."""
-
 KIND = re.compile(rb"[A-Z][A-Z0-9_]*\0*")
 MOST_TEXT = 65_535
 """Bytes of a STRING: its length has two."""
-
 ASCII, UTF8 = 3, 106
 """A text's encoding, by its number at IANA."""
-
 ORTHOGONAL = 1e-3
 """How far R^T R may be from 1: a tracker's own rounding; only the axis is used."""
-
 POINT = struct.Struct(">64s32s4B3ff20s")
 TRACKED = struct.Struct(">20sBB48s")
 IMAGE = struct.Struct(">HBBBB3H12f6H")
 UINT16, LITTLE, RAS = 5, 2, 1
 """An image's type of numbers, their order, and its space."""
-
 MESH = struct.Struct(">10I")
 SCALAR = struct.Struct(">BBI")
 POINT_SCALAR = 0x00
@@ -98,11 +88,7 @@ class Message(NamedTuple):
 
 
 def read_header(data: bytes) -> Header:
-    """A header of 58 bytes.
-
-    Raises:
-        InputError: It is none: whatever follows it cannot be told apart any more.
-    """
+    """A header of 58 bytes; none is refused: whatever follows it cannot be told apart any more."""
     version, kind, name, *rest = HEADER.unpack(data)
     if version not in VERSIONS or not KIND.fullmatch(kind):
         what = f"no header of a message (version {version}, type {kind!r})"
@@ -114,11 +100,7 @@ def read_header(data: bytes) -> Header:
 
 
 def read_message(header: Header, body: bytes) -> Message:
-    """The message of a header and its body.
-
-    Raises:
-        InputError: Another checksum, or parts that do not fit into the body.
-    """
+    """The message of a header and its body; another checksum, or parts that do not fit, are refused."""
     if checksum(body) != header.checksum:
         refuse("its checksum is another", f"{header.kind} {header.name}", "the CRC-64 of its body", "file_damaged")
     if header.version == 1:
@@ -139,8 +121,7 @@ def read_place(message: Message) -> Floats:
     """
     if message.kind == "TRANSFORM":
         return _finite(_matrix(message.content, message)[:, 3], message)
-    count, rest = divmod(len(message.content), POINT.size)
-    if count != 1 or rest:
+    if len(message.content) != POINT.size:
         _refuse_content(message, f"{len(message.content) / POINT.size:g} points", "one point", "wrong_count")
     return _finite(np.array(POINT.unpack(message.content)[6:9], float), message)
 
@@ -151,21 +132,19 @@ def read_pose(message: Message, name: str) -> tuple[Floats, Floats]:
     Raises:
         InputError: No such tool, a number that is not finite, or axes that no rotation has.
     """
-    content = _tool(message, name) if message.kind == "TDATA" else message.content
+    content = message.content
+    if message.kind == "TDATA":
+        if len(content) % TRACKED.size:
+            _refuse_content(message, f"{len(content)} bytes", f"{TRACKED.size} bytes a tool", "wrong_shape")
+        tools = {_word(tool): pose for tool, _, _, pose in TRACKED.iter_unpack(content)}
+        if name not in tools:
+            _refuse_content(message, f"no tool '{name}' among {len(tools)}", f"a tool '{name}'", "unknown_name")
+        content = tools[name]
     matrix = _finite(_matrix(content, message), message)
     R, size = matrix[:, :3], np.abs(matrix[:, :3]).max()
     if not size < 2.0 or np.abs(R.T @ R - np.eye(3)).max() > ORTHOGONAL or np.linalg.det(R) < 0.0:
         _refuse_content(message, "axes that no rotation has", "three unit vectors, right-handed", "not_rigid")
     return matrix[:, 3], R[:, 2] / np.linalg.norm(R[:, 2])
-
-
-def _tool(message: Message, name: str) -> bytes:
-    if len(message.content) % TRACKED.size:
-        _refuse_content(message, f"{len(message.content)} bytes", f"{TRACKED.size} bytes a tool", "wrong_shape")
-    tools = {_word(tool): content for tool, _, _, content in TRACKED.iter_unpack(message.content)}
-    if name not in tools:
-        _refuse_content(message, f"no tool '{name}' among {len(tools)}", f"a tool '{name}'", "unknown_name")
-    return tools[name]
 
 
 def _matrix(content: bytes, message: Message) -> Floats:
@@ -187,7 +166,6 @@ def _refuse_content(message: Message, what: str, allowed: str, code: str) -> Non
 
 
 def _word(field: bytes) -> str:
-    """Text of a field of fixed length; what is no ASCII names nothing here."""
     return field.split(b"\0", 1)[0].decode("ascii", "replace")
 
 
@@ -201,11 +179,7 @@ def packed(kind: str, name: str, stamp: Stamp, content: bytes) -> bytes:
 
 
 def text_content(text: str) -> bytes:
-    """Of a STRING.
-
-    Raises:
-        InputError: Too long for one.
-    """
+    """Of a STRING; one too long is refused."""
     data = text.encode()
     if len(data) > MOST_TEXT:
         refuse(f"an answer of {len(data)} bytes", "STRING", f"at most {MOST_TEXT} bytes", "too_large")
@@ -220,13 +194,7 @@ def point_content(point: Sequence[float] | Floats | None, name: str) -> bytes:
 
 
 def image_content(values: NDArray[np.uint16], first: tuple[float, float], step: float) -> bytes:
-    """Of an IMAGE of one slice.
-
-    Args:
-        values: Shape (rows, columns).
-        first: Coordinates of the first value, along a row and along a column.
-        step: From value to value.
-    """
+    """Of an IMAGE of one slice; `first` are coordinates along a row and along a column."""
     rows, columns = values.shape
     middle = first[0] + step * (columns - 1) / 2.0, first[1] + step * (rows - 1) / 2.0
     axes = (step, 0.0, 0.0, 0.0, step, 0.0, 0.0, 0.0, 1.0, *middle, 0.0)
@@ -235,13 +203,7 @@ def image_content(values: NDArray[np.uint16], first: tuple[float, float], step: 
 
 
 def mesh_content(points: Floats, cells: bytes, scalars: Mapping[str, NDArray[Any]]) -> bytes:
-    """Of a POLYDATA of quads with scalars.
-
-    Args:
-        points: Shape (p, 3).
-        cells: From `quad_bytes`.
-        scalars: Shape (p,) each, by name.
-    """
+    """Of a POLYDATA of quads (`quad_bytes`) with scalars."""
     count = len(cells) // (5 * 4)
     names = b"".join(name.encode() + b"\0" for name in scalars)
     head = MESH.pack(len(points), 0, 0, 0, 0, count, len(cells), 0, 0, len(scalars))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points import parse_joint_recording
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE
+from puncture_twin.twin.guidance.ct.needle import needle_error
 from puncture_twin.twin.jobs.live.rtde import RecordedState, connect, live_states
 
 MAX_RECORDING_BYTES = 200_000_000
@@ -34,7 +35,6 @@ class Mirrored(NamedTuple):
     T_ct_flange: Floats
     tip_ct: Floats
     to_target_mm: float
-    """Tip to target."""
     off_axis_mm: float
     """The target's distance from the needle's line: what a straight drive would miss by."""
 
@@ -61,11 +61,7 @@ class Mirror:
 
     @classmethod
     def of(cls, case: Case) -> Mirror:
-        """The mirror of a case.
-
-        Raises:
-            InputError: The case does not say where the robot stands, or its markers cannot be trusted.
-        """
+        """The mirror of a case that says where the robot is mounted, and whose markers can be trusted."""
         checked = checked_placement(case, user_cache())
         if checked is None:
             refuse(NO_BASE, case.path, ALLOWED_BASE, "no_base")
@@ -74,56 +70,9 @@ class Mirror:
     def show(self, state: RecordedState) -> Mirrored:
         """One joint state."""
         T = np.linalg.inv(self.T_base_ct) @ flange_pose(self.model, state.q)
-        forward = T[:3, 2]
-        tip = T[:3, 3] + self.needle_length_mm * forward
-        to_target = self.target_ct - tip
-        off = np.linalg.norm(to_target - (to_target @ forward) * forward)
-        return Mirrored(state.time_s, state.q, T, tip, float(np.linalg.norm(to_target)), float(off))
-
-    def follow(self, states: Iterable[RecordedState]) -> Iterator[Mirrored]:
-        """One after the other."""
-        return map(self.show, states)
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedJoints:
-    """A recording of an arm: CSV with times and joints, as ``export --format csv`` or an RTDE client writes it."""
-
-    path: Path
-    data: bytes
-
-    @classmethod
-    def read(cls, path: Path) -> RecordedJoints:
-        """Read the file, once.
-
-        Raises:
-            InputError: It cannot be read.
-        """
-        return cls(path, read_input(path, max_bytes=MAX_RECORDING_BYTES, where=str(path)))
-
-    @property
-    def input(self) -> Input:
-        """As an input of what is shown."""
-        return content_input("recording", self.path.name, self.data)
-
-    def states(self, case: Case | None = None) -> Iterator[RecordedState]:
-        """One row after the other; nothing before all are read.
-
-        Args:
-            case: Whose arm they are to be of, where the controller's own pose is recorded beside them.
-
-        Raises:
-            InputError: A column is missing, something is no number, or no such arm has them.
-        """
-        read = parse_joint_recording(self.data, self.path, timed=True)
-        assert read.time_s is not None
-        if case is not None:
-            check_recording(case.robot.model, case.needle.length_mm, read, where=self.path)
-        return map(RecordedState, read.time_s.tolist(), read.q)
-
-    def warnings(self) -> tuple[str, ...]:
-        """What the recording's end leaves open, one sentence each."""
-        return unfinished_warnings(self.data, self.path.name)
+        tip = T[:3, 3] + self.needle_length_mm * T[:3, 2]
+        error = needle_error(tip, T[:3, 2], self.target_ct)
+        return Mirrored(state.time_s, state.q, T, tip, error.tip_to_target_mm, error.lateral_mm)
 
 
 class Readings(NamedTuple):
@@ -134,23 +83,30 @@ class Readings(NamedTuple):
     warnings: tuple[str, ...] = ()
 
 
+def recorded(path: Path, case: Case | None = None) -> Readings:
+    """The rows of a recording, CSV as ``export --format csv`` or an RTDE client writes it; those of a case's arm.
+
+    Raises:
+        InputError: A file that cannot be read, a column is missing, something is no number, or no such arm has them.
+    """
+    data = read_input(path, max_bytes=MAX_RECORDING_BYTES, where=str(path))
+    read = parse_joint_recording(data, path, timed=True)
+    assert read.time_s is not None
+    if case is not None:
+        check_recording(case.robot.model, case.needle.length_mm, read, where=path)
+    inputs = (content_input("recording", path.name, data), *(() if case is None else case.inputs))
+    return Readings(map(RecordedState, read.time_s.tolist(), read.q), inputs, unfinished_warnings(data, path.name))
+
+
 def readings_of(
     host: str | None, recording: Path | None, case: Case, *, period_s: float, seconds: float | None
 ) -> Readings:
-    """The readings of a running arm, or of a recording.
-
-    Args:
-        seconds: How long it is read; None until it is interrupted.
-
-    Raises:
-        InputError: Not one of the two, an arm that does not answer, or a file that cannot be used.
-    """
+    """The readings of a running arm, for so many seconds or until it is interrupted, or of a recording."""
     if recording is None and host is not None:
         return Readings(live_states(connect(host), period_s=period_s, seconds=seconds), case.inputs)
     if recording is None or host is not None:
         refuse("two sources of joints, or none", "mirror", "HOST, or --from joints.csv", "conflicting_options")
-    read = RecordedJoints.read(recording)
-    return Readings(read.states(case), (read.input, *case.inputs), read.warnings())
+    return recorded(recording, case)
 
 
 def mirror_text(shown: Mirrored) -> str:

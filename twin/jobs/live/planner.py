@@ -1,19 +1,16 @@
 """What `live` answers: the safe map of a target, and the verdict of a needle's direction, as `check` gives it.
 
-A message is about one of three subjects, by its name:
-
     Target  a point       -> SafeMap (POLYDATA), SafeGrid (IMAGE), SafeMapInfo (STRING)
     Needle  a pose        -> Verdict (STRING), Entry (POINT)
     Query   a text        -> Status (STRING); GET_STATUS -> STATUS
 
-The needle's axis is z, from hub to tip; with f the target, p the tip and z the axis, its direction outward is -z, and
-its line passes the target at the distance |(f - p) - ((f - p)'z) z|. A verdict is that of the parallel path through the
-target. With its tip a = max((p - f)'z, 0) beyond the target and d beside it, no point of the needle lies farther from
-the path than sqrt(d^2 + a^2): by no more than the least slack of that path, and it keeps every margin. One that is off
-by more, or by more than `AIMED_MM`, is "not aimed", however safe that is.
+The needle's axis z runs from hub to tip; its line passes the target f at the distance |(f - p) - ((f - p)'z) z|, p the
+tip. A verdict is that of the parallel path through f. With its tip a = max((p - f)'z, 0) beyond f and d beside it, no
+point of the needle is farther from the path than sqrt(d^2 + a^2): by no more than that path's least slack it keeps
+every margin. One that is off by more, or by more than `AIMED_MM`, is "not aimed".
 
-What cannot be answered takes the place of the answer: a map without cells, a verdict "refused", no entry. So nothing
-that was said of an earlier target or needle stands where the newest is expected.
+What cannot be answered takes the place of the answer (a map without cells, a verdict "refused", no entry): nothing that
+was said of an earlier target or needle is left where the newest is expected.
 """
 
 from __future__ import annotations
@@ -58,34 +55,24 @@ from puncture_twin.twin.jobs.live.messages import (
 
 AIMED_MM = 2.0
 """A hand and a tracker together keep a needle on a line to about this."""
-
 NOT_AIMED = "not aimed"
 """The path is safe, and the needle is not on it."""
-
 LEFT_OUT = ("case", "inputs", "entry_ct_mm", "warnings", "findings")
 """Of a direction's summary: Status has them, or they are in the case's space."""
-
 FREE, NO_STRUCTURE = 0, 65_535
 """Values of SafeGrid where nothing blocks, and where no structure can be named."""
-
 ELSEWHERE_MM = 1e-6
 """Within this of the case's target another is as good."""
-
 WARM = 64
 """Directions that are checked before the first client comes: kernels are compiled then."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapMesh:
-    """The sphere on which a map is drawn: a quad for each of the n directions, half a step to each side.
+    """The sphere on which a map is drawn: a quad for each of the n directions, corners (4 n, 3) RAS, unit.
 
     Each quad has corners of its own, and so a colour of its own; scalars of cells would say the same, but the
     OpenIGTLink library (1.11, and later) takes them for tensors and reads beyond the message.
-
-    Attributes:
-        corners: Shape (4 n, 3), unit vectors, RAS.
-        cells: The quads as bytes of a POLYDATA.
-        radius_mm: The needle's length: with its tip on the target, its hub is on the sphere.
     """
 
     grid: AngleGrid
@@ -122,12 +109,7 @@ SUBJECTS = ("status", "target", "needle")
 
 @dataclass(eq=False)
 class Session:
-    """What a client has said: its target, and its needle.
-
-    Attributes:
-        context: Of the target; None after one that was refused.
-        needle: Its last question.
-    """
+    """What a client has said: its target, unless it was refused, and its needle."""
 
     context: CaseContext | None
     needle: Question | None = None
@@ -155,11 +137,7 @@ class Planner:
     """Answers the questions of many clients about one case, each with a target of its own."""
 
     def __init__(self, context: CaseContext) -> None:
-        """Prepare for questions: everything that is made once is made here.
-
-        Raises:
-            InputError: The case is in a frame of its own.
-        """
+        """Prepare for questions: everything that is made once is made here."""
         if context.case.space is Space.LOCAL:
             refuse('space "local": OpenIGTLink knows RAS', context.case.path, "a case of a patient", "local_space")
         self._mesh = MapMesh.of(context.case)
@@ -196,11 +174,7 @@ class Planner:
         return None if session.context is None else session.needle
 
     def answers(self, question: Question) -> Iterator[Answer]:
-        """The answers to a message, as they are found.
-
-        Raises:
-            InputError: No target or needle that can be answered.
-        """
+        """The answers to a message, as they are found; an `InputError` where there are none."""
         session = question.session
         if question.subject == "target":
             session.context = None  # an old target is not answered for, should this one be refused
@@ -253,7 +227,6 @@ class Planner:
         return _text("Status", stamp, document)
 
     def _map(self, found: SafeMap, stamp: Stamp) -> Iterator[Answer]:
-        """Mesh, grid and what they mean."""
         mesh, target_ras = self._mesh, _ras(found.target_ct)
         scalars: dict[str, NDArray[Any]] = {"blocked": found.blocked.astype(np.int64), "structure": found.structure}
         yield _answer("POLYDATA", "SafeMap", stamp, mesh.content(target_ras, scalars))
@@ -280,11 +253,14 @@ class Planner:
         ahead = float((case.target_ct - tip) @ axis)
         off = float(np.linalg.norm(case.target_ct - tip - ahead * axis))
         entry, q = found.candidates.path.entry_ct[0], found.candidates.arm.q_insertion[0]
-        verdict, text = _verdict_text(found, off, ahead), " ".join(line.strip() for line in found.head())
+        farthest = float(np.hypot(off, max(-ahead, 0.0)))  # a point of the needle from the path, up to its hub
+        aimed = farthest <= AIMED_MM and farthest <= slack_mm(found.candidates)
+        verdict, text = found.verdict, " ".join(line.strip() for line in found.head())
+        if found.safe:
+            verdict = found.candidates.safe_text if aimed else NOT_AIMED
         if verdict == NOT_AIMED:
-            text = (
-                f"{verdict}: the line passes the target at {off:.1f} mm, {ahead:.1f} mm ahead; parallel to it, {text}"
-            )
+            where = f"the line passes the target at {off:.1f} mm, {ahead:.1f} mm ahead"
+            text = f"{verdict}: {where}; parallel to it, {text}"
         point = _ras(entry) if np.isfinite(entry).all() else None
         document = {
             "verdict": verdict,
@@ -306,15 +282,6 @@ def explained(context: CaseContext, theta: float, beta: float) -> Explanation:
     return explained_ways(context, explain_choice(context, Choice(angles=(theta, beta))))
 
 
-def _verdict_text(found: Explanation, off_mm: float, ahead_mm: float) -> str:
-    """The verdict of the needle as it is held: beside its path, beyond the path's end, or both."""
-    if not found.safe:
-        return found.verdict
-    farthest = float(np.hypot(off_mm, max(-ahead_mm, 0.0)))  # a point of the needle from the path, up to its hub
-    aimed = farthest <= AIMED_MM and farthest <= slack_mm(found.candidates)
-    return found.candidates.safe_text if aimed else NOT_AIMED
-
-
 def slack_mm(candidates: Candidates) -> float:
     """By how much the first path keeps more than each margin, at least: beside what the needle may bend.
 
@@ -329,7 +296,6 @@ def slack_mm(candidates: Candidates) -> float:
 
 
 def _ras(point_ct: Floats) -> list[float]:
-    """A point of the CT frame in RAS."""
     return [float(one) for one in to_lps(point_ct[None], Space.RAS)[0]]
 
 

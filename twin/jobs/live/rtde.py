@@ -16,26 +16,18 @@ from puncture_twin.planning.formats.points import joint_readings
 
 RTDE_PORT = 30004
 """On which a controller tells its state; the only port that is used."""
-
 VARIABLES = ("timestamp", "actual_q")
 """What the controller is queried to tell."""
-
 MAX_HOST, MAX_LABEL = 253, 63
 """Characters of a name on a network, and between two of its dots (RFC 1035)."""
-
 ANSWER_S = 5.0
 """A controller that does not take the call within this time is not there."""
-
 SILENCE_S = 1.0
 """A controller that tells nothing new for so long has stopped: it tells its state at least every 8 ms."""
-
-
 STILL_RAD, STILL_S = np.radians(0.02), 0.5
 """An arm rests that has not turned a joint by more for so long, by its own clock."""
-
 NEAR_RAD = np.radians(0.5)
 """An arm that is led rests where it is wished when no joint is farther from there."""
-
 LED_S = 300.0
 """By its clock, an arm that is not led to rest by then is not led."""
 
@@ -45,32 +37,29 @@ class Receiver(Protocol):
 
     def getActualQ(self) -> list[float]:  # noqa: N802  # the library's name
         """The joint angles, rad."""
-        ...
 
     def getTimestamp(self) -> float:  # noqa: N802  # the library's name
         """Seconds since the controller started; 0 before its first word."""
-        ...
 
     def isConnected(self) -> bool:  # noqa: N802  # the library's name
         """Whether the line stands."""
-        ...
 
 
 class RecordedState(NamedTuple):
-    """The joints at one time."""
+    """The joints (6,), rad, at one time."""
 
     time_s: float
     q: Floats
-    """Shape (6,), rad."""
 
 
 def connect(host: str, command: str = "mirror") -> Receiver:
-    """The receiving half of RTDE; the controlling half is never opened.
-
-    Raises:
-        InputError: The extra is not installed, or no robot answers there.
-    """
-    _check_host(host, command)
+    """The receiving half of RTDE; the controlling half is never opened. Who does not answer is refused."""
+    labels = [len(label) for label in host.removesuffix(".").split(".")]
+    fits = len(host) <= MAX_HOST and min(labels) > 0 and max(labels) <= MAX_LABEL
+    if not fits or not host.isprintable() or any(map(str.isspace, host)):
+        what = f"host name of {len(host)} characters, {min(labels)} to {max(labels)} between dots, or with spaces"
+        allowed = f"a name or address of 1 to {MAX_HOST} characters, 1 to {MAX_LABEL} between dots"
+        refuse(what, f"{command} {host}", allowed, "bad_host")
     require_extra("mirror", command)
     from rtde_receive import RTDEReceiveInterface
 
@@ -84,15 +73,6 @@ def connect(host: str, command: str = "mirror") -> Receiver:
     return receiver
 
 
-def _check_host(host: str, command: str) -> None:
-    labels = [len(label) for label in host.removesuffix(".").split(".")]
-    fits = len(host) <= MAX_HOST and min(labels) > 0 and max(labels) <= MAX_LABEL
-    if not fits or not host.isprintable() or any(map(str.isspace, host)):
-        what = f"host name of {len(host)} characters, {min(labels)} to {max(labels)} between dots, or with spaces"
-        allowed = f"a name or address of 1 to {MAX_HOST} characters, 1 to {MAX_LABEL} between dots"
-        refuse(what, f"{command} {host}", allowed, "bad_host")
-
-
 def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -> Iterator[RecordedState]:
     """What a receiver reads, every so often; nothing twice. Time and angles may be one package (8 ms) apart.
 
@@ -104,7 +84,10 @@ def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -
     """
     start, last, heard = None, 0.0, time.monotonic()
     while True:
-        state = told(receiver.getTimestamp(), receiver.getActualQ())
+        time_s, where = receiver.getTimestamp(), "the robot's answer"
+        if not np.isfinite(time_s):
+            refuse(f"a time of {time_s} s", where, "a finite time", "not_finite")
+        state = RecordedState(float(time_s), joint_readings([receiver.getActualQ()], "rad", where=where)[0])
         if state.time_s != last:
             start = state.time_s if start is None else start
             last, heard = state.time_s, time.monotonic()
@@ -118,32 +101,15 @@ def live_states(receiver: Receiver, *, period_s: float, seconds: float | None) -
         time.sleep(period_s)
 
 
-def told(time_s: float, q: list[float]) -> RecordedState:
-    """A controller's word, if it is a time and six angles that an arm can have; else an `InputError`."""
-    if not np.isfinite(time_s):
-        refuse(f"a time of {time_s} s", "the robot's answer", "a finite time", "not_finite")
-    return RecordedState(float(time_s), joint_readings([q], "rad", where="the robot's answer")[0])
-
-
 @dataclass(frozen=True)
 class LedArm:
-    """A UR that somebody else moves, by hand or by its pendant: an `Arm` that reads, and waits until it is there.
-
-    Attributes:
-        receiver: As `connect` gives it.
-        period_s: Between two readings.
-    """
+    """A UR that somebody else moves, by hand or by its pendant: an `Arm` that reads, and waits until it is there."""
 
     receiver: Receiver
     period_s: float = 0.02
 
     def measured_jp(self) -> Floats:
-        """Joints (6,), rad, of the first rest from now on: the mean of what the encoders say while it lasts.
-
-        Raises:
-            InputError: The robot hangs up or falls silent.
-            NoAnswerError: It does not come to rest within `LED_S`.
-        """
+        """Joints (6,), rad, of the first rest from now on, a mean; a `NoAnswerError` where none begins in `LED_S`."""
         return next(self._rests())
 
     def move_jp(self, q: Floats) -> None:

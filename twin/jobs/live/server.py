@@ -1,16 +1,10 @@
 """The sockets of `live`: messages of many clients in, newest questions to the planner, newest answers out.
 
-Each client has two threads that wait, one to read and one to send; one more thread computes one answer after the other.
-Between them nothing queues: of each client there waits at most one question of each subject, and one answer of each
-name. A newer one takes its place, so that a needle that is tracked at 50 Hz is answered as it is now, as often as the
-planner can.
-
-What a client does wrong costs that client alone: what is no message, stays half, or is never read, ends its connection
-with one line in the log; what is a message with something wrong in it is answered, and passed over. A client is read a
-limited amount in a time; beyond that its bytes wait in its own socket.
-
-pyigtl's own server is not used: it reads whatever size a header claims into memory, serves one client while others
-wait, answers all of them from one queue, and prints a traceback for each message that it cannot read.
+Each client has two threads, one to read and one to send; one more computes one answer after the other. Nothing queues:
+of each client there waits at most one question of each subject, and one answer of each name; a newer one takes its
+place. What is no message, stays half, or is never read, ends its connection with one line in the log; what is a message
+with something wrong in it is answered. A client is read a limited amount in a time. (pyigtl's own server reads whatever
+size a header claims, and serves one client while others wait.)
 """
 
 from __future__ import annotations
@@ -20,7 +14,6 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from ipaddress import ip_address
 from itertools import count
@@ -30,33 +23,24 @@ from puncture_twin.twin.jobs.live.messages import HEADER, Header, read_header, r
 from puncture_twin.twin.jobs.live.planner import SUBJECTS, Answer, Planner, Question
 
 LOG = logging.getLogger(__name__)
-
 MOST_CLIENTS = 8
 MOST_KEPT = 65_536
 """Bytes of a body that is kept: 900 tracked tools. A larger one is passed over."""
-
 CHUNK = 65_536
 MOST_AT_ONCE, REST_S = 20, 0.005
 """So many messages, or as many bytes as a chunk, before a client is not read for a while: 4,000 in a second, 13 MB."""
-
 MESSAGE_S = 5.0
 """A message that has begun is whole after this time, or its sender is gone."""
-
 STALL_S = 10.0
 """An answer that is not taken in this time has no reader."""
-
 VANISHED_S, PROBES = 20.0, 4
 """A client whose machine acknowledges nothing in this time is gone; one that is silent is probed so often in it."""
-
 POSE_S = 2.0
 """A pose counts so long: a tracker that stopped leaves no verdict behind."""
-
 SEND_BUFFER = 262_144
 """Bytes that the system keeps for a client: what waits there cannot be replaced by what is newer."""
-
 MOST_LINES, LINES_S = 20, 60.0
 """So many lines in the log in this time."""
-
 USED = "the messages of docs/reference/live.md"
 
 
@@ -177,11 +161,7 @@ class Log:
 
 
 def bound(host: str, port: int) -> socket.socket:
-    """A socket that listens: a port that is taken is told before a case is read. Clients wait until `serve`.
-
-    Raises:
-        InputError: No such address here, or the port is taken.
-    """
+    """A socket that listens; a port that is taken is told before a case is read. Clients wait until `serve`."""
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.socket(family, socket.SOCK_STREAM)
@@ -202,12 +182,7 @@ def bound(host: str, port: int) -> socket.socket:
 
 
 def serve(listener: socket.socket, planner: Planner, pose_s: float = POSE_S) -> None:
-    """Answer clients until it is interrupted; the port is free then.
-
-    Args:
-        listener: From `bound`; closed at the end.
-        pose_s: How long a needle's pose counts.
-    """
+    """Answer clients until it is interrupted; the port is free then. A needle's pose counts so many seconds."""
     exchange, log, clients = Exchange(pose_s), Log(), dict[int, Client]()
     computing = threading.Thread(target=_compute, args=(exchange, planner), daemon=True)
     computing.start()
@@ -246,19 +221,18 @@ def _compute(exchange: Exchange, planner: Planner) -> None:
 
 
 def _answer(exchange: Exchange, planner: Planner, question: Question) -> None:
-    for answer in _found(planner, question):
-        exchange.give(question.client, answer)
-
-
-def _found(planner: Planner, question: Question) -> Iterator[Answer]:
-    """The answers, or why there are none."""
+    """Give the answers, or why there are none."""
+    fault = None
     try:
-        yield from planner.answers(question)
+        for answer in planner.answers(question):
+            exchange.give(question.client, answer)
     except PlanningError as error:
-        yield from planner.refused(question.subject, question.stamp, error)
+        fault = error
     except Exception as error:  # the last line of defence: the others are answered on
         LOG.exception("live: the program failed")
-        yield from planner.refused(question.subject, question.stamp, PlanningError(f"the program failed: {error!r}"))
+        fault = PlanningError(f"the program failed: {error!r}")
+    for answer in () if fault is None else planner.refused(question.subject, question.stamp, fault):
+        exchange.give(question.client, answer)
 
 
 def _notice_the_vanished(connection: socket.socket) -> None:
@@ -337,7 +311,6 @@ class Client:
             self._broken(error, "half_a_message", f"a message is not whole after {MESSAGE_S:g} s")
 
     def _first(self) -> bytes:
-        """The next message's first byte, whenever it comes; none at the end."""
         self._in.settimeout(None)
         return self._in.recv(1)
 
@@ -372,7 +345,6 @@ class Client:
                 self._exchange.give(self._number, answer)
 
     def _exactly(self, size: int, until: float) -> bytes:
-        """So many bytes."""
         data = bytearray()
         while len(data) < size:
             left = until - time.monotonic()

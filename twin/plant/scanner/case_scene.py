@@ -1,7 +1,4 @@
-"""A case as a scene in the scanner: its structures with Hounsfield units, markers of metal, the table, a needle.
-
-`scan_grid` gives the voxels of a scan: the whole body, or as much of it as the field of view shows.
-"""
+"""A case as a scene in the scanner: its structures with Hounsfield units, markers of metal, the table, a needle."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from puncture_twin.planning.anatomy.unseen import BEYOND_LABELS
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case, bed_frame
-from puncture_twin.planning.formats.points import NamedPoints, parse_points
+from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.formats.volumes.volume_header import VolumeGrid
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -38,6 +35,7 @@ from puncture_twin.twin.plant.scanner.image import (
     rod,
     scan_solids,
 )
+from puncture_twin.twin.plant.truth import read_points
 
 METAL_HU = 8000.0
 """Steel and titanium lie beyond what 12 bits hold; how far is declared as ours."""
@@ -54,14 +52,9 @@ HU_OF_GROUP = MappingProxyType(
         "pelvis": 400.0,  # ours
         "limbs and girdles": 700.0,
         "skull and face": 900.0,
-        "spinal cord": 35.0,  # as grey and white matter
-        "brain": 35.0,
-        "aorta and venae cavae": 45.0,
-        "great vessels of the chest and neck": 45.0,
-        "portal vein": 45.0,
-        "iliac vessels": 45.0,
-        "other vessels": 45.0,
-        "heart": 45.0,
+        **dict.fromkeys(("spinal cord", "brain"), 35.0),  # as grey and white matter
+        **dict.fromkeys(("aorta and venae cavae", "great vessels of the chest and neck", "portal vein"), 45.0),
+        **dict.fromkeys(("iliac vessels", "other vessels", "heart"), 45.0),
         "lungs": -800.0,
         "airways": -1000.0,
         "gallbladder and bile ducts": 8.0,  # ours: nearly water
@@ -79,30 +72,21 @@ HU_OF_GROUP = MappingProxyType(
     }
 )
 """By group of the table of default roles (`planning.anatomy.default_roles`)."""
-
 OF_NAME = MappingProxyType({"bolt": METAL_HU, "unnamed_dense": 700.0, "unnamed_gas": -1000.0})
 """By the beginning of a name, before the groups."""
 
 
 def default_hu(name: str, region: str) -> float:
-    """Hounsfield units of a structure by its name.
-
-    Args:
-        name: In any spelling.
-        region: As the case states it.
-    """
-    for start, hu in OF_NAME.items():
-        if name.lower().startswith(start):
-            return hu
+    """Hounsfield units of a structure by its name."""
     line = default_role(name, region)
-    return SOFT_TISSUE_HU if line is None else HU_OF_GROUP.get(line.group, SOFT_TISSUE_HU)
+    by_group = SOFT_TISSUE_HU if line is None else HU_OF_GROUP.get(line.group, SOFT_TISSUE_HU)
+    return next((hu for start, hu in OF_NAME.items() if name.lower().startswith(start)), by_group)
 
 
 MARKER_MM, MARKER_THICK_MM = 8.0, 1.5
 """A disc of metal of the size of a shirt button (ours; Chen 2019 does not state one); a ball has the diameter."""
 MOST_UNIFORM = np.sqrt(12.0)
 """Width of a cell over the standard deviation of what is read to it."""
-
 MarkerKind = Literal["disc", "ball", "none"]
 
 
@@ -118,8 +102,6 @@ class Part(NamedTuple):
     """One body outside of a patient; a later one fills the place of an earlier one.
 
     Attributes:
-        mesh: Closed, mm.
-        hu: What it is made of, Hounsfield units.
         place: ``beneath`` the patient, as the bed; ``upon`` them, as arms and lines, which the body displaces;
             ``within`` an arm, as its bones, which displace the body.
     """
@@ -139,13 +121,9 @@ class CaseScene:
     """Content of the scanner, in its frame (LPS of the scan, mm).
 
     Attributes:
-        solids: In the order in which they fill each other's place.
         T_scan_ct: Shape (4, 4): the case's frame to the scanner's; a rotation, never a mirror.
         cut: Shape (3, 2): at which ends the body goes on beyond its surface.
         tables: Shape (2, 3): the box about what the patient lies on; infinite without any.
-        markers: True positions, or None.
-        listed: The case's own readings of them.
-        target: Shape (3,).
     """
 
     solids: tuple[Solid, ...]
@@ -160,29 +138,20 @@ class CaseScene:
 
 
 def case_scene(
-    case: Case,
-    anatomy: Anatomy,
-    settings: ScanSettings,
-    rng: np.random.Generator,
-    *,
-    marker: MarkerKind = "disc",
-    needle: TrueRod | None = None,
-    outside: Placer | None = None,
-) -> CaseScene:
+    case: Case, anatomy: Anatomy, settings: ScanSettings, rng: np.random.Generator, *,
+    marker: MarkerKind = "disc", needle: TrueRod | None = None, outside: Placer | None = None,
+) -> CaseScene:  # fmt: skip
     """Place a case in the scanner.
 
     Args:
-        settings: By how much the patient is rotated; the cells of readings where the case declares none.
         rng: Draws each true marker in its cell.
-        marker: What stands at each marker's place.
-        needle: Drawn of metal, its usable length.
-        outside: Places what lies outside of the patient.
 
     Raises:
         InputError: A structure's surface is open.
     """
-    T = scan_frame(case, settings.turn)
-    listed = None if marker == "none" else _listed_markers(case)
+    T, listed = scan_frame(case, settings.turn), None
+    if marker != "none" and case.registration is not None:
+        listed = read_points(case, case.registration.markers_ct, case.space)
     true = None if listed is None else _drawn_in_cells(case, listed, settings, rng)
     skin = anatomy.skin.mesh.transformed(T)
     target = apply(T, case.target_ct)
@@ -193,20 +162,17 @@ def case_scene(
     if needle is not None:
         start = needle.tip_ct - case.needle.shaft_mm * needle.forward_ct
         solids.append(Solid("needle", rod(start, needle.tip_ct, case.needle.diameter_mm), METAL_HU))
-    tables, (body, *rest) = _moved_solids(_tables(case), T), _moved_solids(solids, T)
-    beneath, upon, within = (_laid(laid, place) for place in ("beneath", "upon", "within"))
-    view = anatomy.skin.field_of_view
-    return CaseScene(
-        solids=(*tables, *beneath, *upon, body, *within, *rest),
-        T_scan_ct=T,
-        skin=skin,
-        cut=np.zeros((3, 2), np.bool_) if view is None else view.cut,
-        tables=_bounds([one.mesh for one in (*tables, *beneath)]),
-        outside_objects=laid,
-        markers=_moved(true, T),
-        listed=_moved(listed, T),
-        target=target,
+    tables, (body, *rest) = (
+        [one._replace(mesh=one.mesh.transformed(T)) for one in part] for part in (_tables(case), solids)
     )
+    beneath, upon, within = (
+        [Solid(one.name, one.mesh, one.hu) for one in laid if one.place == place]  # no segmentation names them
+        for place in ("beneath", "upon", "within")
+    )
+    view, around = anatomy.skin.field_of_view, _bounds([one.mesh for one in (*tables, *beneath)])
+    cut = np.zeros((3, 2), np.bool_) if view is None else view.cut
+    filled = (*tables, *beneath, *upon, body, *within, *rest)
+    return CaseScene(filled, T, skin, cut, around, laid, _moved(true, T), _moved(listed, T), target)
 
 
 def scan_frame(case: Case, turn: float) -> Floats:
@@ -214,9 +180,6 @@ def scan_frame(case: Case, turn: float) -> Floats:
 
     A frame of its own is laid on the bed by its rotation: z along `bed_frame`'s x, y against its z, x = y × z. Its
     determinant is 1, where swapping two axes would be a mirror that no distance shows.
-
-    Args:
-        turn: About the bed's direction through the target, rad.
     """
     R = np.eye(3)
     if case.space is Space.LOCAL:
@@ -255,7 +218,8 @@ def _body(case: Case, anatomy: Anatomy) -> list[Solid]:
     }
     region = case.region or "other"
     ordered = sorted((one for one in anatomy.structures if one.name in places), key=_filling)
-    skin = Solid("skin", anatomy.skin.mesh, stated.get(_skin_name(case), SOFT_TISSUE_HU))
+    skin_name = next(one.name for one in case.structure if one.role == "skin")
+    skin = Solid("skin", anatomy.skin.mesh, stated.get(skin_name, SOFT_TISSUE_HU))
     hu = {s.name: stated.get(s.name, default_hu(s.name, region)) for s in ordered}
     solids = [Solid(s.name, s.mesh, hu[s.name], *places[s.name], whole=s.demands_margin) for s in ordered]
     return [check_closed(one, str(case.path)) for one in (skin, *solids)]
@@ -267,12 +231,7 @@ def _filling(structure: Structure) -> tuple[bool, float, float]:
     return structure.demands_margin, structure.margin_mm, -abs(float(volume))
 
 
-def _skin_name(case: Case) -> str:
-    return next(one.name for one in case.structure if one.role == "skin")
-
-
 def _tables(case: Case) -> list[Solid]:
-    """Boxes in the CT's frame: a shell about foam."""
     solids = []
     for one in case.obstacles:
         if one.frame == "ct":
@@ -280,22 +239,6 @@ def _tables(case: Case) -> list[Solid]:
             if one.size_mm.min() > 2 * SHELL_MM:
                 solids.append(Solid(one.name, box(one.center_mm, one.size_mm - 2 * SHELL_MM), FOAM_HU))
     return solids
-
-
-def _laid(parts: Sequence[Part], place: str) -> list[Solid]:
-    """Solids of the outside objects; no segmentation names them."""
-    return [Solid(one.name, one.mesh, one.hu) for one in parts if one.place == place]
-
-
-def _moved_solids(solids: Sequence[Solid], T_scan_ct: Floats) -> list[Solid]:
-    return [one._replace(mesh=one.mesh.transformed(T_scan_ct)) for one in solids]
-
-
-def _listed_markers(case: Case) -> NamedPoints | None:
-    if case.registration is None:
-        return None
-    name = case.registration.markers_ct
-    return parse_points(case.files.content(name), case.folder / name, default_space=case.space)
 
 
 def _drawn_in_cells(case: Case, listed: NamedPoints, settings: ScanSettings, rng: np.random.Generator) -> NamedPoints:
@@ -327,7 +270,6 @@ def _moved(points: NamedPoints | None, T_scan_ct: Floats) -> NamedPoints | None:
 
 
 def _bounds(meshes: Sequence[TriangleMesh]) -> Floats:
-    """Lowest and highest corner of all solids, shape (2, 3), mm."""
     if not meshes:
         return np.array([np.full(3, np.inf), np.full(3, -np.inf)])
     bounds = np.stack([mesh.bounds for mesh in meshes])
@@ -369,10 +311,6 @@ def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator
     """The voxels of a scan, axes along LPS.
 
     Where the first of them falls is drawn within one voxel: a patient lies anywhere between two slices.
-
-    Args:
-        scene: What lies in the scanner; where the body goes on beyond its surface, the scan ends within it.
-        rng: Draws where the grid falls.
     """
     low, high = _shown(scene, settings)
     spacing = np.array([settings.pixel_mm, settings.pixel_mm, settings.spacing_mm])
@@ -388,7 +326,6 @@ def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator
 
 
 def _shown(scene: CaseScene, settings: ScanSettings) -> tuple[Floats, Floats]:
-    """Lowest and highest corner of the image."""
     low, high = scene.skin.bounds
     low = low - np.where(scene.cut[:, 0], 0.0, AIR_MM)
     high = high + np.where(scene.cut[:, 1], 0.0, AIR_MM)

@@ -23,40 +23,24 @@ LEAST_LINES = 3
 
 
 class Cut(NamedTuple):
-    """Mean value and label of each voxel by the lines through it.
-
-    Attributes:
-        values: Shape (nx, ny, nz), float32, the mean over each voxel.
-        labels: Shape (layers, nx, ny, nz), uint8 or uint16: what is labelled at each voxel's centre; 0 for nothing.
-    """
+    """Mean value of each voxel (nx, ny, nz), and (layers, nx, ny, nz) the label at its centre; 0 for nothing."""
 
     values: NDArray[np.float32]
     labels: NDArray[Any]
 
 
 def cut_solids(
-    corners: Floats,
-    owners: NDArray[np.int64],
-    fills: Floats,
-    labels: NDArray[Any],
-    shape: tuple[int, int, int],
-    *,
-    spacing_mm: Floats,
-    empty: float,
-) -> Cut:
+    corners: Floats, owners: NDArray[np.int64], fills: Floats, labels: NDArray[Any], shape: tuple[int, int, int], *,
+    spacing_mm: Floats, empty: float,
+) -> Cut:  # fmt: skip
     """Mean of what fills each voxel, and the label at its centre.
 
     Args:
         corners: Triangles of all solids, shape (m, 3, 3), in voxels: a voxel's centre has whole coordinates.
-        owners: Which solid each triangle belongs to, shape (m,).
         fills: Value of each solid, shape (n,); a later one fills the place of an earlier one.
-        labels: Of each solid in each label map, shape (layers, n); 0 where a map does not show it.
-        shape: Of the grid.
-        spacing_mm: Of the voxels, shape (3,); it says how many lines there are.
-        empty: Value where no solid is.
     """
     nx, ny, nz = shape
-    lines, planes = (_odd(spacing) for spacing in spacing_mm[1:])
+    lines, planes = (max(LEAST_LINES, 2 * int(np.ceil(mm / LINE_MM / 2)) + 1) for mm in spacing_mm[1:])
     values = np.empty((nz, ny, nx), np.float32)
     marks = np.zeros((len(labels), nz, ny, nx), labels.dtype)
     starts, members = _of_slices(corners, nz)
@@ -64,10 +48,6 @@ def cut_solids(
         some = members[starts[k] : starts[k + 1]]
         _slice(corners[some], owners[some], fills, labels, (k, lines, planes), empty, values[k], marks[:, k])
     return Cut(values.transpose(2, 1, 0), marks.transpose(0, 3, 2, 1))
-
-
-def _odd(spacing_mm: float) -> int:
-    return max(LEAST_LINES, 2 * int(np.ceil(spacing_mm / LINE_MM / 2)) + 1)  # odd
 
 
 def _of_slices(corners: Floats, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -83,7 +63,6 @@ def _of_slices(corners: Floats, count: int) -> tuple[NDArray[np.int64], NDArray[
 
 @nb.njit(cache=True, nogil=True)
 def _slice(corners, owners, fills, labels, cuts, empty, values, marks):  # type: ignore[no-untyped-def]  # numba infers
-    """One slice: planes, lines on them, pieces of the lines."""
     ny, nx = values.shape
     k, subs, planes = cuts
     steps = np.zeros((ny, nx + 1))
@@ -180,7 +159,6 @@ def _lines_between(a, b, subs, within, lines):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _sort(xs, turns):  # type: ignore[no-untyped-def]
-    """By insertion: a line has a few dozen crossings."""
     for i in range(1, len(xs)):
         x, turn, j = xs[i], turns[i], i - 1
         while j >= 0 and xs[j] > x:
@@ -191,7 +169,6 @@ def _sort(xs, turns):  # type: ignore[no-untyped-def]
 
 @nb.njit(cache=True, nogil=True)
 def _topmost(top, solid, winding):  # type: ignore[no-untyped-def]
-    """The last solid that is there, after one has changed; -1 for none."""
     if winding[solid] != 0:
         return max(top, solid)
     if solid == top:
@@ -223,7 +200,6 @@ def _add_line(xs, turns, fills, empty, winding, steps):  # type: ignore[no-untyp
 
 @nb.njit(cache=True, nogil=True)
 def _mark_line(xs, turns, labels, winding, marks):  # type: ignore[no-untyped-def]
-    """The label of the last labelled solid at each centre of a row."""
     nx, top, begin = len(marks), -1, 0
     for e in range(len(xs)):
         solid = abs(turns[e]) - 1

@@ -1,7 +1,4 @@
-"""A CT image of solids: exact partial volume, blur in the plane, noise, and the range that a scanner stores.
-
-A `Solid` is a closed surface with Hounsfield units; balls, rods and boxes are the simple bodies of devices.
-"""
+"""A CT image of solids: exact partial volume, blur in the plane, noise, and the range that a scanner stores."""
 
 from __future__ import annotations
 
@@ -32,16 +29,10 @@ BLUR_ENDS = 3.0
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """Settings of a scan.
+    """Settings of a scan: noise of each voxel on its own, full width at half maximum of the blur in the plane.
 
     Attributes:
-        spacing_mm: Of the slices, which are as thick.
-        pixel_mm: In the plane, square.
-        noise_hu: Standard deviation of a voxel, each on its own (in a real scan neighbours are correlated).
-        blur_mm: Full width at half maximum of the Gaussian blur in the plane.
-        seed: Of the noise and of where the grid falls.
-        fov_mm: Side of the square image; None shows the whole body.
-        length_mm: Along the bed; None scans the whole body.
+        fov_mm: Side of the square image; None shows the whole body, as no ``length_mm`` along the bed does.
         turn: By which the patient is rotated about the bed's direction, rad.
     """
 
@@ -60,11 +51,8 @@ class CtImage:
     """A scan, with its ground truth.
 
     Attributes:
-        hu: Shape (nx, ny, nz), int16.
         labels: Shape (layers, nx, ny, nz): what is labelled at each voxel's centre, in each label map, and the parts of
-            whole solids that the centres miss.
-        grid: Where the voxels lie, LPS mm.
-        thin: Name of a solid to the number of voxels whose label its thin parts got.
+            whole solids that the centres miss; `thin` counts these by the solid's name.
     """
 
     hu: NDArray[np.int16]
@@ -74,18 +62,15 @@ class CtImage:
 
 
 def scan_solids(solids: Sequence[Solid], grid: VolumeGrid, settings: ScanSettings, rng: np.random.Generator) -> CtImage:
-    """Scan a scene in air.
-
-    Args:
-        solids: The scene in the scanner's frame, LPS mm; later ones fill the place of earlier ones.
-        grid: The voxels; axis k runs across the slices.
-    """
+    """Scan a scene in air: solids in the scanner's frame, LPS mm; later ones fill the place of earlier ones."""
     T_index_ct = np.linalg.inv(grid.T_ct_index)
     each = [apply(T_index_ct, solid.mesh.vertices)[solid.mesh.faces] for solid in solids]
     corners = np.concatenate(each)
     owners = np.repeat(np.arange(len(solids)), [len(solid.mesh.faces) for solid in solids])
     fills = np.array([solid.hu for solid in solids])
-    labels = _label_table(solids)
+    labels = np.zeros((1 + max(solid.layer for solid in solids), len(solids)), np.uint16)  # of each, in each map
+    labels[[solid.layer for solid in solids], np.arange(len(solids))] = [solid.label for solid in solids]
+    labels = labels.astype(np.uint8) if labels.max() <= np.iinfo(np.uint8).max else labels
     cut = cut_solids(corners, owners, fills, labels, grid.shape, spacing_mm=grid.spacing_mm, empty=AIR_HU)
     thin = _label_thin_parts(solids, each, labels, cut.labels)
     return CtImage(_stored(cut.values, grid.spacing_mm, settings, rng), cut.labels, grid, thin)
@@ -98,29 +83,18 @@ def _label_thin_parts(
     counts: dict[str, int] = {}
     for number, solid in enumerate(solids):
         if solid.whole and solid.label:
-            layer = labels[solid.layer]
             later = np.zeros(int(table[solid.layer].max()) + 1, bool)
             later[table[solid.layer, number + 1 :]] = True
             later[0] = False
-            missed = missed_voxels(layer, solid.label, corners[number], later)
-            layer[tuple(missed.T)] = solid.label
-            if len(missed):
-                counts[solid.name] = len(missed)
-    return counts
-
-
-def _label_table(solids: Sequence[Solid]) -> NDArray[Any]:
-    """Label of each solid in each map, shape (layers, n)."""
-    table = np.zeros((1 + max(solid.layer for solid in solids), len(solids)), np.uint16)
-    for number, solid in enumerate(solids):
-        table[solid.layer, number] = solid.label
-    return table.astype(np.uint8) if table.max() <= np.iinfo(np.uint8).max else table
+            missed = missed_voxels(labels[solid.layer], solid.label, corners[number], later)
+            labels[solid.layer][tuple(missed.T)] = solid.label
+            counts[solid.name] = len(missed)
+    return {name: count for name, count in counts.items() if count}
 
 
 def _stored(
     values: NDArray[np.float32], spacing_mm: Floats, settings: ScanSettings, rng: np.random.Generator
 ) -> NDArray[np.int16]:
-    """Blurred slice by slice, with noise, rounded and clipped, shape as ``values``."""
     stored = np.empty(values.shape, np.int16, order="F")
     sigma = settings.blur_mm / FWHM_PER_SIGMA / spacing_mm[:2]  # in voxels
     for k in range(values.shape[2]):
@@ -137,12 +111,7 @@ MOST_SAMPLES = 1_000_000
 
 
 def passed_voxels(corners: Floats, shape: tuple[int, int, int]) -> Ints:
-    """The voxels that triangles pass, shape (m, 3), each once.
-
-    Args:
-        corners: Shape (n, 3, 3), in voxels: a voxel's centre has whole coordinates.
-        shape: Of the grid; what lies outside is left out.
-    """
+    """The voxels that triangles (n, 3, 3) pass, shape (m, 3), each once; all in voxels, centres whole."""
     found = [np.empty(0, np.int64)]
     for points in _samples(corners):
         index = np.floor(points + 0.5).astype(np.int64)  # a voxel reaches half a voxel to each side
@@ -152,13 +121,7 @@ def passed_voxels(corners: Floats, shape: tuple[int, int, int]) -> Ints:
 
 
 def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bools) -> Ints:
-    """Voxels that a structure passes while neither they nor their neighbours have its label, shape (m, 3).
-
-    Args:
-        labels: Shape (nx, ny, nz), what is labelled at each centre.
-        corners: Its triangles, shape (n, 3, 3), in voxels.
-        later: Shape (largest label + 1,), which labels fill the place of this one: their voxels are not missed.
-    """
+    """Voxels (m, 3) that a structure passes though neither they nor neighbours have its label, nor they a later one."""
     shape = (labels.shape[0], labels.shape[1], labels.shape[2])
     at = passed_voxels(corners, shape)
     if not len(at):
@@ -171,7 +134,6 @@ def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bool
 
 
 def _samples(corners: Floats) -> Iterator[Floats]:
-    """Points of triangles, at most `SAMPLE_VOXELS` apart, shape (m, 3) at a time."""
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     counts = np.maximum(1, np.ceil(edges / SAMPLE_VOXELS).astype(np.int64))  # pieces of the longest edge
     for count in np.unique(counts).tolist():
@@ -188,13 +150,10 @@ SIDES = 64
 
 
 class Solid(NamedTuple):
-    """One body in the scanner; a later one fills the place of an earlier one.
+    """One body in the scanner, Hounsfield units; a later one fills the place of an earlier one.
 
     Attributes:
-        mesh: Closed, mm.
-        hu: What it is made of, Hounsfield units.
-        label: Its number in its label map; 0 for what no segmentation names.
-        layer: Which label map shows it: bodies that hold others have one of their own.
+        label: Its number in its label map (bodies that hold others have one of their own); 0 where none names it.
         whole: Its label leaves out no part of it, however thin.
     """
 
@@ -207,11 +166,7 @@ class Solid(NamedTuple):
 
 
 def check_closed(solid: Solid, where: str) -> Solid:
-    """The solid; one without an inside is refused.
-
-    Raises:
-        InputError: Its surface is open.
-    """
+    """The solid; one without an inside is refused."""
     if not solid.mesh.closed:
         refuse(f"'{solid.name}' is not a closed surface", where, "closed surfaces", "open_mesh")
     return solid

@@ -1,7 +1,4 @@
-"""Writers of a scan: a DICOM series, CT Image Storage, one file a slice (PS3.3, A.3 and C.8.2), and NIfTI-1.
-
-NIfTI (nifti1.h, DFWG 2003): one file, its place as sform in RAS, gzip without a time.
-"""
+"""A scan as DICOM, one CT Image a file (PS3.3, A.3 and C.8.2), or NIfTI-1 (nifti1.h, DFWG 2003), sform in RAS."""
 
 from __future__ import annotations
 
@@ -25,23 +22,14 @@ DECIMAL_STRING = 16
 
 
 def write_series(folder: Path, image: CtImage, settings: ScanSettings, identity: str, name: str) -> list[Path]:
-    """Write a series into a folder.
-
-    Args:
-        folder: It is made.
-        identity: What the scan was made from: the same gives the same identifiers, anything else gives others.
-        name: Of the patient.
-
-    Returns:
-        The files, in the order of the slices.
-    """
+    """Write a series into a new folder; the same ``identity`` gives the same identifiers, any other gives others."""
     folder.mkdir(parents=True, exist_ok=True)
     T = image.grid.T_ct_index
     spacing = image.grid.spacing_mm
     axes = T[:3, :3] / spacing
     files = []
     for k in range(image.grid.shape[2]):
-        data = _identified(identity, k, name)
+        data = _image(identity, k, name, image.hu[:, :, k].T)
         data.ImageOrientationPatient = _decimals(axes[:, :2].T)
         data.ImagePositionPatient = _decimals(T[:3, 3] + k * T[:3, 2])
         data.PixelSpacing = _decimals(spacing[[1, 0]])
@@ -49,7 +37,6 @@ def write_series(folder: Path, image: CtImage, settings: ScanSettings, identity:
         data.SliceLocation = _decimals((T[:3, 3] + k * T[:3, 2]) @ axes[:, 2])[0]
         data.InstanceNumber = k + 1
         data.SeriesDescription = f"virtual CT {settings.spacing_mm:g} mm"
-        _with_pixels(data, image.hu[:, :, k].T)
         path = folder / f"IM{k + 1:04d}.dcm"
         data.save_as(path, enforce_file_format=True)
         files.append(path)
@@ -62,8 +49,7 @@ def uid(*parts: object) -> UID:
     return UID(f"2.25.{int(digest[:32], 16)}")
 
 
-def _identified(identity: str, k: int, name: str) -> FileDataset:
-    """An image with its identifiers and whatever must be there, if only empty; no date, nothing is measured."""
+def _image(identity: str, k: int, name: str, rows: NDArray[np.int16]) -> FileDataset:
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID = CTImageStorage
     meta.MediaStorageSOPInstanceUID = uid(identity, "image", k)
@@ -83,29 +69,18 @@ def _identified(identity: str, k: int, name: str) -> FileDataset:
     data.SeriesNumber, data.PatientPosition = 1, "HFS"
     data.ImageType = ["ORIGINAL", "PRIMARY", "AXIAL"]
     data.ImageComments = "simulated by puncture-twin: no patient"
-    return data
-
-
-def _with_pixels(data: FileDataset, rows: np.ndarray[tuple[int, int], np.dtype[np.int16]]) -> None:
     data.Rows, data.Columns = rows.shape
     data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
     data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 1
     data.RescaleSlope, data.RescaleIntercept, data.RescaleType = "1", "0", "HU"
     data.WindowCenter, data.WindowWidth = "40", "400"
     data.PixelData = np.ascontiguousarray(rows).astype("<i2", copy=False).tobytes()
+    return data
 
 
 def _decimals(numbers: Floats) -> list[str]:
-    """Decimal strings, as precise as fits."""
-    return [_decimal(float(number)) for number in np.ravel(numbers)]
-
-
-def _decimal(number: float) -> str:
-    for digits in range(15, 5, -1):
-        text = f"{number + 0.0:.{digits}g}"
-        if len(text) <= DECIMAL_STRING:
-            return text
-    return f"{number:.6g}"
+    texts = ([f"{number + 0.0:.{digits}g}" for digits in range(15, 4, -1)] for number in np.ravel(numbers).tolist())
+    return [next(text for text in those if len(text) <= DECIMAL_STRING) for those in texts]
 
 
 CODE_OF_TYPE = {name: code for code, name in TYPES.items()}
@@ -118,12 +93,7 @@ FAST = 1
 
 
 def write_nifti(path: Path, values: NDArray[Any], T_ct_index: Floats) -> Path:
-    """Write a ``.nii.gz``.
-
-    Args:
-        values: Shape (ni, nj, nk), whole numbers or floats.
-        T_ct_index: Shape (4, 4), voxel index to LPS mm; kept in single precision, as the format does.
-    """
+    """Write a ``.nii.gz``; T (4, 4), voxel index to LPS mm, is kept in single precision, as the format does."""
     code = CODE_OF_TYPE[values.dtype.str[1:]]
     header = bytearray(FIRST_VOXEL_BYTE)
     struct.pack_into("<i", header, 0, 348)
