@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+from typer import Argument, Option
 
 from puncture_twin.meshes import folder as meshes_folder
 from puncture_twin.planning.base.errors import require_extra
@@ -42,9 +43,7 @@ from puncture_twin.twin.report.progress import progress_display
 if TYPE_CHECKING:
     from puncture_twin.planning.search.choice import Choice
 
-MOST_SEEDS = 10_000
-"""Rooms or draws of one command; each takes seconds."""
-
+MOST_SEEDS = 10_000  # rooms or draws of one command; each takes seconds
 app = typer.Typer(no_args_is_help=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 """Plain help: in boxes, a terminal of 40 columns shows names of options cut off."""
 app.add_typer(batch_app, name="batch", help="Many cases: plan, run, status, merge, compare.")
@@ -83,45 +82,37 @@ def schema() -> None:
 
 @app.command()
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder with a CT and a segmentation.")],
-    target: Annotated[str | None, typer.Option("--target", help="Target position X,Y,Z, mm.")] = None,
-    target_label: Annotated[str | None, typer.Option("--target-label", help="Its deepest point is the target.")] = None,
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder with a CT and a segmentation.")],
+    target: Annotated[str | None, Option(help="Target position X,Y,Z, mm.")] = None,
+    target_label: Annotated[str | None, Option(help="Its deepest point is the target.")] = None,
     hit_radius: Annotated[
-        float | None,
-        typer.Option("--hit-radius", metavar="MM", help="The target is a ball of this radius, in no structure."),
+        float | None, Option(metavar="MM", help="The target is a ball of this radius, in no structure.")
     ] = None,
-    space: Annotated[
-        Space | None, typer.Option("--space", help="Space of the target, the case and meshes.", show_default="LPS")
-    ] = None,
-    region: Annotated[str | None, typer.Option("--region", help="Body region; default: inferred from organs.")] = None,
-    naming: Annotated[
-        str | None, typer.Option("--naming", help="Label names: totalsegmentator-v1, -v2, or a table.")
-    ] = None,
-    unit: Annotated[Unit | None, typer.Option("--unit", help="Unit of meshes; default: inferred from size.")] = None,
+    space: Annotated[Space | None, Option(help="Space of the target, the case and meshes.", show_default="LPS")] = None,
+    region: Annotated[str | None, Option(help="Body region; default: inferred from organs.")] = None,
+    naming: Annotated[str | None, Option(help="Label names: totalsegmentator-v1, -v2, or a table.")] = None,
+    unit: Annotated[Unit | None, Option(help="Unit of meshes; default: inferred from size.")] = None,
     up: Annotated[
-        Up | None,
-        typer.Option("--up", help="Up axis of meshes: y (rotated to z) or z; required for GLB.", show_default="z"),
+        Up | None, Option(help="Up axis of meshes: y (rotated to z) or z; required for GLB.", show_default="z")
     ] = None,
-    ct: Annotated[str | None, typer.Option("--ct", help="CT to use if FOLDER holds several.")] = None,
-    segmentation: Annotated[
-        str | None, typer.Option("--segmentation", help="Segmentation to use if FOLDER holds several.")
-    ] = None,
+    ct: Annotated[str | None, Option(help="CT to use if FOLDER holds several.")] = None,
+    segmentation: Annotated[str | None, Option(help="Segmentation to use if FOLDER holds several.")] = None,
     trust_labels: Annotated[
-        bool, typer.Option("--trust-labels", help="Accept the structures; you have checked them on the CT.")
+        bool, Option("--trust-labels", help="Accept the structures; you have checked them on the CT.")
     ] = False,
     skin: Annotated[
-        str | None, typer.Option("--skin", metavar="NAME", help="Structure that is the skin; default: found in the CT.")
+        str | None, Option(metavar="NAME", help="Structure that is the skin; default: found in the CT.")
     ] = None,
     ignore: Annotated[
-        list[str] | None, typer.Option("--ignore", metavar="NAME", help="Structure or file to leave out; repeatable.")
+        list[str] | None, Option(metavar="NAME", help="Structure or file to leave out; repeatable.")
     ] = None,
     unknown: Annotated[
-        list[str] | None, typer.Option("--unknown", metavar="NAME", help="Structure no path may cross; repeatable.")
+        list[str] | None, Option(metavar="NAME", help="Structure no path may cross; repeatable.")
     ] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a case key, such as ct.arms=none.")
+        list[str] | None, Option("--set", metavar="KEY=VALUE", help="Set a case key, such as ct.arms=none.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing case.toml.")] = False,
+    force: Annotated[bool, Option("--force", help="Replace an existing case.toml.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write FOLDER/case.toml from a CT and a segmentation. Roles and margins are the default ones."""
@@ -148,15 +139,13 @@ def search(
     arm: ArmOption = None,
     pictures: PicturesOption = True,
     engine: EngineOption = "fast",
-    check_again: Annotated[int, typer.Option("--cross-check", min=0, help="Directions to measure again with FCL.")] = 0,
-    certified: Annotated[bool, typer.Option("--certify", help="Also certify the angles between grid points.")] = False,
+    check_again: Annotated[int, Option("--cross-check", min=0, help="Directions to measure again with FCL.")] = 0,
+    certified: Annotated[bool, Option("--certify", help="Also certify the angles between grid points.")] = False,
     certify_size: Annotated[
-        float | None,
-        typer.Option(min=0.05, max=10, help="Smallest cell of --certify, degrees.", show_default="0.25"),
+        float | None, Option(min=0.05, max=10, help="Smallest cell of --certify, degrees.", show_default="0.25")
     ] = None,
     certify_touch: Annotated[
-        float | None,
-        typer.Option(metavar="P", help="With --certify: highest chance to touch any structure."),
+        float | None, Option(metavar="P", help="With --certify: highest chance to touch any structure.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -173,8 +162,8 @@ def search(
 
 @app.command()
 def verify(
-    certificate: Annotated[Path, typer.Argument(metavar="CERTIFICATE", help="Written by search --certify.")],
-    case: Annotated[Path, typer.Option("--case", help="The case that it certifies.")],
+    certificate: Annotated[Path, Argument(metavar="CERTIFICATE", help="Written by search --certify.")],
+    case: Annotated[Path, Option(help="The case that it certifies.")],
     as_json: JsonOption = False,
 ) -> None:
     """Prove every cell of a certificate again. The plain checker shares no code with the fast one."""
@@ -191,18 +180,14 @@ def check(
     case: CaseArgument,
     choice: Choice,
     arm: ArmOption = None,
-    picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE.png", help="Write the CT slices through the path.")
-    ] = None,
-    every: Annotated[bool, typer.Option("--all", help="List every structure, not only the nearest.")] = False,
+    picture: Annotated[Path | None, Option(metavar="FILE.png", help="Write the CT slices through the path.")] = None,
+    every: Annotated[bool, Option("--all", help="List every structure, not only the nearest.")] = False,
     entries: Annotated[
-        Path | None, typer.Option("--entries", metavar="FILE", help="Check every row of a list of entries or angles.")
+        Path | None, Option(metavar="FILE", help="Check every row of a list of entries or angles.")
     ] = None,
-    targets: Annotated[
-        Path | None, typer.Option("--targets", metavar="FILE", help="Check every row of a list of targets.")
-    ] = None,
+    targets: Annotated[Path | None, Option(metavar="FILE", help="Check every row of a list of targets.")] = None,
     out_dir: Annotated[
-        Path | None, typer.Option("--out", help="Folder for the checked.csv and checked.parquet of a list.")
+        Path | None, Option("--out", help="Folder for the checked.csv and checked.parquet of a list.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -229,13 +214,13 @@ def check(
 @app.command()
 def compare(
     source: SourceArgument,
-    other: Annotated[Path | None, typer.Argument(metavar="PLAN_B", help="The second plan.json, to compare.")] = None,
-    case: Annotated[Path | None, typer.Option("--case", help="Case of the two plans: checks them again.")] = None,
-    theta: Annotated[list[float] | None, typer.Option("--theta", min=0, max=180, help="See check; repeatable.")] = None,
-    beta: Annotated[list[float] | None, typer.Option("--beta", min=0, max=360, help="See check; repeatable.")] = None,
-    rank: Annotated[list[int] | None, typer.Option("--rank", min=1, help="See check; repeatable.")] = None,
-    window: Annotated[list[int] | None, typer.Option("--window", min=1, help="See check; repeatable.")] = None,
-    entry: Annotated[list[str] | None, typer.Option("--entry", metavar="X,Y,Z", help="See check; repeatable.")] = None,
+    other: Annotated[Path | None, Argument(metavar="PLAN_B", help="The second plan.json, to compare.")] = None,
+    case: Annotated[Path | None, Option(help="Case of the two plans: checks them again.")] = None,
+    theta: Annotated[list[float] | None, Option(min=0, max=180, help="See check; repeatable.")] = None,
+    beta: Annotated[list[float] | None, Option(min=0, max=360, help="See check; repeatable.")] = None,
+    rank: Annotated[list[int] | None, Option(min=1, help="See check; repeatable.")] = None,
+    window: Annotated[list[int] | None, Option(min=1, help="See check; repeatable.")] = None,
+    entry: Annotated[list[str] | None, Option(metavar="X,Y,Z", help="See check; repeatable.")] = None,
     arm: ArmOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -250,12 +235,7 @@ def compare(
 
 @app.command()
 @with_choice
-def plan(
-    case: CaseArgument,
-    choice: Choice,
-    out_dir: OutOfCaseOption = None,
-    as_json: JsonOption = False,
-) -> None:
+def plan(case: CaseArgument, choice: Choice, out_dir: OutOfCaseOption = None, as_json: JsonOption = False) -> None:
     """Plan the arm's motion to the best or a chosen candidate. Searches first, and writes plan.json."""
     from puncture_twin.twin.jobs.patient import main_job
 
@@ -270,25 +250,19 @@ def plan(
 def rehearse(
     source: SourceArgument,
     choice: Choice,
-    case: Annotated[Path | None, typer.Option("--case", help="The case of a plan.json.")] = None,
+    case: Annotated[Path | None, Option(help="The case of a plan.json.")] = None,
     out_dir: OutOfCaseOption = None,
-    seeds: Annotated[
-        int | None, typer.Option("--seeds", min=1, max=1_000_000, help="Trials, each with its own ground truth.")
-    ] = None,
-    physics: Annotated[int, typer.Option("--physics", min=0, max=MOST_SEEDS, help="Trials run in the simulator.")] = 0,
+    seeds: Annotated[int | None, Option(min=1, max=1_000_000, help="Trials, each with its own ground truth.")] = None,
+    physics: Annotated[int, Option(min=0, max=MOST_SEEDS, help="Trials run in the simulator.")] = 0,
     guidance: Annotated[
-        str | None,
-        typer.Option(
-            "--guidance", metavar="WAY", help="What leads the needle in the trials: ct, us, ...; a list compares."
-        ),
+        str | None, Option(metavar="WAY", help="What leads the needle in the trials: ct, us, ...; a list compares.")
     ] = None,
     steps: Annotated[
-        int | None, typer.Option("--steps", metavar="N", help="With --guidance ct: scan and correct after each step.")
+        int | None, Option(metavar="N", help="With --guidance ct: scan and correct after each step.")
     ] = None,
-    sweep: Annotated[bool, typer.Option("--sweep", help="Rotate the needle about the target, outside.")] = False,
+    sweep: Annotated[bool, Option("--sweep", help="Rotate the needle about the target, outside.")] = False,
     to: Annotated[
-        str | None,
-        typer.Option("--to", metavar="THETA,BETA", help="End of the sweep.", show_default="its window's farthest"),
+        str | None, Option(metavar="THETA,BETA", help="End of the sweep.", show_default="its window's farthest")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -325,15 +299,15 @@ def rehearse(
 
 @app.command()
 def markers(
-    source: Annotated[Path, typer.Argument(metavar="SOURCE", help="Folder or file with a CT, or a case with one.")],
-    kind: Annotated[str | None, typer.Option("--kind", metavar="ball|disc|ring", help="Kind of all markers.")] = None,
-    diameter: Annotated[float | None, typer.Option("--diameter", metavar="MM", help="Their diameter, 1 to 15.")] = None,
-    count: Annotated[int | None, typer.Option("--count", metavar="N", help="How many there are.")] = None,
+    source: Annotated[Path, Argument(metavar="SOURCE", help="Folder or file with a CT, or a case with one.")],
+    kind: Annotated[str | None, Option(metavar="ball|disc|ring", help="Kind of all markers.")] = None,
+    diameter: Annotated[float | None, Option(metavar="MM", help="Their diameter, 1 to 15.")] = None,
+    count: Annotated[int | None, Option(metavar="N", help="How many there are.")] = None,
     layout: Annotated[
-        Path | None, typer.Option("--layout", metavar="FILE", help="Names them: points of any frame, by distances.")
+        Path | None, Option(metavar="FILE", help="Names them: points of any frame, by distances.")
     ] = None,
     propose: Annotated[
-        int | None, typer.Option("--propose", metavar="N", help="Propose places for N markers on the skin of a CASE.")
+        int | None, Option(metavar="N", help="Propose places for N markers on the skin of a CASE.")
     ] = None,
     out_dir: OutOfCaseOption = None,
     as_json: JsonOption = False,
@@ -359,10 +333,8 @@ def touch(
     case: CaseArgument,
     choice: Choice,
     out_dir: OutOfCaseOption = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, max=2**31 - 1, help="Seed of motions and ground truth.")] = 0,
-    host: Annotated[
-        str | None, typer.Option("--host", help="Address of a UR that is led by hand: read only, no twin.")
-    ] = None,
+    seed: Annotated[int, Option(min=0, max=2**31 - 1, help="Seed of motions and ground truth.")] = 0,
+    host: Annotated[str | None, Option(help="Address of a UR that is led by hand: read only, no twin.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Plan the marker touches and execute them in the twin, or read a UR's. Writes touch.csv. Exit 1 on too few."""
@@ -396,16 +368,15 @@ def pivot(
     case: CaseArgument,
     joints: Annotated[
         Path | None,
-        typer.Argument(metavar="JOINTS.csv", help="Touches of one point: one pose per line, with q1_deg to q6_deg."),
+        Argument(metavar="JOINTS.csv", help="Touches of one point: one pose per line, with q1_deg to q6_deg."),
     ] = None,
     out_dir: OutOfCaseOption = None,
-    poses: Annotated[int | None, typer.Option("--poses", help="Poses in the twin, 4 to 12.", show_default="8")] = None,
+    poses: Annotated[int | None, Option(help="Poses in the twin, 4 to 12.", show_default="8")] = None,
     at: Annotated[
-        str | None,
-        typer.Option("--at", metavar="X,Y,Z", help="Touched point, mm, base frame.", show_default="beside the patient"),
+        str | None, Option(metavar="X,Y,Z", help="Touched point, mm, base frame.", show_default="beside the patient")
     ] = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", min=0, max=2**31 - 1, help="Seed of the ground truth.", show_default="0")
+        int | None, Option(min=0, max=2**31 - 1, help="Seed of the ground truth.", show_default="0")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -430,10 +401,9 @@ def place(
     case: CaseArgument,
     out_dir: OutOfCaseOption = None,
     quick: Annotated[
-        float,
-        typer.Option("--quick", metavar="SECONDS", min=1, help="Stop after about this time, with the best so far."),
+        float, Option(metavar="SECONDS", min=1, help="Stop after about this time, with the best so far.")
     ] = 30.0,
-    full: Annotated[bool, typer.Option("--full", help="Search to the end, however long it takes.")] = False,
+    full: Annotated[bool, Option("--full", help="Search to the end, however long it takes.")] = False,
     jobs: JobsOption = 1,
     pictures: PicturesOption = True,
     as_json: JsonOption = False,
@@ -449,14 +419,13 @@ def place(
 
 @app.command()
 def mirror(
-    case: Annotated[Path, typer.Option("--case", help="Case of the patient.")],
-    host: Annotated[str | None, typer.Argument(metavar="HOST", help="Address of a running UR (read only).")] = None,
+    case: Annotated[Path, Option(help="Case of the patient.")],
+    host: Annotated[str | None, Argument(metavar="HOST", help="Address of a running UR (read only).")] = None,
     recorded: Annotated[
-        Path | None,
-        typer.Option("--from", help="CSV with time_s and q1_rad to q6_rad, or a recording of RTDE."),
+        Path | None, Option("--from", help="CSV with time_s and q1_rad to q6_rad, or a recording of RTDE.")
     ] = None,
-    seconds: Annotated[float | None, typer.Option("--seconds", min=0, help="Duration; default: until Ctrl-C.")] = None,
-    rate: Annotated[float, typer.Option("--rate", min=0.1, max=125, help="Readings per second.")] = 10.0,
+    seconds: Annotated[float | None, Option(min=0, help="Duration; default: until Ctrl-C.")] = None,
+    rate: Annotated[float, Option(min=0.1, max=125, help="Readings per second.")] = 10.0,
     as_json: JsonOption = False,
 ) -> None:
     """Show a running arm's needle in the CT. Prints tip and distance to the target; only reads the robot."""
@@ -481,13 +450,9 @@ def mirror(
 @app.command()
 def live(
     case: CaseArgument,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0 takes a free one.")] = 18944,
-    host: Annotated[
-        str, typer.Option("--host", help="Address to listen at; others than loopback are warned of.")
-    ] = "127.0.0.1",
-    pose_s: Annotated[
-        int, typer.Option("--pose-s", min=1, max=86400, help="Seconds for which a needle's pose counts.")
-    ] = 2,
+    port: Annotated[int, Option(min=0, max=65535, help="Port; 0 takes a free one.")] = 18944,
+    host: Annotated[str, Option(help="Address to listen at; others than loopback are warned of.")] = "127.0.0.1",
+    pose_s: Annotated[int, Option(min=1, max=86400, help="Seconds for which a needle's pose counts.")] = 2,
     arm: ArmOption = None,
 ) -> None:
     """Answer navigation programs by OpenIGTLink until Ctrl-C. Safe map of a target, verdict of a needle's pose."""
@@ -508,14 +473,14 @@ def export(
     choice: Choice,
     format_name: Annotated[
         str,
-        typer.Option(
+        Option(
             "--format",
             metavar="FORMAT",
             help="urscript, ros2, moveit, csv, slicer, dicom, candidates-csv, candidates-json, or another package's.",
         ),
     ],
-    case: Annotated[Path | None, typer.Option("--case", help="Case of the plan: checks the plan again.")] = None,
-    scan: Annotated[Path | None, typer.Option("--scan", help="Of confirm.json: the control scan, for dicom.")] = None,
+    case: Annotated[Path | None, Option(help="Case of the plan: checks the plan again.")] = None,
+    scan: Annotated[Path | None, Option(help="Of confirm.json: the control scan, for dicom.")] = None,
     out_dir: OutOfCaseOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -531,17 +496,15 @@ def export(
 
 @app.command()
 def register(
-    source: Annotated[Path, typer.Argument(metavar="CASE_OR_MARKERS_CT", help="A case, or markers read in the CT.")],
+    source: Annotated[Path, Argument(metavar="CASE_OR_MARKERS_CT", help="A case, or markers read in the CT.")],
     markers_base: Annotated[
-        Path | None, typer.Argument(metavar="MARKERS_BASE", help="The same markers, touched by the robot.")
+        Path | None, Argument(metavar="MARKERS_BASE", help="The same markers, touched by the robot.")
     ] = None,
-    target: Annotated[str | None, typer.Option("--target", help="Target X,Y,Z, mm, for two lists of markers.")] = None,
-    space: Annotated[
-        Space, typer.Option("--space", help="Space of the CT list and the target, if the file states none.")
-    ] = Space.LPS,
-    fle: Annotated[float | None, typer.Option("--fle", min=0.001, help="Known localisation error (rms), mm.")] = None,
+    target: Annotated[str | None, Option(help="Target X,Y,Z, mm, for two lists of markers.")] = None,
+    space: Annotated[Space, Option(help="Space of the CT list and the target, if the file states none.")] = Space.LPS,
+    fle: Annotated[float | None, Option(min=0.001, help="Known localisation error (rms), mm.")] = None,
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE.png", help="Write a picture of the case's error budget.")
+        Path | None, Option(metavar="FILE.png", help="Write a picture of the case's error budget.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -558,19 +521,15 @@ def register(
 
 @app.command()
 def selfcal(
-    case: Annotated[Path | None, typer.Argument(metavar="[CASE]", help="selfcal.toml or its folder.")] = None,
-    recording: Annotated[
-        Path | None, typer.Option("--recording", help="Recording: a CSV, or its folder with pictures or without.")
-    ] = None,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, max=1000, help="Number of trials.")] = 3,
+    case: Annotated[Path | None, Argument(metavar="[CASE]", help="selfcal.toml or its folder.")] = None,
+    recording: Annotated[Path | None, Option(help="Recording: a CSV, or its folder with pictures or without.")] = None,
+    seeds: Annotated[int, Option(min=1, max=1000, help="Number of trials.")] = 3,
     out_dir: OutOption = Path("out/selfcal"),
     record: Annotated[
-        Path | None,
-        typer.Option("--record", metavar="FOLDER", help="Keep the first trial's pictures in this new folder."),
+        Path | None, Option(metavar="FOLDER", help="Keep the first trial's pictures in this new folder.")
     ] = None,
     shots: Annotated[
-        Path | None,
-        typer.Option("--shots", help="Recording of what was seen afterwards: each pose updates the answer."),
+        Path | None, Option(help="Recording of what was seen afterwards: each pose updates the answer.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -591,15 +550,12 @@ def _calibrate() -> None:
 
 @calibrate_app.command("hand-eye")
 def _hand_eye(
-    recording: Annotated[
-        Path, typer.Option("--recording", metavar="FILE", help="CSV with a pair of poses a row: flange and camera.")
-    ],
+    recording: Annotated[Path, Option(metavar="FILE", help="CSV with a pair of poses a row: flange and camera.")],
     motions: Annotated[
-        bool, typer.Option("--motions", help="Rows are motions from pose to pose (AX = XB), not poses (AX = ZB).")
+        bool, Option("--motions", help="Rows are motions from pose to pose (AX = XB), not poses (AX = ZB).")
     ] = False,
     noise: Annotated[
-        str | None,
-        typer.Option("--noise", metavar="MM,DEG,MM,DEG", help="Known noise of flange and camera; default: found."),
+        str | None, Option(metavar="MM,DEG,MM,DEG", help="Known noise of flange and camera; default: found.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -616,13 +572,11 @@ def _hand_eye(
 @calibrate_app.command("dynamics")
 def _dynamics(
     case: CaseArgument,
-    recording: Annotated[
-        Path | None, typer.Option("--recording", metavar="FILE", help="CSV of joints and torques over time.")
-    ] = None,
+    recording: Annotated[Path | None, Option(metavar="FILE", help="CSV of joints and torques over time.")] = None,
     record: Annotated[
-        Path | None, typer.Option("--record", metavar="FILE", help="Write such a file with the simulated arm first.")
+        Path | None, Option(metavar="FILE", help="Write such a file with the simulated arm first.")
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of what --record draws.")] = 1,
+    seed: Annotated[int, Option(min=0, help="Of what --record draws.")] = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Identify the arm's dynamics from torques, and what their error costs at the tip."""
@@ -636,15 +590,11 @@ def _dynamics(
 
 @app.command()
 def servo(
-    case: Annotated[Path, typer.Argument(metavar="CASE", help="Servo case, or the folder that holds servo.toml.")],
+    case: Annotated[Path, Argument(metavar="CASE", help="Servo case, or the folder that holds servo.toml.")],
     out_dir: OutOfCaseOption = None,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="Number of trials.")] = 1,
-    recording: Annotated[
-        Path | None, typer.Option("--recording", metavar="FOLDER", help="Read this recorded session instead.")
-    ] = None,
-    record: Annotated[
-        Path | None, typer.Option("--record", metavar="FOLDER", help="Keep the first session in this new folder.")
-    ] = None,
+    seeds: Annotated[int, Option(min=1, max=MOST_SEEDS, help="Number of trials.")] = 1,
+    recording: Annotated[Path | None, Option(metavar="FOLDER", help="Read this recorded session instead.")] = None,
+    record: Annotated[Path | None, Option(metavar="FOLDER", help="Keep the first session in this new folder.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Guide the tool to every target with two cameras. Errors are drawn per trial. Writes pictures, plot and page."""
@@ -667,34 +617,23 @@ def servo(
 def scan(
     case: CaseArgument,
     out_dir: OutOfCaseOption = None,
-    spacing: Annotated[float, typer.Option("--spacing", min=0.3, max=10, help="Slice spacing (thickness), mm.")] = 2.5,
-    pixel: Annotated[float, typer.Option("--pixel", min=0.2, max=5, help="Side of a pixel, mm.")] = 0.8,
-    noise: Annotated[float, typer.Option("--noise", min=0, max=200, help="Noise (standard deviation), HU.")] = 20.0,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of noise, grid and true marker positions.")] = 0,
+    spacing: Annotated[float, Option(min=0.3, max=10, help="Slice spacing (thickness), mm.")] = 2.5,
+    pixel: Annotated[float, Option(min=0.2, max=5, help="Side of a pixel, mm.")] = 0.8,
+    noise: Annotated[float, Option(min=0, max=200, help="Noise (standard deviation), HU.")] = 20.0,
+    seed: Annotated[int, Option(min=0, help="Seed of noise, grid and true marker positions.")] = 0,
     fov: Annotated[
-        float | None, typer.Option("--fov", min=20, max=2000, help="Side of the image, mm.", show_default="the body")
+        float | None, Option(min=20, max=2000, help="Side of the image, mm.", show_default="the body")
     ] = None,
-    length: Annotated[
-        float | None, typer.Option("--length", min=5, max=5000, help="Scan length, mm.", show_default="the body")
-    ] = None,
-    turn: Annotated[
-        float, typer.Option("--turn", min=-180, max=180, help="Rotation about the bed's axis, degrees.")
-    ] = 0.0,
-    marker: Annotated[str, typer.Option("--marker", metavar="disc|ball|none", help="Metal markers, 8 mm.")] = "disc",
-    rehearsal: Annotated[
-        Path | None, typer.Option("--rehearsal", metavar="rehearsal.json", help="Show the needle of a rehearsal.")
-    ] = None,
+    length: Annotated[float | None, Option(min=5, max=5000, help="Scan length, mm.", show_default="the body")] = None,
+    turn: Annotated[float, Option(min=-180, max=180, help="Rotation about the bed's axis, degrees.")] = 0.0,
+    marker: Annotated[str, Option(metavar="disc|ball|none", help="Metal markers, 8 mm.")] = "disc",
+    rehearsal: Annotated[Path | None, Option(metavar="rehearsal.json", help="Show the needle of a rehearsal.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Scan a case with a virtual CT. Write DICOM, NIfTI, labels, and its readings next to the ground truth."""
     from math import radians
 
-    from puncture_twin.twin.jobs.experiment.scan_job import (
-        ScanRequest,
-        parse_marker,
-        scan_case,
-        scan_text,
-    )
+    from puncture_twin.twin.jobs.experiment.scan_job import ScanRequest, parse_marker, scan_case, scan_text
     from puncture_twin.twin.plant.scanner.image import ScanSettings
 
     settings = ScanSettings(spacing, pixel, noise, seed=seed, fov_mm=fov, length_mm=length, turn=radians(turn))
@@ -706,16 +645,11 @@ def scan(
 
 @app.command()
 def confirm(
-    case: Annotated[Path | None, typer.Argument(metavar="CASE", help="Case file, or the folder that holds it.")] = None,
-    scan: Annotated[
-        Path | None, typer.Option("--scan", metavar="SCAN", help="Control CT: DICOM folder, NIfTI or NRRD.")
-    ] = None,
-    plan: Annotated[
-        Path | None, typer.Option("--plan", metavar="plan.json", help="The plan that was executed, to compare.")
-    ] = None,
+    case: Annotated[Path | None, Argument(metavar="CASE", help="Case file, or the folder that holds it.")] = None,
+    scan: Annotated[Path | None, Option(metavar="SCAN", help="Control CT: DICOM folder, NIfTI or NRRD.")] = None,
+    plan: Annotated[Path | None, Option(metavar="plan.json", help="The plan that was executed, to compare.")] = None,
     learn: Annotated[
-        list[Path] | None,
-        typer.Option("--learn", metavar="confirm.json", help="Compare [errors] with confirmations; repeatable."),
+        list[Path] | None, Option(metavar="confirm.json", help="Compare [errors] with confirmations; repeatable.")
     ] = None,
     out_dir: OutOfCaseOption = None,
     as_json: JsonOption = False,
@@ -735,15 +669,13 @@ def confirm(
 
 @app.command()
 def reproduce(
-    paper: Annotated[str, typer.Argument(metavar="chen2019|liu2007|axp-ybq", help="Paper to reproduce.")],
+    paper: Annotated[str, Argument(metavar="chen2019|liu2007|axp-ybq", help="Paper to reproduce.")],
     out_dir: OutOfCaseOption = None,
-    seeds: Annotated[int | None, typer.Option("--seeds", min=1, max=MOST_SEEDS, help="Number of draws.")] = None,
+    seeds: Annotated[int | None, Option(min=1, max=MOST_SEEDS, help="Number of draws.")] = None,
     experiment: Annotated[
-        bool, typer.Option("--experiment", help="For chen2019: draw its experiment anew, --seeds times.")
+        bool, Option("--experiment", help="For chen2019: draw its experiment anew, --seeds times.")
     ] = False,
-    runs: Annotated[
-        int, typer.Option("--runs", min=0, max=MOST_SEEDS, help="With --experiment: runs in the simulator.")
-    ] = 0,
+    runs: Annotated[int, Option(min=0, max=MOST_SEEDS, help="With --experiment: runs in the simulator.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """Print a paper's numbers next to ours. Exit 0 only if all are within their limits."""
@@ -760,12 +692,11 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small matrices: more threads only wait for one another
     as_json = "--json" in (sys.argv[1:] if arguments is None else arguments)
-    return exit_code_of(partial(_parsed, arguments), print_whole, as_json=as_json)
 
+    def command() -> Any:
+        return _parser()(arguments, standalone_mode=False)
 
-def _parsed(arguments: list[str] | None) -> Any:
-    """Parse, and run what is asked for; returns what the command returns."""
-    return _parser()(arguments, standalone_mode=False)
+    return exit_code_of(command, print_whole, as_json=as_json)
 
 
 @cache

@@ -74,20 +74,15 @@ def init_case(
     """Write FOLDER/case.toml from what is in the folder, a CT and its segmentation, and return the case.
 
     Args:
-        folder: With a CT and a segmentation.
-        target: Shape (3,), mm, in `space`.
-        target_label: Or the deepest point of this structure.
+        target: Shape (3,), mm, in `space`; or `target_label`, whose deepest point it is.
         hit_radius_mm: The target is a ball of its own, in no structure.
         region: What the CT shows; else inferred from the organs.
         space: ``LPS`` or ``RAS``: of the target, of the case, and of meshes; LPS by default.
         naming: Of labels: ``totalsegmentator-v1``, ``-v2``, or a table.
-        unit: Of meshes: ``mm``, ``cm`` or ``m``; else inferred from their extent.
-        up: Axis of meshes that is up: ``y`` or ``z``.
-        ct: Which file, where the folder holds several CTs.
-        segmentation: Which file or folder, where it holds several.
+        unit: Of meshes: ``mm``, ``cm`` or ``m``; else inferred from their extent. `up` is their axis ``y`` or ``z``.
+        ct: Which file, where the folder holds several; so `segmentation`.
         skin: Structure that is the skin; else the CT's body.
-        ignore: Structures or files to be left out.
-        unknown: Structures that no path may cross.
+        ignore: Structures or files to be left out; no path may cross those of `unknown`.
         settings: Keys of the case, such as ``ct.arms=none`` or ``search.trust_labels=true``.
         force: Replace a case.toml that is there.
 
@@ -121,9 +116,6 @@ def load_case(path: Path | str) -> Case:
 
     Args:
         path: Case file, or the folder that holds ``case.toml``.
-
-    Raises:
-        InputError: One line: what is wrong, where, and what is allowed.
     """
     from puncture_twin.planning.case.case import load_case
 
@@ -140,9 +132,6 @@ def prepare(case: Case | Path | str, *, arm: bool | None = None, engine: str | E
         engine: Who measures clearance: ``fast``, ``fcl`` (the plain reference), or a class of your own that keeps the
             protocol `puncture_twin.planning.clearance.engine.ClearanceEngine`. The fast engine measures again what it
             measures: where it finds more clearance than there is, the search ends with an error.
-
-    Raises:
-        InputError: Anything in the case that cannot be used.
     """
     from puncture_twin.planning.search.context import prepare
 
@@ -168,7 +157,6 @@ def check(
     """One direction, explained: every constraint with its number and its limit. Without a choice it is the best one.
 
     Args:
-        context: From `prepare`.
         theta_deg: Puncture angle θ, 0 to 180, with `beta_deg`.
         beta_deg: Azimuth β, 0 to 360.
         candidate: Or one of a search, such as ``candidates.best`` or ``candidates.pick(row)``.
@@ -176,7 +164,6 @@ def check(
         entry: Or where the needle enters the skin: shape (3,), mm, in the case's space; or a Slicer file of it.
 
     Raises:
-        InputError: An angle outside of its range, two choices, or an entry from which no straight path enters there.
         NoAnswerError: Nothing is safe, so that nothing is the best.
     """
     from puncture_twin.planning.budget.guidance import explained_ways
@@ -191,12 +178,8 @@ def check_many(context: CaseContext, theta_deg: ArrayLike, beta_deg: ArrayLike) 
     """Many directions at once: a row each, ranked among themselves; without the windows and safe cones of a grid.
 
     Args:
-        context: From `prepare`.
         theta_deg: Shape (n,), puncture angles θ, 0 to 180.
         beta_deg: Shape (n,), azimuths β, 0 to 360.
-
-    Raises:
-        InputError: No directions, two lengths, or an angle outside of its range.
     """
     theta = checked_degrees(theta_deg, 180.0, "check_many: theta_deg")
     beta = checked_degrees(beta_deg, 360.0, "check_many: beta_deg")
@@ -213,7 +196,6 @@ def safe_map(context: CaseContext, target_ct: ArrayLike | None = None) -> SafeMa
     not tested: `check` does that, of the context ``context.at(target_ct)``.
 
     Args:
-        context: From `prepare`.
         target_ct: Another target in the same structure, shape (3,), mm, LPS (or the case's local frame); None is the
             context's own.
 
@@ -232,11 +214,9 @@ def best_target(context: CaseContext, points: int | ArrayLike = 1000) -> BestTar
     ``context.at(found.target_ct)`` goes on from there; ``found.window_deg2`` has a row a point.
 
     Args:
-        context: From `prepare`.
         points: How many, evenly in the structure; or your own, shape (n, 3), mm, LPS (or the case's local frame).
 
     Raises:
-        InputError: Points that are none, or an open structure that is to be filled.
         NoAnswerError: No point has an open direction.
     """
     from puncture_twin.planning.search.safe_map import best_target
@@ -249,11 +229,7 @@ def rerank(candidates: Candidates, cost: ArrayLike) -> Candidates:
     """The candidates ranked by a cost of one's own. Which are safe stays as it is.
 
     Args:
-        candidates: From `search`.
         cost: Shape (n,), smaller is better; what it says of rejected candidates does not matter.
-
-    Raises:
-        InputError: Another shape, or a safe candidate without a finite cost.
     """
     from puncture_twin.planning.search.ranking import ranked_by
 
@@ -308,7 +284,6 @@ def markers(
         layout: Names them by their distances, in any frame, mm.
 
     Raises:
-        InputError: No CT, what no marker is, or a mirrored layout.
         NoAnswerError: No markers, too few or many, or several sizes; it says what was seen.
     """
     from puncture_twin.planning.base.progress import Silent
@@ -325,7 +300,6 @@ def certify(context: CaseContext, *, size_deg: float = 0.25, touch: float | None
     """The map between the grid points: cells of directions that are proven safe for the organs, or rejected.
 
     Args:
-        context: From `prepare`.
         size_deg: Cells are halved down to this size.
         touch: No structure is touched more often than this, 0 to 1, in a safe cell; None proves margins alone.
 
@@ -365,17 +339,12 @@ def plan(
     """Plan a direction: approach and insertion of the arm. Without a choice it is the best that the arm can come to.
 
     Args:
-        context: From `prepare`, with the arm.
+        context: With the arm.
         candidates: From `search`, or ranked anew by `rerank`; None searches where the choice needs it.
-        theta_deg: Puncture angle θ, 0 to 180, with `beta_deg`.
-        beta_deg: Azimuth β, 0 to 360.
-        candidate: Or one of a search, such as ``candidates.best`` or ``candidates.pick(row)``.
-        window: Or the best of this window of the search; 1 holds the best of all.
-        entry: Or where the needle enters the skin: shape (3,), mm, in the case's space; or a Slicer file of it.
+        theta_deg: The choice, as in `check`: two angles, or one of `candidate`, `window` and `entry`.
         seed: Of the approach's planner; the case's by default.
 
     Raises:
-        InputError: The case does not say where the robot's base is, or there is nothing of what was chosen.
         NoAnswerError: Nothing is safe, what was chosen is rejected, or the arm finds no free approach to it.
     """
     from puncture_twin.planning.budget.guidance import with_ways
@@ -388,11 +357,7 @@ def plan(
 
 @checked
 def read_plan(path: Path | str, context: CaseContext) -> Plan:
-    """A plan from its file, checked against its case again: same inputs, still safe, a motion that touches nothing.
-
-    Raises:
-        InputError: It cannot be read, or it does not hold any more.
-    """
+    """A plan from its file, checked against its case again: same inputs, still safe, a motion that touches nothing."""
     from puncture_twin.planning.plan.plan_document import read_plan
 
     return _own_plan(context, read_plan(Path(path)), str(path))
@@ -400,11 +365,7 @@ def read_plan(path: Path | str, context: CaseContext) -> Plan:
 
 @checked
 def read_certificate(path: Path | str) -> Certificate:
-    """A certificate from its file; `verify` proves it.
-
-    Raises:
-        InputError: Not a certificate, another version, missing or contradicting parts.
-    """
+    """A certificate from its file; `verify` proves it."""
     from puncture_twin.planning.certify.certificate import read_certificate
 
     return read_certificate(Path(path))
@@ -412,11 +373,7 @@ def read_certificate(path: Path | str) -> Certificate:
 
 @checked
 def read_points(path: Path | str) -> NamedPoints:
-    """Named points from CSV, Slicer markups (.mrk.json) or .fcsv: mm, and LPS where the file states a space.
-
-    Raises:
-        InputError: It cannot be read, or is not whole.
-    """
+    """Named points from CSV, Slicer markups (.mrk.json) or .fcsv: mm, and LPS where the file states a space."""
     from puncture_twin.planning.formats.points import read_points
 
     return read_points(Path(path))
@@ -424,11 +381,7 @@ def read_points(path: Path | str) -> NamedPoints:
 
 @checked
 def write_points(points: Points, path: Path | str) -> None:
-    """Write named points as CSV in mm, whole or not at all; the space is not written, a CSV speaks in its case's.
-
-    Raises:
-        InputError: A point that is not three finite numbers, or a place that cannot be written to.
-    """
+    """Write named points as CSV in mm, whole or not at all; the space is not written, a CSV speaks in its case's."""
     from puncture_twin.planning.formats.points import named_points, write_points
 
     write_points(Path(path), named_points(points, "write_points"))
@@ -439,13 +392,9 @@ def read_mesh(path: Path | str, *, unit: str = "mm", space: str = "LPS", up: str
     """One surface from STL, OBJ, PLY, GLB or VTP, in mm and LPS (or its own frame), checked against its own promises.
 
     Args:
-        path: The file; nothing about unit or space is taken from it.
-        unit: ``mm``, ``cm`` or ``m``: of its coordinates.
-        space: ``LPS``, ``RAS`` or ``local``: of its coordinates.
+        unit: ``mm``, ``cm`` or ``m``, of its coordinates; nothing about unit or space is taken from the file.
+        space: ``LPS``, ``RAS`` or ``local``.
         up: ``y`` or ``z``, its axis that is up; of GLB it must be stated.
-
-    Raises:
-        InputError: It is cut, contradicts itself, is empty, or has coordinates that are no finite numbers.
     """
     from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
     from puncture_twin.planning.geometry.spaces import Space, Unit, Up
@@ -459,9 +408,6 @@ def read_volume(path: Path | str) -> Volume:
     """A CT or label map from NIfTI or NRRD, or a CT from a DICOM series: its voxels, and where they lie in LPS mm.
 
     A series is named by its folder, or by any of its files where the folder holds several.
-
-    Raises:
-        InputError: It is cut, contradicts itself, or holds a voxel that is no finite number.
     """
     from puncture_twin.planning.formats.dicom.ct_series import read_series
     from puncture_twin.planning.formats.dicom.storage import is_series
@@ -473,11 +419,7 @@ def read_volume(path: Path | str) -> Volume:
 
 @checked
 def read_recording(path: Path | str) -> Recording:
-    """What two arms and a probe's pictures said, pose by pose, from ``recording.csv`` or its folder; see `calibrate`.
-
-    Raises:
-        InputError: It cannot be read, or a row is no pair of rigid motions with a point.
-    """
+    """What two arms and a probe's pictures said, pose by pose: ``recording.csv`` or its folder; see `calibrate`."""
     from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording
 
     return read_recording(Path(path))
@@ -506,9 +448,6 @@ def read_pose_pairs(path: Path | str, *, motions: bool = False) -> PosePairs:
     Args:
         path: Columns ``name``, ``A_r11 .. A_z_mm`` (T_base_flange) and ``B_r11 .. B_z_mm`` (T_board_camera).
         motions: Whether rows are motions from pose to pose.
-
-    Raises:
-        InputError: It cannot be read, or a row is no pair of rigid motions.
     """
     from puncture_twin.planning.registration.hand_eye import read_pose_pairs
 
@@ -528,10 +467,8 @@ def calibrate_hand_eye(
 
     Args:
         pairs: At least three poses or two motions, from `read_pose_pairs`.
-        robot_mm: Standard deviation of the flange's place, per axis; all four, or none to find the noise.
-        robot_deg: Of its rotation.
-        camera_mm: Of the camera's place.
-        camera_deg: Of its rotation.
+        robot_mm: Standard deviations of the flange's place, per axis, and of its rotation, and of the camera's; all
+            four, or none to find the noise.
 
     Raises:
         InputError: Too few pairs, rotations about one axis alone, or poses that do not belong together.
@@ -546,7 +483,6 @@ def calibrate_dynamics(context: CaseContext, recording: Path | str) -> Dynamics:
     """The dynamics of a case's arm from joints and torques over time, and what their error costs at the tip.
 
     Args:
-        context: With the arm.
         recording: Columns ``time_s``, ``q1_deg .. q6_deg``, ``tau1_nm .. tau6_nm``, or RTDE's.
 
     Raises:
@@ -573,11 +509,7 @@ def shot_by_shot(calibration: Calibration) -> ShotByShot:
 
 @checked
 def check_folder(folder: Path | str) -> tuple[str, ...]:
-    """What keeps an output folder from being one whole set, a sentence each; empty if nothing does.
-
-    Raises:
-        InputError: Its ``manifest.json`` cannot be read, or is another program's.
-    """
+    """What keeps an output folder from being one whole set, a sentence each; empty if nothing does."""
     from puncture_twin.planning.base.output.manifest import problems
 
     return problems(Path(folder))
@@ -605,8 +537,6 @@ def rehearse(
     """Execute a plan in the twin, where the ground truth differs from the belief.
 
     Args:
-        context: The plan's case.
-        plan: From `plan` or `read_plan`.
         seed: What the ground truth is drawn from; the case's by default.
         seeds: Draw so many rooms: the median one is executed, and ``distribution`` holds all.
         physics: So many of them are executed in the simulator too.
@@ -616,8 +546,6 @@ def rehearse(
         steps: Of ct: after each of so many, 1 to 10, a control scan is read and the needle corrected.
 
     Raises:
-        InputError: A plan that does not hold in this case, many rooms of a case without declared errors or markers,
-            unknown guidance, steps of another than ct, some without ``seeds``, or the extra ``twin`` is not installed.
         NoAnswerError: The arm reaches the target in none of the rooms.
     """
     from puncture_twin.planning.base.errors import require_extra
@@ -635,11 +563,9 @@ def camera_view(context: CaseContext, plan: Plan) -> CameraView:
     """Where two cameras look from, and what both see of the balls on the needle and of the markers at each depth.
 
     Args:
-        context: From `prepare`, with the arm, of a case with ``[stereo]``.
-        plan: From `plan`.
+        context: With the arm, of a case with ``[stereo]``.
 
     Raises:
-        InputError: The case declares no cameras, or a plan that does not hold in it.
         NoAnswerError: The surroundings leave no place for cameras that the case does not state.
     """
     from puncture_twin.planning.visibility.cameras import camera_view
@@ -652,11 +578,7 @@ def probe_view(context: CaseContext, plan: Plan) -> ProbeView:
     """Where an ultrasound probe on an arm of its own sees needle and target; or that it does not, why, and the way out.
 
     Args:
-        context: From `prepare`, with the arm, of a case with ``[ultrasound]``.
-        plan: From `plan`.
-
-    Raises:
-        InputError: The case declares no probe, its arm would stand in the patient, or a plan that does not hold in it.
+        context: With the arm, of a case with ``[ultrasound]``.
     """
     from puncture_twin.planning.visibility.probe import probe_view
 
@@ -677,16 +599,11 @@ def touch(
     """Plan how the markers are touched for a puncture, and touch them in the twin; ``points`` are what was read.
 
     Args:
-        context: From `prepare`, with the arm, declared errors and markers.
-        theta_deg: Of the puncture, as in `plan`; without a choice the best.
-        beta_deg: As in `plan`.
-        candidate: As in `plan`.
-        window: As in `plan`.
-        entry: As in `plan`.
+        context: With the arm, declared errors and markers.
+        theta_deg: The choice of the puncture, as in `check`; without one the best.
         seed: Of the motions and of the truth.
 
     Raises:
-        InputError: The case declares no errors or has no markers, or the extra ``twin`` is not installed.
         NoAnswerError: Nothing is safe, or too few markers can be touched.
     """
     from puncture_twin.planning.base.errors import require_extra
@@ -703,7 +620,6 @@ def confirm(context: CaseContext, scan: Path | str, *, plan: Path | str | None =
     """The needle in a control CT: where it is, what the line that it takes comes near to, and what to do next.
 
     Args:
-        context: From `prepare`.
         scan: A DICOM folder or a file in it, NIfTI or NRRD; of the same patient, in any frame.
         plan: The ``plan.json`` that was executed, to compare.
 
@@ -722,13 +638,11 @@ def place(context: CaseContext, *, jobs: int = 2, quick_s: float | None = None) 
     ``prepare(context.case.replace(mount=dict(found.rated[0].mount)))`` is the case with the arm there.
 
     Args:
-        context: From `prepare`.
         jobs: Processes; the answer of a whole search is the same.
         quick_s: Stop after about this time with the best so far; ``complete`` is then False. A fraction of a verdict
             whose ``count`` is below ``directions`` is an estimate. None searches to the end.
 
     Raises:
-        InputError: Bounds that contradict the case.
         NoAnswerError: No direction is safe for the organs, or the arm reaches none from any placement.
     """
     from puncture_twin.twin.jobs.patient.place_job import find_places, refuse_none
@@ -749,13 +663,8 @@ def compare(
     """Two paths of a case side by side: numbers, and why one is not safe. ``text()`` is the command's table.
 
     Args:
-        context: From `prepare`.
-        one: From `check` or `plan`, or a candidate such as ``candidates.best``.
-        other: Another.
+        one: From `check` or `plan`, or a candidate such as ``candidates.best``; so is the other.
         candidates: From `search`, for ranks and windows; None searches.
-
-    Raises:
-        InputError: A plan that does not hold in this case, or a path of another case.
     """
     from puncture_twin.planning.search.candidates import Pick
     from puncture_twin.planning.search.explain import Explanation
@@ -778,14 +687,8 @@ def export(
         source: A plan (``urscript``, ``ros2``, ``csv``, ``moveit``, or another package's format; ``plan.json`` is
             written beside it), candidates (``candidates-csv``, ``candidates-json``), or a checked direction
             (``slicer``, ``dicom``).
-        format_name: One of these.
-        folder: Where the files go; made where it is missing.
         context: The plan is checked again against this case, and corners are rounded where that is free; ``moveit``,
             ``slicer`` and ``dicom`` need it.
-
-    Raises:
-        InputError: A format that is not of this source, a plan that breaks a limit of the arm or does not hold, or
-            candidates or a direction of another case than the context's.
     """
     from puncture_twin.twin.jobs.patient.export_jobs import export_value
 
@@ -804,15 +707,8 @@ def report(
     """Write the page and the pictures of a search, and of a plan and its rehearsal, and return the page's path.
 
     Args:
-        context: From `prepare`.
-        candidates: From `search`.
-        folder: Where they go; made where it is missing.
-        plan: From `plan`, shown as the chosen path.
-        rehearsal: From `rehearse`, of this plan.
-
-    Raises:
-        InputError: A folder that cannot be written to, candidates or a plan of another case, or a rehearsal without its
-            plan.
+        folder: Made where it is missing.
+        plan: Shown as the chosen path; `rehearsal` is of it.
     """
     from puncture_twin.planning.base.files import check_writable
     from puncture_twin.twin.jobs.patient.main_job import report_case
@@ -868,11 +764,7 @@ def batch(
 
 
 def _own_plan(context: CaseContext, plan: Plan, where: str) -> Plan:
-    """A plan that holds in this case, whatever it was made for or has become since.
-
-    Raises:
-        InputError: It does not; see `read_plan`.
-    """
+    """A plan that holds in this case, whatever it was made for or has become since."""
     from puncture_twin.planning.budget.guidance import check_ways
     from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
 

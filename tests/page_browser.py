@@ -58,6 +58,15 @@ def opened(browser, address, width):
     context.close()
 
 
+@contextmanager
+def ready(browser, address, width=1300):
+    """The page of a report, whose script has run and whose slices are drawn."""
+    with opened(browser, address, width) as page:
+        page.wait_for_function("document.body.dataset.ready === 'true'")
+        drawn(page)
+        yield page
+
+
 def serious_findings(page):
     """What axe-core's own rules find, none of them left out."""
     page.evaluate((files("axe_playwright_python") / "axe.min.js").read_text(encoding="utf-8"))
@@ -95,3 +104,10 @@ def at_pixel(page, number, column, row):
     over.hover(position=place)
     box = over.bounding_box()
     return box["x"] + place["x"], box["y"] + place["y"]
+
+
+def pick_first(page):
+    """Choose the best window's direction in the table, and wait for its slices; returns its row."""
+    first = page.locator("button.pick").first
+    first.click()
+    return int(drawn(page, first.get_attribute("data-row")))

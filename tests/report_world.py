@@ -1,10 +1,12 @@
 """A small patient for the tests of what a person looks at: every verdict is known from θ and β alone."""
 
+import io
 from pathlib import Path as FilePath
 from types import SimpleNamespace
 
 import numpy as np
 import trimesh
+from PIL import Image
 
 from puncture_twin.planning.anatomy.scan import nearest
 from puncture_twin.planning.arm.inverse_kinematics import inverse
@@ -316,3 +318,18 @@ def samples(layer, camera, most=1):
     slant = 1.0 / (rays(camera) @ camera.axes[2]).reshape(size)
     with np.errstate(divide="ignore"):
         return slant / drawn.inverse, drawn.triangle
+
+
+def unpacked_bytes(block):
+    """The bytes of a block of the CT that is packed with loss, shape (nz, ny, nx), as Pillow decodes it."""
+    at, found, (nx, ny, _) = 0, [], block.facts["shape"]
+    for size, count, _ in block.facts["strips"]:
+        rows = np.asarray(Image.open(io.BytesIO(block.content[at : at + size])))
+        found.append(rows.reshape(count, block.facts["rows"], nx)[:, :ny])
+        at += size
+    return np.concatenate(found)
+
+
+def block_pose(block):
+    """Index to mm of a block, 4 x 4."""
+    return np.vstack([np.reshape(block.facts["T"], (3, 4)), [0, 0, 0, 1]])

@@ -30,7 +30,6 @@ MAX_BYTES = 1_000_000_000
 """Of one file: 2,000 frames of 800 x 600."""
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
-MINMAX = ("Min", "Max")
 TWO_D, TISSUE, CENTIMETRES = 1, 1, 3
 """Codes of a region's format, content and unit: a box of colour flow lies within one of tissue."""
 
@@ -40,9 +39,7 @@ LUMINANCE = (0.299, 0.587, 0.114)
 NEARLY_GREY = 24
 """Greatest difference between a grey pixel's channels: JPEG keeps brightness and colour apart, and rounds both."""
 
-MOST_COLOURED = 0.5
-"""Fraction of coloured pixels above which colour is no drawing on a grey picture."""
-
+MOST_COLOURED = 0.5  # fraction of coloured pixels above which colour is no drawing on a grey picture
 SAME_SIZE = 1e-3
 """Sizes of a pixel that differ by a smaller fraction are one: headers keep four digits."""
 
@@ -60,11 +57,7 @@ class GreyFrames(NamedTuple):
 
 
 def read_frames(path: Path) -> GreyFrames:
-    """The pictures of a PNG or DICOM file; which of both it is, its first bytes say.
-
-    Raises:
-        InputError: It is neither, cut short, in colour, of more than 8 bits, contradicts itself, or cannot be decoded.
-    """
+    """The pictures of a whole PNG or DICOM file, grey and of 8 bits; which of both it is, its first bytes say."""
     content = read_input(path, max_bytes=MAX_BYTES, where=str(path))
     source = content_input("picture", path.name, content)
     if is_dicom(content[:META_START]):
@@ -73,11 +66,7 @@ def read_frames(path: Path) -> GreyFrames:
 
 
 def parse_png(content: bytes, path: Path) -> Pixels:
-    """The grey picture of a PNG that has been read, shape (rows, columns).
-
-    Raises:
-        InputError: It is no whole PNG of one grey channel with 8 bits.
-    """
+    """The grey picture of a PNG that has been read, shape (rows, columns): whole, and of one channel of 8 bits."""
     _check_chunks(content, path)
     width, height, depth, colour = struct.unpack(">LLBB", content[16:26])
     if max(width, height) > MAX_SIDE or (depth, colour) != (8, 0):
@@ -130,8 +119,8 @@ def _dicom_frames(
         down, along = numbers(data, "PixelSpacing", 2, where=where)
         spacing = (along, down)
     if spacing is not None and region_size is not None and not np.allclose(spacing, region_size, rtol=SAME_SIZE):
-        width, height = region_size
-        what = f"PixelSpacing {spacing[0]:g} x {spacing[1]:g} mm, but its region {width:g} x {height:g} mm"
+        (across, down), (wide, high) = spacing, region_size
+        what = f"PixelSpacing {across:g} x {down:g} mm, but its region {wide:g} x {high:g} mm"
         refuse(what, where, "one size of a pixel", "pixel_size")
     found = [_grey(cells[box]) for cells in decoded_frames(data, where, raw=False)]
     grey = np.stack([one[0] for one in found]) if found else np.zeros((0, 1, 1), np.uint8)
@@ -171,31 +160,26 @@ def _layout(data: Dataset, where: str) -> tuple[int, tuple[slice, slice], tuple[
         bits = (3 * (not layout.signed), layout.allocated, layout.stored)
     if bits != (3, 8, 8):
         refuse(f"samples of {bits[2]} bits", where, "8 bits without sign, 3 a coloured pixel", "not_grey")
-    region = _region(data, where)
-    if region is None:
-        return frames, (slice(None), slice(None)), None
-    x0, x1 = (
-        whole(region, f"RegionLocation{key}X{i}", low=0, high=columns - 1, where=where) for i, key in enumerate(MINMAX)
-    )
-    y0, y1 = (
-        whole(region, f"RegionLocation{key}Y{i}", low=0, high=rows - 1, where=where) for i, key in enumerate(MINMAX)
-    )
-    if x1 <= x0 or y1 <= y0:
-        refuse(f"a region from {x0}, {y0} to {x1}, {y1}", where, "a region with an area", "bad_tag")
-    width, height = (10.0 * number(region, f"PhysicalDelta{axis}", where=where) for axis in "XY")
-    return frames, (slice(y0, y1 + 1), slice(x0, x1 + 1)), (width, height)
-
-
-def _region(data: Dataset, where: str) -> Dataset | None:
-    """The one region that shows a slice of tissue in cm; None where no region is named."""
     regions = items(data, "SequenceOfUltrasoundRegions", where=where)
 
     def is_slice(one: Dataset) -> bool:
+        """Whether a region shows a slice of tissue in cm."""
         keys = ("RegionSpatialFormat", "RegionDataType", "PhysicalUnitsXDirection", "PhysicalUnitsYDirection")
         codes = [whole(one, key, low=0, high=1 << 16, where=where) for key in keys]
         return codes == [TWO_D, TISSUE, CENTIMETRES, CENTIMETRES]
 
     slices = [one for one in regions if is_slice(one)]
-    if regions and len(slices) != 1:
+    if not regions:
+        return frames, (slice(None), slice(None)), None
+    if len(slices) != 1:
         refuse(f"{len(slices)} regions of tissue in cm", where, "one region", "unsupported_feature")
-    return slices[0] if slices else None
+    (region,) = slices
+    x0, y0, x1, y1 = (
+        whole(region, f"RegionLocation{key}{axis}{i}", low=0, high=most - 1, where=where)
+        for i, key in enumerate(("Min", "Max"))
+        for axis, most in (("X", columns), ("Y", rows))
+    )
+    if x1 <= x0 or y1 <= y0:
+        refuse(f"a region from {x0}, {y0} to {x1}, {y1}", where, "a region with an area", "bad_tag")
+    width, height = (10.0 * number(region, f"PhysicalDelta{axis}", where=where) for axis in "XY")
+    return frames, (slice(y0, y1 + 1), slice(x0, x1 + 1)), (width, height)

@@ -52,7 +52,7 @@ def checked(function: Callable[Given, Found]) -> Callable[Given, Found]:
                 low, high = RANGES.get(name, (-math.inf, math.inf))
                 if not math.isfinite(value):
                     refuse(f"{name} is {float(value)}", function.__name__, "a finite number", "not_finite")
-                if not low <= value <= high:
+                if not low <= float(value) <= high:
                     allowed = f"{low:g} to {high:g}"
                     refuse(f"{name} is {float(value):g}", function.__name__, allowed, "out_of_range")
                 if not isinstance(value, bool | int):  # half precision counts no further

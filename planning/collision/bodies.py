@@ -144,9 +144,9 @@ def arm_bodies(model: UrModel, tool: Tool, padding_mm: float) -> tuple[Body, ...
         following = iter(unpacked_meshes(user_cache().arrays(made_from, grown, by=__name__, check=unpacked_meshes)))
         fuller = [replace(link, pieces=tuple(islice(following, len(link.pieces)))) for link in links]
         full = [_link_shape(link) for link in fuller]
-    for link, own, more in zip(links, bare, full, strict=True):
+    for link, shape, more in zip(links, bare, full, strict=True):
         radius_mm = float(np.linalg.norm(link.mesh.vertices, axis=1).max())
-        bodies.append(Body(link.name, link.frame, np.eye(4), own, more, radius_mm))
+        bodies.append(Body(link.name, link.frame, np.eye(4), shape, more, radius_mm))
     return (
         *bodies,
         round_body("holder", tool.holder_diameter_mm, tool.holder_span_mm, padding_mm),

@@ -395,8 +395,8 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
     except csv.Error as error:
         raise InputError(f"is not a CSV file ({error})", where=path, allowed=_ALLOWED_JOINTS, code="not_csv") from error
     header = [cell.strip().strip('"') for cell in rows[0]] if rows else []
-    kinds: tuple[tuple[tuple[str, ...], AngleUnit], ...]
-    kinds = (JOINTS_RAD, "rad"), (JOINTS_DEG, "deg"), (RTDE_JOINTS, "rad")
+    kinds: list[tuple[tuple[str, ...], AngleUnit]]
+    kinds = [(JOINTS_RAD, "rad"), (JOINTS_DEG, "deg"), (RTDE_JOINTS, "rad")]
     joints, unit = max(kinds, key=lambda kind: sum(name in header for name in kind[0]))
     missing = [name for name in joints if name not in header]
     if missing:

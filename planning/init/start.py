@@ -83,7 +83,11 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         overrides.check_names(names, [name for name, _ in found.passed])
     ct, own = _checked(found, names, point, request)
     progress("skin")
-    skin = ct.surfaces.imaged().skin() if own is None else own.segmentation.skin(own.label)
+    if own is None:
+        assert ct is not None  # one of the two is there
+        skin, skin_source = ct.surfaces.imaged().skin(), ct.source
+    else:
+        skin, skin_source = own.segmentation.skin(own.label), f"'{own.name}' of {own.segmentation.source}"
     seen, of_seen = _seen_in_ct(request.folder, found, ct, skin)
     progress("structures")
     if point is not None and ct is not None:
@@ -122,7 +126,7 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
         structure=holding.target,
         hit_radius_mm=target.hit_radius_mm,
         ct=None if ct is None else ct.source,
-        skin=ct.source if own is None else f"'{own.name}' of {own.segmentation.source}",
+        skin=skin_source,
         sources=tuple((one, assign(one.names, region, holding, left_out, stated)) for one in found.segmentations),
         markers=tuple(markers) or tuple(filter(None, [seen])),
         left_out=tuple(name for name, why in found.passed if why == LEFT_OUT),

@@ -139,10 +139,11 @@ def surveyed(
     margins = np.empty((len(lines), N_BRANCHES, len(rolls)))
     turns = np.empty((len(lines), N_BRANCHES, len(rolls), 6))
     found = []
-    for request, line, *filled in zip(requests, lines, stops, starts, margins, turns, strict=True):
+    for i, (request, line) in enumerate(zip(requests, lines, strict=True)):
         depths = _depths(request.standoff_mm)
         distances = request.needle_length_mm + request.standoff_mm - depths
-        _survey_line(model.lengths, model.joint_limits, *line, distances, depths, rolls, bounds, *filled)
+        path, filled = (*line, distances, depths), (stops[i], starts[i], margins[i], turns[i])
+        _survey_line(model.lengths, model.joint_limits, *path, rolls, bounds, *filled)
         found.append(Surveyed(request, line, depths, distances, rolls, *filled))
     return found
 

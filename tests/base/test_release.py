@@ -72,7 +72,7 @@ def test_what_is_refused_changes_nothing(clone):
     for version in ("", "0.9.9", "0.9.8", "0.10", "v0.10.0", "0.10.0rc1", "0.010.0", "1.0.0\n"):
         is_refused("higher than 0.9.9", version)
     is_refused("a test fails", check=fails)
-    is_refused("", check=interrupted, error=KeyboardInterrupt)
+    is_refused(None, check=interrupted, error=KeyboardInterrupt)
     before = (clone / "CITATION.cff").read_text()
     for name, text in (("CITATION.cff", before), ("new.txt", None)):
         (clone / name).write_text("another\n")

@@ -108,7 +108,7 @@ def test_a_full_disk_is_one_line_and_the_merged_set_stays(planned, tmp_path, mon
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("puncture_twin.twin.jobs.batch.jobs.write_dataset", full)
+    monkeypatch.setattr("puncture_twin.planning.batch.merge.write_dataset", full)
     assert "cannot be written (No space left on device)" in said(capfd, 2, "batch", "merge", "--out", planned).err
     assert {path: path.read_bytes() for path in planned.rglob("*") if path.is_file()} == before
 

@@ -311,7 +311,7 @@ def test_a_mask_that_is_none_is_no_structure_left_out(masked, capfd):
 def test_a_mask_in_another_format_is_not_passed_over(masked, capfd):
     """Neither by `init` nor by a case that names the folder: its organ would be free."""
     assert init(capfd, masked, "--target", TARGET)[0] == 0
-    for ending in ("nhdr", "mha"):
+    for ending in ("mha", "nhdr"):
         write_mask(masked / "seg" / f"vein.{ending}", inside((30, 0, 0), 9.0))
         with refused("entries_not_read", ending):
             prepare(masked, arm=False)
@@ -319,6 +319,7 @@ def test_a_mask_in_another_format_is_not_passed_over(masked, capfd):
         if ending == "mha":
             assert code == 2 and "seg: the folder also has files that cannot be read" in said[0]
             assert "vein.mha" in said[0]
+            (masked / "seg" / "vein.mha").unlink()
         else:
             assert code == 0 and roles(masked)["vein.nhdr"] == ("avoid", 3.0)
 

@@ -16,7 +16,6 @@ CHANGES = (("theta_deg = [0, 10]\nstep_deg = 10.0", 'frame = "ct"\ntheta_deg = [
 
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory):
-    """A case without an arm, and the folder of its search."""
     here = tmp_path_factory.mktemp("candidates")
     case = write_case(here, *CHANGES)
     assert main(["search", str(case), "--no-arm", "--no-pictures", "--out", str(here / "out")]) == OK
@@ -24,7 +23,6 @@ def searched(tmp_path_factory):
 
 
 def expected(folder):
-    """The table's rows, column by name; null is None."""
     return pq.read_table(folder / "candidates.parquet").to_pylist()
 
 
@@ -77,7 +75,6 @@ def test_a_case_is_searched_first(searched, tmp_path, capsys):
 
 
 def test_what_is_no_table_or_was_edited_is_refused(searched, tmp_path, capsys):
-    """One line; nothing is written. And a choice has no meaning for all of them."""
     no_table = tmp_path / "x.parquet"
     no_table.write_bytes(b"PAR1 and no more")
     form = ["--format", "candidates-csv", "--out", str(tmp_path / "out")]

@@ -9,24 +9,14 @@ import pyarrow.parquet as pq
 import pytest
 from refusals import refused_command
 
-from puncture_twin.planning.search.context import prepare
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.choosing.list_job import COLUMNS
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, OK
-from tests.case_world import write_case
 
-CHANGES = (('space = "LPS"', 'space = "RAS"'), ("theta_deg = [0, 10]", 'frame = "ct"\ntheta_deg = [0, 60]'))
 RAS = np.array([-1.0, -1.0, 1.0])
 
 
-@pytest.fixture(scope="module")
-def context(tmp_path_factory):
-    """Balls about a target, without an arm, in RAS."""
-    return prepare(write_case(tmp_path_factory.mktemp("lists"), *CHANGES), arm=False)
-
-
 def run(capsys, *arguments):
-    """Run with --json; exit code and the object."""
     code = main(["check", *map(str, arguments), "--no-arm", "--json"])
     out = capsys.readouterr().out
     return code, json.loads(out) if out else None
@@ -66,7 +56,6 @@ def test_entries_are_checked_as_each_alone(context, tmp_path, capsys):
 
 
 def test_angles_are_a_list_of_entries_too(context, tmp_path, capsys):
-    """With and without names; 0 only where every row is safe."""
     found = context.search()
     lines = [f"{at['theta_deg']},{at['beta_deg']}" for at in map(found.at, found.ranked[:3])]
     code, told = run(
@@ -78,7 +67,7 @@ def test_angles_are_a_list_of_entries_too(context, tmp_path, capsys):
     assert len([line for line in capsys.readouterr().out.splitlines() if line.split()[1:2] == ["safe"]]) == 3
 
 
-def test_each_target_is_what_a_case_with_that_target_says(context, tmp_path, capsys):
+def test_each_target_is_what_a_case_with_that_target_says(context, another, tmp_path, capsys):
     """Also the direction that was chosen for all; a target outside of the body is a row that says why."""
     points = {"first": (5.0, 3.0, -4.0), "outside": (300.0, 0.0, 0.0)}
     listed = write(
@@ -86,10 +75,7 @@ def test_each_target_is_what_a_case_with_that_target_says(context, tmp_path, cap
     )
     code, told = run(capsys, context.case.path, "--targets", listed)
     assert code == ANSWER_IS_NO
-    other = tmp_path / "other"
-    other.mkdir()
-    case = write_case(other, *CHANGES, ("position_mm = [0.0, 0.0, 0.0]", "position_mm = [5.0, 3.0, -4.0]"))
-    alone = prepare(case, arm=False)
+    alone = another(("position_mm = [0.0, 0.0, 0.0]", "position_mm = [5.0, 3.0, -4.0]"))
     found = alone.search()
     first, second = told["rows"]
     assert first["safe_directions"] == int(found.safe.sum()) > 0

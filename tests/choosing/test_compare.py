@@ -16,15 +16,8 @@ from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.choosing.compare_job import BEST_OF_ALL, compare_choices, parse_two, two_plans
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, OK
-from tests.case_world import write_case
 
-CHANGES = (('space = "LPS"', 'space = "RAS"'), ("theta_deg = [0, 10]", 'frame = "ct"\ntheta_deg = [0, 60]'))
 NONE = [], [], [], [], []
-
-
-@pytest.fixture(scope="module")
-def context(tmp_path_factory):
-    return prepare(write_case(tmp_path_factory.mktemp("compare"), *CHANGES), arm=False)
 
 
 def test_each_side_is_what_check_says_of_it(context):

@@ -8,17 +8,9 @@ from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.base.output.manifest import read_manifest
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.search.choice import Choice
-from puncture_twin.planning.search.context import CaseContext, prepare
+from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.jobs.patient import main_job
 from puncture_twin.twin.jobs.patient.path_exports import export_path
-from tests.case_world import write_case
-
-CHANGES = (("theta_deg = [0, 10]", 'frame = "ct"\ntheta_deg = [0, 60]'),)
-
-
-@pytest.fixture(scope="module")
-def context(tmp_path_factory):
-    return prepare(write_case(tmp_path_factory.mktemp("stated"), *CHANGES), arm=False)
 
 
 @pytest.fixture(scope="module")

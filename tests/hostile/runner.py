@@ -5,6 +5,7 @@ A line on stdin is JSON: ``argv`` of the command line, or ``reader`` with ``path
 clock, ``megabytes``.
 """
 
+import importlib
 import json
 import os
 import resource
@@ -21,6 +22,12 @@ from puncture_twin.planning.formats.meshes.mesh_files import read_mesh
 from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.run_twin import main
+
+LOADED = ("patient.main_job", "patient.pictures", "selfcal.report", "servo.job", "live.mirror", "batch.jobs")
+"""What commands load by themselves: once here, where each child would else spend a second on it."""
+
+for name in ("planning.search.context", *(f"twin.jobs.{one}" for one in LOADED)):
+    importlib.import_module(f"puncture_twin.{name}")
 
 READERS = {
     "certificate": read_certificate,

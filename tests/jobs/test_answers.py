@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from pathlib import Path
-from types import SimpleNamespace
+from types import SimpleNamespace as Of
 
 import numpy as np
 import pytest
@@ -17,7 +17,6 @@ ROOT = Path(__file__).parents[2]
 
 
 def commands(group, before=""):
-    """Every command by its whole name."""
     for name, command in group.commands.items():
         below = hasattr(command, "commands")
         yield from commands(command, f"{before}{name} ") if below else [f"{before}{name}"]
@@ -39,28 +38,25 @@ def test_no_command_ends_by_another_rule():
 
 
 CASES = {
-    "demo": (SimpleNamespace(failures=()), SimpleNamespace(failures=("missed",))),
-    "rehearse": (SimpleNamespace(failures=()), SimpleNamespace(failures=("missed",))),
-    "rehearse --sweep": (SimpleNamespace(whole=True), SimpleNamespace(whole=False)),
-    "rehearse --guidance A,B": (SimpleNamespace(passed=True), SimpleNamespace(passed=False)),
-    "search": tuple(
-        SimpleNamespace(candidates=SimpleNamespace(safe=np.array(safe))) for safe in ([False, True], [False])
-    ),
-    "check": (SimpleNamespace(safe=True), SimpleNamespace(safe=False)),
-    "compare": (SimpleNamespace(safe=True), SimpleNamespace(safe=False)),
-    "confirm": (SimpleNamespace(yes=True), SimpleNamespace(yes=False)),
-    "touch": (SimpleNamespace(suffices=True), SimpleNamespace(suffices=False)),
-    "pivot": tuple(SimpleNamespace(pivot=SimpleNamespace(large=large)) for large in (False, True)),
-    "servo": (SimpleNamespace(passed=True), SimpleNamespace(passed=False)),
-    "reproduce": (SimpleNamespace(passed=True), SimpleNamespace(passed=False)),
-    "batch run": tuple(SimpleNamespace(whole=whole, ended=Counter({2: 1})) for whole in (True, False)),
-    "batch merge": (SimpleNamespace(as_expected=True), SimpleNamespace(as_expected=False)),
+    "demo": (Of(failures=()), Of(failures=("missed",))),
+    "rehearse": (Of(failures=()), Of(failures=("missed",))),
+    "rehearse --sweep": (Of(whole=True), Of(whole=False)),
+    "rehearse --guidance A,B": (Of(passed=True), Of(passed=False)),
+    "search": tuple(Of(candidates=Of(safe=np.array(safe))) for safe in ([False, True], [False])),
+    "check": (Of(safe=True), Of(safe=False)),
+    "compare": (Of(safe=True), Of(safe=False)),
+    "confirm": (Of(yes=True), Of(yes=False)),
+    "touch": (Of(suffices=True), Of(suffices=False)),
+    "pivot": tuple(Of(pivot=Of(large=large)) for large in (False, True)),
+    "servo": (Of(passed=True), Of(passed=False)),
+    "reproduce": (Of(passed=True), Of(passed=False)),
+    "batch run": tuple(Of(whole=whole, ended=Counter({2: 1})) for whole in (True, False)),
+    "batch merge": (Of(as_expected=True), Of(as_expected=False)),
 }
 
 
 @pytest.mark.parametrize("command", sorted(RULES))
 def test_a_command_ends_with_the_code_of_its_rule(command, capsys):
-    """0 for yes, 1 for no."""
     yes, no = CASES[command]
     finish(command, yes, {"a": 1}, "found", False)
     assert capsys.readouterr().out == "found\n"
@@ -71,7 +67,7 @@ def test_a_command_ends_with_the_code_of_its_rule(command, capsys):
 
 
 def test_a_batch_in_which_the_program_failed_ends_with_3():
-    counts = SimpleNamespace(whole=False, ended=Counter({PROGRAM_FAILED: 1}))
+    counts = Of(whole=False, ended=Counter({PROGRAM_FAILED: 1}))
     with pytest.raises(typer.Exit) as ended:
         finish("batch run", counts, {}, "", True)
     assert ended.value.exit_code == PROGRAM_FAILED
@@ -79,17 +75,17 @@ def test_a_batch_in_which_the_program_failed_ends_with_3():
 
 def context(radius_mm=5.0, **limits):
     """A case whose target is a ball, with two structures that must not be touched and one that may."""
-    settings = SimpleNamespace(min_hit=None, max_touch=None, max_touch_of={})
+    settings = Of(min_hit=None, max_touch=None, max_touch_of={})
     vars(settings).update(limits)
     kinds = (("vessel", True), ("rib", True), ("fat", False))
-    checked = [SimpleNamespace(name=name, demands_margin=demands) for name, demands in kinds]
-    case = SimpleNamespace(hit_radius_mm=radius_mm, search=settings)
-    return SimpleNamespace(case=case, anatomy=SimpleNamespace(checked=checked))
+    checked = [Of(name=name, demands_margin=demands) for name, demands in kinds]
+    case = Of(hit_radius_mm=radius_mm, search=settings)
+    return Of(case=case, anatomy=Of(checked=checked))
 
 
 def room(off_mm=1.0, contacts=(), **clearance_mm):
     """A rehearsal that ended so far from its target, with the least clearances."""
-    return SimpleNamespace(
+    return Of(
         tip_true_ct=np.array([[9.0, 9.0, 9.0], [off_mm, 0.0, 0.0]]),
         target_true_ct=np.zeros(3),
         clearance_mm={name: np.array([20.0, mm]) for name, mm in clearance_mm.items()},
@@ -102,11 +98,11 @@ def test_a_room_says_no_where_it_misses_or_touches():
     assert rehearsal_failures(context(), room(vessel=0.1, fat=-3.0)) == ()
     assert rehearsal_failures(context(), room(5.1)) == ("the tip missed the target",)
     assert rehearsal_failures(context(), room(vessel=-0.1, rib=2.0)) == ("the needle touched vessel",)
-    met = [SimpleNamespace(link="forearm", body="patient")] * 2
+    met = [Of(link="forearm", body="patient")] * 2
     assert rehearsal_failures(context(), room(contacts=met)) == ("the arm's forearm touched patient",)
 
 
-class Trials(SimpleNamespace):
+class Trials(Of):
     """Some of many rooms."""
 
     def __len__(self):

@@ -134,7 +134,7 @@ def test_where_the_arm_should_stand_goes_into_a_case(given, monkeypatch):
     armed = given["armed"]
     seen, one = [], SimpleNamespace(verdict=SimpleNamespace(reached=1))
     found = SimpleNamespace(rated=[one], checked=(1, 1), complete=True)
-    monkeypatch.setattr(place_job, "search_placements", lambda *_, **keys: seen.append(keys["jobs"]) or found)
+    monkeypatch.setattr(place_job.place, "search_placements", lambda *_, **keys: seen.append(keys["jobs"]) or found)
     assert pt.place(armed, jobs=1) is found and seen == [1]
     one.verdict.reached = 0
     with refused("no_placement", by=pt.NoAnswerError):

@@ -27,11 +27,8 @@ code = main(sys.argv[2:])
 timer.cancel()
 sys.exit(code if sent.is_set() else %d)
 """
-ENDED_BEFORE = 77
-"""The program's exit code where the command ended before it was interrupted: the machine is too fast."""
-
-QUICK = {"batch", "init"}
-"""Commands that take less than the second after which the others are interrupted."""
+ENDED_BEFORE = 77  # the program's exit code where the command ended before it was interrupted: the machine is too fast
+QUICK = {"batch", "init"}  # commands that take less than the second after which the others are interrupted
 
 WRITING = {"search", "rehearse", "place", "batch", "selfcal"}
 COMMANDS = sorted(WRITING | {"init", "live"})
@@ -41,7 +38,6 @@ tests/jobs/test_interrupt.py; `mirror`, which has then done what it was asked fo
 
 @pytest.fixture(scope="module")
 def typed(tmp_path_factory):
-    """The arguments of every command, of a coarse case."""
     here = tmp_path_factory.mktemp("ctrl-c")
     case = str(coarse_cases(here)[0])
     (here / "selfcal").mkdir()
@@ -64,7 +60,6 @@ def typed(tmp_path_factory):
 
 
 def is_whole(out):
-    """Whether a folder is there with all that its manifest lists."""
     return (out / MANIFEST_NAME).exists() and not problems(out)
 
 

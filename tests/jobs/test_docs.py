@@ -26,7 +26,6 @@ each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.rel
 
 
 def slug(heading):
-    """The anchor of a heading, as the site and the usual viewers make it."""
     kept = re.sub(r"[^\w\- ]", "", heading.replace("`", "").lower())
     return re.sub(r"[ ]", "-", kept.strip())
 
@@ -39,6 +38,11 @@ def anchors(page):
 @cache
 def class_names():
     return {name for path in modules().values() for name in DEFINED.findall(path.read_text(encoding="utf-8"))}
+
+
+@cache
+def make_targets():
+    return set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.M))
 
 
 def names_of(path):
@@ -67,25 +71,15 @@ def test_every_link_leads_somewhere(page):
 
 
 @each_page
-def test_every_file_and_module_that_is_named_exists(page):
-    """A page that names a moved file is worse than one that names none."""
-    text = page.read_text(encoding="utf-8")
-    known = modules()
+def test_everything_that_is_named_exists(page):
+    """Files, modules, classes and targets of make: a page that names a moved file is worse than one that names none."""
+    text, known = page.read_text(encoding="utf-8"), modules()
     assert [name for name in FILE.findall(text) if not (ROOT / name).exists()] == []
     for dotted in set(DOTTED.findall(text)) - {GROUP}:  # an entry point, no module
         room, _, name = dotted.rpartition(".")
         assert dotted in known or (room in known and name in names_of(known[room])), dotted
-
-
-@each_page
-def test_every_class_that_is_named_exists(page):
-    assert set(CLASS.findall(page.read_text(encoding="utf-8"))) - class_names() == set()
-
-
-@each_page
-def test_every_make_target_that_is_named_exists(page):
-    targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.M))
-    assert set(re.findall(r"`make (\w+)`", page.read_text(encoding="utf-8"))) - targets == set()
+    assert set(CLASS.findall(text)) - class_names() == set()
+    assert set(re.findall(r"`make (\w+)`", text)) - make_targets() == set()
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if list(code_blocks(page))], ids=lambda page: page.stem)
@@ -104,7 +98,6 @@ def test_the_code_of_the_readme_runs(monkeypatch, capsys):
 
 
 def commands(group, before=""):
-    """Every command with its whole name."""
     for name, command in group.commands.items():
         below = hasattr(command, "commands")
         yield from commands(command, f"{before}{name} ") if below else [(f"{before}{name}", command)]

@@ -9,8 +9,7 @@ import pytest
 from fuzz.runner import Fuzzer
 from fuzz.targets import read_case, whole_case
 
-RUNS = 400
-"""Of each of the four parts, which run side by side."""
+RUNS = 400  # of each of the four parts, which run side by side
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +18,6 @@ def fuzzer(tmp_path_factory):
 
 
 def test_every_file_of_the_corpus_is_whole(fuzzer):
-    """What the mutators start from is accepted: what they break was right."""
     fuzzer.check_corpus()
 
 

@@ -1,6 +1,7 @@
 """Hostile inputs, each with its story in hostile/cases.toml: one line, no traceback, no hang, no gigabytes."""
 
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
@@ -14,19 +15,16 @@ from puncture_twin.planning.base.processes import worker_count, working
 
 HERE = TESTS
 CASES = tomllib.loads((HERE / "hostile" / "cases.toml").read_text())["case"]
-SECONDS, MEGABYTES = 10, 1000
-"""Bounds of a case that states none, generous: the machine may be shared."""
+SECONDS, MEGABYTES = 10, 1000  # bounds of a case that states none, generous: the machine may be shared
 SPAN_MEGABYTES = 6000
 """Address space beyond what the imports hold: libraries reserve more than they use. It protects the machine; what is
 used is compared afterwards."""
 LONGEST_LINE = 1500
-PROGRESS = ("stage: ", "anatomy: ")
-"""How lines of progress begin, which a slow machine shows before the refusal."""
+PROGRESS = ("stage: ", "anatomy: ")  # how lines of progress begin, which a slow machine shows before the refusal
 
 
 @pytest.fixture(scope="module")
 def runner():
-    """A process that has imported the program, and forks for each case."""
     here = HERE.parent
     path = os.pathsep.join([str(here), str(HERE), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
@@ -80,7 +78,6 @@ def test_a_hostile_input_costs_one_line(case, runner, tmp_path):
 
 
 def test_every_maker_has_a_story():
-    """Nothing is made that no case tells of, and every story says something."""
     assert {case["make"] for case in CASES} == set(MAKERS)
     assert len({case["name"] for case in CASES}) == len(CASES)
     assert all(len(case["story"]) > 3 for case in CASES)
@@ -89,14 +86,7 @@ def test_every_maker_has_a_story():
 def test_a_million_jobs_are_as_many_processes_as_cores():
     """``place --jobs 1000000`` started 3,136 processes before it was stopped; the answers stay in order."""
     cores = len(os.sched_getaffinity(0))
-    assert worker_count(1_000_000, 1_000_000) == cores
-    assert worker_count(1_000_000, 1) == 1
-    assert worker_count(1_000_000, 0) == 1
+    assert [worker_count(1_000_000, pieces) for pieces in (1_000_000, 1, 0)] == [cores, 1, 1]
     with working(1_000_000, 400) as work:
-        answers = list(work(_process, range(400), chunksize=48))
-    assert [number for number, _ in answers] == list(range(400))
-    assert len({process for _, process in answers}) <= cores
-
-
-def _process(number):
-    return number, os.getpid()
+        assert list(work(abs, range(-400, 0), chunksize=48)) == list(range(400, 0, -1))
+        assert len(multiprocessing.active_children()) <= cores

@@ -18,9 +18,10 @@ from puncture_twin.planning.base.output.manifest import problems, read_manifest
 from puncture_twin.run_twin import main
 from puncture_twin.twin.jobs.exit_codes import ANSWER_IS_NO, BAD_INPUT, OK, PROGRAM_FAILED
 from puncture_twin.twin.jobs.options import prepared
-from puncture_twin.twin.jobs.patient.main_job import demo_case
+from puncture_twin.twin.jobs.patient import main_job
 from puncture_twin.twin.report.progress import LineDisplay, progress_display
-from puncture_twin.twin.report.scene.film import FilmTimes
+
+pytestmark = pytest.mark.usefixtures("short_film")
 
 
 @pytest.fixture(scope="module")
@@ -29,36 +30,25 @@ def carton(tmp_path_factory):
     return coarse_carton(tmp_path_factory.mktemp("carton") / "case")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def short_film():
-    """Three frames, in this process: a whole film, and one of another process, are made in test_reproducible."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("puncture_twin.twin.jobs.patient.rehearsed.worker_count", lambda wanted, pieces: 1)
-        times = "puncture_twin.twin.report.scene.film.film_times"
-        patch.setattr(times, lambda total: FilmTimes((0.0, total), 1.0, 1))
-        yield
+def copied(carton, here, change=str):
+    """A copy of the case, whose text is changed; its file."""
+    shutil.copytree(carton.parent, here)
+    (here / carton.name).write_text(change((here / carton.name).read_text()))
+    return here / carton.name
 
 
 @pytest.fixture(scope="module")
-def rehearsed(carton, tmp_path_factory):
+def rehearsed(carton, short_film, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
     assert main(["rehearse", str(carton), "--out", str(out)]) == OK
     return out
 
 
-def run(capfd, *arguments):
-    """Run with --json; returns the exit code and the one object on stdout."""
-    code = main([*map(str, arguments), "--json"])
-    out = capfd.readouterr().out
-    return code, json.loads(out) if out else None
-
-
 def test_a_demo_without_the_simulator_plans(carton, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(errors, "find_spec", lambda name: None if name == "pybullet" else name)
+    monkeypatch.setattr(main_job, "plan_case", lambda *asked: asked)
     with prepared(carton) as context:
-        run = demo_case(context, tmp_path)
-    assert run.plan is not None and run.rehearsal is None
-    assert {"plan.json", "report.html"} <= {path.name for path in tmp_path.iterdir()}
+        assert main_job.demo_case(context, tmp_path) == (context, tmp_path)
     assert "warning: planned, not rehearsed: demo: it needs the extra 'twin'" in capfd.readouterr().err
 
 
@@ -69,22 +59,20 @@ def test_a_rehearsal_writes_every_file(rehearsed):
     assert all(path.stat().st_size > 0 for path in rehearsed.iterdir())
 
 
-def test_the_page_says_where_the_needle_enters_as_check_does(carton, rehearsed, capfd):
+def test_the_page_says_where_the_needle_enters_as_check_does(carton, rehearsed, run):
     plan = json.loads((rehearsed / "plan.json").read_text())
-    code, told = run(capfd, "check", carton, "--theta", plan["theta_deg"], "--beta", plan["beta_deg"], "--no-arm")
+    code, told = run("check", carton, "--theta", plan["theta_deg"], "--beta", plan["beta_deg"], "--no-arm")
     words = told["entry_from"]["text"]
     assert code == OK and "from marker " in words
     assert f"<td>{words}</td>" in (rehearsed / "report.html").read_text()
 
 
-def test_an_expected_error_says_of_what_it_is(carton, rehearsed, capfd):
+def test_an_expected_error_says_of_what_it_is(carton, rehearsed, run, capfd):
     """Of the markers alone register and page say the same number; of the tip, page and plan do."""
-    _, registered = run(capfd, "register", carton)
+    _, registered = run("register", carton)
     page = (rehearsed / "report.html").read_text()
-    tre, tip = (
-        registered["expected_tre_target_mm"],
-        json.loads((rehearsed / "plan.json").read_text())["expected_target_error_mm"],
-    )
+    tre = registered["expected_tre_target_mm"]
+    tip = json.loads((rehearsed / "plan.json").read_text())["expected_target_error_mm"]
     assert abs(tre - tip) > 0.1  # else they may be mixed up here
     assert f"expected TRE at the target (rms), from the markers alone</th><td><b>{tre:.2f} mm" in page
     assert f"expected tip error (rms), in the arm configuration of the plan</th><td>{tip:.2f} mm" in page
@@ -122,11 +110,11 @@ def test_the_carton_errs_like_the_paper(rehearsed):
     assert all(speed <= limit for speed, limit in speeds)
 
 
-def test_a_written_plan_is_rehearsed_again_with_the_same_result(carton, rehearsed, tmp_path, capfd):
+def test_a_written_plan_is_rehearsed_again_with_the_same_result(carton, rehearsed, run, tmp_path):
     """Checked and executed, it ends where it ended before."""
     copy = tmp_path / "copy"
     shutil.copytree(rehearsed, copy)
-    code, again = run(capfd, "rehearse", copy / "plan.json", "--case", carton, "--out", copy)
+    code, again = run("rehearse", copy / "plan.json", "--case", carton, "--out", copy)
     assert code == OK
     before = json.loads((rehearsed / "rehearsal.json").read_text())
     assert again["rehearsal"]["tip_error_mm"] == pytest.approx(before["tip_error_mm"], abs=1e-6)
@@ -145,17 +133,16 @@ def no_encoder(monkeypatch):
 
 
 @pytest.mark.usefixtures("no_encoder")
-def test_of_many_rooms_the_median_is_shown(carton, rehearsed, tmp_path, capfd):
+def test_of_many_rooms_the_median_is_shown(carton, rehearsed, run, tmp_path):
     """Headline, film and numbers are of the room in the middle, which the simulator confirms."""
-    here = tmp_path / "case"
-    shutil.copytree(carton.parent, here)
-    text = re.sub(r"\n\[errors\].*?(?=\n\[)", "", (here / "case_m.toml").read_text(), flags=re.DOTALL).split("\n[end]")[
-        0
-    ]
-    errors = "\n[errors]\ntouch_mm = 0.2\nct_in_plane_mm = 0.3\nct_slice_mm = 0.3\n"
-    (here / "case_m.toml").write_text(f"{text}\n{errors}\n[end]\nstructures = 4\n")
-    arguments = ("rehearse", here / "case_m.toml", "--seeds", 201, "--physics", 1, "--out", tmp_path / "out")
-    code, found = run(capfd, *arguments)
+
+    def declared(text):
+        text = re.sub(r"\n\[errors\].*?(?=\n\[)", "", text, flags=re.DOTALL).split("\n[end]")[0]
+        errors = "\n[errors]\ntouch_mm = 0.2\nct_in_plane_mm = 0.3\nct_slice_mm = 0.3\n"
+        return f"{text}\n{errors}\n[end]\nstructures = 4\n"
+
+    case = copied(carton, tmp_path / "case", declared)
+    code, found = run("rehearse", case, "--seeds", 201, "--physics", 1, "--out", tmp_path / "out")
     assert code == OK
     one, rooms = found["rehearsal"], found["distribution"]
     assert one["percentile"] == pytest.approx(50, abs=2) and one["percentile_of"] == "rooms"
@@ -172,38 +159,26 @@ def test_of_many_rooms_the_median_is_shown(carton, rehearsed, tmp_path, capfd):
 
 def test_a_plan_whose_marker_file_changed_is_refused(carton, rehearsed, tmp_path, capfd):
     """One touched marker moved by a hundredth: the plan is stale, and nothing is written."""
-    other = tmp_path / "case"
-    shutil.copytree(carton.parent, other)
-    text = (other / "touch.csv").read_text()
-    (other / "touch.csv").write_text(text.replace("417.67", "417.68"))
-    out = tmp_path / "out"
-    command = ["rehearse", rehearsed / "plan.json", "--case", other / "case_m.toml", "--out", out]
+    other, out = copied(carton, tmp_path / "case"), tmp_path / "out"
+    touched = other.with_name("touch.csv")
+    touched.write_text(touched.read_text().replace("417.67", "417.68"))
+    command = ["rehearse", rehearsed / "plan.json", "--case", other, "--out", out]
     refused_command(command, capfd, "input_changed", "touch.csv")
     assert not out.exists()
 
 
-def test_search_prints_counts_and_writes_the_table(carton, tmp_path, capfd):
-    code, found = run(capfd, "search", carton, "--no-arm", "--out", tmp_path)
-    assert code == OK
+def test_a_new_search_leaves_nothing_of_an_old_one(carton, run, tmp_path, capfd):
+    """Counts are the table's; pictures and page of an earlier search go with it; notes kept there by somebody stay."""
+    code, found = run("search", carton, "--no-arm", "--out", tmp_path)
     verdicts = pq.read_table(tmp_path / "candidates.parquet")["verdict"].to_pylist()
-    assert found["counts"]["safe"] == verdicts.count("safe")
-    assert found["directions"] == len(verdicts)
-    assert found["plan"] is None
-
-
-def test_a_new_search_leaves_nothing_of_an_old_one(carton, tmp_path, capfd):
-    """Pictures and page of an earlier search go with it; notes that somebody keeps there stay."""
-    assert main(["search", str(carton), "--no-arm", "--out", str(tmp_path)]) == OK
-    assert (tmp_path / "report.html").is_file()
+    assert code == OK and (found["directions"], found["plan"]) == (len(verdicts), None)
+    assert found["counts"]["safe"] == verdicts.count("safe") and (tmp_path / "report.html").is_file()
     (tmp_path / "notes.txt").write_text("mine")
-    capfd.readouterr()
     assert main(["search", str(carton), "--no-arm", "--no-pictures", "--out", str(tmp_path)]) == OK
-    said = capfd.readouterr().err
     went = "map.png, report.html, scene.png, slices.png of an earlier run removed: not part of this search"
-    assert f"{tmp_path}: {went}" in said
+    assert f"{tmp_path}: {went}" in capfd.readouterr().err
     names = {"candidates.parquet", "manifest.json", "timings.json", "notes.txt"}
-    assert {path.name for path in tmp_path.iterdir()} == names
-    assert problems(tmp_path) == ()
+    assert {path.name for path in tmp_path.iterdir()} == names and problems(tmp_path) == ()
 
 
 def test_a_plan_of_a_set_is_read_only_as_it_was_written(rehearsed, tmp_path, capfd):
@@ -236,25 +211,21 @@ def test_an_export_lists_what_decided_it(rehearsed, tmp_path, capfd):
 
 def test_nothing_safe_is_exit_code_1_with_the_closest_miss(carton, tmp_path, capfd):
     """All bolts demand 80 mm: no candidate is safe, and the one that came closest is named with what it lacked."""
-    other = tmp_path / "case"
-    shutil.copytree(carton.parent, other)
-    text = (other / "case_m.toml").read_text()
-    (other / "case_m.toml").write_text(text.replace("margin_mm = 2.0", "margin_mm = 80.0"))
-    assert main(["search", str(other / "case_m.toml"), "--no-arm", "--out", str(tmp_path / "out")]) == ANSWER_IS_NO
+    other = copied(carton, tmp_path / "case", lambda text: text.replace("margin_mm = 2.0", "margin_mm = 80.0"))
+    searched = ["search", str(other), "--no-arm", "--no-pictures", "--out", str(tmp_path / "out")]
+    assert main(searched) == ANSWER_IS_NO
     said = capfd.readouterr().out
-    assert "no candidate is safe; the closest, theta" in said
-    assert "too_close (bolt" in said
-    assert (tmp_path / "out" / "map.png").is_file()
-    assert main(["plan", str(other / "case_m.toml"), "--out", str(tmp_path / "plan")]) == ANSWER_IS_NO
+    assert "no candidate is safe; the closest, theta" in said and "too_close (bolt" in said
+    assert main(["plan", str(other), "--out", str(tmp_path / "plan")]) == ANSWER_IS_NO
     assert "no plan: no candidate is safe" in capfd.readouterr().err
     assert "Planning failed: no candidate is safe" in (tmp_path / "plan" / "report.html").read_text(encoding="utf-8")
-    assert not (tmp_path / "plan" / "plan.json").exists()
+    assert (tmp_path / "plan" / "map.png").is_file() and not (tmp_path / "plan" / "plan.json").exists()
 
 
-def test_check_draws_slices(carton, tmp_path, capfd):
+def test_check_draws_slices(carton, run, tmp_path):
     """Of a refused direction too, as an entry of the folder's set; what is no PNG is refused."""
     arguments = ["check", carton, "--theta", 45, "--beta", 270, "--no-arm", "--picture"]
-    code, found = run(capfd, *arguments, tmp_path / "one.png")
+    code, found = run(*arguments, tmp_path / "one.png")
     assert (code, found["verdict"]) == (ANSWER_IS_NO, "rejected")
     assert Image.open(tmp_path / "one.png").format == "PNG"
     assert list(read_manifest(tmp_path).entries) == ["check one.png"] and problems(tmp_path) == ()
@@ -274,27 +245,20 @@ def test_check_explains_a_refusal(carton, capfd):
         assert line in said
 
 
-@pytest.fixture
-def without_base(carton, tmp_path):
-    """The carton, in a case that does not say where the robot's base is."""
-    other = tmp_path / "without_base"
-    shutil.copytree(carton.parent, other)
-    text = (other / "case_m.toml").read_text()
-    start, end = text.index("[registration]"), text.index("[robot]")
-    (other / "case_m.toml").write_text(text[:start] + text[end:])
-    return other / "case_m.toml"
-
-
-def test_an_arm_that_was_switched_off_is_named(carton, capfd):
+def test_an_arm_that_was_switched_off_is_named(carton, run):
     """--no-arm on a case that says where the base is: the verdict is for the organs, and why is said."""
-    code, found = run(capfd, "check", carton, "--theta", 0, "--beta", 0, "--no-arm")
+    code, found = run("check", carton, "--theta", 0, "--beta", 0, "--no-arm")
     assert (code, found["arm"]) == (OK, "not checked: switched off (--no-arm)")
     assert not any("states a robot" in warning for warning in found["warnings"])
 
 
-@pytest.mark.parametrize("command", [["search"], ["check", "--theta", "0", "--beta", "0"]])
-def test_an_arm_that_is_asked_for_must_have_a_base(without_base, command, capfd):
-    refused_command([*command, without_base, "--arm"], capfd, "no_base")
+def test_an_arm_that_is_asked_for_must_have_a_base(carton, tmp_path, capfd):
+    def without(text):
+        return text[: text.index("[registration]")] + text[text.index("[robot]") :]
+
+    other = copied(carton, tmp_path / "without_base", without)
+    for command in (["search"], ["check", "--theta", "0", "--beta", "0"]):
+        refused_command([*command, other, "--arm"], capfd, "no_base")
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc on this system")

@@ -30,8 +30,7 @@ from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.twin.jobs.live import led_touches, mirror, rtde
 
 ABDOMEN = folder() / "abdomen"
-HOST = "127.0.0.47"
-"""A loopback address of its own, so that a controller's ports are free there."""
+HOST = "127.0.0.47"  # a loopback address of its own, so that a controller's ports are free there
 COLUMNS = "time_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"
 needs_the_extra = pytest.mark.skipif(
     importlib.util.find_spec("rtde_receive") is None, reason="ur-rtde is not installed: pip install '.[mirror]'"
@@ -39,23 +38,20 @@ needs_the_extra = pytest.mark.skipif(
 
 
 class FakeArm:
-    """Reads like a robot; anything but the two readings is an attribute error."""
+    """Reads like a robot, row after row, and stays at the last where it `stays`; all but its readings is an error."""
 
-    step_s = 0.5
-
-    def __init__(self, rows):
-        self.rows = list(rows)
-        self.time = 100.0
+    def __init__(self, rows, *, time=100.0, step_s=0.5, connected=True, stays=False):
+        self.rows, self.time, self.step_s, self.connected, self.stays = list(rows), time, step_s, connected, stays
 
     def getActualQ(self):  # noqa: N802
-        return self.rows.pop(0)
+        return self.rows[0] if self.stays and len(self.rows) == 1 else self.rows.pop(0)
 
     def getTimestamp(self):  # noqa: N802
         self.time += self.step_s
         return self.time
 
     def isConnected(self):  # noqa: N802
-        return True
+        return self.connected
 
 
 @pytest.fixture(scope="module")
@@ -96,24 +92,14 @@ def test_joint_angles_that_are_none_are_refused():
             next(rtde.live_states(FakeArm([row]), period_s=0.0, seconds=None))
 
 
-class SilentArm(FakeArm):
-    """Says the same for ever, as the library does once the line is gone."""
-
-    step_s = 0.0
-
-    def __init__(self, connected):
-        super().__init__([[0.0] * 6] * 1000)
-        self.time, self.connected = 7.5, connected
-
-    def isConnected(self):  # noqa: N802
-        return self.connected
-
-
 @pytest.mark.parametrize("connected", [False, True])
 def test_an_old_state_is_not_shown_again(monkeypatch, connected):
     """The last word of a robot that is gone must not look like an arm that stands still."""
     monkeypatch.setattr(rtde, "SILENCE_S", 0.05)
-    states = rtde.live_states(SilentArm(connected), period_s=0.001, seconds=None)
+    silent = FakeArm(
+        [[0.0] * 6] * 1000, time=7.5, step_s=0.0, connected=connected
+    )  # as the library once the line is gone
+    states = rtde.live_states(silent, period_s=0.001, seconds=None)
     assert next(states).time_s == 7.5
     with refused("robot_silent", "7.500"):
         next(states)
@@ -137,19 +123,17 @@ def rows(drive):
 
 
 @needs_the_extra
-def test_a_controller_is_mirrored_as_its_recording_is(rows, tmp_path, capfd):
+def test_a_controller_is_mirrored_as_its_recording_is(rows, tmp_path, run):
     """Through ur-rtde itself: the same tips. The controller is sent four packages that set up the reading, no more."""
     recording = tmp_path / "joints.csv"
     lines = [f"{START_S + i * PERIOD_S!r},{','.join(map(repr, map(float, q)))}" for i, q in enumerate(rows)]
     recording.write_text("\n".join([COLUMNS, *lines]))
-    assert run_twin.main(["mirror", "--case", str(ABDOMEN), "--from", str(recording), "--json"]) == 0
-    recorded = json.loads(capfd.readouterr().out)["states"]
+    _, recorded = run("mirror", "--case", ABDOMEN, "--from", recording)
     with rtde_server(HOST, rows) as controller:
-        live = ["mirror", HOST, "--case", str(ABDOMEN), "--seconds", "0.5", "--rate", "50", "--json"]
-        assert run_twin.main(live) == 0
-    said = json.loads(capfd.readouterr().out)["states"]
-    assert len(said) >= 5 and said[-1]["time_s"] - said[0]["time_s"] > 0.3
-    by_joints = {tuple(one["q_deg"]): one for one in recorded}
+        code, live = run("mirror", HOST, "--case", ABDOMEN, "--seconds", 0.5, "--rate", 50)
+    said = live["states"]
+    assert code == 0 and len(said) >= 5 and said[-1]["time_s"] - said[0]["time_s"] > 0.3
+    by_joints = {tuple(one["q_deg"]): one for one in recorded["states"]}
     for one in said:
         same = by_joints[tuple(one["q_deg"])]  # bit for bit the recording's
         assert one["time_s"] == pytest.approx(same["time_s"], abs=1.5 * PERIOD_S)
@@ -243,24 +227,15 @@ def test_only_the_receiving_half_is_ever_named():
     assert "rtde_receive" in text and not any(word in text for word in ("rtde_control", "rtde_io", "RTDEControl"))
 
 
-class PushedArm(FakeArm):
-    """Reads like an arm that moves from row to row, a hundredth of a second each, and stays at the last."""
-
-    step_s = 0.01
-
-    def getActualQ(self):  # noqa: N802
-        return self.rows.pop(0) if len(self.rows) > 1 else self.rows[0]
-
-
 def test_a_led_arm_is_read_at_rest():
     """Not while it moves: the mean of half a second in which no joint turned; `move_jp` passes over other rests."""
     moving = np.linspace(0.0, 1.0, 50)[:, None] * np.ones(6)
     rest, noise = np.full(6, 1.2), np.random.default_rng(0).uniform(-1e-4, 1e-4, (60, 6))
-    arm = rtde.LedArm(PushedArm([*moving, *(rest + noise), rest]), period_s=0.0)
+    arm = rtde.LedArm(FakeArm([*moving, *(rest + noise), rest], step_s=0.01, stays=True), period_s=0.0)
     q = arm.measured_jp()
     assert 0.0 < np.abs(q - rest).max() < 2e-5  # of the mean of fifty readings
     elsewhere = np.full((80, 6), 0.3)
-    arm = rtde.LedArm(PushedArm([*elsewhere, *moving, rest]), period_s=0.0)
+    arm = rtde.LedArm(FakeArm([*elsewhere, *moving, rest], step_s=0.01, stays=True), period_s=0.0)
     arm.move_jp(rest + np.radians(0.4))
     np.testing.assert_allclose(arm.measured_jp(), rest, atol=1e-12)
 
@@ -269,7 +244,7 @@ def test_an_arm_that_nobody_leads_is_not_waited_for_without_end(monkeypatch):
     monkeypatch.setattr(rtde, "LED_S", 3.0)
     for rows in ([np.zeros(6)], np.linspace(0.0, 5.0, 400)[:, None] * np.ones(6)):
         with pytest.raises(NoAnswerError) as error:
-            rtde.LedArm(PushedArm(list(rows)), period_s=0.0).move_jp(np.ones(6) * 2.0)
+            rtde.LedArm(FakeArm(rows, step_s=0.01, stays=True), period_s=0.0).move_jp(np.ones(6) * 2.0)
         assert error.value.code == "not_led"
 
 
@@ -282,7 +257,7 @@ def touched_q():
 
 
 @needs_the_extra
-def test_markers_are_read_off_a_controller(touched_q, tmp_path, capfd, monkeypatch):
+def test_markers_are_read_off_a_controller(touched_q, tmp_path, run, monkeypatch):
     """Through ur-rtde: `touch.csv` is what the nominal arm computes of the joints, and registers; nothing is sent."""
     case, markers, q = touched_q
     monkeypatch.setattr(rtde, "STILL_S", 0.2)
@@ -302,8 +277,7 @@ def test_markers_are_read_off_a_controller(touched_q, tmp_path, capfd, monkeypat
     monkeypatch.setattr(rtde, "connect", connected)
     monkeypatch.setattr(sys, "stdin", Terminal())
     with rtde_server(HOST, np.repeat(q, 250, axis=0)) as controller:
-        code = run_twin.main(["touch", str(ABDOMEN), "--host", HOST, "--out", str(tmp_path), "--json"])
-    said = json.loads(capfd.readouterr().out)
+        code, said = run("touch", ABDOMEN, "--host", HOST, "--out", tmp_path)
     assert code == 0 and said["suffices"]
     read = read_points(tmp_path / "touch.csv", default_unit=Unit.MM)
     listed = [markers.names.index(name) for name in read.names]

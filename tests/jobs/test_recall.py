@@ -73,10 +73,8 @@ def test_what_passes_beyond_a_cut_face_is_unseen_and_the_rest_is_not():
     s = np.arange(0.0, 400.0)
     points = TARGET + s[:, None] * u[:, None]
     wide = np.where(s >= NEEDLE.shaft, NEEDLE.hub, NEEDLE.radius)
-    ahead, aside = (
-        np.abs(points[..., 2]) + wide - 72.0,
-        np.hypot(points[..., 0], points[..., 1]) - RADIUS - 150.0 - wide,
-    )
+    ahead = np.abs(points[..., 2]) + wide - 72.0
+    aside = np.hypot(points[..., 0], points[..., 1]) - RADIUS - 150.0 - wide
 
     def passes(by):
         return ((ahead > by) & (aside < -by) & (s <= flange[:, None] - by)).any(axis=1)

@@ -42,17 +42,17 @@ def test_a_narrow_terminal_gets_the_whole_help(command, monkeypatch, capsys):
     assert "\x1b" not in narrow and "…" not in narrow
 
 
-def run_unread(code, *arguments):
-    """Run Python whose stdout is a pipe that nobody reads: exit code and stderr."""
-    reader, writer = os.pipe()
-    os.close(reader)
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", code, *arguments], stdout=writer, stderr=subprocess.PIPE, text=True, cwd=ROOT
-        )
-    finally:
-        os.close(writer)
-    return done.returncode, done.stderr
+def run_program(arguments, environment=(), code="", **options):
+    """The program in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-c", f"{code}\n{PROGRAM}", *arguments],
+        env={**os.environ, **dict(environment)},
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        check=False,
+        **{"stdout": subprocess.PIPE, **options},
+    )
 
 
 PROGRAM = "from puncture_twin.run_twin import program\nprogram()"
@@ -61,8 +61,13 @@ PROGRAM = "from puncture_twin.run_twin import program\nprogram()"
 @pytest.mark.parametrize("arguments", [["search", "--help"], [*ONE, "--json"]])
 def test_an_output_that_nobody_reads_ends_as_the_shell_has_it(arguments):
     """141, never 1 (which is an answer), and no traceback."""
-    code, said = run_unread(PROGRAM, *arguments)
-    assert (code, "Traceback" in said, "BrokenPipe" in said) == (141, False, False)
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        done = run_program(arguments, stdout=writer)
+    finally:
+        os.close(writer)
+    assert (done.returncode, "Traceback" in done.stderr, "BrokenPipe" in done.stderr) == (141, False, False)
 
 
 def test_a_pipe_that_broke_elsewhere_is_a_failure(capsys):
@@ -111,14 +116,7 @@ def test_each_shell_is_told_how_to_ask(shell):
 
 def run_as_installed(environment):
     """The command under the name that is installed."""
-    return subprocess.run(
-        [sys.executable, "-c", f"import sys\nsys.argv[0] = 'run-twin'\n{PROGRAM}"],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        check=False,
-    )
+    return run_program([], environment, "import sys\nsys.argv[0] = 'run-twin'")
 
 
 @pytest.mark.parametrize(
@@ -150,33 +148,17 @@ def test_a_search_writes_there_without_out(tmp_path, monkeypatch, capsys):
 def test_neither_width_nor_colour_changes_what_is_printed():
     """A narrow terminal wraps; no line and no table is broken by us, and nothing is coloured."""
     compared = ["compare", str(CARTON), "--theta", "0", "--beta", "0", "--theta", "10", "--beta", "0", "--no-arm"]
-    shown = [
-        subprocess.run(
-            [sys.executable, "-c", PROGRAM, *compared],
-            env={**os.environ, **extra},
-            capture_output=True,
-            check=True,
-            text=True,
-            cwd=ROOT,
-        ).stdout
-        for extra in ({"COLUMNS": "200", "FORCE_COLOR": "1"}, {"COLUMNS": "40", "NO_COLOR": "1"})
-    ]
-    assert shown[0] == shown[1]
-    assert "\x1b" not in shown[0]
+    looks = ({"COLUMNS": "200", "FORCE_COLOR": "1"}, {"COLUMNS": "40", "NO_COLOR": "1"})
+    wide, narrow = (run_program(compared, look) for look in looks)
+    assert (wide.returncode, wide.stdout) == (narrow.returncode, narrow.stdout)
+    assert wide.returncode == 0 and wide.stdout and "\x1b" not in wide.stdout
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/dev/full is of Linux")
 @pytest.mark.parametrize(("arguments", "unbuffered"), [(["--version"], ""), (["--help"], "1"), (ONE, "")])
 def test_a_full_disk_under_stdout_is_told_in_one_line(arguments, unbuffered):
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-c", PROGRAM, *arguments],
-            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=ROOT,
-        )
+        done = run_program(arguments, {"PYTHONUNBUFFERED": unbuffered}, stdout=full)
     told = [line for line in done.stderr.splitlines() if "stdout" in line]
     assert done.returncode == PROGRAM_FAILED
     assert told == ["stdout: No space left on device; allowed: an output that can be written to"]

@@ -34,6 +34,7 @@ def test_the_page_has_a_command_for_each_of_its_sections():
     assert {said_by(command) for command in COMMANDS} == set(SAID.values())
 
 
+@pytest.mark.usefixtures("short_film")
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_says_what_the_page_says(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -95,7 +95,7 @@ def test_sources_add_up(compared, plan):
         assert sum(float(row[column]) ** 2 for row in parts) == pytest.approx(float(whole[column]) ** 2, rel=0.05)
 
 
-def test_a_plan_is_compared_too_and_blind_ways_say_why(compared, plan, tmp_path, capfd, monkeypatch):
+def test_a_plan_is_compared_too_and_blind_ways_say_why(compared, plan, tmp_path, run, monkeypatch):
     """Of plan.json the same numbers, as one object; a way that sees too little has its reason in place of them."""
     _, out, case = compared
 
@@ -104,8 +104,9 @@ def test_a_plan_is_compared_too_and_blind_ways_say_why(compared, plan, tmp_path,
 
     monkeypatch.setattr(ways, "sight_of", sight)
     arguments = ["rehearse", out / "plan.json", "--case", case, "--guidance", "stereo,ct", "--seeds", SEEDS]
-    assert main([*map(str, arguments), "--out", str(tmp_path), "--json"]) == OK
-    ct, stereo = json.loads(capfd.readouterr().out)["ways"]
+    code, told = run(*arguments, "--out", tmp_path)
+    ct, stereo = told["ways"]
+    assert code == OK
     before = next(row for row in compared[0]["ways"] if row["guidance"] == "ct")
     assert ct["realised_rms_mm"] == pytest.approx(before["realised_rms_mm"]) and ct["rating"] == "best"
     assert stereo["guidance"] == "stereo" and "no place for cameras" in stereo["no_answer"]

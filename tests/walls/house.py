@@ -19,14 +19,12 @@ def modules():
 
 
 def name_of(path):
-    """The name under which a file is imported."""
     parts = path.relative_to(ROOT).with_suffix("").parts
     return ".".join([NAME, *(part for part in parts if part not in ("__init__", NAME))])
 
 
 @cache
 def tree(path):
-    """A file's syntax tree."""
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
@@ -59,12 +57,10 @@ def arrows():
 
 
 def is_package(name):
-    """Whether a module is the ``__init__`` of a folder."""
     return modules()[name].name == "__init__.py"
 
 
 def room_of(name):
-    """The folder in which a module lies."""
     return name if is_package(name) else name.rpartition(".")[0]
 
 

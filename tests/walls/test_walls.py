@@ -25,7 +25,6 @@ def sources():
 
 
 def within(module, package):
-    """Whether a module is a package or lies in it."""
     return module == package or module.startswith(package + ".")
 
 
@@ -49,22 +48,18 @@ def names_in(path):
 
 
 def of_truth(name):
-    """Whether a name speaks of the truth, in either way of joining words."""
     return bool({"true", "truth"} & set(re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().split("_")))
 
 
 def test_planning_never_imports_the_twin_or_the_physics():
-    """It decides by what it is given."""
     assert broken(f"{NAME}.planning", [f"{NAME}.twin", f"{NAME}.run_twin", "pybullet", "matplotlib"]) == []
 
 
 def test_the_physics_is_met_in_one_room():
-    """PyBullet, and with it metres, stay in twin/world."""
     assert [line for line in broken(NAME, ["pybullet", "pybullet_data"]) if ".twin.world." not in line] == []
 
 
 def test_nobody_imports_the_command_line():
-    """It is the outermost."""
     assert broken(NAME, [f"{NAME}.run_twin"], but={f"{NAME}.__main__"}) == []
 
 
@@ -79,7 +74,6 @@ def test_guidance_never_sees_the_plant():
 
 
 def test_the_ways_of_guidance_do_not_meet():
-    """Each can be read, and thrown away, without the others."""
     kinds = [name for name in modules() if name.count(".") == 3 and within(name, f"{NAME}.twin.guidance")]
     assert len(kinds) >= 2
     for kind in kinds:
@@ -129,7 +123,6 @@ def test_everything_is_imported_under_one_name():
 
 
 def test_modules_form_no_cycle():
-    """No module imports itself through others."""
     assert (
         cycle({name: {other for other in targets if not is_package(other)} for name, targets in arrows().items()}) == []
     )
@@ -144,7 +137,6 @@ def test_rooms_form_no_cycle():
 
 
 def test_every_room_says_what_lives_in_it():
-    """Its ``__init__`` is a paragraph and no code."""
     for name, path in modules().items():
         if is_package(name) and name not in (NAME, f"{NAME}.meshes"):
             assert len(ast.get_docstring(tree(path)) or "") > 50, name
@@ -208,7 +200,6 @@ HEAVY = {"pybullet", "matplotlib", "numba", "trimesh", "SimpleITK", "ompl"}
 
 
 def test_importing_the_planner_loads_nothing_heavy():
-    """A command pays only for what it uses."""
     code = f"import sys, {NAME}, {NAME}.planning\nassert not {HEAVY!r} & set(sys.modules), {HEAVY!r} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 

@@ -1,7 +1,4 @@
-"""How a command ends: what it found, its exit code, and one line for what went wrong.
-
-What a wrong command line may say instead.
-"""
+"""How a command ends: what it found, its exit code, and one line for what went wrong."""
 
 from __future__ import annotations
 
@@ -11,7 +8,6 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping
 from enum import Enum
-from types import MappingProxyType
 from typing import Any, get_args
 
 import typer
@@ -38,34 +34,28 @@ OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 1
 """The last two as the shell gives them for a program that Ctrl-C, or a closed pipe, has ended."""
 
 
-RULES: Mapping[str, Callable[[Any], bool]] = MappingProxyType(
-    {
-        "demo": lambda run: not run.failures,
-        "search": lambda run: bool(run.candidates.safe.any()),
-        "check": lambda found: found.safe,
-        "compare": lambda found: found.safe,
-        "rehearse": lambda run: not run.failures,
-        "rehearse --sweep": lambda run: run.whole,
-        "rehearse --guidance A,B": lambda found: found.passed,
-        "touch": lambda run: run.suffices,
-        "pivot": lambda found: not found.pivot.large,
-        "servo": lambda job: job.passed,
-        "confirm": lambda done: done.yes,
-        "reproduce": lambda result: result.passed,
-        "batch run": lambda counts: counts.whole,
-        "batch merge": lambda found: found.as_expected,
-    }
-)
+RULES: Mapping[str, Callable[[Any], bool]] = {
+    "demo": lambda run: not run.failures,
+    "search": lambda run: bool(run.candidates.safe.any()),
+    "check": lambda found: found.safe,
+    "compare": lambda found: found.safe,
+    "rehearse": lambda run: not run.failures,
+    "rehearse --sweep": lambda run: run.whole,
+    "rehearse --guidance A,B": lambda found: found.passed,
+    "touch": lambda run: run.suffices,
+    "pivot": lambda found: not found.pivot.large,
+    "servo": lambda job: job.passed,
+    "confirm": lambda done: done.yes,
+    "reproduce": lambda result: result.passed,
+    "batch run": lambda counts: counts.whole,
+    "batch merge": lambda found: found.as_expected,
+}
 """Whether what a command found is the answer yes, by its name; the others have no other. In words, where it is no:
 ``docs/reference/command-line.md``."""
 
 
 def finish(command: str, found: Any, summary: dict[str, Any], text: str, as_json: bool) -> None:
-    """Print what a command found, and end it with the code that its rule gives.
-
-    Raises:
-        typer.Exit: The code is not 0.
-    """
+    """Print what a command found, and end it with the code that its rule gives, by `typer.Exit` where that is not 0."""
     print_answer(summary, text, as_json)
     if command in RULES and not RULES[command](found):
         failed = command == "batch run" and found.ended[PROGRAM_FAILED] > 0
@@ -77,13 +67,7 @@ PrintLine = Callable[[str], None]
 
 
 def exit_code_of(command: Callable[[], object], print_line: PrintLine, *, as_json: bool = False) -> int:
-    """Run a command, which returns its exit code or None; what it raises becomes a code and a line.
-
-    Args:
-        command: Such as the parser with its arguments.
-        print_line: Shows the line, and what was made anew.
-        as_json: Whether stdout gets what was refused, or not found, as an object too.
-    """
+    """Run a command, which returns its exit code or None; what it raises becomes a code and a line, or JSON too."""
     try:
         return _exit_code_of(command, print_line, as_json)
     except KeyboardInterrupt:  # as the command's own last line was printed
@@ -92,8 +76,19 @@ def exit_code_of(command: Callable[[], object], print_line: PrintLine, *, as_jso
 
 
 def _exit_code_of(command: Callable[[], object], print_line: PrintLine, as_json: bool) -> int:
+    said: set[str] = set()
     with warnings.catch_warnings():
-        warnings.showwarning = _notes(warnings.showwarning, print_line)
+        usual = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
+            """What was made anew, in one line, once; other warnings are Python's."""
+            if not issubclass(category, CacheWarning):
+                usual(message, category, *rest, **more)
+            elif str(message) not in said:
+                said.add(str(message))
+                print_line(f"note: {message}")
+
+        warnings.showwarning = show
         try:
             with insistent_ctrl_c():
                 result = _answered(command) if as_json else command()
@@ -169,20 +164,6 @@ def _answered(command: Callable[[], object]) -> object:
         raise
 
 
-def _notes(usual: Callable[..., None], print_line: PrintLine) -> Callable[..., None]:
-    """Says in one line, once, what was made anew; other warnings are Python's."""
-    said: set[str] = set()
-
-    def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if not issubclass(category, CacheWarning):
-            usual(message, category, *rest)
-        elif str(message) not in said:
-            said.add(str(message))
-            print_line(f"note: {message}")
-
-    return show
-
-
 NUMBERS = {int: "a whole number", float: "a number"}
 
 
@@ -195,12 +176,8 @@ def allowed_text(error: typer.TyperException) -> str:
     if isinstance(kind, type) and issubclass(kind, Enum):
         return ", ".join(str(one.value) for one in kind)
     if kind in NUMBERS and type(error).__name__ == "BadParameter":
-        return NUMBERS[kind] + _range(option)
+        bounds = (("from", getattr(option, "min", None)), ("to", getattr(option, "max", None)))
+        return NUMBERS[kind] + "".join(f" {word} {bound:.10g}" for word, bound in bounds if bound is not None)
     context = getattr(error, "ctx", None)
     command = "" if context is None else context.command_path.removeprefix(context.find_root().command_path).strip()
     return f"see {command} --help" if command else "see --help"
-
-
-def _range(option: Any) -> str:
-    bounds = (("from", getattr(option, "min", None)), ("to", getattr(option, "max", None)))
-    return "".join(f" {word} {bound:.10g}" for word, bound in bounds if bound is not None)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer import Argument, Option
 
 from puncture_twin.planning.base.files import check_writable
 from puncture_twin.twin.jobs.terminal import default_out
@@ -19,22 +20,18 @@ from puncture_twin.twin.report.progress import progress_display
 if TYPE_CHECKING:
     from puncture_twin.planning.search.context import CaseContext
 
-CaseArgument = Annotated[Path, typer.Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
-SourceArgument = Annotated[Path, typer.Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json.")]
-OutOption = Annotated[Path, typer.Option("--out", help="Output folder.", callback=check_writable)]
-OutOfCaseOption = Annotated[Path | None, typer.Option("--out", help="Output folder.", show_default="out/CASE-COMMAND")]
-CohortOption = Annotated[
-    Path, typer.Option("--out", metavar="DIR", help="Folder of the cohort.", callback=check_writable)
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
-JobsOption = Annotated[
-    int, typer.Option("--jobs", min=1, help="Processes, at most one per core; the result is the same.")
-]
-EngineOption = Annotated[str, typer.Option("--engine", help="Clearance engine: fast, or fcl (the reference).")]
-PicturesOption = Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw the map, the scene and the page.")]
+CaseArgument = Annotated[Path, Argument(metavar="CASE", help="Case file, or the folder that holds case.toml.")]
+SourceArgument = Annotated[Path, Argument(metavar="CASE_OR_PLAN", help="A case, or a plan.json.")]
+OutOption = Annotated[Path, Option("--out", help="Output folder.", callback=check_writable)]
+OutOfCaseOption = Annotated[Path | None, Option("--out", help="Output folder.", show_default="out/CASE-COMMAND")]
+CohortOption = Annotated[Path, Option("--out", metavar="DIR", help="Folder of the cohort.", callback=check_writable)]
+JsonOption = Annotated[bool, Option("--json", help="Print one JSON object on stdout and nothing else.")]
+JobsOption = Annotated[int, Option("--jobs", min=1, help="Processes, at most one per core; the result is the same.")]
+EngineOption = Annotated[str, Option("--engine", help="Clearance engine: fast, or fcl (the reference).")]
+PicturesOption = Annotated[bool, Option("--pictures/--no-pictures", help="Draw the map, the scene and the page.")]
 ArmOption = Annotated[
     bool | None,
-    typer.Option(
+    Option(
         "--arm/--no-arm",
         help="Require that the arm reaches a candidate.",
         show_default="on if the case states its base",
@@ -51,16 +48,12 @@ def _print_version(wanted: bool) -> None:
 
 
 VersionOption = Annotated[
-    bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    bool, Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
 ]
 
 
 def out_folder(named: Path | None, source: Path, command: str) -> Path:
-    """The folder of `OutOfCaseOption`.
-
-    Raises:
-        InputError: It cannot be written to.
-    """
+    """The folder of `OutOfCaseOption`, which must be one that can be written to."""
     return check_writable(named or default_out(source, command))
 
 
@@ -74,15 +67,13 @@ def prepared(case: Path, *, arm: bool | None = None, engine: str = "fast") -> It
 
 
 CHOICE_OPTIONS = {
-    "theta": Annotated[float | None, typer.Option("--theta", min=0, max=180, help="Puncture angle, degrees.")],
-    "beta": Annotated[float | None, typer.Option("--beta", min=0, max=360, help="Azimuth, degrees.")],
-    "rank": Annotated[int | None, typer.Option("--rank", min=1, help="Rank in the search; 1 is the best candidate.")],
-    "window": Annotated[int | None, typer.Option("--window", min=1, help="Best candidate of this window.")],
+    "theta": Annotated[float | None, Option("--theta", min=0, max=180, help="Puncture angle, degrees.")],
+    "beta": Annotated[float | None, Option("--beta", min=0, max=360, help="Azimuth, degrees.")],
+    "rank": Annotated[int | None, Option("--rank", min=1, help="Rank in the search; 1 is the best candidate.")],
+    "window": Annotated[int | None, Option("--window", min=1, help="Best candidate of this window.")],
     "entry": Annotated[
         str | None,
-        typer.Option(
-            "--entry", metavar="X,Y,Z", help="Entry point on the skin, mm, in the case's space; or a Slicer line."
-        ),
+        Option("--entry", metavar="X,Y,Z", help="Entry point on the skin, mm, in the case's space; or a Slicer line."),
     ],
 }
 """What names a candidate, in the order in which `parse_choice` takes it."""
@@ -95,9 +86,11 @@ def with_choice(command: Callable[..., None]) -> Callable[..., None]:
     refused where it is contradictory, before the command starts.
     """
     signature = inspect.signature(command, eval_str=True, locals={"Choice": object})
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    named = [inspect.Parameter(name, keyword, default=None, annotation=one) for name, one in CHOICE_OPTIONS.items()]
     parameters: list[inspect.Parameter] = []
     for parameter in signature.parameters.values():
-        parameters += _choice_parameters() if parameter.name == "choice" else [parameter.replace(kind=_KEYWORD)]
+        parameters += named if parameter.name == "choice" else [parameter.replace(kind=keyword)]
 
     @functools.wraps(command)
     def chosen(**values: Any) -> None:
@@ -109,12 +102,3 @@ def with_choice(command: Callable[..., None]) -> Callable[..., None]:
     chosen.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     chosen.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]  # inspect reads it
     return chosen
-
-
-_KEYWORD = inspect.Parameter.KEYWORD_ONLY
-
-
-def _choice_parameters() -> list[inspect.Parameter]:
-    return [
-        inspect.Parameter(name, _KEYWORD, default=None, annotation=option) for name, option in CHOICE_OPTIONS.items()
-    ]

@@ -8,8 +8,6 @@ exception is dropped there, and the command would run to its end.
 
 And put off where it would break what is not made for it: a compiled module that is half imported stays so, and LLVM's
 memory is freed twice where its Python side learns not that it was freed, which ends the process without a word.
-
-The JSON of an experiment beside its other files: the same bytes wherever the folder lies.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -36,22 +34,15 @@ UNNAMED_CASES = frozenset({"case.toml", "servo.toml", "selfcal.toml", "plan.json
 
 
 class Answer(NamedTuple):
-    """What a command found."""
+    """What a command found: yes or no, for the exit code; plain values, for ``--json``; and text for a person."""
 
     passed: bool
-    """What the exit code says: yes or no."""
     summary: dict[str, Any]
-    """Plain values, for ``--json``."""
     text: str
-    """For a person."""
 
 
 def default_out(source: Path, command: str) -> Path:
-    """The folder for a command's files where none is named, such as ``out/abdomen-search``.
-
-    Args:
-        source: What the command reads: a case, its folder, or a plan.
-    """
+    """The folder for the files of a command on a case or plan where none is named, such as ``out/abdomen-search``."""
     place = source.absolute()
     if place.suffix.lower() not in {".toml", ".json"}:
         name = place.name
@@ -104,11 +95,7 @@ def leave_unread(stream: TextIO) -> None:
 
 
 def flush_output() -> None:
-    """Hand over everything that was printed.
-
-    Raises:
-        BrokenPipeError: Nobody reads it.
-    """
+    """Hand over everything that was printed; a `BrokenPipeError` where nobody reads it."""
     if sys.stdout is not None and not sys.stdout.closed:
         sys.stdout.flush()
 
@@ -227,26 +214,17 @@ def leave(code: int) -> NoReturn:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     threading._shutdown()  # type: ignore[attr-defined]  # Python's own, by which executors end their threads
     atexit._run_exitfuncs()
-    os._exit(code if _written() else 120)
-
-
-def _written() -> bool:
-    """Whether all that was printed could be written."""
     for stream in (sys.stdout, sys.stderr):
-        if stream is not None and not stream.closed:
-            with suppress(OSError):
+        try:
+            if stream is not None and not stream.closed:
                 stream.flush()
-                continue
-            return False
-    return True
+        except OSError:
+            code = 120
+    os._exit(code)
 
 
 def write_result(summary: Mapping[str, Any], path: Path, out: Path) -> None:
-    """Write what ``--json`` prints, its files named as the folder holds them.
-
-    Args:
-        summary: With ``files``, where they lie in the end.
-    """
+    """Write what ``--json`` prints, its files named as the folder holds them: the same bytes wherever that lies."""
     write_json({**summary, "files": [os.path.relpath(file, out) for file in summary["files"]]}, path)
 
 

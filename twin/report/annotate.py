@@ -28,9 +28,7 @@ RED: Rgb = (190, 0, 20)
 SHORT_AXIS = 0.45
 """Axes that appear shorter than this share of their length point at the viewer; their labels would collide."""
 
-LEGEND_SIZE = 15
-"""Pixels: a legend's letters and patches."""
-
+LEGEND_SIZE = 15  # pixels: a legend's letters and patches
 SCALE_BARS_MM = (5, 10, 20, 50, 100, 200, 500)
 
 Anchor = Literal["lm", "rm", "mm", "la", "ra", "ma", "lb", "mb", "ls", "rs", "ms"]
@@ -78,15 +76,11 @@ def body_axes(
     length: float,
     size: int = 15,
 ) -> None:
-    """A small cross of the body's directions as they lie in this view; the far ends are pale.
-
-    Args:
-        length: Pixels of an axis that lies in the picture plane.
-    """
+    """A small cross of the body's directions in this view, far ends pale; one in its plane is `length` pixels long."""
     reach = length + 3.6 * size
     disc = [centre[0] - reach, centre[1] - reach, centre[0] + reach, centre[1] + reach]
     draw.ellipse(disc, fill=(250, 250, 252), outline=(200, 204, 210))
-    toward = camera.axes[2]
+    toward, gap = camera.axes[2], 6  # pixels; words that stand nearer read as one
     taken: list[tuple[float, float, float, float]] = []
     ends = sorted(body_directions(space).items(), key=lambda item: -float(item[1] @ toward))
     for name, vector in ends:
@@ -104,18 +98,16 @@ def body_axes(
         anchor: Anchor = "lm" if out[0] > 0.35 else "rm" if out[0] < -0.35 else "mm"
         box = draw.textbbox(at, short, font=font(size, not far), anchor=anchor)
         for side in (1, -1, 2, -2, 3, -3):  # beside words that already stand there: above them it would read as one
-            if not any(_overlap(box, other) for other in taken):
+            if not any(
+                box[0] < one[2] + gap and one[0] < box[2] + gap and box[1] < one[3] + gap and one[1] < box[3] + gap
+                for one in taken
+            ):
                 break
             at = end[0] + side * size * 0.6, end[1]
             anchor = "lm" if side > 0 else "rm"
             box = draw.textbbox(at, short, font=font(size, not far), anchor=anchor)
         taken.append(box)
         write(draw, at, short, size=size, bold=not far, colour=colour, anchor=anchor, halo=2)
-
-
-def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    gap = 6  # pixels; words that stand nearer read as one
-    return a[0] < b[2] + gap and b[0] < a[2] + gap and a[1] < b[3] + gap and b[1] < a[3] + gap
 
 
 def scale_bar(
@@ -127,12 +119,7 @@ def scale_bar(
     width_px: float,
     note: str = " at the target's depth",
 ) -> None:
-    """A bar of a round length, true at the depth of one point (perspective: nearer things look larger).
-
-    Args:
-        at_ct: The point whose depth counts, shape (3,).
-        width_px: Greatest length in pixels.
-    """
+    """A bar of a round length, true at the depth of one point (3,), where nearer things look larger."""
     depth = float(camera.project(at_ct)[0, 2])
     per_mm = camera.scale / depth
     fitting = [mm for mm in SCALE_BARS_MM if mm * per_mm <= width_px]

@@ -1,14 +1,9 @@
-"""What each source of the needle's error costs, and what a change of scan, markers or arm leaves of it, drawn.
-
-``rooms.png``: where the tips of many rooms ended, and how often, beside what was predicted. And of one rehearsal, how
-far tip and needle were from target and structures over time.
-"""
+"""Pictures of errors: by source and after a change; of the tips of many rooms; over the time of one rehearsal."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,16 +14,13 @@ from scipy.special import chdtri
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.text import plural
+from puncture_twin.planning.geometry.rigid import frame_about
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.twin.report.figures import png, write_png
 
 WIDTH_INCHES, HEAD_INCHES, ROW_INCHES, DPI = 13.2, 1.6, 0.25, 110
-LEAST_ROWS = 16
-"""Of changes; more of them make the picture higher."""
-
-ROOM_FOR_NUMBERS = 1.12
-"""Beside the longest bar."""
-
+LEAST_ROWS = 16  # of changes; more of them make the picture higher
+ROOM_FOR_NUMBERS = 1.12  # beside the longest bar
 ALONE, BETTER, WORSE = "#0072b2", "#009e73", "#d55e00"
 """Okabe and Ito's blue, green and vermilion; better and worse lie on two sides of a line besides."""
 
@@ -36,11 +28,7 @@ SHOWN_MM = 0.005
 
 
 def draw_budget(facts: Mapping[str, Any], path: Path) -> None:
-    """Write the picture.
-
-    Args:
-        facts: As ``register --json`` has them under ``budget``.
-    """
+    """Write the picture of facts as ``register --json`` has them under ``budget``."""
     write_png(_budget(facts), path)
 
 
@@ -55,12 +43,9 @@ def _budget(facts: Mapping[str, Any]) -> Figure:
     sources, what_if = figure.subplots(1, 2)
     _sources(sources, facts)
     _changes(what_if, facts)
-    best = facts["best"]
-    figure.suptitle(
-        f"expected tip error {facts['expected_mm']:.2f} mm (rms); least with {best['text']}: "
-        f"{best['expected_mm']:.2f} mm",
-        fontsize=11.5,
-    )
+    best, now = facts["best"], f"{facts['expected_mm']:.2f}"
+    title = f"expected tip error {now} mm (rms); least with {best['text']}: {best['expected_mm']:.2f} mm"
+    figure.suptitle(title, fontsize=11.5)
     return figure
 
 
@@ -79,8 +64,9 @@ def _sources(axes: Axes, facts: Mapping[str, Any]) -> None:
 def _changes(axes: Axes, facts: Mapping[str, Any]) -> None:
     now, rows = facts["expected_mm"], facts["changes"]
     left = [one["expected_mm"] for one in rows]
-    axes.hlines(range(len(rows)), now, left, color=[BETTER if mm <= now else WORSE for mm in left], linewidth=2)
-    axes.scatter(left, range(len(rows)), color=[BETTER if mm <= now else WORSE for mm in left], zorder=3)
+    colours = [BETTER if mm <= now else WORSE for mm in left]
+    axes.hlines(range(len(rows)), now, left, color=colours, linewidth=2)
+    axes.scatter(left, range(len(rows)), color=colours, zorder=3)
     axes.axvline(now, color="black", linewidth=1)
     axes.text(now, -0.9, " now", fontsize=9, va="center")
     axes.set_yticks(range(len(rows)), [one["text"] for one in rows])
@@ -94,44 +80,29 @@ def _plain(axes: Axes) -> None:
     axes.set_xlim(left=0)
     axes.grid(axis="x", alpha=0.3)
     axes.tick_params(labelsize=9)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 FIGURE_INCHES, DISTRIBUTION_DPI = (17.2, 4.7), 110
-EDGES = MappingProxyType({"left": 0.036, "right": 0.994, "bottom": 0.175, "top": 0.865, "wspace": 0.19})
+EDGES = {"left": 0.036, "right": 0.994, "bottom": 0.175, "top": 0.865, "wspace": 0.19}
 """Of the four plots, in the picture: to find out what room their words need takes longer than to draw them."""
 
-MOST_POINTS = 4000
-"""Of a cloud: more hide one another."""
-
+MOST_POINTS = 4000  # of a cloud: more hide one another
 WITHIN, BEYOND, PREDICTED = "#0072b2", "#d55e00", "#000000"
 """Okabe and Ito's blue and vermilion; what lies beyond is a cross too."""
 
 BINS = 40
 REGION = 0.95
-CROWDED = 0.6
-"""Radii of the ellipse that stay free around it."""
-
+CROWDED = 0.6  # radii of the ellipse that stay free around it
 LEVELS = np.linspace(0.05, 0.95, 19)
 """Predicted chances at which the rooms are counted: so far from the target the tip should be within this often."""
 
-TWO_SIDED = 1.96
-"""Standard errors that hold 95 % of what chance alone does."""
-
-
-def needle_frame(outward_ct: Floats) -> Floats:
-    """R_needle_ct, shape (3, 3), of a needle that comes along a unit vector (3,): two lateral axes, then depth."""
-    depth = -outward_ct
-    helper = np.eye(3)[np.argmin(np.abs(depth))]
-    x = np.cross(helper, depth)
-    x = x / np.linalg.norm(x)
-    return np.stack([x, np.cross(depth, x), depth])
+TWO_SIDED = 1.96  # standard errors that hold 95 % of what chance alone does
 
 
 def draw_rooms_picture(found: Any, path: Path) -> None:
-    """Write the picture."""
-    R = needle_frame(found.puncture.outward_ct)
+    """Write the picture, in the needle's frame: two axes across it, then depth."""
+    R = frame_about(-found.puncture.outward_ct).T
     error, cov = found.error_ct @ R.T, R @ found.cov_ct @ R.T
     figure = Figure(figsize=FIGURE_INCHES, dpi=DISTRIBUTION_DPI, facecolor="white")
     side, along, sizes, chances = figure.subplots(1, 4, gridspec_kw=dict(EDGES))
@@ -143,12 +114,9 @@ def draw_rooms_picture(found: Any, path: Path) -> None:
     figure.legend(*along.get_legend_handles_labels(), fontsize=7.5, loc="lower left", ncols=4)
     _histogram(sizes, found)
     _reliability(chances, found)
-    figure.suptitle(
-        f"{plural(len(found), 'trial')}, seed {found.seed}: {100 * found.in_region.mean():.1f} % inside the "
-        "predicted 95 % "
-        f"ellipsoid; rms {found.realised_rms_mm:.2f} mm, predicted {found.predicted_rms_mm:.2f} mm",
-        fontsize=11.5,
-    )
+    inside = f"{100 * found.in_region.mean():.1f} % inside the predicted 95 % ellipsoid"
+    rms = f"rms {found.realised_rms_mm:.2f} mm, predicted {found.predicted_rms_mm:.2f} mm"
+    figure.suptitle(f"{plural(len(found), 'trial')}, seed {found.seed}: {inside}; {rms}", fontsize=11.5)
     write_png(figure, path)
 
 
@@ -167,11 +135,7 @@ def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int,
     axes.plot(*ring, color=PREDICTED, lw=1.6, label="predicted 95 % ellipsoid")
     axes.plot([0], [0], marker="+", color=PREDICTED, ms=11, mew=1.6, ls="none", label="true target")
     reach = max((1 + CROWDED) * float(np.abs(ring).max()), float(np.abs(error[:, list(pair)]).max(initial=0.0)))
-    axes.set_xlim(-reach, reach)
-    axes.set_ylim(-reach, reach)
-    axes.set_aspect("equal")
-    axes.set_xlabel(names[0])
-    axes.set_ylabel(names[1])
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel=names[0], ylabel=names[1])
     axes.grid(visible=True, color="0.9")
     axes.set_axisbelow(True)
 
@@ -188,12 +152,11 @@ def draw_clouds(
         ways: The trials of each, a word beside its name, and its colour.
         outward_ct: Shape (3,), unit, from the target along the needle.
         hit_mm: Radius of a hit, drawn as a ring.
-        columns: Clouds beside each other; two can still be read on a telephone.
     """
-    R, reach = needle_frame(outward_ct), 0.0
+    R, reach = frame_about(-outward_ct).T, 0.0
     widest = np.sum([R[:2] @ found.cov_ct @ R[:2].T for found, _, _ in ways], axis=0)
     R[:2] = np.linalg.eigh(widest)[1].T[::-1] @ R[:2]
-    rows = -(-len(ways) // columns)
+    rows = -(-len(ways) // columns)  # two columns can still be read on a telephone
     size = (PANEL_INCHES[0] * columns, PANEL_INCHES[1] * rows)
     figure = Figure(figsize=size, dpi=DPI, facecolor="white", layout="compressed")
     panels = list(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat)
@@ -225,9 +188,7 @@ def _histogram(axes: Axes, found: Any) -> None:
     axes.plot((fine[1:] + fine[:-1]) / 2, density, color=PREDICTED, lw=1.6, label="predicted")
     median = float(np.median(sizes))
     axes.axvline(median, color=BEYOND, ls="--", lw=1.5, label=f"median {median:.2f} mm")
-    axes.set_xlim(0, top)
-    axes.set_xlabel("true tip to true target, mm")
-    axes.set_ylabel("trials")
+    axes.set(xlim=(0, top), xlabel="true tip to true target, mm", ylabel="trials")
     axes.set_title("tip error", fontsize=10)
     axes.legend(fontsize=8)
 
@@ -243,27 +204,18 @@ def _reliability(axes: Axes, found: Any) -> None:
     axes.fill_between(fine, fine - spread, fine + spread, color="0.85", lw=0, label="95 % range of chance alone")
     axes.plot([0, 1], [0, 1], color=PREDICTED, lw=1.0)
     axes.scatter(LEVELS, within, s=16, c=WITHIN, label="tip within a radius", zorder=3)
-    axes.scatter([found.p_hit], [found.hit_share], s=60, c=BEYOND, marker="*", label="target hit", zorder=4)
-    axes.scatter(
-        found.p_touch, found.touched.mean(axis=0), s=26, c=BEYOND, marker="x", label="a structure touched", zorder=4
-    )
-    axes.set_xlim(-0.02, 1.02)
-    axes.set_ylim(-0.02, 1.02)
-    axes.set_aspect("equal")
-    axes.set_xlabel("predicted chance")
-    axes.set_ylabel("observed fraction of trials")
+    hits, touches = ([found.p_hit], [found.hit_share]), (found.p_touch, found.touched.mean(axis=0))
+    axes.scatter(*hits, s=60, c=BEYOND, marker="*", label="target hit", zorder=4)
+    axes.scatter(*touches, s=26, c=BEYOND, marker="x", label="a structure touched", zorder=4)
+    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), aspect="equal")
+    axes.set(xlabel="predicted chance", ylabel="observed fraction of trials")
     axes.set_title("predicted and observed chances", fontsize=10)
     axes.legend(fontsize=7.5, loc="upper left")
 
 
-MOST_STRUCTURES = 6
-"""Curves of clearance: so many of the nearest structures; the table has the rest."""
-
-NAMED_PHASE = 0.07
-"""Fraction of the time that a phase must last to carry its name; shorter ones would overlap."""
-
-CURVES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
-"""Okabe and Ito's, one for each curve."""
+MOST_STRUCTURES = 6  # curves of clearance: so many of the nearest structures; the table has the rest
+NAMED_PHASE = 0.07  # fraction of the time that a phase must last to carry its name; shorter ones would overlap
+CURVES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")  # Okabe and Ito's, one for each curve
 
 
 def rehearsal_png(rehearsal: Any, keep_away: frozenset[str]) -> bytes:
@@ -273,10 +225,12 @@ def rehearsal_png(rehearsal: Any, keep_away: frozenset[str]) -> bytes:
     away = np.linalg.norm(rehearsal.tip_true_ct - rehearsal.target_true_ct, axis=1)
     distance.plot(rehearsal.times_s, away, color="#00684a")
     distance.set_ylabel("true tip to true target, mm")
-    for phase, start, length in _phases(rehearsal):
+    phase, times = rehearsal.phase, rehearsal.times_s
+    first = np.concatenate([[0], np.flatnonzero(phase[1:] != phase[:-1]) + 1])
+    for start, end, name in zip(times[first], np.append(times[first[1:]], times[-1]), phase[first], strict=True):
         distance.axvline(start, color="0.6", linestyle=":", linewidth=1)
-        if length > NAMED_PHASE * rehearsal.times_s[-1]:
-            distance.annotate(phase, (start, 1.0), (3, -10), ("data", "axes fraction"), textcoords="offset points")
+        if end - start > NAMED_PHASE * times[-1]:
+            distance.annotate(name, (start, 1.0), (3, -10), ("data", "axes fraction"), textcoords="offset points")
     names = [name for name in rehearsal.clearance_mm if name in keep_away]
     nearest = sorted(names, key=lambda n: float(np.min(rehearsal.clearance_mm[n], initial=np.inf)))
     for name, colour in zip(nearest, CURVES[:MOST_STRUCTURES], strict=False):
@@ -290,11 +244,3 @@ def rehearsal_png(rehearsal: Any, keep_away: frozenset[str]) -> bytes:
         axes.set_xlabel("time, s")
         axes.grid(color="0.9")
     return png(figure)
-
-
-def _phases(rehearsal: Any) -> list[tuple[str, float, float]]:
-    """Name, start and length of each phase, s."""
-    phase, times = rehearsal.phase, rehearsal.times_s
-    starts = np.concatenate([[0], np.flatnonzero(phase[1:] != phase[:-1]) + 1])
-    ends = np.append(starts[1:], len(times) - 1)
-    return [(str(phase[i]), float(times[i]), float(times[j] - times[i])) for i, j in zip(starts, ends, strict=True)]

@@ -21,8 +21,7 @@ from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.twin.report.palette import PNG_LEVEL
 
-PIXEL_DPI = 72
-"""At so many dots an inch a printer's point is a pixel: sizes of letters and lines are in pixels."""
+PIXEL_DPI = 72  # at so many dots an inch a printer's point is a pixel: sizes of letters and lines are in pixels
 
 
 def figure_of(width: int, height: int, *, dpi: int = PIXEL_DPI, ground: str = "white") -> Figure:
@@ -33,23 +32,14 @@ def figure_of(width: int, height: int, *, dpi: int = PIXEL_DPI, ground: str = "w
 
 
 def halo(width: float, colour: str = "white") -> list[Any]:
-    """Path effects: a rim behind words or under a line.
-
-    Args:
-        width: Of the rim on both sides together, and of the line itself, points.
-    """
+    """Path effects: a rim behind words or under a line, whose width, points, is that of line and rim together."""
     return [withStroke(linewidth=width, foreground=colour)]
 
 
 def picture_axes(
     figure: Figure, image: NDArray[np.uint8], at: tuple[float, float, float, float] = (0, 0, 1, 1)
 ) -> Axes:
-    """Axes in an image's own pixels (right, down; 0 is its upper left corner) that hold it.
-
-    Args:
-        image: Shape (h, w) or (h, w, 3).
-        at: Left, lower edge, width and height, of the figure's.
-    """
+    """Axes in an image's own pixels (right, down; 0 is its upper left corner); `at`: left, low, wide, high."""
     axes, (high, wide) = figure.add_axes(at), image.shape[:2]
     axes.set_axis_off()
     axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, wide, high, 0), interpolation="lanczos", aspect="auto")
@@ -59,9 +49,7 @@ def picture_axes(
 
 def ring(axes: Axes, at: Any, radius: float, colour: Rgb, text: str = "", width: float = 2.0) -> None:
     """A ring of so many pixels about a point, with words beside it."""
-    axes.plot(
-        *at, "o", markersize=2 * radius, markerfacecolor="none", markeredgecolor=css(colour), markeredgewidth=width
-    )
+    axes.plot(*at, "o", ms=2 * radius, mfc="none", mec=css(colour), mew=width)
     look: dict[str, Any] = {"color": css(colour), "fontsize": 15, "va": "center", "path_effects": halo(3)}
     axes.annotate(text, at, (radius + 4, 0), textcoords="offset points", **look)
 

@@ -18,30 +18,20 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, angles
 from puncture_twin.planning.search.candidates import Candidates
 
-NAMES_LPS = {
-    "left": "patient's left",
-    "right": "patient's right",
-    "posterior": "back",
-    "anterior": "front",
-    "head": "head",
-    "feet": "feet",
-}
+NAMES_LPS = {"left": "patient's left", "right": "patient's right", "posterior": "back", "anterior": "front"}
+"""Head and feet are called so."""
 
 IN_PLANE = 0.5
 """Least sine of the angle to the view axis at which a body direction gets a place at the rim (30 degrees)."""
 
-BEYOND = np.radians(92.0)
-"""A map whose rim lies beyond this shows directions from the far side, and says so."""
-
+BEYOND = np.radians(92.0)  # a map whose rim lies beyond this shows directions from the far side, and says so
 SAME_PLACE = np.radians(20.0)
 """Rim labels nearer than this share one line."""
 
 RING_SLACK = 1e-7
 """Two θ nearer than this (rad) are one ring of the grid."""
 
-RING = 8.0
-"""More than a turn: by it rings lie beside one another where all cells are in one order."""
-
+RING = 8.0  # more than a turn: by it rings lie beside one another where all cells are in one order
 HALF_CELL_SLACK = 1e-6
 """Share by which rounding may widen half a cell."""
 
@@ -87,7 +77,7 @@ def body_directions(space: str) -> dict[str, Floats]:
     if str(space) == "local":
         names = ((f"{sign}{axis}", i, s) for i, axis in enumerate("xyz") for sign, s in (("+", 1.0), ("−", -1.0)))
         return {name: s * np.eye(3)[i] for name, i, s in names}
-    return {NAMES_LPS[name]: np.array(vector) for name, vector in ANATOMICAL_LPS.items()}
+    return {NAMES_LPS.get(name, name): np.array(vector) for name, vector in ANATOMICAL_LPS.items()}
 
 
 def map_view(case: Any, candidates: Candidates) -> MapView:
@@ -102,24 +92,19 @@ def map_view(case: Any, candidates: Candidates) -> MapView:
     theta_max = float(candidates.theta.max(initial=0.0)) + 0.5 * step_of(candidates)
     centre = max(vectors, key=lambda name: vectors[name][2])
     exact = vectors[centre][2] > np.cos(np.radians(1.0))
-    return MapView(turn, theta_max, _rim(vectors, turn), centre if exact else "")
-
-
-def _rim(vectors: dict[str, Floats], turn: float) -> tuple[RimLabel, ...]:
-    labels: list[RimLabel] = []
+    rim: list[RimLabel] = []
     for name, vector in vectors.items():
         theta, beta = (float(a) for a in angles(vector / np.linalg.norm(vector)))
         if np.sin(theta) < IN_PLANE:
             continue
-        sideways = abs(theta - np.pi / 2) < np.radians(1.0)
-        text = name if sideways else f"{name} (θ {np.degrees(theta):.0f}°)"
+        text = name if abs(theta - np.pi / 2) < np.radians(1.0) else f"{name} (θ {np.degrees(theta):.0f}°)"
         angle = float(np.mod(beta + turn, 2 * np.pi))
-        near = [i for i, other in enumerate(labels) if abs(_turn_between(other.angle, angle)) < SAME_PLACE]
+        near = [i for i, other in enumerate(rim) if abs(_turn_between(other.angle, angle)) < SAME_PLACE]
         if near:
-            labels[near[0]] = RimLabel(f"{labels[near[0]].text} / {text}", labels[near[0]].angle)
+            rim[near[0]] = RimLabel(f"{rim[near[0]].text} / {text}", rim[near[0]].angle)
         else:
-            labels.append(RimLabel(text, angle))
-    return tuple(labels)
+            rim.append(RimLabel(text, angle))
+    return MapView(turn, theta_max, tuple(rim), centre if exact else "")
 
 
 def step_of(candidates: Candidates) -> float:

@@ -1,7 +1,4 @@
-"""Words and numbers that both the pictures and the page print, said once.
-
-Directions and mounts in the patient's words.
-"""
+"""Words and numbers that both the pictures and the page print; directions and mounts in the patient's words."""
 
 from __future__ import annotations
 
@@ -34,12 +31,7 @@ TRUTH_IS_BELIEF = (
 
 @dataclass(frozen=True)
 class ReasonCount:
-    """One line of the legend.
-
-    Attributes:
-        code: The reason's code, "safe" for safe.
-        solid_angle: Of the searched solid angle, 0..1; the grid is denser near θ = 0, this is not.
-    """
+    """One line of the legend; `solid_angle` is a fraction of what was searched: the grid is denser near θ = 0."""
 
     text: str
     code: str
@@ -79,10 +71,7 @@ def nearest_structure(candidates: Candidates, row: int) -> tuple[str, float]:
 
 
 def carried_mm(scan: Any | None) -> tuple[int, str]:
-    """How many digits of a mm the voxels of a case's CT carry, and half the longest side of one as " ± 0.4".
-
-    A case of meshes alone has one digit and "".
-    """
+    """How many digits of a mm a CT's voxels carry, and half the longest side of one as " ± 0.4"; 1 and "" without."""
     if scan is None:
         return 1, ""
     half = float(np.linalg.norm(scan.grid.T_ct_index[:3, :3], axis=0).max()) / 2
@@ -144,11 +133,7 @@ NEARLY = 0.985
 
 
 def direction_text(direction_ct: Floats, space: str) -> str:
-    """Name of a direction for a person, such as "the patient's left"; "" where none fits.
-
-    Args:
-        direction_ct: Shape (3,), unit.
-    """
+    """Name of a direction (3,), unit, for a person, such as "the patient's left"; "" where none fits."""
     for name, vector in body_directions(space).items():
         if float(vector @ direction_ct) > NEARLY:
             return name if space == "local" else f"the {name}"

@@ -9,15 +9,9 @@ from numpy.typing import NDArray
 
 from puncture_twin.planning.base.reasons import Rgb
 
-PNG_LEVEL = 3
-"""How hard pictures are packed: a tenth larger than at Pillow's own 6, in half the time."""
-
-SAFE_LOW: Rgb = (150, 224, 190)
-"""Safe, with the least clearance of the safe region."""
-
-SAFE_HIGH: Rgb = (0, 104, 74)
-"""Safe, with the greatest clearance."""
-
+PNG_LEVEL = 3  # how hard pictures are packed: a tenth larger than at Pillow's own 6, in half the time
+SAFE_LOW: Rgb = (150, 224, 190)  # safe, with the least clearance of the safe region
+SAFE_HIGH: Rgb = (0, 104, 74)  # safe, with the greatest clearance
 NEEDLE: Rgb = (20, 20, 24)
 HOLDER: Rgb = (70, 74, 82)
 ARM: Rgb = (173, 183, 196)
@@ -85,8 +79,7 @@ what they keep. None is near the green that means safe, nor needle and region in
 they fill the picture. The portal vein is told from the veins that drain the liver; vessels of no kind look as it.
 """
 
-SIDES = re.compile(r"(^|[_ ])(right|left|r|l)(?=[_ ]|$)")
-"""Of a structure's name: both sides look alike."""
+SIDES = re.compile(r"(^|[_ ])(right|left|r|l)(?=[_ ]|$)")  # of a structure's name: both sides look alike
 
 
 def organ_colours(names: tuple[str, ...]) -> dict[str, Rgb]:

@@ -1,13 +1,9 @@
-"""A patient's search, plan, rehearsal, registration and error budget as blocks that terminal and page both show.
-
-Each takes what was computed, or the plain values of it that ``--json`` prints too.
-"""
+"""A patient's search, plan, rehearsal, registration and error budget as blocks that terminal and page both show."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -27,31 +23,17 @@ from puncture_twin.planning.search.uncertainty_breakdown import (
 )
 from puncture_twin.planning.search.windows import MOST_WINDOWS, Window
 from puncture_twin.planning.uncertainty.sources import SOURCES
-from puncture_twin.twin.report.numbers import (
-    ReasonCount,
-    arm_text,
-    carried_mm,
-    clearance_text,
-    expected_text,
-    nearest_structure,
-    reason_counts,
-)
+from puncture_twin.twin.report import numbers
 from puncture_twin.twin.report.present import Block, Field, Table, Warn, bold, facts, grid, number, percent, vector
 
-CONE_TEXT = MappingProxyType(
-    {
-        "grid": "from the directions of the search, to one step; a certificate can prove it",
-        "certificate": "proven by the certificate",
-    }
-)
+CONE_TEXT = {
+    "grid": "from the directions of the search, to one step; a certificate can prove it",
+    "certificate": "proven by the certificate",
+}
 """Where the safe cone comes from."""
 
-LEAST_SHOWN = 5e-5
-"""A chance or share below it rounds to nothing."""
-
-SHOWN_MM = 0.005
-"""A source that costs less would be 0.00."""
-
+LEAST_SHOWN = 5e-5  # a chance or share below it rounds to nothing
+SHOWN_MM = 0.005  # a source that costs less would be 0.00
 NO_CHANCES = "No chances: they need markers, the arm, and a direction that is safe for the organs and the arm."
 NOT_REQUESTED = "this run only searched; the plan command plans the arm's motion"
 """Where no plan was made because nobody wanted one."""
@@ -60,31 +42,19 @@ TRE_TEXT = "expected TRE at the target (rms), from the markers alone"
 TIP_ERROR_TEXT = "expected tip error (rms), in the arm configuration of the plan"
 """Of the registration, and of the whole insertion with the arm's declared errors."""
 
-MOST_NEAREST = 12
-"""Structures whose least clearance in a rehearsal is listed."""
+MOST_NEAREST = 12  # structures whose least clearance in a rehearsal is listed
 
 
 def counts(candidates: Candidates) -> list[Block]:
-    """How many directions fell to which reason; also the map's legend."""
-    rows = (
-        (
-            Markup('<span class="patch {}" style="background-color:{}"></span>{}').format(
-                _hatches(line), css(line.colour), line.text
-            ),
-            percent(line.solid_angle),
-            f"{line.count:,}",
-            Markup("<code>{}</code>").format(line.code),
-        )
-        for line in reason_counts(candidates)
-    )
-    return [Table(("verdict", "of solid angle", "directions", "code"), tuple(rows)), f"{arm_text(candidates)}."]
-
-
-def _hatches(line: ReasonCount) -> str:
-    """The class of a patch with the lines that the map has over its colour."""
-    if line.code != Reason.UNKNOWN_REGION.value:
-        return ""
-    return "hatched air" if line.colour == UNSEEN_AIR else "hatched"
+    """How many directions fell to which reason; also the map's legend, whose patches have the lines of the map."""
+    patch = Markup('<span class="patch {}" style="background-color:{}"></span>{}')
+    code, rows = Markup("<code>{}</code>"), []
+    for line in numbers.reason_counts(candidates):
+        lines = "hatched air" if line.colour == UNSEEN_AIR else "hatched"
+        lines = lines if line.code == Reason.UNKNOWN_REGION.value else ""
+        text = patch.format(lines, css(line.colour), line.text)
+        rows.append((text, percent(line.solid_angle), f"{line.count:,}", code.format(line.code)))
+    return [Table(("verdict", "of solid angle", "directions", "code"), tuple(rows)), f"{numbers.arm_text(candidates)}."]
 
 
 def windows(candidates: Candidates, scan: Any | None) -> list[Block]:
@@ -92,10 +62,12 @@ def windows(candidates: Candidates, scan: Any | None) -> list[Block]:
     found = candidates.windows.windows
     if not found:
         return ["No direction is safe, so there is nothing to rank."]
-    return [
-        grid(_window_fields(candidates, *carried_mm(scan)), found[:MOST_WINDOWS]),
-        _windows_text(candidates, len(found)),
-    ]
+    shown = f"the first {MOST_WINDOWS} of " if len(found) > MOST_WINDOWS else ""
+    text = f"{shown}{plural(len(found), 'window')} (connected sets of safe directions), each with its best direction."
+    if candidates.cone_source:
+        source = CONE_TEXT[candidates.cone_source]
+        text += f" Safe cone: angle by which the needle may be off and stay safe for the organs, {source}."
+    return [grid(_window_fields(candidates, *numbers.carried_mm(scan)), found[:MOST_WINDOWS]), text]
 
 
 def _window_fields(candidates: Candidates, digits: int, told: str) -> list[Field]:
@@ -105,7 +77,7 @@ def _window_fields(candidates: Candidates, digits: int, told: str) -> list[Field
         return lambda window: float(values[window.best])
 
     def nearest(window: Window) -> tuple[str, float]:
-        return nearest_structure(candidates, window.best)
+        return numbers.nearest_structure(candidates, window.best)
 
     path, ranking = candidates.path, candidates.ranking
     return [
@@ -125,15 +97,6 @@ def _window_fields(candidates: Candidates, digits: int, told: str) -> list[Field
     ]
 
 
-def _windows_text(candidates: Candidates, count: int) -> str:
-    shown = f"the first {MOST_WINDOWS} of " if count > MOST_WINDOWS else ""
-    text = f"{shown}{plural(count, 'window')} (connected sets of safe directions), each with its best direction."
-    if candidates.cone_source:
-        source = CONE_TEXT[candidates.cone_source]
-        text += f" Safe cone: angle by which the needle may be off and stay safe for the organs, {source}."
-    return text
-
-
 def plan(
     plan: Any | None,
     at_patient: Iterable[tuple[str, str]] = (),
@@ -145,7 +108,6 @@ def plan(
     """The plan's numbers, or why there is none, and how its path, or that of the best direction, is found.
 
     Args:
-        at_patient: Names and values for whoever stands at the patient.
         refusal: Why there is no plan although one was requested; "" where none was.
         declared: Whether the case declares the arm's errors, which a plan's expected error then counts.
     """
@@ -163,7 +125,7 @@ def plan(
         ("approach", f"{plan.approach.times_s[-1]:.1f} s, {len(plan.approach.q)} waypoints"),
         ("insertion", f"{plan.insertion.times_s[-1]:.1f} s, {len(plan.insertion.q)} waypoints"),
         *((CLEARANCE_TEXT[phase], number(float(mm), 1, "mm")) for phase, mm in plan.clearance_mm.items()),
-        (TIP_ERROR_TEXT if declared else TRE_TEXT, expected_text(plan.expected_target_error_mm)),
+        (TIP_ERROR_TEXT if declared else TRE_TEXT, numbers.expected_text(plan.expected_target_error_mm)),
         ("seed", str(plan.seed)),
     ]
     led = [Table(WAY_HEAD, tuple(map(way_cells, plan.guidance)))] if plan.guidance else []
@@ -180,17 +142,19 @@ def rehearsal(
         for c in done.contacts
     ]
     fraction = np.max(done.max_joint_speed / done.speed_limits)
-    least = sorted(
-        ((name, float(np.min(mm))) for name, mm in done.clearance_mm.items() if name in keep_away and len(mm)),
-        key=lambda item: item[1],
-    )
+    kept = {name: float(np.min(mm)) for name, mm in done.clearance_mm.items() if name in keep_away and len(mm)}
+    least = sorted(kept.items(), key=lambda item: item[1])
+    name, mm = least[0] if least else ("nothing", math.nan)
+    needle = f"keeps {number(mm, 2, 'mm')} or more from every structure to avoid; nearest: {name}"
+    if mm < 0:
+        needle = f"crosses {name}, which it must avoid{deep_text(mm)}"
     rows = [
         ("tip error at the end", bold(number(done.tip_error_mm, 2, "mm"))),
         *([] if done.standing is None else [("rank", done.standing.text)]),
         ("its lateral part", number(done.lateral_mm, 2, "mm")),
         ("its depth part", f"{number(abs(done.depth_mm), 2, 'mm')} too {'deep' if done.depth_mm >= 0 else 'shallow'}"),
-        ("expected by the plan (rms)", expected_text(done.predicted_error_mm)),
-        ("true needle", _true_needle(least)),
+        ("expected by the plan (rms)", numbers.expected_text(done.predicted_error_mm)),
+        ("true needle", needle),
         ("contacts", "; ".join(touched) or "none"),
         ("insertion", done.followed_text),
         ("force", done.force_text),
@@ -201,18 +165,11 @@ def rehearsal(
         ("seed", str(done.seed)),
         *([("film", Markup('<a href="{}">{}</a>').format(film, film))] if film else ()),
     ]
-    named = ((name.replace("_", " "), clearance_text(mm)) for name, mm in least[:MOST_NEAREST])
+    named = ((name.replace("_", " "), numbers.clearance_text(mm)) for name, mm in least[:MOST_NEAREST])
     nearest = Table(("structure", "least clearance mm"), tuple(named))
     more = f"The {MOST_NEAREST} nearest of {len(least)} structures to avoid."
     warned = Warn(tuple(f"the answer is no: {one}" for one in failures))
     return [warned, (facts(rows), nearest), *([more] if len(least) > MOST_NEAREST else [])]
-
-
-def _true_needle(least: Sequence[tuple[str, float]]) -> str:
-    name, mm = least[0] if least else ("nothing", math.nan)
-    if mm < 0:
-        return f"crosses {name}, which it must avoid{deep_text(mm)}"
-    return f"keeps {number(mm, 2, 'mm')} or more from every structure to avoid; nearest: {name}"
 
 
 def rooms(found: Mapping[str, Any] | None) -> list[Block]:
@@ -232,7 +189,7 @@ def rooms(found: Mapping[str, Any] | None) -> list[Block]:
         *((text, fraction, chance) for text, fraction, chance in touched if max(fraction, chance) >= LEAST_SHOWN),
     )
     rows = [("tip error, rms, mm", f"{found['realised_rms_mm']:.3f}", f"{found['predicted_rms_mm']:.3f}")]
-    rows += [(text, _percent(fraction), _percent(chance)) for text, fraction, chance in shares]
+    rows += [(text, _share(fraction), _share(chance)) for text, fraction, chance in shares]
     rows += _stepwise_rows(found) if "steps" in found else []
     led = f", guidance {found['guidance']}" if "guidance" in found else ""
     head = (f"{plural(found['rooms'], 'trial')}, seed {found['seed']}{led}", "realised", "predicted")
@@ -243,17 +200,17 @@ def _stepwise_rows(found: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """The same patients without control scans, and what these cost; predictions where there are some."""
     alone, sizes = found["open_loop"], ", ".join(number(mm, 2) for mm in found["correction_mm"] if mm is not None)
     rms = "-" if alone["realised_rms_mm"] is None else f"{alone['realised_rms_mm']:.3f}"
-    hits = "-" if alone["hit_share"] is None else _percent(alone["hit_share"])
+    hits = "-" if alone["hit_share"] is None else _share(alone["hit_share"])
     return [
         ("open loop: tip error, rms, mm", rms, f"{alone['predicted_rms_mm']:.3f}"),
-        ("open loop: hit the target", hits, _percent(alone["mean_p_hit"])),
+        ("open loop: hit the target", hits, _share(alone["mean_p_hit"])),
         (f"corrections of {plural(found['steps'], 'step')} (rms, mm: {sizes})", number(found["passes"], 2), "-"),
         ("control scans, and their dose, mSv", f"{number(found['scans'], 2)}: {number(found['dose_msv'], 2)}", "-"),
         ("minutes (open loop)", f"{number(found['minutes'], 1)} ({number(alone['minutes'], 1)})", "-"),
     ]
 
 
-def _percent(fraction: float) -> str:
+def _share(fraction: float) -> str:
     return f"{100 * fraction:.2f} %"
 
 
@@ -266,7 +223,7 @@ def _reserves(found: Mapping[str, Any]) -> list[str]:
         said.append(f"In {found['unreached']:,} trials the arm did not reach the pose; they are not counted.")
     if found.get("stopped"):
         left = "a correction would have left the corridor, and the needle was stopped"
-        counted = f"predicted: {_percent(found['p_stop'])}; they do not hit, and are in no other number"
+        counted = f"predicted: {_share(found['p_stop'])}; they do not hit, and are in no other number"
         said.append(f"In {found['stopped']:,} trials {left} ({counted}).")
     notes = (*found.get("assumed", ()), *found.get("lost_sight", ()))
     said += [f"{one[0].upper()}{one[1:]}." for one in notes]
@@ -277,7 +234,6 @@ def _reserves(found: Mapping[str, Any]) -> list[str]:
 
 
 def _sources(found: Mapping[str, Any]) -> list[Block]:
-    """Of the predicted variance; the needle that bends, the simulator, and what is left out."""
     shares = sorted(found.get("predicted_share", {}).items(), key=lambda source: -source[1])
     named = [f"{SOURCES[name].text} {100 * part:.0f} %" for name, part in shares if part >= LEAST_FRACTION]
     said = [f"Sources of the predicted variance: {', '.join(named)}."] if named else []
@@ -294,12 +250,7 @@ def _sources(found: Mapping[str, Any]) -> list[Block]:
 
 
 def chances(breakdown: UncertaintyBreakdown | None, registration: Mapping[str, Any] | None) -> list[Block]:
-    """Chances, expected error and its sources, the declaration's test, and what would have to be better.
-
-    Args:
-        breakdown: Of the chosen direction, or None where it has no chances.
-        registration: As plain values, for the FLE and its interval.
-    """
+    """Chances, expected error and its sources, the declaration's test, and what would have to be better."""
     if breakdown is None:
         return [Markup("<p>{}</p>").format(NO_CHANCES)]
     budget, (name, chance) = breakdown.budget, breakdown.likeliest
@@ -321,14 +272,12 @@ def chances(breakdown: UncertaintyBreakdown | None, registration: Mapping[str, A
 
 
 def _fle(registration: Mapping[str, Any]) -> str:
-    """With its interval where it is estimated; "" where it is not known."""
     if registration.get("fle_mm") is None:
         return ""
     return number(registration["fle_mm"], 3, "mm") + _interval(registration.get("fle_interval_mm"))
 
 
 def _interval(bounds: Sequence[float] | None, of: str = "") -> str:
-    """A 95 % interval; nothing where both bounds are one."""
     low, high = bounds or (0.0, 0.0)
     return f" ({of}95 %: {number(low, 3)} to {number(high, 3)})" if low < high else ""
 
@@ -384,27 +333,18 @@ def _advice(report: Mapping[str, Any]) -> list[Block]:
         more = report["one_more"]
         place = f"{vector(more['point_mm'], 0, 'mm')} {more['space']}"
         said.append(f"one more marker helps most at {place}: {more['rms_mm']:.3f} mm")
-    if report.get("correction") is not None:
-        said.append(_correction(report["correction"]))
+    if (found := report.get("correction")) is not None:
+        joints = ", ".join(f"{angle:.2f}" for angle in found["joints_deg"])
+        said.append((
+            "aim corrected for the insertion at theta {theta_deg:.0f}, beta {beta_deg:.0f} (joints {joints} deg): "
+            "moved by {moved_mm:.2f} mm and {turned_deg:.2f} deg; expected there {expected_mm:.2f} mm (rms), not "
+            "corrected ({uncorrected_method}) {uncorrected_mm:.2f} mm; this relies on the arm errors in [errors]"
+        ).format(**{**found, "joints": joints}))  # fmt: skip
     return said
 
 
-def _correction(found: Mapping[str, Any]) -> str:
-    """Both expectations of a corrected aim, and where the correction is the best one."""
-    joints = ", ".join(f"{angle:.2f}" for angle in found["joints_deg"])
-    return (
-        "aim corrected for the insertion at theta {theta_deg:.0f}, beta {beta_deg:.0f} (joints {joints} deg): moved by "
-        "{moved_mm:.2f} mm and {turned_deg:.2f} deg; expected there {expected_mm:.2f} mm (rms), not corrected "
-        "({uncorrected_method}) {uncorrected_mm:.2f} mm; this relies on the arm errors in [errors]"
-    ).format(**{**found, "joints": joints})
-
-
 def budget(found: Mapping[str, Any] | None) -> list[Block]:
-    """What each source costs, what one change would leave, and the change that wins most.
-
-    Args:
-        found: As ``register --json`` has it under ``budget``, of the direction that is shown.
-    """
+    """What each source costs, what one change would leave, and the change that wins most."""
     if found is None:
         return []
     now, best = found["expected_mm"], found["best"]

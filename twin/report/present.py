@@ -30,9 +30,7 @@ if TYPE_CHECKING:
     from puncture_twin.twin.report.page.template import Card
 
 PROJECT = "puncture-twin"
-
-NOTHING = "–"
-"""Where there is no number."""
+NOTHING = "–"  # where there is no number
 
 PLAIN = str.maketrans({"−": "-", "–": "-", "θ": "theta", "β": "beta", "°": " deg", "²": "2", "₂": "2", "₁": "1",
                        "χ": "chi", "σ": "sigma", "’": "'", "≥": ">=", "“": "'", "”": "'", "×": "x"})  # fmt: skip
@@ -60,8 +58,7 @@ def vector(values: Iterable[float | None], digits: int, unit: str = "") -> str:
     return f"({inside}) {unit}".rstrip() if inside else ""
 
 
-FOLDED = 10
-"""Letters: a shorter head is not folded."""
+FOLDED = 10  # letters: a shorter head is not folded
 
 
 class Field(NamedTuple):
@@ -179,7 +176,10 @@ def _table_lines(table: Table) -> Iterator[str]:
     folded = [wrap(head, max(wide, 1)) for head, wide in zip(heads, widths, strict=True)]
     high = max(map(len, folded))
     top = zip(*([*[""] * (high - len(one)), *one] for one in folded), strict=True)
-    to_right = [at > 0 and any(heads) and all(_is_number(row[at]) for row in body) for at in range(len(heads))]
+    numeric = [
+        all(not row[at] or row[at][0] in "-+<>" or row[at][0].isdigit() for row in body) for at in range(len(heads))
+    ]
+    to_right = [at > 0 and any(heads) and each for at, each in enumerate(numeric)]
     for row in (*top, *body):
         each = zip(row, widths, to_right, strict=True)
         yield "  ".join(cell.rjust(wide) if right else cell.ljust(wide) for cell, wide, right in each)
@@ -189,25 +189,21 @@ def _plain(cell: str) -> str:
     return (cell.striptags() if isinstance(cell, Markup) else cell).translate(PLAIN).replace("  deg", " deg")
 
 
-def _is_number(cell: str) -> bool:
-    return not cell or cell[0] in "-+<>" or cell[0].isdigit()
-
-
 def html(sections: Iterable[Section]) -> Markup:
     """For a page; text is escaped, `Markup` is not."""
     from puncture_twin.twin.report.page.template import filled
 
-    return Markup(filled("blocks.html", sections=sections, kind_of=_kind))
+    kinds = ((Table, "table"), (Warn, "warn"), (tuple, "beside"), (Markup, "markup"), (str, "sentence"))
+
+    def kind_of(block: Block) -> str:
+        return next(kind for shape, kind in kinds if isinstance(block, shape))
+
+    return Markup(filled("blocks.html", sections=sections, kind_of=kind_of))
 
 
 def blocks_html(blocks: Sequence[Block]) -> Markup:
     """Blocks below one another, without a title."""
     return html([Section("", blocks)])
-
-
-def _kind(block: Block) -> str:
-    kinds = ((Table, "table"), (Warn, "warn"), (tuple, "beside"), (Markup, "markup"), (str, "sentence"))
-    return next(kind for shape, kind in kinds if isinstance(block, shape))
 
 
 def bold(text: str) -> Markup:
@@ -225,11 +221,7 @@ def picture(png: Path | bytes, alt: str) -> Markup:
 
 def write_page(path: Path, title: str, under: str, cards: Sequence[Card], sections: Iterable[Section],
                inputs: Iterable[Input], **parts: object) -> Path:  # fmt: skip
-    """Write a job's page: cards, sections, inputs; it appears whole or not at all.
-
-    Args:
-        parts: What the page has beyond: ``origin``, and ``data``, ``plotly`` and ``script``.
-    """
+    """Write a job's page, whole or not at all; `parts` are ``origin``, and ``data``, ``plotly`` and ``script``."""
     from puncture_twin.twin.report.page.template import write_html
 
     shown = {"under": under, "cards": cards, "sections": html(sections), "inputs": inputs_table(inputs)}
@@ -249,7 +241,12 @@ TIMES = Markup('<p class="faint">Date and duration of each stage: <a href="timin
 
 def origin_section(seed: int | None) -> Markup:
     """Versions and seed, and where the times are: they differ from run to run, and the page does not."""
-    versions = [] if seed is None else [("Python", platform.python_version()), *((n, _version(n)) for n in parts())]
+    versions = [] if seed is None else [("Python", platform.python_version())]
+    for name in () if seed is None else parts():
+        try:
+            versions.append((name, version(name)))
+        except PackageNotFoundError:
+            versions.append((name, "not installed as a package"))
     drawn = "none: no random numbers" if seed is None else str(seed)
     return blocks_html([facts([("seed", drawn), *versions]), TIMES])
 
@@ -261,13 +258,6 @@ def parts() -> list[str]:
     except PackageNotFoundError:  # run from a checkout that nobody installed
         stated = []
     return [PROJECT, *sorted(re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in stated if "extra ==" not in line)]
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed as a package"
 
 
 def footer(

@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Self, TextIO
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-LINE_EVERY_S = 5.0
-"""In a log one line in this time says enough."""
-LONG_S = 3.0
-"""What took so long is told when it is done."""
+LINE_EVERY_S = 5.0  # in a log one line in this time says enough
+LONG_S = 3.0  # what took so long is told when it is done
 
 
 def progress_display(stream: TextIO | None = None) -> BarDisplay | LineDisplay:
@@ -67,14 +65,8 @@ class BarDisplay:
         from rich.console import Console  # here: a log does not wait for it
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-        self._bars = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[far]}"),
-            TimeElapsedColumn(),
-            console=Console(file=stream),
-            transient=True,
-        )
+        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[far]}"), TimeElapsedColumn())
+        self._bars = Progress(*columns, console=Console(file=stream), transient=True)
         self._tasks: dict[str, TaskID] = {}
         self._pace = Pace()
 
@@ -104,9 +96,7 @@ class BarDisplay:
         return self._tasks[stage]
 
 
-LEAST_TIME_S = 0.5
-"""Of a rate: with less behind it, it says nothing."""
-
+LEAST_TIME_S = 0.5  # of a rate: with less behind it, it says nothing
 USUALLY_S = {"map": 1.0, "scene": 1.0, "slices": 1.0, "page": 1.0, "rehearsal": 2.0, "film": 3.0}
 """Stages that take about as long for every case, on two cores; others count, or depend on what there is to read."""
 
@@ -140,14 +130,11 @@ class Pace:
             began, first = time.monotonic(), done
             self._since[stage] = began, first, total
         self._last[stage] = done
-        failures = f", {failed} failed" if failed else ""
-        return f"{done:,}/{total:,}{failures}{_rate_text(done - first, time.monotonic() - began, total - done)}"
-
-
-def _rate_text(done: int, seconds: float, left: int) -> str:
-    if done <= 0 or seconds < LEAST_TIME_S:
-        return ""
-    return f", {rate_text(done / seconds)}, {duration_text(left * seconds / done)} left"
+        failures, rate, seconds = f", {failed} failed" if failed else "", "", time.monotonic() - began
+        if done > first and seconds >= LEAST_TIME_S:
+            per_second = (done - first) / seconds
+            rate = f", {rate_text(per_second)}, {duration_text((total - done) / per_second)} left"
+        return f"{done:,}/{total:,}{failures}{rate}"
 
 
 def step_text(what: str) -> str:

@@ -11,7 +11,7 @@ from PIL import Image
 from puncture_twin.planning.search.uncertainty_breakdown import Goal, Remedy, UncertaintyBreakdown
 from puncture_twin.planning.uncertainty.chance_model import Chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
-from puncture_twin.twin.report.error_pictures import draw_rooms_picture, needle_frame
+from puncture_twin.twin.report.error_pictures import draw_rooms_picture
 from puncture_twin.twin.report.map.map_disc import chance_raster, touch_nothing
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import map_raster
@@ -72,7 +72,6 @@ def test_the_layer_shows_what_the_table_holds(shown):
 
 
 def test_the_map_has_the_layer_only_with_chances(shown, tmp_path):
-    """Hatched and lined, with its legend."""
     case, found = shown
     draw_map(found, case, tmp_path / "with.png")
     draw_map(replace(found, chances=None), case, tmp_path / "without.png")
@@ -133,39 +132,26 @@ def test_the_page_says_where_the_next_millimetre_is_won(shown, tmp_path):
     assert 'id="budget"' not in plain.read_text()
 
 
-def test_a_truth_that_equals_the_belief_is_said_above_all(shown, tmp_path):
-    """Before the cards."""
-    case, found = shown
-    plan = world.make_plan(case, found)
-    done = world.make_rehearsal(plan)
-    done.truth_is_belief = True
-    write_page(Shown(case, world.make_anatomy(), found, plan, done), tmp_path / "page.html")
-    text = (tmp_path / "page.html").read_text()
-    assert 0 < text.index("The truth equals the belief") < text.index("safe directions")
-
-
 def test_rooms_without_any_that_was_reached_say_nothing():
-    """There is no table of nothing."""
     said = text([Section("many trials", rooms({**ROOMS, "realised_rms_mm": None}))])
     assert "the needle reached the target in none" in said and "realised" not in said and rooms(None) == []
 
 
-def test_the_cloud_is_drawn_in_the_needles_frame(tmp_path):
-    """The last axis is depth, positive too deep; the others are across."""
+class Found(SimpleNamespace):
+    """Trials as the picture takes them."""
+
+    def __len__(self):
+        return len(self.error_ct)
+
+
+def test_the_clouds_of_many_rooms_are_drawn(tmp_path):
     outward = np.array([0.6, 0.0, 0.8])
-    R = needle_frame(outward)
-    assert np.allclose(R @ R.T, np.eye(3)) and np.allclose(R @ -outward, [0, 0, 1]) and np.linalg.det(R) > 0
     error = np.random.default_rng(0).normal(size=(300, 3)) * [1.0, 2.0, 0.5]
-    found = SimpleNamespace(
+    found = Found(
         puncture=SimpleNamespace(outward_ct=outward), error_ct=error, cov_ct=np.diag([1.0, 4.0, 0.25]), seed=0,
         in_region=np.arange(300) < 285, realised_rms_mm=2.3, predicted_rms_mm=2.29,
-        tip_error_mm=np.linalg.norm(error, axis=1), __len__=lambda: 300,
+        tip_error_mm=np.linalg.norm(error, axis=1),
         hit_share=0.7, p_hit=0.71, touched=np.zeros((300, 2), bool), p_touch=np.array([0.01, 0.0]),
     )  # fmt: skip
-
-    class Found(SimpleNamespace):
-        def __len__(self):
-            return 300
-
-    draw_rooms_picture(Found(**vars(found)), tmp_path / "rooms.png")
+    draw_rooms_picture(found, tmp_path / "rooms.png")
     assert Image.open(tmp_path / "rooms.png").size[0] > 1000

@@ -27,14 +27,8 @@ from puncture_twin.twin.report.page.page_map import map_data
 
 
 @pytest.fixture(scope="module")
-def case():
-    """The small patient."""
-    return world.make_case()
-
-
-@pytest.fixture(scope="module")
 def candidates(case):
-    """Its verdicts: the far ring leaves the image, and a rib is in the path of a sector."""
+    """The far ring leaves the image, and a rib is in the path of a sector."""
     found = world.make_candidates(case)
     far = found.verdict.reason == "too_long"
     verdict = replace(

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import report_world as world
-from page_browser import PATIENCE_MS, chromium, opened, row_of
+from page_browser import PATIENCE_MS, ready, row_of
 
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.slices.panel import TONES
@@ -15,37 +15,15 @@ SCENE = "#scene3d"
 
 
 @pytest.fixture(scope="module")
-def case():
-    """The small patient."""
-    return world.make_case()
-
-
-@pytest.fixture(scope="module")
-def candidates(case):
-    """Its verdicts."""
-    return world.make_candidates(case)
-
-
-@pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    """Its page."""
     path = tmp_path_factory.mktemp("browser") / "report.html"
     world.make_page(path)
     return path
 
 
 @pytest.fixture(scope="module")
-def browser():
-    """One browser for all."""
-    with chromium() as browser:
-        yield browser
-
-
-@pytest.fixture(scope="module")
 def page(browser, path):
-    """The page, open."""
-    with opened(browser, path.as_uri(), 1300) as page:
-        page.wait_for_function("document.body.dataset.ready === 'true'")
+    with ready(browser, path.as_uri()) as page:
         yield page
 
 
@@ -131,7 +109,6 @@ def test_slices_are_shown_in_every_window(page):
 
 
 def test_the_focus_is_visible(page):
-    """An outline where the keyboard is."""
     page.keyboard.press("Tab")
     assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
 

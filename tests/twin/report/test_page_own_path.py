@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import report_world as world
-from page_browser import GREYS, SHOWN, at_pixel, chromium, drawn, opened, picture, row_of
+from page_browser import GREYS, SHOWN, at_pixel, drawn, picture, ready, row_of
 
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.case.entry import angles
@@ -45,35 +45,23 @@ def patient():
     return case, anatomy, found
 
 
-@pytest.fixture(scope="module")
-def browser():
-    """One browser for all pages."""
-    with chromium() as browser:
-        yield browser
-
-
 @contextmanager
 def page_of(browser, patient, path, has_ct):
-    """The page, with its CT or without."""
     case, anatomy, found = patient
     shown = world.make_anatomy()
     shown.scan = anatomy.scan if has_ct else None
     write_page(Shown(case, shown, found, world.make_plan(case, found), subject=Subject(case, shown, found.best)), path)
-    with opened(browser, path.as_uri(), 1300) as page:
-        page.wait_for_function("document.body.dataset.ready === 'true'")
-        drawn(page)
+    with ready(browser, path.as_uri()) as page:
         yield page
 
 
 @pytest.fixture(scope="module")
 def page(browser, patient, tmp_path_factory):
-    """With its CT."""
     with page_of(browser, patient, tmp_path_factory.mktemp("page") / "report.html", True) as page:
         yield page
 
 
 def choose(page, found, theta_deg, beta_deg):
-    """By both sliders; returns the row."""
     page.locator("#beta").fill(str(beta_deg))
     page.locator("#theta").fill(str(theta_deg))
     page.locator("#beta").fill(str(beta_deg))
@@ -213,8 +201,7 @@ def test_a_pick_beside_the_grid_leaves_the_sliders_whole(browser, patient, tmp_p
         Shown(case, anatomy, found, pick=Pick(apart, row), subject=Subject(case, anatomy, Pick(apart, row))),
         tmp_path / "p.html",
     )
-    with opened(browser, (tmp_path / "p.html").as_uri(), 1300) as page:
-        page.wait_for_function("document.body.dataset.ready === 'true'")
+    with ready(browser, (tmp_path / "p.html").as_uri()) as page:
         assert "--theta 10.37 --beta 180" in page.locator("#command").inner_text()
         page.locator("#theta").focus()
         seen = set()
@@ -234,8 +221,7 @@ def test_an_open_structure_is_crossed_too(browser, patient, tmp_path):
     parts = (liver, SimpleNamespace(**{**vars(rib), "mesh": mesh, "closed": False}), aorta)
     shown = SimpleNamespace(**{**vars(anatomy), "checked": parts, "structures": parts, "scan": None})
     write_page(Shown(case, shown, found), tmp_path / "p.html")
-    with opened(browser, (tmp_path / "p.html").as_uri(), 1300) as page:
-        page.wait_for_function("document.body.dataset.ready === 'true'")
+    with ready(browser, (tmp_path / "p.html").as_uri()) as page:
         row = choose(page, found, *right)
         units = picture(page.evaluate("document.getElementById('slices-units').toDataURL()"))
         colour = np.array(organ_colours(("liver", "rib_right_9", "aorta"))["rib_right_9"])
@@ -248,7 +234,6 @@ def test_an_open_structure_is_crossed_too(browser, patient, tmp_path):
 
 
 def test_all_are_rejected_in_words(patient, tmp_path):
-    """A count with its noun."""
     case, anatomy, found = patient
     write_page(Shown(case, anatomy, world.make_candidates(case, safe=False)), tmp_path / "p.html")
     assert f"{plural(len(found), 'direction')} searched, all rejected" in (tmp_path / "p.html").read_text()

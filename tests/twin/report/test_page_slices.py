@@ -1,14 +1,12 @@
 """The page's block of the CT and its rows, without a browser."""
 
 import gzip
-import io
 
 import numpy as np
 import pytest
 import report_world as world
 import scipy
 from hypothesis import given, strategies as st
-from PIL import Image
 
 from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report.page.page_map import map_data, picked_row
@@ -17,7 +15,7 @@ from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU
 
 
 def unpacked_ct(block):
-    """Hounsfield units of a block, and its map of an index to mm."""
+    """Hounsfield units of a block without loss."""
     nx, ny, nz = block.facts["shape"]
     differences = np.frombuffer(gzip.decompress(block.content), np.uint8).reshape(nz, ny, nx)
     values = np.zeros((nz + 1, ny + 1, nx + 1), int)
@@ -26,8 +24,7 @@ def unpacked_ct(block):
             for i in range(nx):
                 before = values[k + 1, j + 1, i] + values[k + 1, j, i + 1] + values[k, j + 1, i + 1]
                 values[k + 1, j + 1, i + 1] = (differences[k, j, i] + before // 3) % 256
-    T = np.vstack([np.reshape(block.facts["T"], (3, 4)), [0, 0, 0, 1]])
-    return np.interp(values[1:, 1:, 1:], KNOTS_BYTE, KNOTS_HU).transpose(2, 1, 0), T
+    return np.interp(values[1:, 1:, 1:], KNOTS_BYTE, KNOTS_HU).transpose(2, 1, 0)
 
 
 def oblique(shape, spacing):
@@ -44,7 +41,7 @@ def test_a_block_holds_the_voxels_where_they_lie():
     hu, T = oblique((12, 10, 8), (2.0, 2.5, 3.0))
     middle = (T @ [6, 5, 4, 1])[:3]
     block = ct_block(hu, T, np.stack([middle - 4, middle + 4]))
-    found, T_block = unpacked_ct(block)
+    found, T_block = unpacked_ct(block), world.block_pose(block)
     assert found.size < hu.size
     for index in np.ndindex(*found.shape):
         at = np.linalg.solve(T, T_block @ [*index, 1])[:3]
@@ -62,20 +59,14 @@ def test_voxels_too_many_for_the_page_become_a_millimetre():
     assert "strips" not in whole.facts and whole.facts["shown_mm"] == whole.facts["voxel_mm"] == [0.7, 0.4, 3.0]
     less = ct_block(hu, T, box, most=len(whole.content) // 2)
     assert less.facts["shown_mm"] == [1.0, 1.0, 3.0] and less.facts["shape"] == (42, 24, 16)
-    T_block = np.vstack([np.reshape(less.facts["T"], (3, 4)), [0, 0, 0, 1]])
-    place = np.linalg.solve(T, T_block @ [20, 4, 5, 1])
+    place = np.linalg.solve(T, world.block_pose(less) @ [20, 4, 5, 1])
     assert place[:3] == pytest.approx([20.5 / 0.7 - 0.5, 4.5 / 0.4 - 0.5, 5])
     assert decoded(less)[20].mean() == pytest.approx(3 * place[0] + 29.5, abs=2)
 
 
 def decoded(block):
     """Hounsfield units of a block with loss."""
-    at, found, (nx, ny, _) = 0, [], block.facts["shape"]
-    for size, count, _ in block.facts["strips"]:
-        rows = np.asarray(Image.open(io.BytesIO(block.content[at : at + size])))
-        found.append(rows.reshape(count, block.facts["rows"], nx)[:, :ny])
-        at += size
-    return np.interp(np.concatenate(found), KNOTS_BYTE, KNOTS_HU).transpose(2, 1, 0)
+    return np.interp(world.unpacked_bytes(block), KNOTS_BYTE, KNOTS_HU).transpose(2, 1, 0)
 
 
 def test_a_noisy_ct_is_packed_with_the_loss_that_is_stated():
@@ -89,7 +80,7 @@ def test_a_noisy_ct_is_packed_with_the_loss_that_is_stated():
     exact = ct_block(hu, T, box, most=10**9)
     assert "strips" not in exact.facts and len(exact.content) > 3 * world.NOISY_BYTES
     index = np.moveaxis(np.indices(facts["shape"]), 0, -1)
-    T_block = np.vstack([np.reshape(facts["T"], (3, 4)), [0, 0, 0, 1]])
+    T_block = world.block_pose(block)
     at = index @ T_block[:3, :3].T + T_block[:3, 3]
     inside = np.linalg.norm(at - world.TARGET, axis=-1) < world.SKIN_RADIUS - 5
     mean = scipy.ndimage.uniform_filter(np.where(inside, decoded(block) - scan.quiet(at), 0.0), 5)
@@ -98,9 +89,8 @@ def test_a_noisy_ct_is_packed_with_the_loss_that_is_stated():
     assert facts["rms_hu"] < 12 and facts["rms_bytes"] < 8 and facts["worst_hu"] < 400
 
 
-def test_the_block_holds_target_and_safe_entries():
+def test_the_block_holds_target_and_safe_entries(case):
     """With room about them; where nothing is safe, all entries."""
-    case = world.make_case()
     for safe in (True, False):
         candidates = world.make_candidates(case, safe=safe)
         low, high = block_box(case.target_ct, candidates)
@@ -121,10 +111,9 @@ def test_a_pick_beside_the_grid_is_a_row_more(row, off_deg):
     assert picked_row(candidates, Pick(apart, row)) == len(candidates)
 
 
-def test_the_row_more_has_all_columns():
+def test_the_row_more_has_all_columns(case, candidates):
     """Also where the search names other structures than the check."""
-    case = world.make_case()
-    candidates, apart = world.make_candidates(case), world.make_candidates(case)
+    apart = world.make_candidates(case)
     apart.theta.setflags(write=True)
     apart.theta[5] += 0.01
     data = map_data(case, candidates, Pick(apart, 5))

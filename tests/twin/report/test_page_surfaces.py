@@ -92,10 +92,7 @@ def test_outlines_of_a_fine_label_map_are_true_to_half_a_millimetre(monkeypatch)
     for mesh, (corners, faces), at in zip(meshes, unpacked_surfaces(packed), middles, strict=True):
         assert even(faces)
         for normal in (np.eye(3)[0], np.eye(3)[2], np.array([0.6, 0.0, 0.8])):
-            shown, exact = (
-                outline(corners, faces, at, normal),
-                outline(mesh.vertices, mesh.faces, at, normal),
-            )
+            shown, exact = (outline(corners, faces, at, normal), outline(mesh.vertices, mesh.faces, at, normal))
             for one, other in ((shown, exact), (exact, shown)):
                 far = cKDTree(other[((other > BOX[0]) & (other < BOX[1])).all(axis=1)]).query(one)[0]
                 assert far[((one > BOX[0] + 1) & (one < BOX[1] - 1)).all(axis=1)].max() <= 0.55  # points 0.2 mm apart

@@ -4,7 +4,6 @@ What its script cuts out of the page's block of the CT is what ``slices.png`` sh
 """
 
 import base64
-import io
 import json
 import re
 from contextlib import contextmanager
@@ -14,8 +13,7 @@ import numpy as np
 import pytest
 import report_world as world
 import scipy
-from page_browser import GREYS, SHOWN, at_pixel, chromium, drawn, opened, picture, row_of, serious_findings
-from PIL import Image
+from page_browser import GREYS, SHOWN, at_pixel, drawn, pick_first, picture, ready, row_of, serious_findings
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.kinematics import link_poses
@@ -30,48 +28,35 @@ from puncture_twin.twin.report.slices.sheet import flat
 
 WIDTHS = [390, 900, 1440]
 LIVER = (224, 124, 72)
-LETTERS = 46
-"""Pixels from the middle of an edge within which letters stand; the browser's are of another font."""
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """One browser for all widths."""
-    with chromium() as browser:
-        yield browser
+LETTERS = 46  # pixels from the middle of an edge within which letters stand; the browser's are of another font
 
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory):
-    """The page's."""
     path = tmp_path_factory.mktemp("page") / "report.html"
     world.make_page(path)
     return path.as_uri()
 
 
 @pytest.fixture(scope="module")
-def patient():
+def patient(case, candidates):
     """Case, anatomy with a CT of noise, candidates."""
-    case = world.make_case()
     anatomy = world.make_anatomy()
     anatomy.scan = world.make_scan()
-    return case, anatomy, world.make_candidates(case)
+    return case, anatomy, candidates
 
 
 @pytest.fixture(scope="module", params=WIDTHS)
 def page(request, browser, address):
     """The page, open and drawn, at one width; all tests of a width share it."""
-    with opened(browser, address, request.param) as page:
-        page.wait_for_function("document.body.dataset.ready === 'true'")
-        drawn(page)
+    with ready(browser, address, request.param) as page:
         yield page
 
 
 @pytest.fixture(scope="module")
 def desk(browser, address):
     """The page on a desk alone: what it cuts and reads does not hang on the window."""
-    with opened(browser, address, WIDTHS[-1]) as page:
-        drawn(page)
+    with ready(browser, address, WIDTHS[-1]) as page:
         yield page
 
 
@@ -97,18 +82,13 @@ def same_slices(page, patient, row, off_mm=0.0):
 
 
 def widened(mask, pixels):
-    """So many pixels more to every side."""
     return scipy.ndimage.binary_dilation(mask, np.ones((3, 3)), pixels)
 
 
 def letters_and_scale():
-    """Where words stand."""
     mask = np.zeros((PIXELS, PIXELS), bool)
-    middle, edge = (
-        slice(PIXELS // 2 - LETTERS, PIXELS // 2 + LETTERS),
-        (slice(0, LETTERS), slice(PIXELS - LETTERS, PIXELS)),
-    )
-    for one in edge:
+    middle = slice(PIXELS // 2 - LETTERS, PIXELS // 2 + LETTERS)
+    for one in (slice(0, LETTERS), slice(PIXELS - LETTERS, PIXELS)):
         mask[middle, one] = mask[one, middle] = True
     mask[PIXELS - 60 :, :200] = True
     return mask
@@ -205,10 +185,7 @@ def test_slices_of_what_is_chosen_are_those_of_the_program(desk, patient):
     slid = row_of(candidates, clicked[0] - 30, clicked[1])
     drawn(desk, slid)
     same_slices(desk, patient, slid)
-    desk.locator("button.pick").first.click()
-    best = int(desk.locator("button.pick").first.get_attribute("data-row"))
-    drawn(desk, best)
-    same_slices(desk, patient, best)
+    same_slices(desk, patient, pick_first(desk))
     assert desk.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 
@@ -218,13 +195,10 @@ def test_lighter_surfaces_are_drawn_where_the_program_draws_the_checked_ones(bro
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_surfaces, "MOST_TRIANGLES", whole // 2)
         world.make_page(tmp_path / "report.html")
-    with opened(browser, (tmp_path / "report.html").as_uri(), 1440) as page:
-        page.wait_for_function("document.body.dataset.ready === 'true'")
+    with ready(browser, (tmp_path / "report.html").as_uri(), 1440) as page:
         shown = page.evaluate("unpacked.then(({ slices }) => slices.surfaces)")
         assert shown["off_mm"] <= 0.5 and sum(one["triangles"] for one in shown["parts"]) <= whole // 2
-        page.locator("button.pick").first.click()
-        row = int(page.locator("button.pick").first.get_attribute("data-row"))
-        drawn(page, row)
+        row = pick_first(page)
         same_slices(page, patient, row, shown["off_mm"])
         plane = plane_of(patient, row, 0)
         far = np.linalg.norm(plane.points_ct(PIXELS) - patient[0].target_ct, axis=1).reshape(PIXELS, PIXELS)
@@ -236,7 +210,6 @@ def test_lighter_surfaces_are_drawn_where_the_program_draws_the_checked_ones(bro
 
 
 def plane_of(patient, row, number):
-    """A plane of ``slices.png``."""
     case, _, candidates = patient
     return needle_planes(case.target_ct, candidates.outward_ct[row], candidates.path.length[row])[number]
 
@@ -244,9 +217,7 @@ def plane_of(patient, row, number):
 def test_the_cursor_reads_units_and_structure(desk, patient):
     """At pixels of an axial slice: the CT's value within what is stated, and the structure that holds the point."""
     case, anatomy, _ = patient
-    desk.locator("button.pick").first.click()
-    row = int(desk.locator("button.pick").first.get_attribute("data-row"))
-    drawn(desk, row)
+    row = pick_first(desk)
     points = plane_of(patient, row, 0).points_ct(PIXELS).reshape(PIXELS, PIXELS, 3)
     for column, line in ((240, 250), (200, 380), (60, 380), (20, 30)):
         at_pixel(desk, 0, column, line)
@@ -264,8 +235,7 @@ def test_the_cursor_reads_units_and_structure(desk, patient):
 def test_a_scrolled_slice_is_that_of_the_place(desk, patient):
     """The wheel moves one plane along its normal; its CT is the program's there, and the others stay."""
     _, anatomy, _ = patient
-    desk.locator("button.pick").first.click()
-    row = int(desk.locator("button.pick").first.get_attribute("data-row"))
+    row = pick_first(desk)
     desk.locator("#slices-centre").click()
     drawn(desk, row)
     slider = desk.locator("#slices-a input[type=range]").first
@@ -281,8 +251,7 @@ def test_a_scrolled_slice_is_that_of_the_place(desk, patient):
 
 def test_a_path_of_ones_own_has_no_verdict_of_its_own(page, patient):
     """A dragged entry gets the nearest direction's, said to be that; a moved target none; two paths side by side."""
-    page.locator("button.pick").first.click()
-    row = int(page.locator("button.pick").first.get_attribute("data-row"))
+    row = pick_first(page)
     page.locator("#slices-keep").click()
     page.locator("[data-mode=move]").click()
     drawn(page, row)
@@ -320,8 +289,7 @@ def lossy(browser, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(page_slices, "ct_block", small)
         write_page(Shown(case, anatomy, world.make_candidates(case)), path)
-    with opened(browser, path.as_uri(), 1000) as page:
-        drawn(page)
+    with ready(browser, path.as_uri(), 1000) as page:
         yield page, path, blocks[0]
 
 
@@ -335,12 +303,7 @@ def test_a_browser_decodes_what_the_program_measured(lossy, browser):
     }))""")
     nx, ny, nz = block.facts["shape"]
     found = np.frombuffer(base64.b64decode(shown.partition(",")[2]), np.uint8).reshape(nz, ny, nx)
-    at, wanted = 0, []
-    for size, count, _ in block.facts["strips"]:
-        rows = np.asarray(Image.open(io.BytesIO(block.content[at : at + size])))
-        wanted.append(rows.reshape(count, block.facts["rows"], nx)[:, :ny])
-        at += size
-    assert np.abs(found.astype(int) - np.concatenate(wanted)).max() <= 1
+    assert np.abs(found.astype(int) - world.unpacked_bytes(block)).max() <= 1
     notes = page.locator("#slices-notes").inner_text()
     assert "packed with loss" in notes and f"off by {np.ceil(block.facts['rms_hu']):.0f} HU" in notes
     with altered(browser, path) as page:
@@ -376,8 +339,7 @@ def test_the_arm_follows_what_is_chosen(browser, tmp_path):
     write_page(Shown(case, anatomy, found, pick=first, T_base_ct=T_base_ct), path)
     drawn_first = scene_figure(case, anatomy, found, None, pick=first, T_base_ct=T_base_ct)["data"]
     before = [unpacked(one) for one in drawn_first if one.get("meta", {}).get("frame")]
-    with opened(browser, path.as_uri(), 1000) as page:
-        drawn(page)
+    with ready(browser, path.as_uri(), 1000) as page:
         if page.evaluate("document.getElementById('scene3d').hidden"):
             pytest.skip("this browser has no WebGL")
         follow_rows(page, found, before, case.robot.model, (q, first.row, T_base_ct))
@@ -406,12 +368,10 @@ def follow_rows(page, found, before, model, arm):
 
 
 def unpacked(trace):
-    """The corners of a trace, shape (n, 3)."""
     return np.stack([np.frombuffer(base64.b64decode(trace[axis]["bdata"]), "<f4") for axis in "xyz"], axis=1)
 
 
 def random_pose(rng):
-    """Any."""
     T = np.eye(4)
     T[:3, :3] = Rotation.random(random_state=rng).as_matrix()
     T[:3, 3] = rng.uniform(-300, 300, 3)

@@ -7,6 +7,7 @@ import pytest
 import report_world as world
 from embreex.mesh_construction import TriangleMesh as EmbreeMesh
 from embreex.rtcore_scene import EmbreeScene
+from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.map.map_raster import map_raster, row_colours
@@ -28,19 +29,16 @@ SIZE = 90, 120
 
 
 def soup(rng, count, size=30.0, spread=80.0):
-    """Triangles of any place and shape."""
     middle = rng.uniform(-spread, spread, (count, 1, 3))
     corners = (middle + rng.normal(0, size, (count, 3, 3))).reshape(-1, 3)
     return TriangleMesh(corners, np.arange(3 * count, dtype=np.int32).reshape(-1, 3))
 
 
 def alone(triangles):
-    """A mesh of triangles that share no corner."""
     return TriangleMesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
 
 
 def camera_at(eye, look_at=(0.0, 0.0, 0.0)):
-    """A small picture."""
     return ViewCamera(
         np.array(eye, dtype=float), np.array(look_at, dtype=float), np.array([0, 0, 1.0]), 0.6, SIZE[1], SIZE[0]
     )
@@ -96,7 +94,6 @@ def test_shells_are_all_hits_in_order(rng):
 
 
 def test_shells_behind_something_opaque_are_left_out(ball):
-    """What is hidden is not drawn at all."""
     camera, wall = camera_at((0, -400, 0)), Layer([Surface(ball(50.0), (9, 9, 9))])
     translucent = Layer([Surface(ball(40.0), (200, 0, 0), 0.3)])
     assert np.isfinite(world.samples(translucent, camera, MAX_SHELLS)[0]).any(axis=(1, 2)).sum() == 2
@@ -160,19 +157,18 @@ def test_a_picture_does_not_depend_on_what_lay_in_memory(rng, ball, monkeypatch)
 
 
 def test_an_empty_layer_is_background():
-    """Nothing to draw is no error."""
     assert (picture(Layer([]), Layer([]), camera_at((0, -400, 0))) == [246, 247, 249]).all()
 
 
-def at_place(place):
-    """A pose without turn."""
+def at_place(place, turn=0.0):
+    """A pose: there, turned about an oblique axis by an angle, rad."""
     T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec(turn * np.array([0.6, 0.0, 0.8])).as_matrix()
     T[:3, 3] = place
     return T
 
 
 def test_a_moving_body_out_of_the_picture_changes_nothing(ball):
-    """Behind the eye, or beside the picture, nothing is drawn."""
     camera, nothing = camera_at((0, -400, 0)), Layer([])
     moving = MovingPicture(nothing, nothing, [Layer([Surface(ball(20.0), (1, 2, 3))])], camera)
     for place in ((0, -800, 0), (900, 0, 0)):
@@ -185,8 +181,8 @@ def test_bodies_that_move_look_as_if_they_stood_there_and_leave_nothing_behind(b
     wall, glass = Surface(ball(30.0), (90, 160, 40)), Surface(ball(60.0), (200, 0, 0), 0.3)
     one, other = (Surface(ball(15.0), colour) for colour in ((0, 0, 250), (250, 200, 0)))
     moving = MovingPicture(Layer([wall]), Layer([glass]), [Layer([one]), Layer([other])], camera)
-    for places in (((0, -90, 0), (45, 0, 0)), ((-70, 0, 40), (-60, -20, 30)), ((900, 0, 0), (0, -800, 0))):
-        poses = [at_place(place) for place in places]
+    for places in (((0, -90, 0), (45, 0, 0)), ((-70, 0, 40), (-60, -20, 30)), ((900, 0, 0), (-10, 120, -30))):
+        poses = [at_place(place, 0.7) for place in places]
         stand = [replace(s, mesh=s.mesh.transformed(T)) for s, T in zip((one, other), poses, strict=True)]
         wanted = picture(Layer([wall, *stand]), Layer([glass]), camera)
         found = moving.at(poses)
@@ -211,7 +207,6 @@ def test_line_of_sight_is_what_all_triangles_say(rng, points):
 
 
 def test_corner_normals_of_a_ball_point_outward(ball):
-    """Area-weighted normals of a fine ball are its radii."""
     mesh = ball(30.0, (1, 2, 3), 4)
     radii = (mesh.vertices - [1, 2, 3]) / 30.0
     assert np.abs(corner_normals(mesh.vertices, mesh.faces) - radii).max() < 0.01

@@ -19,7 +19,6 @@ BODIES = {
 
 
 def solid(mesh):
-    """The mesh as trimesh takes it."""
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
@@ -34,7 +33,6 @@ def test_a_body_is_trimeshs_own(name):
 
 
 def test_a_bar_lies_between_its_points():
-    """Its axis is the line between them, its ends lie in them."""
     start, end = np.array([10.0, -20.0, 5.0]), np.array([-30.0, 15.0, 60.0])
     along = (end - start) / np.linalg.norm(end - start)
     points = bar(start, end, 3.0).vertices
@@ -45,7 +43,6 @@ def test_a_bar_lies_between_its_points():
 
 
 def test_a_ball_is_round():
-    """Every corner on the sphere, closed, facing outwards, of nearly its volume."""
     mesh = solid(ball(np.array([5.0, 6.0, 7.0]), 4.0))
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert np.allclose(np.linalg.norm(mesh.vertices - [5.0, 6.0, 7.0], axis=1), 4.0)
@@ -53,7 +50,6 @@ def test_a_ball_is_round():
 
 
 def test_corners_on_the_axis_are_one():
-    """A cone has a single apex."""
     cone = solid(revolved(np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 3.0]]), 7))
     assert len(cone.vertices) == 7 + 2 and cone.is_watertight
     assert cone.volume > 0.0

@@ -49,7 +49,6 @@ def test_the_patients_right_is_on_the_left():
 
 
 def test_pixels_lie_where_the_plane_says():
-    """The middle of the picture is its centre, rows go down, columns to the right."""
     plane = needle_planes(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0]), 40.0)[0]
     points = plane.points_ct(4).reshape(4, 4, 3)
     assert np.allclose(plane.place(points).mean(axis=(0, 1)), plane.centre)
@@ -110,7 +109,6 @@ def test_stored_bytes_give_every_window(name):
 
 
 def subject(*, scan=None, region=None, row=None):
-    """The best direction of the small patient."""
     case, anatomy = world.make_case(), world.make_anatomy()
     candidates = world.make_candidates(case)
     anatomy.scan = scan
@@ -141,7 +139,6 @@ def test_the_needle_is_drawn_as_thick_as_it_is():
 
 
 def test_without_a_ct_the_sheet_says_so(tmp_path):
-    """Outlines alone, without a plot of units."""
     slices = draw_slices(subject())
     assert slices.units is None and all(panel.hu is None for panel in slices.panels)
     assert NO_CT in slices.notes

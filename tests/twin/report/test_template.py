@@ -18,7 +18,6 @@ JOB = ("under", "sections", "inputs", "origin")
 
 
 def job_parts(text):
-    """What a job's page is given, every text the same."""
     return dict.fromkeys(JOB, text) | {"title": text, "cards": [Card(text, text, text)]}
 
 
@@ -26,7 +25,6 @@ def job_parts(text):
     "name", sorted(path.name for path in (files("puncture_twin.twin.report") / "templates").iterdir())
 )
 def test_every_template_is_in_the_package_and_is_read(name):
-    """By name, as text."""
     assert (files("puncture_twin.twin.report") / "templates" / name).read_text(encoding="utf-8")
 
 
@@ -42,7 +40,6 @@ def test_plotly_is_the_published_bundle():
 
 
 def plotly_head():
-    """The first lines of the script as a page carries it."""
     return gzip.decompress(base64.b64decode(plotly_script())).decode()[:400]
 
 

@@ -74,6 +74,13 @@ def test_correlation_is_the_point_spreads(fields, depth_mm):
         assert width == pytest.approx(sigma, rel=0.12)
 
 
+def test_point_spread_widens():
+    spread, depth = IMAGER.spread, np.array([0.0, 30.0, 60.0])
+    assert (np.diff(spread.axial_sigma(depth)) > 0).all()
+    assert (np.diff(spread.lateral_sigma(depth)) > 0).all()
+    assert 2.0 * np.sqrt(2.0 * np.log(2.0)) * spread.lateral_sigma(np.zeros(1)) == pytest.approx([spread.lateral_mm])
+
+
 def test_needle_signal_is_the_plain_sum():
     """Every sample of the shaft, spread out one by one, at a few pixels."""
     pose, rng = needle(40.0), np.random.default_rng(3)

@@ -21,7 +21,7 @@ for studies of everything behind it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -323,7 +323,7 @@ def _cut(whole: GreyImage, center: Floats, half: float) -> GreyImage:
     return GreyImage(part, (int(low[0]) + whole.offset[0], int(low[1]) + whole.offset[1]))
 
 
-def _contrast(grey: NDArray[np.uint8]) -> float:
+def _contrast(grey: NDArray[Any]) -> float:
     return float(np.percentile(grey, 99.5) - np.percentile(grey, 0.5))
 
 

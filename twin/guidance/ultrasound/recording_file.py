@@ -217,8 +217,8 @@ def _seen(table: GroupedTable, file: Path, case: SelfcalCase | None, inputs: lis
     if not coloured:
         return _Seen(P, v, shaft, tuple(missed), ())
     most = max(coloured, key=lambda name: coloured[name])
-    covered = f"at most {100 * coloured[most]:.1f} % of one, {most}"
-    warning = f"colour in {len(coloured)} pictures ({covered}): not searched for the needle"
+    extent = f"at most {100 * coloured[most]:.1f} % of one, {most}"
+    warning = f"colour in {len(coloured)} pictures ({extent}): not searched for the needle"
     return _Seen(P, v, shaft, tuple(missed), (warning,))
 
 

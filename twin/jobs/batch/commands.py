@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from typer import Argument, Option
 
 from puncture_twin.twin.jobs.exit_codes import finish
 from puncture_twin.twin.jobs.options import CohortOption, JobsOption, JsonOption
@@ -19,10 +20,10 @@ batch_app = typer.Typer(
 
 @batch_app.command("plan")
 def _plan(
-    cohort: Annotated[Path, typer.Argument(metavar="COHORT", help="Folder, CSV with column case, or cohort.toml.")],
+    cohort: Annotated[Path, Argument(metavar="COHORT", help="Folder, CSV with column case, or cohort.toml.")],
     out_dir: CohortOption,
-    no_arm: Annotated[bool, typer.Option("--no-arm", help="Do not check the arm in any case.")] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Estimate time, memory and disk; write nothing.")] = False,
+    no_arm: Annotated[bool, Option("--no-arm", help="Do not check the arm in any case.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Estimate time, memory and disk; write nothing.")] = False,
     jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
@@ -38,26 +39,24 @@ def _plan(
 @batch_app.command("run")
 def _run(
     out_dir: CohortOption,
-    part: Annotated[
-        str | None, typer.Option("--part", metavar="i/n", help="Part to run; default: SLURM's array task, or all.")
-    ] = None,
+    part: Annotated[str | None, Option(metavar="i/n", help="Part to run; default: SLURM's array task, or all.")] = None,
     scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler; its workers run the cases.")
+        str | None, Option(metavar="ADDRESS", help="Dask scheduler; its workers run the cases.")
     ] = None,
     jobs: JobsOption = 1,
-    memory_mb: Annotated[int | None, typer.Option("--memory-mb", min=100, help="Memory limit of a worker, MB.")] = None,
-    timeout_s: Annotated[float | None, typer.Option("--timeout-s", min=0.1, help="Time limit of a case, s.")] = None,
-    pages: Annotated[bool, typer.Option("--pages", help="Also draw the pictures and the page of each case.")] = False,
+    memory_mb: Annotated[int | None, Option(min=100, help="Memory limit of a worker, MB.")] = None,
+    timeout_s: Annotated[float | None, Option(min=0.1, help="Time limit of a case, s.")] = None,
+    pages: Annotated[bool, Option("--pages", help="Also draw the pictures and the page of each case.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run the cases that have no result yet. Finished cases are kept if the run is stopped."""
     from puncture_twin.planning.batch.run_case import Limits
-    from puncture_twin.twin.jobs.batch.jobs import Where, run_part, run_summary
+    from puncture_twin.twin.jobs.batch.jobs import run_part, run_summary
     from puncture_twin.twin.jobs.batch.report import run_text
 
-    where = Where(part, scheduler, jobs, pages, Limits(memory_mb, timeout_s))
     with progress_display() as progress:
-        counts = run_part(out_dir, where, progress)
+        limits = Limits(memory_mb, timeout_s)
+        counts = run_part(out_dir, part, scheduler, jobs, limits, progress, pages=pages)
     finish("batch run", counts, run_summary(out_dir, counts), run_text(out_dir, counts), as_json)
 
 
@@ -75,11 +74,9 @@ def _status(out_dir: CohortOption, as_json: JsonOption = False) -> None:
 @batch_app.command("merge")
 def _merge(
     out_dir: CohortOption,
-    expect: Annotated[
-        Path | None, typer.Option("--expect", metavar="FILE", help="Earlier cases.parquet; exit 1 if it differs.")
-    ] = None,
+    expect: Annotated[Path | None, Option(metavar="FILE", help="Earlier cases.parquet; exit 1 if it differs.")] = None,
     tolerance: Annotated[
-        float, typer.Option("--tolerance-mm", min=0, help="Allowed difference of a best clearance from --expect, mm.")
+        float, Option("--tolerance-mm", min=0, help="Allowed difference of a best clearance from --expect, mm.")
     ] = 0.01,
     as_json: JsonOption = False,
 ) -> None:
@@ -94,8 +91,8 @@ def _merge(
 
 @batch_app.command("compare")
 def _compare(
-    before: Annotated[Path, typer.Argument(metavar="A", help="Merged cohort: its folder, or its cases.parquet.")],
-    after: Annotated[Path, typer.Argument(metavar="B", help="Another merged cohort of the same cases.")],
+    before: Annotated[Path, Argument(metavar="A", help="Merged cohort: its folder, or its cases.parquet.")],
+    after: Annotated[Path, Argument(metavar="B", help="Another merged cohort of the same cases.")],
     as_json: JsonOption = False,
 ) -> None:
     """Compare two merged cohorts. Reports which cases became safe or were lost, and how far best entries moved."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from markupsafe import Markup
 
 from puncture_twin.planning.base.provenance import Input
-from puncture_twin.planning.base.text import plural
+from puncture_twin.planning.base.text import first_few, plural
 from puncture_twin.planning.batch.merge import NO_SAFE, NOT_RUN, CaseChange, Comparison
 from puncture_twin.planning.batch.run import CohortState, RunCounts
 from puncture_twin.planning.search.candidates import ARM_CHECKED
@@ -20,12 +20,8 @@ from puncture_twin.twin.report.page.template import Card, packed, script_json
 from puncture_twin.twin.report.present import Block, Field, Section, Table, grid, picture, text, write_page
 from puncture_twin.twin.report.progress import duration_text
 
-MOST_LINES = 10
-"""Of a list; the rest is counted. ``--json`` has all."""
-
-MOST_CASES = 5
-"""Named of one reason."""
-
+MOST_LINES = 10  # of a list; the rest is counted. ``--json`` has all
+MOST_CASES = 5  # named of one reason
 STALE = "inputs changed since the plan"
 NOW = "for the inputs as planned; batch status lists those that changed since"
 
@@ -88,30 +84,26 @@ def compare_text(found: Comparison) -> str:
     """Per case what changed, and in sum."""
     counts, moved = found.counts, found.moved_mm
     kinds = ", ".join(f"{counts[kind]} {kind}" for kind in sorted(counts))
-    far = (
-        [
-            f"cases that are safe in both: {len(moved)}; their best entries moved by {np.median(moved):.2f} mm "
-            "(median), "
-            f"{max(moved):.2f} mm at most"
-        ]
-        if moved
-        else []
-    )
+    far = []
+    if moved:
+        far = [f"cases that are safe in both: {len(moved)}; their best entries moved by {np.median(moved):.2f} mm "
+               f"(median), {max(moved):.2f} mm at most"]  # fmt: skip
     changed = [one for one in found.changes if one.kind != "same" or one.moved_mm]
     return text([Section(f"{_cases(len(found.changes))}: {kinds}", [*far, *_listed(map(change_line, changed))])])
 
 
 def change_line(change: CaseChange) -> str:
     """One case in two cohorts."""
-    before, after = ("-" if row is None else _told(row) for row in (change.before, change.after))
+
+    def told(row: Any) -> str:
+        if row is None:
+            return "-"
+        return f"{row['safe']} safe" if row["reason"] is None else str(row["reason"])
+
     moved = "" if change.moved_mm is None else f"; best entry moved {change.moved_mm:.2f} mm"
     more = "" if change.clearance_mm is None else f", clearance {change.clearance_mm:+.3f} mm"
     options = "" if change.options == "{}" else f" {change.options}"
-    return f"{change.case}{options}: {change.kind}: {before} -> {after}{moved}{more}"
-
-
-def _told(row: Any) -> str:
-    return f"{row['safe']} safe" if row["reason"] is None else str(row["reason"])
+    return f"{change.case}{options}: {change.kind}: {told(change.before)} -> {told(change.after)}{moved}{more}"
 
 
 def _cases(count: int) -> str:
@@ -138,9 +130,7 @@ DISTRIBUTIONS = (
 )
 """Columns whose distribution is drawn, each over the cases that have it."""
 
-OUTCOMES = {1: NO_SAFE, 2: "refused", 3: "the program failed"}
-"""What a person reads for an exit code."""
-
+OUTCOMES = {1: NO_SAFE, 2: "refused", 3: "the program failed"}  # what a person reads for an exit code
 UNDER = "One row per case. cases.parquet, next to this page, has every column; candidates/ has every direction."
 REFUSED = "Cases without a verdict, by reason. A refused case states what is wrong with its inputs."
 COLUMNS = (
@@ -150,7 +140,7 @@ COLUMNS = (
 CASE = (
     Field("case", "case"),
     Field("name", "name"),
-    Field("verdict", lambda row: _verdict(row)),
+    Field("verdict", "verdict"),
     Field("safe", "safe", 0),
     Field("of", "directions", 0),
     Field("θ °", "best_theta_deg", 1),
@@ -168,59 +158,45 @@ CASE = (
 
 def write_cohort_page(name: str, rows: Sequence[Row], inputs: Sequence[Input], path: Path) -> None:
     """Write the page: failures first, then distributions, then a sortable table."""
-    charts = tuple(histogram(found, said) for column, said in DISTRIBUTIONS if (found := _values(rows, column)))
-    shown = [
-        Section("failures", [REFUSED, _failures(rows)]),
-        Section("distributions", [charts] if charts else ["No case has a verdict."]),
-        Section("cases", [COLUMNS, grid(CASE, rows, "numbers sortable")]),
-    ]
-    scripts = {"data": script_json({}), "plotly": packed(""), "script": "sortable.js"}
-    write_page(path, f"Cohort {name}", UNDER, _cards(rows), shown, inputs, **scripts)
-
-
-def _cards(rows: Sequence[Row]) -> list[Card]:
     codes = Counter(row["exit_code"] for row in rows)
     failed = codes[2] + codes[3] + codes[None]
-    return [
+    shares = [f"{codes[code] / len(rows):.1%} of all" if rows else "of none" for code in (0, 1)]
+    cards = [
         Card("cases", f"{len(rows):,}", "of the plan"),
-        Card("with a safe direction", f"{codes[0]:,}", _part(codes[0], len(rows))),
-        Card("without one", f"{codes[1]:,}", _part(codes[1], len(rows))),
+        Card("with a safe direction", f"{codes[0]:,}", shares[0]),
+        Card("without one", f"{codes[1]:,}", shares[1]),
         Card("failed", f"{failed:,}", f"{codes[2]} refused, {codes[3]} failed in the program, {codes[None]} not run"),
     ]
 
+    def verdict(row: Row) -> str:
+        """Never "safe" alone where the arm was not checked; why a case has none stands under the failures."""
+        if row["exit_code"] == 0:
+            return "safe" if row["arm"] == ARM_CHECKED else "safe for the organs"
+        return OUTCOMES.get(row["exit_code"], NOT_RUN)
 
-def _part(count: int, of: int) -> str:
-    return f"{count / of:.1%} of all" if of else "of none"
+    known = ((said, [row[name] for row in rows if row[name] is not None]) for name, said in DISTRIBUTIONS)
+    charts = tuple(histogram(values, said) for said, values in known if values)
+    shown = [
+        Section("failures", [REFUSED, _failures(rows)]),
+        Section("distributions", [charts] if charts else ["No case has a verdict."]),
+        Section("cases", [COLUMNS, grid(CASE, [{**row, "verdict": verdict(row)} for row in rows], "numbers sortable")]),
+    ]
+    scripts = {"data": script_json({}), "plotly": packed(""), "script": "sortable.js"}
+    write_page(path, f"Cohort {name}", UNDER, cards, shown, inputs, **scripts)
 
 
 def _failures(rows: Sequence[Row]) -> Block:
-    """Every reason, most frequent first, with its cases."""
-    failed = [row for row in rows if row["exit_code"] not in (0, 1)]
-    counts = Counter(str(row["reason"]) for row in failed)
-    lines = tuple((str(count), reason, _cases_of(failed, reason)) for reason, count in counts.most_common())
+    cases = defaultdict[str, list[str]](list)
+    for row in rows:
+        if row["exit_code"] not in (0, 1):
+            cases[str(row["reason"])].append(str(row["case"]))
+    by_count = sorted(cases.items(), key=lambda item: -len(item[1]))
+    lines = tuple((str(len(named)), reason, first_few(named, MOST_CASES)) for reason, named in by_count)
     return Table(("cases", "reason", "which"), lines, "") if lines else Markup("<p>None.</p>")
 
 
-def _cases_of(rows: Iterable[Row], reason: str) -> str:
-    names = [str(row["case"]) for row in rows if row["reason"] == reason]
-    more = f" and {len(names) - MOST_CASES} more" if len(names) > MOST_CASES else ""
-    return ", ".join(names[:MOST_CASES]) + more
-
-
-def _values(rows: Sequence[Row], column: str) -> list[float]:
-    return [row[column] for row in rows if row[column] is not None]
-
-
-def _verdict(row: Row) -> str:
-    """Never "safe" alone where the arm was not checked; why a case has none stands under the failures."""
-    if row["exit_code"] == 0:
-        return "safe" if row["arm"] == ARM_CHECKED else "safe for the organs"
-    return OUTCOMES.get(row["exit_code"], NOT_RUN)
-
-
 BARS = 30
-WIDTH, HEIGHT, SHARP = 460, 220, 2
-"""Of the picture on the page, and how much finer it is, for sharp screens."""
+WIDTH, HEIGHT, SHARP = 460, 220, 2  # of the picture on the page, and how much finer it is, for sharp screens
 
 
 def histogram(values: Sequence[float], text: str) -> Markup:
@@ -229,7 +205,9 @@ def histogram(values: Sequence[float], text: str) -> Markup:
 
     from puncture_twin.twin.report.figures import PIXEL_DPI, figure_of, png
 
-    head = f"{text}: {_cases(len(values))}, median {_plain(float(np.median(values)))}"
+    middle = float(np.median(values))
+    shown = f"{middle:,.0f}" if abs(middle) >= 1000.0 else f"{middle:.3g}"  # no exponent, three digits or more
+    head = f"{text}: {_cases(len(values))}, median {shown}"
     figure = figure_of(WIDTH * SHARP, HEIGHT * SHARP, dpi=PIXEL_DPI * SHARP)
     axes = figure.add_axes((0.1, 0.19, 0.87, 0.68))
     axes.hist(values, BARS, color="#00684a", rwidth=0.92)
@@ -241,8 +219,3 @@ def histogram(values: Sequence[float], text: str) -> Markup:
     axes.ticklabel_format(style="plain", useOffset=False)
     axes.spines[["top", "right"]].set_visible(False)
     return picture(png(figure), head)
-
-
-def _plain(value: float) -> str:
-    """A number without an exponent, to three digits or more."""
-    return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"

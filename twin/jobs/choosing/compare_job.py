@@ -1,13 +1,9 @@
-"""Which two paths are compared: two choices of one case, or two plans.
-
-Two paths side by side: numbers with their units, and why one is not safe.
-"""
+"""Two paths side by side, two choices of one case or two plans: numbers with their units, and why one is not safe."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +13,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
-from puncture_twin.planning.base.text import Shown, plural
+from puncture_twin.planning.base.text import Shown, first_few, plural
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_plan
 from puncture_twin.planning.search.candidates import Candidates
@@ -32,9 +28,7 @@ from puncture_twin.twin.report.present import NOTHING, Block, Field, Section, Ta
 SAME_DIRECTION = 1e-9
 """Radians within which a direction is one of the grid: rounding of typed degrees."""
 
-MOST_ROLES = 4
-"""Of inputs that differ, so many are named."""
-
+MOST_ROLES = 4  # of inputs that differ, so many are named
 BEST_OF_ALL = Choice(rank=1)
 
 
@@ -80,11 +74,7 @@ def two_plans(source: Path, other: Path | None, case: Path | None, chosen: bool)
 def compare_source(
     source: Path, other: Path | None, case: Path | None, stated: Stated, arm: bool | None, watcher: Watcher
 ) -> Comparison:
-    """Two plans, or two choices of a case: see the functions below.
-
-    Args:
-        arm: Whether the arm must reach a choice; None where the case says where its base is.
-    """
+    """Two plans, or two choices of a case; the arm must reach them, or with None where the case has its base."""
     plans = two_plans(source, other, case, any(stated))
     if plans is None:
         choices = parse_two(*stated)
@@ -99,22 +89,12 @@ def compare_choices(context: CaseContext, choices: tuple[Choice, Choice]) -> Com
     return compare_paths(context, found, a, b)
 
 
-Titled = tuple[str, Explanation | Plan]
-"""A path, and how it was chosen or where its plan is."""
+Titled = tuple[str, Explanation | Plan]  # a path, and how it was chosen or where its plan is
 
 
 def compare_paths(context: CaseContext, found: Candidates, *paths: Titled) -> Comparison:
-    """Two directions or plans of a case, beside what its search says of them; a plan is checked again.
-
-    Raises:
-        InputError: A plan that does not hold any more.
-    """
-    a, b = (
-        _planned_side(context, found, Path(title), path)
-        if isinstance(path, Plan)
-        else _explained_side(found, title, path)
-        for title, path in paths
-    )
+    """Two directions or plans of a case, beside what its search says of them; a plan is checked again."""
+    a, b = (_checked_side(context, found, title, path) for title, path in paths)
     read = [one for side in (a, b) if side.explained is not None for one in side.explained.read]
     return Comparison(context.case.name, (*read, *context.case.inputs), a, b, tuple(context.anatomy.warnings))
 
@@ -125,7 +105,7 @@ def compare_plans(paths: tuple[Path, Path], context: CaseContext | None, note: C
     inputs = tuple(source for source, _ in read)
     plans = [plan for _, plan in read]
     if context is None:
-        a, b = (_stated_side(path, plan) for path, plan in zip(paths, plans, strict=True))
+        a, b = (Side(f"{path}", one.outward_ct, one.entry_ct, plan=one) for path, one in zip(paths, plans, strict=True))
         names = sorted({plan.case_name for plan in plans})
         read_by_both = (*inputs, *plans[0].inputs, *plans[1].inputs)
         return Comparison(" and ".join(names), read_by_both, a, b, _differing(*plans))
@@ -140,31 +120,23 @@ def _differing(a: Plan, b: Plan) -> tuple[str, ...]:
     roles = sorted(role for role in ours.keys() | theirs.keys() if ours.get(role) != theirs.get(role))
     if not roles:
         return ()
-    more = f" and {len(roles) - MOST_ROLES} more" if len(roles) > MOST_ROLES else ""
-    return (f"the plans were made from different files ({', '.join(roles[:MOST_ROLES])}{more}): are they of one case?",)
+    return (f"the plans were made from different files ({first_few(roles, MOST_ROLES)}): are they of one case?",)
 
 
-def _explained_side(candidates: Candidates, title: str, explained: Explanation) -> Side:
-    row = explained.candidates
-    grid = _on_grid(candidates, row.outward_ct[0], safe=explained.safe)
-    return Side(title, row.outward_ct[0], row.path.entry_ct[0], explained, grid)
-
-
-def _stated_side(path: Path, plan: Plan) -> Side:
-    return Side(f"{path}", plan.outward_ct, plan.entry_ct, plan=plan)
-
-
-def _planned_side(context: CaseContext, candidates: Candidates, path: Path, plan: Plan) -> Side:
-    """A plan that holds; its chances are those of the configuration in which it ends."""
-    check_plan(plan, context, path)
-    explained = context.explain(plan.theta, plan.beta)
-    explained = replace(explained, breakdown=context.breakdown_at(plan.outward_ct, plan.insertion.q[-1]))
-    grid = _on_grid(candidates, plan.outward_ct, safe=True)
-    return replace(_stated_side(path, plan), explained=explained, grid=grid)
+def _checked_side(context: CaseContext, candidates: Candidates, title: str, path: Explanation | Plan) -> Side:
+    """A plan must hold; its chances are those of the configuration in which it ends."""
+    if isinstance(path, Plan):
+        check_plan(path, context, Path(title))
+        explained = context.explain(path.theta, path.beta)
+        explained = replace(explained, breakdown=context.breakdown_at(path.outward_ct, path.insertion.q[-1]))
+        grid = _on_grid(candidates, path.outward_ct, safe=True)
+        return Side(title, path.outward_ct, path.entry_ct, explained, grid, path)
+    row = path.candidates
+    grid = _on_grid(candidates, row.outward_ct[0], safe=path.safe)
+    return Side(title, row.outward_ct[0], row.path.entry_ct[0], path, grid)
 
 
 def _on_grid(candidates: Candidates, outward_ct: Floats, *, safe: bool) -> OnGrid:
-    """What the search says of a direction, or of the one of its grid beside it."""
     row = nearest_row(candidates, outward_ct)
     if row is None or not (safe and candidates.safe[row]):
         return OnGrid(None, float("nan"), None)
@@ -175,9 +147,7 @@ def _on_grid(candidates: Candidates, outward_ct: Floats, *, safe: bool) -> OnGri
     return OnGrid(int(candidates.ranking.rank[row]), float(candidates.safe_cone[row]), window)
 
 
-NEAREST = 5
-"""Structures of either side whose clearances stand beside each other."""
-
+NEAREST = 5  # structures of either side whose clearances stand beside each other
 LEAST_CHANCE = 1e-4
 """What is shown of a chance: a smaller one is no number that anybody can rely on."""
 
@@ -185,13 +155,7 @@ NOT_CHECKED = "values as the plans state them; --case CASE checks them again, wi
 
 
 class OnGrid(NamedTuple):
-    """What a search says of the direction of its grid that a path is, or lies beside.
-
-    Attributes:
-        rank: None between the grid's directions, and for a rejected one.
-        safe_cone: rad; NaN where the grid does not say.
-        window: None outside of all windows.
-    """
+    """What a search says of a path on its grid; of one beside it the rank is None, and the cone, rad, NaN."""
 
     rank: int | None
     safe_cone: float
@@ -200,13 +164,7 @@ class OnGrid(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of two paths.
-
-    Attributes:
-        entry_ct: Shape (3,), mm; NaN without a skin entry.
-        explained: Checked against its case; None of a plan alone.
-        grid: What the search of its case says; None without one.
-    """
+    """One of two paths; `entry_ct`, (3,), mm, is NaN without a skin entry; of a plan alone nothing is explained."""
 
     title: str
     outward_ct: Floats
@@ -244,11 +202,7 @@ class Side:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Shown):
-    """Two paths.
-
-    Attributes:
-        case_name: The case, or those that two plans name.
-    """
+    """Two paths of a case, or of those that two plans name."""
 
     case_name: str
     inputs: tuple[Input, ...]
@@ -287,115 +241,76 @@ class Comparison(Shown):
     def text(self) -> str:
         """A table, then what takes a sentence."""
         entries = f", entries {self.entries_apart_mm:.0f} mm" if np.isfinite(self.entries_apart_mm) else ""
-        sides = [{**side.summary(), "side": side} for side in (self.a, self.b)]
-        rows = [(one.name, *(one.of(side, unit=True) for side in sides)) for one in (*FIELDS, *self._clearances())]
-        table = Table(("", "A", "B"), tuple(row for row in rows if row[1:] != (NOTHING, NOTHING)))
         head = f"case {self.case_name}: two paths {self.apart_deg:.1f}° apart{entries}"
-        return text([
-            Section(head, [table, *self._sentences()]), *(Section(f"warning: {one}", []) for one in self.warnings),
-        ])  # fmt: skip
-
-    def _clearances(self) -> Iterator[Field]:
-        for name in self._structures():
-            yield Field(f"clearance to {name}", partial(_clearance, name=name))
-
-    def _structures(self) -> list[str]:
-        """The nearest of either side that demand a margin, the nearest first."""
-        least: dict[str, float] = {}
-        for side in (self.a, self.b):
-            for name, mm in _demanding(side)[:NEAREST]:
-                least[name] = min(mm, least.get(name, np.inf))
-        return sorted(least, key=lambda name: least[name])
-
-    def _sentences(self) -> Iterator[Block]:
+        sides = [{**side.summary(), "spoken": _spoken(side)} for side in (self.a, self.b)]
+        rows = [(one.name, *(one.of(side, unit=True) for side in sides)) for one in FIELDS]
+        least: dict[str, float] = {}  # the nearest of either side that demand a margin, the nearest first
+        sentences: list[Block] = []
         for letter, side in (("A", self.a), ("B", self.b)):
-            if side.explained is None:
+            if (explained := side.explained) is None:
                 continue
             if not side.safe:
-                yield f"{letter} is rejected: {reason_text(side.explained.candidates, 0)}"
-            yield facts((f"{letter} {what}", value) for what, value in side.explained.facts.rows())
+                sentences.append(f"{letter} is rejected: {reason_text(explained.candidates, 0)}")
+            sentences.append(facts((f"{letter} {what}", value) for what, value in explained.facts.rows()))
+            demanding = {one.name for one in explained.anatomy.checked if one.demands_margin}
+            clearances = sorted(explained.clearances().items(), key=lambda item: item[1])
+            for name, mm in [item for item in clearances if item[0] in demanding][:NEAREST]:
+                least[name] = min(mm, least.get(name, np.inf))
         if self.a.explained is None:
-            yield NOT_CHECKED
+            sentences.append(NOT_CHECKED)
+        for name in sorted(least, key=least.__getitem__):
+            rows.append((f"clearance to {name}", *(_clearance(side.explained, name) for side in (self.a, self.b))))
+        table = Table(("", "A", "B"), tuple(row for row in rows if row[1:] != (NOTHING, NOTHING)))
+        warned = (Section(f"warning: {one}", []) for one in self.warnings)
+        return text([Section(head, [table, *sentences]), *warned])
 
 
-def _demanding(side: Side) -> list[tuple[str, float]]:
-    if side.explained is None:
-        return []
-    demanding = {one.name for one in side.explained.anatomy.checked if one.demands_margin}
-    return sorted(
-        (item for item in side.explained.clearances().items() if item[0] in demanding), key=lambda item: item[1]
-    )
-
-
-def _clearance(row: Mapping[str, Any], name: str) -> str | None:
-    explained = row["side"].explained
+def _clearance(explained: Explanation | None, name: str) -> str:
     if explained is None:
-        return None
+        return NOTHING
     digits = next(decimals(one) for one in explained.anatomy.checked if one.name == name)
     clearance = explained.clearances()[name]
     return "crossed" if clearance < 0 else number(clearance, digits, "mm")
 
 
-def _angles(row: Mapping[str, Any]) -> str:
-    at = row["plan"] or row["check"]
-    return f"{at['theta_deg']:.6g}, {at['beta_deg']:.6g}"
-
-
-def _verdict(row: Mapping[str, Any]) -> str:
-    side = row["side"]
-    if side.explained is None:
-        return "not checked"
-    return str(side.explained.candidates.safe_text) if side.safe else str(side.explained.verdict)
-
-
-def _chance(key: str) -> Callable[[Mapping[str, Any]], str | None]:
-    """In percent, of a side that has chances."""
-
-    def shown(row: Mapping[str, Any]) -> str | None:
-        known = (row["check"] or {}).get("chances")
-        return None if known is None else _percent(known[key])
-
-    return shown
+def _spoken(side: Side) -> dict[str, Any]:
+    row, explained = side.summary(), side.explained
+    angles = "{theta_deg:.6g}, {beta_deg:.6g}".format(**(row["plan"] or row["check"]))
+    if explained is None:
+        return {"angles": angles, "verdict": "not checked"}
+    check, chances = row["check"], row["check"].get("chances") or {}
+    name, chance = ("", 0.0) if explained.breakdown is None else explained.breakdown.likeliest
+    reached = {None: "not computed", False: "no", True: f"yes, margin {number(check['reach_margin'], 2)}"}
+    return {
+        "angles": angles,
+        "verdict": str(explained.candidates.safe_text if side.safe else explained.verdict),
+        **{key: _percent(chances[key]) for key in ("p_hit", "p_touch_any") if key in chances},
+        "likeliest": f"{_percent(chance)}, {name}" if name else None,
+        "reach": reached[check["reachable"]],
+        "least": float(explained.candidates.least_clearance[0]),
+    }
 
 
 def _percent(chance: float) -> str:
     return f"{100 * chance:.2f}" if chance >= LEAST_CHANCE else "below 0.01"
 
 
-def _likeliest(row: Mapping[str, Any]) -> str | None:
-    breakdown = None if row["side"].explained is None else row["side"].explained.breakdown
-    name, chance = ("", 0.0) if breakdown is None else breakdown.likeliest
-    return f"{_percent(chance)}, {name}" if name else None
-
-
-def _reach(row: Mapping[str, Any]) -> str | None:
-    if row["check"] is None:
-        return None
-    margin = f"yes, margin {number(row['check']['reach_margin'], 2)}"
-    return {None: "not computed", False: "no", True: margin}[row["check"]["reachable"]]
-
-
-def _least(row: Mapping[str, Any]) -> float | None:
-    explained = row["side"].explained
-    return None if explained is None else float(explained.candidates.least_clearance[0])
-
-
 FIELDS = (
     Field("chosen by", "title"),
-    Field("theta, beta, deg", _angles),
-    Field("verdict", _verdict),
+    Field("theta, beta, deg", "spoken.angles"),
+    Field("verdict", "spoken.verdict"),
     Field("rank", "search.rank"),
     Field("window", "search.window"),
     Field("window's area, deg2", "search.window_square_deg", 0),
     Field("its entry on the skin, cm2", "search.window_entry_cm2", 1),
     Field("safe cone", "search.safe_cone_deg", 1, "deg"),
-    Field("chance to hit, %", _chance("p_hit")),
-    Field("chance to touch anything, %", _chance("p_touch_any")),
-    Field("most likely touched, %", _likeliest),
+    Field("chance to hit, %", "spoken.p_hit"),
+    Field("chance to touch anything, %", "spoken.p_touch_any"),
+    Field("most likely touched, %", "spoken.likeliest"),
     Field("expected tip error (rms)", "check.chances.expected_rms_mm", 2, "mm"),
     Field("path length", "check.path_length_mm", 1, "mm"),
     Field("skin angle", "check.skin_angle_deg", 1, "deg"),
-    Field("arm reaches it", _reach),
+    Field("arm reaches it", "spoken.reach"),
     Field("standoff", "plan.standoff_mm", 1, "mm"),
     Field("approach", "plan.approach_s", 1, "s"),
     Field("insertion", "plan.insertion_s", 1, "s"),
@@ -403,6 +318,6 @@ FIELDS = (
     Field("needle to the nearest structure", "plan.clearance_mm.needle", 2, "mm"),
     Field("arm on the approach", "plan.clearance_mm.approach", 2, "mm"),
     Field("arm on the insertion", "plan.clearance_mm.insertion", 2, "mm"),
-    Field("least clearance", _least, 2, "mm"),
+    Field("least clearance", "spoken.least", 2, "mm"),
 )
 """What stands in each row; rows that neither side has are left out."""

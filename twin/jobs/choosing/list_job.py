@@ -1,12 +1,9 @@
-"""The command that checks a list: which list it is, and what it is read and written with.
-
-A list of entries, or of targets, checked row by row: one row out for each row in.
-"""
+"""A list of entries, or of targets, checked row by row: one row out for each row in."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -21,15 +18,7 @@ from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.geometry.spaces import to_lps
-from puncture_twin.planning.search.choice import (
-    BEST,
-    Choice,
-    Listed,
-    ReadList,
-    explain_choice,
-    read_entries,
-    read_targets,
-)
+from puncture_twin.planning.search.choice import BEST, Choice, Listed, explain_choice, read_entries, read_targets
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, finite
 from puncture_twin.twin.report.present import Field, Section, footer, grid, text
@@ -38,20 +27,17 @@ from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 def lists_of(
     entries: Path | None, targets: Path | None, choice: Choice, *, picture: Path | None, out_dir: Path | None
 ) -> bool:
-    """Whether a list is to be checked.
-
-    Raises:
-        InputError: Two lists, a list of directions beside a choice, a picture of a list, or a folder without a list.
-    """
+    """Whether a list is to be checked; options that do not go together are refused."""
+    listed = entries is not None or targets is not None
     if entries is not None and targets is not None:
         refuse("two lists were given", "--entries, --targets", "one of them", "conflicting_options")
     if entries is not None and choice != BEST:
         refuse("a list and a choice of a direction", "--entries", "only the list", "conflicting_options")
-    if (entries or targets) is not None and picture is not None:
+    if listed and picture is not None:
         refuse("--picture draws one candidate", "--picture", "check without a list", "conflicting_options")
-    if (entries or targets) is None and out_dir is not None:
+    if not listed and out_dir is not None:
         refuse("one candidate is only printed", "--out", "--entries or --targets", "conflicting_options")
-    return (entries or targets) is not None
+    return listed
 
 
 def check_list(
@@ -64,30 +50,29 @@ def check_list(
     arm: bool | None,
     watcher: Watcher,
 ) -> CheckedList:
-    """Check a list of entries or of targets; written where a folder is named.
-
-    Raises:
-        InputError: A case, list or folder that cannot be used. A row that cannot be checked is a row that says so.
-    """
+    """Check a list of entries or of targets; written where a folder is named."""
     out = None if out_dir is None else check_writable(out_dir)
     context = prepare(path, arm=arm, watcher=watcher)
-
-    def aimed(row: Listed) -> CaseContext:
-        point = to_lps(np.array([row.point_mm]), context.case.space)[0]
-        return context.at(point)
-
     if entries is not None:
-        checked = check_entries(context, read_entries(entries, context.case))
+        listed, outcome = read_entries(entries, context.case), _of_entry
     else:
         assert targets is not None
-        checked = check_targets(context, read_targets(targets, context.case, choice), aimed)
-    return checked if out is None else write_checked(checked, context, out)
+        listed, outcome = read_targets(targets, context.case, choice), _of_target
+    rows = []
+    for done, row in enumerate(listed.rows, start=1):
+        try:
+            found = outcome(context, row)
+        except InputError as error:
+            found = Outcome(None, REFUSED, str(error))
+        rows.append(_document(row, found))
+        context.watcher.count("rows", done, len(listed.rows))
+    inputs, warnings = (listed.input, *context.case.inputs), (*listed.warnings, *context.anatomy.warnings)
+    checked = CheckedList(context.case.name, context.arm, inputs, tuple(rows), warnings)
+    return checked if out is None else _written(checked, context, out)
 
 
 CSV, PARQUET = "checked.csv", "checked.parquet"
-
-REFUSED = "refused"
-"""The verdict of a row that could not be checked: neither safe nor rejected."""
+REFUSED = "refused"  # the verdict of a row that could not be checked: neither safe nor rejected
 
 TYPES: Mapping[str, str] = MappingProxyType(
     {"row": "int64", "reachable": "bool", "safe_directions": "int64", "windows": "int64"}
@@ -104,12 +89,7 @@ COLUMNS = (
 
 
 class Outcome(NamedTuple):
-    """A row that was checked.
-
-    Attributes:
-        explained: None of a row that was refused, or for whose target nothing is safe.
-        safe_directions: Of a target's search; None of an entry.
-    """
+    """A row that was checked, explained unless it was refused or nothing is safe; counts are of a target's search."""
 
     explained: Explanation | None
     verdict: str
@@ -120,14 +100,7 @@ class Outcome(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class CheckedList:
-    """All rows of a list.
-
-    Attributes:
-        arm: Whether the arm was checked: see `Candidates.arm_note`.
-        inputs: The list, then what the case names.
-        rows: In the order of the list, by `COLUMNS`.
-        warnings: Of the list and of the case.
-    """
+    """All rows of a list in its order, by `COLUMNS`; inputs and warnings of the list, then of the case."""
 
     case_name: str
     arm: str
@@ -154,47 +127,61 @@ class CheckedList:
 
     def text(self) -> str:
         """A line a row, then what kept those that are not safe."""
-        kept = [f"row {row['row']}: {_why(row)}" for row in self.rows if row["verdict"] != "safe"]
+        kept = []
+        for row in self.rows:
+            where = f" ({row['reason_structure']})" if row["reason_structure"] else ""
+            why = f"{row['reason']}{where}" if row["reason"] else row["verdict"]
+            detail = f": {row['detail']}" if row["detail"] else ""
+            kept += [f"row {row['row']}: {why}{detail}"] if row["verdict"] != "safe" else []
         head = Section(
             f"case {self.case_name}: {plural(len(self.rows), 'row')}, arm {self.arm}", [grid(FIELDS, self.rows), *kept]
         )
         return text([head, *footer(self.files, self.warnings)])
 
 
-def check_entries(context: CaseContext, listed: ReadList) -> CheckedList:
-    """Check every listed direction of one case."""
-
-    def outcome(row: Listed) -> Outcome:
-        explained = explain_choice(context, row.choice, None)
-        return Outcome(explained, explained.verdict)
-
-    return _checked(context, listed, outcome)
+def _of_entry(context: CaseContext, row: Listed) -> Outcome:
+    explained = explain_choice(context, row.choice, None)
+    return Outcome(explained, explained.verdict)
 
 
-def check_targets(context: CaseContext, listed: ReadList, aimed: Callable[[Listed], CaseContext]) -> CheckedList:
-    """Search the case again for every listed target, and explain the choice, or the best.
-
-    Args:
-        context: Of the case, for what does not depend on the target.
-        aimed: The case with a row's point as its target, read anew.
-    """
-
-    def outcome(row: Listed) -> Outcome:
-        there = aimed(row)
-        found = there.search()
-        windows = len(found.windows)
-        counts = int(found.safe.sum()), windows
-        try:
-            explained = explain_choice(there, row.choice, found)
-        except NoAnswerError as error:
-            return Outcome(None, "rejected", str(error), *counts)
-        return Outcome(explained, explained.verdict, "", *counts)
-
-    return _checked(context, listed, outcome)
+def _of_target(context: CaseContext, row: Listed) -> Outcome:
+    """The case searched again about a listed target, and the choice there, or the best."""
+    there = context.at(to_lps(np.array([row.point_mm]), context.case.space)[0])
+    found = there.search()
+    counts = int(found.safe.sum()), len(found.windows)
+    try:
+        explained = explain_choice(there, row.choice, found)
+    except NoAnswerError as error:
+        return Outcome(None, "rejected", str(error), *counts)
+    return Outcome(explained, explained.verdict, "", *counts)
 
 
-def write_checked(checked: CheckedList, context: CaseContext, out: Path) -> CheckedList:
-    """Write a checked list's rows as CSV and Parquet into a folder."""
+def _document(row: Listed, found: Outcome) -> dict[str, Any]:
+    document: dict[str, Any] = {name: "" if TYPES.get(name) == "string" else None for name in COLUMNS}
+    document |= {} if row.point_mm is None else dict(zip(("x_mm", "y_mm", "z_mm"), row.point_mm, strict=True))
+    if (explained := found.explained) is not None:
+        one, place, breakdown = explained.candidates, explained.facts.place, explained.breakdown
+        entry = to_lps(one.path.entry_ct, explained.case.space)[0]
+        document |= {
+            **one.at(0),
+            "reason": str(one.verdict.reason[0]),
+            "reason_structure": str(one.verdict.structure[0]),
+            "detail": str(one.verdict.detail[0]),
+            **{f"entry_{axis}_mm": finite(mm) for axis, mm in zip("xyz", entry, strict=True)},
+            "on_the_skin": "" if place is None else place.text(explained.case.space),
+            "path_length_mm": finite(one.path.length[0]),
+            "skin_angle_deg": finite(np.degrees(one.path.skin_angle[0])),
+            "min_clearance_mm": finite(one.least_clearance[0]),
+            "nearest": explained.nearest_demanding(),
+            "reachable": None if one.arm.reachable[0] < 0 else bool(one.arm.reachable[0]),
+            "p_hit": None if breakdown is None else breakdown.p_hit,
+            "p_touch_any": None if breakdown is None else breakdown.p_touch_any,
+        }
+    document |= {"row": row.number, "name": row.name, "verdict": found.verdict, "windows": found.windows}
+    return document | {"safe_directions": found.safe_directions, "detail": found.detail or document["detail"]}
+
+
+def _written(checked: CheckedList, context: CaseContext, out: Path) -> CheckedList:
     names, stages, note = (CSV, PARQUET), context.stages.seconds, context.watcher.note
     with writing(out, "check list", inputs=checked.inputs, seconds=stages, names=names, note=note) as draft:
         paths = (draft.folder / CSV, draft.folder / PARQUET)
@@ -213,50 +200,6 @@ def write_checked(checked: CheckedList, context: CaseContext, out: Path) -> Chec
     return replace(checked, files=draft.final(paths))
 
 
-def _checked(context: CaseContext, listed: ReadList, outcome: Callable[[Listed], Outcome]) -> CheckedList:
-    rows = []
-    for done, row in enumerate(listed.rows, start=1):
-        try:
-            rows.append(_document(context, row, outcome(row)))
-        except InputError as error:
-            rows.append(_document(context, row, Outcome(None, REFUSED, str(error))))
-        context.watcher.count("rows", done, len(listed.rows))
-    inputs = (listed.input, *context.case.inputs)
-    return CheckedList(
-        context.case.name, context.arm, inputs, tuple(rows), (*listed.warnings, *context.anatomy.warnings)
-    )
-
-
-def _document(context: CaseContext, row: Listed, found: Outcome) -> dict[str, Any]:
-    blank: dict[str, Any] = {name: "" if TYPES.get(name) == "string" else None for name in COLUMNS}
-    point = {} if row.point_mm is None else dict(zip(("x_mm", "y_mm", "z_mm"), row.point_mm, strict=True))
-    stated = {"row": row.number, "name": row.name, "verdict": found.verdict, "detail": found.detail}
-    counts = {"safe_directions": found.safe_directions, "windows": found.windows}
-    rest = {} if found.explained is None else _explained(found.explained)
-    return {**blank, **point, **rest, **stated, **counts, "detail": found.detail or rest.get("detail", "")}
-
-
-def _explained(explained: Explanation) -> dict[str, Any]:
-    one = explained.candidates
-    entry = to_lps(one.path.entry_ct, explained.case.space)[0]
-    place, breakdown = explained.facts.place, explained.breakdown
-    return {
-        **one.at(0),
-        "reason": str(one.verdict.reason[0]),
-        "reason_structure": str(one.verdict.structure[0]),
-        "detail": str(one.verdict.detail[0]),
-        **{f"entry_{axis}_mm": finite(mm) for axis, mm in zip("xyz", entry, strict=True)},
-        "on_the_skin": "" if place is None else place.text(explained.case.space),
-        "path_length_mm": finite(one.path.length[0]),
-        "skin_angle_deg": finite(np.degrees(one.path.skin_angle[0])),
-        "min_clearance_mm": finite(one.least_clearance[0]),
-        "nearest": explained.nearest_demanding(),
-        "reachable": None if one.arm.reachable[0] < 0 else bool(one.arm.reachable[0]),
-        "p_hit": None if breakdown is None else breakdown.p_hit,
-        "p_touch_any": None if breakdown is None else breakdown.p_touch_any,
-    }
-
-
 FIELDS = (
     Field("row", "row"),
     Field("name", "name"),
@@ -268,9 +211,3 @@ FIELDS = (
     Field("angle", "skin_angle_deg", 1, "deg"),
     Field("nearest", lambda row: "crosses " * ((row["min_clearance_mm"] or 0) < 0) + row["nearest"]),
 )
-
-
-def _why(row: dict[str, Any]) -> str:
-    where = f" ({row['reason_structure']})" if row["reason_structure"] else ""
-    reason = f"{row['reason']}{where}" if row["reason"] else row["verdict"]
-    return f"{reason}: {row['detail']}" if row["detail"] else reason

@@ -241,7 +241,7 @@ def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
 
 def _draw(run: ScanRun, path: Path) -> Path:
     """Slices through the target, and through each marker and the needle's tip where they were read."""
-    from puncture_twin.twin.report.slices.points import Mark, write_points_sheet  # with matplotlib
+    from puncture_twin.twin.report.slices.sheet import Mark, write_points_sheet  # with matplotlib
 
     marks, control = [Mark("target", run.scene.target, "true place")], run.control
     if control is not None and control.found is not None:

@@ -9,7 +9,6 @@ Every error is the root mean square over 200 held-out exact poses and all runs.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,57 +38,58 @@ UNSEEN = 200
 COUNTS = (16, 20, 30, 50)
 METHODS = ("closed form", "Gauss-Newton", "weighted", "Cramer-Rao bound")
 
-TABLE: Mapping[int, tuple[float, float, float, float]] = MappingProxyType(
-    {
-        16: (8.8, 0.320, 0.310, 0.319),
-        20: (0.492, 0.308, 0.280, 0.273),
-        30: (0.261, 0.217, 0.208, 0.211),
-        50: (0.178, 0.163, 0.152, 0.157),
-    }
-)
+TABLE: Mapping[int, tuple[float, float, float, float]] = {
+    16: (8.8, 0.320, 0.310, 0.319),
+    20: (0.492, 0.308, 0.280, 0.273),
+    30: (0.261, 0.217, 0.208, 0.211),
+    50: (0.178, 0.163, 0.152, 0.157),
+}
 """The specification's error at the tip in mm by number of poses, in the order of ``METHODS``."""
 
 COMPARED_WITH = "this project's specification, from a simulation; the patent application states no figure"
 
-LIMITS: Mapping[tuple[int, str], float] = MappingProxyType(
-    {(20, "Gauss-Newton"): 0.34, (30, "closed form"): 0.30, (30, "Gauss-Newton"): 0.24, (50, "Gauss-Newton"): 0.18}
-)
+LIMITS: Mapping[tuple[int, str], float] = {
+    (20, "Gauss-Newton"): 0.34,
+    (30, "closed form"): 0.30,
+    (30, "Gauss-Newton"): 0.24,
+    (50, "Gauss-Newton"): 0.18,
+}
 """What must be reached, mm."""
 
-OVER_BOUND: Mapping[str, float] = MappingProxyType({"Gauss-Newton": 1.2, "weighted": 1.05})
+OVER_BOUND: Mapping[str, float] = {"Gauss-Newton": 1.2, "weighted": 1.05}
 """How far above the Cramer-Rao bound of the same recordings a method may be."""
 
-MOST_STEPS = 10
-"""Steps of the refinement from 20 poses on."""
-
+MOST_STEPS = 10  # steps of the refinement from 20 poses on
 OUTLIER_FRACTION, OUTLIER_MM = 0.1, 5.0
 SCALE_LIMIT_MM = 0.25
 """With the pixel size estimated; the known number is 0.239."""
 
 
 def _row(what: str, known: float | None, ours: float, limit: float | None, unit: str) -> dict[str, Any]:
-    """One number beside the specified one."""
     holds = limit is None or ours <= limit
     return {"what": what, "known": known, "ours": ours, "limit": limit, "unit": unit, "holds": holds}
 
 
 class _Run(NamedTuple):
-    """One simulated recording, solved in every way: mean squared errors at the tip (mm^2), and more."""
+    """One simulated recording: mean squared errors at the tip by ``METHODS``, mm^2, steps, and error of direction."""
 
     squared: Floats
-    """Shape (4,), in the order of ``METHODS``."""
     steps: int
     direction_deg: float
 
 
 def reproduce(seeds: int | None) -> Answer:
-    """Compute every number.
-
-    Args:
-        seeds: Number of runs; None takes 200, for which the limits are meant. With fewer they are wider.
-    """
-    runs = seeds or RUNS
-    facts = summary([_exact_row(), *_table(runs), *_outliers(runs), *_scales(runs)], runs)
+    """Compute every number; None takes 200 runs, for which the limits are meant. With fewer they are wider."""
+    runs, worst = seeds or RUNS, 0.0
+    for n in (16, 20, 50):  # the closed form without noise: the largest error of any unknown
+        recording, truth = simulate_recording(np.random.default_rng([SEED, n]), n, noise=None)
+        found, exact = closed_form(recording), truth_estimate(truth)
+        turns = [log_rotation(a.T @ b) for a, b in ((found.R_X, exact.R_X), (found.R_Y, exact.R_Y))]
+        moves = [found.t_X - exact.t_X, found.t_Y - exact.t_Y, found.t_Q - exact.t_Q]
+        worst = max(worst, float(np.degrees(np.abs(turns).max())), float(np.abs(moves).max()))
+    what = "closed form without noise, 16, 20 and 50 poses: largest error"
+    rows = [_row(what, None, worst, 1e-6, "mm or deg"), *_table(runs), *_outliers(runs), *_scales(runs)]
+    facts = summary(rows, runs)
     return Answer(facts["holds"], facts, reproduction_text(facts))
 
 
@@ -103,18 +103,6 @@ def truth_estimate(truth: SimulatedTruth) -> Estimate:
     """The truth in the form of an estimate."""
     X, Y = truth.X, truth.Y
     return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], truth.tip_end2, np.ones(2), truth.direction_end2)
-
-
-def _exact_row() -> dict[str, Any]:
-    """The closed form without noise: the largest error of any unknown, in mm or degrees."""
-    worst = 0.0
-    for n in (16, 20, 50):
-        recording, truth = simulate_recording(np.random.default_rng([SEED, n]), n, noise=None)
-        found, exact = closed_form(recording), truth_estimate(truth)
-        turns = [log_rotation(a.T @ b) for a, b in ((found.R_X, exact.R_X), (found.R_Y, exact.R_Y))]
-        moves = [found.t_X - exact.t_X, found.t_Y - exact.t_Y, found.t_Q - exact.t_Q]
-        worst = max(worst, float(np.degrees(np.abs(turns).max())), float(np.abs(moves).max()))
-    return _row("closed form without noise, 16, 20 and 50 poses: largest error", None, worst, 1e-6, "mm or deg")
 
 
 def _table(runs: int) -> list[dict[str, Any]]:
@@ -140,10 +128,7 @@ def _table(runs: int) -> list[dict[str, Any]]:
 def widened(squares: Floats) -> float:
     """What a limit of a root mean square is multiplied by: 1 from 200 runs on, more where chance alone does more.
 
-    Two standard errors of the root mean square of so few runs, less what 200 of them have.
-
-    Args:
-        squares: One per run, shape (runs,).
+    Two standard errors of the root mean square of so few runs, less what 200 of them have; squares (runs,).
     """
     runs = len(squares)
     spread = float(np.std(squares, ddof=1) / np.mean(squares)) if runs > 1 else 1.0
@@ -218,16 +203,10 @@ def _scales(runs: int) -> list[dict[str, Any]]:
     return rows
 
 
-class _Rms(NamedTuple):
+def _rms(one: Callable[[np.random.Generator], list[float]], runs: int, key: int) -> tuple[list[float], list[float]]:
     """Root mean squares of what a run gives, and what their limits are multiplied by."""
-
-    values: list[float]
-    widen: list[float]
-
-
-def _rms(one: Callable[[np.random.Generator], list[float]], runs: int, key: int) -> _Rms:
     squared = np.array([one(np.random.default_rng([SEED, key, k])) for k in range(runs)])
-    return _Rms(np.sqrt(np.mean(squared, axis=0)).tolist(), [widened(column) for column in squared.T])
+    return np.sqrt(np.mean(squared, axis=0)).tolist(), [widened(column) for column in squared.T]
 
 
 FIELDS = (

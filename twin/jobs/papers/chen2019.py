@@ -7,7 +7,6 @@ Chen G. et al., "Robot-Assisted Puncture Positioning Methods under CT Navigation
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,19 +19,7 @@ from puncture_twin.planning.base.strict_json import plain
 from puncture_twin.planning.case.entry import needle_pose, outward
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_affine, fit_triad
-from puncture_twin.twin.experiment.chen2019 import (
-    AS_FOUND,
-    AS_STATED,
-    REJECTED,
-    TABLE_1,
-    TABLE_2,
-    TABLE_4,
-    Experiment,
-    Point,
-    find_skew,
-    paper_strains,
-    run_draws,
-)
+from puncture_twin.twin.experiment import chen2019 as chen
 from puncture_twin.twin.jobs.terminal import Answer
 from puncture_twin.twin.report.present import Field, Section, Table, grid, text
 
@@ -42,44 +29,35 @@ TOLERANCE_MM = 0.01
 _ROUNDING = 1e-9
 """Binary against decimal fractions, when a difference is exactly the tolerance."""
 
-TABLE_3: Mapping[str, tuple[Point, float]] = MappingProxyType(
-    {
-        "L": ((544.83, -338.12, 643.33), 2.99),
-        "M": ((528.96, -325.92, 619.34), 2.94),
-        "H": ((521.03, -319.82, 606.35), 2.99),
-    }
-)
+TABLE_3: Mapping[str, tuple[chen.Point, float]] = {
+    "L": ((544.83, -338.12, 643.33), 2.99),
+    "M": ((528.96, -325.92, 619.34), 2.94),
+    "H": ((521.03, -319.82, 606.35), 2.99),
+}
 """Lesions by the triad A-B-C of setup 1, and their error."""
 
-TABLE_5: Mapping[str, tuple[Point, float]] = MappingProxyType(
-    {
-        "ABC": ((555.87, -370.49, 619.19), 2.38),
-        "ABE": ((555.81, -371.97, 617.94), 2.47),
-        "ACD": ((560.82, -367.30, 617.43), 7.17),
-    }
-)
+TABLE_5: Mapping[str, tuple[chen.Point, float]] = {
+    "ABC": ((555.87, -370.49, 619.19), 2.38),
+    "ABE": ((555.81, -371.97, 617.94), 2.47),
+    "ACD": ((560.82, -367.30, 617.43), 7.17),
+}
 """Lesion M by different triads of setup 2, and its error."""
 
-TABLE_6: Mapping[str, float] = MappingProxyType({"ABC": 2.38, "ABCE": 3.55, "ABCDE": 2.48})
+TABLE_6: Mapping[str, float] = {"ABC": 2.38, "ABCE": 3.55, "ABCDE": 2.48}
 """Error of lesion M in setup 2: triad for three markers, the paper's (affine) least squares for more."""
 
-TABLE_7: Mapping[str, tuple[Point, float]] = MappingProxyType(
-    {
-        "A": ((417.33, -290.59, 535.40), 1.09),
-        "B": ((557.55, -272.17, 535.38), 1.06),
-        "C": ((424.00, -232.71, 602.44), 2.14),
-    }
-)
+TABLE_7: Mapping[str, tuple[chen.Point, float]] = {
+    "A": ((417.33, -290.59, 535.40), 1.09),
+    "B": ((557.55, -272.17, 535.38), 1.06),
+    "C": ((424.00, -232.71, 602.44), 2.14),
+}
 """Markers by their own triad in setup 1, and their residuals."""
 
-TABLE_7_MEAN = 1.43
-"""Eq. 16 for setup 1."""
-
-WORKED_THETA, WORKED_BETA = np.radians(10.0), np.radians(45.0)
+TABLE_7_MEAN = 1.43  # Eq. 16 for setup 1
+WORKED_THETA, WORKED_BETA = np.radians(10.0), np.radians(45.0)  # section 3.3: setup 1, A-B-C, lesion M
 WORKED_STANDOFF_MM, WORKED_LENGTH_MM = 150.0, 401.0
-WORKED_TIP: Point = (554.75, -322.40, 471.62)
-WORKED_TOP: Point = (623.69, -313.01, 76.70)
-"""Section 3.3: setup 1, A-B-C, lesion M."""
+WORKED_TIP: chen.Point = (554.75, -322.40, 471.62)
+WORKED_TOP: chen.Point = (623.69, -313.01, 76.70)
 
 
 def reproduce() -> Answer:
@@ -90,21 +68,23 @@ def reproduce() -> Answer:
 
 def reproduction_facts() -> dict[str, Any]:
     """Every printed quantity beside ours, mm, and the finding about the worked pose: out of a UR3's reach."""
-    first = fit_triad(_points(TABLE_1, "ABC"), _points(TABLE_2, "ABC"))
+    first = fit_triad(_points(chen.TABLE_1, "ABC"), _points(chen.TABLE_2, "ABC"))
     second = {
-        names: (fit_triad if len(names) == 3 else fit_affine)(_points(TABLE_1, names), _points(TABLE_4, names))
+        names: (fit_triad if len(names) == 3 else fit_affine)(
+            _points(chen.TABLE_1, names), _points(chen.TABLE_4, names)
+        )
         for names in (*TABLE_5, *TABLE_6)
     }
     rows: list[dict[str, Any]] = []
     for name, printed in TABLE_3.items():
-        rows += _rows("3", f"{name} by A-B-C, setup 1", first, name, TABLE_2, printed)
+        rows += _rows("3", f"{name} by A-B-C, setup 1", first, name, chen.TABLE_2, printed)
     for names, printed in TABLE_5.items():
-        rows += _rows("5", f"M by {'-'.join(names)}, setup 2", second[names], "M", TABLE_4, printed)
+        rows += _rows("5", f"M by {'-'.join(names)}, setup 2", second[names], "M", chen.TABLE_4, printed)
     for names, error in TABLE_6.items():
-        rows.append(_row("6", f"error of M by {'-'.join(names)}", error, _error(second[names], "M", TABLE_4)))
+        rows.append(_row("6", f"error of M by {'-'.join(names)}", error, _error(second[names], "M", chen.TABLE_4)))
     for name, printed in TABLE_7.items():
-        rows += _rows("7", f"marker {name}, setup 1", first, name, TABLE_2, printed)
-    mean = np.mean([_error(first, name, TABLE_2) for name in TABLE_7])
+        rows += _rows("7", f"marker {name}, setup 1", first, name, chen.TABLE_2, printed)
+    mean = np.mean([_error(first, name, chen.TABLE_2) for name in TABLE_7])
     rows.append(_row("7", "mean error (Eq. 16)", TABLE_7_MEAN, mean))
     tip, top = (apply(first, point) for point in _worked_pose())
     rows.append(_row("3.3", "needle tip, theta 10 beta 45 r 150", WORKED_TIP, tip))
@@ -120,10 +100,9 @@ def reproduction_facts() -> dict[str, Any]:
 
 
 def _rows(
-    table: str, what: str, T: Floats, name: str, touched: Mapping[str, Point], printed: tuple[Point, float]
+    table: str, what: str, T: Floats, name: str, touched: Mapping[str, chen.Point], printed: tuple[chen.Point, float]
 ) -> list[dict[str, Any]]:
-    """A point as T has it, and its error."""
-    own = apply(T, np.array(TABLE_1[name], float))
+    own = apply(T, np.array(chen.TABLE_1[name], float))
     return [_row(table, what, printed[0], own), _row(table, f"error of {what}", printed[1], _error(T, name, touched))]
 
 
@@ -134,12 +113,12 @@ def _row(table: str, what: str, paper: Any, ours: Any) -> dict[str, Any]:
     return {"table": table, "what": what, "paper_mm": theirs.tolist(), "ours_mm": own.tolist(), "holds": holds}
 
 
-def _points(table: Mapping[str, Point], names: str) -> Floats:
+def _points(table: Mapping[str, chen.Point], names: str) -> Floats:
     return np.array([table[name] for name in names], dtype=float)
 
 
-def _error(T: Floats, name: str, touched: Mapping[str, Point]) -> float:
-    return float(np.linalg.norm(apply(T, np.array(TABLE_1[name], float)) - np.array(touched[name])))
+def _error(T: Floats, name: str, touched: Mapping[str, chen.Point]) -> float:
+    return float(np.linalg.norm(apply(T, np.array(chen.TABLE_1[name], float)) - np.array(touched[name])))
 
 
 def worked_reach(T_base_ct: Floats) -> tuple[float, float]:
@@ -156,7 +135,7 @@ def worked_reach(T_base_ct: Floats) -> tuple[float, float]:
 
 def _worked_pose() -> tuple[Floats, Floats]:
     u = outward(WORKED_THETA, WORKED_BETA)
-    pose = needle_pose(np.array(TABLE_1["M"], float), u, standoff=WORKED_STANDOFF_MM, length=WORKED_LENGTH_MM)
+    pose = needle_pose(np.array(chen.TABLE_1["M"], float), u, standoff=WORKED_STANDOFF_MM, length=WORKED_LENGTH_MM)
     return pose.tip_ct, pose.top_ct
 
 
@@ -165,9 +144,7 @@ FIELDS = (
     Field("what", "what"),
     Field("paper, mm", lambda row: "  ".join(f"{mm:.2f}" for mm in row["paper_mm"])),
     Field("ours, mm", lambda row: "  ".join(f"{mm:.2f}" for mm in row["ours_mm"])),
-    Field(
-        "differs", lambda row: max(abs(a - b) for a, b in zip(row["paper_mm"], row["ours_mm"], strict=True)), 4, "mm"
-    ),
+    Field("differs", lambda row: np.abs(np.subtract(row["paper_mm"], row["ours_mm"])).max(), 4, "mm"),
     Field("", lambda row: "" if row["holds"] else "DOES NOT HOLD"),
 )
 
@@ -176,17 +153,14 @@ def reproduction_text(found: Mapping[str, Any]) -> str:
     """The paper's numbers beside ours."""
     reach = (
         "the worked example puts the flange {flange_from_shoulder_mm:.1f} mm from the shoulder of a UR3, whose links "
-        "span "
-        "{longest_span_mm:.1f} mm at most: it is "
+        "span {longest_span_mm:.1f} mm at most: it is "
     ).format(**found) + ("out of reach" if found["out_of_reach"] else "within reach")
     verdict = "all within their limits" if found["holds"] else "NOT all within their limits"
     return text([Section("Chen et al. 2019, and ours", [grid(FIELDS, found["rows"]), reach]), Section(verdict, [])])
 
 
 DRAWS, SEED = 1000, 2019
-
-SETUP_2 = "carton/case_m_setup2.toml"
-"""The embedded case of the paper's second setup, five markers."""
+SETUP_2 = "carton/case_m_setup2.toml"  # the embedded case of the paper's second setup, five markers
 
 
 def experiment(draws: int | None, runs: int, watcher: Watcher) -> Answer:
@@ -194,7 +168,8 @@ def experiment(draws: int | None, runs: int, watcher: Watcher) -> Answer:
 
     It holds where the stated errors are rejected, and the found ones explain every number.
     """
-    stated, found = (run_draws(one, draws or DRAWS, np.random.default_rng(SEED)) for one in (AS_STATED, AS_FOUND))
+    declared = (chen.AS_STATED, chen.AS_FOUND)
+    stated, found = (chen.run_draws(one, draws or DRAWS, np.random.default_rng(SEED)) for one in declared)
     facts = experiment_facts(stated, found)
     shown = experiment_text(facts)
     if runs:
@@ -206,14 +181,20 @@ def experiment(draws: int | None, runs: int, watcher: Watcher) -> Answer:
     return Answer(facts["holds"], facts, shown)
 
 
-def experiment_facts(stated: Experiment, found: Experiment) -> dict[str, Any]:
+def experiment_facts(stated: chen.Experiment, found: chen.Experiment) -> dict[str, Any]:
     """Plain values for ``--json``, mm and degrees."""
-    skew = find_skew()
+    skew, declarations = chen.find_skew(), []
+    for one in (stated, found):
+        declared = plain(one.declaration)
+        declared["skew_deg"] = float(np.degrees(declared.pop("skew")))
+        declared |= {"printed": plain(one.printed), "joint": plain(one.joint), "probability": one.probability}
+        declared |= {"rejected": one.rejected, "agrees": one.agrees}
+        declarations.append({**declared, "best_strain_fraction_of_draws": one.best_strain})
     return {
         "seed": SEED,
         "draws": stated.draws,
-        "declarations": [_declaration(one) for one in (stated, found)],
-        "strain_share": dict(paper_strains()),
+        "declarations": declarations,
+        "strain_share": dict(chen.paper_strains()),
         "skew_deg": float(np.degrees(skew.angle)),
         "lesions": [
             {"what": name, "as_read_mm": read, "square_mm": square} for name, (read, square) in skew.lesions.items()
@@ -225,27 +206,13 @@ def experiment_facts(stated: Experiment, found: Experiment) -> dict[str, Any]:
     }
 
 
-def _declaration(one: Experiment) -> dict[str, Any]:
-    declared = plain(one.declaration)
-    declared["skew_deg"] = float(np.degrees(declared.pop("skew")))
-    return {
-        **declared,
-        "printed": plain(one.printed),
-        "joint": plain(one.joint),
-        "probability": one.probability,
-        "rejected": one.rejected,
-        "agrees": one.agrees,
-        "best_strain_fraction_of_draws": one.best_strain,
-    }
-
-
 def experiment_text(facts: Mapping[str, Any]) -> str:
     """The finding first, then the numbers behind it."""
     (stated, found), strains = facts["declarations"], facts["strain_share"]
     others = max(value for name, value in strains.items() if name != "y against z")
     verdicts = [
         f"stated: p {stated['probability']:.1g}, {'REJECTED' if stated['rejected'] else 'not rejected'} "
-        f"(below {REJECTED:g}): slices of 5 mm cannot give the smallest residuals along the bed.",
+        f"(below {chen.REJECTED:g}): slices of 5 mm cannot give the smallest residuals along the bed.",
         f"found: p {found['probability']:.2g}; every number within its range: {'yes' if found['agrees'] else 'NO'} "
         "(fitted to these points: consistent, but no proof)",
         f"a skew of the CT's y against z alone takes {100 * strains['y against z']:.0f} % of the squared residuals, "

@@ -33,32 +33,17 @@ from puncture_twin.twin.jobs.terminal import Answer
 from puncture_twin.twin.rehearsal.stereo_session import ServoTrial, TargetRow
 from puncture_twin.twin.report.present import Field, Section, Table, grid, number
 
-TABLE_1 = (0.33, 0.31, 0.19, 0.27, 0.21, 0.26, 0.34, 0.33, 0.38, 0.35)
-"""Error of the stereo at ten points."""
+TABLE_1 = (0.33, 0.31, 0.19, 0.27, 0.21, 0.26, 0.34, 0.33, 0.38, 0.35)  # error of the stereo at ten points
 
 TABLE_2 = (
-    (0.73, 1.19, 0.76),
-    (1.76, 2.29, 1.67),
-    (0.88, 1.45, 0.68),
-    (1.37, 1.25, 1.39),
-    (1.49, 1.49, 1.25),
-    (1.67, 1.77, 1.61),
-    (0.94, 0.93, 0.97),
-    (1.12, 1.67, 0.97),
-    (0.96, 0.99, 0.53),
-    (0.98, 1.72, 0.91),
-    (0.79, 1.27, 0.78),
-    (0.61, 2.41, 0.59),
-    (1.25, 1.89, 1.41),
-    (1.39, 1.47, 1.35),
-    (0.74, 0.96, 0.60),
+    (0.73, 1.19, 0.76), (1.76, 2.29, 1.67), (0.88, 1.45, 0.68), (1.37, 1.25, 1.39), (1.49, 1.49, 1.25),
+    (1.67, 1.77, 1.61), (0.94, 0.93, 0.97), (1.12, 1.67, 0.97), (0.96, 0.99, 0.53), (0.98, 1.72, 0.91),
+    (0.79, 1.27, 0.78), (0.61, 2.41, 0.59), (1.25, 1.89, 1.41), (1.39, 1.47, 1.35), (0.74, 0.96, 0.60),
     (0.23, 0.91, 0.58),
-)
+)  # fmt: skip
 """Error of the mapping, before and after the servo, at sixteen targets."""
 
-TABLE_1_PRINTED = (0.30, 0.38)
-"""Mean and maximum."""
-
+TABLE_1_PRINTED = (0.30, 0.38)  # mean and maximum
 TABLE_2_PRINTED = ((1.06, 1.76), (1.47, 2.41), (1.00, 1.67))
 """Mean and maximum of mapping, before, after. The mean before is 1.477 by the rows: 1.48, not 1.47."""
 
@@ -78,17 +63,11 @@ CHANCE = 2.0
 
 CASE = "liu2007.toml"
 DEFAULT_SEEDS = 8
-
-Facts = Mapping[str, Any]
-"""What `reproduction_facts` returns: mm, shares 0..1."""
+Facts = Mapping[str, Any]  # what `reproduction_facts` returns: mm, shares 0..1
 
 
 def reproduce(out_dir: Path, seeds: int | None) -> Answer:
-    """Hold the paper's sessions in the twin, print its tables beside ours, and write pictures, plot and page.
-
-    Args:
-        seeds: How many; the first is the case's own, the others follow it.
-    """
+    """Hold so many of the paper's sessions in the twin, print its tables beside ours, and write pictures and page."""
     with writing(out_dir, "reproduce", names=NAMES) as draft:
         case, count = paper_case(), seeds or DEFAULT_SEEDS
         draft.inputs = case.inputs
@@ -184,11 +163,9 @@ def mean_of_seeds(trials: Sequence[ServoTrial], value: Callable[[TargetRow], flo
 def paper_sections(facts: Facts) -> list[Section]:
     """The paper's tables beside ours, what the servo is worth, and what the exit code demands."""
     first, ours = facts["sessions"][0], facts["statistics"]
+    printed = zip(facts["paper_table_2_mm"], facts["paper_servo_only_at_least_mm"], first["targets"], strict=False)
     rows = [
-        {"theirs": dict(zip(COLUMNS[1:], theirs, strict=True)), "least": least, **row}
-        for theirs, least, row in zip(
-            facts["paper_table_2_mm"], facts["paper_servo_only_at_least_mm"], first["targets"], strict=False
-        )
+        {"theirs": dict(zip(COLUMNS[1:], theirs, strict=True)), "least": least, **row} for theirs, least, row in printed
     ]
     gains = [
         f"{facts[key]['mean']:.2f} (standard error {facts[key]['error']:.2f})"

@@ -4,31 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import MappingProxyType
 
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.progress import Watcher
 from puncture_twin.twin.jobs.papers import axp_ybq, chen2019, liu2007
 from puncture_twin.twin.jobs.terminal import Answer
 
-PAPERS: Mapping[str, Callable[[Path, int | None], Answer]] = MappingProxyType(
-    {
-        "chen2019": lambda out_dir, seeds: chen2019.reproduce(),  # arithmetic on printed tables: nothing is drawn
-        "liu2007": liu2007.reproduce,
-        "axp-ybq": lambda out_dir, seeds: axp_ybq.reproduce(seeds),
-    }
-)
+PAPERS: Mapping[str, Callable[[Path, int | None], Answer]] = {
+    "chen2019": lambda out_dir, seeds: chen2019.reproduce(),  # arithmetic on printed tables: nothing is drawn
+    "liu2007": liu2007.reproduce,
+    "axp-ybq": lambda out_dir, seeds: axp_ybq.reproduce(seeds),
+}
 """Name on the command line to what takes the folder for pictures and pages, and how many seeds (None: its own)."""
 
 
 def reproduced(
     paper: str, out_dir: Path, seeds: int | None, watcher: Watcher, *, experiment: bool, runs: int
 ) -> Answer:
-    """A paper's numbers beside ours, or its experiment drawn anew.
-
-    Raises:
-        InputError: A paper that is not known, or has no such experiment; a folder that cannot be written to.
-    """
+    """A paper's numbers beside ours, or its experiment drawn anew."""
     if paper not in PAPERS:
         refuse(f"paper '{paper}' is not known", "reproduce", ", ".join(PAPERS), "unknown_choice")
     if experiment and paper != "chen2019":

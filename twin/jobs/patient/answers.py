@@ -30,13 +30,13 @@ from puncture_twin.planning.registration.fits import ReadingNoise, rigid_fre_mm
 from puncture_twin.planning.registration.hand_eye import HandEye, HandEyeNoise, noise_of
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs, match
 from puncture_twin.planning.registration.method import LEAST_FOUND_MM
-from puncture_twin.planning.registration.placement import OneMore, odd_branches, one_more, without_each
+from puncture_twin.planning.registration.placement import odd_branches, one_more, without_each
 from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.registration.residuals import INTERVAL
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.twin.jobs.patient.budget import budget_facts, correction_facts
-from puncture_twin.twin.jobs.patient.run import registration_summary
+from puncture_twin.twin.jobs.patient.run import plain_of, registration_summary
 from puncture_twin.twin.report import patient
 from puncture_twin.twin.report.present import Field, Section, Table, Warn, facts, text, vector
 
@@ -44,11 +44,7 @@ from puncture_twin.twin.report.present import Field, Section, Table, Warn, facts
 def register_report(
     source: Path, markers_base: Path | None, target: str | None, space: Space, fle_mm: float | None
 ) -> dict[str, Any]:
-    """The report of a case's markers, or of two lists of markers; see the functions below.
-
-    Raises:
-        InputError: Two lists without a target, or see there.
-    """
+    """The report of a case's markers, or of two lists of markers, which need a target."""
     if markers_base is None:
         return registration_report(source)
     if target is None:
@@ -66,53 +62,59 @@ def registration_report(path: Path) -> dict[str, Any]:
         compared = () if checked is None else (one.sentence for one in checked.findings)
         allowed = "only markers_ct and markers_base"
         raise InputListError("; ".join((what, *compared)), where=case.path, allowed=allowed, code="no_markers")
-    placement, registration = checked.placement, checked.placement.registration
-    report = registration_summary(registration)
-    pose = case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2]
-    along = np.linspace(case.target_ct, pose, 4)
-    report["case"] = case.name
-    report["inputs"] = inputs_document(case.inputs)
-    report["expected_tre_target_mm"] = placement.target_error_mm
-    report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(case.target_ct))
-    read = None if case.errors is None else case.errors.target_cov_ct
-    report |= one_insertion(registration, case.target_ct, read)
-    report["expected_tre_along_shaft_mm"] = registration.expected_tre_mm(along).tolist()
-    found = {kind: [one.sentence for one in checked.findings if one.severity is kind] for kind in Severity}
-    report["warnings"] = [*case.warnings, *found[Severity.WARNING], *_branch_warning(case, registration)]
-    report |= _advice(case, registration)
-    report["notes"] = found[Severity.NOTE]
+    registration, kinds = checked.placement.registration, (Severity.WARNING, Severity.NOTE)
+    warned, notes = ([one.sentence for one in checked.findings if one.severity is kind] for kind in kinds)
+    odd = odd_branches(registration, case.robot.model)
+    touched = f"{', '.join(odd)} touched in another branch of the arm than the rest: arm errors do not cancel there"
+    along = np.linspace(case.target_ct, case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2], 4)
+    report = _report(registration, case.target_ct, None if case.errors is None else case.errors.target_cov_ct)
     report["findings"] += [one.document() for one in checked.findings]
-    return report
+    return {
+        **report,
+        "case": case.name,
+        "inputs": inputs_document(case.inputs),
+        "expected_tre_target_mm": checked.placement.target_error_mm,
+        "expected_tre_along_shaft_mm": registration.expected_tre_mm(along).tolist(),
+        "warnings": [*case.warnings, *warned, *([touched] if odd else [])],
+        **_advice_of_case(case, registration),
+        "notes": notes,
+    }
 
 
 def lists_report(
     markers_ct: Path, markers_base: Path, target: str, space: Space, fle_mm: float | None
 ) -> dict[str, Any]:
     """The registration of two lists of markers alone, as plain values."""
-    numbers = parse_triple(target, "--target")
-    content = [read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)) for path in (markers_ct, markers_base)]
+    numbers, paths = parse_triple(target, "--target"), (markers_ct, markers_base)
+    content = [read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)) for path in paths]
     read = [parse_points(content[0], markers_ct, default_space=space), parse_points(content[1], markers_base)]
     target_ct = to_lps(np.array([numbers]), space)[0]
     pairs = match(*read, use=None, where=f"{markers_ct}, {markers_base}")
-    stated = {"method": "rigid", "target_ct": target_ct, "where": str(markers_base)}
     noise = noise_of_lists(pairs, fle_mm)
-    given = {"fle_mm": fle_mm} if noise is None else {"noise": noise, "noise_found": fle_mm is None}
-    registration = register(pairs, **stated, **given)
-    report = registration_summary(registration)
-    report["case"] = f"{markers_ct} and {markers_base}"
-    report["target_mm"], report["space"] = list(numbers), str(space)
-    named = zip(("markers_ct", "markers_base"), (markers_ct, markers_base), content, strict=True)
-    report["inputs"] = inputs_document(
-        tuple(Input(role, str(path), hashlib.sha256(data).hexdigest()) for role, path, data in named)
-    )
-    report["expected_tre_target_mm"] = float(registration.expected_tre_mm(target_ct[None])[0])
-    report["expected_tre_target_interval_mm"] = list(registration.expected_tre_interval_mm(target_ct))
-    report |= one_insertion(registration, target_ct, None)
-    report["expected_tre_along_shaft_mm"] = []
-    report |= _advice_of_lists(registration, target_ct, space)
-    report["warnings"] = []
-    report["notes"] = ["only two lists: no skin or couch to check the axes and names against"]
-    return report
+    given: dict[str, Any] = {"fle_mm": fle_mm} if noise is None else {"noise": noise, "noise_found": fle_mm is None}
+    registration = register(pairs, method="rigid", target_ct=target_ct, where=str(markers_base), **given)
+    named = zip(("markers_ct", "markers_base"), paths, content, strict=True)
+    inputs = [Input(role, str(path), hashlib.sha256(data).hexdigest()) for role, path, data in named]
+    return {
+        **_report(registration, target_ct, None),
+        "case": f"{markers_ct} and {markers_base}",
+        "target_mm": list(numbers),
+        "space": str(space),
+        "inputs": inputs_document(inputs),
+        "expected_tre_target_mm": float(registration.expected_tre_mm(target_ct[None])[0]),
+        "expected_tre_along_shaft_mm": [],
+        **_advice_of_lists(registration, target_ct, space),
+        "warnings": [],
+        "notes": ["only two lists: no skin or couch to check the axes and names against"],
+    }
+
+
+def _report(registration: Registration, target_ct: Floats, read_cov_ct: Floats | None) -> dict[str, Any]:
+    return {
+        **registration_summary(registration),
+        "expected_tre_target_interval_mm": list(registration.expected_tre_interval_mm(target_ct)),
+        **one_insertion(registration, target_ct, read_cov_ct),
+    }
 
 
 def one_insertion(registration: Registration, target_ct: Floats, read_cov_ct: Floats | None) -> dict[str, Any]:
@@ -136,9 +138,8 @@ def noise_of_lists(pairs: MarkerPairs, fle_mm: float | None) -> ReadingNoise | N
     if fle_mm is None and rigid_fre_mm(pairs.points_ct, pairs.points_base) < LEAST_FOUND_MM:
         return None
     count = len(pairs)
-    found_mm = rigid_fre_mm(pairs.points_ct, pairs.points_base) * np.sqrt(
-        count / (count - 2)
-    )  # Fitzpatrick 1998: FRE^2 = (1 - 2 / N) FLE^2
+    # Fitzpatrick 1998: FRE^2 = (1 - 2 / N) FLE^2
+    found_mm = rigid_fre_mm(pairs.points_ct, pairs.points_base) * np.sqrt(count / (count - 2))
     each = np.eye(3) * (found_mm if fle_mm is None else fle_mm) ** 2 / 6.0
     return ReadingNoise(
         cov_ct=each,
@@ -150,77 +151,58 @@ def noise_of_lists(pairs: MarkerPairs, fle_mm: float | None) -> ReadingNoise | N
 
 
 def _advice_of_lists(registration: Registration, target_ct: Floats, space: Space) -> dict[str, Any]:
-    """As `_advice`, by the readings alone: which marker to drop, and to which side one more would help most."""
-    uncertainty = registration.uncertainty
-    if uncertainty is None:
+    """By the readings alone: which marker to drop, and to which side one more would help most."""
+    if registration.uncertainty is None:
         return {}
-    cov = uncertainty.cov_at(apply(registration.T_base_ct, target_ct))[:3, :3]
     far = np.linalg.norm(registration.markers.points_ct - target_ct, axis=1).max()
     sides = np.array([side for side in product((-1.0, 0.0, 1.0), repeat=3) if any(side)])
     sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-    more = one_more(registration, target_ct, target_ct + far * sides)
-    test = uncertainty.test
+    test = registration.uncertainty.test
     stated = test.text().replace("the declared errors", "--fle")
     found = f"noise estimated from the residuals: {registration.fle_mm:.3f} mm, with {test.freedom} degrees of freedom"
     return {
         "budget": None,
         "fle_source": "estimated from the FRE of the rigid fit" if test.scaled else "stated by --fle",
         "declaration": {**registration_summary(registration)["declaration"], "text": found if test.scaled else stated},
-        "half_axes_95_mm": (uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
         "share": {"the markers in both lists": 1.0},
-        "without": _without(registration, target_ct),
-        "one_more": None if more is None else _one_more(space, more),
+        **_advice(registration, target_ct, space, target_ct + far * sides),
     }
 
 
-def _without(registration: Registration, target_ct: Floats) -> dict[str, Any]:
-    return {
-        one.name: {"rms_mm": one.rms_mm, "probability": one.probability}
-        for one in without_each(registration, target_ct)
-    }
-
-
-def _branch_warning(case: Case, registration: Registration) -> tuple[str, ...]:
-    odd = odd_branches(registration, case.robot.model)
-    if not odd:
-        return ()
-    return (f"{', '.join(odd)} touched in another branch of the arm than the rest: arm errors do not cancel there",)
-
-
-def _advice(case: Case, registration: Registration) -> dict[str, Any]:
-    """Ellipsoid and sources at the target by the readings alone, and what would make it better; for declared errors."""
-    uncertainty = registration.uncertainty
-    if uncertainty is None:
+def _advice_of_case(case: Case, registration: Registration) -> dict[str, Any]:
+    """By the declared errors: their sources at the target, and what would make it better."""
+    if registration.uncertainty is None:
         return {}
-    target_base = apply(registration.T_base_ct, case.target_ct)
-    cov = uncertainty.cov_at(target_base)[:3, :3]
-    read, touched = (np.trace(part) for part in uncertainty.parts_at(target_base))
-    skin = load_skin(case, user_cache())
-    touchable = touchable_points(case, skin.mesh, registration.T_base_ct)
-    more = one_more(registration, case.target_ct, touchable)
+    read, touched = map(np.trace, registration.uncertainty.parts_at(apply(registration.T_base_ct, case.target_ct)))
+    touchable = touchable_points(case, load_skin(case, user_cache()).mesh, registration.T_base_ct)
     return {
         "budget": budget_facts(case, registration, touchable, partial(load_anatomy, case, cache=user_cache())),
         **({} if registration.aim is None else {"correction": correction_facts(case, registration)}),
-        "half_axes_95_mm": (uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])).tolist(),
         "share": {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))},
-        "without": _without(registration, case.target_ct),
-        "one_more": None if more is None else _one_more(case.space, more),
+        **_advice(registration, case.target_ct, case.space, touchable),
     }
 
 
-def _one_more(space: Space, more: OneMore) -> dict[str, Any]:
-    """Where: LPS, and in the space that the user reads."""
-    typed = to_lps(more.point_ct[None], space)[0]  # its own inverse
-    place = {"point_ct_mm": more.point_ct.tolist(), "point_mm": typed.tolist(), "space": str(space)}
-    return {**place, "rms_mm": more.rms_mm}
+def _advice(registration: Registration, target_ct: Floats, space: Space, places_ct: Floats) -> dict[str, Any]:
+    """The target's ellipsoid, the rest without each marker, and at which of the places (n, 3) one more helps most."""
+    assert registration.uncertainty is not None
+    cov = registration.uncertainty.cov_at(apply(registration.T_base_ct, target_ct))[:3, :3]
+    without = without_each(registration, target_ct)
+    best = None
+    if more := one_more(registration, target_ct, places_ct):
+        typed = to_lps(more.point_ct[None], space)[0].tolist()  # its own inverse
+        best = {"point_ct_mm": more.point_ct.tolist(), "point_mm": typed, "space": str(space), "rms_mm": more.rms_mm}
+    return {
+        "half_axes_95_mm": (
+            registration.uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])
+        ).tolist(),
+        "without": {one.name: {"rms_mm": one.rms_mm, "probability": one.probability} for one in without},
+        "one_more": best,
+    }
 
 
 def verify_certificate(path: Path, context: CaseContext) -> dict[str, Any]:
-    """Prove every cell of a certificate again, by the plain checker.
-
-    Raises:
-        InputError: Not a certificate, not of this case, or a cell whose verdict does not follow.
-    """
+    """Prove every cell of a certificate again, by the plain checker; one that does not follow is refused."""
     found = read_output(path, max_bytes=MAX_CERTIFICATE_BYTES)
     stated, certificate = found.input("certificate"), parse_certificate(found.data, path)
     if found.note:
@@ -249,14 +231,8 @@ def registration_text(report: dict[str, Any]) -> str:
 
 
 def parse_noise(words: str | None) -> HandEyeNoise | None:
-    """The noise as it is typed, ``MM,DEG,MM,DEG``; None where nothing is.
-
-    Raises:
-        InputError: It is not four numbers.
-    """
-    if words is None:
-        return None
-    return noise_of([parse_coordinate(word.strip(), "--noise") for word in words.split(",")])
+    """The noise as it is typed, ``MM,DEG,MM,DEG``; None where nothing is."""
+    return None if words is None else noise_of([parse_coordinate(one.strip(), "--noise") for one in words.split(",")])
 
 
 def hand_eye_summary(found: HandEye) -> dict[str, Any]:
@@ -275,10 +251,7 @@ def hand_eye_summary(found: HandEye) -> dict[str, Any]:
         },
         "residual_deg": float(np.degrees(rad)),
         "residual_mm": mm,
-        "chi_squared": found.chi_squared,
-        "freedom": found.freedom,
-        "condition": found.condition,
-        "covariance": found.covariance.tolist(),
+        **plain_of(found, "chi_squared", "freedom", "condition", "covariance"),
         "findings": [one.document() for one in found.findings()],
     }
 

@@ -44,20 +44,27 @@ def budget_facts(
     chain = budget_chain(case, registration, anatomy, q_insertion)
     if chain is None:
         return None
-    found = changes(chain, skin_points_ct, _bed_ct(case, chain.errors.marker_cov_ct))
-    best = best_change(found)
+    values, axes = np.linalg.eigh(chain.errors.marker_cov_ct)
+    bed = None if case.space is Space.LOCAL else np.array([0.0, 0.0, 1.0])
+    if values[2] > values[1] * (1 + 1e-9):  # across the slices a marker is read worst
+        bed = np.asarray(axes[:, 2])
+    found, square = changes(chain, skin_points_ct, bed), chain.tip_mean_square()
+    along_base = flange_pose(chain.model, chain.q_insertion)[:3, 2]
+    depth = float(along_base @ square @ along_base)
+    counted = {"breathing": chain.breathing, "bending": chain.path, "motion": chain.motion_base}
     return {
         **needle_angles(case, registration, chain.q_insertion),
         "expected_mm": chain.expected_mm(),
-        "limit_95_mm": radius_for_chance(chain.tip_mean_square(), INTERVAL, registration.freedom),
-        **_across_and_along(chain),
+        "limit_95_mm": radius_for_chance(square, INTERVAL, registration.freedom),
+        "expected_lateral_mm": float(np.sqrt(max(float(np.trace(square)) - depth, 0.0))),
+        "expected_depth_mm": float(np.sqrt(depth)),
         "sources": [
             {"text": SOURCES[one.source].text, "alone_mm": one.alone_mm, "without_mm": one.without_mm}
             for one in source_costs(chain)
         ],
         "changes": [_change(case, one) for one in found],
-        "best": _change(case, best),
-        "not_modelled": not_modelled(case, counted=_counted(chain)),
+        "best": _change(case, best_change(found)),
+        "not_modelled": not_modelled(case, counted=[name for name, one in counted.items() if one is not None]),
     }
 
 
@@ -67,32 +74,13 @@ def budget_chain(
     """The chain of one insertion; arguments as of `budget_facts`."""
     if registration.uncertainty is None:
         return None
-    q = _insertion(case, registration) if q_insertion is None else q_insertion
+    q = q_insertion if registration.aim is None or q_insertion is not None else registration.aim.q
+    q = reached_insertion(case, registration.T_base_ct) if q is None else q
     if q is None:
         return None
     outward_ct = -(registration.T_base_ct[:3, :3].T @ flange_pose(case.robot.model, q)[:3, 2])
     path = None if case.bending is None else bent_path(case, anatomy(), outward_ct)
     return chain_of(case, registration, q, path)
-
-
-def _across_and_along(chain: Chain) -> dict[str, float]:
-    """The error's parts across and along the needle, rms: their squares add up to that of the whole."""
-    along_base = flange_pose(chain.model, chain.q_insertion)[:3, 2]
-    square = chain.tip_mean_square()
-    depth = float(along_base @ square @ along_base)
-    lateral = max(float(np.trace(square)) - depth, 0.0)
-    return {"expected_lateral_mm": float(np.sqrt(lateral)), "expected_depth_mm": float(np.sqrt(depth))}
-
-
-def _counted(chain: Chain) -> list[str]:
-    """What a budget counts beside the declared errors."""
-    counted = {"breathing": chain.breathing, "bending": chain.path, "motion": chain.motion_base}
-    return [name for name, one in counted.items() if one is not None]
-
-
-def _insertion(case: Case, registration: Registration) -> Floats | None:
-    """The insertion that the aim is corrected for, or one that the arm reaches."""
-    return reached_insertion(case, registration.T_base_ct) if registration.aim is None else registration.aim.q
 
 
 def needle_angles(case: Case, registration: Registration, q: Floats) -> dict[str, Any]:
@@ -109,14 +97,6 @@ def _change(case: Case, one: Change) -> dict[str, Any]:
     point = to_lps(one.point_ct[None], case.space)[0]  # its own inverse
     place = ", ".join(f"{mm:.0f}" for mm in point)
     return {**facts, "text": f"{one.what}, the last at ({place}) mm {case.space}", "last_mm": point.tolist()}
-
-
-def _bed_ct(case: Case, marker_cov_ct: Floats) -> Floats | None:
-    """Across the slices: along which a marker is read worst; z where it is read alike and the space has a head."""
-    values, axes = np.linalg.eigh(marker_cov_ct)
-    if values[2] > values[1] * (1 + 1e-9):
-        return np.asarray(axes[:, 2])
-    return None if case.space is Space.LOCAL else np.array([0.0, 0.0, 1.0])
 
 
 def correction_facts(case: Case, registration: Registration) -> dict[str, Any] | None:

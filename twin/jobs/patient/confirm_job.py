@@ -1,25 +1,19 @@
-"""`confirm CASE --scan SCAN`: where the needle is in a control CT, what its line touches, and what to do next.
-
-`confirm --learn FILES`: by how much the errors of many confirmations exceed what was predicted.
-"""
+"""``confirm``: where the needle is in a control CT, what its line touches, what to do next; ``--learn`` from many."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import ndimage
 from scipy.special import chdtri
 
 from puncture_twin.planning.anatomy.default_roles import BONES, plain_name
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.errors import Finding, refuse
 from puncture_twin.planning.base.output.manifest import read_output
-from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, InputFiles, inputs_document
 from puncture_twin.planning.base.strict_json import array, fitting, or_null, parse_json
 from puncture_twin.planning.base.text import Facts, Shown
@@ -27,7 +21,6 @@ from puncture_twin.planning.case.named_files import CaseVolumes
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.containment import inside_each
-from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, inverse
 from puncture_twin.planning.plan.plan import Plan
 from puncture_twin.planning.plan.plan_check import check_inputs
@@ -38,22 +31,16 @@ from puncture_twin.twin.guidance.ct.needle import needle_error, read_needle
 from puncture_twin.twin.guidance.ct.needle_fit import FoundNeedle
 from puncture_twin.twin.guidance.ct.tie import Body, Tie, body_of, tie_frames
 from puncture_twin.twin.jobs.patient.main_job import read_noted_plan
+from puncture_twin.twin.jobs.patient.run import writing_of
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.report import present
 from puncture_twin.twin.report.page.template import Card
 from puncture_twin.twin.report.present import Field, Section, facts, grid, number, percent, vector
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from puncture_twin.twin.report.slices.planes import Plane
-
 PAGE, PICTURE, REPORT = FILES = ("confirm.html", "confirm.png", "confirm.json")
 MAX_REPORT_BYTES = 5_000_000
-FEW = 10
-"""Fewer needles say little about the size of errors."""
-SHOWN = 8
-"""Structures in the text; the page and the JSON have all."""
+FEW = 10  # fewer needles say little about the size of errors
+SHOWN = 8  # structures in the text; the page and the JSON have all
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +145,7 @@ class Confirmed(Shown):
 
     def sections(self, most: int | None = None) -> list[Section]:
         """What terminal and page show; of structures so many, or all."""
-        needle, tie, said = self.needle, self.tie, self.predicted()
+        needle, tie, line, said = self.needle, self.tie, self.line, self.predicted()
         at_target = self.against(self.context.case.target_ct, needle.forward_ct)
         rows = [
             ("tip", f"{vector(needle.tip_ct.tolist(), 1, 'mm')}, ± {needle.tip_sd_mm:.2f} mm (sd, worst direction)"),
@@ -177,23 +164,18 @@ class Confirmed(Shown):
             inside = "{deviations:.1f} of {region_deviations:.1f} deviations".format(**said)
             where = "inside" if said["inside"] else "outside"
             rows.append(("predicted", f"{said['rms_mm']:.1f} mm (rms); {where} the 95 % region ({inside})"))
+        verdict = f"safe, by {SURE:g} standard deviations of the reading or more"
+        if not line.safe:
+            unsure = ", its margin may be broken by what the reading errs" if line.verdict == UNCERTAIN else ""
+            verdict = f"not safe, {line.verdict}{f': {line.structure}' if line.structure else ''}{unsure}"
         return [
             Section("the needle in the scan", [facts(rows)]),
-            Section(f"the line that it takes: {self._verdict()}", [grid(STRUCTURES, self.line.each[:most]), LINE_TEXT]),
+            Section(f"the line that it takes: {verdict}", [grid(STRUCTURES, line.each[:most]), LINE_TEXT]),
             Section(f"next: {aim_text(self.aims[0])}", [grid(AIMS, self.aims), AIM_TEXT]),
         ]
 
-    def _verdict(self) -> str:
-        line = self.line
-        if line.safe:
-            return f"safe, by {SURE:g} standard deviations of the reading or more"
-        named = f": {line.structure}" if line.structure else ""
-        unsure = ", its margin may be broken by what the reading errs" if line.verdict == UNCERTAIN else ""
-        return f"not safe, {line.verdict}{named}{unsure}"
-
 
 def _off_text(off: Mapping[str, float]) -> str:
-    """How a tip misses a point, in the words of who holds the needle."""
     depth = f"{abs(off['depth_mm']):.1f} {'short' if off['depth_mm'] < 0 else 'too deep'}"
     return f"tip {off['tip_mm']:.1f} mm off: {off['lateral_mm']:.1f} across, {depth}"
 
@@ -236,16 +218,7 @@ def aim_text(aim: Aim) -> str:
 
 
 def confirm_needle(context: CaseContext, scanner: Scanner, plan_path: Path | None = None) -> Confirmed:
-    """Read a control scan of a case's patient with the needle in, and check its line.
-
-    Args:
-        scanner: Has the patient in, such as `ScanFiles`.
-        plan_path: The plan that was executed.
-
-    Raises:
-        InputError: A scan that cannot be read or tied to the case, no needle, two of them, a tip that is not seen, or
-            a plan of another case.
-    """
+    """Read a control scan of a case's patient with the needle in, of a scanner such as `ScanFiles`; check its line."""
     read: list[Input] = []
     plan = None
     if plan_path is not None:
@@ -264,7 +237,10 @@ def confirm_needle(context: CaseContext, scanner: Scanner, plan_path: Path | Non
         planned = None if plan is None else (apply(T, plan.target_ct), -T[:3, :3] @ plan.outward_ct)
         diameter = context.case.needle.diameter_mm
         markers = None if body.markers is None else apply(T, body.markers.points)
-        inside = partial(_inside, skin, back)
+
+        def inside(points: Floats) -> Bools:
+            return inside_each(skin, apply(back, points))
+
         seen, findings = read_needle(volume, target, diameter, inside, planned, markers)
         needle = seen.moved(back, tie.cov_at(apply(back, seen.tip_ct)))
     with context.stages.time("line"):
@@ -276,21 +252,16 @@ def confirm_needle(context: CaseContext, scanner: Scanner, plan_path: Path | Non
 
 def confirm_case(context: CaseContext, scan: Path, out: Path, plan_path: Path | None = None) -> Confirmed:
     """`confirm_needle`, with its page, picture and report as one set of files."""
+    from puncture_twin.twin.jobs.patient.pictures import draw_confirmed  # with matplotlib
+
     done = confirm_needle(context, ScanFiles(scan), plan_path)
-    made_from = {one.path: one.sha256 for one in done.read if one.role == "plan"}
-    inputs, seconds = (*done.read, *context.case.inputs), context.stages.seconds
-    with writing(
-        out, "confirm", inputs=inputs, seconds=seconds, names=FILES, made_from=made_from, note=context.watcher.note
-    ) as draft:
+    planned = next((one for one in done.read if one.role == "plan"), None)
+    with writing_of(context, out, "confirm", FILES, done.read, planned) as draft:
         draw_confirmed(done, draft.folder / PICTURE)
         _write_page(done, draft.folder)
         done = replace(done, files=draft.final(tuple(draft.folder / name for name in FILES)))
         write_result(done.summary(), draft.folder / REPORT, out)
     return done
-
-
-def _inside(skin: TriangleMesh, T_ct_scan: Floats, points: Floats) -> Bools:
-    return inside_each(skin, apply(T_ct_scan, points))
 
 
 @dataclass(frozen=True)
@@ -336,9 +307,8 @@ def _write_page(done: Confirmed, folder: Path) -> None:
         Card("next", best.kind, aim_text(best).removeprefix("accept"), best.kind == "withdraw"),
         Card("chance to hit now", percent(next((one.p_hit for one in done.aims if one.kind == "accept"), 0.0)), ""),
     ]
-    warned = (
-        [Section("warnings", [present.Warn(tuple(one.sentence for one in done.findings))])] if done.findings else []
-    )
+    found = tuple(one.sentence for one in done.findings)
+    warned = [Section("warnings", [present.Warn(found)])] if found else []
     shown = present.picture(folder / PICTURE, "slices along the needle")
     sections = [*warned, *done.sections(), Section("slices of the control scan", [shown, PICTURE_TEXT])]
     inputs = (*done.read, *done.context.case.inputs)
@@ -351,92 +321,15 @@ PICTURE_TEXT = (
     "Cyan: the needle as it was read; magenta, dashed: the planned line; green cross: target. Outlines are those of "
     "the planning CT, carried to the scan."
 )
-EDGES = {(0.06, 0.56): (-1, 0), (0.94, 0.56): (1, 0), (0.5, 0.03): (0, -1), (0.5, 0.97): (0, 1)}
-"""Where the patient's directions are written on a panel, as fractions of it, and along which of its axes."""
-PIXELS, INCHES, DPI = 320, 9.0, 100
-WINDOW_HU = (-160.0, 240.0)
-
-
-def draw_confirmed(done: Confirmed, path: Path) -> Path:
-    """Draw the control scan in the axial plane of the tip, along the real needle twice, and across it at its tip."""
-    from matplotlib.figure import Figure
-
-    from puncture_twin.twin.report.figures import write_png
-    from puncture_twin.twin.report.slices.planes import needle_planes
-
-    figure = Figure(figsize=(INCHES, INCHES), dpi=DPI)
-    planes = needle_planes(done.needle.tip_ct, -done.needle.forward_ct, done.line.inserted_mm)
-    for axes, plane in zip(figure.subplots(2, 2).ravel(), planes, strict=True):
-        _draw_scan(axes, done, plane)
-        _draw_lines(axes, done, plane)
-        _draw_frame(axes, done, plane)
-    figure.tight_layout(rect=(0, 0.03, 1, 1))
-    handles, named = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, named, loc="lower left", ncols=4, fontsize=8, facecolor="0.35", labelcolor="white")
-    figure.text(0.99, 0.012, "research software, not a medical device", fontsize=8, color="0.4", ha="right")
-    write_png(figure, path)
-    return path
-
-
-def _draw_scan(axes: Axes, done: Confirmed, plane: Plane) -> None:
-    """The scan in a plane, with the outlines of the planning CT's structures carried to it."""
-    from matplotlib.collections import LineCollection
-
-    from puncture_twin.planning.base.reasons import css
-    from puncture_twin.twin.report.palette import SKIN, organ_colours
-    from puncture_twin.twin.report.slices.planes import outline
-
-    index = apply(np.linalg.inv(done.volume.T_ct_index) @ done.tie.T_scan_ct, plane.points_ct(PIXELS)).T
-    shown = ndimage.map_coordinates(done.volume.values, index, np.float64, order=1, cval=-1024.0)
-    (x, y), half, (low, high) = plane.centre, plane.half_mm, WINDOW_HU
-    extent = (x - half, x + half, y - half, y + half)
-    axes.imshow(shown.reshape(PIXELS, PIXELS), cmap="gray", vmin=low, vmax=high, extent=extent)
-    anatomy = done.context.anatomy
-    colours = organ_colours(tuple(one.name for one in anatomy.structures))
-    meshes = [*((one.mesh, colours[one.name]) for one in anatomy.structures), (anatomy.skin.mesh, SKIN)]
-    for mesh, colour in meshes:
-        axes.add_collection(LineCollection(list(outline(mesh, plane)), colors=css(colour), linewidths=0.8))
-    axes.set(xlim=extent[:2], ylim=extent[2:])
-
-
-def _draw_lines(axes: Axes, done: Confirmed, plane: Plane) -> None:
-    """The needle, the planned line and the target in a plane."""
-    from puncture_twin.twin.report.figures import halo
-
-    rim, needle = halo(3, "black"), done.needle
-    axes.plot(*plane.place(needle.path_ct).T, color="cyan", linewidth=0.8, label="needle as read")
-    axes.plot(*plane.place(needle.tip_ct), "x", color="cyan", path_effects=rim, label="its tip")
-    if done.plan is not None:
-        ends = np.stack([done.plan.target_ct, done.plan.entry_ct])
-        axes.plot(*plane.place(ends).T, "--", color="magenta", linewidth=0.8, label="planned line")
-    target = plane.place(done.context.case.target_ct)
-    axes.plot(*target, "+", color="#38d39f", markersize=12, path_effects=rim, label="target")
-
-
-def _draw_frame(axes: Axes, done: Confirmed, plane: Plane) -> None:
-    """A plane's name, its millimetres and the patient's directions at its edges."""
-    from puncture_twin.twin.report.figures import halo
-    from puncture_twin.twin.report.slices.planes import letters
-
-    axes.set_title(plane.name.replace("target", "tip"), fontsize=9)
-    axes.set_xlabel("mm", fontsize=7, labelpad=1)
-    axes.tick_params(labelsize=7)
-    for at, toward in EDGES.items():
-        letter = letters(done.context.case.space, toward[0] * plane.right + toward[1] * plane.up)
-        look: dict[str, Any] = {"color": "white", "ha": "center", "va": "center", "weight": "bold"}
-        axes.text(*at, letter, transform=axes.transAxes, path_effects=halo(3, "black"), **look)
 
 
 class Learned(NamedTuple):
     """By how much errors exceed what was predicted, of n needles.
 
     Attributes:
-        factor: Of every standard deviation: 1 where the declaration is right.
-        low: Of its 95 % interval, and
-        high: the same.
+        factor: Of every standard deviation: 1 where the declaration is right; `low` to `high` is its 95 % interval.
         mean_mm: Shape (3,), the mean error, LPS.
-        rms_mm: Realised, and
-        predicted_rms_mm: what was predicted of it.
+        rms_mm: Realised.
         inside: How many were in their 95 % region.
     """
 
@@ -458,27 +351,18 @@ class Learned(NamedTuple):
         """What a terminal shows."""
         size = "too small" if self.low > 1 else "too large" if self.high < 1 else "neither too small nor too large"
         few = f"; so few say little: {FEW} or more narrow the interval" if self.needles < FEW else ""
-        factor = (
-            f"{self.factor:.2f} times what is declared (95 %: {self.low:.2f} to {self.high:.2f}): it is {size}{few}"
-        )
+        interval = f"(95 %: {self.low:.2f} to {self.high:.2f})"
         rows = [
             ("needles", f"{self.needles}, {self.inside} in their predicted 95 % region"),
             ("tip against plan", f"{self.rms_mm:.2f} mm (rms), predicted {self.predicted_rms_mm:.2f} mm"),
             ("mean error, LPS", vector(self.mean_mm, 2, "mm")),
-            ("errors", factor),
+            ("errors", f"{self.factor:.2f} times what is declared {interval}: it is {size}{few}"),
         ]
         return present.text([Section("what these needles say of [errors]", [facts(rows)])])
 
 
 def learn(paths: Sequence[Path]) -> Learned:
-    """Estimate the size of a case's errors from confirmations: sum d' S^-1 d = f^2 chi-squared with 3 n degrees.
-
-    Args:
-        paths: Of ``confirm.json``, each with a plan and declared errors.
-
-    Raises:
-        InputError: A file that is none, or says no prediction; or one that is named twice.
-    """
+    """Estimate the size of a case's errors from many ``confirm.json``: sum d' S^-1 d = f^2 chi-squared, 3 n degrees."""
     offs, covs, inside, inputs = [], [], 0, []
     allowed = "confirm.json of a case with [errors], markers and --plan"
     for path in paths:
@@ -501,19 +385,11 @@ def learn(paths: Sequence[Path]) -> Learned:
 
 
 def confirm_source(case: Path | None, scan: Path | None, learned: Sequence[Path]) -> Path | None:
-    """The case that is confirmed; None where confirmations are learned from.
-
-    Raises:
-        InputError: Neither, or both.
-    """
+    """The case that is confirmed; None where confirmations are learned from. One of both is demanded."""
     if learned:
         if case is not None or scan is not None:
-            refuse(
-                "--learn takes no case and no scan",
-                "--learn",
-                "confirm --learn confirm.json ...",
-                "conflicting_options",
-            )
+            allowed = "confirm --learn confirm.json ..."
+            refuse("--learn takes no case and no scan", "--learn", allowed, "conflicting_options")
         return None
     if case is None or scan is None:
         refuse("a case and its control scan are needed", "confirm", "confirm CASE --scan SCAN", "missing_option")

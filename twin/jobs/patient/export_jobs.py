@@ -1,7 +1,4 @@
-"""A plan for MoveIt and ROS 2: the scene, the goals, the arm with its needle and a sender, as one set.
-
-The table of candidates for programs that read no Parquet: CSV or JSON, read back and equal before it is shown.
-"""
+"""A plan for a robot; and the table of candidates as CSV or JSON, read back and equal before it is shown."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ import io
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,7 +18,7 @@ from puncture_twin.planning.base.files import check_writable
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.progress import Silent, Watcher
-from puncture_twin.planning.base.provenance import Input, read_inputs
+from puncture_twin.planning.base.provenance import read_inputs
 from puncture_twin.planning.base.strict_json import parse_json
 from puncture_twin.planning.budget.guidance import check_ways
 from puncture_twin.planning.export.archive import DICOM
@@ -40,20 +36,17 @@ from puncture_twin.twin.jobs.patient.path_exports import PATH_FORMATS, Written, 
 from puncture_twin.twin.report.present import Section
 
 TABLE = "candidates.parquet"
+CANDIDATES_CSV = "candidates-csv"
+CANDIDATE_FORMATS = (CANDIDATES_CSV, "candidates-json")
 ALLOWED = "a case, or the candidates.parquet of a search, or its folder"
 MAX_TABLE_BYTES = 4_000_000_000
 """Twice a million directions with 60 structures."""
 
-ROUNDED = ("theta_deg", "beta_deg")
-"""Tables of older versions have 59.99999999999999 for 60."""
+ROUNDED = ("theta_deg", "beta_deg")  # tables of older versions have 59.99999999999999 for 60
 
 
 def table_of(source: Path, choice: Choice) -> Path | None:
-    """The table that a source is or holds; None of a case, whose folder has a ``case.toml``.
-
-    Raises:
-        InputError: One candidate is chosen, or a plan is the source.
-    """
+    """The table that a source is or holds; None of a case, whose folder has a ``case.toml``."""
     if choice != BEST or is_plan(source):
         refuse("a table holds all candidates", source, f"{ALLOWED}; no choice", "conflicting_options")
     if source.suffix.lower() == ".parquet":
@@ -63,22 +56,30 @@ def table_of(source: Path, choice: Choice) -> Path | None:
 
 
 def export_candidates(table_path: Path, format_name: str, out: Path, note: Callable[[str], None]) -> Written:
-    """Write a table of candidates as text, beside its own set or elsewhere.
-
-    Raises:
-        InputError: No table of candidates, or not the one that its folder's manifest lists.
-    """
+    """Write a table of candidates as text, beside its own set or elsewhere."""
     found = read_output(table_path, max_bytes=MAX_TABLE_BYTES)
     if found.note:
         note(f"warning: {found.note}")
-    table, source = _table(found.data, table_path), found.input("candidates")
-    run = json.loads(table.schema.metadata[b"run"])
-    inputs = (source, *read_inputs(run["inputs"]))
-    name = f"candidates.{format_name.removeprefix('candidates-')}"
-    columns, rows = table.column_names, _rows(table)
-    write, read = _WRITERS[format_name], _READERS[format_name]
-    text = write(run, columns, rows)
-    if read(text, table) != rows:
+    try:
+        table = pq.read_table(pa.BufferReader(found.data))
+    except (pa.ArrowException, OSError) as error:
+        what = f"no Parquet file ({str(error)[:100]})"
+        raise InputError(what, where=table_path, allowed=ALLOWED, code="not_parquet") from error
+    if b"run" not in (table.schema.metadata or {}) or not {*ROUNDED, "verdict"} <= set(table.column_names):
+        refuse("no table of candidates", table_path, ALLOWED, "no_such_file")
+    source, run = found.input("candidates"), json.loads(table.schema.metadata[b"run"])
+    inputs, name = (source, *read_inputs(run["inputs"])), f"candidates.{format_name.removeprefix('candidates-')}"
+    columns = {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}
+    columns |= {name: [round(value, ANGLE_DIGITS) for value in columns[name]] for name in ROUNDED}
+    rows = [list(row) for row in zip(*columns.values(), strict=True)]
+    if format_name == CANDIDATES_CSV:  # which has no place for the run; the manifest lists the inputs
+        text = csv_text(table.column_names, rows)
+        read = _read_csv(text, table)
+    else:
+        text = json.dumps({"run": run, "columns": table.column_names, "rows": rows}, allow_nan=False) + "\n"
+        document = parse_json(text.encode(), where="candidates.json", allowed="what was written")
+        read = document["rows"] if document["columns"] == table.column_names else []
+    if read != rows:
         raise ArithmeticError(f"{name} does not read back as the table")
     made_from = {source.path: source.sha256}
     with writing(out, f"export {name}", inputs=inputs, names=(name,), made_from=made_from, note=note) as draft:
@@ -87,43 +88,18 @@ def export_candidates(table_path: Path, format_name: str, out: Path, note: Calla
     return Written(format_name, files, {"rows": len(rows)}, said, inputs)
 
 
-def _table(data: bytes, path: Path) -> pa.Table:
-    try:
-        table = pq.read_table(pa.BufferReader(data))
-    except (pa.ArrowException, OSError) as error:
-        what = f"no Parquet file ({str(error)[:100]})"
-        raise InputError(what, where=path, allowed=ALLOWED, code="not_parquet") from error
-    if b"run" not in (table.schema.metadata or {}) or not {*ROUNDED, "verdict"} <= set(table.column_names):
-        refuse("no table of candidates", path, ALLOWED, "no_such_file")
-    return table
-
-
-def _rows(table: pa.Table) -> list[list[Any]]:
-    columns = [column.to_pylist() for column in table.columns]
-    for at, name in enumerate(table.column_names):
-        if name in ROUNDED:
-            columns[at] = [round(value, ANGLE_DIGITS) for value in columns[at]]
-    return [list(row) for row in zip(*columns, strict=True)]
-
-
-def _csv(run: Mapping[str, Any], columns: list[str], rows: list[list[Any]]) -> str:
-    del run  # a CSV has no place for it; the manifest lists the inputs
-    return csv_text(columns, rows)
-
-
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A table as CSV; what has no value is empty."""
+
+    def field(value: Any) -> str:
+        text = "" if value is None else str(value)
+        return text.lower() if isinstance(value, bool) else text
+
     stream = io.StringIO(newline="")
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows([_field(value) for value in row] for row in rows)
+    writer.writerows([field(value) for value in row] for row in rows)
     return stream.getvalue()
-
-
-def _field(value: Any) -> str:
-    if value is None:
-        return ""
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _read_csv(text: str, table: pa.Table) -> list[list[Any]]:
@@ -137,28 +113,9 @@ def _value_of(kind: pa.DataType) -> Callable[[str], Any]:
     if pa.types.is_string(kind):
         return str
     if pa.types.is_boolean(kind):
-        return lambda field: {"true": True, "false": False}.get(field)
+        return {"true": True, "false": False}.get
     number: Callable[[str], Any] = int if pa.types.is_integer(kind) else float
     return lambda field: None if field == "" else number(field)
-
-
-def _json(run: Mapping[str, Any], columns: list[str], rows: list[list[Any]]) -> str:
-    return json.dumps({"run": run, "columns": columns, "rows": rows}, allow_nan=False) + "\n"
-
-
-def _read_json(text: str, table: pa.Table) -> list[list[Any]]:
-    document = parse_json(text.encode(), where="candidates.json", allowed="what was written")
-    return list(document["rows"]) if document["columns"] == table.column_names else []
-
-
-_WRITERS: Mapping[str, Callable[[Mapping[str, Any], list[str], list[list[Any]]], str]] = MappingProxyType(
-    {"candidates-csv": _csv, "candidates-json": _json}
-)
-_READERS: Mapping[str, Callable[[str, pa.Table], list[list[Any]]]] = MappingProxyType(
-    {"candidates-csv": _read_csv, "candidates-json": _read_json}
-)
-CANDIDATE_FORMATS = tuple(_WRITERS)
-"""Of ``export --format``."""
 
 
 MOVEIT_NOTES: tuple[str, ...] = (
@@ -184,9 +141,6 @@ def export_robot(
 
     Args:
         seed: That the plan must state; the case's by default.
-
-    Raises:
-        InputError: A plan that cannot be used, does not hold any more, or breaks a limit of the arm.
     """
     source, plan = read_noted_plan(plan_path, note)
     if context is not None:
@@ -205,35 +159,25 @@ def export_robot(
             checker = None if context is None or context.reach is None else context.reach.checker
             done = export_plan(plan, format_name, draft.folder, source=plan_path, checker=checker)
             files, notes = draft.final((done.path,)), done.notes
-    return _of_robot(format_name, files[0], plan, notes, inputs, case_checked=context is not None)
-
-
-def _of_robot(
-    format_name: str, path: Path, plan: Plan, notes: Sequence[str], inputs: tuple[Input, ...], *, case_checked: bool
-) -> Written:
-    """What was written, and what whoever runs it should know."""
     theta, beta = float(np.degrees(plan.theta)), float(np.degrees(plan.beta))
     facts = {
         "theta_deg": theta,
         "beta_deg": beta,
         "notes": list(notes),
         "warnings": list(plan.warnings),
-        "case_checked": case_checked,
+        "case_checked": context is not None,
     }
-    unchecked = [] if case_checked else ["the plan was not checked against its case again; --case CASE does so"]
-    head = Section(f"{format_name}: {path}", [f"direction: theta {theta:g} deg, beta {beta:g} deg", *notes, *unchecked])
-    said = [head, *(Section(f"warning: {one}", []) for one in plan.warnings)]
-    return Written(format_name, (path,), facts, said, inputs)
+    lines = [f"direction: theta {theta:g} deg, beta {beta:g} deg", *notes]
+    if context is None:
+        lines.append("the plan was not checked against its case again; --case CASE does so")
+    said = [Section(f"{format_name}: {files[0]}", lines), *(Section(f"warning: {one}", []) for one in plan.warnings)]
+    return Written(format_name, files[:1], facts, said, inputs)
 
 
 def export_value(
     source: Plan | Candidates | Explanation, format_name: str, folder: Path | str, context: CaseContext | None
 ) -> Written:
-    """Write what is in memory: a plan for a robot, a table, or a checked direction for 3D Slicer or an archive.
-
-    Raises:
-        InputError: A format of another source, or see the functions that write.
-    """
+    """Write what is in memory: a plan for a robot, a table, or a checked direction for 3D Slicer or an archive."""
     refuse_format(format_name)
     kind = Candidates if format_name in CANDIDATE_FORMATS else Explanation if format_name in PATH_FORMATS else Plan
     if not isinstance(source, kind):
@@ -278,7 +222,6 @@ def export_source(
         scan: The control scan of a confirmation.
 
     Raises:
-        InputError: A source of which the format is not, or see the functions that write.
         NoAnswerError: No plan.
     """
     if format_name in CANDIDATE_FORMATS:

@@ -75,11 +75,7 @@ class InitRun:
 
 
 def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
-    """Make the case, read it as `search` does, and write it; what is wrong leaves nothing behind.
-
-    Raises:
-        InputError: Everything that keeps the case from being searched, in one line.
-    """
+    """Make the case, read it as `search` does, and write it; what is wrong leaves nothing behind."""
     _refuse_options(request)
     folder, path = request.folder, request.folder / CASE
     if not is_folder(folder):
@@ -96,9 +92,8 @@ def init_case(request: Request, *, force: bool, watcher: Watcher) -> InitRun:
             context = prepare(draft, arm=False, watcher=watcher, memory=memory)
         except InputError as error:
             what, where = (text.replace(draft.name, CASE) for text in (error.what, error.where))
-            raise type(error)(
-                what, where=where, allowed=f"{error.allowed}; {WAYS}", code=error.code, numbers=error.numbers
-            ) from error
+            parts = {"where": where, "allowed": f"{error.allowed}; {WAYS}", "code": error.code}
+            raise type(error)(what, **parts, numbers=error.numbers) from error
         text = _with_seen(start, request, context)
         parse_toml(text.encode(), path, CaseFile, allowed=ALLOWED_CASE, keys="docs/reference/case.md")
         if start.seen is not None:
@@ -135,21 +130,17 @@ def _with_seen(start: Start, request: Request, context: CaseContext) -> str:
     return with_keys(text, keys, {"search.theta_deg": looked, "search.frame": "theta 0 is its z"})
 
 
-def _source(place: str) -> str:
-    """A file or folder below the case's; meshes may lie in that itself."""
-    return "the meshes next to it" if place == "." else place
-
-
 def init_text(run: InitRun) -> str:
     """What was found, and the next command."""
     parts, counts = run.start.parts, Counter(row.kind for row in run.start.parts.rows)
     position = ", ".join(f"{one:.1f}" for one in to_lps(parts.target_ct[None], parts.space)[0])
     needle = run.context.case.needle
     roles = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
+    sources = ("the meshes next to it" if one.source == "." else one.source for one, _ in parts.sources)
     lines = [
         f"{run.path}",
         f"  skin           {parts.skin}",
-        f"  structures     {roles}, of {', '.join(_source(one.source) for one, _ in parts.sources)}",
+        f"  structures     {roles}, of {', '.join(sources)}",
         f"  target         {position} mm {parts.space}, in {parts.structure or 'no structure'}",
         f"  region         {parts.region}",
         f"  needle         {needle.length_mm:g} mm, shaft {needle.shaft_mm:g} mm, diameter {needle.diameter_mm:g} mm",

@@ -7,8 +7,7 @@ planner, simulator or plotter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,7 @@ import numpy as np
 
 from puncture_twin.planning.base.errors import InputError, NoAnswerError, refuse, require_extra
 from puncture_twin.planning.base.output.manifest import read_output
-from puncture_twin.planning.base.output.output_set import Draft, withdraw, writing
+from puncture_twin.planning.base.output.output_set import Draft, withdraw
 from puncture_twin.planning.base.provenance import Input
 from puncture_twin.planning.budget.guidance import check_ways, with_ways
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
@@ -28,18 +27,12 @@ from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.choice import BEST, Choice, choose_stated, with_file_read
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import write_table
-from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run
+from puncture_twin.twin.jobs.patient.run import FILM, PAGE, PICTURES, ROOMS, RoomCount, Run, writing_of
 
 CERTIFICATE = "certificate.json"
-
-CERTIFY_DEG = 0.25
-"""Smallest cell of a certificate where nobody says."""
-
-NO_PLAN = "no plan: "
-"""Before the reason, whoever gives it: the choice, or the planner."""
-
-DEMO_ROOMS = 1000
-"""What a stranger sees first is a distribution, where the case declares what it may be off by."""
+CERTIFY_DEG = 0.25  # smallest cell of a certificate where nobody says
+NO_PLAN = "no plan: "  # before the reason, whoever gives it: the choice, or the planner
+DEMO_ROOMS = 1000  # what a stranger sees first is a distribution, where the case declares what it may be off by
 
 
 class CertifyOptions(NamedTuple):
@@ -50,11 +43,7 @@ class CertifyOptions(NamedTuple):
 
 
 def certify_options(wanted: bool, size_deg: float | None, touch: float | None) -> CertifyOptions | None:
-    """What is asked of a certificate; None where none is.
-
-    Raises:
-        InputError: Options of a certificate that nobody asked for.
-    """
+    """What is asked of a certificate; None where none is. Options of one that nobody asked for are refused."""
     for option, value in (("--certify-touch", touch), ("--certify-size", size_deg)):
         if value is not None and not wanted:
             refuse("options of a certificate without --certify", option, "with --certify", "conflicting_options")
@@ -69,58 +58,41 @@ def search_case(
     checked: CrossChecked | None = None,
     certify: CertifyOptions | None = None,
 ) -> Run:
-    """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page.
-
-    Raises:
-        InputError: A certificate that the case cannot have; before anything is searched.
-    """
+    """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page."""
     if certify is not None:
         from puncture_twin.planning.certify.question import question_of
 
         question_of(context.case, context.anatomy)
     names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify is None else (CERTIFICATE,)))
-    with _writing(out, "search", context, names) as draft:
+    with writing_of(context, out, "search", names) as draft:
         run = Run(context, context.search(), (), checked=checked)
         run = run if certify is None else _certified(run, certify, draft.folder)
         run = _with_table(run, draft.folder)
         run = _with_pictures(run, draft.folder) if pictures else run
-    return _final(run, draft)
+    return replace(run, files=draft.final(run.files))
 
 
 def plan_case(context: CaseContext, out: Path, choice: Choice = BEST) -> Run:
-    """Search and plan the best candidate, or the chosen one; write ``plan.json`` too.
-
-    Raises:
-        InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
-        NoAnswerError: No plan; the search's files are written all the same.
-    """
+    """Search and plan the best or the chosen candidate. Without a plan the search's files are written all the same."""
     context.require_arm()
     choice = _stated(context, out, choice)
-    with _writing(out, "plan", context, ("candidates.parquet", "plan.json", *PICTURES), read=choice.read) as draft:
+    with writing_of(context, out, "plan", ("candidates.parquet", "plan.json", *PICTURES), choice.read) as draft:
         run = Run(context, context.search(), (), read=choice.read)
         run = _planned(run, draft.folder, choice)
         run = _with_table(run, draft.folder)
         run = _with_pictures(run, draft.folder)
-    return _answered(_final(run, draft), out)
+    return _answered(run, draft, out)
 
 
 def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = None, choice: Choice = BEST) -> Run:
-    """Plan, rehearse the plan, in many rooms too where a number is given, and write everything.
-
-    Args:
-        rooms: How many, beside the one that is filmed.
-
-    Raises:
-        InputError: The case does not say where the arm stands, or there is nothing of what was chosen.
-        NoAnswerError: No plan; the search's files are written all the same.
-    """
+    """Plan, rehearse the plan, in many rooms too beside the one that is filmed, and write everything."""
     from puncture_twin.twin.jobs.patient.pictures import draw_pictures, with_page
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal, two_stages
 
     context.require_arm()
     choice = _stated(context, out, choice)
     names = ("candidates.parquet", "plan.json", "rehearsal.json", FILM, ROOMS, *PICTURES)
-    with _writing(out, "plan", context, names, read=choice.read) as draft, two_stages() as begin:
+    with writing_of(context, out, "plan", names, choice.read) as draft, two_stages() as begin:
         run = Run(context, context.search(), (), read=choice.read)
         run = _planned(run, draft.folder, choice)
         run = _with_table(run, draft.folder)
@@ -131,25 +103,18 @@ def rehearse_case(context: CaseContext, out: Path, rooms: RoomCount | None = Non
         if run.rehearsal is not None:  # the page shows it: it goes with it
             shown = {draft.folder / name for name in PICTURES if name != PAGE}
             draft.split("rehearse", *(path for path in run.files if path not in {*planned, *shown}))
-    return _answered(_final(run, draft), out)
+    return _answered(run, draft, out)
 
 
 def rehearsed_case(source: Path, case: Path | None, choice: Choice) -> Path:
-    """The case of what is rehearsed; see `case_of`.
-
-    Raises:
-        InputError: A plan without its case, or see there.
-    """
+    """The case of what is rehearsed, as `case_of`; a plan without its case is refused."""
     if (found := case_of(source, case, choice)) is None:
         refuse("a plan needs its case", source, "rehearse plan.json --case CASE", "missing_option")
     return found
 
 
 def demo_case(context: CaseContext, out: Path) -> Run:
-    """`rehearse_case`, in `DEMO_ROOMS` rooms where the case declares errors and has markers.
-
-    Without the simulator it is `plan_case`, and a note says so: whoever has no compiler sees the rest at once.
-    """
+    """`rehearse_case`, in `DEMO_ROOMS` rooms where errors are declared; without a simulator `plan_case`, and a note."""
     try:
         require_extra("twin", "demo")
     except InputError as missing:
@@ -172,67 +137,30 @@ def _stated(context: CaseContext, out: Path, choice: Choice) -> Choice:
     return choice
 
 
-def _writing(
-    out: Path,
-    command: str,
-    context: CaseContext,
-    names: Iterable[str],
-    source: Input | None = None,
-    read: tuple[Input, ...] = (),
-) -> AbstractContextManager[Draft]:
-    """A draft of a command's files, with the inputs of the case and of the choice, and the run's times."""
-    made_from = () if source is None else (source,)
-    return writing(
-        out,
-        command,
-        inputs=(*made_from, *read, *context.case.inputs),
-        seconds=context.stages.seconds,
-        names=names,
-        made_from={one.path: one.sha256 for one in made_from},
-        note=context.watcher.note,
-    )
-
-
-def _final(run: Run, draft: Draft) -> Run:
-    """The run with its files where they lie now."""
-    return replace(run, files=draft.final(run.files))
-
-
-def _answered(run: Run, out: Path) -> Run:
-    """The run, if it has a plan."""
+def _answered(run: Run, draft: Draft, out: Path) -> Run:
     if run.plan is None:
         what = f"{NO_PLAN}{run.refusal}; see {out / 'report.html'}"
         raise NoAnswerError(what, counts=run.candidates.counts(), code="no_plan")
-    return run
+    return replace(run, files=draft.final(run.files))
 
 
 def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomCount | None = None) -> Run:
-    """Load a plan, check it again, rehearse it; write the rehearsal's files and the scene, but no map of one direction.
-
-    The scene is left out where the plan's own stands beside it: it shows the same.
-
-    Raises:
-        InputError: A plan that does not belong to the case or does not hold any more.
-    """
+    """Check a written plan again and rehearse it; the scene is left out where the plan's own stands beside it."""
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
     source, plan, candidates = checked_plan(context, plan_path)
-    with _writing(out, "rehearse", context, ("rehearsal.json", FILM, ROOMS), source) as draft:
+    with writing_of(context, out, "rehearse", ("rehearsal.json", FILM, ROOMS), (source,), source) as draft:
         run = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), rooms, partial).ended(draft.folder)
         if not draft.source_has("scene.png"):
             with context.stages.time("scene"):
                 draw_scene(context.case, context.anatomy, candidates, plan, draft.folder / "scene.png")
             run = run.with_files(draft.folder / "scene.png")
-    return _final(run, draft)
+    return replace(run, files=draft.final(run.files))
 
 
 def checked_plan(context: CaseContext, path: Path) -> tuple[Input, Plan, Candidates]:
-    """A plan as its case moves the arm, where it comes from, and its direction, checked again.
-
-    Raises:
-        InputError: It does not belong to the case or does not hold any more.
-    """
+    """A plan as its case moves the arm, where it comes from, and its direction; one that does not hold is refused."""
     from puncture_twin.planning.plan.plan_check import check_plan, with_case_arm
 
     source, plan = read_noted_plan(path, context.watcher.note)
@@ -253,9 +181,9 @@ def read_noted_plan(path: Path, note: Callable[[str], None]) -> tuple[Input, Pla
 
 def report_case(run: Run, out: Path) -> Run:
     """Write the pictures and the page of what is known."""
-    with _writing(out, "report", run.context, PICTURES) as draft:
+    with writing_of(run.context, out, "report", PICTURES) as draft:
         run = _with_pictures(run, draft.folder)
-    return _final(run, draft)
+    return replace(run, files=draft.final(run.files))
 
 
 def _certified(run: Run, wanted: CertifyOptions, out: Path) -> Run:
@@ -308,11 +236,7 @@ def is_plan(source: Path) -> bool:
 
 
 def case_of(source: Path, case: Path | None, choice: Choice) -> Path | None:
-    """The case of a command: its source, or what is named beside a plan; None of a plan without its case.
-
-    Raises:
-        InputError: A plan with a choice, since it has its direction, or two cases.
-    """
+    """The case of a command: its source, or what is named beside a plan; None of a plan without its case."""
     if is_plan(source):
         if choice != BEST:
             refuse("a plan already has its direction", source, "a case, to choose a direction", "conflicting_options")

@@ -34,7 +34,7 @@ from puncture_twin.planning.search.bedside import slice_numbers
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.marker_places import MarkerPlace, Proposal, check_count, propose_markers
 from puncture_twin.twin.jobs.terminal import write_result
-from puncture_twin.twin.report.present import Field, Section, facts, footer, grid, number, text, vector
+from puncture_twin.twin.report.present import Field, Section, Table, facts, footer, grid, number, text, vector
 
 FOUND, PROPOSED, MARKUPS = "markers_ct.csv", "markers_proposed.csv", ".mrk.json"
 """Never one name for both: a person puts a marker some mm beside its proposed place."""
@@ -49,28 +49,18 @@ ALLOWED = "a folder with one CT, a CT file (NIfTI, NRRD, a DICOM folder), or a c
 def stated_of(
     kind: str | None, diameter_mm: float | None, count: int | None, layout: Path | None, propose: int | None
 ) -> Stated:
-    """What a person says of the markers.
-
-    Raises:
-        InputError: A kind, size or count that none has, any of it beside a proposal, or too few or many to propose.
-    """
-    if propose is not None and any(one is not None for one in (kind, diameter_mm, count, layout)):
-        allowed = "--propose alone, or options of the markers that are there"
-        refuse("markers are to be found and proposed", "--propose", allowed, "conflicting_options")
+    """What a person says of the markers; nothing of it may stand beside a proposal."""
     if propose is not None:
+        if any(one is not None for one in (kind, diameter_mm, count, layout)):
+            allowed = "--propose alone, or options of the markers that are there"
+            refuse("markers are to be found and proposed", "--propose", allowed, "conflicting_options")
         check_count(propose)
     return Stated(kind, diameter_mm, count)
 
 
 @dataclass(frozen=True, eq=False)
 class SourceCt:
-    """A CT in which markers are looked for.
-
-    Attributes:
-        name: Of the file, folder or case.
-        volume: Hounsfield units, axes to the left, back and head, LPS.
-        space: In which a person reads places.
-    """
+    """A CT in which markers are looked for, HU, axes to the left, back and head; `space` is that of its reader."""
 
     name: str
     volume: Volume
@@ -127,8 +117,8 @@ class MarkersRun(Shown):
     @property
     def not_seen(self) -> list[str]:
         """The names of the layout that no marker has: hidden, or moved since."""
-        names = () if self.layout is None else self.layout.names
-        return [one for one in names if one not in {marker.name for marker in self.seen.fiducials}]
+        seen = {one.name for one in self.seen.fiducials}
+        return [] if self.layout is None else [name for name in self.layout.names if name not in seen]
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm, in the stated space."""
@@ -194,39 +184,24 @@ FIELDS = (
 def look_for_markers(
     source: Path, stated: Stated, layout: NamedPoints | None, where: str | Path, watcher: Watcher
 ) -> MarkersRun:
-    """Find the markers of a CT.
-
-    Args:
-        where: Of the layout, for a refusal.
-
-    Raises:
-        InputError: Nothing that can be read, or a mirrored layout.
-        NoAnswerError: No markers, too few or many, or several sizes.
-    """
+    """Find the markers of a CT; `where` names the layout in a refusal."""
     ct = read_source(source, watcher)
     watcher.step("markers", "looking")
     return MarkersRun(ct, find_fiducials(ct.volume, ct.skin, stated, layout, where=where), layout)
 
 
 def find_markers(source: Path, out: Path, stated: Stated, layout: Path | None, watcher: Watcher) -> MarkersRun:
-    """Find the markers of a CT; write their list, the list for Slicer, a picture and the report.
-
-    Raises:
-        InputError: As `look_for_markers`.
-        NoAnswerError: As `look_for_markers`.
-    """
+    """`look_for_markers`; write their list, the list for Slicer, a picture and the report."""
     wanted = None if layout is None else read_points(layout, default_unit=Unit.MM)
     run = look_for_markers(source, stated, wanted, layout or source, watcher)
-    shapes = [one.reading.shape for one in run.seen.fiducials]
-    sheet = _Sheet(
-        run.source.name,
-        replace(run.points, space=run.source.space),
+    shapes, volume, source_ct = [one.reading.shape for one in run.seen.fiducials], run.source.volume, run.source
+    hu_at = partial(nearest, volume.values, np.asarray(np.linalg.inv(volume.T_ct_index)))
+    lines, points = (
         [f"{one.kind} {one.diameter_mm:.1f} mm" for one in shapes],
-        partial(nearest, run.source.volume.values, np.asarray(np.linalg.inv(run.source.volume.T_ct_index))),
-        run.source.skin,
-        NEAR_MM,
+        replace(run.points, space=source_ct.space),
     )
-    return _written(run, sheet, out, FOUND, run.source.inputs, watcher)
+    sheet = _Sheet(source_ct.name, points, lines, hu_at, source_ct.skin, NEAR_MM)
+    return _written(run, sheet, out, FOUND, source_ct.inputs, watcher)
 
 
 class _Sheet(NamedTuple):
@@ -241,7 +216,7 @@ class _Sheet(NamedTuple):
 
     def write(self, folder: Path, lists: Sequence[str]) -> None:
         """The points as the case reads them, as Slicer does, and as a picture."""
-        from puncture_twin.twin.report.slices.points import Mark, write_points_sheet  # with matplotlib
+        from puncture_twin.twin.report.slices.sheet import Mark, write_points_sheet  # with matplotlib
 
         names, points, space = self.points.names, self.points.points, self.points.space or Space.LPS
         write_points(folder / lists[0], replace(self.points, points=to_lps(points, space)))
@@ -304,34 +279,27 @@ class ProposalRun:
     def text(self) -> str:
         """For the terminal."""
         found = self.summary()
-        names = [one["name"] for one in found["proposed"]]
-        rows = [{"name": name, **dict(zip(names, row, strict=True))} for name, row in
-                zip(names, found["distances_mm"], strict=True)]  # fmt: skip
-        facts_ = [
+        names, places = [one["name"] for one in found["proposed"]], []
+        for one in found["proposed"]:
+            places.append(
+                (one["name"], one["text"] + (f"; slice {one['slice']} from the feet" if "slice" in one else ""))
+            )
+        known = [
             ("expected error", f"{found['expected_error_mm']:.2f} mm (rms) at the target, of the markers alone"),
             ("errors", found["errors"]),
             ("arm", found["arm"]),
             ("nearest entry", f"{found['nearest_entry_mm']:.0f} mm from a marker"),
-        ]  # fmt: skip
+        ]
+        apart = [(name, *(number(mm, 0) for mm in row)) for name, row in zip(names, found["distances_mm"], strict=True)]
         return text([
-            Section(f"where to put {len(names)} markers, {self.context.case.name}",
-                    [facts([(one["name"], _place_text(one)) for one in found["proposed"]]), facts(facts_)]),
-            Section("straight distances, mm", [grid([Field("", "name"), *(Field(n, n, 0) for n in names)], rows)]),
+            Section(f"where to put {len(names)} markers, {self.context.case.name}", [facts(places), facts(known)]),
+            Section("straight distances, mm", [Table(("", *names), tuple(apart))]),
             *footer(self.files, self.proposal.unmet),
         ])  # fmt: skip
 
 
-def _place_text(row: dict[str, Any]) -> str:
-    return row["text"] + (f"; slice {row['slice']} from the feet" if "slice" in row else "")
-
-
 def propose_places(context: CaseContext, out: Path, count: int) -> ProposalRun:
-    """Search the case, propose places for markers beside its windows, and write them.
-
-    Raises:
-        InputError: A count out of range.
-        NoAnswerError: No direction is safe, or too few places are left.
-    """
+    """Search the case, propose places for markers beside its windows, and write them."""
     candidates = context.search()
     with context.stages.time("marker places"):
         run = ProposalRun(context, propose_markers(context, candidates, count))

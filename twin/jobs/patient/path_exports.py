@@ -40,6 +40,7 @@ from puncture_twin.planning.search.choice import Choice, choose, choose_stated, 
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.table import to_table
 from puncture_twin.twin.jobs.patient.main_job import is_plan, read_noted_plan
+from puncture_twin.twin.jobs.patient.run import writing_of
 from puncture_twin.twin.report.present import Block, Section, Warn, text
 
 PATH_FORMATS = (SLICER, DICOM)
@@ -48,8 +49,7 @@ PLANNED = "the direction is the plan's, checked again with its motion"
 NO_DEVICE = "Research software, not a medical device."
 OF_ONE_SEARCH = frozenset({"rank", "window", "cost", "pareto"})
 """Columns that compare a direction with the others of its search: they say nothing of it alone."""
-UNITS = {"_mm": "mm", "_deg": "deg"}
-"""Endings of columns to units."""
+UNITS = {"_mm": "mm", "_deg": "deg"}  # endings of columns to units
 CONFIRMATION = "a confirm.json of this version"
 MAX_CONFIRMATION_BYTES = 5_000_000
 CONFIRMED = ("lateral_mm", "depth_mm", "angle_deg", "inserted_mm", "sagitta_mm")
@@ -87,20 +87,12 @@ class Written(Shown):
         """As lines."""
         return text(self.said)
 
-    @classmethod
-    def of_path(
-        cls,
-        name: str,
-        files: tuple[Path, ...],
-        path: str,
-        notes: Sequence[str],
-        warnings: Sequence[str],
-        inputs: tuple[Input, ...],
-    ) -> Written:
-        """Of one path."""  # fmt: skip
-        facts = {"path": path, "notes": list(notes), "warnings": list(warnings)}
-        lines: list[Block] = [Warn(tuple(map(str, files))), *notes, *(f"warning: {one}" for one in warnings)]
-        return cls(name, files, facts, [Section(f"{name}: {path}", lines)], inputs)
+
+def _of_path(name: str, files: tuple[Path, ...], path: str, notes: Sequence[str], warnings: Sequence[str],
+             inputs: tuple[Input, ...]) -> Written:  # fmt: skip
+    facts = {"path": path, "notes": list(notes), "warnings": list(warnings)}
+    lines: list[Block] = [Warn(tuple(map(str, files))), *notes, *(f"warning: {one}" for one in warnings)]
+    return Written(name, files, facts, [Section(f"{name}: {path}", lines)], inputs)
 
 
 def put(draft: Draft, made: Mapping[str, str | bytes]) -> tuple[Path, ...]:
@@ -123,7 +115,7 @@ def export_path(
             for DICOM no DICOM series as its CT.
         NoAnswerError: Nothing is safe, or what was chosen is not.
     """
-    case, stages, note = context.case, context.stages, context.watcher.note
+    case, note = context.case, context.watcher.note
     scan = _series(case) if format_name == DICOM else None
     choice, plan = with_file_read(case, choice), None
     read: tuple[Input, ...] = ()
@@ -135,7 +127,7 @@ def export_path(
     if not choice.of_grid:
         choose_stated(context, choice)  # before the search is made for nothing
     names = archive.NAMES if scan is not None else slicer.NAMES
-    with writing(out, f"export {format_name}", inputs=inputs, seconds=stages.seconds, names=names, note=note) as draft:
+    with writing_of(context, out, f"export {format_name}", names, (*read, *choice.read)) as draft:
         found = context.search()
         chosen = choose(context, found, choice)
         pick = Pick(chosen.candidates, int(chosen.rows[0]))
@@ -149,19 +141,11 @@ def export_path(
             made, notes = archive_files(scan, _archived(context, scan, found, pick)), (NO_DEVICE,)
         written = put(draft, made)
     said = (NO_APPROACH if plan is None else PLANNED, f"arm: {found.arm_note}", *notes)
-    return Written.of_path(format_name, written, name, said, context.anatomy.warnings, inputs)
+    return _of_path(format_name, written, name, said, context.anatomy.warnings, inputs)
 
 
 def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str], None]) -> Written:
-    """Write the needle that `confirm` read, on the slices of its control scan.
-
-    Args:
-        source: Its ``confirm.json``.
-        scan: The scan, whose bytes must be those that were confirmed.
-
-    Raises:
-        InputError: No confirmation, another scan than its own, or one that is no DICOM series.
-    """
+    """Write the needle of a ``confirm.json`` on the slices of the very control scan that was confirmed."""
     require_extra("dicom", f"--format {DICOM}")
     read = read_output(source, max_bytes=MAX_CONFIRMATION_BYTES)
     document = parse_json(read.data, where=source, allowed=CONFIRMATION)
@@ -172,9 +156,7 @@ def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str
         radius_mm, aim = number(document["diameter_mm"]) / 2, document["next_aim"]
         numbers = {name: document[name] for name in CONFIRMED} | {f"next_{name}": aim[name] for name in AIMED}
         quantities = tuple(_quantity(name, number(value)) for name, value in numbers.items() if value is not None)
-        words = {name: document[name] for name in ("verdict", "structure", "in_predicted_region")} | {
-            "next": aim["kind"]
-        }
+        words = {name: document[name] for name in STATED} | {"next": aim["kind"]}
     place = scan.resolve()
     files = InputFiles(place.parent)
     volumes = CaseVolumes(files, place.parent / "--scan")
@@ -191,11 +173,10 @@ def export_confirmation(source: Path, scan: Path, out: Path, note: Callable[[str
     inputs = (read.input("confirmation"), *files.inputs)
     with writing(out, f"export {DICOM}", inputs=inputs, names=archive.NAMES, note=note) as draft:
         written = put(draft, made)
-    return Written.of_path(DICOM, written, f"needle, {words['verdict']}", (NO_DEVICE,), (), inputs)
+    return _of_path(DICOM, written, f"needle, {words['verdict']}", (NO_DEVICE,), (), inputs)
 
 
 def _series(case: Case) -> CtSeries:
-    """The DICOM series that is the case's CT."""
     require_extra("dicom", f"--format {DICOM}")
     name = case.skin_section.ct or case.ct.file
     series = case.volumes.series(name)
@@ -209,7 +190,7 @@ def _series(case: Case) -> CtSeries:
 
 
 def _archived(context: CaseContext, scan: CtSeries, found: Candidates, pick: Pick) -> ArchiveContent:
-    """Windows and needle as regions, the path as a line, and the direction's row of the table as numbers."""
+    """Windows and needle as regions, the path as a line, and what the table knows of the direction."""
     case, area = context.case, entry_area(found)
     entry, target, step = pick.candidates.path.entry_ct[pick.row], case.target_ct, archive.finest_mm(scan)
     of_face = area.window[area.faces[:, 0]] if len(area.faces) else np.zeros(0, np.int64)
@@ -218,7 +199,11 @@ def _archived(context: CaseContext, scan: CtSeries, found: Candidates, pick: Pic
         for number in np.unique(of_face).tolist()
     ]
     rod = rod_points(np.stack([target, entry]), case.needle.diameter_mm / 2, step)
-    quantities, sentences = _row(pick)
+    row = to_table(pick.candidates).slice(pick.row, 1).to_pylist()[0]
+    known = {name: value for name, value in row.items() if value not in (None, "") and name not in OF_ONE_SEARCH}
+    numbers = {name: float(value) for name, value in known.items() if type(value) in (int, float)}
+    quantities = tuple(_quantity(name, value) for name, value in numbers.items())
+    sentences = ((name, str(value)) for name, value in known.items() if name not in numbers)
     return ArchiveContent(
         "Planned needle path",
         (Region("planned needle", "needle", rod), *windows),
@@ -228,17 +213,5 @@ def _archived(context: CaseContext, scan: CtSeries, found: Candidates, pick: Pic
     )
 
 
-def _row(pick: Pick) -> tuple[tuple[Quantity, ...], tuple[tuple[str, str], ...]]:
-    """What the table says of one direction: its numbers, and its words; what is not known is left out."""
-    row = to_table(pick.candidates).slice(pick.row, 1).to_pylist()[0]
-    known = {name: value for name, value in row.items() if value not in (None, "") and name not in OF_ONE_SEARCH}
-    numbers = {name: float(value) for name, value in known.items() if type(value) in (int, float)}
-    return (
-        tuple(_quantity(name, value) for name, value in numbers.items()),
-        tuple((name, str(value)) for name, value in known.items() if name not in numbers),
-    )
-
-
 def _quantity(name: str, value: float) -> Quantity:
-    """A number with the unit that its name ends with."""
     return Quantity(name, value, UNITS.get(f"_{name.rpartition('_')[2]}", ""))

@@ -1,38 +1,30 @@
-"""The job ``place``: search for the best position of the arm's base, and write the files that show it.
-
-What ``place`` prints for a person.
-"""
+"""The job ``place``: the best position of the arm's base is searched for, written, and printed for a person."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.base.output.output_set import withdraw, writing
+from puncture_twin.planning.base.output.output_set import withdraw
 from puncture_twin.planning.base.text import plural
-from puncture_twin.planning.place.search import (
-    PlaceSearch,
-    RatedPlacement,
-    place_document,
-    search_placements,
-    write_place_document,
-    write_placements,
-)
+from puncture_twin.planning.place import search as place
 from puncture_twin.planning.search.candidates import ARM_CHECKED, Candidates
 from puncture_twin.planning.search.constraints import with_answers
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.ranking import ranked
 from puncture_twin.planning.search.search import organ_candidates
+from puncture_twin.twin.jobs.patient.run import writing_of
 from puncture_twin.twin.report.numbers import direction_text, mounting_text
 from puncture_twin.twin.report.present import Field, Section, Warn, footer, grid, text
 
-Ranked = tuple[str, RatedPlacement]
+Ranked = tuple[str, place.RatedPlacement]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +32,7 @@ class PlaceRun:
     """Result of ``place``, and the files that it wrote."""
 
     context: CaseContext
-    found: PlaceSearch
+    found: place.PlaceSearch
     document: dict[str, Any]
     files: tuple[Path, ...]
 
@@ -50,19 +42,12 @@ class PlaceRun:
         return {**self.document, "seconds": seconds, "files": [str(path) for path in self.files]}
 
 
-QUICK_S = 30.0
-"""As long as a person waits."""
-
-PICTURES_S = 2.0
-"""What drawing takes, about."""
+QUICK_S = 30.0  # as long as a person waits
+PICTURES_S = 2.0  # what drawing takes, about
 
 
 class _Clock:
-    """Whether the search goes on, and for how long still.
-
-    Args:
-        end: `time.perf_counter` then; infinite for a search to its end.
-    """
+    """Whether the search goes on, and for how long still; its end is a `time.perf_counter`, or infinite."""
 
     def __init__(self, context: CaseContext, end: float) -> None:
         self._count, self._end = context.watcher.count, end
@@ -100,20 +85,12 @@ def place_case(
         began: `time.perf_counter` from which they count; now, if None.
 
     Raises:
-        InputError: Bounds that contradict the case.
         NoAnswerError: No direction is safe for the organs, or no placement reaches one; the files are written in
             the second case.
     """
     names = ("placements.csv", "place.json", *(("placements.png", "map_best_place.png") if pictures else ()))
     try:
-        with writing(
-            out,
-            "place",
-            inputs=context.case.inputs,
-            seconds=context.stages.seconds,
-            names=names,
-            note=context.watcher.note,
-        ) as draft:
+        with writing_of(context, out, "place", names) as draft:
             until = np.inf if quick_s is None else quick_s + (time.perf_counter() if began is None else began)
             run = _placed(context, draft.folder, jobs, pictures, until)
     except NoAnswerError:
@@ -123,15 +100,12 @@ def place_case(
     return replace(run, files=draft.final(run.files))
 
 
-def refuse_none(found: PlaceSearch) -> None:
+def refuse_none(found: place.PlaceSearch) -> None:
     """Refuse a search in which no placement reaches a direction: its best is none."""
     if not any(one.verdict.reached for one in found.rated):
         what = f"the arm reaches no organ-safe direction from any placement ({plural(found.checked[0], 'check')})"
-        what += (
-            ""
-            if found.complete
-            else ", as far as was searched; to search to the end: --full, or quick_s=None in Python"
-        )
+        if not found.complete:
+            what += ", as far as was searched; to search to the end: --full, or quick_s=None in Python"
         raise NoAnswerError(what, code="no_placement")
 
 
@@ -139,44 +113,28 @@ class Places(NamedTuple):
     """The directions that the organs allow, and where the arm should stand to reach them."""
 
     candidates: Candidates
-    found: PlaceSearch
+    found: place.PlaceSearch
 
 
 def find_places(context: CaseContext, jobs: int, until: float = np.inf) -> Places:
-    """Search for the best position of the arm's base.
-
-    Args:
-        until: `time.perf_counter` at which it ends with what is known then; infinite for a search to its end.
-
-    Raises:
-        InputError: Bounds that contradict the case.
-        NoAnswerError: No direction is safe for the organs.
-    """
+    """Search for the best position of the arm's base, until a `time.perf_counter`, or to its end if infinite."""
     case, stages = context.case, context.stages
     with stages.time("organs"):
         candidates = organ_candidates(case, context.anatomy, context.engine, case.directions())
     with stages.time("placements"):
-        found = search_placements(
-            case,
-            context.anatomy,
-            candidates,
-            context.placement,
-            jobs=jobs,
-            goes_on=_Clock(context, until),
-            first=lambda one: context.watcher.note(_first_text(one)),
-        )
+        goes_on, parts = _Clock(context, until), (case, context.anatomy, candidates, context.placement)
+        found = place.search_placements(*parts, jobs=jobs, goes_on=goes_on, first=partial(_tell_first, context))
     return Places(candidates, found)
 
 
 def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: float) -> PlaceRun:
-    """Search, and write everything into a folder."""
     case, stages = context.case, context.stages
     candidates, found = find_places(context, jobs, until - PICTURES_S * pictures)
-    document = place_document(found, context.provenance() | {"arm": ARM_CHECKED})
+    document = place.place_document(found, context.provenance() | {"arm": ARM_CHECKED})
     if not found.complete:
         document["warnings"] = [*document["warnings"], _ended_text(found)]
-    write_placements(found, out / "placements.csv")
-    write_place_document(document, out / "place.json")
+    place.write_placements(found, out / "placements.csv")
+    place.write_place_document(document, out / "place.json")
     files = [out / "placements.csv", out / "place.json"]
     if pictures:
         from puncture_twin.twin.report.map.placement_picture import draw_placements  # with matplotlib
@@ -196,15 +154,14 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: f
     return PlaceRun(context, found, document, tuple(files))
 
 
-def _first_text(one: RatedPlacement) -> str:
-    """The first answer, while the search goes on."""
+def _tell_first(context: CaseContext, one: place.RatedPlacement) -> None:
     verdict, where = one.verdict, list(one.mount.position_mm)
     reached = f"it reaches {verdict.reached} of {plural(verdict.count, 'checked direction')}"
-    return f"best so far: {one.name}, base at {where} mm: {reached}, about {100 * verdict.fraction:.0f} % of all"
+    fraction = f"about {100 * verdict.fraction:.0f} % of all"
+    context.watcher.note(f"best so far: {one.name}, base at {where} mm: {reached}, {fraction}")
 
 
-def _ended_text(found: PlaceSearch) -> str:
-    """How far a search came that the clock ended."""
+def _ended_text(found: place.PlaceSearch) -> str:
     whole = sum(one.verdict.count == found.directions for one in found.rated)
     return (
         f"the time is over: {whole} of {plural(len(found.rated), 'placement')} were checked in all directions; the "
@@ -238,8 +195,6 @@ def place_text(run: PlaceRun) -> str:
 
 
 def _fields(run: PlaceRun) -> list[Field]:
-    """Of a rank and its placement."""
-
     def at(axis: int) -> Callable[[Ranked], float | None]:
         return lambda ranked: None if ranked[1].site is None else ranked[1].site.position[axis]
 

@@ -35,10 +35,7 @@ Begin = Callable[..., Wait]
 
 @contextmanager
 def two_stages() -> Iterator[Begin]:
-    """Begin stages in a process beside this one, where a core is free for it.
-
-    A demo's plan is executed and filmed while its pictures are drawn: a third less by the clock.
-    """
+    """Begin stages in a process beside this one, if a core is free: a plan is filmed while its pictures are drawn."""
     if worker_count(2, 2) == 1:
         yield partial
         return
@@ -91,16 +88,21 @@ class PendingRehearsal:
             with_page: Adds the page that shows them all to a run; while the film is made, which has the usual name
                 but where no encoder can be started.
         """
-        shown, run, time = self._rooms_drawn(out), self.run, self.run.context.stages.time
+        from puncture_twin.twin.report.error_pictures import draw_rooms_picture
+
+        run, time, many = self.run, self.run.context.stages.time, self.run.distribution
         assert run.plan is not None
+        if many is not None:
+            with time("rooms.png"):
+                draw_rooms_picture(many, out / ROOMS)
         with time("rehearsal"):
             rehearsal: Rehearsal = self.rehearsal()
-        standing = error_rank(run.context, run.plan.insertion.q[-1], run.distribution, rehearsal.tip_error_mm)
+        standing = error_rank(run.context, run.plan.insertion.q[-1], many, rehearsal.tip_error_mm)
         rehearsal = replace(rehearsal, standing=standing)
         film_at = self.begin(_film, rehearsal, run.plan, run.context.case, run.context.anatomy, out / FILM)
+        shown, rooms = ({}, ()) if many is None else ({"distribution": many.summary()}, (out / ROOMS,))
         document = {**rehearsal_summary(rehearsal), **shown, "inputs": inputs_document(run.inputs)}
         measured = replace(run, rehearsal=rehearsal).with_files(write_json(document, out / "rehearsal.json"))
-        rooms = (out / ROOMS,) if shown else ()
         run = measured.with_files(out / FILM, *rooms)
         run = run if with_page is None else with_page(run)
         with time("film"):
@@ -109,17 +111,6 @@ class PendingRehearsal:
             return run
         run = measured.with_files(film, *rooms)
         return run if with_page is None else with_page(run)
-
-    def _rooms_drawn(self, out: Path) -> dict[str, Any]:
-        """What the rehearsal's file says of many rooms, their picture being drawn; nothing where there are none."""
-        from puncture_twin.twin.report.error_pictures import draw_rooms_picture
-
-        found = self.run.distribution
-        if found is None:
-            return {}
-        with self.run.context.stages.time("rooms.png"):
-            draw_rooms_picture(found, out / ROOMS)
-        return {"distribution": found.summary()}
 
 
 def begin_rehearsal(run: Run, rooms: RoomCount | None, begin: Begin) -> PendingRehearsal:

@@ -1,11 +1,9 @@
-"""What a command about a patient has done so far, and the files that it wrote, by their names.
-
-What it answers, as plain values for ``--json``, the pages and the text: mm and degrees.
-"""
+"""What a command about a patient has done so far, as plain values (mm, degrees) and as text, and its files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,7 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from puncture_twin.planning.base.errors import Severity, refuse
+from puncture_twin.planning.base.output.output_set import Draft, writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.planning.base.strict_json import plain
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.budget.guidance import check_way, stepped
 from puncture_twin.planning.case.case import Case
@@ -21,7 +21,6 @@ from puncture_twin.planning.certify.certificate import Certificate
 from puncture_twin.planning.clearance.fcl_engine import CrossChecked
 from puncture_twin.planning.geometry.containment import inside_each
 from puncture_twin.planning.plan.plan import Plan
-from puncture_twin.planning.registration.fits import Distortion
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates, Pick
@@ -47,6 +46,20 @@ PICTURES = ("map.png", "scene.png", SLICES, PAGE)
 FILM, ROOMS = "rehearsal.mp4", "rooms.png"
 
 
+def writing_of(
+    context: CaseContext,
+    out: Path,
+    command: str,
+    names: Iterable[str],
+    read: tuple[Input, ...] = (),
+    source: Input | None = None,
+) -> AbstractContextManager[Draft]:
+    """A draft of a command's files, of its inputs and the case's; `source` of them is an earlier command's output."""
+    inputs, made_from = (*read, *context.case.inputs), {} if source is None else {source.path: source.sha256}
+    seconds, note = context.stages.seconds, context.watcher.note
+    return writing(out, command, inputs=inputs, seconds=seconds, names=names, made_from=made_from, note=note)
+
+
 class RoomCount(NamedTuple):
     """How many rooms are rehearsed, how many in the simulator too, the way of guidance if any, and its steps."""
 
@@ -59,12 +72,7 @@ class RoomCount(NamedTuple):
 def room_count(
     rooms: int | None, physics: int, guidance: str | None = None, steps: int | None = None
 ) -> RoomCount | None:
-    """How many rooms are wanted; None for none beside the one that is executed.
-
-    Raises:
-        InputError: More in the simulator than there are, guidance that is unknown, or without trials, or steps of
-            another than ct.
-    """
+    """How many rooms are wanted; None for none beside the one that is executed."""
     stepped(guidance, steps)
     if guidance is not None:
         check_way(guidance)
@@ -78,11 +86,7 @@ def room_count(
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a command has done so far, and the files that it wrote.
-
-    Attributes:
-        refusal: Why there is no plan although the command makes one; "" where it makes none.
-    """
+    """What a command has done so far, and its files; `refusal` says why there is no plan although it makes one."""
 
     context: CaseContext
     candidates: Candidates
@@ -157,53 +161,54 @@ class Run:
     @property
     def plan_notes(self) -> tuple[str, ...]:
         """What else must be known of the plan's expected error and of its aim."""
-        if self.plan is None:
+        plan, chances = self.plan, self.candidates.chances
+        if plan is None:
             return ()
         notes = [] if self.context.case.bending is None else ["The expected error assumes a straight needle."]
         if self.context.chance is None:
             notes.append("The expected error counts the markers alone: [errors] does not declare the arm's errors.")
-        return (*notes, *_other_configuration(self.candidates, self.plan), *self._other_aim(self.plan))
-
-    def _other_aim(self, plan: Plan) -> list[str]:
-        """That the pose was corrected for another insertion, and what would correct it for this one."""
+        same = (self.candidates.theta == plan.theta) & (self.candidates.beta == plan.beta)
+        if chances is not None and same.any():  # its row may be of another configuration
+            other = float(np.hypot(chances.lateral_mm[same][0], chances.depth_mm[same][0]))
+            if abs(other - plan.expected_target_error_mm) > NOTABLE * plan.expected_target_error_mm:
+                configuration = f"In the configuration of the table and of check: {other:.2f} mm."
+                notes.append(f"{configuration} The approach may end in another.")
         registration = None if self.context.placement is None else self.context.placement.registration
-        q = plan.insertion.q[-1]
-        if registration is None or registration.aim is None or np.abs(q - registration.aim.q).max() < SAME_AIM:
-            return []
-        joints = ", ".join(f"{angle:.2f}" for angle in np.degrees(q))
-        return [f"The aim is corrected for another insertion. For this one, set correct_joints_deg = [{joints}]."]
+        aim, q = None if registration is None else registration.aim, plan.insertion.q[-1]
+        if aim is not None and np.abs(q - aim.q).max() >= SAME_AIM:
+            joints = ", ".join(f"{angle:.2f}" for angle in np.degrees(q))
+            notes.append(
+                f"The aim is corrected for another insertion. For this one, set correct_joints_deg = [{joints}]."
+            )
+        return tuple(notes)
 
     def text(self) -> str:
         """What a person reads: what must be read first, the search, then what was done with it; then the files."""
-        return text([*self._first(), *self._searched(), *self._done(), *self._footer()])
-
-    def _first(self) -> list[Section]:
-        belief = self.rehearsal is not None and self.rehearsal.truth_is_belief
-        return [Section(f"NOTE: {TRUTH_IS_BELIEF}", [])] if belief else []
+        anatomy, belief = self.context.anatomy, self.rehearsal is not None and self.rehearsal.truth_is_belief
+        first = [Section(f"NOTE: {TRUTH_IS_BELIEF}", [])] if belief else []
+        notes = [Section(f"note: {one.sentence}", []) for one in anatomy.findings if one.severity is Severity.NOTE]
+        ending = footer(self.files, anatomy.warnings, self.context.stages.seconds)
+        return text([*first, *self._searched(), *self._done(), *notes, *ending])
 
     def _searched(self) -> list[Section]:
         found, sides = self.candidates, self.context.sides
         looked = f", entry sides: {sides_text(sides, searched=True)}" if sides else ""
         warned = (*needle_warnings(self.context.case, found), *(one.sentence for one in found.findings))
+        if found.safe.any():
+            best = Section("the best of each window", patient.windows(found, self.context.anatomy.scan))
+        elif (row := closest_miss(found)) is None:
+            best = Section("no candidate is safe", [])
+        else:
+            angles = "theta {theta_deg:g} deg, beta {beta_deg:g} deg".format(**found.at(row))
+            best = Section(f"no candidate is safe; the closest, {angles}: {reason_text(found, row)}", [])
         return [
             Section(f"case {self.context.case.name}: {found.windows.headline}", []),
             Section(f"{plural(len(found), 'direction')}{looked}", patient.counts(found)),
             *(Section(one, []) for one in warned),
-            Section("the best of each window", patient.windows(found, self.context.anatomy.scan))
-            if found.safe.any()
-            else self._nothing_safe(),
+            best,
         ]
 
-    def _nothing_safe(self) -> Section:
-        row = closest_miss(self.candidates)
-        if row is None:
-            return Section("no candidate is safe", [])
-        at = self.candidates.at(row)
-        angles = f"theta {at['theta_deg']:g} deg, beta {at['beta_deg']:g} deg"
-        return Section(f"no candidate is safe; the closest, {angles}: {reason_text(self.candidates, row)}", [])
-
     def _done(self) -> list[Section]:
-        """Plan, rehearsal, many rooms, certificate and cross-check, where there are any."""
         away = frozenset(one.name for one in self.context.anatomy.structures if one.demands_margin)
         at_patient = () if self.facts is None else self.facts.rows()
         declared = self.context.chance is not None
@@ -222,12 +227,6 @@ class Run:
                 f" largest difference {checked.largest_mm:.1e} mm", []))  # fmt: skip
         return done
 
-    def _footer(self) -> list[Section]:
-        anatomy = self.context.anatomy
-        notes = [Section(f"note: {one.sentence}", []) for one in anatomy.findings if one.severity is Severity.NOTE]
-        ending = footer(self.files, anatomy.warnings, self.context.stages.seconds)
-        return [*notes, *ending]
-
 
 NOTABLE = 0.05
 """Of an expected error: by as much two configurations' differ before people are told."""
@@ -236,60 +235,41 @@ SAME_AIM = 0.02
 """rad: joints that differ by less are of one insertion; an arm's errors do the same there within a fiftieth."""
 
 
-def _other_configuration(candidates: Candidates, plan: Plan) -> list[str]:
-    """That the table's row of the plan's direction is of another configuration, where that tells."""
-    row = np.flatnonzero((candidates.theta == plan.theta) & (candidates.beta == plan.beta))
-    if candidates.chances is None or not len(row):
-        return []
-    other = float(np.hypot(candidates.chances.lateral_mm[row[0]], candidates.chances.depth_mm[row[0]]))
-    if not abs(other - plan.expected_target_error_mm) > NOTABLE * plan.expected_target_error_mm:
-        return []
-    return [f"In the configuration of the table and of check: {other:.2f} mm. The approach may end in another."]
+def plain_of(one: Any, *names: str) -> dict[str, Any]:
+    """Some of a record's fields as JSON has them."""
+    return {name: plain(getattr(one, name)) for name in names}
 
 
 def registration_summary(registration: Registration) -> dict[str, Any]:
-    """A registration as plain values: mm."""
-    uncertainty = registration.uncertainty
+    """A registration as plain values: mm; of declared errors what they add."""
+    uncertainty, distortion = registration.uncertainty, registration.distortion
     test = registration.residual_test if uncertainty is None else uncertainty.test
+    declared = {}
+    if uncertainty is not None:
+        noise = uncertainty.test
+        declared["declaration"] = {
+            "holds": noise.agrees,
+            "probability": noise.probability,
+            "residuals_over_declared": noise.estimate,
+            "interval": list(noise.interval),
+            "text": noise.text(),
+        }
+    distorted = None
+    if distortion is not None:
+        distorted = {**vars(distortion), "doubted": distortion.significant, "text": distortion.finding().sentence}
     return {
-        "method": registration.method,
-        "T_base_ct": registration.T_base_ct.tolist(),
+        **plain_of(registration, "method", "T_base_ct"),
         "residual_mm": dict(zip(registration.markers.names, registration.residual_mm.tolist(), strict=True)),
-        "fre_mm": registration.fre_mm,
-        "mean_error_mm": registration.mean_error_mm,
-        "fle_mm": registration.fle_mm,
-        "fle_source": registration.fle_source,
+        **plain_of(registration, "fre_mm", "mean_error_mm", "fle_mm", "fle_source"),
         "fle_interval_mm": list(registration.fle_interval_mm),
         "chi_squared": finite(test.chi_squared),
         "degrees_of_freedom": test.freedom,
         "noise_scale": test.scale,
-        **_declared(registration),
-        "spread_ratio": registration.conditioning.spread_ratio,
-        "altitude_mm": registration.conditioning.altitude_mm,
-        "leverage": registration.conditioning.leverage,
-        "distortion": _distortion(registration.distortion),
+        **declared,
+        **plain_of(registration.conditioning, "spread_ratio", "altitude_mm", "leverage"),
+        "distortion": distorted,
         "flags": [flag.sentence for flag in registration.flags],
         "findings": [flag.document() for flag in registration.flags],
-    }
-
-
-def _distortion(found: Distortion | None) -> dict[str, Any] | None:
-    return None if found is None else {**vars(found), "doubted": found.significant, "text": found.text()}
-
-
-def _declared(registration: Registration) -> dict[str, Any]:
-    """What declared errors add."""
-    if registration.uncertainty is None:
-        return {}
-    test = registration.uncertainty.test
-    return {
-        "declaration": {
-            "holds": test.agrees,
-            "probability": test.probability,
-            "residuals_over_declared": test.estimate,
-            "interval": list(test.interval),
-            "text": test.text(),
-        }
     }
 
 
@@ -332,19 +312,19 @@ def plan_summary(plan: Plan) -> dict[str, Any]:
 
 
 def rehearsal_summary(rehearsal: Rehearsal) -> dict[str, Any]:
-    """A rehearsal's main numbers as plain values."""
+    """A rehearsal's main numbers as plain values; the needle's end in LPS, or the case's local frame."""
+    forward = np.linalg.inv(rehearsal.T_base_ct_true)[:3, :3] @ rehearsal.T_base_flange_true[-1, :3, 2]
     return {
-        "seed": rehearsal.seed,
-        "tip_error_mm": rehearsal.tip_error_mm,
-        "lateral_mm": rehearsal.lateral_mm,
-        "depth_mm": rehearsal.depth_mm,
-        "predicted_error_mm": finite(rehearsal.predicted_error_mm),
+        **plain_of(rehearsal, "seed", "tip_error_mm", "lateral_mm", "depth_mm", "predicted_error_mm"),
         "contacts": [f"{c.link} touches {c.body} at {c.time_s:.2f} s" for c in rehearsal.contacts],
         "least_clearance_mm": {name: float(np.min(values)) for name, values in rehearsal.clearance_mm.items()},
-        "control": rehearsal.control,
-        "off_path_mm": rehearsal.off_path_mm,
+        **plain_of(rehearsal, "control", "off_path_mm"),
         "tissue_n": None if rehearsal.tissue_force is None else rehearsal.tissue_force._asdict(),
-        "needle_end": _needle_end(rehearsal),
+        "needle_end": {
+            "tip_ct_mm": rehearsal.tip_true_ct[-1].tolist(),
+            "direction_ct": forward.tolist(),
+            "target_ct_mm": rehearsal.target_true_ct.tolist(),
+        },
         "max_joint_speed_deg_s": np.degrees(rehearsal.max_joint_speed).tolist(),
         "joint_speed_limit_deg_s": np.degrees(rehearsal.speed_limits).tolist(),
         **({} if rehearsal.standing is None else rehearsal.standing.summary()),
@@ -378,13 +358,3 @@ def trial_failures(case: Case, found: Distribution) -> Iterator[str]:
     for name, share in zip(found.structures, touched.tolist(), strict=True):
         if share > (most := touch_limit(case, name)):
             yield f"{100 * share:.2f} % of the trials touched {name}; the case allows {100 * most:.2f} %"
-
-
-def _needle_end(rehearsal: Rehearsal) -> dict[str, list[float]]:
-    """Where the needle truly ended in the patient, LPS (or the case's local frame), and the target that it was for."""
-    forward = np.linalg.inv(rehearsal.T_base_ct_true)[:3, :3] @ rehearsal.T_base_flange_true[-1, :3, 2]
-    return {
-        "tip_ct_mm": rehearsal.tip_true_ct[-1].tolist(),
-        "direction_ct": forward.tolist(),
-        "target_ct_mm": rehearsal.target_true_ct.tolist(),
-    }

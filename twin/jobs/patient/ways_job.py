@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
 from puncture_twin.planning.base.errors import NoAnswerError
-from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.budget.guidance import equipped, sight_of
@@ -29,7 +26,7 @@ from puncture_twin.planning.search.uncertainty_breakdown import LEAST_FRACTION
 from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.jobs.patient.main_job import checked_plan, is_plan, plan_case
-from puncture_twin.twin.jobs.patient.run import plan_summary, trial_failures
+from puncture_twin.twin.jobs.patient.run import plan_summary, trial_failures, writing_of
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
 from puncture_twin.twin.report import present
@@ -39,13 +36,14 @@ from puncture_twin.twin.report.present import Field, Section, Table, Warn, grid,
 
 PAGE, PICTURE, TABLE = FILES = ("ways.html", "ways.png", "ways.json")
 
+SAME = "one plan, the same patients for every way."
 CLEAR = 2.0
 """Standard errors of a difference that make it clear."""
 
-LOOK_S = MappingProxyType({"camera_pairs": 5.0, "pictures": 30.0})
+LOOK_S = {"camera_pairs": 5.0, "pictures": 30.0}
 """Seconds of a look until the needle goes on. Assumed: cameras are read by the program, a picture by a person."""
 
-COLOURS = MappingProxyType({"best": BETTER, "as good": ALONE, "worse": WORSE})
+COLOURS = {"best": BETTER, "as good": ALONE, "worse": WORSE}
 
 
 class Rated(NamedTuple):
@@ -148,11 +146,10 @@ class Compared:
 
     def text(self) -> str:
         """What a person reads."""
-        title = Section(f"case {self.context.case.name}, {self._under()}", [])
+        title = Section(
+            f"case {self.context.case.name}, θ {self.plan.theta_deg:g}°, β {self.plan.beta_deg:g}°: {SAME}", []
+        )
         return present.text([title, *self.sections(), *present.footer(self.files, self.context.anatomy.warnings)])
-
-    def _under(self) -> str:
-        return f"θ {self.plan.theta_deg:g}°, β {self.plan.beta_deg:g}°: one plan, the same patients for every way."
 
     def write(self, folder: Path) -> None:
         """Write page and picture."""
@@ -169,7 +166,8 @@ class Compared:
         sections = [first, Section("where the tip ended", [clouds, CLOUD_TEXT]), *rest]
         inputs, origin = (*self.read, *self.context.case.inputs), present.origin_section(self.ways[0].found.seed)
         title = f"Ways of guidance of {self.context.case.name}"
-        present.write_page(folder / PAGE, title, self._under(), cards, sections, inputs, origin=origin)
+        under = f"θ {self.plan.theta_deg:g}°, β {self.plan.beta_deg:g}°: {SAME}"
+        present.write_page(folder / PAGE, title, under, cards, sections, inputs, origin=origin)
 
 
 def _rating(row: Mapping[str, Any]) -> str:
@@ -230,22 +228,16 @@ HAND_TEXT = (
 def ways_job(
     context: CaseContext, source: Path, out: Path, ways: tuple[str, ...], count: int, choice: Choice
 ) -> Compared:
-    """Compare ways of guidance along a plan, or along a case's best or chosen direction; write page and picture.
-
-    Raises:
-        InputError: The case lacks errors or markers, or the plan does not hold in it.
-        NoAnswerError: There is no plan, or no way sees enough.
-    """
-    read, made_from, planned = tuple[Input, ...](), dict[str, str](), tuple[Path, ...]()
+    """Compare ways of guidance along a plan, or along a case's best or chosen direction; write page and picture."""
+    started, planned = None, tuple[Path, ...]()
     if is_plan(source):
-        stated, plan, _ = checked_plan(context, source)
-        read, made_from = (stated,), {stated.path: stated.sha256}
+        started, plan, _ = checked_plan(context, source)
+        read: tuple[Input, ...] = (started,)
     else:
         run = plan_case(context, out, choice)
         assert run.plan is not None  # else it has raised
         plan, read, planned = run.plan, run.read, run.files
-    made = partial(writing, out, "rehearse", seconds=context.stages.seconds, note=context.watcher.note)
-    with made(inputs=(*read, *context.case.inputs), names=FILES, made_from=made_from) as draft:
+    with writing_of(context, out, "rehearse", FILES, read, started) as draft:
         done = Compared(context, plan, *_rehearsed(context, plan, ways, count), read)
         done.write(draft.folder)
         done = replace(done, files=(*planned, *draft.final(tuple(draft.folder / name for name in FILES))))
@@ -256,7 +248,6 @@ def ways_job(
 def _rehearsed(
     context: CaseContext, plan: Plan, ways: tuple[str, ...], count: int
 ) -> tuple[tuple[Rated, ...], dict[str, str]]:
-    """The ways, the best first, and why others see too little."""
     found, unknown, case = list[Distribution](), dict[str, str](), context.case
     for way in ways:
         case, _ = equipped(case, way)

@@ -8,7 +8,6 @@ stands beside the map as a number.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from matplotlib.patches import Circle
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Texts
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.search.candidates import Candidates, Pick, Verdict
 from puncture_twin.planning.search.windows import MOST_WINDOWS
@@ -25,28 +24,18 @@ from puncture_twin.twin.report.figures import halo
 from puncture_twin.twin.report.map.map_raster import MapRaster, shown_front
 from puncture_twin.twin.report.map_view import BEYOND, MapView
 
-RADIUS = 412
-"""Of the disc, pixels."""
-
-DPI = 130
-"""Dots an inch of the map; letters and lines are in points."""
-
+RADIUS = 412  # of the disc, pixels
+DPI = 130  # dots an inch of the map; letters and lines are in points
 RINGS_AT, RINGS_CLEAR = np.radians((67.5, 52.5, 22.5, 112.5, 127.5)), 0.09
 """Where the rings' angles may be written, counter-clockwise from the right: the first at which every mark keeps so far
 from them, in the disc's radii."""
 
-RIM_LABEL = 0.95
-"""Of the disc's radii: the angle of a ring at the rim stands there, not over the line."""
-
-BORDER_OPACITY = 0.45
-"""Of the lines between regions of different structures."""
-
-LETTERS, LETTERS_RIM = 9.0, halo(3.2)
-"""Points: what is written in the disc, and the white about it."""
-
-CHOSEN: Mapping[str, Any] = MappingProxyType({"marker": "*", "ms": 19, "mew": 1.6, "mfc": "white", "mec": "black"})
-BEST: Mapping[str, Any] = MappingProxyType({"marker": "o", "ms": 6.8, "mew": 1.2, "mfc": "none", "mec": "black"})
-FRONT: Mapping[str, Any] = MappingProxyType({"marker": "o", "ms": 3.0, "mew": 0.5, "mfc": "white", "mec": "black"})
+RIM_LABEL = 0.95  # of the disc's radii: the angle of a ring at the rim stands there, not over the line
+BORDER_OPACITY = 0.45  # of the lines between regions of different structures
+LETTERS, LETTERS_RIM = 9.0, halo(3.2)  # points: what is written in the disc, and the white about it
+CHOSEN: Mapping[str, Any] = {"marker": "*", "ms": 19, "mew": 1.6, "mfc": "white", "mec": "black"}
+BEST: Mapping[str, Any] = {"marker": "o", "ms": 6.8, "mew": 1.2, "mfc": "none", "mec": "black"}
+FRONT: Mapping[str, Any] = {"marker": "o", "ms": 3.0, "mew": 0.5, "mfc": "white", "mec": "black"}
 """The marks of directions, on the map and in its legend."""
 
 
@@ -59,20 +48,23 @@ class Label(NamedTuple):
 
 
 def draw_disc(axes: Axes, candidates: Candidates, view: MapView, raster: MapRaster, pick: Pick | None) -> None:
-    """Draw it in the disc's radii; what stands at the rim lies outside of the axes.
-
-    Args:
-        axes: A square of 2 `RADIUS` pixels.
-    """
+    """Draw it on square axes of 2 `RADIUS` pixels, in the disc's radii; what stands at the rim lies outside of them."""
     axes.set_axis_off()
     axes.set(xlim=(-1, 1), ylim=(-1, 1), autoscale_on=False)
     codes, names = region_codes(candidates.verdict, raster.rows)
-    axes.imshow(_lined(raster, candidates, codes), extent=(-1, 1, -1, 1), interpolation="hanning")
+    opaque = raster.rgba[..., 3:] / 255.0  # on white, with lines between regions, and about what is safe
+    rgb = np.round(raster.rgba[..., :3] * opaque + 255.0 * (1.0 - opaque)).astype(np.uint8)
+    between = _edges(codes, named=True)
+    rgb[between] = np.round(rgb[between] * (1 - BORDER_OPACITY))
+    rgb[_edges(np.append(candidates.safe, False)[raster.rows].astype(np.int64))] = 0
+    axes.imshow(rgb, extent=(-1, 1, -1, 1), interpolation="hanning")
     _frame(axes, view)
     _chances(axes, candidates, raster.rows)
     bests = [window.best for window in candidates.windows.windows[:MOST_WINDOWS]]
     marked = view.place(candidates.theta[bests], candidates.beta[bests])
-    chosen = np.zeros((0, 2)) if pick is None else view.place(*_angles(pick))
+    chosen = np.zeros((0, 2))
+    if pick is not None:
+        chosen = view.place(pick.candidates.theta[[pick.row]], pick.candidates.beta[[pick.row]])
     rings = ring_labels(view, np.concatenate([marked, chosen]))
     about_bests = [Label(x, y, "OO") for x, y in marked]
     for x, y, text in rings:
@@ -86,22 +78,8 @@ def draw_disc(axes: Axes, candidates: Candidates, view: MapView, raster: MapRast
         axes.plot(*places.T, ls="none", clip_on=False, zorder=4, **mark)  # over all words
 
 
-def _angles(pick: Pick) -> tuple[Floats, Floats]:
-    return pick.candidates.theta[[pick.row]], pick.candidates.beta[[pick.row]]
-
-
 def _write(axes: Axes, x: float, y: float, text: str, **look: Any) -> None:
     axes.text(x, y, text, fontsize=LETTERS, ha="center", va="center", path_effects=LETTERS_RIM, **look)
-
-
-def _lined(raster: MapRaster, candidates: Candidates, codes: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """The raster on white, with lines between regions of different structures, and about what is safe."""
-    opaque = raster.rgba[..., 3:] / 255.0
-    rgb = np.round(raster.rgba[..., :3] * opaque + 255.0 * (1.0 - opaque)).astype(np.uint8)
-    between = _edges(codes, named=True)
-    rgb[between] = np.round(rgb[between] * (1 - BORDER_OPACITY))
-    rgb[_edges(np.append(candidates.safe, False)[raster.rows].astype(np.int64))] = 0
-    return rgb
 
 
 def _edges(values: NDArray[np.int64], *, named: bool = False) -> Bools:
@@ -113,7 +91,6 @@ def _edges(values: NDArray[np.int64], *, named: bool = False) -> Bools:
 
 
 def _frame(axes: Axes, view: MapView) -> None:
-    """Rings, spokes and what lies beyond the rim."""
     for ring, radius in ring_radii(view):
         wide = 1.6 if ring == 90 and view.theta_max > BEYOND else 0.7
         axes.add_patch(Circle((0, 0), radius, fill=False, lw=wide, alpha=0.45))
@@ -149,19 +126,11 @@ def ring_labels(view: MapView, marks: Floats) -> list[Label]:
 
 
 LEVELS = (0.5, 0.9, 0.99)
-STYLES = (":", "--", "-")
-"""Of the line of each level."""
-
-HATCHES = ("xxxx", "////", "..", "")
-"""Below the first level, between the levels, above the last."""
-
+STYLES = (":", "--", "-")  # of the line of each level
+HATCHES = ("xxxx", "////", "..", "")  # below the first level, between the levels, above the last
 HATCH_INK = (0.0, 0.0, 0.0, 0.55)
-
-COARSE = 2
-"""Every so manyth pixel is looked at: what is smoothed needs no more."""
-
-SMOOTHED = 0.006
-"""Of the picture's side: the cells' corners are rounded off, and lines move by less than half a cell."""
+COARSE = 2  # every so manyth pixel is looked at: what is smoothed needs no more
+SMOOTHED = 0.006  # of the picture's side: the cells' corners are rounded off, and lines move by less than half a cell
 
 
 def touch_nothing(candidates: Candidates) -> NDArray[np.float64] | None:
@@ -172,11 +141,7 @@ def touch_nothing(candidates: Candidates) -> NDArray[np.float64] | None:
 
 
 def chance_raster(candidates: Candidates, rows: NDArray[np.int64]) -> NDArray[np.float64] | None:
-    """The chance under each pixel, smoothed within the region that has chances; NaN elsewhere; None without any.
-
-    Args:
-        rows: Shape (n, n), the candidate under each pixel, -1 outside.
-    """
+    """The chance under each pixel of rows (n, n), smoothed where there are chances; NaN elsewhere; None without any."""
     chance = touch_nothing(candidates)
     if chance is None:
         return None
@@ -203,26 +168,20 @@ def _chances(axes: Axes, candidates: Candidates, rows: NDArray[np.int64]) -> Non
         axes.contour(axis, -axis, shown, levels=LEVELS, colors=colour, linestyles=STYLES, linewidths=width)
 
 
-NAMED_FRACTION = 0.006
-"""Least fraction of the disc that a rejected region needs to carry its structure's name."""
-
-NOT_SEEN_HERE = "not seen"
-"""In a region whose directions leave what was scanned; the legend says how."""
-
+NAMED_FRACTION = 0.006  # least fraction of the disc that a rejected region needs to carry its structure's name
+NOT_SEEN_HERE = "not seen"  # in a region whose directions leave what was scanned; the legend says how
 LETTER_HIGH, LETTER_WIDE = 0.7 * LETTERS * DPI / 72, 0.29 * LETTERS * DPI / 72
 """Pixels: half the room of a line and of a letter; no two names lie over one another while there is room."""
 
-NAMES_COARSE = 4
-"""Every so manyth pixel is looked at to find a name's place."""
+NAMES_COARSE = 4  # every so manyth pixel is looked at to find a name's place
 
 
 def region_codes(verdict: Verdict, rows: Ints) -> tuple[NDArray[np.int64], list[str]]:
-    """Index, for each pixel, of the name that is written over it, in a list whose first name is empty.
-
-    Args:
-        rows: Shape (n, n), the candidate under each pixel, -1 outside.
-    """
-    written = _region_names(verdict)
+    """Each pixel's name (what forbids its candidate), an index into names, of which the first is empty; rows (n, n)."""
+    unknown = verdict.reason == Reason.UNKNOWN_REGION.value
+    written = np.where(verdict.reason == Reason.TOO_CLOSE.value, verdict.structure, "").astype(object)
+    whys = np.where(verdict.not_seen, NOT_SEEN_HERE, verdict.structure)
+    written[unknown] = [f"unknown:\n{why}" for why in whys[unknown]]
     names = ["", *sorted(set(written) - {""})]
     place = {name: i for i, name in enumerate(names)}
     codes = np.array([*map(place.__getitem__, written), 0])
@@ -232,11 +191,17 @@ def region_codes(verdict: Verdict, rows: Ints) -> tuple[NDArray[np.int64], list[
 def region_labels(codes: NDArray[np.int64], names: Sequence[str], written: Sequence[Label]) -> list[Label]:
     """The names of all large enough regions, deep inside them and off what is written there."""
     coarse = codes[::NAMES_COARSE, ::NAMES_COARSE]
-    free = np.ones(coarse.shape, dtype=bool)
+    free, size = np.ones(coarse.shape, dtype=bool), len(coarse)
     for x, y, text in written:
-        _take(free, *_pixel(x, y, len(coarse)), *_half_size(text, len(coarse)))
-    labels = []
-    for depth, structure in _regions(coarse, names):
+        _take(free, round((1 - y) / 2 * size), round((1 + x) / 2 * size), *_half_size(text, size))
+    regions, labels = [], []
+    for code, name in enumerate(names):
+        parts, _ = ndimage.label((coarse == code) if name else np.zeros(coarse.shape, dtype=bool))
+        areas = np.bincount(parts.ravel())[1:]
+        for part in np.flatnonzero(areas > NAMED_FRACTION * coarse.size * np.pi / 4) + 1:
+            depth = ndimage.distance_transform_edt(np.pad(parts == part, 1))[1:-1, 1:-1]
+            regions.append((float(areas[part - 1]), depth, name))
+    for _, depth, structure in sorted(regions, key=lambda region: -region[0]):
         text = structure.replace("_", " ")
         high, wide = _half_size(text, len(coarse))
         space = np.where(ndimage.minimum_filter(free, (2 * high + 1, 2 * wide + 1)), depth, 0.0)
@@ -247,36 +212,10 @@ def region_labels(codes: NDArray[np.int64], names: Sequence[str], written: Seque
     return labels
 
 
-def _region_names(verdict: Verdict) -> Texts:
-    """Name written over each direction, shape (n,): the structure that forbids it, or "unknown" and why."""
-    unknown = verdict.reason == Reason.UNKNOWN_REGION.value
-    named = np.where(verdict.reason == Reason.TOO_CLOSE.value, verdict.structure, "").astype(object)
-    whys = np.where(verdict.not_seen, NOT_SEEN_HERE, verdict.structure)
-    named[unknown] = [f"unknown:\n{why}" for why in whys[unknown]]
-    return np.asarray(named)
-
-
-def _regions(codes: NDArray[np.int64], names: Sequence[str]) -> list[tuple[Floats, str]]:
-    """Large enough regions of one name, the largest first: how deep inside each pixel lies, and the name."""
-    found = []
-    for code, name in enumerate(names):
-        labels, _ = ndimage.label((codes == code) if name else np.zeros(codes.shape, dtype=bool))
-        areas = np.bincount(labels.ravel())[1:]
-        for part in np.flatnonzero(areas > NAMED_FRACTION * codes.size * np.pi / 4) + 1:
-            depth = ndimage.distance_transform_edt(np.pad(labels == part, 1))[1:-1, 1:-1]
-            found.append((float(areas[part - 1]), depth, name))
-    return [(depth, name) for _, depth, name in sorted(found, key=lambda region: -region[0])]
-
-
 def _half_size(text: str, size: int) -> tuple[int, int]:
     """Half the height and half the width of a name with some white, in pixels of a square picture of the disc."""
     scale, lines = size / (2 * RADIUS), text.split("\n")
     return round(LETTER_HIGH * len(lines) * scale), round(LETTER_WIDE * (max(map(len, lines)) + 1) * scale)
-
-
-def _pixel(x: float, y: float, size: int) -> tuple[int, int]:
-    """Row and column of a point of the disc (x right, y up) in a square picture of it."""
-    return round((1 - y) / 2 * size), round((1 + x) / 2 * size)
 
 
 def _take(free: Bools, row: int, column: int, high: int, wide: int) -> None:

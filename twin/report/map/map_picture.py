@@ -23,53 +23,27 @@ from puncture_twin.planning.base.reasons import NOT_SEARCHED_TEXT, UNSEEN_AIR, R
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
+from puncture_twin.twin.report import numbers
 from puncture_twin.twin.report.figures import figure_of, write_png
-from puncture_twin.twin.report.map.map_disc import (
-    BEST,
-    CHOSEN,
-    DPI,
-    FRONT,
-    HATCH_INK,
-    HATCHES,
-    LEVELS,
-    RADIUS,
-    STYLES,
-    draw_disc,
-    touch_nothing,
-)
-from puncture_twin.twin.report.map.map_raster import (
-    HATCH,
-    HATCH_AIR,
-    SCALE_DIGITS,
-    ClearanceScale,
-    MapRaster,
-    clearance_scale,
-    map_raster,
-    shown_front,
-)
+from puncture_twin.twin.report.map import map_disc, map_raster
 from puncture_twin.twin.report.map_view import BEYOND, MapView, map_view, step_of
-from puncture_twin.twin.report.numbers import (
-    ReasonCount,
-    arm_text,
-    length_text,
-    nearest_text,
-    needle_text,
-    reason_counts,
-    target_text,
-)
 from puncture_twin.twin.report.palette import safe_shades
 from puncture_twin.twin.report.present import number, percent
 
 WIDTH, HEIGHT = 1690, 1222
 
-DISC = ((583 - RADIUS) / WIDTH, 1 - (642 + RADIUS) / HEIGHT, 2 * RADIUS / WIDTH, 2 * RADIUS / HEIGHT)
+DISC = (
+    (583 - map_disc.RADIUS) / WIDTH,
+    1 - (642 + map_disc.RADIUS) / HEIGHT,
+    2 * map_disc.RADIUS / WIDTH,
+    2 * map_disc.RADIUS / HEIGHT,
+)
 SIDE_WIDE, SIDE_HIGH = 515, 1039
 SIDE = (1158 / WIDTH, 1 - (122 + SIDE_HIGH) / HEIGHT, SIDE_WIDE / WIDTH, SIDE_HIGH / HEIGHT)
 """Of the picture: left, lower edge, width and height of the disc and of the column beside it; labels stand around the
 disc."""
 
-SMALL = 9.5
-"""Points: letters of the column."""
+SMALL = 9.5  # points: letters of the column
 
 
 def draw_map(
@@ -77,15 +51,10 @@ def draw_map(
     case: Any,
     path: Path,
     pick: Pick | None = None,
-    raster: MapRaster | None = None,
+    raster: map_raster.MapRaster | None = None,
     scan: Any | None = None,
 ) -> None:
-    """Write the map of a search.
-
-    Args:
-        raster: The map's pixels where somebody has them already.
-        scan: The CT, whose voxels say how many digits a length has; None for meshes alone.
-    """
+    """Write the map of a search, of a raster that somebody has already; lengths in the digits of a scan's voxels."""
     write_png(map_figure(candidates, case, pick, raster, scan), path)
 
 
@@ -93,19 +62,20 @@ def map_figure(
     candidates: Candidates,
     case: Any,
     pick: Pick | None = None,
-    raster: MapRaster | None = None,
+    raster: map_raster.MapRaster | None = None,
     scan: Any | None = None,
 ) -> Figure:
     """The map, arguments as of `draw_map`; the disc is the first of its axes, the column the second."""
     pick = pick or candidates.best
     view = map_view(case, candidates)
-    figure = figure_of(WIDTH, HEIGHT, dpi=DPI)
-    raster = map_raster(candidates, view) if raster is None else raster
-    draw_disc(figure.add_axes(DISC), candidates, view, raster, pick)
+    figure = figure_of(WIDTH, HEIGHT, dpi=map_disc.DPI)
+    raster = map_raster.map_raster(candidates, view) if raster is None else raster
+    map_disc.draw_disc(figure.add_axes(DISC), candidates, view, raster, pick)
     _column(figure.add_axes(SIDE), candidates, view, pick, scan)
-    title = f"{case.name}: entry directions to {target_text(case)}"
+    title = f"{case.name}: entry directions to {numbers.target_text(case)}"
     figure.text(0.02, 0.955, title, fontsize=19, weight="bold")
-    line = f"{plural(len(candidates), 'direction')}, step {np.degrees(step_of(candidates)):g}°;  {needle_text(case)}"
+    line = f"{plural(len(candidates), 'direction')}, step {np.degrees(step_of(candidates)):g}°"
+    line += f";  {numbers.needle_text(case)}"
     if not candidates.arm_checked:
         line += ";  ARM NOT CHECKED"
     figure.text(0.02, 0.918, line, fontsize=12, color="0.25")
@@ -117,7 +87,7 @@ def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None
     """What the colours and marks mean, the chosen direction, and how to read the map; y 0..1 runs downwards."""
     axes.set_axis_off()
     axes.set(xlim=(0, 1), ylim=(1, 0), autoscale_on=False)
-    y = _reasons(axes, reason_counts(candidates))
+    y = _reasons(axes, numbers.reason_counts(candidates))
     y = _scale(axes, candidates, y + GAP)
     y = _chance_key(axes, candidates, y)
     y = _mark_key(axes, candidates, view, y)
@@ -132,14 +102,12 @@ def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None
         "from OUTSIDE, along −z of the entry frame. A point is\n"
         "where the needle comes from: θ grows from the centre\n"
         "to the rim, β runs counter-clockwise.\n"
-        f"{outside}{toward}{textwrap.fill(arm_text(candidates), 52)}"
+        f"{outside}{toward}{textwrap.fill(numbers.arm_text(candidates), 52)}"
     )
     axes.text(0.0, 1.0, text, fontsize=SMALL, va="bottom", linespacing=1.4, color="0.25")
 
 
-GAP = 0.025
-"""Between the parts of the column, of its height."""
-
+GAP = 0.025  # between the parts of the column, of its height
 LETTERS, MOST_LINES = 46, 19
 """Of the key of reasons: letters in a line, and lines at its full size; with more of them it is smaller."""
 
@@ -155,13 +123,14 @@ def _key(axes: Axes, y: float, handles: Sequence[Artist], title: str = "", **loo
     return 1.0 - (key.get_window_extent().y0 - axes.bbox.y0) / axes.bbox.height + GAP
 
 
-def _reasons(axes: Axes, counts: Sequence[ReasonCount]) -> float:
+def _reasons(axes: Axes, counts: Sequence[numbers.ReasonCount]) -> float:
     """A patch, a text and numbers for each reason, with the lines that the map has over its colour."""
     handles = []
     for one in counts:
         hatch, ink = "", "black"
         if one.code == Reason.UNKNOWN_REGION.value:
-            hatch, ink = ("\\\\", css(HATCH_AIR)) if one.colour == UNSEEN_AIR else ("//", css(HATCH))
+            beside = one.colour == UNSEEN_AIR
+            hatch, ink = "\\\\" if beside else "//", css(map_raster.HATCH_AIR if beside else map_raster.HATCH)
         text = textwrap.fill(f"{one.text}: {one.count:,} ({percent(one.solid_angle)})", LETTERS)
         handles.append(Patch(facecolor=css(one.colour), edgecolor=ink, hatch=hatch, label=text))
     lines = sum(str(one.get_label()).count("\n") + 1 for one in handles)
@@ -170,51 +139,43 @@ def _reasons(axes: Axes, counts: Sequence[ReasonCount]) -> float:
 
 
 def _scale(axes: Axes, candidates: Candidates, y: float) -> float:
-    """The shades of safe; one shade where one number says it all."""
     if not candidates.safe.any():
         return y
-    scale = clearance_scale(candidates)
+    scale = map_raster.clearance_scale(candidates)
     safe = "" if candidates.breathing is not None else f"{candidates.safe_text}, "  # too long for one line
     if scale.even:
         red, green, blue = scale.shades(np.zeros(1))[0].tolist()
         shade = css((red, green, blue))
-        return _key(axes, y, [Patch(facecolor=shade, edgecolor="black", label=f"{safe}{_even_text(scale)}")])
+        text = "no structure has a margin"
+        if np.isfinite(scale.low):
+            text = f"least clearance {number(scale.low, map_raster.SCALE_DIGITS, 'mm')} everywhere"
+        return _key(axes, y, [Patch(facecolor=shade, edgecolor="black", label=f"{safe}{text}")])
     shades, box = safe_shades(np.linspace(0, 1, 256))[None], (0.0, 1.0, y + 0.025, y)
     axes.imshow(shades, extent=box, aspect="auto", interpolation="bilinear")
     axes.add_patch(Rectangle((0.0, y), 1.0, 0.025, fill=False, lw=0.8, clip_on=False))
     for x, text, ha in (
-        (0.0, number(scale.low, SCALE_DIGITS, "mm"), "left"),
+        (0.0, number(scale.low, map_raster.SCALE_DIGITS, "mm"), "left"),
         (0.5, f"{safe}by least clearance", "center"),
-        (1.0, number(scale.high, SCALE_DIGITS, "mm"), "right"),
+        (1.0, number(scale.high, map_raster.SCALE_DIGITS, "mm"), "right"),
     ):
         axes.text(x, y + 0.03, text, fontsize=SMALL, ha=ha, va="top")
     return y + 0.045 + GAP
 
 
-def _even_text(scale: ClearanceScale) -> str:
-    """Text for what one shade means."""
-    if not np.isfinite(scale.low):
-        return "no structure has a margin"
-    return f"least clearance {number(scale.low, SCALE_DIGITS, 'mm')} everywhere"
-
-
-PALE: Rgb = (205, 235, 220)
-"""Below the legend's hatching."""
+PALE: Rgb = (205, 235, 220)  # below the legend's hatching
 
 
 def _chance_key(axes: Axes, candidates: Candidates, y: float) -> float:
-    """What hatching and lines mean; nothing without chances."""
-    if touch_nothing(candidates) is None:
+    if map_disc.touch_nothing(candidates) is None:
         return y
-    text = (f"< {LEVELS[0]:g}", *(f"{low:g}–{high:g}" for low, high in pairwise(LEVELS)), f"> {LEVELS[-1]:g}")
+    low, *_, high = map_disc.LEVELS
+    text = (f"< {low:g}", *(f"{a:g}–{b:g}" for a, b in pairwise(map_disc.LEVELS)), f"> {high:g}")
     hatched = [
-        Patch(facecolor=css(PALE), edgecolor=HATCH_INK, hatch=hatch, label=name)
-        for name, hatch in zip(text, HATCHES, strict=True)
+        Patch(facecolor=css(PALE), edgecolor=map_disc.HATCH_INK, hatch=hatch, label=name)
+        for name, hatch in zip(text, map_disc.HATCHES, strict=True)
     ]
-    lines = [
-        Line2D([], [], color="black", ls=style, label=f"at {level:g}")
-        for level, style in zip(LEVELS, STYLES, strict=True)
-    ]
+    levels = zip(map_disc.LEVELS, map_disc.STYLES, strict=True)
+    lines = [Line2D([], [], color="black", ls=style, label=f"at {level:g}") for level, style in levels]
     by_column = [one for pair in zip_longest(hatched, lines) for one in pair if one is not None]
     return _key(axes, y, by_column, "chance to touch no structure to avoid: hatched, and lines", ncols=len(hatched))
 
@@ -222,8 +183,9 @@ def _chance_key(axes: Axes, candidates: Candidates, y: float) -> float:
 def _mark_key(axes: Axes, candidates: Candidates, view: MapView, y: float) -> float:
     if not candidates.safe.any():
         return y
-    marks, front = [(CHOSEN, "chosen"), (BEST, "best of a window")], shown_front(candidates, view)
-    marks += [(FRONT, front.text)] if front.of else []
+    marks = [(map_disc.CHOSEN, "chosen"), (map_disc.BEST, "best of a window")]
+    front = map_raster.shown_front(candidates, view)
+    marks += [(map_disc.FRONT, front.text)] if front.of else []
     handles = [Line2D([], [], ls="none", label=text, **mark) for mark, text in marks]
     return _key(axes, y, handles, ncols=3, handlelength=1.2)
 
@@ -239,20 +201,14 @@ def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float, sca
     else:
         word = "Best" if pick == candidates.best else "Chosen"
         found, row = pick
-        theta, beta = np.degrees(found.theta[row]), np.degrees(found.beta[row])
+        theta, beta, known, chances = np.degrees(found.theta[row]), np.degrees(found.beta[row]), "", found.chances
+        if chances is not None and np.isfinite(chances.hit[row]):
+            hit, touch = chance_text(float(chances.hit[row])), chance_text(float(chances.touch_any[row]))
+            known = f"; p(hit) {hit}, p(touch) {touch}{'' if chances.refined[row] else ' to first order'}"
         text = (
-            f"{word}: θ {theta:.4g}°, β {beta:.4g}°{_chances(found, row)}\n"
-            f"path in the body {length_text(float(found.path.length[row]), scan)}, "
+            f"{word}: θ {theta:.4g}°, β {beta:.4g}°{known}\n"
+            f"path in the body {numbers.length_text(float(found.path.length[row]), scan)}, "
             f"skin angle {number(float(np.degrees(found.path.skin_angle[row])), 0)}°\n"
-            f"{nearest_text(found, row, scan)}"
+            f"{numbers.nearest_text(found, row, scan)}"
         )
     axes.text(0.017, y + 0.008, text, **look)
-
-
-def _chances(candidates: Candidates, row: int) -> str:
-    """The chosen direction's chances, to follow it; nothing where there are none."""
-    chances = candidates.chances
-    if chances is None or not np.isfinite(chances.hit[row]):
-        return ""
-    hit, touch = chance_text(float(chances.hit[row])), chance_text(float(chances.touch_any[row]))
-    return f"; p(hit) {hit}, p(touch) {touch}{'' if chances.refined[row] else ' to first order'}"

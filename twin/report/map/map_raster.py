@@ -1,8 +1,7 @@
-"""The map as pixels: every pixel asks which grid cell it lies in, so no gap and no moire can arise.
+"""The map as pixels, each of which asks which grid cell it lies in: no gap and no moire can arise.
 
-It is finer than anything that shows it, which smooths the cells' borders.
-
-The Pareto front on the map: hundreds of dots hide the shades below, so a large front is thinned, and says so.
+It is finer than anything that shows it, which smooths the cells' borders. A large Pareto front is thinned, and says so:
+hundreds of dots would hide the shades below.
 """
 
 from __future__ import annotations
@@ -22,38 +21,24 @@ from puncture_twin.twin.report.palette import safe_shades
 PIXELS = 1120
 """Side of the raster that picture and page share: twice as fine as the page shows it, finer than the picture does."""
 
-SCALE_DIGITS = 1
-"""Of the scale's ends, mm; where both print as one number, shades between them would show nothing."""
-
-EVEN_SHADE = 0.5
-"""The shade of such a map, 0..1: neither that of the least clearance nor that of the greatest."""
-
+SCALE_DIGITS = 1  # of the scale's ends, mm; where both print as one number, shades between them would show nothing
+EVEN_SHADE = 0.5  # the shade of such a map, 0..1: neither that of the least clearance nor that of the greatest
 HATCH: Rgb = (235, 235, 235)
 HATCH_AIR: Rgb = (95, 95, 95)
 NOT_SEARCHED, HATCH_NOT_SEARCHED = (255, 255, 255), (205, 205, 205)
-HATCHES, HATCH_LEAST = 80, 5
-"""Lines across the picture, and pixels between two of them at least."""
+HATCHES, HATCH_LEAST = 80, 5  # lines across the picture, and pixels between two of them at least
 
 
 @dataclass(frozen=True, eq=False)
 class MapRaster:
-    """The square picture of the cap; row 0 is the top.
-
-    Attributes:
-        rgba: Shape (n, n, 4), transparent outside the grid.
-        rows: Shape (n, n), the candidate under each pixel's centre, -1 outside the grid.
-    """
+    """The square picture of the cap, (n, n, 4), clear outside the grid; and each pixel's candidate, (n, n), or -1."""
 
     rgba: NDArray[np.uint8]
     rows: NDArray[np.int64]
 
 
 class ClearanceScale(NamedTuple):
-    """The clearances that the shades of safe stand for, mm.
-
-    Attributes:
-        high: Of the darkest; infinite, as ``low`` is, where no structure has a margin.
-    """
+    """The clearances that the shades of safe stand for, mm, `high` the darkest; infinite where nothing has a margin."""
 
     low: float
     high: float
@@ -104,11 +89,7 @@ def map_raster(candidates: Candidates, view: MapView, size: int = PIXELS) -> Map
 
 
 def _hatch(rgba: NDArray[np.uint8], rows: NDArray[np.int64], candidates: Candidates) -> None:
-    """Lines over what is not known, in place: its grey alone is near the green of safe for the colour-blind.
-
-    They rise over what is unknown in the body, fall over what is unknown beside it, and lie within the disc where
-    nobody looked.
-    """
+    """Lines over what is unknown, in place: rising in the body, falling beside it, others where nobody looked."""
     unknown, air = candidates.verdict.reason == Reason.UNKNOWN_REGION.value, candidates.unseen_air
     line, column = np.arange(len(rows))[:, None], np.arange(len(rows))
     middle = (len(rows) - 1) / 2
@@ -123,9 +104,7 @@ def _hatch(rgba: NDArray[np.uint8], rows: NDArray[np.int64], candidates: Candida
         rgba[where & (phase % period < max(1, period // 5)), :3] = colour
 
 
-MOST_DOTS = 40
-"""A front of up to so many directions is shown whole."""
-
+MOST_DOTS = 40  # a front of up to so many directions is shown whole
 SPACING, WIDER = 0.04, 1.25
 """Of a thinned front, in the map's radii: the least distance of two dots, and its growth while they are too many."""
 
@@ -135,12 +114,7 @@ SAME = 1e-6
 
 
 class ShownFront(NamedTuple):
-    """The dots.
-
-    Attributes:
-        rows: Shape (k,), the candidates that get one, best rank first.
-        of: How many different directions are on the front.
-    """
+    """The candidates (k,) that get a dot, best rank first, and of how many different directions on the front."""
 
     rows: Ints
     of: int

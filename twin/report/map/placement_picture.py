@@ -37,14 +37,9 @@ NOTHING: tuple[float, float, float] = (0.9, 0.9, 0.9)
 SEEN_FROM_ABOVE = (1, 0)
 """The bed's axes to the right and up: across, along. The first runs to the left, as seen from above."""
 
-EDGE_CELLS = 1.6
-"""White about the cells of the widest panel, for the body directions."""
-
+EDGE_CELLS = 1.6  # white about the cells of the widest panel, for the body directions
 TICKS_MM = 500.0
-
-ALL_OF_IT = 1.0 - 5e-4
-"""A fraction that is printed as the whole."""
-
+ALL_OF_IT = 1.0 - 5e-4  # a fraction that is printed as the whole
 HALO = halo(2.5)
 SAME_AXIS = 0.94
 """Cosine from which the case's own base axis is a panel's (20 degrees)."""
@@ -52,19 +47,23 @@ SAME_AXIS = 0.94
 
 def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Path) -> None:
     """Write the map of fractions over position."""
-    panels = _panels(found)
+    of_panel: dict[str, list[Region]] = defaultdict(list)  # the two rails share one
+    for region in dict.fromkeys(site.region for site, _ in found.coarse):
+        of_panel["rail" if region.mount == "rail" else region.name].append(region)
+    panels = list(of_panel.values())
     columns = min(MOST_COLUMNS, len(panels) + 1)
     rows = -(-(len(panels) + 1) // columns)
     figure = Figure(figsize=(columns * PANEL_INCHES, rows * PANEL_INCHES + 1.0), dpi=DPI, facecolor="white")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     top = max((e.fraction for _, e in found.coarse), default=0.0)
     scale = Normalize(0.0, max(top, max((one.verdict.fraction for one in found.rated), default=0.0), 0.01))
-    extent = _extent(found, float(case.place.step_mm))
+    points = np.array([site.position for site, _ in found.coarse])[:, SEEN_FROM_ABOVE]
+    edge = EDGE_CELLS * float(case.place.step_mm)
+    low, high = (points.min(axis=0) - edge).tolist(), (points.max(axis=0) + edge).tolist()
     for axes, regions in zip(grid, panels, strict=False):
         _panel(axes, regions, found, case, scale)
         _bed(axes, found, case, skin)
-        axes.set_xlim(extent[:2])
-        axes.set_ylim(extent[2:])
+        axes.set(xlim=(high[0], low[0]), ylim=(low[1], high[1]))
     _legend(grid[len(panels)], figure, found, case, scale)
     for axes in grid[len(panels) + 1 :]:
         axes.set_axis_off()
@@ -75,20 +74,6 @@ def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Pat
     write_png(figure, path)
 
 
-def _panels(found: PlaceSearch) -> list[list[Region]]:
-    """The regions of each panel: the two rails share one."""
-    panels: dict[str, list[Region]] = defaultdict(list)
-    for region in dict.fromkeys(site.region for site, _ in found.coarse):
-        panels["rail" if region.mount == "rail" else region.name].append(region)
-    return list(panels.values())
-
-
-def _extent(found: PlaceSearch, step: float) -> tuple[float, float, float, float]:
-    points = np.array([site.position for site, _ in found.coarse])[:, SEEN_FROM_ABOVE]
-    low, high = points.min(axis=0) - EDGE_CELLS * step, points.max(axis=0) + EDGE_CELLS * step
-    return float(high[0]), float(low[0]), float(low[1]), float(high[1])
-
-
 def _panel(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any, scale: Normalize) -> None:
     best: dict[tuple[float, float], float] = {}
     for site, estimate in found.coarse:
@@ -96,8 +81,7 @@ def _panel(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any,
             key = site.position[:2]
             best[key] = max(best.get(key, 0.0), estimate.fraction)
     step = float(case.place.step_mm)
-    for key, fraction in best.items():
-        y, x = key
+    for (y, x), fraction in best.items():
         colour = SHADES(scale(fraction)) if fraction > 0 else NOTHING
         axes.add_patch(Rectangle((x - step / 2, y - step / 2), step, step, facecolor=colour, edgecolor="none"))
     space = str(case.space)
@@ -105,8 +89,8 @@ def _panel(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any,
     axes.set_title(text, fontsize=10.5, fontweight="bold")
     axes.set_aspect("equal")
     axes.tick_params(labelsize=8)
-    axes.xaxis.set_major_locator(MultipleLocator(TICKS_MM))
-    axes.yaxis.set_major_locator(MultipleLocator(TICKS_MM))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MultipleLocator(TICKS_MM))
     axes.set_xlabel("across, mm", fontsize=8)
     axes.set_ylabel("along, mm", fontsize=8)
     _directions(axes, found, space)
@@ -114,20 +98,18 @@ def _panel(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any,
 
 
 def _directions(axes: Axes, found: PlaceSearch, space: str) -> None:
-    """Body directions at the panel's edges; the ticks are mm from the target."""
     R = found.T_ct_bed[:3, :3]
-    places = ((R[:, 0], 0.5, 0.985, "top"), (-R[:, 0], 0.5, 0.015, "bottom"))
-    for direction, x, y, side in places:
-        text = direction_text(direction, space)
-        axes.text(x, y, text, transform=axes.transAxes, ha="center", va=side, fontsize=9, path_effects=HALO, zorder=8)
-    for direction, x, turn in ((R[:, 1], 0.015, 90), (-R[:, 1], 0.985, -90)):
-        text, side = direction_text(direction, space), "left" if x < 0.5 else "right"
-        look: dict[str, Any] = {"fontsize": 9, "path_effects": HALO, "zorder": 8}
-        axes.text(x, 0.5, text, transform=axes.transAxes, ha=side, va="center", rotation=turn, **look)
+    look: dict[str, Any] = {"fontsize": 9, "path_effects": HALO, "zorder": 8, "transform": axes.transAxes}
+    for direction, x, y, ha, va, turn in (
+        (R[:, 0], 0.5, 0.985, "center", "top", 0),
+        (-R[:, 0], 0.5, 0.015, "center", "bottom", 0),
+        (R[:, 1], 0.015, 0.5, "left", "center", 90),
+        (-R[:, 1], 0.985, 0.5, "right", "center", -90),
+    ):
+        axes.text(x, y, direction_text(direction, space), ha=ha, va=va, rotation=turn, **look)
 
 
-LABELS_ALONG_MM, LABELS_ACROSS_MM = 200.0, 900.0
-"""Nearer marks have the upper one's label above it."""
+LABELS_ALONG_MM, LABELS_ACROSS_MM = 200.0, 900.0  # nearer marks have the upper one's label above it
 
 
 def _marks(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any) -> None:
@@ -158,13 +140,11 @@ def _mark(axes: Axes, x: float, y: float, shape: str, text: str, *, above: bool 
     size = 230 if shape == "*" else 60
     axes.scatter([x], [y], s=size, marker=shape, c="white", edgecolors="black", linewidths=1.3, zorder=9)
     offset, align = ((0, 8 if above else -15), "center") if shape != "D" else ((8, -3), "left")
-    axes.annotate(
-        text, (x, y), offset, textcoords="offset points", ha=align, fontsize=8.5, path_effects=HALO, zorder=10
-    )
+    look: dict[str, Any] = {"ha": align, "fontsize": 8.5, "path_effects": HALO, "zorder": 10}
+    axes.annotate(text, (x, y), offset, textcoords="offset points", **look)
 
 
 def _bed(axes: Axes, found: PlaceSearch, case: Any, skin: TriangleMesh) -> None:
-    """Outlines of the patient, of the boxes beside them, and of the gantry; the target."""
     T_bed_ct = np.linalg.inv(found.T_ct_bed)
     carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
     parts: dict[str, list[Floats]] = defaultdict(list)

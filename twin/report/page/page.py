@@ -21,52 +21,19 @@ from puncture_twin.planning.geometry.spaces import to_lps
 from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, chance_text
-from puncture_twin.twin.report import patient
+from puncture_twin.twin.report import numbers, patient, present
 from puncture_twin.twin.report.error_pictures import budget_png, rehearsal_png
 from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.map_view import step_of
-from puncture_twin.twin.report.numbers import (
-    TRUTH_IS_BELIEF,
-    demanding,
-    expected_text,
-    length_text,
-    nearest_text,
-    needle_text,
-    reason_counts,
-    target_text,
-)
 from puncture_twin.twin.report.page.page_map import map_data, picked_row
 from puncture_twin.twin.report.page.page_scene import arm_data, scene_figure
 from puncture_twin.twin.report.page.page_slices import slices_data
-from puncture_twin.twin.report.page.template import (
-    Card,
-    base64_text,
-    plotly_script,
-    script_json,
-    write_html,
-)
-from puncture_twin.twin.report.present import (
-    PROJECT,
-    Block,
-    Warn,
-    blocks_html,
-    inputs_table,
-    number,
-    origin_section,
-    percent,
-    picture,
-)
+from puncture_twin.twin.report.page.template import Card, base64_text, plotly_script, script_json, write_html
 from puncture_twin.twin.report.slices.panel import TONES, Subject
 
 
 class Uncertainty(NamedTuple):
-    """What a page says of chances.
-
-    Attributes:
-        breakdown: Of the chosen direction, or None where it has no chances.
-        rooms: A `Distribution` as plain values, or None.
-        budget: Of the chosen direction, as ``register --json`` has it, or None.
-    """
+    """What a page says of chances; `breakdown` and `budget` are of the chosen direction, `rooms` a `Distribution`'s."""
 
     breakdown: UncertaintyBreakdown | None
     rooms: Mapping[str, Any] | None = None
@@ -79,17 +46,15 @@ class Shown:
     """What a page shows.
 
     Attributes:
-        film: Name of the rehearsal's film, which lies beside the page and is linked; None without one.
-        uncertainty: What there is to say of chances and rooms; None where the case declares no errors.
+        film: Name of the rehearsal's film, which lies beside the page and is linked.
+        uncertainty: None where the case declares no errors.
         pick: The planned candidate, or the one to be shown; None shows the best.
-        subject: What the slices show first; None where there is no direction at all.
+        subject: What the slices show first.
         T_base_ct: Shape (4, 4), mm, where the arm was checked; else None.
-        regions_ct: Shape (n, 3, 3), mm^2: of the tip, as `CaseContext.regions_ct`; None without declared errors.
+        regions_ct: Shape (n, 3, 3), mm^2: of the tip, as `CaseContext.regions_ct`.
         facts: How the planned or shown path is found at the patient.
-        refusal: Why there is no plan although one was requested; "" where none was.
-        raster: The map's pixels where somebody has them already.
-        notes: What else must be known of the plan, one sentence each.
-        failures: Why the rehearsal's answer is no, one sentence each.
+        refusal: Why there is no plan although one was requested.
+        notes: What else must be known of the plan; `failures` say why the rehearsal's answer is no.
     """
 
     case: Any
@@ -119,57 +84,60 @@ class Shown:
 def write_page(shown: Shown, path: Path) -> None:
     """Write the page; it appears whole or not at all."""
     case, found, plan, done = shown.case, shown.candidates, shown.plan, shown.rehearsal
-    at_patient = () if shown.facts is None else shown.facts.rows()
-    declared = shown.uncertainty is not None
-    write_html(
-        "report.html",
-        path,
-        title=f"{case.name}: puncture of {target_text(case)}",
-        stands=_location(case),
-        dates=dates_text(case),
-        needle=needle_text(case),
-        tones=() if shown.anatomy.scan is None else tuple(TONES),
-        methods=methods_text(case, shown.anatomy, found),
-        notice=TRUTH_IS_BELIEF if done is not None and done.truth_is_belief else "",
-        refused=_refused(found),
-        cards=_cards(shown),
-        counts=blocks_html(patient.counts(found)),
-        best=blocks_html(patient.windows(found, shown.anatomy.scan)),
-        plan=blocks_html(patient.plan(plan, at_patient, shown.refusal, declared=declared, notes=shown.notes)),
-        planned="Plan" if plan is not None or shown.refusal else "The best path at the patient",
-        registration=blocks_html(patient.registration(shown.registration)) if shown.registration else "",
-        rehearsal="" if done is None else blocks_html(_rehearsed(done, shown)),
-        study=scan_date(case),
-        warnings=_doubts(found, shown.anatomy),
-        inputs=inputs_table(case.inputs),
-        origin=origin_section(case.rehearsal.seed if plan is None else plan.seed),
-        **_drawn(shown),
-        plotly=plotly_script(),
-        **_uncertain_sections(shown.uncertainty, shown.registration),
-    )
-
-
-def _drawn(shown: Shown) -> dict[str, Any]:
-    """What the page's scripts draw: map, scene and slices."""
-    case, pick, found = shown.case, shown.chosen, shown.candidates
+    at_patient, away = () if shown.facts is None else shown.facts.rows(), numbers.demanding(shown.anatomy)
+    declared, pick, scan = shown.uncertainty is not None, shown.chosen, shown.anatomy.scan
+    point = ", ".join(f"{mm:.1f}" for mm in to_lps(np.asarray(case.target_ct)[None], case.space)[0])
+    warned = (*(one.sentence for one in found.findings), *shown.anatomy.warnings)
+    noted = tuple(one.sentence for one in shown.anatomy.findings if one.severity is Severity.NOTE)
+    refused = ""
+    if not found.safe.any():
+        counts = ", ".join(f"{k.replace('_', ' ')}: {v:,}" for k, v in found.counts().items())
+        refused = f"{plural(len(found), 'direction')} searched, all rejected ({counts})."
+    rehearsed: list[present.Block] = []
+    if done is not None:
+        alt = "True tip to true target, and true needle to true structures, over time"
+        curves = present.picture(rehearsal_png(done, away), alt)
+        rehearsed = [*patient.rehearsal(done, away, shown.film, shown.failures), curves]
     subject = shown.subject or Subject(case, shown.anatomy, pick or Pick(found, 0))
     slices, ct, surfaces = slices_data(subject, found, picked_row(found, pick), shown.regions_ct)
     data = {
         "map": map_data(case, found, pick, shown.raster),
-        "scene": scene_figure(case, shown.anatomy, found, shown.plan, pick, shown.T_base_ct),
-        "arm": arm_data(case, found, shown.plan, pick, shown.T_base_ct),
+        "scene": scene_figure(case, shown.anatomy, found, plan, pick, shown.T_base_ct),
+        "arm": arm_data(case, found, plan, pick, shown.T_base_ct),
         "slices": slices,
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),
     }
-    return {"data": script_json(data), "ct": base64_text(ct), "surfaces": base64_text(surfaces)}
-
-
-def _rehearsed(rehearsal: Any, shown: Shown) -> list[Block]:
-    """The rehearsal's numbers, and its curves over time."""
-    alt, away = "True tip to true target, and true needle to true structures, over time", demanding(shown.anatomy)
-    curves = picture(rehearsal_png(rehearsal, away), alt)
-    return [*patient.rehearsal(rehearsal, away, shown.film, shown.failures), curves]
+    write_html(
+        "report.html",
+        path,
+        title=f"{case.name}: puncture of {numbers.target_text(case)}",
+        stands=f"Case {case.name}; target {numbers.target_text(case)} at ({point}) mm {case.space};",
+        dates=dates_text(case),
+        needle=numbers.needle_text(case),
+        tones=() if scan is None else tuple(TONES),
+        methods=methods_text(case, shown.anatomy, found),
+        notice=numbers.TRUTH_IS_BELIEF if done is not None and done.truth_is_belief else "",
+        refused=refused,
+        cards=_cards(shown),
+        counts=present.blocks_html(patient.counts(found)),
+        best=present.blocks_html(patient.windows(found, scan)),
+        plan=present.blocks_html(patient.plan(plan, at_patient, shown.refusal, declared=declared, notes=shown.notes)),
+        planned="Plan" if plan is not None or shown.refusal else "The best path at the patient",
+        registration=present.blocks_html(patient.registration(shown.registration)) if shown.registration else "",
+        rehearsal=present.blocks_html(rehearsed) if rehearsed else "",
+        study=scan_date(case),
+        warnings=present.blocks_html(
+            [present.Warn(warned) if warned else Markup("<p>None.</p>"), present.Warn(noted, f"Notes ({len(noted)})")]
+        ),
+        inputs=present.inputs_table(case.inputs),
+        origin=present.origin_section(case.rehearsal.seed if plan is None else plan.seed),
+        data=script_json(data),
+        ct=base64_text(ct),
+        surfaces=base64_text(surfaces),
+        plotly=plotly_script(),
+        **_uncertain_sections(shown.uncertainty, shown.registration),
+    )
 
 
 def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -179,39 +147,24 @@ def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[s
     facts, tips = uncertainty.budget, uncertainty.picture
     costs = "Error sources, and the effect of single changes"
     budget = patient.budget(facts)
-    budget[1:1] = [] if facts is None else [picture(budget_png(facts), costs)]
+    budget[1:1] = [] if facts is None else [present.picture(budget_png(facts), costs)]
     rooms = patient.rooms(uncertainty.rooms)
     if rooms and tips is not None:
-        rooms.append(picture(tips, "Tips of all trials in the frame of the needle"))
+        rooms.append(present.picture(tips, "Tips of all trials in the frame of the needle"))
     return {
-        "chances": blocks_html(patient.chances(uncertainty.breakdown, registration)),
-        "budget": blocks_html(budget) if budget else None,
-        "rooms": blocks_html(rooms),
+        "chances": present.blocks_html(patient.chances(uncertainty.breakdown, registration)),
+        "budget": present.blocks_html(budget) if budget else None,
+        "rooms": present.blocks_html(rooms),
     }
-
-
-def _doubts(candidates: Candidates, anatomy: Any) -> Markup:
-    """What could not be known, and, folded, what was noted besides."""
-    warned = (*(one.sentence for one in candidates.findings), *anatomy.warnings)
-    noted = tuple(one.sentence for one in anatomy.findings if one.severity is Severity.NOTE)
-    return blocks_html([Warn(warned) if warned else Markup("<p>None.</p>"), Warn(noted, f"Notes ({len(noted)})")])
 
 
 def chance_card(breakdown: UncertaintyBreakdown, of: str) -> Card:
     """Both chances and the expected error of a direction, for the top of the page."""
     detail = (
         f"{of}; touches a structure to avoid {chance_text(breakdown.p_touch_any)}; expected tip error "
-        f"{number(breakdown.budget.rms_mm, 2, 'mm')} (rms); not modelled: {breakdown.not_modelled}"
+        f"{present.number(breakdown.budget.rms_mm, 2, 'mm')} (rms); not modelled: {breakdown.not_modelled}"
     )
     return Card("chance to hit", chance_text(breakdown.p_hit), detail)
-
-
-def _refused(candidates: Candidates) -> str:
-    """What stands in place of the cards where nothing is safe; "" where something is."""
-    if candidates.safe.any():
-        return ""
-    counts = ", ".join(f"{k.replace('_', ' ')}: {v:,}" for k, v in candidates.counts().items())
-    return f"{plural(len(candidates), 'direction')} searched, all rejected ({counts})."
 
 
 def _cards(shown: Shown) -> list[Card]:
@@ -222,7 +175,11 @@ def _cards(shown: Shown) -> list[Card]:
     cards = [] if breakdown is None or shown.chosen is None else [chance_card(breakdown, _angles(*shown.chosen))]
     cards.append(_window_card(candidates))
     if shown.chosen is not None:
-        cards.append(_direction_card(*shown.chosen, shown.anatomy.scan, best=shown.chosen == candidates.best))
+        (found, row), scan = shown.chosen, shown.anatomy.scan
+        path = numbers.length_text(float(found.path.length[row]), scan)
+        detail = f"{path} in the body; {numbers.nearest_text(found, row, scan)}"
+        name = "best direction" if shown.chosen == candidates.best else "chosen direction"
+        cards.append(Card(name, _angles(found, row), detail))
     if not candidates.arm_checked:
         cards.append(Card("arm", "not checked", candidates.arm_note.removeprefix("not checked: ")))
     if shown.plan is None:
@@ -231,10 +188,10 @@ def _cards(shown: Shown) -> list[Card]:
     if rehearsal is not None:
         touched = len(rehearsal.contacts)
         detail = plural(touched, "contact") if touched else "no contact"
-        expected = f"expected (rms) {expected_text(rehearsal.predicted_error_mm)}; {detail}"
+        expected = f"expected (rms) {numbers.expected_text(rehearsal.predicted_error_mm)}; {detail}"
         if rehearsal.standing is not None:
             expected = f"{rehearsal.standing.text}; {expected}"
-        cards.append(Card("rehearsed tip error", number(rehearsal.tip_error_mm, 2, "mm"), expected))
+        cards.append(Card("rehearsed tip error", present.number(rehearsal.tip_error_mm, 2, "mm"), expected))
     return cards
 
 
@@ -243,24 +200,12 @@ def _window_card(candidates: Candidates) -> Card:
     windows = candidates.windows
     largest = windows.largest
     value, wide = ("", "") if largest is None else (f"{largest.entry_cm2:.1f} cm²", f"{largest.wide_deg:.0f}° wide")
-    solid = percent(next(line.solid_angle for line in reason_counts(candidates) if line.code == "safe"))
+    solid = present.percent(next(line.solid_angle for line in numbers.reason_counts(candidates) if line.code == "safe"))
     return Card(
         "safe directions" if candidates.arm_checked else f"directions {candidates.safe_text}",
         value,
         f"the largest window on the skin, {wide}; in {plural(len(windows), 'window')} {solid} of the solid angle",
     )
-
-
-def _location(case: Any) -> str:
-    """Case, space and target in the coordinates that the case is written in."""
-    point = ", ".join(f"{mm:.1f}" for mm in to_lps(np.asarray(case.target_ct)[None], case.space)[0])
-    return f"Case {case.name}; target {target_text(case)} at ({point}) mm {case.space};"
-
-
-def _direction_card(candidates: Candidates, row: int, scan: Any | None, *, best: bool) -> Card:
-    path = length_text(float(candidates.path.length[row]), scan)
-    detail = f"{path} in the body; {nearest_text(candidates, row, scan)}"
-    return Card("best direction" if best else "chosen direction", _angles(candidates, row), detail)
 
 
 def _angles(candidates: Candidates, row: int) -> str:
@@ -271,52 +216,37 @@ def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
     """What was checked, by what, and what was not."""
     theta, step = np.degrees(candidates.theta), np.degrees(step_of(candidates))
     checked = sum(1 for one in anatomy.checked if str(one.role) in {"avoid", "unknown"})
-    arm_name = case.robot.model.name.upper()
-    arm = (
-        f"For each remaining direction it was checked whether a {arm_name} reaches it and inserts the "
-        "needle without contact."
-        if candidates.arm_checked
-        else "The arm was not checked."
-    )
-    chances = (
-        "Chances to hit and to touch were propagated from the declared errors of markers, touches and arm."
-        if candidates.chances is not None and np.isfinite(candidates.chances.hit).any()
-        else "No chances were computed: they need declared errors, markers, and the arm."
-    )
+    arm = "The arm was not checked."
+    chances = "No chances were computed: they need declared errors, markers, and the arm."
+    if candidates.arm_checked:
+        arm = f"For each remaining direction it was checked whether a {case.robot.model.name.upper()} reaches it and "
+        arm += "inserts the needle without contact."
+    if candidates.chances is not None and np.isfinite(candidates.chances.hit).any():
+        chances = "Chances to hit and to touch were propagated from the declared errors of markers, touches and arm."
+    moving = "Breathing, needle bending and tissue motion were not modelled."
+    if case.breathing is not None or case.bending is not None:
+        breath, needle = "Breathing was not modelled.", "Needle bending was not modelled."
+        if (one := case.breathing) is not None:
+            breath = (
+                f"Breathing was taken as a motion of {one.amplitude_mm:g} mm along one line after Lujan et al. 1999 "
+                f"(exponent {one.exponent}, {len(one.positions)} positions), each structure with a weight of its own: "
+                f"a safe direction is safe {one.window_text}; a needle in place moves with the organ and bends."
+            )
+        if case.bending is not None:
+            needle = (
+                "The needle was taken as a beam in an elastic foundation whose bevel cuts "
+                f"{np.degrees(case.bending.alpha):g}° off its direction (Webster et al. 2006); its greatest deflection "
+                "to any side was kept as clearance."
+            )
+        moving = f"{breath} {needle} The deformation of tissue was not modelled."
+    program = f"{present.PROJECT} {version(present.PROJECT)}"
     return (
-        f"Straight needle paths to the target were searched with {PROJECT} {version(PROJECT)} over {len(candidates):,} "
-        f"entry directions, θ {theta.min():g}° to {theta.max():g}° and every azimuth β of the case, in steps of "
-        f"{step:g}° (angles as in Chen et al. 2019, Eq. 10-15; {needle_text(case)}). For each direction the distance "
-        f"between the needle and each of {checked} structures to keep away from was computed exactly on their triangle "
-        f"meshes and compared with the structure's margin; a direction through a region that the images or labels do "
-        f"not show was rejected as unknown. {arm} {chances} Every input is listed below with its SHA-256. "
-        + _left_out(case)
-    )
-
-
-def _left_out(case: Any) -> str:
-    """What was not modelled, and what was of breath and needle."""
-    if case.breathing is None and case.bending is None:
-        return "Breathing, needle bending and tissue motion were not modelled."
-    return " ".join([_breath(case.breathing), _needle(case.bending), "The deformation of tissue was not modelled."])
-
-
-def _breath(breath: Any) -> str:
-    if breath is None:
-        return "Breathing was not modelled."
-    return (
-        f"Breathing was taken as a motion of {breath.amplitude_mm:g} mm along one line after Lujan et al. 1999 "
-        f"(exponent {breath.exponent}, {len(breath.positions)} positions), each structure with a weight of its own: a "
-        f"safe direction is safe {breath.window_text}; a needle in place moves with the organ and bends."
-    )
-
-
-def _needle(bending: Any) -> str:
-    if bending is None:
-        return "Needle bending was not modelled."
-    return (
-        f"The needle was taken as a beam in an elastic foundation whose bevel cuts {np.degrees(bending.alpha):g}° off "
-        "its direction (Webster et al. 2006); its greatest deflection to any side was kept as clearance."
+        f"Straight needle paths to the target were searched with {program} over {len(candidates):,} entry directions, "
+        f"θ {theta.min():g}° to {theta.max():g}° and every azimuth β of the case, in steps of {step:g}° (angles as in "
+        f"Chen et al. 2019, Eq. 10-15; {numbers.needle_text(case)}). For each direction the distance between the "
+        f"needle and each of {checked} structures to keep away from was computed exactly on their triangle meshes and "
+        "compared with the structure's margin; a direction through a region that the images or labels do not show was "
+        f"rejected as unknown. {arm} {chances} Every input is listed below with its SHA-256. {moving}"
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,8 +20,7 @@ from puncture_twin.twin.report.page.template import image_address
 from puncture_twin.twin.report.palette import PNG_LEVEL
 from puncture_twin.twin.report.slices.panel import MOST_NEAR, NEAR_MM
 
-PIXELS = FINE // 2
-"""Side of the map on the page, CSS pixels; the picture is twice as fine for sharp screens."""
+PIXELS = FINE // 2  # side of the map on the page, CSS pixels; the picture is twice as fine for sharp screens
 
 DETAIL_UNITS = {
     Reason.TOO_CLOSE: ("clearance", "mm"),
@@ -77,7 +75,7 @@ def map_data(case: Any, candidates: Candidates, pick: Pick | None, raster: MapRa
         "arm": candidates.arm_note,
         **_directions(parts),
         "outcome": "plan" if candidates.arm_checked else "check",
-        "file": _typed(case.path),
+        "file": shlex.quote(str(case.path.parent.resolve() / case.path.name)),  # a link keeps its name
         "space": str(case.space),
         "picked": picked,
         "first": picked if picked >= 0 else closest_miss(candidates) or 0,
@@ -109,7 +107,6 @@ def _directions(parts: Sequence[tuple[Candidates, Ints, Ints]]) -> dict[str, Any
 def _columns(
     found: Candidates, rows: Ints, window: Ints, structures: list[str], reasons: list[str], sentences: list[str]
 ) -> dict[str, list[Any]]:
-    """The columns of some rows."""
     verdict, path, arm = found.verdict.of(rows), found.path, found.arm
     index = {name: i for i, name in enumerate(structures)}
     columns = {
@@ -140,10 +137,7 @@ def _columns(
 
 
 def _near(found: Candidates, rows: Ints, index: dict[str, int]) -> list[list[float]]:
-    """Of every row the structures with a margin near the needle, nearest first: place, mm, place, mm, and so on.
-
-    As `Subject.near`; at least the nearest, however far it is.
-    """
+    """As `Subject.near`, of every row: place, mm, place, mm, and so on; at least the nearest, however far it is."""
     demanding = np.flatnonzero(np.isfinite(found.clearance.margins))
     distance = found.clearance.distance[np.ix_(rows, demanding)]
     order = np.argsort(distance, axis=1, kind="stable")[:, :MOST_NEAR]
@@ -156,11 +150,6 @@ def _near(found: Candidates, rows: Ints, index: dict[str, int]) -> list[list[flo
     ]
 
 
-def _typed(path: Path) -> str:
-    """A file as a shell takes it, from whatever folder; a link keeps its name, for its folder is what counts."""
-    return shlex.quote(str(path.parent.resolve() / path.name))
-
-
 def map_raster_rows(rows: Any) -> list[int]:
     """Run lengths of a table of integers, flattened: [value, length, value, length, ...]."""
     flat = np.asarray(rows).ravel()
@@ -171,7 +160,6 @@ def map_raster_rows(rows: Any) -> list[int]:
 
 
 def _rounded(values: Any, digits: int) -> list[float | None]:
-    """JSON-ready numbers; what is not finite becomes null."""
     values = np.asarray(values, dtype=float)
     rounded: list[float | None] = np.round(values, digits).tolist()
     for i in np.flatnonzero(~np.isfinite(values)):

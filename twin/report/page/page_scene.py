@@ -1,7 +1,4 @@
-"""The page's scene: the same bodies as the picture, lightened for a browser, as plotly traces.
-
-A mesh with fewer triangles, for a browser; pictures only.
-"""
+"""The page's scene: the same bodies as the picture, with fewer triangles for a browser, as plotly traces."""
 
 from __future__ import annotations
 
@@ -22,56 +19,25 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.twin.report.map_view import body_directions
 from puncture_twin.twin.report.raster.render import Layer
-from puncture_twin.twin.report.scene.scene_parts import (
-    FLANGE,
-    ArmPicture,
-    SceneBody,
-    arm_bodies,
-    chosen_direction,
-    joints_on_target,
-    needle_bodies,
-    patient,
-    room,
-    safe_region,
-)
+from puncture_twin.twin.report.scene import scene_parts
 from puncture_twin.twin.report.scene.views import overview, up_ct
 
-TRIANGLES = 40_000
-"""For the whole scene: a phone turns that smoothly, and the page stays near 3 MB."""
-
-GRAIN_MM = 0.25
-"""Vertices are shown to so much, a power of two: it packs well."""
-
-JOINT_DIGITS = 5
-"""Of rad: 0.01 mm at a metre."""
-
-AROUND_LINKS_MM = 100.0
-"""More than a link's body is from the line between its frames."""
-
-VIEW = (1200, 640)
-"""Width and height of the scene on the page, CSS pixels."""
-
-LEAST_TRIANGLES = 300
-"""A body is never cut below this."""
-
-LEAST_OF_ARM = 1_500
-"""Nor a part of an arm below this: the thin shells of its links fell apart into single triangles."""
-
+TRIANGLES = 40_000  # for the whole scene: a phone turns that smoothly, and the page stays near 3 MB
+GRAIN_MM = 0.25  # vertices are shown to so much, a power of two: it packs well
+JOINT_DIGITS = 5  # of rad: 0.01 mm at a metre
+AROUND_LINKS_MM = 100.0  # more than a link's body is from the line between its frames
+VIEW = (1200, 640)  # width and height of the scene on the page, CSS pixels
+LEAST_TRIANGLES = 300  # a body is never cut below this
+LEAST_OF_ARM = 1_500  # nor a part of an arm below this: the thin shells of its links fell apart into single triangles
 LABEL_OUT_MM = 45.0
-BORDER = 0.02
-"""Of the scene's box, around it."""
-LEGEND_FRACTION = 0.14
-"""Of the width; the legend stands left of the scene."""
-
-EYE_DISTANCE = 1.55
-"""In plotly's unit, the scene's size."""
-
+BORDER = 0.02  # of the scene's box, around it
+LEGEND_FRACTION = 0.14  # of the width; the legend stands left of the scene
+EYE_DISTANCE = 1.55  # in plotly's unit, the scene's size
 GROUP_NAMES = {"safe": "safe region", "arm": "arm", "room": "room", "needle": "needle"}
 """Bodies that share one line of the legend."""
 
 
-HOLDER_OPACITY = 0.3
-"""Of the needle's holder: from the entry it stands before what the needle goes to."""
+HOLDER_OPACITY = 0.3  # of the needle's holder: from the entry it stands before what the needle goes to
 
 
 def scene_figure(
@@ -89,7 +55,21 @@ def scene_figure(
         pick: Whose needle is shown where there is no plan; None shows none.
         T_base_ct: Shape (4, 4), mm, of a search whose arm was checked.
     """
-    bodies, standoff = _bodies(case, anatomy, candidates, plan, pick, T_base_ct if plan is None else plan.T_base_ct)
+    base = T_base_ct if plan is None else plan.T_base_ct
+    direction, standoff = scene_parts.chosen_direction(pick, plan), []
+    bodies = [
+        *scene_parts.patient(anatomy, case),
+        *scene_parts.room(case, base),
+        *scene_parts.safe_region(candidates, case),
+    ]
+    if direction is not None:
+        bodies += scene_parts.needle_bodies(case.needle, case.target_ct, direction)
+    bodies += scene_parts.arm_bodies(case, plan, pick, base)
+    if plan is not None and direction is not None:
+        tip = case.target_ct + plan.standoff_mm * direction
+        arm = scene_parts.ArmPicture(plan.model, plan.T_base_ct, case.tool).bodies(plan.insertion.q[0])
+        for b in (*arm, *scene_parts.needle_bodies(case.needle, tip, direction)):
+            standoff.append(scene_parts.SceneBody(f"{b.name}, standoff", f"{b.group}-standoff", b.mesh, b.colour))
     light = lightened([*bodies, *standoff], TRIANGLES)
     hidden = set(range(len(bodies), len(light)))
     first = {_legend_name(body): i for i, body in reversed(list(enumerate(light))) if i not in hidden}
@@ -97,20 +77,23 @@ def scene_figure(
         _trace(body, hidden=i in hidden, in_legend=first.get(_legend_name(body)) == i) for i, body in enumerate(light)
     ]
     traces.append(_labels(case, anatomy))
-    arms = _arms_box(case, candidates, T_base_ct)
-    shown = np.concatenate([*(one.mesh.vertices for one in light if one.group != "room"), arms])
-    layout = _layout(case, bodies, box_of(np.concatenate([shown, _label_places(case, anatomy)])))
-    return {"data": [*traces, _probe()], "layout": layout}
-
-
-def _arms_box(case: Any, candidates: Candidates, T_base_ct: Floats | None) -> Floats:
-    """Corners of a box that holds the arm of every direction, shape (2, 3), mm, or none: plotly cuts what is beyond."""
+    shown = [one.mesh.vertices for one in light if one.group != "room"]
     q = candidates.arm.q_insertion
     q = q[np.isfinite(q).all(axis=1)]
-    if T_base_ct is None or not len(q):
-        return np.zeros((0, 3))
-    origins = apply(np.linalg.inv(T_base_ct), link_poses(case.robot.model, q)[..., :3, 3].reshape(-1, 3))
-    return np.stack([origins.min(axis=0) - AROUND_LINKS_MM, origins.max(axis=0) + AROUND_LINKS_MM])
+    if T_base_ct is not None and len(q):  # the arm of every direction: plotly cuts what is beyond
+        origins = apply(np.linalg.inv(T_base_ct), link_poses(case.robot.model, q)[..., :3, 3].reshape(-1, 3))
+        shown.append(np.stack([origins.min(axis=0) - AROUND_LINKS_MM, origins.max(axis=0) + AROUND_LINKS_MM]))
+    layout = _layout(case, bodies, box_of(np.concatenate([*shown, _label_places(case, anatomy)])))
+    probe = {  # of the direction that the pointer chose on the map; the page's script fills it
+        "type": "scatter3d",
+        **{axis: [None] for axis in "xyz"},
+        "mode": "lines",
+        "line": {"color": "#d6001e", "width": 7},
+        "name": "direction clicked on the map",
+        "hoverinfo": "skip",
+        "showlegend": False,
+    }
+    return {"data": [*traces, probe], "layout": layout}
 
 
 def arm_data(
@@ -120,7 +103,7 @@ def arm_data(
 
     Denavit and Hartenberg's lengths, where the base is, the joints of the scene's meshes, and those of each row, rad.
     """
-    first = joints_on_target(plan, pick)
+    first = scene_parts.joints_on_target(plan, pick)
     if first is None or T_base_ct is None or (plan is not None and not np.allclose(plan.T_base_ct, T_base_ct)):
         return None
     q = candidates.arm.q_insertion
@@ -139,7 +122,7 @@ def box_of(points_ct: Floats) -> Floats:
     return np.stack([low, high]) + BORDER * (high - low) * np.array([[-1.0], [1.0]])
 
 
-def lightened(bodies: Sequence[SceneBody], triangles: int) -> list[SceneBody]:
+def lightened(bodies: Sequence[scene_parts.SceneBody], triangles: int) -> list[scene_parts.SceneBody]:
     """The bodies with about so many triangles altogether, each cut by the same share."""
     fraction = min(1.0, triangles / max(1, sum(len(b.mesh.faces) for b in bodies)))
     least = [LEAST_OF_ARM if body.group.startswith("arm") else LEAST_TRIANGLES for body in bodies]
@@ -147,29 +130,12 @@ def lightened(bodies: Sequence[SceneBody], triangles: int) -> list[SceneBody]:
     return [replace(body, mesh=lighter_mesh(body.mesh, most)) for body, most in zip(bodies, wanted, strict=True)]
 
 
-def _bodies(
-    case: Any, anatomy: Any, candidates: Candidates, plan: Any | None, pick: Pick | None, T_base_ct: Floats | None
-) -> tuple[list[SceneBody], list[SceneBody]]:
-    """What is shown at first (the needle on the target), and what the standoff pose adds."""
-    bodies = [*patient(anatomy, case), *room(case, T_base_ct), *safe_region(candidates, case)]
-    direction = chosen_direction(pick, plan)
-    if direction is not None:
-        bodies += needle_bodies(case.needle, case.target_ct, direction)
-    bodies += arm_bodies(case, plan, pick, T_base_ct)
-    if plan is None or direction is None:
-        return bodies, []
-    arm = ArmPicture(plan.model, plan.T_base_ct, case.tool)
-    tip = case.target_ct + plan.standoff_mm * direction
-    waiting = [*arm.bodies(plan.insertion.q[0]), *needle_bodies(case.needle, tip, direction)]
-    return bodies, [SceneBody(f"{b.name}, standoff", f"{b.group}-standoff", b.mesh, b.colour) for b in waiting]
-
-
-def _legend_name(body: SceneBody) -> str:
+def _legend_name(body: scene_parts.SceneBody) -> str:
     base = body.group.removesuffix("-standoff")
     return GROUP_NAMES.get(base, body.name).replace("_", " ")
 
 
-def _trace(body: SceneBody, *, hidden: bool, in_legend: bool) -> dict[str, Any]:
+def _trace(body: scene_parts.SceneBody, *, hidden: bool, in_legend: bool) -> dict[str, Any]:
     base, group = body.group.removesuffix("-standoff"), _legend_name(body)
     moving = base in {"arm", "needle"}
     vertices = np.round(body.mesh.vertices / GRAIN_MM) * GRAIN_MM
@@ -190,7 +156,7 @@ def _trace(body: SceneBody, *, hidden: bool, in_legend: bool) -> dict[str, Any]:
         "meta": {
             "pose": "standoff" if hidden else "target" if moving else "",
             "arm": base == "arm",
-            "frame": FLANGE if base == "needle" else body.frame,
+            "frame": scene_parts.FLANGE if base == "needle" else body.frame,
         },
     }
 
@@ -202,7 +168,6 @@ def _packed(values: NDArray[Any], dtype: type) -> dict[str, str]:
 
 
 def _labels(case: Any, anatomy: Any) -> dict[str, Any]:
-    """The body's directions, written around it."""
     names, places = body_directions(case.space), _label_places(case, anatomy)
     return {
         "type": "scatter3d",
@@ -222,21 +187,14 @@ def _label_places(case: Any, anatomy: Any) -> Floats:
     return np.array([centre + v * (np.abs(v) @ half + LABEL_OUT_MM) for v in body_directions(case.space).values()])
 
 
-def _probe() -> dict[str, Any]:
-    """The line of the direction that the pointer chose on the map; the page's script fills it."""
-    return {
-        "type": "scatter3d",
-        **{axis: [None] for axis in "xyz"},
-        "mode": "lines",
-        "line": {"color": "#d6001e", "width": 7},
-        "name": "direction clicked on the map",
-        "hoverinfo": "skip",
-        "showlegend": False,
+def _layout(case: Any, bodies: Sequence[scene_parts.SceneBody], box: Floats) -> dict[str, Any]:
+    # Unseen, with fixed ranges, so that the page's script can place its camera; edges of the drawn box as these ranges,
+    # divided by their geometric mean, which is its unit: of itself plotly scales each axis by the shown traces.
+    axes = {
+        f"{name}axis": {"visible": False, "showspikes": False, "range": box[:, i].tolist()}
+        for i, name in enumerate("xyz")
     }
-
-
-def _layout(case: Any, bodies: Sequence[SceneBody], box: Floats) -> dict[str, Any]:
-    axes = {f"{name}axis": _axis(*box[:, i].tolist()) for i, name in enumerate("xyz")}
+    ratio = np.diff(box, axis=0)[0] / np.cbrt(np.prod(np.diff(box, axis=0)))
     content = np.concatenate([b.mesh.vertices for b in bodies if b.group != "room"])
     blockers = Layer([b.surface for b in bodies if b.group in {"arm", "room", "target"}])
     seen = overview(case, content, case.target_ct[None], blockers, VIEW)
@@ -245,7 +203,8 @@ def _layout(case: Any, bodies: Sequence[SceneBody], box: Floats) -> dict[str, An
     return {
         "scene": {
             "domain": {"x": [LEGEND_FRACTION, 1.0]},
-            **_true_to_scale(box),
+            "aspectmode": "manual",
+            "aspectratio": dict(zip("xyz", ratio.tolist(), strict=True)),
             **axes,
             "camera": camera,
         },
@@ -256,23 +215,7 @@ def _layout(case: Any, bodies: Sequence[SceneBody], box: Floats) -> dict[str, An
     }
 
 
-def _true_to_scale(box: Floats) -> dict[str, Any]:
-    """Edges of the drawn box as its ranges: of itself plotly scales each axis by the traces that are shown.
-
-    Divided by their geometric mean, which is the unit in which the page's script places its camera.
-    """
-    extent = box[1] - box[0]
-    ratio = extent / np.cbrt(np.prod(extent))
-    return {"aspectmode": "manual", "aspectratio": dict(zip("xyz", ratio.tolist(), strict=True))}
-
-
-def _axis(low: float, high: float) -> dict[str, Any]:
-    """Unseen, and with a fixed range, so that the page's script can place its camera."""
-    return {"visible": False, "showspikes": False, "range": [low, high]}
-
-
-WELDED = 0.75
-"""Corners per triangle; a closed surface that shares its corners has half a corner per triangle."""
+WELDED = 0.75  # corners per triangle; a closed surface that shares its corners has half a corner per triangle
 
 
 def lighter_mesh(mesh: TriangleMesh, triangles: int) -> TriangleMesh:

@@ -24,32 +24,17 @@ from puncture_twin.twin.report.palette import SKIN
 from puncture_twin.twin.report.slices.panel import BESIDE, KNOTS_BYTE, KNOTS_HU, TONES, Subject, stored
 from puncture_twin.twin.report.slices.planes import letters, toward_text
 
-AROUND_MM = 60.0
-"""What the block holds beyond target and entries, to every side."""
-
-FINE_MM = 1.0
-"""Where the CT's own voxels do not fit the page, finer ones become means over this."""
-
+AROUND_MM = 60.0  # what the block holds beyond target and entries, to every side
+FINE_MM = 1.0  # where the CT's own voxels do not fit the page, finer ones become means over this
 MOST_CT, MOST_TOGETHER = 1_600_000, 2_800_000
 """Bytes of the packed CT, and of CT and surfaces: in base64 2.1 and 3.7 MB of the page."""
 
-MOST_VOXELS = 30_000_000
-"""A browser holds a byte for each; more of them are not tried as they are."""
-
-SAMPLE = 16
-"""Slices by which it is seen at once that all will not fit."""
-
-WORST, BEST = 15, 95
-"""Qualities of a JPEG. Below the first, edges ring; then voxels grow by a quarter."""
-
-STRIP = 4096
-"""Rows of a JPEG at most: browsers on phones read no larger canvas."""
-
-JPEG_BLOCK = 8
-"""Rows of a slice are filled up to a multiple, so that no block of the JPEG holds two slices."""
-
-SOFT_HU = (-160.0, 240.0)
-"""Where the page states the error of a lossy CT."""
+MOST_VOXELS = 30_000_000  # a browser holds a byte for each; more of them are not tried as they are
+SAMPLE = 16  # slices by which it is seen at once that all will not fit
+WORST, BEST = 15, 95  # qualities of a JPEG. Below the first, edges ring; then voxels grow by a quarter
+STRIP = 4096  # rows of a JPEG at most: browsers on phones read no larger canvas
+JPEG_BLOCK = 8  # rows of a slice are filled up to a multiple, so that no block of the JPEG holds two slices
+SOFT_HU = (-160.0, 240.0)  # where the page states the error of a lossy CT
 
 
 def slices_data(
@@ -66,13 +51,16 @@ def slices_data(
     box = block_box(case.target_ct, candidates)
     skin = ("skin", "skin", anatomy.skin.mesh)
     shapes = surfaces([*((one.name, str(one.role), one.mesh) for one in anatomy.checked), skin], case.target_ct, box)
-    ct = None
+    ct = numbers = None
     if anatomy.scan is not None:
+        of_point, count = slice_numbers(anatomy.scan.grid)
+        numbers = [of_point.tolist(), count]
         hu, T_ct_index = anatomy.scan.measured
         ct = ct_block(hu, T_ct_index, box, min(MOST_CT, MOST_TOGETHER - len(shapes.content)))
     colours = {**subject.colours, "skin": SKIN}
     for one in shapes.facts["parts"]:
         one |= {"colour": css(colours[one["name"]]), "target": one["name"] == case.target_structure}
+    axes = np.concatenate([np.eye(3), 0.0 - np.eye(3)])
     bent = None if picked < 0 or subject.bent_mm is None else np.round(subject.bent_mm, 2).tolist()
     facts = {
         "ct": None if ct is None else ct.facts,
@@ -80,9 +68,9 @@ def slices_data(
         "surfaces": shapes.facts,
         "knots": [KNOTS_HU, KNOTS_BYTE],
         "tones": dict(TONES),
-        "letters": [[letters(case.space, one), toward_text(case.space, one), one.tolist()] for one in _axes()],
+        "letters": [[letters(case.space, one), toward_text(case.space, one), one.tolist()] for one in axes],
         "needle": {"shaft": case.needle.shaft_mm, "radius": case.needle.radius_mm},
-        "numbers": None if anatomy.scan is None else _numbers(*slice_numbers(anatomy.scan.grid)),
+        "numbers": numbers,
         "catalogue": [[mm, case.needle.of_length(mm).longest_path_mm] for mm in sorted(case.needle.lengths_mm)],
         "names": {name: text for name, (text, _) in BESIDE.items()},
         "bent": {} if bent is None else {picked: bent},
@@ -105,20 +93,8 @@ def _regions(regions_ct: Floats, picked: int, of_picked: Floats | None) -> dict[
     return found if of_picked is None else found | {picked: np.round(of_picked[upper], 3).tolist()}
 
 
-def _numbers(of_point: Floats, count: int) -> list[Any]:
-    return [of_point.tolist(), count]
-
-
-def _axes() -> Floats:
-    """The six directions along the axes, shape (6, 3)."""
-    return np.concatenate([np.eye(3), 0.0 - np.eye(3)])
-
-
 def block_box(target_ct: Floats, candidates: Candidates) -> Floats:
-    """What the block holds, shape (2, 3), mm: the target, the entries of safe directions, and `AROUND_MM` about them.
-
-    Where nothing is safe, the entries of all directions.
-    """
+    """What the block holds, (2, 3), mm: target, the safe entries, or all if none is, and `AROUND_MM` about them."""
     entries = candidates.path.entry_ct[candidates.safe if candidates.safe.any() else slice(None)]
     points = np.concatenate([np.asarray(target_ct)[None], entries[np.isfinite(entries).all(axis=1)]])
     return np.stack([points.min(axis=0) - AROUND_MM, points.max(axis=0) + AROUND_MM])
@@ -166,7 +142,11 @@ def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = M
 
 
 def _exact(values: NDArray[np.uint8]) -> Packed:
-    return Packed({"shape": values.shape}, gzip.compress(_differences(values), LEVEL, mtime=0))
+    """Bytes less the mean of their three neighbours before, x fastest: they pack to two thirds."""
+    wide = np.pad(values, ((1, 0),) * 3).astype(np.int16)
+    before = (wide[:-1, 1:, 1:] + wide[1:, :-1, 1:] + wide[1:, 1:, :-1]) // 3
+    content = (values - before).astype(np.uint8).transpose(2, 1, 0).tobytes()
+    return Packed({"shape": values.shape}, gzip.compress(content, LEVEL, mtime=0))
 
 
 def _means(values: NDArray[Any], factor: Floats) -> NDArray[Any]:
@@ -217,10 +197,3 @@ def _jpeg(rows: NDArray[np.uint8], quality: int) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(rows).save(stream, "JPEG", quality=quality, optimize=True)
     return stream.getvalue()
-
-
-def _differences(values: NDArray[np.uint8]) -> bytes:
-    """Bytes less the mean of their three neighbours before, x fastest: they pack to two thirds."""
-    wide = np.pad(values, ((1, 0),) * 3).astype(np.int16)
-    before = (wide[:-1, 1:, 1:] + wide[1:, :-1, 1:] + wide[1:, 1:, :-1]) // 3
-    return (values - before).astype(np.uint8).transpose(2, 1, 0).tobytes()

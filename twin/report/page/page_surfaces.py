@@ -20,50 +20,23 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import lower_squares, squared_distance
 
-MOST_TRIANGLES = 400_000
-"""Of all surfaces: in base64 they take at most 2.5 MB of the page."""
-
-APART_MM = 0.48
-"""How far lighter surfaces may be from the checked ones; half a millimetre with the rounding of these."""
-
-MOST_APART_MM = 8.0
-"""Nothing is made coarser than this: then a page is larger."""
-
-UNIT_MM = 1 / 16
-"""To which corners are rounded; doubled until the farthest fits `MOST_UNITS`."""
-
-FINER = 4
-"""Parts of the unit to which surfaces are rounded that are made lighter."""
-
-ROUNDED = 0.87
-"""Units by which a corner moves at most: half the diagonal of a cube."""
-
-MOST_UNITS = 32_000
-"""A corner's coordinates fit 16 bits."""
-
-COARSE_MM = 32.0
-"""How coarse surfaces beyond the box are, and how far beyond: they are not drawn."""
-
-SMOOTH, ROUNDS = 0.3, 3
-"""By how much of the allowed distance stairs are smoothed along each axis, and how often."""
-
-QUADRIC = 2.0
-"""Of the allowed distance, the root of the quadric up to which edges collapse: it sums over many planes."""
-
+MOST_TRIANGLES = 400_000  # of all surfaces: in base64 they take at most 2.5 MB of the page
+APART_MM = 0.48  # how far lighter surfaces may be from the checked ones; half a millimetre with the rounding of these
+MOST_APART_MM = 8.0  # nothing is made coarser than this: then a page is larger
+UNIT_MM = 1 / 16  # to which corners are rounded; doubled until the farthest fits `MOST_UNITS`
+FINER = 4  # parts of the unit to which surfaces are rounded that are made lighter
+ROUNDED = 0.87  # units by which a corner moves at most: half the diagonal of a cube
+MOST_UNITS = 32_000  # a corner's coordinates fit 16 bits
+COARSE_MM = 32.0  # how coarse surfaces beyond the box are, and how far beyond: they are not drawn
+SMOOTH, ROUNDS = 0.3, 3  # by how much of the allowed distance stairs are smoothed along each axis, and how often
+QUADRIC = 2.0  # of the allowed distance, the root of the quadric up to which edges collapse: it sums over many planes
 AGGRESSION, LAST_QUADRIC = 5.0, 1e-9 * 102.0**5
 """Of fast-simplification: its threshold grows with this power of the pass, to this in its last."""
 
-NEAREST = 8
-"""Corners about which triangles are looked at, where those of a place are far."""
-
-MOST_ALONE = 40
-"""Corners that are measured from all triangles."""
-
-TRIES, LESS = 5, 0.85
-"""How often, each time with less of the distance, before a surface is left as it is."""
-
-LEVEL = 6
-"""Of gzip's."""
+NEAREST = 8  # corners about which triangles are looked at, where those of a place are far
+MOST_ALONE = 40  # corners that are measured from all triangles
+TRIES, LESS = 5, 0.85  # how often, each time with less of the distance, before a surface is left as it is
+LEVEL = 6  # of gzip's
 
 
 class Packed(NamedTuple):
@@ -116,7 +89,11 @@ def surfaces(parts: Iterable[tuple[str, str, TriangleMesh]], target_ct: Floats, 
         apart *= 2
     kept = [(one, part) for one, part in zip(named, shown, strict=True) if part.drawn or (one[2] and len(part.faces))]
     corners = [_planes(np.diff(part.corners, axis=0, prepend=0).T, 2) for _, part in kept]
-    triangles = [_planes(_from_newest(part.faces.ravel()), 3) for _, part in kept]
+    triangles = []
+    for _, part in kept:
+        index = part.faces.ravel()
+        newest = np.maximum.accumulate(np.concatenate([[-1], index[:-1]])) + 1
+        triangles.append(_planes(newest - index, 3))  # below the next that no index before had: 0 for a new one
     facts = [
         {"name": one[0], "role": one[1], "closed": one[2]}
         | {"corners": len(part.corners), "triangles": len(part.faces), "drawn": part.drawn}
@@ -124,11 +101,6 @@ def surfaces(parts: Iterable[tuple[str, str, TriangleMesh]], target_ct: Floats, 
     ]
     content = gzip.compress(b"".join([*corners, *triangles]), LEVEL, mtime=0)
     return Packed({"unit_mm": unit, "off_mm": off, "parts": facts}, content)
-
-
-def _from_newest(index: NDArray[np.int64]) -> NDArray[np.int64]:
-    """How far each index is below the next that no index before had: 0 for a new one."""
-    return np.maximum.accumulate(np.concatenate([[-1], index[:-1]])) + 1 - index
 
 
 def _planes(values: NDArray[np.int64], count: int) -> bytes:

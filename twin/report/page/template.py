@@ -25,8 +25,7 @@ PLOTLY = "plotly_js/plotly-gl3d.min.js"
 """Plotly 4.1.1's own bundle, as its makers publish it; beside it lie licence, source and hash."""
 
 
-PACKED = 4
-"""Of gzip's levels: at 6 it takes two and a half times as long for six parts in a hundred."""
+PACKED = 4  # of gzip's levels: at 6 it takes two and a half times as long for six parts in a hundred
 
 
 class Card(NamedTuple):
@@ -39,14 +38,7 @@ class Card(NamedTuple):
 
 
 def write_html(template: str, path: Path, **parts: object) -> None:
-    """Fill a template and write the page, whole or not at all.
-
-    Args:
-        parts: What the template names: plain text, or `Markup`.
-
-    Raises:
-        jinja2.UndefinedError: The template names a part that is not given.
-    """
+    """Fill a template and write the page, whole or not at all; a part that it names and is not given is an error."""
     text = filled(template, **parts)
     with atomic(Path(path)) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -67,7 +59,6 @@ def _environment() -> Environment:
 
 
 def _asset(name: str) -> str:
-    """A file of ``twin/report/templates``."""
     return (files("puncture_twin.twin.report") / "templates" / name).read_text(encoding="utf-8")
 
 

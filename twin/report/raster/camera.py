@@ -48,18 +48,14 @@ class ViewCamera:
         return replace(self, width=self.width * factor, height=self.height * factor)
 
     def project(self, points_ct: Floats) -> Floats:
-        """Pixel coordinates (column, row; (0, 0) is the top left corner) and depth along the view, shape (n, 3).
-
-        A point behind the eye has a depth below zero and means nothing.
-        """
+        """Column and row ((0, 0) is the top left corner) and depth along the view, (n, 3); below zero behind it."""
         x, y, z = self.axes @ (np.asarray(points_ct, dtype=float).reshape(-1, 3) - self.eye).T
         with np.errstate(divide="ignore", invalid="ignore"):
             column, row = self.width / 2 + self.scale * x / z, self.height / 2 - self.scale * y / z
         return np.stack([column, row, z], axis=1)
 
 
-SPARE = 1.05
-"""How much wider than what must be seen a picture is."""
+SPARE = 1.05  # how much wider than what must be seen a picture is
 
 
 def camera_around(points_ct: Floats, toward: Floats, up: Floats, *, fov: float, width: int, height: int) -> ViewCamera:

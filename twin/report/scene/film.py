@@ -24,46 +24,23 @@ from puncture_twin.twin.report.numbers import demanding
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import Layer, MovingPicture, Surface
 from puncture_twin.twin.report.scene.film_text import BELOW, FilmFrames, write_gif, write_mp4
-from puncture_twin.twin.report.scene.scene_parts import (
-    ArmPicture,
-    SceneBody,
-    bar,
-    needle_bodies,
-    patient,
-    room,
-)
+from puncture_twin.twin.report.scene.scene_parts import ArmPicture, SceneBody, bar, needle_bodies, patient, room
 from puncture_twin.twin.report.scene.views import close_up, overview
 
-MOST_THREADS = 4
-"""Of those that draw: each takes 40 MB, and the encoder and the words do not keep up with more."""
-
-WIDTH, HEIGHT = 832, 608
-"""Pixels; multiples of 16, as H.264 likes them."""
-
-VIEW_WIDTH, VIEW_HEIGHT = 592, HEIGHT - BELOW
-"""The overview, upper left. Below it stand the numbers."""
-
-INSET = 240
-"""Side of the close-up, upper right; below it stand the names and the body's directions."""
-
+MOST_THREADS = 4  # of those that draw: each takes 40 MB, and the encoder and the words do not keep up with more
+WIDTH, HEIGHT = 832, 608  # pixels; multiples of 16, as H.264 likes them
+VIEW_WIDTH, VIEW_HEIGHT = 592, HEIGHT - BELOW  # the overview, upper left. Below it stand the numbers
+INSET = 240  # side of the close-up, upper right; below it stand the names and the body's directions
 FRAMES_PER_SECOND = 15
 """Enough for an arm that takes seconds from pose to pose; each frame costs its drawing and its encoding."""
 
-LONGEST_S = 8.0
-"""Playback is sped up until the motion fits into this time; then the last frame stands still."""
-
+LONGEST_S = 8.0  # playback is sped up until the motion fits into this time; then the last frame stands still
 STILL_S = 2.0
 SPEEDS = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 30, 40, 60, 100, 200, 500)
 INSET_RADIUS_MM = 30.0
-BODY_MM = 250.0
-"""What of the body the overview holds, about the target: the patient fills it, and the arm may leave it."""
-
-ABOVE_MM = 30.0
-"""Of the needle at standoff above its tip."""
-
-NEEDLE_PIXELS = 4.5
-"""The needle's width at least, where it stands on the target."""
-
+BODY_MM = 250.0  # what of the body the overview holds, about the target: the patient fills it, and the arm may leave it
+ABOVE_MM = 30.0  # of the needle at standoff above its tip
+NEEDLE_PIXELS = 4.5  # the needle's width at least, where it stands on the target
 PLANNED: Rgb = (0, 158, 115)
 PLANNED_RADIUS_MM = 0.7
 
@@ -96,11 +73,7 @@ def film_times(total_s: float) -> FilmTimes:
 
 
 def draw_film(rehearsal: Any, plan: Any, case: Any, anatomy: Any, path: Path) -> Path:
-    """Write the film; a GIF beside it when no H.264 encoder can be started.
-
-    Returns:
-        The file that was written.
-    """
+    """Write the film, a GIF beside it when no H.264 encoder can be started; returns the file that was written."""
     times = film_times(float(rehearsal.times_s[-1]))
     film, path = _Film.of(rehearsal, plan, case, anatomy, times.speed), Path(path)
     try:
@@ -125,9 +98,12 @@ class _Film(NamedTuple):
         """What does not move is drawn here, once."""
         T_base_ct = rehearsal.T_base_ct_true
         arm = ArmPicture(plan.model, T_base_ct)
-        base = arm.bodies(rehearsal.q[0])[0]
-        still = [*patient(anatomy, case), *room(case, T_base_ct), arm.plate, _planned_path(plan)]
-        cameras = _wide_camera(case, still, arm, rehearsal, plan), _near_camera(case, still, plan)
+        base, at_standoff = arm.bodies(rehearsal.q[0])[0], plan.target_ct + plan.standoff_mm * plan.outward_ct
+        planned = SceneBody("planned path", "safe", bar(plan.target_ct, at_standoff, PLANNED_RADIUS_MM), PLANNED)
+        still = [*patient(anatomy, case), *room(case, T_base_ct), arm.plate, planned]
+        organs = Layer([b.surface for b in still if b.alpha >= 1 and b.group in {"organ", "target"}])
+        near_by = close_up(case, np.stack([plan.target_ct, plan.entry_ct]), INSET_RADIUS_MM, organs, (INSET, INSET))
+        cameras = _wide_camera(case, still, arm, rehearsal, plan), near_by
         wide, near = (_tool_layer(case, camera) for camera in cameras)
 
         def poses(row: int) -> list[Floats]:
@@ -144,31 +120,24 @@ class _Film(NamedTuple):
     def frames(self, times: FilmTimes) -> Iterator[Pixels]:
         """The frames that move, drawn by as many threads as there are cores while others are encoded; then the last."""
         threads = min(len(os.sched_getaffinity(0)), MOST_THREADS)
+
+        def drawn(moment: float) -> Pixels:
+            poses = self.poses(self.words.row(moment))
+            return self.words.frame(moment, self.wide.at(poses), self.near.at(poses[-1:]))
+
         with ThreadPoolExecutor(threads) as pool:
             waiting: deque[Future[Pixels]] = deque()
             for number, moment in enumerate(times.moments):
-                waiting.append(pool.submit(self._frame, moment))
+                waiting.append(pool.submit(drawn, moment))
                 while len(waiting) > threads or (waiting and number == len(times.moments) - 1):
                     frame = waiting.popleft().result()
                     yield frame
         yield from repeat(frame, times.still_frames)
 
-    def _frame(self, moment: float) -> Pixels:
-        poses = self.poses(self.words.row(moment))
-        return self.words.frame(moment, self.wide.at(poses), self.near.at(poses[-1:]))
-
 
 def _moving_picture(bodies: list[SceneBody], camera: ViewCamera, layers: Sequence[Layer]) -> MovingPicture:
-    """One view of bodies that stand still (CT frame) and of layers that move."""
     opaque, translucent = ([b.surface for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False))
     return MovingPicture(Layer(opaque), Layer(translucent), layers, camera)
-
-
-def _planned_path(plan: Any) -> SceneBody:
-    """The line that the tip should follow, from standoff to target."""
-    direction = plan.outward_ct
-    line = bar(plan.target_ct, plan.target_ct + plan.standoff_mm * direction, PLANNED_RADIUS_MM)
-    return SceneBody("planned path", "safe", line, PLANNED)
 
 
 def _tool_layer(case: Any, camera: ViewCamera) -> Layer:
@@ -190,9 +159,3 @@ def _wide_camera(case: Any, still: list[SceneBody], arm: ArmPicture, rehearsal: 
     at_work = [body for q in (plan.insertion.q[0], rehearsal.q[-1]) for body in arm.bodies(q)]
     blockers = Layer([b.surface for b in at_work] + [b.surface for b in still if b.group == "room"])
     return overview(case, np.concatenate([*near, shown]), focus, blockers, (VIEW_WIDTH, VIEW_HEIGHT), direction)
-
-
-def _near_camera(case: Any, still: list[SceneBody], plan: Any) -> ViewCamera:
-    blockers = Layer([b.surface for b in still if b.alpha >= 1 and b.group in {"organ", "target"}])
-    path_ct = np.stack([plan.target_ct, plan.entry_ct])
-    return close_up(case, path_ct, INSET_RADIUS_MM, blockers, (INSET, INSET))

@@ -37,15 +37,8 @@ def write_mp4(frames: Iterable[Pixels], size: tuple[int, int], path: Path, fps: 
         RuntimeError: It has no H.264, or did not write all frames.
     """
     with atomic(path) as temporary:
-        writer = imageio_ffmpeg.write_frames(
-            str(temporary),
-            size,
-            fps=fps,
-            codec="libx264",
-            quality=None,
-            output_params=[*QUALITY, *SAME_BYTES],
-            ffmpeg_log_level="quiet",
-        )
+        keys = {"fps": fps, "codec": "libx264", "quality": None, "ffmpeg_log_level": "quiet"}
+        writer = imageio_ffmpeg.write_frames(str(temporary), size, output_params=[*QUALITY, *SAME_BYTES], **keys)
         writer.send(None)
         sent = 0
         try:
@@ -72,17 +65,11 @@ PHASES = {
     "insertion": "insertion",
     "hold": "at the target",
 }
-CONTACT_SHOWN_S = 3.0
-"""How long (time of the rehearsal) a contact stays in large letters."""
-
+CONTACT_SHOWN_S = 3.0  # how long (time of the rehearsal) a contact stays in large letters
 LABEL, VALUE = 13, 17
-
-BELOW = 80
-"""Pixels: height of the numbers below the views."""
-
+BELOW = 80  # pixels: height of the numbers below the views
 FRAME: Rgb = (150, 156, 164)
-RULE: Rgb = (190, 194, 200)
-"""The lines about the close-up, and between views and words."""
+RULE: Rgb = (190, 194, 200)  # the lines about the close-up, and between views and words
 
 CELLS = (
     (12, "time"),
@@ -95,11 +82,7 @@ CELLS = (
 
 
 class FilmFrames:
-    """Whole frames: the overview is upper left, the close-up beside it, numbers below.
-
-    Args:
-        cameras: Of the overview and of the close-up.
-    """
+    """Whole frames: the overview upper left, the close-up beside it (with a camera each), numbers below."""
 
     def __init__(
         self, rehearsal: Any, cameras: tuple[ViewCamera, ViewCamera], case: Any, speed: float, keep_away: frozenset[str]
@@ -128,14 +111,10 @@ class FilmFrames:
         """The record that is shown at a moment."""
         return int(np.searchsorted(self._rehearsal.times_s, moment, side="right")) - 1
 
-    def _contacts(self, moment: float) -> list[Any]:
-        """The contacts seen so far."""
-        return [contact for contact in self._rehearsal.contacts if contact.time_s <= moment]
-
     def _news(self, draw: ImageDraw.ImageDraw, moment: float) -> None:
         """Over the overview: what touches while that is news, and at the end the result."""
         done = self._rehearsal
-        fresh = [contact for contact in self._contacts(moment) if moment - contact.time_s <= CONTACT_SHOWN_S]
+        fresh = [contact for contact in done.contacts if 0.0 <= moment - contact.time_s <= CONTACT_SHOWN_S]
         for line, contact in enumerate(fresh[-3:]):
             text = f"CONTACT: {_short(contact.link)} touches {_short(contact.body)}"
             annotate.write(draw, (12, 12 + 24 * line), text, size=17, bold=True, colour=annotate.RED, halo=3)
@@ -147,7 +126,8 @@ class FilmFrames:
 
     def _numbers(self, draw: ImageDraw.ImageDraw, top: int, row: int, moment: float) -> None:
         """Below the views: the numbers of a record; at the end what the tip's error consists of."""
-        done, contacts = self._rehearsal, len(self._contacts(moment))
+        done = self._rehearsal
+        contacts = sum(one.time_s <= moment for one in done.contacts)
         phase, away = str(done.phase[row]), float(np.linalg.norm(done.tip_true_ct[row] - done.target_true_ct))
         values = (
             (f"{moment:.1f}/{done.times_s[-1]:.1f} s", annotate.INK),
@@ -180,7 +160,6 @@ class FilmFrames:
 
 
 def _ground(rehearsal: Any, cameras: Sequence[ViewCamera], case: Any, speed: float) -> Image.Image:
-    """What every frame has, without its views."""
     wide, near = cameras
     frame = Image.new("RGB", (wide.width + near.width, wide.height + BELOW), annotate.WHITE)
     draw, left, below = ImageDraw.Draw(frame), wide.width, near.height
@@ -212,11 +191,9 @@ def _over_near(near: ViewCamera, case: Any) -> Image.Image:
 
 def model_note(case: Any) -> str:
     """What a film shows of needle, tissue and breath: what the case declares of them is computed, not drawn."""
-    needle = (
-        "needle and tissue are rigid"
-        if case.bending is None
-        else "tissue pushes on the needle: its end is bent, the drawing is straight"
-    )
+    needle = "needle and tissue are rigid"
+    if case.bending is not None:
+        needle = "tissue pushes on the needle: its end is bent, the drawing is straight"
     breath = "nothing breathes" if case.breathing is None else "the body is drawn still, as in the CT"
     return f"{needle}; {breath}; research software, not a medical device"
 

@@ -1,7 +1,4 @@
-"""The scene as coloured meshes in the CT frame, for image, film and page.
-
-Simple bodies that the pictures need: needle, holder, ball, box, and the corridor of safe directions.
-"""
+"""The scene as coloured meshes in the CT frame, for image, film and page: patient, room, arm, needle, corridor."""
 
 from __future__ import annotations
 
@@ -26,12 +23,8 @@ from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.map_view import step_of
 from puncture_twin.twin.report.raster.render import Layer, Surface
 
-SECTIONS = 24
-"""Sides of a round bar."""
-
-LIFT_MM = 1.0
-"""How far the corridor's mouth is drawn outside the skin, so that the two surfaces do not flicker."""
-
+SECTIONS = 24  # sides of a round bar
+LIFT_MM = 1.0  # how far the corridor's mouth is drawn outside the skin, so that the two surfaces do not flicker
 KEY = 1e-6
 """rad; corners of cells nearer than this are one corner."""
 
@@ -120,9 +113,7 @@ def revolved(outline: Floats, sections: int) -> TriangleMesh:
     return TriangleMesh(points.reshape(-1, 3)[used], number.reshape(-1, 3).astype(np.int32))
 
 
-ORGAN_OPACITY = 0.38
-"""Opacity of the organ that holds the target, so that the lesion and its vessels show."""
-
+ORGAN_OPACITY = 0.38  # opacity of the organ that holds the target, so that the lesion and its vessels show
 MOST_AROUND = 0.7
 """A structure that hides the target from more than so much of all directions holds it: also an organ from whose label
 the lesion is left out, and one with an opening, as of a vessel."""
@@ -131,17 +122,12 @@ UNKNOWN_OPACITY = 0.30
 OUTSIDE_SHOWN_MM = np.array([150.0, 150.0, 0.0])
 """How far beyond the skin's box what is outside of the body is drawn: to the sides, front and back, along the bed."""
 SKIN_OPACITY = 0.20
-GANTRY_OPACITY = 0.15
-"""Opacity of the gantry, so that it does not hide the patient in its bore."""
-
+GANTRY_OPACITY = 0.15  # opacity of the gantry, so that it does not hide the patient in its bore
 MOUTH_OPACITY = 0.88
 """Of where a needle may enter: what lies behind it hardly shows, since seen through green it would look safe to hit."""
 
 WALL_OPACITY = 0.10
-
-TARGET_BALL_MM = 3.0
-"""Radius of the ball that marks the target point."""
-
+TARGET_BALL_MM = 3.0  # radius of the ball that marks the target point
 PLATE_RADIUS_MM, PLATE_THICK_MM = 130.0, 25.0
 """Of the plate under the arm's base: wider than any base, so that it is seen."""
 
@@ -178,20 +164,14 @@ def patient(anatomy: Any, case: Any) -> tuple[SceneBody, ...]:
     structures = anatomy.structures
     colours = palette.organ_colours(tuple(s.name for s in structures))
     bodies = [SceneBody(s.name, "organ", s.mesh, colours[s.name], _opacity(s, case)) for s in structures]
-    bodies += [
-        SceneBody(s.name, "organ", _near(s.mesh, anatomy.skin.mesh), palette.OUTSIDE, UNKNOWN_OPACITY)
-        for s in anatomy.surroundings
-        if str(s.role) == "unknown"
-    ]
+    low, high = anatomy.skin.mesh.bounds + OUTSIDE_SHOWN_MM * np.array([[-1.0], [1.0]])
+    for s in anatomy.surroundings:  # of what goes on beyond the image the part about the skin, flattened at the rest
+        if str(s.role) == "unknown":
+            mesh = TriangleMesh(np.clip(s.mesh.vertices, low, high), s.mesh.faces)
+            bodies.append(SceneBody(s.name, "organ", mesh, palette.OUTSIDE, UNKNOWN_OPACITY))
     bodies.append(SceneBody("skin", "skin", anatomy.skin.mesh, palette.SKIN, SKIN_OPACITY))
     bodies.append(SceneBody("target", "target", ball(case.target_ct, TARGET_BALL_MM), palette.TARGET_POINT))
     return tuple(bodies)
-
-
-def _near(mesh: TriangleMesh, skin: TriangleMesh) -> TriangleMesh:
-    """What is drawn of a surface that goes on beyond the image: its part about the skin, flattened at the rest."""
-    low, high = skin.bounds
-    return TriangleMesh(np.clip(mesh.vertices, low - OUTSIDE_SHOWN_MM, high + OUTSIDE_SHOWN_MM), mesh.faces)
 
 
 def _opacity(structure: Any, case: Any) -> float:
@@ -214,13 +194,7 @@ def safe_region(candidates: Candidates, case: Any) -> tuple[SceneBody, ...]:
 def needle_bodies(
     needle: Any, tip_ct: Floats, outward_ct: Floats, least_mm: float = LEAST_NEEDLE_MM
 ) -> tuple[SceneBody, ...]:
-    """Needle and holder with the tip at a point; the needle alone where the shaft reaches the flange.
-
-    Args:
-        needle: With ``length_mm``, ``shaft_mm``, ``radius_mm``, ``holder_diameter_mm``.
-        tip_ct: Shape (3,).
-        outward_ct: Shape (3,), unit, from the tip to the flange.
-    """
+    """Needle and holder, the tip at (3,), along `outward_ct`, (3,), unit; the needle alone where its shaft is all."""
     radius = max(needle.radius_mm, least_mm)
     shaft, top = tip_ct + needle.shaft_mm * outward_ct, tip_ct + needle.length_mm * outward_ct
     body = SceneBody("needle", "needle", bar(tip_ct, shaft, radius), palette.NEEDLE)
@@ -259,8 +233,7 @@ def needle_text(needle: Any) -> str:
     return f"needle (drawn ⌀ {2 * LEAST_NEEDLE_MM:g} mm, is ⌀ {needle.diameter_mm:g} mm)"
 
 
-FLANGE = 6
-"""The frame with which a tool moves."""
+FLANGE = 6  # the frame with which a tool moves
 
 
 class ArmPicture:
@@ -285,17 +258,10 @@ class ArmPicture:
 
     def bodies(self, q: Floats) -> tuple[SceneBody, ...]:
         """The links in the CT frame at one configuration."""
-        poses = self.poses_ct(q)
-        links = (
-            SceneBody(
-                link.name,
-                "arm",
-                link.mesh.transformed(T),
-                palette.HOLDER if link.name == "tool" else palette.ARM,
-                frame=link.frame,
-            )
-            for link, T in zip(self._links, poses, strict=True)
-        )
+        links = []
+        for link, T in zip(self._links, self.poses_ct(q), strict=True):
+            colour = palette.HOLDER if link.name == "tool" else palette.ARM
+            links.append(SceneBody(link.name, "arm", link.mesh.transformed(T), colour, frame=link.frame))
         return (*links, self.plate)
 
     @property
@@ -308,7 +274,11 @@ class ArmPicture:
 
 def room(case: Any, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
     """The case's gantry and obstacles (table and the like); those given in the base frame need to know where it is."""
-    bodies = [] if case.gantry is None else [_gantry(case.gantry)]
+    bodies, gantry = [], case.gantry
+    if gantry is not None:
+        radius = gantry.bore_diameter_mm / 2
+        wall = ring(gantry.T_ct_gantry, radius, radius + gantry.wall_mm, gantry.thickness_mm)
+        bodies.append(SceneBody("gantry", "room", wall, palette.TABLE, GANTRY_OPACITY))
     for obstacle in case.obstacles:
         T = pose(np.eye(3), obstacle.center_mm)
         if obstacle.frame == "base":
@@ -317,9 +287,3 @@ def room(case: Any, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
             T = np.linalg.inv(T_base_ct) @ T
         bodies.append(SceneBody(obstacle.name, "room", box(T, obstacle.size_mm), palette.TABLE))
     return tuple(bodies)
-
-
-def _gantry(gantry: Any) -> SceneBody:
-    radius = gantry.bore_diameter_mm / 2
-    wall = ring(gantry.T_ct_gantry, radius, radius + gantry.wall_mm, gantry.thickness_mm)
-    return SceneBody("gantry", "room", wall, palette.TABLE, GANTRY_OPACITY)

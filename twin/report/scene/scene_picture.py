@@ -17,38 +17,21 @@ from puncture_twin.twin.report import annotate, palette
 from puncture_twin.twin.report.numbers import length_text, nearest_text, target_text
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
-from puncture_twin.twin.report.scene.scene_parts import (
-    SceneBody,
-    arm_bodies,
-    chosen_direction,
-    needle_bodies,
-    needle_text,
-    patient,
-    room,
-    safe_region,
-)
+from puncture_twin.twin.report.scene import scene_parts
 from puncture_twin.twin.report.scene.views import close_up, overview
 
 WIDTH, HEIGHT = 1720, 1020
 LEFT_BOX = (16, 84, 926, 840)
 RIGHT_BOX = (942, 84, 1704, 840)
 LEGEND_TOP = 858
-
-AXES_LENGTH, AXES_CORNER = 44, 110
-"""Pixels: length of the body's axes, and how far from the corner they cross."""
-
-CORNER_GAIN = 0.1
-"""How much emptier the upper corner must be for the axes to stand there instead of below."""
-
-BODY_RADIUS_MM = 700.0
-"""The overview shows the patient within this distance of the target, and the whole arm."""
-
+AXES_LENGTH, AXES_CORNER = 44, 110  # pixels: length of the body's axes, and how far from the corner they cross
+CORNER_GAIN = 0.1  # how much emptier the upper corner must be for the axes to stand there instead of below
+BODY_RADIUS_MM = 700.0  # the overview shows the patient within this distance of the target, and the whole arm
 CLOSE_RADIUS_MM = 38.0
 HIDDEN_NEARBY = ("room", "safe")
 """Groups that the close-up leaves out: a rib seen through the green of the skin would look safe to hit."""
 
-NOTHING_RADIUS_MM = 90.0
-"""Around the target, when there is no path to show."""
+NOTHING_RADIUS_MM = 90.0  # around the target, when there is no path to show
 
 
 def draw_scene(
@@ -62,31 +45,39 @@ def draw_scene(
     *,
     failed: bool = False,
 ) -> None:
-    """Write the picture of the scene.
+    """Write the picture of the scene; without a plan the arm is that of the search, and the needle that of the pick.
 
     Args:
-        candidates: The search's rows; the safe ones make the corridor.
-        plan: The plan, or None: then the needle is that of the best candidate, and the arm that of the search.
         pick: The planned candidate, or the one to be shown; None shows the best.
         T_base_ct: Shape (4, 4), mm, of a search whose arm was checked.
         failed: Whether a plan was requested, and there is none.
     """
     pick = pick or candidates.best
     T_base_ct = T_base_ct if plan is None else plan.T_base_ct
-    bodies = [*patient(anatomy, case), *safe_region(candidates, case), *room(case, T_base_ct)]
-    direction = chosen_direction(pick, plan)
+    bodies = [
+        *scene_parts.patient(anatomy, case),
+        *scene_parts.safe_region(candidates, case),
+        *scene_parts.room(case, T_base_ct),
+    ]
+    direction = scene_parts.chosen_direction(pick, plan)
     if direction is not None:
-        bodies.extend(needle_bodies(case.needle, case.target_ct, direction))
-    arm = [] if failed else arm_bodies(case, plan, pick, T_base_ct)
+        bodies.extend(scene_parts.needle_bodies(case.needle, case.target_ct, direction))
+    arm = [] if failed else scene_parts.arm_bodies(case, plan, pick, T_base_ct)
     image = Image.new("RGB", (WIDTH, HEIGHT), annotate.WHITE)
     draw = ImageDraw.Draw(image)
-    path_ct = _path(case, pick, plan)
+    path_ct = None if pick is None else np.stack([case.target_ct, pick.candidates.path.entry_ct[pick.row]])
+    if plan is not None:
+        path_ct = np.stack([plan.target_ct, plan.entry_ct])
     with_arm = [*bodies, *arm]
     far = _overview_camera(case, with_arm, path_ct)
     needle = None if path_ct is None else _needle_line(case, path_ct)
     title = "Overview" + (": needle on the target" if arm else "")
     _view(image, draw, with_arm, far, LEFT_BOX, case, title, needle)
-    near = _close_camera(case, bodies, path_ct)
+    along, radius = path_ct, CLOSE_RADIUS_MM
+    if along is None:
+        along, radius = case.target_ct + np.outer([0.0, 1.0], case.T_ct_entry[:3, 2]), NOTHING_RADIUS_MM
+    organs = Layer([b.surface for b in bodies if b.alpha >= 1 and b.group in {"organ", "target"}])
+    near = close_up(case, along, radius, organs, _size(RIGHT_BOX))
     few = [body for body in bodies if body.name != "needle holder" and body.group not in HIDDEN_NEARBY]
     _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
     bottom = _text(draw, case, candidates, plan, bool(arm), bodies, pick, failed, anatomy.scan)
@@ -94,25 +85,19 @@ def draw_scene(
     annotate.write_image(image, path)
 
 
-def render_bodies(bodies: Sequence[SceneBody], camera: ViewCamera) -> NDArray[np.uint8]:
+def render_bodies(bodies: Sequence[scene_parts.SceneBody], camera: ViewCamera) -> NDArray[np.uint8]:
     """One view of a scene, anti-aliased: the opaque bodies, and the see-through ones over them."""
     opaque, glass = ([b.surface for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False))
     return picture(Layer(opaque), Layer(glass), camera)
 
 
-def _path(case: Any, pick: Pick | None, plan: Any | None) -> NDArray[np.float64] | None:
-    """Target and entry, shape (2, 3), or None."""
-    if plan is not None:
-        return np.stack([plan.target_ct, plan.entry_ct])
-    return None if pick is None else np.stack([case.target_ct, pick.candidates.path.entry_ct[pick.row]])
-
-
-def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> ViewCamera:
+def _overview_camera(case: Any, bodies: Sequence[scene_parts.SceneBody], path_ct: Any) -> ViewCamera:
     size = _size(LEFT_BOX)
     points = []
     for body in bodies:
         vertices = body.mesh.vertices
-        if body.group in {"skin", "organ"} and _reach_mm(body, case.target_ct) >= BODY_RADIUS_MM:
+        farthest = np.linalg.norm(np.abs(body.mesh.bounds - case.target_ct).max(axis=0))  # no corner is farther
+        if body.group in {"skin", "organ"} and farthest >= BODY_RADIUS_MM:
             vertices = vertices[np.linalg.norm(vertices - case.target_ct, axis=1) < BODY_RADIUS_MM]
         if body.group != "room" and len(vertices):
             points.append(vertices)
@@ -122,24 +107,10 @@ def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> Vi
     return overview(case, np.concatenate(points), focus, blockers, size, outward)
 
 
-def _reach_mm(body: SceneBody, point_ct: NDArray[np.float64]) -> float:
-    """No corner of a body is farther than this from a point (3,)."""
-    return float(np.linalg.norm(np.abs(body.mesh.bounds - point_ct).max(axis=0)))
-
-
 def _needle_line(case: Any, path_ct: NDArray[np.float64]) -> NDArray[np.float64]:
     along = path_ct[1] - path_ct[0]
     along = along / np.linalg.norm(along)
     return np.asarray(path_ct[0] + np.linspace(0, case.needle.length_mm, 24)[:, None] * along)
-
-
-def _close_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> ViewCamera:
-    radius = CLOSE_RADIUS_MM
-    if path_ct is None:
-        z = np.asarray(case.T_ct_entry)[:3, 2]
-        path_ct, radius = np.stack([case.target_ct, case.target_ct + z]), NOTHING_RADIUS_MM
-    blockers = Layer([b.surface for b in bodies if b.alpha >= 1 and b.group in {"organ", "target"}])
-    return close_up(case, path_ct, radius, blockers, _size(RIGHT_BOX))
 
 
 def _size(box: tuple[int, int, int, int]) -> tuple[int, int]:
@@ -149,7 +120,7 @@ def _size(box: tuple[int, int, int, int]) -> tuple[int, int]:
 def _view(
     image: Image.Image,
     draw: ImageDraw.ImageDraw,
-    bodies: Sequence[SceneBody],
+    bodies: Sequence[scene_parts.SceneBody],
     camera: ViewCamera,
     box: tuple[int, int, int, int],
     case: Any,
@@ -184,7 +155,7 @@ def _text(
     candidates: Candidates,
     plan: Any | None,
     arm: bool,
-    bodies: Sequence[SceneBody],
+    bodies: Sequence[scene_parts.SceneBody],
     pick: Pick | None,
     failed: bool,
     scan: Any | None,
@@ -197,29 +168,20 @@ def _text(
     else:
         text, colour = _path_text(plan, pick, failed, arm, scan), annotate.RED if failed else annotate.FAINT
     annotate.write(draw, (18, 50), text, size=18, bold=nothing, colour=colour)
-    items = [("target", palette.TARGET_POINT), (needle_text(case.needle), palette.NEEDLE)]
+    items = [("target", palette.TARGET_POINT), (scene_parts.needle_text(case.needle), palette.NEEDLE)]
     if candidates.safe.any():
         items.append((f"{candidates.safe_text}: safe entry area and corridor (overview)", SAFE))
     items.append(("skin (see-through)", palette.SKIN))
     if arm:
-        items += [
-            (
-                f"arm ({plan.model.name})" if plan is not None else "arm, as the search reaches this direction",
-                palette.ARM,
-            ),
-            ("needle holder", palette.HOLDER),
-            ("position of its base", palette.TABLE),
-        ]
-    items += [(_see_through(b), b.colour) for b in bodies if b.group == "room"]
+        shown = f"arm ({plan.model.name})" if plan is not None else "arm, as the search reaches this direction"
+        items += [(shown, palette.ARM), ("needle holder", palette.HOLDER), ("position of its base", palette.TABLE)]
+    named = [(body, body.name + (" (see-through)" if body.alpha < 1 else "")) for body in bodies]
+    items += [(name, body.colour) for body, name in named if body.group == "room"]
     below = annotate.legend(draw, items, 20, LEGEND_TOP, WIDTH - 20)
-    names = [(_see_through(b), b.colour) for b in bodies if b.group == "organ"]
+    names = [(name, body.colour) for body, name in named if body.group == "organ"]
     note = "research software, not a medical device"
     annotate.write(draw, (WIDTH - 18, 24), note, size=14, colour=annotate.FAINT, anchor="ra")
     return annotate.legend(draw, families(names), 20, below, WIDTH - 20)
-
-
-def _see_through(body: SceneBody) -> str:
-    return body.name + (" (see-through)" if body.alpha < 1 else "")
 
 
 def _path_text(plan: Any | None, pick: Pick | None, failed: bool, arm: bool, scan: Any | None) -> str:
@@ -238,8 +200,7 @@ def _path_text(plan: Any | None, pick: Pick | None, failed: bool, arm: bool, sca
     return text + ("  PLANNING FAILED: no arm is shown" if failed else "  (no plan was requested: no arm is shown)")
 
 
-MOST_ENTRIES = 26
-"""Up to so many entries of the legend nothing is folded."""
+MOST_ENTRIES = 26  # up to so many entries of the legend nothing is folded
 
 
 def families(names: list[tuple[str, Rgb]]) -> list[tuple[str, Rgb]]:

@@ -10,30 +10,24 @@ from scipy.spatial import ConvexHull
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS
+from puncture_twin.planning.geometry.rigid import frame_about
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.render import Layer
 
-FOV = np.radians(28.0)
-"""A long lens: little perspective, sizes compare."""
-
+FOV = np.radians(28.0)  # a long lens: little perspective, sizes compare
 UPRIGHT = 0.5
 """An entry frame whose z is within 60 degrees of the body's long axis does not say what is up on the table."""
 
 ALONG_BODY = 0.62
 """A patient is not looked at more steeply along the body than this cosine: from head or feet little is recognised."""
 
-ENTRY_SIDE = 0.35
-"""Least cosine between the needle and the way to whoever looks: from behind the body no entry is seen."""
-
+ENTRY_SIDE = 0.35  # least cosine between the needle and the way to whoever looks: from behind the body no entry is seen
 ELEVATIONS = (np.radians(22.0), np.radians(40.0))
 AZIMUTHS = 16
 TILTS = (0.0, np.radians(25.0), np.radians(-25.0))
-EXTENT_WEIGHT = 0.8
-"""What the focus' length in the picture counts, where all of it being seen counts 1."""
-
+EXTENT_WEIGHT = 0.8  # what the focus' length in the picture counts, where all of it being seen counts 1
 PATH_SAMPLES = 24
-TARGET_WEIGHT = 8
-"""The target counts as so many points of the path when one asks what a view hides."""
+TARGET_WEIGHT = 8  # the target counts as so many points of the path when one asks what a view hides
 
 
 def up_ct(case: Any) -> Floats:
@@ -55,8 +49,7 @@ def overview(
     """A view of everything from above the table and from the needle's side, from where it is best seen.
 
     Args:
-        content_ct: Shape (n, 3), what must be in the picture.
-        focus_ct: Shape (k, 3), what should not be hidden.
+        content_ct: Shape (n, 3), what must be in the picture; focus_ct, (k, 3), should not be hidden.
         outward_ct: Shape (3,), unit, from the target out of the body along the needle; None looks from any side.
     """
     up = up_ct(case)
@@ -88,16 +81,10 @@ def close_up(case: Any, path_ct: Floats, radius: float, blockers: Layer, size: t
 
 def _around(axis: Floats, tilts: Sequence[float]) -> list[Floats]:
     """Unit vectors about a unit axis (3,), at so many azimuths, so far toward it from across, rad."""
-    side = _across(axis)
+    side = -frame_about(axis)[:, 0]
     turns = (np.arange(AZIMUTHS) + 0.5) * 2 * np.pi / AZIMUTHS
     levels = [np.cos(turn) * side + np.sin(turn) * np.cross(axis, side) for turn in turns]
     return [np.cos(tilt) * level + np.sin(tilt) * axis for tilt in tilts for level in levels]
-
-
-def _across(direction: Floats) -> Floats:
-    least = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    side = np.cross(direction, least)
-    return np.asarray(side / np.linalg.norm(side))
 
 
 def _best(
@@ -111,8 +98,9 @@ def _best(
         if abs(toward @ up) <= 0.95
     ]
     if not cameras:
-        return camera_around(content, -_across(up), up, fov=FOV, width=size[0], height=size[1])
-    extents = [_extent(camera, focus, size) for camera in cameras]
+        return camera_around(content, frame_about(up)[:, 0], up, fov=FOV, width=size[0], height=size[1])
+    spans = [np.ptp(camera.project(focus)[:, :2], axis=0) for camera in cameras]
+    extents = [float(np.linalg.norm(span) / np.hypot(*size)) for span in spans]  # of the picture's diagonal
     best, best_score = 0, -np.inf
     for i in np.argsort(-np.array(extents), kind="stable").tolist():
         if EXTENT_WEIGHT * extents[i] + 1.0 < best_score:  # nor does one after it, were nothing hidden
@@ -121,9 +109,3 @@ def _best(
         if score > best_score or (score == best_score and i < best):
             best, best_score = i, score
     return cameras[best]
-
-
-def _extent(camera: ViewCamera, focus: Floats, size: tuple[int, int]) -> float:
-    """How long the focus is in the picture, of the picture's diagonal."""
-    seen = camera.project(focus)
-    return float(np.linalg.norm(np.ptp(seen[:, :2], axis=0)) / np.hypot(*size))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,10 +28,8 @@ from puncture_twin.twin.report.palette import OUTSIDE, SKIN, TARGET_POINT, organ
 from puncture_twin.twin.report.present import number
 from puncture_twin.twin.report.slices.planes import Plane, capsule, ellipse, letters, outline, toward_text
 
-NEAR_MM = 30.0
-"""A structure with a margin that lies nearer to the needle is drawn strongly and named."""
-MOST_NEAR = 8
-"""So many of them at most, the nearest."""
+NEAR_MM = 30.0  # a structure with a margin that lies nearer to the needle is drawn strongly and named
+MOST_NEAR = 8  # so many of them at most, the nearest
 
 BESIDE: dict[str, tuple[str, Rgb]] = {
     OUTSIDE_BODY: ("beside the body: table, cloths, lines, and their unseen parts", (255, 170, 40)),
@@ -113,17 +110,12 @@ class Subject:
 
     @cached_property
     def _demanding(self) -> tuple[Near, ...]:
-        """All structures with a margin, nearest first."""
         if self.pick is None:
             return ()
         found, row = self.pick.candidates.clearance, self.pick.row
-        rows = zip(found.structures, found.distance[row], found.margins, strict=True)
-        demanding = [
-            Near(name, self.colours.get(name, OUTSIDE), float(mm), float(margin))
-            for name, mm, margin in rows
-            if np.isfinite(margin)
-        ]
-        return tuple(sorted(demanding, key=lambda one: one.clearance_mm))
+        rows = zip(found.structures, found.distance[row].tolist(), found.margins.tolist(), strict=True)
+        near = (Near(name, self.colours.get(name, OUTSIDE), mm, margin) for name, mm, margin in rows)
+        return tuple(sorted((one for one in near if np.isfinite(one.margin_mm)), key=lambda one: one.clearance_mm))
 
     @property
     def margin_mm(self) -> float:
@@ -132,21 +124,12 @@ class Subject:
 
     @cached_property
     def bent_mm(self) -> Floats | None:
-        """The shaft of a bevel that never turns, shape (m, 2): along the path from the target, and off it, mm.
-
-        None where the case declares no tissue, or the path has no entry.
-        """
+        """A bevel's shaft, shape (m, 2), mm along the path and off it; None without tissue, or without an entry."""
         if self.case.bending is None or not np.isfinite(self.path_mm):
             return None
-        found = insertion_along(
-            self.case.bending, self.anatomy, self.case.target_ct, self.outward_ct, self.path_mm
-        ).path
+        where = self.case.target_ct, self.outward_ct, self.path_mm
+        found = insertion_along(self.case.bending, self.anatomy, *where).path
         return np.stack([self.path_mm - found.depth_mm, found.needle_mm], axis=1)
-
-    @property
-    def needle_radius_mm(self) -> float:
-        """Half the needle's diameter."""
-        return float(self.case.needle.radius_mm)
 
     @property
     def title(self) -> str:
@@ -161,43 +144,25 @@ PIXELS = 480
 
 NEEDLE_COLOUR: Rgb = (0, 229, 255)
 REGION_COLOUR: Rgb = (255, 77, 240)
-BENT_COLOUR: Rgb = (182, 255, 0)
-"""On grey none is near a structure's colour."""
-
-STRONG, WEAK, OF_SKIN, OF_BEAD = 2.5, 1.1, 1.6, 4.0
-"""Pixels: how wide outlines are, and how large a bead is."""
-
-RIM = 1.8
-"""Pixels of black under thin lines, both sides together, so that they show on bright tissue too."""
-
+BENT_COLOUR: Rgb = (182, 255, 0)  # on grey none is near a structure's colour
+STRONG, WEAK, OF_SKIN, OF_BEAD = 2.5, 1.1, 1.6, 4.0  # pixels: how wide outlines are, and how large a bead is
+RIM = 1.8  # pixels of black under thin lines, both sides together, so that they show on bright tissue too
 LETTERS, SMALL, LETTERS_RIM = 16, 12, halo(3.2, "black")
 """Pixels: of the directions and of the scale, in white with a black rim."""
 
 IN_PLANE = 1e-3
 """A needle whose direction has less than this along a plane's normal lies in it."""
 
-BEADS = 0.025
-"""Between two beads, of half a picture's side."""
-MOST_BEADS = 1 << 20
-"""More than beads side by side; numbers their rows and columns as one."""
-
-SCALE_FRACTION = 0.34
-"""Of a picture's side, the scale bar at most."""
-
-EDGE = 7.0
-"""Pixels between a picture's edge and the letters there."""
-
+BEADS = 0.025  # between two beads, of half a picture's side
+MOST_BEADS = 1 << 20  # more than beads side by side; numbers their rows and columns as one
+SCALE_FRACTION = 0.34  # of a picture's side, the scale bar at most
+EDGE = 7.0  # pixels between a picture's edge and the letters there
 CLEAR = 24.0
 """Pixels that letters keep from the needle's line, along their edge."""
 
 
 class Panel(NamedTuple):
-    """One slice.
-
-    Attributes:
-        hu: Shape (PIXELS, PIXELS), NaN where the image ends; None in a case without CT.
-        overlay: Shape (PIXELS, PIXELS, 4), RGB and opacity.
-    """
+    """One slice: HU (PIXELS, PIXELS), NaN where the image ends, None without a CT; lines over it, RGB and opacity."""
 
     plane: Plane
     hu: Floats | None
@@ -211,15 +176,21 @@ def draw_panel(subject: Subject, plane: Plane) -> Panel:
     figure = figure_of(PIXELS, PIXELS, ground="none")
     axes = figure.add_axes((0, 0, 1, 1))  # in the plane's mm
     axes.set_axis_off()
-    axes.set_xlim(plane.centre[0] - plane.half_mm, plane.centre[0] + plane.half_mm)
-    axes.set_ylim(plane.centre[1] - plane.half_mm, plane.centre[1] + plane.half_mm)
-    axes.set_autoscale_on(False)
+    edges = plane.centre + plane.half_mm * np.array([[-1.0], [1.0]])
+    axes.set(xlim=edges[:, 0], ylim=edges[:, 1], autoscale_on=False)
     _outlines(axes, subject, plane)
     if subject.pick is not None:
         _needle(axes, subject, plane)
-    _target(axes, plane)
+    near, far = 0.03 * plane.half_mm, 0.09 * plane.half_mm
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        axes.plot((near * x, far * x), (near * y, far * y), color=css(TARGET_POINT), linewidth=2.4)
     _directions(axes, subject, plane)
-    _scale(axes, plane)
+    side = 2 * plane.half_mm
+    length = max((mm for mm in SCALE_BARS_MM if mm <= SCALE_FRACTION * side), default=SCALE_BARS_MM[0])
+    left, low = plane.centre - plane.half_mm * np.array([0.94, 0.93])
+    bar: dict[str, Any] = {"solid_capstyle": "butt", "linewidth": 4, "path_effects": halo(6, "black")}
+    axes.plot((left, left + length), (low, low), color="white", **bar)
+    _write(axes, (0.03 * PIXELS, 0.035 * PIXELS + 8), f"{length} mm", SMALL)
     return Panel(plane, hu, pixels(figure))
 
 
@@ -281,8 +252,8 @@ def _needle(axes: Axes, subject: Subject, plane: Plane) -> None:
 
     Nothing is drawn of a needle that is not in the plane: its shadow would cross what the needle passes by.
     """
-    outward, radius = subject.outward_ct, subject.needle_radius_mm
-    shaft = subject.case.needle.shaft_mm
+    outward, needle = subject.outward_ct, subject.case.needle
+    radius, shaft = float(needle.radius_mm), needle.shaft_mm
     path = subject.path_mm if np.isfinite(subject.path_mm) else shaft
     if subject.margin_mm > 0:
         _line(axes, capsule(outward, path, radius + subject.margin_mm, plane), 1.3, NEEDLE_COLOUR, "--")
@@ -303,12 +274,6 @@ def _bent(axes: Axes, subject: Subject, plane: Plane, bent_mm: Floats) -> None:
     along = plane.place(plane.at_ct + outward)
     for aside in (np.array([-along[1], along[0]]), np.array([along[1], -along[0]])):
         _line(axes, bent_mm @ np.stack([along, aside]), 1.7, BENT_COLOUR)
-
-
-def _target(axes: Axes, plane: Plane) -> None:
-    near, far = 0.03 * plane.half_mm, 0.09 * plane.half_mm
-    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        axes.plot((near * x, far * x), (near * y, far * y), color=css(TARGET_POINT), linewidth=2.4)
 
 
 def _directions(axes: Axes, subject: Subject, plane: Plane) -> None:
@@ -337,16 +302,6 @@ def _write(axes: Axes, at: tuple[float, float], text: str, size: float, **look: 
     axes.text(*at, text, fontsize=size, color="white", path_effects=LETTERS_RIM, transform=None, **look)
 
 
-def _scale(axes: Axes, plane: Plane) -> None:
-    """A bar of a round length in the lower left corner."""
-    side = 2 * plane.half_mm
-    length = max((mm for mm in SCALE_BARS_MM if mm <= SCALE_FRACTION * side), default=SCALE_BARS_MM[0])
-    left, low = plane.centre - plane.half_mm * np.array([0.94, 0.93])
-    bar: dict[str, Any] = {"solid_capstyle": "butt", "linewidth": 4, "path_effects": halo(6, "black")}
-    axes.plot((left, left + length), (low, low), color="white", **bar)
-    _write(axes, (0.03 * PIXELS, 0.035 * PIXELS + 8), f"{length} mm", SMALL)
-
-
 class Tone(NamedTuple):
     """A window of Hounsfield units: its middle is grey, its ends are black and white."""
 
@@ -359,9 +314,7 @@ class Tone(NamedTuple):
         return np.round(255 * np.clip(fraction, 0.0, 1.0)).astype(np.uint8)
 
 
-TONES = MappingProxyType(
-    {"abdomen": Tone(40, 400), "lung": Tone(-600, 1500), "bone": Tone(400, 1800), "brain": Tone(40, 80)}
-)
+TONES = {"abdomen": Tone(40, 400), "lung": Tone(-600, 1500), "bone": Tone(400, 1800), "brain": Tone(40, 80)}
 """As on the consoles of scanners."""
 
 KNOTS_HU = (-1350.0, -160.0, 0.0, 80.0, 240.0, 1300.0)

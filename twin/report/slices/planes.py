@@ -1,7 +1,4 @@
-"""The planes in which a needle's path or an image is looked at: where each lies, what is right and up in it.
-
-Where a plane cuts surfaces, the needle, and the ellipsoid of the tip.
-"""
+"""The planes in which a needle's path or an image is looked at, and where each cuts surfaces, needle and tip region."""
 
 from __future__ import annotations
 
@@ -23,8 +20,7 @@ ALONG_LEFT = 0.95
 LEAST_HALF_MM, BESIDE_MM, PROBE_HALF_MM = 60.0, 35.0, 40.0
 """Half a picture's side at least, what it shows beyond target and entry, and half of the probe's-eye view."""
 
-OBLIQUE = 0.38
-"""A direction within 22 degrees of an axis is named by that axis alone."""
+OBLIQUE = 0.38  # a direction within 22 degrees of an axis is named by that axis alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +80,14 @@ def needle_planes(target_ct: Floats, outward_ct: Floats, path_mm: float) -> tupl
         return Plane(name, target_ct, right, up, centre, half_mm)
 
     side, up, across = _oblique_axes(outward_ct)
+    top = HEAD if abs(outward_ct @ HEAD) < ALONG_LEFT else -BACK  # of who looks along the needle: head, or else front
+    top = _unit(top - (top @ outward_ct) * outward_ct)
     along = outward_ct if outward_ct @ BACK > 0 else -outward_ct
     return (
         plane("axial, through the target", LEFT, -BACK),
         plane(f"along the needle, {_tilt_deg(side, up):.0f}° from axial", side, up),
         plane(f"along the needle, {_tilt_deg(along, across):.0f}° from axial", along, across),
-        plane("across the needle at the target", *_seen_along(-outward_ct), PROBE_HALF_MM),
+        plane("across the needle at the target", np.cross(-outward_ct, top), top, PROBE_HALF_MM),
     )
 
 
@@ -114,22 +112,11 @@ def _oblique_axes(outward_ct: Floats) -> tuple[Floats, Floats, Floats]:
     else:
         side = outward_ct if outward_ct @ LEFT > 0 else -outward_ct
         up = _unit(-BACK - (-BACK @ side) * side)
-    return side, up, _toward_head(np.cross(side, up))
-
-
-def _toward_head(normal: Floats) -> Floats:
-    return normal if normal @ (HEAD - 0.8 * BACK) > 0 else -normal
-
-
-def _seen_along(toward: Floats) -> tuple[Floats, Floats]:
-    """Right and up of who looks along a unit vector (3,), with the head, or else the front, at the top."""
-    top = HEAD if abs(toward @ HEAD) < ALONG_LEFT else -BACK
-    up = _unit(top - (top @ toward) * toward)
-    return np.cross(toward, up), up
+    normal = np.cross(side, up)
+    return side, up, normal if normal @ (HEAD - 0.8 * BACK) > 0 else -normal
 
 
 def _tilt_deg(right: Floats, up: Floats) -> float:
-    """Between a plane and the axial ones, degrees, 0..90."""
     return float(np.degrees(np.arccos(min(1.0, abs(np.cross(right, up) @ HEAD)))))
 
 
@@ -158,10 +145,7 @@ def _named(space: str, direction: Floats) -> list[str]:
 
 
 def outline(mesh: TriangleMesh, plane: Plane) -> Floats:
-    """The cut of a surface, shape (n, 2, 2): segments in the plane, mm to the right and up of the target.
-
-    Nothing of a surface whose box does not reach what the plane shows.
-    """
+    """The cut of a surface, shape (n, 2, 2): segments, mm from the target; none where its box is out of the picture."""
     if not _is_seen(mesh, plane):
         return np.zeros((0, 2, 2))
     return plane.place(_cut(mesh, plane))
@@ -170,9 +154,7 @@ def outline(mesh: TriangleMesh, plane: Plane) -> Floats:
 def _cut(mesh: TriangleMesh, plane: Plane) -> Floats:
     """Segments in which a plane cuts a mesh's triangles, shape (n, 2, 3), mm, in the order of the triangles."""
     height = (mesh.vertices - plane.at_ct) @ plane.normal
-    above = (
-        height[mesh.faces] > 0
-    )  # a corner in the plane counts as below it: every triangle is cut in no edge or in two
+    above = height[mesh.faces] > 0  # a corner in the plane counts as below: each triangle is cut in no edge or in two
     count = above.sum(axis=1)
     rows = np.flatnonzero((count == 1) | (count == 2))
     alone = np.argmax(above[rows] == (count[rows] == 1)[:, None], axis=1)  # the corner that is alone on its side
@@ -183,7 +165,6 @@ def _cut(mesh: TriangleMesh, plane: Plane) -> Floats:
 
 
 def _is_seen(mesh: TriangleMesh, plane: Plane) -> bool:
-    """Whether a surface's box reaches the part of the plane that is shown."""
     low, high = mesh.bounds
     middle, half = (low + high) / 2, (high - low) / 2
     axes = np.stack([plane.right, plane.up, plane.normal])
@@ -221,10 +202,7 @@ def capsule(outward_ct: Floats, length_mm: float, radius_mm: float, plane: Plane
 
 
 def ellipse(region_ct: Floats, plane: Plane, points: int = 121) -> Floats:
-    """The cut of the ellipsoid x' inv(region) x = 1 about the target, a closed line of shape (points, 2), mm.
-
-    Of a region without thickness across the plane's axes the line is flat, as it is.
-    """
+    """The cut of the ellipsoid x' inv(region) x = 1 about the target, a closed line of shape (points, 2), mm."""
     basis = np.stack([plane.right, plane.up])
     inverse = basis @ np.linalg.pinv(region_ct, hermitian=True) @ basis.T
     values, vectors = np.linalg.eigh(inverse)

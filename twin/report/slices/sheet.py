@@ -1,20 +1,27 @@
-"""``slices.png``: the slices of a direction and the units along its needle, or of an image alone, on one sheet."""
+"""``slices.png``: the slices of a direction and the units along its needle, or of an image alone, on one sheet.
+
+And a sheet of small slices about points: each in the axial plane and along the body, with a cross and its name.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from PIL import Image, ImageDraw
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb, css
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.bending import BEYOND_SKIN_MM, Stretch, stretches
 from puncture_twin.twin.report.annotate import FAINT, legend, write, write_image
 from puncture_twin.twin.report.figures import figure_of, pixels
 from puncture_twin.twin.report.numbers import target_text
-from puncture_twin.twin.report.palette import TARGET_POINT
+from puncture_twin.twin.report.palette import SKIN, TARGET_POINT
 from puncture_twin.twin.report.present import number
 from puncture_twin.twin.report.slices.panel import (
     NEEDLE_COLOUR,
@@ -27,11 +34,17 @@ from puncture_twin.twin.report.slices.panel import (
     draw_panel,
     leaning,
 )
-from puncture_twin.twin.report.slices.planes import body_planes, needle_planes
+from puncture_twin.twin.report.slices.planes import (
+    BACK,
+    HEAD,
+    LEFT as TO_LEFT,
+    Plane,
+    body_planes,
+    needle_planes,
+    outline,
+)
 
-WITHOUT_CT: Rgb = (44, 47, 54)
-"""Behind the outlines of a case without CT."""
-
+WITHOUT_CT: Rgb = (44, 47, 54)  # behind the outlines of a case without CT
 NO_CT = "The case has no CT: only the outlines of the structures."
 RADIOLOGICAL = "The patient's right is on the left. Each slice shows only its own plane: look at all of them."
 GAP, TOP, CAPTION = 16, 92, 50
@@ -39,12 +52,7 @@ GAP, TOP, CAPTION = 16, 92, 50
 
 @dataclass(frozen=True, eq=False)
 class Slices:
-    """The drawn slices of one direction.
-
-    Attributes:
-        panels: Four slices; three of an image alone.
-        units: Hounsfield units along the needle; None without a CT or an entry.
-    """
+    """Four slices of a direction, three of an image alone; the units along the needle where there is a CT."""
 
     subject: Subject
     panels: tuple[Panel, ...]
@@ -89,26 +97,18 @@ def draw_slices(subject: Subject) -> Slices:
     return Slices(subject, tuple(draw_panel(subject, plane) for plane in planes), units)
 
 
-UNITS_SIZE = (976, 330)
-"""Pixels: the plot of the units along the needle."""
+UNITS_SIZE = (976, 330)  # pixels: the plot of the units along the needle
 STEP_MM = 0.5
-BEYOND_TARGET_MM = 15.0
-"""How far behind the target the units are shown: where a tip goes that is too deep."""
-
-SHOWN_HU = (-1050.0, 500.0)
-"""At least; denser samples widen it."""
-
-BAR = 0.74
-"""Height of a structure's bar, of its row."""
-
+BEYOND_TARGET_MM = 15.0  # how far behind the target the units are shown: where a tip goes that is too deep
+SHOWN_HU = (-1050.0, 500.0)  # at least; denser samples widen it
+BAR = 0.74  # height of a structure's bar, of its row
 LEFT, RIGHT, BOTTOM, UPPER, BETWEEN = 0.2, 0.985, 0.14, 0.98, 0.02
 """Edges of the plot in the picture, names stand to the left; and what lies between the units and the bars."""
 
 ROW, MOST_BARS = 20.5 / UNITS_SIZE[1], 0.5
 """Of the picture: height of a structure's row, and of all of them together at most."""
 
-LETTERS, LEAST_LETTERS = 11.0, 8.0
-"""Pixels: names of many structures are smaller."""
+LETTERS, LEAST_LETTERS = 11.0, 8.0  # pixels: names of many structures are smaller
 
 
 def _hu_plot(subject: Subject) -> Image.Image | None:
@@ -132,12 +132,10 @@ def _hu_plot(subject: Subject) -> Image.Image | None:
 
 
 def _units(axes: Axes, subject: Subject) -> None:
-    """A step a sample; nothing where the image has ended."""
     depths = np.arange(-BEYOND_TARGET_MM, subject.path_mm + BEYOND_SKIN_MM, STEP_MM)
     hu = subject.anatomy.scan.hu_at(subject.case.target_ct + depths[:, None] * subject.outward_ct)
     axes.step(depths, hu, where="mid", color="0.15", linewidth=1.7)
-    axes.set_xlim(depths[-1], depths[0])
-    axes.set_ylim(SHOWN_HU[0], max(SHOWN_HU[1], 1.05 * np.nanmax(hu, initial=0.0)))
+    axes.set(xlim=(depths[-1], depths[0]), ylim=(SHOWN_HU[0], max(SHOWN_HU[1], 1.05 * np.nanmax(hu, initial=0.0))))
     axes.set_ylabel("HU", fontsize=LETTERS + 1)
     axes.tick_params(labelsize=LETTERS, labelbottom=False, length=0)
     axes.grid(visible=True, color="0.9")
@@ -167,9 +165,9 @@ def flat(panel: Panel, tone: Tone) -> Image.Image:
     return Image.alpha_composite(ground, Image.fromarray(panel.overlay)).convert("RGB")
 
 
-def write_sheet(slices: Slices, path: Path, tone: str = "abdomen") -> None:
+def write_sheet(slices: Slices, path: Path) -> None:
     """Write the sheet; it appears whole or not at all."""
-    subject, bottom = slices.subject, TOP + 2 * (PIXELS + CAPTION + GAP)
+    tone, subject, bottom = "abdomen", slices.subject, TOP + 2 * (PIXELS + CAPTION + GAP)
     units = 0 if slices.units is None else slices.units.height + GAP
     size = (3 * GAP + 2 * PIXELS, bottom + units + 150)
     sheet = Image.new("RGB", size, (255, 255, 255))
@@ -192,3 +190,61 @@ def write_sheet(slices: Slices, path: Path, tone: str = "abdomen") -> None:
         row += 20
     sheet = sheet.crop((0, 0, size[0], min(size[1], int(row) + GAP)))
     write_image(sheet, path)
+
+
+TILE, BETWEEN_TILES, HEAD_OF_TILE, ACROSS = 220, 10, 40, 3
+"""Pixels of a slice, between slices, and of a caption; points side by side."""
+CROSS, ARM = (3, 9), 2  # pixels from the point at which its cross begins and ends, and its width
+YELLOW: Rgb = (255, 211, 77)
+
+
+class Mark(NamedTuple):
+    """A point (3,), LPS mm, its name, and a line about it."""
+
+    name: str
+    point_ct: Floats
+    line: str
+
+
+def write_points_sheet(
+    path: Path,
+    title: str,
+    points: Sequence[Mark],
+    hu_at: Callable[[Floats], Floats] | None,
+    skin: TriangleMesh,
+    half_mm: float,
+) -> Path:
+    """Write the sheet, whole or not at all; `hu_at` gives HU at points (n, 3), NaN outside; None without a CT."""
+    rows = -(-len(points) // ACROSS)
+    width, height = 2 * TILE + BETWEEN_TILES, TILE + HEAD_OF_TILE + BETWEEN_TILES
+    across = min(ACROSS, len(points))
+    sheet = Image.new(
+        "RGB", (max(640, BETWEEN_TILES + across * (width + 2 * BETWEEN_TILES)), 70 + rows * height), (255, 255, 255)
+    )
+    draw = ImageDraw.Draw(sheet)
+    write(draw, (BETWEEN_TILES, 8), title, size=18, bold=True)
+    under = "Left: axial, the patient's right on the left. Right: sagittal, the back to the right."
+    under += f" Each {2 * half_mm:g} mm wide. Lines: the skin."
+    write(draw, (BETWEEN_TILES, 36), under, size=13, colour=FAINT)
+    for place, one in enumerate(points):
+        left, top = BETWEEN_TILES + (place % ACROSS) * (width + 2 * BETWEEN_TILES), 64 + (place // ACROSS) * height
+        write(draw, (left, top), one.name, size=15, bold=True)
+        write(draw, (left, top + 19), one.line, size=12, colour=FAINT)
+        for column, (right, up) in enumerate(((TO_LEFT, -BACK), (BACK, HEAD))):
+            plane = Plane(one.name, one.point_ct, right, up, np.zeros(2), half_mm)
+            sheet.paste(_tile(plane, hu_at, skin), (left + column * (TILE + BETWEEN_TILES), top + HEAD_OF_TILE))
+    write_image(sheet, path)
+    return path
+
+
+def _tile(plane: Plane, hu_at: Callable[[Floats], Floats] | None, skin: TriangleMesh) -> Image.Image:
+    tile = Image.new("RGB", (TILE, TILE), WITHOUT_CT)
+    if hu_at is not None:
+        tile = Image.fromarray(TONES["bone"].grey(hu_at(plane.points_ct(TILE)).reshape(TILE, TILE))).convert("RGB")
+    draw, middle = ImageDraw.Draw(tile), TILE / 2
+    for a, b in outline(skin, plane) * [1.0, -1.0] * middle / plane.half_mm + middle:
+        draw.line([*a, *b], fill=SKIN, width=1)
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        near, far = ((middle + x * away, middle + y * away) for away in CROSS)
+        draw.line([near, far], fill=YELLOW, width=ARM)
+    return tile
