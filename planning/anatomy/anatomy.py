@@ -46,24 +46,21 @@ CELLS, OWN_TARGET = 24, "target.hit_radius_mm"
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """What a needle must be checked against, and what could not be known.
-
-    Attributes:
-        structures: All structures of the body but the skin; the CT's unnamed dense components and gas among them.
-        surroundings: Solids outside of the body: what the CT shows there, obstacles, the gantry.
-        findings: The warnings again, and what is said besides, with code and numbers.
-        ignored: Names of labels that the case leaves out on purpose.
-        couch: What lies beyond what the body lies on in the CT, or None where no CT shows it.
-    """
+    """What a needle must be checked against, and what could not be known."""
 
     structures: tuple[Structure, ...]
+    """All structures of the body but the skin; the CT's unnamed dense components and gas among them."""
     skin: Skin
     warnings: tuple[str, ...]
     surroundings: tuple[Structure, ...] = ()
+    """Solids outside of the body: what the CT shows there, obstacles, the gantry."""
     scan: Scan | None = None
     ignored: tuple[str, ...] = ()
+    """Names of labels that the case leaves out on purpose."""
     couch: TriangleMesh | None = None
+    """What lies beyond what the body lies on in the CT, or None where no CT shows it."""
     findings: tuple[Finding, ...] = ()
+    """The warnings again, and what is said besides, with code and numbers."""
 
     @property
     def checked(self) -> tuple[Structure, ...]:

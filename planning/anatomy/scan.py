@@ -40,17 +40,14 @@ dense counts as body. Beyond, it is outside, as an arm is that the skin lacks.""
 
 
 class Outside(NamedTuple):
-    """What a CT shows outside of the body.
-
-    Attributes:
-        mesh: The surface of what is not known to be free, LPS mm; None for air alone.
-        couch: What lies beyond the far side of what the body lies on, where the image shows that; else None. Closed.
-        open_faces: Faces of the image near the body, beyond which nothing is known.
-    """
+    """What a CT shows outside of the body."""
 
     mesh: TriangleMesh | None
+    """The surface of what is not known to be free, LPS mm; None for air alone."""
     couch: TriangleMesh | None
+    """What lies beyond the far side of what the body lies on, where the image shows that; else None. Closed."""
     open_faces: tuple[Face, ...]
+    """Faces of the image near the body, beyond which nothing is known."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,16 +33,13 @@ a triangle that is a face of voxels."""
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """The closed surface of the body, LPS mm, normals outward, and which of its triangles are skin.
-
-    Attributes:
-        cut_faces: Shape (m,), triangles that are not skin: there the field of view ends, and the body goes on.
-        field_of_view: What was imaged, or None for a mesh that says nothing of that.
-    """
+    """The closed surface of the body, LPS mm, normals outward, and which of its triangles are skin."""
 
     mesh: TriangleMesh
     cut_faces: NDArray[np.bool_]
+    """Shape (m,), triangles that are not skin: there the field of view ends, and the body goes on."""
     field_of_view: FieldOfView | None
+    """What was imaged, or None for a mesh that says nothing of that."""
     warnings: tuple[str, ...]
 
     def __post_init__(self) -> None:
@@ -154,20 +151,17 @@ def field_of_view(body: NDArray[np.bool_], T_ct_index: Floats) -> FieldOfView:
 
 @dataclass(frozen=True, eq=False)
 class SkinPaths:
-    """The skin along n paths; mm, radians, NaN where there is none.
-
-    Attributes:
-        entry_ct: Shape (n, 3), where the path from outside first meets the skin for good, seen from the target.
-        path_length, skin_angle: Target to entry, and between the path and the skin's inward normal.
-        reentry_depth: Where the needle would meet skin again, before where its flange waits.
-        unknown_depth: Where the path leaves the body through a cut, or 0 where the skin's crossings do not add up.
-    """
+    """The skin along n paths; mm, radians, NaN where there is none."""
 
     entry_ct: Floats
+    """Shape (n, 3), where the path from outside first meets the skin for good, seen from the target. path_length,
+    skin_angle: Target to entry, and between the path and the skin's inward normal."""
     path_length: Floats
     skin_angle: Floats
     reentry_depth: Floats
+    """Where the needle would meet skin again, before where its flange waits."""
     unknown_depth: Floats
+    """Where the path leaves the body through a cut, or 0 where the skin's crossings do not add up."""
 
 
 def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, farthest: float) -> SkinPaths:

@@ -29,24 +29,21 @@ class Role(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """A named surface with a role.
-
-    Attributes:
-        margin_mm: The clearance that it demands, where its role demands one.
-        mesh: In the CT frame, mm.
-        source: The file it comes from, and the label in it.
-        outside: Whether it is outside of the body: then it is checked up to where the flange waits at its standoff.
-        voxel_ct: Shape (3, 3), the edges of the voxels that it was made of as columns, mm; None for one that no volume
-            shows, such as a mesh: nobody knows then how far its surface may lie off.
-    """
+    """A named surface with a role."""
 
     name: str
     role: Role
     margin_mm: float
+    """The clearance that it demands, where its role demands one."""
     mesh: TriangleMesh
+    """In the CT frame, mm."""
     source: str
+    """The file it comes from, and the label in it."""
     outside: bool = False
+    """Whether it is outside of the body: then it is checked up to where the flange waits at its standoff."""
     voxel_ct: Floats | None = None
+    """Shape (3, 3), the edges of the voxels that it was made of as columns, mm; None for one that no volume shows, such
+    as a mesh: nobody knows then how far its surface may lie off."""
 
     @property
     def voxel_mm(self) -> float:

@@ -173,18 +173,15 @@ class VolumeSurfaces:
 
 @dataclass(frozen=True)
 class Imaged:
-    """A scanner's image of a body: a CT, or a body's label, without padding around it.
-
-    Attributes:
-        box: The part that was seen, voxels of the canonical order.
-        label: Of the body; None where this is a CT.
-        notes: What was left out, one sentence each.
-    """
+    """A scanner's image of a body: a CT, or a body's label, without padding around it."""
 
     surfaces: VolumeSurfaces
     box: Box
+    """The part that was seen, voxels of the canonical order."""
     label: int | None
+    """Of the body; None where this is a CT."""
     notes: tuple[str, ...]
+    """What was left out, one sentence each."""
     shown: Shown
 
     @cached_property

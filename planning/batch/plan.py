@@ -51,23 +51,20 @@ NO_PLAN = "a folder written by `batch plan COHORT --out DIR`"
 
 @dataclass(frozen=True)
 class PlannedCase:
-    """A row of the plan.
-
-    Attributes:
-        id: Hash of inputs, options and version; also the name of its result's folder.
-        arm: False leaves the arm out; None checks it where the case says where its base is.
-        inputs: Role, path and SHA-256 of each file, as JSON.
-        refusal: Why the case cannot be read, or "".
-    """
+    """A row of the plan."""
 
     case: str
     id: str
+    """Hash of inputs, options and version; also the name of its result's folder."""
     name: str
     path: str
     options: str
     arm: bool | None
+    """False leaves the arm out; None checks it where the case says where its base is."""
     inputs: str
+    """Role, path and SHA-256 of each file, as JSON."""
     refusal: str
+    """Why the case cannot be read, or ""."""
 
 
 SCHEMA = pa.schema([(one.name, pa.bool_() if one.name == "arm" else pa.string()) for one in fields(PlannedCase)])

@@ -104,23 +104,20 @@ ALLOWED_AT_ONCE = "one run at a time, parallel parts (--part i/n), or another fo
 
 @dataclass
 class RunCounts:
-    """Counts of one run.
-
-    Attributes:
-        same: Planned cases that are others to the byte: they are run once.
-        before: Others that had their rows, of which ``refused_before`` were refused.
-        ended: Exit code of a row to how many rows.
-        reasons: Of rows whose exit code is above 1.
-        stale: Cases whose files are not those of the plan; they have no row.
-    """
+    """Counts of one run."""
 
     planned: int
     same: int
+    """Planned cases that are others to the byte: they are run once."""
     before: int
+    """Others that had their rows, of which ``refused_before`` were refused."""
     refused_before: int = 0
     ended: Counter[int] = field(default_factory=Counter)
+    """Exit code of a row to how many rows."""
     reasons: Counter[str] = field(default_factory=Counter)
+    """Of rows whose exit code is above 1."""
     stale: int = 0
+    """Cases whose files are not those of the plan; they have no row."""
 
     @property
     def failed(self) -> int:

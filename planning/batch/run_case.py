@@ -59,17 +59,14 @@ class CaseTask:
 
 
 class CaseEnd(NamedTuple):
-    """How a case ended.
-
-    Attributes:
-        exit_code: Of the case's row; None where there is no row, and ``reason`` says why.
-        full: What the system said of a disk that takes no more, or "".
-    """
+    """How a case ended."""
 
     id: str
     exit_code: int | None
+    """Of the case's row; None where there is no row, and ``reason`` says why."""
     reason: str | None
     full: str = ""
+    """What the system said of a disk that takes no more, or ""."""
 
 
 STALE = "its files differ from those of the plan"

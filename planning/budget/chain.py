@@ -80,20 +80,15 @@ GATES = (None, 0.5, 0.25, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """The chain from a target in the CT to a needle's tip: registration, arm, errors.
-
-    Attributes:
-        errors: As declared, times ``scale``.
-        scale: By which the markers' residuals multiply every declared error: 1 where they agree.
-        motion_base: Shape (3, 3), mm^2, of the target since the scan, base axes; None where it is not declared.
-        aim: The insertion that a joint registration is corrected for.
-    """
+    """The chain from a target in the CT to a needle's tip: registration, arm, errors."""
 
     model: UrModel
     tip_mm: float
     method: str
     errors: ErrorModel
+    """As declared, times ``scale``."""
     scale: float
+    """By which the markers' residuals multiply every declared error: 1 where they agree."""
     points_ct: Floats
     q_touch: Floats
     T_base_ct: Floats
@@ -102,7 +97,9 @@ class Chain:
     path: BentPath | None = None
     breathing: Breathing | None = None
     motion_base: Floats | None = None
+    """Shape (3, 3), mm^2, of the target since the scan, base axes; None where it is not declared."""
     aim: Aim | None = None
+    """The insertion that a joint registration is corrected for."""
 
     def pose_error(self) -> PoseError:
         """The pose error of this chain, its errors taken as declared."""

@@ -32,31 +32,25 @@ PIVOTED_MM = 0.05
 
 @dataclass(frozen=True)
 class SourceCost:
-    """One source of the expected error.
-
-    Attributes:
-        alone_mm: The tip's rms error, were there no other.
-        without_mm: Expected error with all sources but this one; the registration's weights stay.
-    """
+    """One source of the expected error."""
 
     source: str
     alone_mm: float
+    """The tip's rms error, were there no other."""
     without_mm: float
+    """Expected error with all sources but this one; the registration's weights stay."""
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """One change of the chain, and the error that it would leave.
-
-    Attributes:
-        group: slices, markers, touches, arm, tip, needle, breath or body.
-        point_ct: Shape (3,), mm, where the last of further markers sits; None for other changes.
-    """
+    """One change of the chain, and the error that it would leave."""
 
     group: str
+    """slices, markers, touches, arm, tip, needle, breath or body."""
     what: str
     rms_mm: float
     point_ct: Floats | None = None
+    """Shape (3,), mm, where the last of further markers sits; None for other changes."""
 
 
 def source_costs(chain: Chain) -> tuple[SourceCost, ...]:

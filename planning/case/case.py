@@ -38,32 +38,20 @@ ALLOWED_CASE = "a TOML case file with schema = 2, or a folder with case.toml"
 
 @dataclass(frozen=True, eq=False)
 class Case(Shown):
-    """What a search, a plan and a rehearsal start from. A `Case` has been validated.
-
-    Attributes:
-        target_ct: Shape (3,), the point to reach.
-        T_ct_entry: Shape (4, 4), the entry frame, its origin on the target.
-        volumes: Those of the files that are volumes: the CT and the label maps.
-        stated_structures: How many structures the case says that it has, the skin among them.
-        hit_radius_mm: Within which of the target the tip hits; None counts the target's own mesh.
-        errors: What is declared to err; None, as of all that follows, where the case does not say.
-        truth_errors: From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`.
-        own_target: Whether the target lies in no structure: its own is then the ball of the hit radius about it, which
-            has its name.
-        tool: What the flange carries beside needle and holder.
-        options: What is stated in place of what the case file states.
-    """
+    """What a search, a plan and a rehearsal start from. A `Case` has been validated."""
 
     path: Path
     name: str
     space: Space
     target_ct: Floats
+    """Shape (3,), the point to reach."""
     target_name: str
     target_structure: str
     needle: settings.Needle
     search: settings.SearchSettings
     ranking: tables.RankingSection
     T_ct_entry: Floats
+    """Shape (4, 4), the entry frame, its origin on the target."""
     structure: tuple[tables.StructureSection, ...]
     structures: tuple[tables.StructuresSection, ...]
     registration: tables.MarkerSection | None
@@ -72,15 +60,20 @@ class Case(Shown):
     rehearsal: tables.RehearsalSection
     files: InputFiles
     volumes: named_files.CaseVolumes
+    """Those of the files that are volumes: the CT and the label maps."""
     stated_structures: int
+    """How many structures the case says that it has, the skin among them."""
     region: str
     ct: settings.CtSettings = field(default_factory=settings.CtSettings)
     gantry: settings.Gantry | None = None
     place: tables.PlaceSection = field(default_factory=tables.PlaceSection)
     warnings: tuple[str, ...] = ()
     hit_radius_mm: float | None = None
+    """Within which of the target the tip hits; None counts the target's own mesh."""
     errors: ErrorModel | None = None
+    """What is declared to err; None, as of all that follows, where the case does not say."""
     truth_errors: ErrorModel | None = None
+    """From what a rehearsal's truth is drawn instead, to test a wrong belief; None draws from `errors`."""
     breathing: Breathing | None = None
     stereo: settings.Stereo | None = None
     ultrasound: settings.Ultrasound | None = None
@@ -88,8 +81,12 @@ class Case(Shown):
     motion: settings.Motion | None = None
     bending: Bending | None = None
     own_target: bool = False
+    """Whether the target lies in no structure: its own is then the ball of the hit radius about it, which has its
+    name."""
     tool: ToolBody | None = None
+    """What the flange carries beside needle and holder."""
     options: CaseOptions = NO_OPTIONS
+    """What is stated in place of what the case file states."""
 
     @brief
     def __repr__(self) -> str:

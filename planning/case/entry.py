@@ -38,18 +38,14 @@ GRID_SLACK, SAME_ANGLE = 1e-9, 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """A set of entry directions.
-
-    Attributes:
-        theta, beta: Shape (n,), rad: puncture angle from the entry frame's +z, azimuth from +x in its xy plane.
-        outward_ct: Shape (n, 3), unit vectors in the CT frame, from the target outward.
-        grid: The regular grid that they are, row by row; None for any others.
-    """
+    """A set of entry directions."""
 
     theta: Floats
     beta: Floats
     outward_ct: Floats
+    """Shape (n, 3), unit vectors in the CT frame, from the target outward."""
     grid: AngleGrid | None = None
+    """The regular grid that they are, row by row; None for any others."""
 
     def __len__(self) -> int:
         return len(self.theta)

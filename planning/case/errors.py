@@ -92,26 +92,23 @@ class ArmErrors(Section):
 
 @dataclass(frozen=True)
 class ArmUncertainty:
-    """Standard deviations of an arm and the needle on it; mm and radians.
-
-    Attributes:
-        link_mm: Of every Denavit-Hartenberg length a_i and d_i.
-        twist, joint: Of every twist alpha_i, and of every joint's zero.
-        repeatability: Of every joint, anew at each arrival.
-        drift: Of every joint, since the markers were touched.
-        jitter: Of every joint about where it arrived, at any one moment; a touch reads its mean.
-        tip_offset_mm: Of the needle's tip, per axis of the flange.
-        needle_direction: Of the needle's direction, about each of the flange's x and y axes.
-    """
+    """Standard deviations of an arm and the needle on it; mm and radians."""
 
     link_mm: float
+    """Of every Denavit-Hartenberg length a_i and d_i. twist, joint: Of every twist alpha_i, and of every joint's
+    zero."""
     twist: float
     joint: float
     repeatability: float
+    """Of every joint, anew at each arrival."""
     drift: float
+    """Of every joint, since the markers were touched."""
     tip_offset_mm: float
+    """Of the needle's tip, per axis of the flange."""
     needle_direction: float
+    """Of the needle's direction, about each of the flange's x and y axes."""
     jitter: float = 0.0
+    """Of every joint about where it arrived, at any one moment; a touch reads its mean."""
 
     @property
     def arriving(self) -> float:
@@ -125,22 +122,18 @@ class ArmUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """All declared errors of a case.
-
-    Attributes:
-        marker_cov_ct, target_cov_ct: Shape (3, 3), mm^2: of one marker, and of the target, read in the CT.
-        touch_mm: Of one touch, per axis of the base frame, besides the arm.
-        surface_mm: By which a whole structure's surface may lie off, along its normal; None where every structure's own
-            voxels say it.
-        found: Whether the markers' residuals give the size of all errors, and the declaration their shape.
-    """
+    """All declared errors of a case."""
 
     marker_cov_ct: Floats
     touch_mm: float
+    """Of one touch, per axis of the base frame, besides the arm."""
     target_cov_ct: Floats
     arm: ArmUncertainty
     surface_mm: float | None
+    """By which a whole structure's surface may lie off, along its normal; None where every structure's own voxels say
+    it."""
     found: bool = False
+    """Whether the markers' residuals give the size of all errors, and the declaration their shape."""
     size: float = 1.0
     """By which factor all that was declared has been scaled."""
 

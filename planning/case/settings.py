@@ -83,28 +83,25 @@ class SearchSettings:
 
 @dataclass(frozen=True)
 class CtSettings:
-    """The CT beside the structures.
-
-    Attributes:
-        file: Where the skin does not come from a CT, the CT's file, or None.
-        air_hu: Outside of the body, what is denser is not air.
-        dense_hu: Inside the body, what is at least so dense must belong to a structure, or to one that demands
-            ``margin_mm`` and is ``unknown``, or ``free``, as ``unnamed`` says.
-        trust_labels: Whether a person has seen that the structures lie right: no check of that refuses them.
-        arms, table: Whether the image shows limbs beside the trunk, and what the body lies on, if a person states it.
-        beyond_mm: How much wider than where the image cuts it the body may be beyond, where a person states it;
-            infinite for all that lies beyond the plane of the cut.
-    """
+    """The CT beside the structures."""
 
     file: str | None = None
+    """Where the skin does not come from a CT, the CT's file, or None."""
     air_hu: float = tables.AIR_HU
+    """Outside of the body, what is denser is not air."""
     dense_hu: float = tables.DENSE_HU
+    """Inside the body, what is at least so dense must belong to a structure, or to one that demands ``margin_mm`` and
+    is ``unknown``, or ``free``, as ``unnamed`` says."""
     margin_mm: float = 2.0
     unnamed: str = "unknown"
     trust_labels: bool = False
+    """Whether a person has seen that the structures lie right: no check of that refuses them. arms, table: Whether the
+    image shows limbs beside the trunk, and what the body lies on, if a person states it."""
     arms: tables.Stated | None = None
     table: tables.Stated | None = None
     beyond_mm: float | None = None
+    """How much wider than where the image cuts it the body may be beyond, where a person states it; infinite for all
+    that lies beyond the plane of the cut."""
 
     @property
     def declared(self) -> tuple[str, ...]:
@@ -139,17 +136,14 @@ class Gantry:
 
 @dataclass(frozen=True, eq=False)
 class RobotSettings:
-    """The arm, its home (6,), rad, or None for the model's own, and where its base is.
-
-    Attributes:
-        T_base_ct_mount: Shape (4, 4), mm, where a mount or a transform is stated.
-        stated: The section that states a transform.
-    """
+    """The arm, its home (6,), rad, or None for the model's own, and where its base is."""
 
     model: UrModel
     home: Floats | None
     T_base_ct_mount: Floats | None
+    """Shape (4, 4), mm, where a mount or a transform is stated."""
     stated: tables.RegistrationSection | None = None
+    """The section that states a transform."""
     speeds: SpeedLimits = DEFAULT_SPEEDS
 
     @property
@@ -172,19 +166,14 @@ class Stereo:
 
 @dataclass(frozen=True, eq=False)
 class Ultrasound:
-    """A probe on an arm of its own, whose base is at T_base_ct_mount (4, 4), mm; None where that is to be proposed.
-
-    Attributes:
-        target_sd_mm, tip_sd_mm: Of a reading in the image plane, per axis, and across it.
-        calibration_sd_mm: Of the image's place on its arm, per axis.
-        depth_mm, width_mm: How deep the probe sees, and its footprint.
-    """
+    """A probe on an arm of its own, whose base is at T_base_ct_mount (4, 4), mm; None where that is to be proposed."""
 
     model: UrModel
     T_base_ct_mount: Floats | None
     target_sd_mm: tuple[float, float]
     tip_sd_mm: tuple[float, float]
     calibration_sd_mm: float
+    """Of the image's place on its arm, per axis. depth_mm, width_mm: How deep the probe sees, and its footprint."""
     depth_mm: float
     width_mm: float
 

@@ -88,19 +88,16 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class Cones:
-    """Cones that enclose n cells, in the CT frame.
-
-    Attributes:
-        centres: Shape (n, 3), unit, the middle of each cell.
-        radius: Shape (n,), half-angle of the cone about it that encloses the cell, rad; π where none is known.
-        bulge: Shape (n,), every direction of the cell is a sum of its corners, with weights that are not negative and
-            add up to at least 1, and of a vector no longer than this.
-    """
+    """Cones that enclose n cells, in the CT frame."""
 
     centres: Floats
+    """Shape (n, 3), unit, the middle of each cell."""
     radius: Floats
+    """Shape (n,), half-angle of the cone about it that encloses the cell, rad; π where none is known."""
     corners: Floats
     bulge: Floats
+    """Shape (n,), every direction of the cell is a sum of its corners, with weights that are not negative and add up to
+    at least 1, and of a vector no longer than this."""
 
 
 @nb.njit(cache=True)

@@ -77,33 +77,30 @@ UNDECIDED_COLOUR: Rgb = (255, 255, 255)
 
 @dataclass(frozen=True, eq=False)
 class Certificate(Shown):
-    """A certified map: directions proven safe, proven rejected, and cells too small to decide.
-
-    Attributes:
-        size: No undecided cell has a larger angular diameter, rad.
-        tree: Level by level, a letter for each cell of the level: a split, or a leaf's verdict. The parts of a level's
-            split cells, in order, are the next level.
-        leaves: The leaves, in the order in which the tree names them.
-        verdict: Shape (n,), letter of each leaf.
-        reason: Shape (n,), for a rejected leaf the `Reason` that holds all over it, else "".
-        structure: Shape (n,), for ``too_close`` the structure that every axis comes too near to, else "".
-        triangle: Shape (n,), which of its triangles, or -1: no axis of the leaf keeps its limit from this one.
-        bound: Shape (n,), for ``too_close`` the largest clearance (mm), for ``too_long`` the least path length (mm),
-            for ``skin_angle`` the least angle (deg), for ``unknown_region`` the largest depth (mm); NaN where no number
-            was needed.
-        queries: Cells for which distances from structures were measured.
-    """
+    """A certified map: directions proven safe, proven rejected, and cells too small to decide."""
 
     question: Question
     size: float
+    """No undecided cell has a larger angular diameter, rad."""
     tree: tuple[str, ...]
+    """Level by level, a letter for each cell of the level: a split, or a leaf's verdict. The parts of a level's split
+    cells, in order, are the next level."""
     leaves: Cells
+    """The leaves, in the order in which the tree names them."""
     verdict: NDArray[np.str_]
+    """Shape (n,), letter of each leaf."""
     reason: NDArray[np.str_]
+    """Shape (n,), for a rejected leaf the `Reason` that holds all over it, else ""."""
     structure: NDArray[np.str_]
+    """Shape (n,), for ``too_close`` the structure that every axis comes too near to, else ""."""
     triangle: Ints
+    """Shape (n,), which of its triangles, or -1: no axis of the leaf keeps its limit from this one."""
     bound: Floats
+    """Shape (n,), for ``too_close`` the largest clearance (mm), for ``too_long`` the least path length (mm), for
+    ``skin_angle`` the least angle (deg), for ``unknown_region`` the largest depth (mm); NaN where no number was
+    needed."""
     queries: int
+    """Cells for which distances from structures were measured."""
 
     @brief
     def __repr__(self) -> str:

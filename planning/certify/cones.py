@@ -15,20 +15,17 @@ ZONE_PAD_RAD = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Zones:
-    """For m triangles, the directions to which each matters: a cone about the target.
-
-    Attributes:
-        axis: Shape (m, 3), unit.
-        cosine, sine: Shape (m,), of the half-angle, below a right angle; (-1, 0) for all directions.
-        farthest: Shape (m,), largest distance of the triangle from the target, mm.
-        nearest: Shape (m,), a distance from the target that no point of the triangle falls short of, mm.
-    """
+    """For m triangles, the directions to which each matters: a cone about the target."""
 
     axis: Floats
+    """Shape (m, 3), unit. cosine, sine: Shape (m,), of the half-angle, below a right angle; (-1, 0) for all
+    directions."""
     cosine: Floats
     sine: Floats
     farthest: Floats
+    """Shape (m,), largest distance of the triangle from the target, mm."""
     nearest: Floats
+    """Shape (m,), a distance from the target that no point of the triangle falls short of, mm."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,37 +29,31 @@ least: a triangle that is no witness by this estimate is not tried."""
 
 @dataclass(frozen=True, eq=False)
 class Organs:
-    """The m triangles of k structures that demand a margin, from the target.
-
-    Attributes:
-        corners: Shape (m, 9), mm.
-        group: Shape (m,), the structure of each, 0 to k - 1.
-        limits: Shape (k,), needle radius plus margin, mm.
-    """
+    """The m triangles of k structures that demand a margin, from the target."""
 
     corners: Floats
+    """Shape (m, 9), mm."""
     group: Ints
+    """Shape (m,), the structure of each, 0 to k - 1."""
     limits: Floats
+    """Shape (k,), needle radius plus margin, mm."""
     zones: Zones
 
 
 @dataclass(frozen=True, eq=False)
 class OrganFacts:
-    """Facts about organs that hold for every axis of n cells.
-
-    Attributes:
-        near: The triangles of which a cell is not proven clear; a cell without one is clear of all.
-        witness: Shape (n,), a triangle, -1 for none. In a rejected cell every axis comes too near to it.
-        rejected: Shape (n,), every axis comes too near to a structure.
-        largest: Shape (n,), in a rejected cell every axis comes at least so near to the witness, mm.
-        measured: Cells for which a triangle was measured that their parents' witness had not settled.
-    """
+    """Facts about organs that hold for every axis of n cells."""
 
     near: Lists
+    """The triangles of which a cell is not proven clear; a cell without one is clear of all."""
     witness: Ints
+    """Shape (n,), a triangle, -1 for none. In a rejected cell every axis comes too near to it."""
     rejected: Bools
+    """Shape (n,), every axis comes too near to a structure."""
     largest: Floats
+    """Shape (n,), in a rejected cell every axis comes at least so near to the witness, mm."""
     measured: int
+    """Cells for which a triangle was measured that their parents' witness had not settled."""
 
 
 def organ_facts(

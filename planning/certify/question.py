@@ -22,17 +22,7 @@ MOST_TOUCH = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """The question of a certificate: everything but the surfaces that a verdict depends on; mm and rad.
-
-    Attributes:
-        theta, beta: The cap: lowest and highest angle.
-        standoff: Distance tip to target before the insertion where the case states one, else None.
-        skin_gap: The least distance from the waiting tip to the skin, along the needle.
-        farthest: The flange's greatest distance from the target while the tip waits: how far skin matters.
-        structures: Names of the k structures that demand a margin.
-        margins: Shape (k,), their margins; with ``touch`` at least so wide that the chance is kept.
-        touch: The chance to touch each structure that no safe cell exceeds; None asks for none.
-    """
+    """The question of a certificate: everything but the surfaces that a verdict depends on; mm and rad."""
 
     case_name: str
     inputs: tuple[Input, ...]
@@ -42,14 +32,20 @@ class Question:
     beta: tuple[float, float]
     length: float
     standoff: float | None
+    """Distance tip to target before the insertion where the case states one, else None."""
     skin_gap: float
+    """The least distance from the waiting tip to the skin, along the needle."""
     farthest: float
+    """The flange's greatest distance from the target while the tip waits: how far skin matters."""
     radius: float
     longest: float
     max_skin_angle: float
     structures: tuple[str, ...]
+    """Names of the k structures that demand a margin."""
     margins: Floats
+    """Shape (k,), their margins; with ``touch`` at least so wide that the chance is kept."""
     touch: float | None = None
+    """The chance to touch each structure that no safe cell exceeds; None asks for none."""
 
     def cap(self) -> Cells:
         """The whole cap of directions as one cell."""

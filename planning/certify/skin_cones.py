@@ -25,21 +25,17 @@ SIDE_ROUNDING = 1e-11
 
 @dataclass(frozen=True, eq=False)
 class SkinBounds:
-    """Bounds that are true of every ray of n cells; mm and rad.
-
-    Attributes:
-        count: Shape (n,), crossings within the needle's length, the same for all rays; -1 where that is not proven.
-        cut: Shape (n,), whether a triangle that is not skin may be hit within the needle's length.
-        least_skin: Shape (n,), no skin is hit at a smaller depth; inf where none is hit within the range.
-        farthest: Shape (n,), no crossing within the needle's length is deeper.
-        least_angle, largest_angle: Shape (n,), bounds of the angle to the normal at every skin crossing that is no
-            deeper than the longest path.
-    """
+    """Bounds that are true of every ray of n cells; mm and rad."""
 
     count: NDArray[np.int64]
+    """Shape (n,), crossings within the needle's length, the same for all rays; -1 where that is not proven."""
     cut: NDArray[np.bool_]
+    """Shape (n,), whether a triangle that is not skin may be hit within the needle's length."""
     least_skin: Floats
+    """Shape (n,), no skin is hit at a smaller depth; inf where none is hit within the range."""
     farthest: Floats
+    """Shape (n,), no crossing within the needle's length is deeper. least_angle, largest_angle: Shape (n,), bounds of
+    the angle to the normal at every skin crossing that is no deeper than the longest path."""
     least_angle: Floats
     largest_angle: Floats
 

@@ -20,24 +20,21 @@ RAYS, SEED = 5, 11
 
 @dataclass(frozen=True, eq=False)
 class SkinSurface:
-    """The m triangles of a skin, from the target.
-
-    Attributes:
-        corners: Shape (m, 3, 3), mm from the target.
-        normals: Shape (m, 3, 3), unit normal at each corner: what `puncture_twin.planning.anatomy.skin` blends.
-        fold: Shape (m, 3), whether the number of crossings may change where a ray passes the edge from corner i to
-            i + 1: it is not shared by exactly two triangles that lie on its two sides as seen from the target.
-        cut: Shape (m,), triangles that are not skin.
-        zones: The directions that hit each triangle.
-        odd: Whether a ray crosses the surface an odd number of times; True for an open one, where it means nothing.
-    """
+    """The m triangles of a skin, from the target."""
 
     corners: Floats
+    """Shape (m, 3, 3), mm from the target."""
     normals: Floats
+    """Shape (m, 3, 3), unit normal at each corner: what `puncture_twin.planning.anatomy.skin` blends."""
     fold: Bools
+    """Shape (m, 3), whether the number of crossings may change where a ray passes the edge from corner i to i + 1: it
+    is not shared by exactly two triangles that lie on its two sides as seen from the target."""
     cut: Bools
+    """Shape (m,), triangles that are not skin."""
     zones: Zones
+    """The directions that hit each triangle."""
     odd: bool
+    """Whether a ray crosses the surface an odd number of times; True for an open one, where it means nothing."""
 
 
 def skin_surface(skin: Skin, target_ct: Floats) -> SkinSurface:

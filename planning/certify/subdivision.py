@@ -93,23 +93,20 @@ def certify(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Knowledge of n cells, inherited from the cells that they are parts of.
-
-    Attributes:
-        parent: Shape (n,), row of each cell's lists.
-        skin: Triangles of the skin that may matter.
-        organs: Triangles of the body's structures that may matter, and behind them those outside of the body.
-        witness: Shape (2, n), of both the triangle that nearly rejected the whole, or -1.
-        skin_good: Shape (n,), the skin's constraints hold.
-        flange: Shape (n, 2), how far from the target flanges are while the tip waits, at least and at most, mm.
-    """
+    """Knowledge of n cells, inherited from the cells that they are parts of."""
 
     parent: Ints
+    """Shape (n,), row of each cell's lists."""
     skin: Lists
+    """Triangles of the skin that may matter."""
     organs: tuple[Lists, Lists]
+    """Triangles of the body's structures that may matter, and behind them those outside of the body."""
     witness: Ints
+    """Shape (2, n), of both the triangle that nearly rejected the whole, or -1."""
     skin_good: Bools
+    """Shape (n,), the skin's constraints hold."""
     flange: Floats
+    """Shape (n, 2), how far from the target flanges are while the tip waits, at least and at most, mm."""
 
     def of(self, rows: Ints) -> _State:
         """The state of parts of the cells ``rows``."""

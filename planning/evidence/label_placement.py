@@ -93,24 +93,21 @@ ALLOWED = (
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Structures that were written together, and lie right or wrong together.
-
-    Attributes:
-        axes: Shape (3, 3), unit columns: of its grid, or of the patient.
-        middles: Places (3,) about which it may be mirrored or turned: of its grid or the image the middle; the origin.
-        first: Shape (3,), the first voxel of its grid, about which it may be scaled too.
-        voxel_mm: Shape (3,), of the coarser of its voxels and the image's along each of its axes.
-        grid_slip: Where the CT has its matrix on another grid: the map (4, 4) to that; else None.
-    """
+    """Structures that were written together, and lie right or wrong together."""
 
     name: str
     meshes: dict[str, TriangleMesh]
     axes: Floats
+    """Shape (3, 3), unit columns: of its grid, or of the patient."""
     middles: tuple[Floats, Floats]
+    """Places (3,) about which it may be mirrored or turned: of its grid or the image the middle; the origin."""
     first: Floats
+    """Shape (3,), the first voxel of its grid, about which it may be scaled too."""
     voxel_mm: Floats
+    """Shape (3,), of the coarser of its voxels and the image's along each of its axes."""
     in_units: bool = False
     grid_slip: Floats | None = None
+    """Where the CT has its matrix on another grid: the map (4, 4) to that; else None."""
 
     def placements(self) -> list[edges.Placement]:
         """Every other place that is tried."""
@@ -132,33 +129,30 @@ class Source:
 
 
 class Assessed(NamedTuple):
-    """What the edges say of one source.
-
-    Attributes:
-        z: The largest over all placements that were tried; -inf where the image shows none of the surfaces.
-        ratio: Of the edge strength there to that as it is.
-        slip: How far it is, rms over the surfaces, in shifts of the least that counts.
-        T: Shape (4, 4), LPS mm: the refined place where one is named, else None.
-        middle_ct: Shape (3,), of the surfaces as they are.
-        open: The kinds of placements that are not excluded.
-        odd, unconfirmed: Structures that lie, or may lie, better shifted by themselves.
-        agreeing: Structures of which two or more lie better at one place, whatever it is.
-        unseen: Structures of which the image shows less than half.
-        uneven: Of the best placement to as it is, over all structures: what is above 1 is no place of organs.
-    """
+    """What the edges say of one source."""
 
     z: float
+    """The largest over all placements that were tried; -inf where the image shows none of the surfaces."""
     ratio: float
+    """Of the edge strength there to that as it is."""
     kind: str
     slip: float
+    """How far it is, rms over the surfaces, in shifts of the least that counts."""
     T: Floats | None
+    """Shape (4, 4), LPS mm: the refined place where one is named, else None."""
     middle_ct: Floats
+    """Shape (3,), of the surfaces as they are."""
     open: tuple[str, ...]
+    """The kinds of placements that are not excluded. odd, unconfirmed: Structures that lie, or may lie, better shifted
+    by themselves."""
     odd: tuple[str, ...]
     agreeing: tuple[str, ...]
+    """Structures of which two or more lie better at one place, whatever it is."""
     unconfirmed: tuple[str, ...]
     unseen: tuple[str, ...]
+    """Structures of which the image shows less than half."""
     uneven: float
+    """Of the best placement to as it is, over all structures: what is above 1 is no place of organs."""
 
     @property
     def doubtful(self) -> bool:

@@ -199,19 +199,16 @@ def _ros2(plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:
 
 
 class Exporter(NamedTuple):
-    """A format: how a plan is written, and how that is read back, to be held against the plan before it is published.
-
-    Attributes:
-        ending: Of the file's name, such as ``.csv``.
-        write: ``write(plan, case_checked=bool)``: an ASCII text.
-        read: ``read(text, where=path)``: the motion that the text holds, as a robot would take it.
-        time_resolution_s: To which times are written.
-    """
+    """How a plan is written in a format, and read back, to be held against the plan before it is published."""
 
     ending: str
+    """Of the file's name, such as ``.csv``."""
     write: Callable[..., str]
+    """``write(plan, case_checked=bool)``: an ASCII text."""
     read: Callable[..., SampledMotion]
+    """``read(text, where=path)``: the motion that the text holds, as a robot would take it."""
     time_resolution_s: float = 0.0
+    """To which times are written."""
     notes: tuple[str, ...] = ()
 
     def draft(self, plan: Plan, source: Path, checker: StateChecker | None) -> _Draft:

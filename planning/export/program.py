@@ -42,22 +42,19 @@ MOST_SAMPLES = 200_000
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A URScript program as numbers: mm, rad, s, the controller's base frame.
-
-    Attributes:
-        tcp_mm: Needle tip in the flange frame, along z.
-        moves: The approach as moves from rest to rest, or empty.
-        stream_q: Shape (n, 6), the approach as angles every ``STREAM_S``, or n = 0.
-        T_base_standoff: Shape (4, 4), needle tip before the insertion; ``standoff_q`` (6,) the arm there.
-        T_base_target: Shape (4, 4), needle tip after it; ``target_q`` (6,) the arm there.
-    """
+    """A URScript program as numbers: mm, rad, s, the controller's base frame."""
 
     tcp_mm: float
+    """Needle tip in the flange frame, along z."""
     start_q: Floats
     moves: tuple[JointMove, ...]
+    """The approach as moves from rest to rest, or empty."""
     stream_q: Floats
+    """Shape (n, 6), the approach as angles every ``STREAM_S``, or n = 0."""
     T_base_standoff: Floats
+    """Shape (4, 4), needle tip before the insertion; ``standoff_q`` (6,) the arm there."""
     T_base_target: Floats
+    """Shape (4, 4), needle tip after it; ``target_q`` (6,) the arm there."""
     standoff_q: Floats
     target_q: Floats
     insertion_mm_s: float

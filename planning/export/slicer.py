@@ -207,17 +207,14 @@ STEEPEST = 4.0
 
 @dataclass(frozen=True, eq=False)
 class EntryArea:
-    """Triangles on the skin, each between three safe directions of one window.
-
-    Attributes:
-        points_ct: Shape (n, 3), LPS mm: where the paths enter.
-        safe_cone_deg: Shape (n,), degrees by which each direction may err all round; 0 where nothing is known.
-    """
+    """Triangles on the skin, each between three safe directions of one window."""
 
     points_ct: Floats
+    """Shape (n, 3), LPS mm: where the paths enter."""
     faces: Ints
     window: Ints
     safe_cone_deg: Floats
+    """Shape (n,), degrees by which each direction may err all round; 0 where nothing is known."""
 
 
 def entry_area(candidates: Candidates) -> EntryArea:

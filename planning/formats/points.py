@@ -33,21 +33,18 @@ from puncture_twin.planning.geometry.spaces import Space, Unit, parse_unit, to_l
 
 @dataclass(frozen=True, eq=False)
 class NamedPoints(Shown):
-    """Points with names, as guarded: finite, at least one, every name once.
-
-    Attributes:
-        names: Shape (n,), in the order of the file.
-        points: Shape (n, 3), mm, read-only, in ``space``.
-        space: LPS for patient data, LOCAL for a frame of its own, None where it is not stated (such as a robot's base).
-        kinds: Shape (n,), what each point is, where the file says so ("marker", "lesion").
-        joints: Shape (n, 6), rad, read-only: how the robot stood at the touch of each, where the file says so.
-    """
+    """Points with names, as guarded: finite, at least one, every name once."""
 
     names: tuple[str, ...]
+    """Shape (n,), in the order of the file."""
     points: NDArray[np.float64]
+    """Shape (n, 3), mm, read-only, in ``space``."""
     space: Space | None
+    """LPS for patient data, LOCAL for a frame of its own, None where it is not stated (such as a robot's base)."""
     kinds: tuple[str, ...] | None = None
+    """Shape (n,), what each point is, where the file says so ("marker", "lesion")."""
     joints: NDArray[np.float64] | None = None
+    """Shape (n, 6), rad, read-only: how the robot stood at the touch of each, where the file says so."""
 
     def _facts(self) -> Facts:
         yield "space", str(self.space or "not stated")

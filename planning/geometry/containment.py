@@ -171,22 +171,19 @@ NUDGE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Every crossing, sorted by ray and then by depth, mm from the origin; the first four of shape (c,).
-
-    Attributes:
-        sense: 1 where the ray comes out through the triangle's front (its corners run counterclockwise seen from
-            there), -1 where it goes in, 0 where it does both at once (two surfaces touch there, or one is folded) or
-            the triangle is seen edge-on.
-        count: Shape (n,), crossings of each ray.
-        first: Shape (n,), row in ``depth`` of each ray's first crossing (meaningless where count is 0).
-    """
+    """Every crossing, sorted by ray and then by depth, mm from the origin; the first four of shape (c,)."""
 
     ray: Ints
     depth: Floats
     face: Ints
     sense: Ints
+    """1 where the ray comes out through the triangle's front (its corners run counterclockwise seen from there), -1
+    where it goes in, 0 where it does both at once (two surfaces touch there, or one is folded) or the triangle is
+    seen edge-on."""
     count: Ints
+    """Shape (n,), crossings of each ray."""
     first: Ints
+    """Shape (n,), row in ``depth`` of each ray's first crossing (meaningless where count is 0)."""
 
 
 def crossings(mesh: TriangleMesh, origin: Floats, directions: Floats, length: float = np.inf) -> Crossings:

@@ -52,20 +52,17 @@ class System(NamedTuple, Generic[X]):
 
 
 class Fit(NamedTuple, Generic[X]):
-    """Result of Gauss-Newton.
-
-    Attributes:
-        system: Linearised where the last step (p,), in the unknowns' units, began; 0 where none was left to make.
-        settled: Whether it arrived within the steps it was given.
-        determined: Whether no unknown was left alone by the last step.
-    """
+    """Result of Gauss-Newton."""
 
     estimate: X
     system: System[X]
+    """Linearised where the last step (p,), in the unknowns' units, began; 0 where none was left to make."""
     step: Floats
     iterations: int
     settled: bool
+    """Whether it arrived within the steps it was given."""
     determined: bool
+    """Whether no unknown was left alone by the last step."""
 
 
 def gauss_newton(
@@ -136,19 +133,14 @@ def _descend(
 
 
 class Lacking(NamedTuple):
-    """Explanation of a linear model's residuals by k unknowns that it lacks.
-
-    Attributes:
-        found, sd: Shape (k,): their values, and standard deviations by the residuals that they leave.
-        probability: Chance of residuals that they explain so well, where all are zero: F(k, freedom).
-        freedom: Residuals less p and k.
-        variance, variance_without: Of one residual, with them and in the model without them.
-    """
+    """Explanation of a linear model's residuals by k unknowns that it lacks."""
 
     found: Floats
     sd: Floats
     probability: float
+    """Chance of residuals that they explain so well, where all are zero: F(k, freedom)."""
     freedom: int
+    """Residuals less p and k. variance, variance_without: Of one residual, with them and in the model without them."""
     variance: float
     variance_without: float
 

@@ -39,20 +39,17 @@ CURVE_PIECES = 8
 
 @dataclass(frozen=True, eq=False)
 class Approach:
-    """A collision-free motion from home to a standoff pose, with the needle outside the patient.
-
-    Attributes:
-        waypoints: Shape (k, 6), rad, k >= 2: straight joint segments from home to the goal.
-        cuts: Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there.
-        trajectory: The motion: rounded at the waypoints, within the limits of speed, acceleration and jerk.
-        checked_q: Shape (m, 6), rad: the states that FCL found free, in order, as of :func:`dense_states`.
-    """
+    """A collision-free motion from home to a standoff pose, with the needle outside the patient."""
 
     waypoints: Floats
+    """Shape (k, 6), rad, k >= 2: straight joint segments from home to the goal."""
     cuts: Floats
+    """Shape (k - 2,), rad: how far from each waypoint between the ends its rounding begins; 0 stops there."""
     trajectory: Trajectory
+    """The motion: rounded at the waypoints, within the limits of speed, acceleration and jerk."""
     goal_index: int
     checked_q: Floats
+    """Shape (m, 6), rad: the states that FCL found free, in order, as of :func:`dense_states`."""
     seed: int
     attempts: int
 

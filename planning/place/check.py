@@ -61,22 +61,19 @@ def placement_check(case: Case, anatomy: Anatomy, candidates: Candidates) -> Pla
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Exact reach from one placement, in the directions that were checked.
-
-    Attributes:
-        fraction: Of the wanted solid angle, 0..1; where not all were checked, each counts for those nearest to it.
-        home_contact: What the arm touches in its home configuration, or "".
-        answers: Of each checked direction; where all were checked, in the order of the candidates.
-    """
+    """Exact reach from one placement, in the directions that were checked."""
 
     fraction: float
+    """Of the wanted solid angle, 0..1; where not all were checked, each counts for those nearest to it."""
     reached: int
     count: int
     margin: float
     reasons: Mapping[str, int]
     home_contact: str
+    """What the arm touches in its home configuration, or ""."""
     q_insertion: Floats
     answers: tuple[ReachAnswer, ...]
+    """Of each checked direction; where all were checked, in the order of the candidates."""
 
 
 class Checked(NamedTuple):
@@ -88,20 +85,17 @@ class Checked(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlacementCheck:
-    """Checks placements. Its values can be sent to another process.
-
-    Attributes:
-        outside: What the CT shows outside of the skin, or None; CT frame, as the skin.
-        fixed: Boxes that stand with the patient; their ``T_base_box`` is in the CT frame.
-        carried: Boxes that stand with the arm, base frame.
-    """
+    """Checks placements. Its values can be sent to another process."""
 
     model: UrModel
     tool: Tool
     skin: TriangleMesh
     outside: TriangleMesh | None
+    """What the CT shows outside of the skin, or None; CT frame, as the skin."""
     fixed: tuple[Box, ...]
+    """Boxes that stand with the patient; their ``T_base_box`` is in the CT frame."""
     carried: tuple[Box, ...]
+    """Boxes that stand with the arm, base frame."""
     padding_mm: float
     target_ct: Floats
     wanted: WantedDirections

@@ -40,19 +40,16 @@ nearly always do. FCL finds 31 % of 1,500 random states of a UR3 in contact with
 
 @dataclass(frozen=True, eq=False)
 class ArmSpheres:
-    """Bounding spheres of the links, the needle's holder and the tool, by body; not the needle.
-
-    Attributes:
-        centres: Shape (n, 3), mm, each in its body's frame.
-        radii: Shape (n,), mm.
-        starts: Shape (k + 1,): the first sphere of each body, which encloses all of the body; the others cover it.
-        frames: Shape (k,), the body's frame among ``link_poses``: 0 is the base's.
-    """
+    """Bounding spheres of the links, the needle's holder and the tool, by body; not the needle."""
 
     centres: Floats
+    """Shape (n, 3), mm, each in its body's frame."""
     radii: Floats
+    """Shape (n,), mm."""
     starts: NDArray[np.int64]
+    """Shape (k + 1,): the first sphere of each body, which encloses all of the body; the others cover it."""
     frames: NDArray[np.int64]
+    """Shape (k,), the body's frame among ``link_poses``: 0 is the base's."""
 
     @classmethod
     def of(cls, model: UrModel, tool: Tool) -> ArmSpheres:
@@ -250,15 +247,12 @@ MARGIN_CELLS = 4
 
 @dataclass(frozen=True, eq=False)
 class SkinField:
-    """Signed distance to the skin on a regular grid: negative inside, where the skin has an inside.
-
-    Attributes:
-        origin: Shape (3,), mm, CT frame: the first node.
-        values: Shape (i, j, k), mm; nodes stand ``CELL_MM`` apart.
-    """
+    """Signed distance to the skin on a regular grid: negative inside, where the skin has an inside."""
 
     origin: Floats
+    """Shape (3,), mm, CT frame: the first node."""
     values: Floats
+    """Shape (i, j, k), mm; nodes stand ``CELL_MM`` apart."""
 
     @classmethod
     def of(cls, skin: TriangleMesh) -> SkinField:

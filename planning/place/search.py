@@ -75,20 +75,17 @@ ERROR_DIGITS = 2
 
 @dataclass(frozen=True)
 class RatedPlacement:
-    """A placement, checked and rated.
-
-    Attributes:
-        site: Position of the base, and by which estimate it was chosen; None for the case's own placement.
-        verdict: The result of the exact check, in some directions or all.
-        expected_mm: Expected (rms) error of the tip over its insertions, the markers touched anew from there; None
-            where the case declares no errors, or has no markers.
-    """
+    """A placement, checked and rated."""
 
     site: Site | None
+    """Position of the base, and by which estimate it was chosen; None for the case's own placement."""
     mount: MountSection
     estimate: ReachEstimate | None
     verdict: Verdict
+    """The result of the exact check, in some directions or all."""
     expected_mm: float | None
+    """Expected (rms) error of the tip over its insertions, the markers touched anew from there; None where the case
+    declares no errors, or has no markers."""
 
     @property
     def name(self) -> str:
@@ -98,24 +95,21 @@ class RatedPlacement:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PlaceSearch(Shown):
-    """Result of a search for placements.
-
-    Attributes:
-        possible: Fraction of directions, 0..1, in which the needle may wait at its standoff: no placement reaches more.
-        checked: Directions checked, summed over placements, and how many would have been in the end, if known.
-        rated: Best first; the case's own placement is not among them.
-        own: The case's own placement, checked; None where it has none, or the search ended before.
-    """
+    """Result of a search for placements."""
 
     T_ct_bed: Floats
     coarse: tuple[tuple[Site, ReachEstimate], ...]
     refined: int
     resolution_mm: float
     possible: float
+    """Fraction of directions, 0..1, in which the needle may wait at its standoff: no placement reaches more."""
     directions: int
     checked: tuple[int, int | None]
+    """Directions checked, summed over placements, and how many would have been in the end, if known."""
     rated: tuple[RatedPlacement, ...]
+    """Best first; the case's own placement is not among them."""
     own: RatedPlacement | None
+    """The case's own placement, checked; None where it has none, or the search ended before."""
 
     @property
     def complete(self) -> bool:

@@ -22,23 +22,17 @@ from puncture_twin.planning.uncertainty.guided import WayChance
 
 @dataclass(frozen=True, eq=False)
 class Plan(Shown):
-    """One puncture, ready to be rehearsed: mm, rad, s.
-
-    Attributes:
-        T_base_ct: Shape (4, 4), the belief of where the patient is.
-        expected_target_error_mm: Expected tip error (rms), in the insertion's configuration of the arm; without
-            ``[errors]`` the registration's TRE alone; NaN for a stated mount or transform.
-        clearance_mm: Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder
-            to patient and workcell, ``needle`` to the nearest structure with a margin.
-        guidance: What each way of guidance would leave; empty where the case declares no devices.
-    """
+    """One puncture, ready to be rehearsed: mm, rad, s."""
 
     case_name: str
     inputs: tuple[Input, ...]
     seed: int
     model: UrModel
     T_base_ct: Floats
+    """Shape (4, 4), the belief of where the patient is."""
     expected_target_error_mm: float
+    """Expected tip error (rms), in the insertion's configuration of the arm; without ``[errors]`` the registration's
+    TRE alone; NaN for a stated mount or transform."""
     theta: float
     beta: float
     entry_ct: Floats
@@ -50,9 +44,12 @@ class Plan(Shown):
     approach: Trajectory
     insertion: Trajectory
     clearance_mm: Mapping[str, float]
+    """Per phase, the least distance that was found: ``approach`` and ``insertion`` of arm and holder to patient and
+    workcell, ``needle`` to the nearest structure with a margin."""
     warnings: tuple[str, ...]
     speeds: SpeedLimits = DEFAULT_SPEEDS
     guidance: tuple[WayChance, ...] = ()
+    """What each way of guidance would leave; empty where the case declares no devices."""
 
     @property
     def theta_deg(self) -> float:

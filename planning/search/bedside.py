@@ -20,24 +20,21 @@ from puncture_twin.planning.geometry.spaces import Space, to_lps
 
 @dataclass(frozen=True, eq=False)
 class EntryFacts:
-    """One path from outside to the target, as described to a person at the patient.
-
-    Attributes:
-        space: Of the case: what a person typed is answered in it.
-        entry_mm: Shape (3,), the skin entry in that space, mm; NaN without one.
-        place: Seen from the nearest marker, or from the target where the case has none; None without an entry.
-        planes: Its angles in the scanner; None in a local space, which has no anatomy.
-        scanned: Where the entry is in the scan; None without a CT or an entry, and in a local space.
-        needle_mm: The shortest needle of the case's catalogue that reaches, tip to flange; NaN where none does, None
-            without a catalogue.
-    """
+    """One path from outside to the target, as described to a person at the patient."""
 
     space: Space
+    """Of the case: what a person typed is answered in it."""
     entry_mm: Floats
+    """Shape (3,), the skin entry in that space, mm; NaN without one."""
     place: EntryPlace | None
+    """Seen from the nearest marker, or from the target where the case has none; None without an entry."""
     planes: NeedlePlanes | None
+    """Its angles in the scanner; None in a local space, which has no anatomy."""
     scanned: ScannedEntry | None = None
+    """Where the entry is in the scan; None without a CT or an entry, and in a local space."""
     needle_mm: float | None = None
+    """The shortest needle of the case's catalogue that reaches, tip to flange; NaN where none does, None without a
+    catalogue."""
 
     def rows(self) -> tuple[tuple[str, str], ...]:
         """Pairs of a label and its text, for people."""
@@ -74,20 +71,17 @@ class EntryFacts:
 
 
 class ScannedEntry(NamedTuple):
-    """Where a skin entry is in the scan.
-
-    Attributes:
-        slice: Its slice, 1 at the feet; 0 or beyond ``slices`` outside of the image.
-        table_mm: The slice's z, as DICOM has it: a console's slice location or, with its own sign, table position.
-        sagittal_mm: From the sagittal laser's line, positive to the patient's left, if x = 0 is the isocentre.
-        coronal_mm: From the coronal laser's line, positive toward the back, if y = 0 is the isocentre.
-    """
+    """Where a skin entry is in the scan."""
 
     slice: int
+    """Its slice, 1 at the feet; 0 or beyond ``slices`` outside of the image."""
     slices: int
     table_mm: float
+    """The slice's z, as DICOM has it: a console's slice location or, with its own sign, table position."""
     sagittal_mm: float
+    """From the sagittal laser's line, positive to the patient's left, if x = 0 is the isocentre."""
     coronal_mm: float
+    """From the coronal laser's line, positive toward the back, if y = 0 is the isocentre."""
 
     def rows(self) -> tuple[tuple[str, str], ...]:
         """Pairs of a label and its text for people."""
@@ -135,18 +129,15 @@ def entry_facts(
 
 
 class NeedlePlanes(NamedTuple):
-    """Angles of one needle, rad.
-
-    Attributes:
-        in_plane: Between the patient's front and the needle as it is seen in the axial slice, -π..π; positive: the hub
-            is on the patient's left. NaN for a needle along the patient.
-        out_of_plane: Between the axial slice and the needle, -π/2..π/2; positive: the hub leans toward the head.
-        gantry_tilt: At which the needle lies in the slice, -π/2..π/2; positive: the top leans toward the feet.
-    """
+    """Angles of one needle, rad."""
 
     in_plane: float
+    """Between the patient's front and the needle as it is seen in the axial slice, -π..π; positive: the hub is on the
+    patient's left. NaN for a needle along the patient."""
     out_of_plane: float
+    """Between the axial slice and the needle, -π/2..π/2; positive: the hub leans toward the head."""
     gantry_tilt: float
+    """At which the needle lies in the slice, -π/2..π/2; positive: the top leans toward the feet."""
 
     def rows(self) -> tuple[tuple[str, str], ...]:
         """Pairs of a label and its text for people."""

@@ -36,22 +36,19 @@ ANGLE_DIGITS = 9
 
 @dataclass(frozen=True, eq=False)
 class Verdict(Columns):
-    """The first constraint that each candidate breaks.
-
-    Attributes:
-        reason: Shape (n,), values of `Reason`; the empty string where the candidate is safe.
-        structure: Shape (n,), the structure (or arm body and what it touches) that the reason names, or "".
-        depth: Shape (n,), distance from the target along the needle, mm; NaN where it means nothing.
-        amount: Shape (n,), the number that fell short: clearance for ``too_close``, path length for ``too_long``, the
-            skin angle in degrees for ``skin_angle``, the chance for ``hit_unlikely``, ``touch_likely``; NaN otherwise.
-        detail: Shape (n,), what kept the arm, in one sentence; "" for the organs' reasons.
-    """
+    """The first constraint that each candidate breaks."""
 
     reason: Texts
+    """Shape (n,), values of `Reason`; the empty string where the candidate is safe."""
     structure: Texts
+    """Shape (n,), the structure (or arm body and what it touches) that the reason names, or ""."""
     depth: Floats
+    """Shape (n,), distance from the target along the needle, mm; NaN where it means nothing."""
     amount: Floats
+    """Shape (n,), the number that fell short: clearance for ``too_close``, path length for ``too_long``, the skin angle
+    in degrees for ``skin_angle``, the chance for ``hit_unlikely``, ``touch_likely``; NaN otherwise."""
     detail: Texts
+    """Shape (n,), what kept the arm, in one sentence; "" for the organs' reasons."""
 
     @property
     def safe(self) -> Bools:
@@ -82,50 +79,41 @@ class Verdict(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Path(Columns):
-    """The path from the skin to the target.
-
-    Attributes:
-        entry_ct: Shape (n, 3), where the path crosses the skin, mm; NaN without an entry.
-        length: Shape (n,), target to entry, mm.
-        skin_angle: Shape (n,), between the path and the skin's inward normal, rad; 0 is straight in.
-        tissue: Shape (n,), length of path inside structures that may be crossed, mm.
-    """
+    """The path from the skin to the target."""
 
     entry_ct: Floats
+    """Shape (n, 3), where the path crosses the skin, mm; NaN without an entry."""
     length: Floats
+    """Shape (n,), target to entry, mm."""
     skin_angle: Floats
+    """Shape (n,), between the path and the skin's inward normal, rad; 0 is straight in."""
     tissue: Floats
+    """Shape (n,), length of path inside structures that may be crossed, mm."""
 
 
 @dataclass(frozen=True, eq=False)
 class Clearance(Columns):
-    """How far the needle's surface stays from each of k structures, mm.
-
-    Attributes:
-        margins: Shape (k,), what each structure demands; NaN for one that demands nothing.
-        distance: Shape (n, k), axis distance minus needle radius.
-        least: Shape (n,), smallest over the structures with a margin.
-    """
+    """How far the needle's surface stays from each of k structures, mm."""
 
     structures: tuple[str, ...]
     margins: Floats
+    """Shape (k,), what each structure demands; NaN for one that demands nothing."""
     distance: Floats
+    """Shape (n, k), axis distance minus needle radius."""
     least: Floats
+    """Shape (n,), smallest over the structures with a margin."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArmColumns(Columns):
-    """Whether and how the arm reaches each candidate.
-
-    Attributes:
-        reachable: Shape (n,), 1 yes, 0 no, -1 not queried.
-        margin: Shape (n,), 0..1 distance from joint limits and singularities; NaN where not queried.
-        q_insertion: Shape (n, 6), the joints that put the tip on the target, rad; NaN where the arm does not reach it.
-    """
+    """Whether and how the arm reaches each candidate."""
 
     reachable: NDArray[np.int8]
+    """Shape (n,), 1 yes, 0 no, -1 not queried."""
     margin: Floats
+    """Shape (n,), 0..1 distance from joint limits and singularities; NaN where not queried."""
     q_insertion: Floats
+    """Shape (n, 6), the joints that put the tip on the target, rad; NaN where the arm does not reach it."""
 
     @classmethod
     def unknown(cls, count: int) -> ArmColumns:
@@ -135,17 +123,14 @@ class ArmColumns(Columns):
 
 @dataclass(frozen=True, eq=False)
 class Ranking(Columns):
-    """The order of the safe candidates.
-
-    Attributes:
-        cost: Shape (n,), NaN for rejected candidates.
-        rank: Shape (n,), 1 is best, 0 for rejected candidates.
-        pareto: Shape (n,), on the Pareto front of the cost's terms.
-    """
+    """The order of the safe candidates."""
 
     cost: Floats
+    """Shape (n,), NaN for rejected candidates."""
     rank: Ints32
+    """Shape (n,), 1 is best, 0 for rejected candidates."""
     pareto: Bools
+    """Shape (n,), on the Pareto front of the cost's terms."""
 
     @classmethod
     def none(cls, count: int) -> Ranking:
@@ -155,59 +140,52 @@ class Ranking(Columns):
 
 @dataclass(frozen=True, eq=False)
 class BreathingColumns(Columns):
-    """Verdict over the breath of each candidate that is safe for the organs where the CT shows them.
-
-    Attributes:
-        safe_all_phases: Shape (n,), safe for the organs at every phase, if inserted at that phase.
-        worst_phase: Shape (n,), the position s in the gate's window (without a gate: of all) with the least clearance
-            beyond a margin; NaN for what was rejected before.
-        clearance: Shape (n,), the least to any structure with a margin, in the window, mm; NaN for what was
-            rejected before.
-        safe_when: At each phase, or in the gate's window, if inserted then; never that a needle may stay.
-    """
+    """Verdict over the breath of each candidate that is safe for the organs where the CT shows them."""
 
     safe_all_phases: Bools
+    """Shape (n,), safe for the organs at every phase, if inserted at that phase."""
     worst_phase: Floats
+    """Shape (n,), the position s in the gate's window (without a gate: of all) with the least clearance beyond a
+    margin; NaN for what was rejected before."""
     clearance: Floats
+    """Shape (n,), the least to any structure with a margin, in the window, mm; NaN for what was rejected before."""
     safe_when: str
+    """At each phase, or in the gate's window, if inserted then; never that a needle may stay."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates(Columns, Shown):
-    """Every direction of the grid: n rows in groups of columns; mm, radians, points in the CT frame.
-
-    Attributes:
-        outward_ct: Shape (n, 3), unit vectors from the target outward.
-        safe_cone: Shape (n,), by how much one may be off in any direction and still be safe for the organs, rad; NaN
-            for rejected candidates, and where neither a grid nor a certificate says.
-        arm_note: `ARM_CHECKED`, or "not checked: " and why: then a safe candidate is safe for the organs alone.
-        chances: To hit and to touch; None where the case declares no errors.
-        breathing: What the breath leaves; None where the case does not declare it.
-        deflection: Shape (n,), how far the needle may bend on each path, mm, NaN without one; None where the case
-            declares no tissue.
-        grid: The regular grid that the rows are; None for any others.
-        cone_source: `CONE_OF_GRID` or `CONE_CERTIFIED`; "" where there are no safe cones.
-        findings: What else would be safe (`planning.search.context`).
-        provenance: Case, input hashes, version, seed and step, as plain values; empty of what no case has searched.
-    """
+    """Every direction of the grid: n rows in groups of columns; mm, radians, points in the CT frame."""
 
     theta: Floats
     beta: Floats
     outward_ct: Floats
+    """Shape (n, 3), unit vectors from the target outward."""
     verdict: Verdict
     path: Path
     clearance: Clearance
     arm: ArmColumns
     ranking: Ranking
     safe_cone: Floats
+    """Shape (n,), by how much one may be off in any direction and still be safe for the organs, rad; NaN for rejected
+    candidates, and where neither a grid nor a certificate says."""
     arm_note: str = "not checked"
+    """`ARM_CHECKED`, or "not checked: " and why: then a safe candidate is safe for the organs alone."""
     chances: Chances | None = None
+    """To hit and to touch; None where the case declares no errors."""
     breathing: BreathingColumns | None = None
+    """What the breath leaves; None where the case does not declare it."""
     deflection: Floats | None = None
+    """Shape (n,), how far the needle may bend on each path, mm, NaN without one; None where the case declares no
+    tissue."""
     grid: AngleGrid | None = None
+    """The regular grid that the rows are; None for any others."""
     cone_source: str = ""
+    """`CONE_OF_GRID` or `CONE_CERTIFIED`; "" where there are no safe cones."""
     findings: tuple[Finding, ...] = ()
+    """What else would be safe (`planning.search.context`)."""
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    """Case, input hashes, version, seed and step, as plain values; empty of what no case has searched."""
 
     def __len__(self) -> int:
         return len(self.theta)

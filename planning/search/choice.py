@@ -46,23 +46,20 @@ LEAST_LEVER_MM = 1.0
 
 @dataclass(frozen=True)
 class Choice:
-    """A person's choice of a candidate; with nothing stated, the best one that the arm can approach.
-
-    Attributes:
-        angles: θ and β, rad.
-        rank: 1 is the best candidate.
-        window: 1 is the window of the best candidate: then the best of this window.
-        entry_mm: Where the needle is to enter the skin, in the case's space, as it is typed.
-        entry_file: A markups file that holds the entry instead; `with_file_read` reads it.
-        read: That file, once it has been read.
-    """
+    """A person's choice of a candidate; with nothing stated, the best one that the arm can approach."""
 
     angles: tuple[float, float] | None = None
+    """θ and β, rad."""
     rank: int | None = None
+    """1 is the best candidate."""
     window: int | None = None
+    """1 is the window of the best candidate: then the best of this window."""
     entry_mm: tuple[float, float, float] | None = None
+    """Where the needle is to enter the skin, in the case's space, as it is typed."""
     entry_file: Path | None = None
+    """A markups file that holds the entry instead; `with_file_read` reads it."""
     read: tuple[Input, ...] = ()
+    """That file, once it has been read."""
 
     @property
     def of_grid(self) -> bool:

@@ -122,13 +122,10 @@ def closest_miss(candidates: Candidates) -> int | None:
 
 @dataclass(frozen=True, eq=False)
 class ArmReach:
-    """The arm in its workcell, as the check of candidates needs it, and where the patient is.
-
-    Attributes:
-        own_checker: Gives the thread that asks its checker: none is for several at once.
-    """
+    """The arm in its workcell, as the check of candidates needs it, and where the patient is."""
 
     own_checker: Callable[[], CellChecker]
+    """Gives the thread that asks its checker: none is for several at once."""
     T_base_ct: Floats
 
     @property

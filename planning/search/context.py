@@ -64,25 +64,22 @@ ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]"
 
 @dataclass(frozen=True, eq=False)
 class CaseContext(Shown):
-    """A prepared case: everything that questions about it need, read once.
-
-    Attributes:
-        placement: Where the patient is for the robot, T_base_ct; None where the case does not say.
-        reach: The checker of the arm; None without a placement.
-        chance: Model of the declared errors; None where the case declares none, or the arm is not checked.
-        stages: How long reading took; later stages are added as they happen.
-        memory: What other targets of the same anatomy share.
-    """
+    """A prepared case: everything that questions about it need, read once."""
 
     case: Case
     anatomy: Anatomy
     placement: Placement | None
+    """Where the patient is for the robot, T_base_ct; None where the case does not say."""
     engine: ClearanceEngine
     reach: ArmReach | None
+    """The checker of the arm; None without a placement."""
     chance: ChanceModel | None
+    """Model of the declared errors; None where the case declares none, or the arm is not checked."""
     watcher: Watcher
     stages: Stages
+    """How long reading took; later stages are added as they happen."""
     memory: Memory
+    """What other targets of the same anatomy share."""
 
     def _title(self) -> str:
         return f"Case {self.case.name}, prepared"

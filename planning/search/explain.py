@@ -41,25 +41,22 @@ UNITS = {
 
 @dataclass(frozen=True, eq=False)
 class Explanation(Shown):
-    """A checked candidate with what it was checked against.
-
-    Attributes:
-        candidates: A search's result with this candidate alone.
-        facts: The path as a person at the patient sees it.
-        breakdown: How sure it is; None where the case declares no errors, or the candidate was rejected before.
-        read: What was read besides the case to choose it.
-        guidance: What each way of guidance would leave; empty where the case declares no devices.
-        sight: Of the declared ones, cameras and probe, what they see of the insertion, or why not, in words.
-    """
+    """A checked candidate with what it was checked against."""
 
     case: Case
     anatomy: Anatomy
     candidates: Candidates
+    """A search's result with this candidate alone."""
     facts: EntryFacts
+    """The path as a person at the patient sees it."""
     breakdown: UncertaintyBreakdown | None = None
+    """How sure it is; None where the case declares no errors, or the candidate was rejected before."""
     read: tuple[Input, ...] = ()
+    """What was read besides the case to choose it."""
     guidance: tuple[WayChance, ...] = ()
+    """What each way of guidance would leave; empty where the case declares no devices."""
     sight: Mapping[str, str] = field(default_factory=dict)
+    """Of the declared ones, cameras and probe, what they see of the insertion, or why not, in words."""
 
     def _title(self) -> str:
         return self.head()[0]

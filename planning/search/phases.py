@@ -191,21 +191,18 @@ class BreathingBody:
 
 @dataclass(frozen=True, eq=False)
 class Phase:
-    """Verdict and clearances of some candidates at one position of the breath.
-
-    Attributes:
-        rows: Shape (m,), which candidates.
-        clearance: Shape (m, k), to the k structures with a margin, mm.
-        excess: Shape (m, k), the same less the margins.
-        deflection: Shape (m,), how far the needle may bend, mm; 0 where it does not.
-    """
+    """Verdict and clearances of some candidates at one position of the breath."""
 
     s: float
     rows: Ints
+    """Shape (m,), which candidates."""
     verdict: Verdict
     clearance: Floats
+    """Shape (m, k), to the k structures with a margin, mm."""
     excess: Floats
+    """Shape (m, k), the same less the margins."""
     deflection: Floats
+    """Shape (m,), how far the needle may bend, mm; 0 where it does not."""
 
     @property
     def least_excess(self) -> Floats:

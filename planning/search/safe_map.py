@@ -33,18 +33,15 @@ NOT_TESTED = f"skin entry and angle, {NOT_TESTED_OF_WINDOWS}"
 
 @dataclass(frozen=True, eq=False)
 class SafeMap(Shown):
-    """Which directions the margins of the structures block.
-
-    Attributes:
-        structures: Names of all that is checked; ``structure`` are places in it.
-        structure: Shape (n,), the first in the case's order that blocks the direction; -1 where none does.
-    """
+    """Which directions the margins of the structures block."""
 
     target_ct: Floats
     directions: Directions
     structures: tuple[str, ...]
+    """Names of all that is checked; ``structure`` are places in it."""
     blocked: Bools
     structure: Ints32
+    """Shape (n,), the first in the case's order that blocks the direction; -1 where none does."""
 
     @property
     def theta_deg(self) -> Floats:
@@ -81,17 +78,14 @@ def safe_map(context: CaseContext) -> SafeMap:
 
 @dataclass(frozen=True, eq=False)
 class BestTarget(Shown):
-    """Which of many points has the widest window: the largest connected solid angle of open directions.
-
-    Attributes:
-        points_ct: Shape (n, 3), mm, LPS; the context's own target is the first.
-        window_deg2: Shape (n,), the widest window of each, square degrees, in the anatomy of the context.
-        best: Row of the point with the widest window, of those that the case could have as its target.
-    """
+    """Which of many points has the widest window: the largest connected solid angle of open directions."""
 
     points_ct: Floats
+    """Shape (n, 3), mm, LPS; the context's own target is the first."""
     window_deg2: Floats
+    """Shape (n,), the widest window of each, square degrees, in the anatomy of the context."""
     best: int
+    """Row of the point with the widest window, of those that the case could have as its target."""
     context: CaseContext
     best_deg2: float
 

@@ -113,16 +113,13 @@ def organ_candidates(
 
 
 class Blocking(NamedTuple):
-    """What blocks n directions of a grid.
-
-    Attributes:
-        structure: The first of ``anatomy.checked`` whose margin a direction breaks; -1 where none.
-        enters: Which of the directions that no structure of the body blocks enter through the skin as the case demands:
-            seen, short enough, at a small enough angle.
-    """
+    """What blocks n directions of a grid."""
 
     structure: Ints32
+    """The first of ``anatomy.checked`` whose margin a direction breaks; -1 where none."""
     enters: Bools
+    """Which of the directions that no structure of the body blocks enter through the skin as the case demands: seen,
+    short enough, at a small enough angle."""
 
     @property
     def open(self) -> Bools:

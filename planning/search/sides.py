@@ -33,20 +33,17 @@ FRONT, BACK, WHOLE = '"bed"', '{ z = "posterior", x = "head" }', (0.0, 180.0)
 
 
 class Side(NamedTuple):
-    """The open directions nearest to one axis of the body, seen from the target.
-
-    Attributes:
-        open: Fraction of its solid angle from where a needle can come, whatever organs are in its path.
-        searched: The fraction that the case's grid holds.
-        nearest_mm: The shortest path to its skin; NaN where none is known.
-        why: What closes most of it; "" where it is open.
-    """
+    """The open directions nearest to one axis of the body, seen from the target."""
 
     name: str
     open: float
+    """Fraction of its solid angle from where a needle can come, whatever organs are in its path."""
     searched: float
+    """The fraction that the case's grid holds."""
     nearest_mm: float
+    """The shortest path to its skin; NaN where none is known."""
     why: str
+    """What closes most of it; "" where it is open."""
 
     @property
     def is_open(self) -> bool:

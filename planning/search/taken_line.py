@@ -40,22 +40,18 @@ LEAST_MM = 0.5
 
 
 class Clear(NamedTuple):
-    """How near the needle comes to a structure, mm.
-
-    Attributes:
-        depth_mm: From the tip, along the needle, of the nearest point.
-        sd_mm: Of the clearance, by what the reading may err, of the piece that may come nearest; NaN where they
-            intersect.
-        margin_mm: NaN of what may be crossed.
-        p_touch: To first order, with what the surface itself may lie off; NaN where they intersect.
-    """
+    """How near the needle comes to a structure, mm."""
 
     name: str
     clearance_mm: float
     sd_mm: float
+    """Of the clearance, by what the reading may err, of the piece that may come nearest; NaN where they intersect."""
     margin_mm: float
+    """NaN of what may be crossed."""
     depth_mm: float
+    """From the tip, along the needle, of the nearest point."""
     p_touch: float
+    """To first order, with what the surface itself may lie off; NaN where they intersect."""
 
     @property
     def sure(self) -> bool:
@@ -69,21 +65,18 @@ class Clear(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LineCheck:
-    """The verdict of a line.
-
-    Attributes:
-        verdict: `SAFE`, `UNCERTAIN`, or a code of `Reason`.
-        structure: Which one decides; empty where none does.
-        each: Every structure, nearest to its margin first.
-        entry_ct: Shape (3,), where it enters the skin; NaN where it does not.
-        inserted_mm: From there to the tip.
-    """
+    """The verdict of a line."""
 
     verdict: str
+    """`SAFE`, `UNCERTAIN`, or a code of `Reason`."""
     structure: str
+    """Which one decides; empty where none does."""
     each: tuple[Clear, ...]
+    """Every structure, nearest to its margin first."""
     entry_ct: Floats
+    """Shape (3,), where it enters the skin; NaN where it does not."""
     inserted_mm: float
+    """From there to the tip."""
 
     @property
     def safe(self) -> bool:
@@ -161,23 +154,20 @@ def _skin(context: CaseContext, path_ct: Floats, outward: Floats, starts: Floats
 
 
 class Aim(NamedTuple):
-    """Something to do next, and what comes of it.
-
-    Attributes:
-        kind: ``accept``, ``deeper`` (x mm; below 0 back), ``turn`` (to the skin and on by an angle) or ``withdraw``.
-        by_mm: How much deeper, along the needle; of a turn how far back first.
-        turn_deg: Between the needle and the line from its entry to the target.
-        p_hit: The chance that the tip is in the target then, by what is known of the reading; NaN where unknown.
-        lateral_mm: By which the tip, or its line, passes the target then.
-        verdict: Of the line that the needle takes then.
-    """
+    """Something to do next, and what comes of it."""
 
     kind: str
+    """``accept``, ``deeper`` (x mm; below 0 back), ``turn`` (to the skin and on by an angle) or ``withdraw``."""
     by_mm: float
+    """How much deeper, along the needle; of a turn how far back first."""
     turn_deg: float
+    """Between the needle and the line from its entry to the target."""
     p_hit: float
+    """The chance that the tip is in the target then, by what is known of the reading; NaN where unknown."""
     lateral_mm: float
+    """By which the tip, or its line, passes the target then."""
     verdict: str
+    """Of the line that the needle takes then."""
     structure: str
 
     @property

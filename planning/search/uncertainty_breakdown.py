@@ -39,19 +39,16 @@ class Remedy(NamedTuple):
 
 @dataclass(frozen=True)
 class Goal:
-    """A limit that is not satisfied, and the errors that would have to shrink for it.
-
-    Attributes:
-        structure: What is touched too likely; "" where the target is hit too unlikely.
-        remedies: The single sources that could mend it, the one that has to shrink least first.
-        all_sources: By which factor all of them together would have to shrink; None where not even 0 is enough.
-    """
+    """A limit that is not satisfied, and the errors that would have to shrink for it."""
 
     structure: str
+    """What is touched too likely; "" where the target is hit too unlikely."""
     limit: float
     stated: bool
     remedies: tuple[Remedy, ...]
+    """The single sources that could mend it, the one that has to shrink least first."""
     all_sources: float | None
+    """By which factor all of them together would have to shrink; None where not even 0 is enough."""
 
     def text(self) -> str:
         """One sentence on the errors that would have to shrink."""
@@ -81,21 +78,18 @@ class Goal:
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyBreakdown:
-    """Chances, error budget and unmet limits of one candidate.
-
-    Attributes:
-        p_touch: Structure to chance to touch it.
-        p_touch_any: Of any, min(1, sum).
-        declaration: Whether the markers' residuals agree with the declared errors, in one sentence.
-        goals: Limits that are not satisfied: the case's, or `WISHED_HIT` where it demands no chance to hit.
-    """
+    """Chances, error budget and unmet limits of one candidate."""
 
     p_hit: float
     p_touch: Mapping[str, float]
+    """Structure to chance to touch it."""
     p_touch_any: float
+    """Of any, min(1, sum)."""
     budget: ErrorBudget
     declaration: str
+    """Whether the markers' residuals agree with the declared errors, in one sentence."""
     goals: tuple[Goal, ...]
+    """Limits that are not satisfied: the case's, or `WISHED_HIT` where it demands no chance to hit."""
     not_modelled: str
 
     @property

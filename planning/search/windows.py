@@ -22,20 +22,17 @@ MOST_WINDOWS = 10
 
 @dataclass(frozen=True, repr=False)
 class Window(Shown):
-    """One connected set of safe directions.
-
-    Attributes:
-        number: 1 for the window that holds the best candidate, then by the rank of each one's best.
-        entry_cm2: Area of skin through which its paths enter, cm2.
-        widest_cone: Largest safe cone of its candidates, rad; NaN where none is known.
-    """
+    """One connected set of safe directions."""
 
     number: int
+    """1 for the window that holds the best candidate, then by the rank of each one's best."""
     best: int
     directions: int
     square_deg: float
     entry_cm2: float
+    """Area of skin through which its paths enter, cm2."""
     widest_cone: float
+    """Largest safe cone of its candidates, rad; NaN where none is known."""
 
     @property
     def wide_deg(self) -> float:
@@ -50,13 +47,10 @@ class Window(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Windows(Shown):
-    """All windows of a search.
-
-    Attributes:
-        of_row: Shape (n,), the number of each candidate's window; 0 for a rejected candidate.
-    """
+    """All windows of a search."""
 
     of_row: Ints
+    """Shape (n,), the number of each candidate's window; 0 for a rejected candidate."""
     windows: tuple[Window, ...]
 
     def __len__(self) -> int:

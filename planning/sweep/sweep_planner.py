@@ -34,23 +34,20 @@ from puncture_twin.planning.search.explain import reason_text
 
 @dataclass(frozen=True, eq=False)
 class SweepPlan:
-    """A motion about the virtual TCP (Chen 2019): the point on the needle's axis, a standoff before its tip.
-
-    Attributes:
-        point_base: Shape (3,), mm: where the virtual TCP stays, the target.
-        angles: Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less.
-        stopped: Where and why it ends before; empty where it does not.
-    """
+    """A motion about the virtual TCP (Chen 2019): the point on the needle's axis, a standoff before its tip."""
 
     model: UrModel
     needle_length_mm: float
     standoff_mm: float
     point_base: Floats
+    """Shape (3,), mm: where the virtual TCP stays, the target."""
     angles: Floats
+    """Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less."""
     wanted: tuple[float, float]
     approach: Trajectory
     sweep: Trajectory
     stopped: str
+    """Where and why it ends before; empty where it does not."""
 
     def off_point_mm(self, T_base_flange: Floats) -> Floats:
         """Distance of the virtual TCP from its point at flange poses (m, 4, 4), mm, shape (m,)."""

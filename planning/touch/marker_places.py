@@ -79,19 +79,16 @@ class Tape(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MarkerPlace:
-    """Where one marker should be put, LPS mm.
-
-    Attributes:
-        point_ct: Shape (3,), on the skin.
-        head_mm: Toward the head from the target's level, negative toward the feet.
-        tape: Round the body at that level; None where the image cuts the body's sides.
-    """
+    """Where one marker should be put, LPS mm."""
 
     name: str
     point_ct: Floats
+    """Shape (3,), on the skin."""
     normal_ct: Floats
     head_mm: float
+    """Toward the head from the target's level, negative toward the feet."""
     tape: Tape | None
+    """Round the body at that level; None where the image cuts the body's sides."""
 
     def words(self, space: Space) -> str:
         """How to find it on the skin; a space of its own has no anatomy, and is told by coordinates."""
@@ -107,20 +104,17 @@ class MarkerPlace:
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """Places for markers.
-
-    Attributes:
-        expected_mm: Error (rms) at the target by reading and touching these markers; of the arm's own nothing.
-        declared: Whether the case declares the errors, or 1 mm a marker is assumed.
-        unmet: What is wanted of places and is not so here, in words.
-    """
+    """Places for markers."""
 
     places: tuple[MarkerPlace, ...]
     expected_mm: float
+    """Error (rms) at the target by reading and touching these markers; of the arm's own nothing."""
     declared: bool
+    """Whether the case declares the errors, or 1 mm a marker is assumed."""
     arm: str
     near_window_mm: float
     unmet: tuple[str, ...]
+    """What is wanted of places and is not so here, in words."""
 
 
 class _Skin(NamedTuple):

@@ -62,16 +62,13 @@ class TouchTour:
 
 @dataclass(frozen=True, eq=False)
 class TouchPlan(TouchTour):
-    """A planned tour of the markers for a puncture.
-
-    Attributes:
-        expected_mm: Of the tip at the target when the registration comes from these touches (rms), mm.
-        worst_mm: ``expected_mm`` with the worst of the poses that could be taken, mm.
-    """
+    """A planned tour of the markers for a puncture."""
 
     left_out: Mapping[str, str]
     expected_mm: float
+    """Of the tip at the target when the registration comes from these touches (rms), mm."""
     worst_mm: float
+    """``expected_mm`` with the worst of the poses that could be taken, mm."""
 
 
 RESOLUTION = 1e-9

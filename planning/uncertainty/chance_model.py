@@ -186,28 +186,25 @@ def satisfies_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools
 
 @dataclass(frozen=True, eq=False)
 class Chances(Columns):
-    """Chances of n candidates and k structures that demand a margin; NaN where nothing was computed.
-
-    Attributes:
-        hit: Shape (n,), that the tip is in the target's mesh, or within its radius.
-        touch: Shape (n, k), that the needle touches each structure.
-        margin: Shape (n, k), that it breaks each structure's margin.
-        touch_any: Shape (n,), min(1, sum of touch): never below the truth of what `touch` says.
-        touch_joint: Shape (n,), that it touches any, all linearised together; of the best candidates alone.
-        lateral_mm: Shape (n,), expected (rms) error of the tip across the needle, target reading included.
-        depth_mm: Shape (n,), along it.
-        refined: Shape (n,), whether touch and margin are line-sampled; else they are of first order.
-    """
+    """Chances of n candidates and k structures that demand a margin; NaN where nothing was computed."""
 
     structures: tuple[str, ...]
     hit: Floats
+    """Shape (n,), that the tip is in the target's mesh, or within its radius."""
     touch: Floats
+    """Shape (n, k), that the needle touches each structure."""
     margin: Floats
+    """Shape (n, k), that it breaks each structure's margin."""
     touch_any: Floats
+    """Shape (n,), min(1, sum of touch): never below the truth of what `touch` says."""
     touch_joint: Floats
+    """Shape (n,), that it touches any, all linearised together; of the best candidates alone."""
     lateral_mm: Floats
+    """Shape (n,), expected (rms) error of the tip across the needle, target reading included."""
     depth_mm: Floats
+    """Shape (n,), along it."""
     refined: Bools
+    """Shape (n,), whether touch and margin are line-sampled; else they are of first order."""
 
     @classmethod
     def unknown(cls, structures: tuple[str, ...], count: int) -> Chances:

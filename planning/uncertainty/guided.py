@@ -168,30 +168,27 @@ class Reading(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GuidedModel:
-    """One insertion as guidance knows it; base axes.
-
-    Attributes:
-        error: Of the needle by its registration, the touches known or assumed.
-        motion: Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan.
-        breath: Shape (3, 2), mm: mean and deviation of the target's displacement by the breath; 0 without breathing.
-        skin_weight: By how much of it the markers move.
-        push: Shape (looks + 1, 3), mm: by how much the needle pushes the target at each look, and at the end.
-        across: Shape (3,), unit: the normal of its picture.
-    """
+    """One insertion as guidance knows it; base axes."""
 
     error: PoseError
+    """Of the needle by its registration, the touches known or assumed."""
     markers: tuple[str, ...]
     points_base: Floats
     q_insertion: Floats
     looks: Sequence[Look]
     motion: Floats
+    """Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan."""
     breath: Floats
+    """Shape (3, 2), mm: mean and deviation of the target's displacement by the breath; 0 without breathing."""
     skin_weight: float = 0.0
+    """By how much of it the markers move."""
     stereo: Stereo | None = None
     ultrasound: Ultrasound | None = None
     across: Floats | None = None
+    """Shape (3,), unit: the normal of its picture."""
     scan: ControlScanSection | None = None
     push: Floats | None = None
+    """Shape (looks + 1, 3), mm: by how much the needle pushes the target at each look, and at the end."""
 
     def _at(self, points_base: Floats) -> Floats:
         """A, shape (3 m, 6): how a shift and rotation at the target move points (m, 3)."""
@@ -503,13 +500,10 @@ class WayChance(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GuidedError(PoseError):
-    """The pose error of one direction's needle under one way of guidance, for whatever asks a `PoseError`.
-
-    Attributes:
-        guided: What the way leaves; ``cov`` is of the anatomy that is asked about.
-    """
+    """The pose error of one direction's needle under one way of guidance, for whatever asks a `PoseError`."""
 
     guided: Guided | None = None
+    """What the way leaves; ``cov`` is of the anatomy that is asked about."""
 
     @property
     def known(self) -> Guided:

@@ -39,15 +39,12 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError
 
 @dataclass(frozen=True, eq=False)
 class HitModel:
-    """When a tip hits: within a radius of the target, or within its mesh.
-
-    Attributes:
-        radius_mm: Where a case gives one.
-        rays: The target's mesh, else; or the ball about a target that tips are off on average.
-    """
+    """When a tip hits: within a radius of the target, or within its mesh."""
 
     radius_mm: float | None
+    """Where a case gives one."""
     rays: TargetRays | None
+    """The target's mesh, else; or the ball about a target that tips are off on average."""
 
     def chance(self, error: PoseError, cov_ct: Floats, surface_mm: float = 0.0) -> Floats:
         """The chance of needles with these Sigma6, shape (n, 6, 6), CT axes, in a mesh that may lie off: shape (n,)."""
@@ -161,20 +158,17 @@ def _series(weight, e1, e2, x):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True, eq=False)
 class TargetRays:
-    """A target's mesh as its point sees it.
-
-    Attributes:
-        ray: Shape (c,), row of each crossing's direction.
-        depth: Shape (c,), mm from the target.
-        sign: Shape (c,), +1 for a direction's last crossing, alternating inwards.
-        moved: Shape (c,), by which a crossing's depth grows where the surface lies farther out by 1; None for a ball.
-    """
+    """A target's mesh as its point sees it."""
 
     directions: Floats
     ray: Ints
+    """Shape (c,), row of each crossing's direction."""
     depth: Floats
+    """Shape (c,), mm from the target."""
     sign: Floats
+    """Shape (c,), +1 for a direction's last crossing, alternating inwards."""
     moved: Floats | None = None
+    """Shape (c,), by which a crossing's depth grows where the surface lies farther out by 1; None for a ball."""
 
 
 DIRECTIONS = 512
@@ -291,17 +285,14 @@ def _length_table() -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Proximity:
-    """Distances, gradients and deviations of n needles and k structures; CT frame.
-
-    Attributes:
-        distance: Shape (n, k), of the axis from the surface, mm.
-        gradient: Shape (n, k, 6), g: what the pose's error (mm, rad) does to it; NaN where they intersect.
-        deviation: Shape (n, k), sigma, mm.
-    """
+    """Distances, gradients and deviations of n needles and k structures; CT frame."""
 
     distance: Floats
+    """Shape (n, k), of the axis from the surface, mm."""
     gradient: Floats
+    """Shape (n, k, 6), g: what the pose's error (mm, rad) does to it; NaN where they intersect."""
     deviation: Floats
+    """Shape (n, k), sigma, mm."""
 
 
 def proximity(

@@ -44,21 +44,18 @@ from puncture_twin.planning.uncertainty.hit import Proximity
 
 @dataclass(frozen=True, eq=False)
 class Needles:
-    """n needles with their covariances and proximity to the structures.
-
-    Attributes:
-        outward_ct: Shape (n, 3), unit.
-        cov_ct: Shape (n, 6, 6), Sigma6, CT axes.
-        near: How they pass the k structures, to first order.
-        surface_mm: Shape (n, k), by which each structure's surface may lie off as a whole where the needle passes it.
-        freedom: Degrees of the errors' size where the residuals gave it.
-    """
+    """n needles with their covariances and proximity to the structures."""
 
     outward_ct: Floats
+    """Shape (n, 3), unit."""
     cov_ct: Floats
+    """Shape (n, 6, 6), Sigma6, CT axes."""
     near: Proximity
+    """How they pass the k structures, to first order."""
     surface_mm: Floats
+    """Shape (n, k), by which each structure's surface may lie off as a whole where the needle passes it."""
     freedom: int | None
+    """Degrees of the errors' size where the residuals gave it."""
 
 
 def refined(
@@ -150,17 +147,14 @@ at most, and by .013 where it is .2 (three anatomies; next to a lung and between
 
 
 class Lines(NamedTuple):
-    """Offsets and sizes of n lines.
-
-    Attributes:
-        offsets: Shape (n, 5), standard deviations, four of the pose and one mixed with the surface.
-        sizes: Shape (n,), of each line's errors over the estimate.
-        weights: Shape (n,), their sum is 1.
-    """
+    """Offsets and sizes of n lines."""
 
     offsets: Floats
+    """Shape (n, 5), standard deviations, four of the pose and one mixed with the surface."""
     sizes: Floats
+    """Shape (n,), of each line's errors over the estimate."""
     weights: Floats
+    """Shape (n,), their sum is 1."""
 
 
 @cache
@@ -225,20 +219,17 @@ SIZES = 16
 
 @dataclass(frozen=True, eq=False)
 class NeedleUncertainty:
-    """One needle and the distribution of its displacement; CT frame, mm and rad.
-
-    Attributes:
-        origin: Shape (3,), the tip's own place, where the axis starts.
-        root: Shape (6, 5), B: shift and lean of each of five standard normals.
-        surface_mm: Standard deviation of the surface, as a whole, of the structure in question.
-        freedom: Degrees of the errors' size where the residuals gave it.
-    """
+    """One needle and the distribution of its displacement; CT frame, mm and rad."""
 
     origin: Floats
+    """Shape (3,), the tip's own place, where the axis starts."""
     outward: Floats
     root: Floats
+    """Shape (6, 5), B: shift and lean of each of five standard normals."""
     surface_mm: float
+    """Standard deviation of the surface, as a whole, of the structure in question."""
     freedom: int | None
+    """Degrees of the errors' size where the residuals gave it."""
 
     def reach(self, length: float, threshold: float) -> tuple[float, float]:
         """Distance within which a face may matter, mm, at the tip and at the axis' other end."""

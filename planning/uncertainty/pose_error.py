@@ -66,19 +66,16 @@ class Bend(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """The needle's pose error in any configuration that puts its tip on the target.
-
-    Attributes:
-        fit: What the registration makes of them; its test's scale multiplies every covariance but that of the bend.
-        bend: Of one direction's needle; None where it is straight, or where it is not of one direction.
-    """
+    """The needle's pose error in any configuration that puts its tip on the target."""
 
     model: UrModel
     tip_mm: float
     target_base: Floats
     errors: ErrorModel
     fit: FitUncertainty
+    """What the registration makes of them; its test's scale multiplies every covariance but that of the bend."""
     bend: Bend | None = None
+    """Of one direction's needle; None where it is straight, or where it is not of one direction."""
 
     @property
     def freedom(self) -> int | None:
@@ -179,19 +176,16 @@ def pose_error(case: Case, registration: Registration | None) -> PoseError | Non
 
 @dataclass(frozen=True, eq=False)
 class ErrorBudget:
-    """The tip's expected error and the fraction of each source.
-
-    Attributes:
-        rms_mm: Tip to the point that was meant; ``lateral_mm`` across, ``depth_mm`` along the needle.
-        half_axes_mm: Shape (3,), of the 95 % ellipsoid, longest first.
-        fraction: Source to its part of rms_mm squared; they add up to 1.
-    """
+    """The tip's expected error and the fraction of each source."""
 
     rms_mm: float
+    """Tip to the point that was meant; ``lateral_mm`` across, ``depth_mm`` along the needle."""
     lateral_mm: float
     depth_mm: float
     half_axes_mm: Floats
+    """Shape (3,), of the 95 % ellipsoid, longest first."""
     fraction: Mapping[str, float]
+    """Source to its part of rms_mm squared; they add up to 1."""
 
 
 def expected_error_mm(error: PoseError, q: Floats) -> float:

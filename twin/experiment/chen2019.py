@@ -189,21 +189,18 @@ class DrawnRank:
 
 @dataclass(frozen=True)
 class Experiment:
-    """The paper's experiment under one declaration.
-
-    Attributes:
-        probability: Of a chi-squared as large as the paper's, by the law with 24 degrees.
-        best_strain: Fraction of draws in which some strain takes away as much as the paper's best one does.
-        several: See `several_triads`: mm by the paper's own points, and rms of the draws.
-    """
+    """The paper's experiment under one declaration."""
 
     declaration: Declaration
     draws: int
     printed: tuple[DrawnRank, ...]
     joint: tuple[DrawnRank, ...]
     probability: float
+    """Of a chi-squared as large as the paper's, by the law with 24 degrees."""
     best_strain: float
+    """Fraction of draws in which some strain takes away as much as the paper's best one does."""
     several: Mapping[str, tuple[float, float]]
+    """See `several_triads`: mm by the paper's own points, and rms of the draws."""
 
     @property
     def rejected(self) -> bool:
@@ -329,17 +326,14 @@ PLANES = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True)
 class Declaration:
-    """Declared errors of one experiment: uniform in slices and pixels, normal readings and touches per axis, mm.
-
-    Attributes:
-        skew: Standard deviation of each plane's angle, rad: one draw for the whole CT.
-    """
+    """Declared errors of one experiment: uniform in slices and pixels, normal readings and touches per axis, mm."""
 
     name: str
     slice_mm: float = 0.0
     pixel_mm: float = 0.0
     reading_mm: float = 0.0
     skew: float = 0.0
+    """Standard deviation of each plane's angle, rad: one draw for the whole CT."""
     touch_mm: float = 0.0
 
     def draw_carton(self, read: Floats, count: int, rng: np.random.Generator) -> Floats:

@@ -30,13 +30,7 @@ OCCLUDER_SIZE = 4.0
 
 @dataclass(frozen=True, eq=False)
 class BallScene:
-    """A ball on its rod as a camera may see it, frame C, mm. Directions need not be unit; greys are from 0 to 255.
-
-    Attributes:
-        diffuse: Fraction of the light that comes from everywhere, 0 to 1; directed light obeys Lambert's law.
-        hidden_fraction: Fraction of the ball's disc that an occluder covers, 0 to 1.
-        hidden_from: Angle in the tangent plane from which it comes, rad.
-    """
+    """A ball on its rod as a camera may see it, frame C, mm. Directions need not be unit; greys are from 0 to 255."""
 
     center_c: Floats
     radius_mm: float = 4.0
@@ -45,13 +39,16 @@ class BallScene:
     rod_length_mm: float = 60.0
     light_c: Floats | tuple[float, float, float] = (0.3, -0.8, -0.6)
     diffuse: float = 0.8
+    """Fraction of the light that comes from everywhere, 0 to 1; directed light obeys Lambert's law."""
     ball_grey: float = 200.0
     rod_grey: float = 130.0
     background_grey: float = 60.0
     texture_grey: float = 0.0
     texture_px: float = 3.0
     hidden_fraction: float = 0.0
+    """Fraction of the ball's disc that an occluder covers, 0 to 1."""
     hidden_from: float = 0.0
+    """Angle in the tangent plane from which it comes, rad."""
     occluder_grey: float = 100.0
     ball: bool = True
     rod: bool = True

@@ -66,16 +66,13 @@ class RoomProbe:
 
 @dataclass(frozen=True, eq=False)
 class RoomScanner:
-    """A CT in each of n rooms, its frame that of the first CT; what is taken for the target is so in all its scans.
-
-    Attributes:
-        T_ct_base: Shape (4, 4), mm: where the couch really is.
-        target_off: Shape (n, 3), mm: what target readings are off by.
-    """
+    """A CT in each of n rooms, its frame that of the first CT; what is taken for the target is so in all its scans."""
 
     T_ct_base: Floats
+    """Shape (4, 4), mm: where the couch really is."""
     tip_root: Floats
     target_off: Floats
+    """Shape (n, 3), mm: what target readings are off by."""
     rng: np.random.Generator
 
     @classmethod

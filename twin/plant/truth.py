@@ -31,19 +31,16 @@ COLLINEAR = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Ground truth of a rehearsal; the bevel of a needle that bends points to its side about the needle's z, rad.
-
-    Attributes:
-        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says. They stand for all that changed
-            or was not seen since the markers were touched.
-        target_ct: Shape (3,), mm: true target in the CT; None where it was read without error.
-    """
+    """Ground truth of a rehearsal; the bevel of a needle that bends points to its side about the needle's z, rad."""
 
     T_base_ct_true: Floats
     joint_offsets: Floats
+    """Shape (6,), rad: true joint angle minus what the encoder says. They stand for all that changed or was not seen
+    since the markers were touched."""
     seed: int
     source: str
     target_ct: Floats | None = None
+    """Shape (3,), mm: true target in the CT; None where it was read without error."""
     bevel_side: float = 0.0
 
     def __post_init__(self) -> None:

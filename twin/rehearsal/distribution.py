@@ -81,32 +81,29 @@ class Stepwise(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """n trials of one puncture in which the arm reached the pose; mm.
-
-    Attributes:
-        unreached: Further trials, whose registration put the pose out of the arm's reach; `stopped` by the corridor.
-        p_hit: Predicted; of a guided needle that it is not stopped, and hits.
-        wrong_belief: Whether the truth was drawn from other errors than the belief declares, on purpose.
-        guessed_touches: Whether it is not stated how the arm touched the markers, so that a posture was assumed.
-        physics: What `physics_trials` says of some of the trials in the simulator, if any.
-    """
+    """n trials of one puncture in which the arm reached the pose; mm."""
 
     seed: int
     unreached: int
+    """Further trials, whose registration put the pose out of the arm's reach; `stopped` by the corridor."""
     puncture: Puncture
     trials: Trials
     cov_ct: Floats
     in_region: Bools
     hit: Bools
     p_hit: float
+    """Predicted; of a guided needle that it is not stopped, and hits."""
     structures: tuple[str, ...]
     touched: Bools
     p_touch: Floats
     wrong_belief: bool
+    """Whether the truth was drawn from other errors than the belief declares, on purpose."""
     budget: ErrorBudget
     guessed_touches: bool
+    """Whether it is not stated how the arm touched the markers, so that a posture was assumed."""
     not_modelled: str
     physics: Mapping[str, Any] | None = None
+    """What `physics_trials` says of some of the trials in the simulator, if any."""
     guidance: str | None = None
     stopped: int = 0
     p_stop: float = 0.0

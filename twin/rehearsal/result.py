@@ -19,14 +19,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ErrorRank:
-    """Percentile of a rehearsal's tip error among trials, or in the predicted distribution.
-
-    Attributes:
-        trials: So many trials were drawn, and this is the median one; 0 where the percentile is the prediction's.
-    """
+    """Percentile of a rehearsal's tip error among trials, or in the predicted distribution."""
 
     percentile: float
     trials: int = 0
+    """So many trials were drawn, and this is the median one; 0 where the percentile is the prediction's."""
 
     @property
     def place(self) -> str:
@@ -80,15 +77,7 @@ class RehearsalContact:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsal(Shown):
-    """Measurements of a rehearsal; m records in time, k samples of clearance. Angles in rad, lengths in mm.
-
-    Attributes:
-        clearance_mm: Structure to shape (k,): true needle's axis to true structure, minus the needle's radius.
-        tip_error_mm: True tip to true target at the end; `depth_mm` along the needle, positive when too deep.
-        truth_is_belief: Whether the patient lay exactly where it was believed, so that the error says little.
-        off_path_mm: The tip from its commanded path, by the encoders, at most from the insertion on.
-        standing: Where the error stands among others; None where the case declares no errors.
-    """
+    """Measurements of a rehearsal; m records in time, k samples of clearance. Angles in rad, lengths in mm."""
 
     seed: int
     truth_source: str
@@ -101,19 +90,24 @@ class Rehearsal(Shown):
     tip_true_ct: Floats
     clearance_times_s: Floats
     clearance_mm: MappingProxyType[str, Floats]
+    """Structure to shape (k,): true needle's axis to true structure, minus the needle's radius."""
     contacts: tuple[RehearsalContact, ...]
     max_joint_speed: Floats
     speed_limits: Floats
     tip_error_mm: float
+    """True tip to true target at the end; `depth_mm` along the needle, positive when too deep."""
     lateral_mm: float
     depth_mm: float
     predicted_error_mm: float
     target_true_ct: Floats
     truth_is_belief: bool
+    """Whether the patient lay exactly where it was believed, so that the error says little."""
     control: str
     off_path_mm: float
+    """The tip from its commanded path, by the encoders, at most from the insertion on."""
     tissue_force: TissueForce | None
     standing: ErrorRank | None = None
+    """Where the error stands among others; None where the case declares no errors."""
     distribution: Distribution | None = None
 
     @brief

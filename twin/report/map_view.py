@@ -45,19 +45,16 @@ class RimLabel(NamedTuple):
 
 @dataclass(frozen=True)
 class MapView:
-    """The map's geometry.
-
-    Attributes:
-        turn: Angle on the picture, counter-clockwise from the right, at which β = 0 lies.
-        theta_max: θ at the rim, rad.
-        rim: Body directions around the rim.
-        centre: What the viewer looks at: the body direction that θ = 0 points to, or "".
-    """
+    """The map's geometry."""
 
     turn: float
+    """Angle on the picture, counter-clockwise from the right, at which β = 0 lies."""
     theta_max: float
+    """θ at the rim, rad."""
     rim: tuple[RimLabel, ...]
+    """Body directions around the rim."""
     centre: str
+    """What the viewer looks at: the body direction that θ = 0 points to, or ""."""
 
     def place(self, theta: Floats, beta: Floats) -> Floats:
         """Points of the unit disc (x right, y up), shape (n, 2), of directions."""
@@ -119,23 +116,20 @@ def step_of(candidates: Candidates) -> float:
 
 @dataclass(frozen=True, eq=False)
 class MapCells:
-    """The grid's cells, ring after ring of equal θ, and in each ring by β in 0..2π.
-
-    Attributes:
-        rows_in_order: Shape (n,), the candidate of each cell.
-        beta: Shape (n,), rad, in 0..2π.
-        starts: Shape (k + 1,), where each ring begins.
-        heights: Shape (k,), θ of each ring, ascending, rad.
-        half_theta: Half a cell, rad.
-        half_beta: Shape (k,), half a cell of each ring, rad.
-    """
+    """The grid's cells, ring after ring of equal θ, and in each ring by β in 0..2π."""
 
     rows_in_order: NDArray[np.int64]
+    """Shape (n,), the candidate of each cell."""
     beta: Floats
+    """Shape (n,), rad, in 0..2π."""
     starts: NDArray[np.int64]
+    """Shape (k + 1,), where each ring begins."""
     heights: Floats
+    """Shape (k,), θ of each ring, ascending, rad."""
     half_theta: float
+    """Half a cell, rad."""
     half_beta: Floats
+    """Shape (k,), half a cell of each ring, rad."""
 
     @classmethod
     def of(cls, candidates: Candidates) -> MapCells:

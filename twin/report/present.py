@@ -62,16 +62,13 @@ FOLDED = 10  # letters: a shorter head is not folded
 
 
 class Field(NamedTuple):
-    """One fact of a row.
-
-    Attributes:
-        value: A key, with dots for keys within (of which each may be missing or None), or what finds it in a row.
-        digits: Of a number; None shows the value as it is.
-    """
+    """One fact of a row."""
 
     name: str
     value: str | Callable[[Any], Any]
+    """A key, with dots for keys within (of which each may be missing or None), or what finds it in a row."""
     digits: int | None = None
+    """Of a number; None shows the value as it is."""
     unit: str = ""
 
     def of(self, row: Any, *, unit: bool = False) -> str:

@@ -107,21 +107,18 @@ class BodyMask:
 
 @dataclass(frozen=True, eq=False)
 class CtImage:
-    """A CT, and the body that it shows by itself.
-
-    Attributes:
-        hu: Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head; of 16 bits
-            where the file has such, else of single precision.
-        as_stored: As the file has them, where that differs.
-        not_measured: What was not, where that is known.
-    """
+    """A CT, and the body that it shows by itself."""
 
     hu: NDArray[Any]
+    """Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head; of 16 bits where
+    the file has such, else of single precision."""
     T_ct_index: Floats
     where: Path
     shown: Shown = PATIENT
     as_stored: NDArray[Any] | None = None
+    """As the file has them, where that differs."""
     not_measured: Bools | None = None
+    """What was not, where that is known."""
 
     @property
     def stored(self) -> NDArray[Any]:

@@ -49,18 +49,15 @@ ENDS_FLAT = (
 
 @dataclass(frozen=True, eq=False)
 class FieldOfView:
-    """What was imaged: beyond a face that cuts the body, the body goes on (`planning.anatomy.unseen`).
-
-    Attributes:
-        T_ct_box: Shape (4, 4), rigid; the box frame's origin is its low corner, its axes run mostly to the
-            patient's left, back and head.
-        size_mm: Shape (3,), of the image, or of the mesh that was cut.
-        cut: Shape (3, 2), which low and high face the body reaches: those of the image, or of a mesh that was cut.
-    """
+    """What was imaged: beyond a face that cuts the body, the body goes on (`planning.anatomy.unseen`)."""
 
     T_ct_box: NDArray[np.float64]
+    """Shape (4, 4), rigid; the box frame's origin is its low corner, its axes run mostly to the patient's left, back
+    and head."""
     size_mm: NDArray[np.float64]
+    """Shape (3,), of the image, or of the mesh that was cut."""
     cut: NDArray[np.bool_]
+    """Shape (3, 2), which low and high face the body reaches: those of the image, or of a mesh that was cut."""
 
     def __post_init__(self) -> None:
         for name, dtype in (("T_ct_box", np.float64), ("size_mm", np.float64), ("cut", np.bool_)):

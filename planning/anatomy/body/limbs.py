@@ -54,16 +54,13 @@ FULL = np.ones((3, 3, 3), bool)
 
 
 class Piece(NamedTuple):
-    """What may be a limb, as blocks; it is none where the target lies in ``near``.
-
-    Attributes:
-        near: Alone a limb's where the target lies in ``whole``.
-        ml: Of a part beyond a neck: if neither it nor what holds the target is as small as a limb, it is none. Else 0.
-    """
+    """What may be a limb, as blocks; it is none where the target lies in ``near``."""
 
     near: Bools
+    """Alone a limb's where the target lies in ``whole``."""
     whole: Bools
     ml: float = 0.0
+    """Of a part beyond a neck: if neither it nor what holds the target is as small as a limb, it is none. Else 0."""
 
 
 class LimbSearch(NamedTuple):

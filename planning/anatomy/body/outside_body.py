@@ -55,12 +55,7 @@ RIM_MM = 50.0
 
 @dataclass(frozen=True, eq=False)
 class OutsideImage:
-    """A CT beside its body, axes running to the left, back and head.
-
-    Attributes:
-        slopes: How what lies there moves along axes 0 and 1 beyond the image's ends, mm per mm along the bed.
-        beyond_mm: How far what the border cuts is taken to go on.
-    """
+    """A CT beside its body, axes running to the left, back and head."""
 
     hu: NDArray[Any]
     body: Bools
@@ -68,7 +63,9 @@ class OutsideImage:
     T_ct_index: Floats
     spacing_mm: Floats
     slopes: tuple[float, float] = (0.0, 0.0)
+    """How what lies there moves along axes 0 and 1 beyond the image's ends, mm per mm along the bed."""
     beyond_mm: tuple[float, float, float] = BEYOND_MM
+    """How far what the border cuts is taken to go on."""
 
 
 def outside_mask(image: OutsideImage, air_hu: float) -> Bools:

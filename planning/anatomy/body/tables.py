@@ -61,19 +61,15 @@ FACES = tuple(NAMES)
 
 @dataclass(frozen=True)
 class Shown:
-    """What a person says of an image: then no rule guesses it.
-
-    Attributes:
-        arms, table: ``none`` or ``present`` (one table, which may be cut off); None where nobody said so.
-        whole: The image shows all of it, in air.
-        about: Of several phantoms the one that holds this point is meant, LPS mm; the largest where none does.
-    """
+    """What a person says of an image: then no rule guesses it."""
 
     phantom: bool = False
     arms: str | None = None
     table: str | None = None
     whole: bool = False
+    """The image shows all of it, in air."""
     about: tuple[float, ...] | None = None
+    """Of several phantoms the one that holds this point is meant, LPS mm; the largest where none does."""
 
     @property
     def limbs(self) -> bool:
@@ -90,21 +86,18 @@ PATIENT = Shown()
 
 
 class TableSide(NamedTuple):
-    """A section, drawn along the bed, at which a body or what it lies on ends.
-
-    Attributes:
-        line: Shape (n, nz), by line of sight and slice, where it ends or may end, voxels along the face's axis.
-        lines: Shape (n,), which lines of sight are those of the table; ``width_mm`` of them are drawn.
-        slope: How it moves along the face's axis, mm per mm along the bed.
-        firm: Whether the ends keep to one another, as those of a straight flank do less.
-    """
+    """A section, drawn along the bed, at which a body or what it lies on ends."""
 
     face: Face
     line: Floats
+    """Shape (n, nz), by line of sight and slice, where it ends or may end, voxels along the face's axis."""
     lines: Bools
+    """Shape (n,), which lines of sight are those of the table; ``width_mm`` of them are drawn."""
     slope: float
+    """How it moves along the face's axis, mm per mm along the bed."""
     width_mm: float
     firm: bool
+    """Whether the ends keep to one another, as those of a straight flank do less."""
 
     def beyond(self, shape: tuple[int, ...]) -> Bools:
         """The voxels of an image beyond the line."""

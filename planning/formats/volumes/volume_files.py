@@ -38,16 +38,13 @@ SCALING_ROUNDING = float(np.finfo(np.float64).eps)
 
 @dataclass(frozen=True, eq=False)
 class Volume(Shown):
-    """A scalar volume in patient space.
-
-    Attributes:
-        values: Shape (ni, nj, nk), read-only; Hounsfield units for a CT.
-        T_ct_index: Shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm. Its determinant
-            may have either sign: index axes can be left-handed, the patient's axes are not touched by that.
-    """
+    """A scalar volume in patient space."""
 
     values: NDArray[Any]
+    """Shape (ni, nj, nk), read-only; Hounsfield units for a CT."""
     T_ct_index: NDArray[np.float64]
+    """Shape (4, 4), maps voxel index (i, j, k), at the voxel's centre, to LPS mm. Its determinant may have either sign:
+    index axes can be left-handed, the patient's axes are not touched by that."""
     path: Path
     fields: dict[str, str] = field(default_factory=dict)
 

@@ -91,27 +91,24 @@ class Line(NamedTuple):
 
 
 class FoundNeedle(NamedTuple):
-    """A needle in a CT, LPS mm.
-
-    Attributes:
-        forward_ct: Shape (3,), unit, the direction in which it ends.
-        width_mm: Root mean square distance of its metal from the axis.
-        path_ct: Shape (m, 3), from the tip to where it is seen last.
-        covs_ct: Shape (m, 6, 6), of each point of the path (mm) and of the direction there as a rotation (rad); none
-            about the axis.
-        sagitta_mm: Largest distance of its middle from the chord; 0 where it is not plainly bent.
-        leaves: Whether the end that should be the tip is where the image ends.
-        unclear: Whether it is long, thin metal that enters the body, but shows no image of a needle.
-    """
+    """A needle in a CT, LPS mm."""
 
     tip_ct: Floats
     forward_ct: Floats
+    """Shape (3,), unit, the direction in which it ends."""
     width_mm: float
+    """Root mean square distance of its metal from the axis."""
     path_ct: Floats
+    """Shape (m, 3), from the tip to where it is seen last."""
     covs_ct: Floats
+    """Shape (m, 6, 6), of each point of the path (mm) and of the direction there as a rotation (rad); none about the
+    axis."""
     sagitta_mm: float = 0.0
+    """Largest distance of its middle from the chord; 0 where it is not plainly bent."""
     leaves: bool = False
+    """Whether the end that should be the tip is where the image ends."""
     unclear: bool = False
+    """Whether it is long, thin metal that enters the body, but shows no image of a needle."""
 
     @property
     def cov_ct(self) -> Floats:
@@ -142,24 +139,21 @@ def toward(line: Line, point_ct: Floats) -> Line:
 
 
 class _Seen(NamedTuple):
-    """The voxels about a straight needle that are compared with its image.
-
-    Attributes:
-        axes: Shape (3, 3), rows: the needle's direction, and two across it.
-        local: Shape (n, 3), mm, in these axes from where the needle begins.
-        slices: Shape (n,), in which slice each lies.
-        thick: Shape (3,), from one slice to the next, in these axes.
-        length: Of the needle, mm.
-    """
+    """The voxels about a straight needle that are compared with its image."""
 
     curve: CurveImage
     axes: Floats
+    """Shape (3, 3), rows: the needle's direction, and two across it."""
     local: Floats
+    """Shape (n, 3), mm, in these axes from where the needle begins."""
     parts: Floats
     slices: Ints
+    """Shape (n,), in which slice each lies."""
     thick: Floats
+    """Shape (3,), from one slice to the next, in these axes."""
     bends: Floats
     length: float
+    """Of the needle, mm."""
 
     @property
     def bright(self) -> Bools:

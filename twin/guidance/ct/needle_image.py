@@ -39,21 +39,18 @@ FAR = 20.0
 
 
 class CurveImage(NamedTuple):
-    """The image of a curve's `NUMBERS`, at points in its axes.
-
-    Attributes:
-        axes: Shape (3, 3), rows: nearly the needle's direction, and the two across it.
-        plane: Shape (3, 3), mm², in these axes: the assumed blur in the image's plane, which is fitted, and
-        fixed: the same, of one layer of a slice and of the needle's own width.
-        full: Part of metal from which a voxel is clipped.
-    """
+    """The image of a curve's `NUMBERS`, at points in its axes."""
 
     axes: Floats
+    """Shape (3, 3), rows: nearly the needle's direction, and the two across it."""
     plane: Floats
+    """Shape (3, 3), mm², in these axes: the assumed blur in the image's plane, which is fitted, and"""
     fixed: Floats
+    """the same, of one layer of a slice and of the needle's own width."""
     layers: Floats
     diameter_mm: float
     full: float
+    """Part of metal from which a voxel is clipped."""
 
     @classmethod
     def of(cls, volume: Volume, axes: Floats, diameter_mm: float) -> CurveImage:

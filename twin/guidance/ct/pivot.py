@@ -59,18 +59,15 @@ def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, 
 
 @dataclass(frozen=True, eq=False)
 class Pivot:
-    """A calibrated tip, flange frame, and its place, base frame; mm.
-
-    Attributes:
-        cov_tip: Shape (3, 3), mm^2, from all that is declared.
-        expected_mm: Rms of the misses as declared touch noise leaves it; `expected_whole_mm` with the arm's errors too.
-    """
+    """A calibrated tip, flange frame, and its place, base frame; mm."""
 
     tip_flange: Floats
     place_base: Floats
     cov_tip: Floats
+    """Shape (3, 3), mm^2, from all that is declared."""
     misses_mm: Floats
     expected_mm: float
+    """Rms of the misses as declared touch noise leaves it; `expected_whole_mm` with the arm's errors too."""
     expected_whole_mm: float
 
     @property

@@ -107,21 +107,18 @@ def body_of(
 
 @dataclass(frozen=True, eq=False)
 class Tie:
-    """Where the case's frame lies in a scan.
-
-    Attributes:
-        cov_ct: Shape (6, 6), of its inverse at the target: shift (mm) and rotation (rad), axes of the case.
-        found: Fraction of the surfaces in the image that were found; the residual (rms) is theirs, or the markers'.
-        moved_mm: How far the target lies from where one frame would have it; NaN where the scan has its own.
-    """
+    """Where the case's frame lies in a scan."""
 
     T_scan_ct: Floats
     cov_ct: Floats
+    """Shape (6, 6), of its inverse at the target: shift (mm) and rotation (rad), axes of the case."""
     target_ct: Floats
     how: str
     residual_mm: float
     found: float
+    """Fraction of the surfaces in the image that were found; the residual (rms) is theirs, or the markers'."""
     moved_mm: float
+    """How far the target lies from where one frame would have it; NaN where the scan has its own."""
     moved_deg: float
     findings: tuple[Finding, ...] = ()
 

@@ -53,39 +53,35 @@ DEFAULT_MARKER_MM = 0.3
 
 
 class ServoErrors(ArmErrors):
-    """Standard deviations per axis.
-
-    Attributes:
-        arm: Whose numbers link, twist and joint take where none are stated.
-        gear_deg: Amplitude of each gear's error, a sine over its joint.
-        gear_cycles: Periods of that sine per turn of the joint: 200 of a harmonic drive of 1:100, twice a turn of its
-            motor (Tuttle, "Understanding and modeling the behavior of a harmonic drive gear transmission", MIT
-            AITR-1365, 1992).
-        ball_offset_mm: Of the ball's centre against where the controller has it on the flange; the cameras see it.
-        tip_offset_mm: Of the needle's tip against the ball's centre, flange axes; no camera sees it.
-        needle_direction_deg: Of the needle, about each of the flange's x and y axes.
-        camera_focal: Of the focal length, as a part of it; ``lens`` of k1, k2, p1, p2.
-        ball_px: Of the centre of a ball or marker in one look; None takes what the tracker states of each image.
-        target_mm: Of the target in the image; as a marker where it is not stated.
-        head_shift_mm: By which the head moves after its markers were seen; it turns about their middle.
-    """
+    """Standard deviations per axis."""
 
     arm: Literal["calibrated", "nominal"] = "calibrated"
+    """Whose numbers link, twist and joint take where none are stated."""
     gear_deg: SmallAngle = 0.0
+    """Amplitude of each gear's error, a sine over its joint."""
     gear_cycles: Annotated[int, Strict(), Field(ge=1, le=1000)] = 200
+    """Periods of that sine per turn of the joint: 200 of a harmonic drive of 1:100, twice a turn of its motor (Tuttle,
+    "Understanding and modeling the behavior of a harmonic drive gear transmission", MIT AITR-1365, 1992)."""
     ball_offset_mm: Millimetres = 0.3
+    """Of the ball's centre against where the controller has it on the flange; the cameras see it."""
     tip_offset_mm: Millimetres = 0.3
+    """Of the needle's tip against the ball's centre, flange axes; no camera sees it."""
     needle_direction_deg: SmallAngle = 0.2
+    """Of the needle, about each of the flange's x and y axes."""
     camera_turn_deg: SmallAngle = 0.23
     camera_shift_mm: Millimetres = 3.0
     camera_axis_px: PixelDeviation = 8.0
     camera_focal: Part = 0.01
+    """Of the focal length, as a part of it; ``lens`` of k1, k2, p1, p2."""
     lens: tuple[Part, Part, Part, Part] = (0.02, 0.02, 0.0005, 0.0005)
     ball_px: DetectionDeviation | None = None
+    """Of the centre of a ball or marker in one look; None takes what the tracker states of each image."""
     measuring_arm_mm: Millimetres = DEFAULT_MEASURING_MM
     marker_mm: Millimetres = DEFAULT_MARKER_MM
     target_mm: Millimetres = DEFAULT_MARKER_MM
+    """Of the target in the image; as a marker where it is not stated."""
     head_shift_mm: Millimetres = 0.0
+    """By which the head moves after its markers were seen; it turns about their middle."""
     head_turn_deg: SmallAngle = 0.0
 
     @model_validator(mode="before")

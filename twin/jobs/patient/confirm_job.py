@@ -45,21 +45,18 @@ SHOWN = 8  # structures in the text; the page and the JSON have all
 
 @dataclass(frozen=True, eq=False)
 class Confirmed(Shown):
-    """A needle in a control CT, in the case's frame (LPS mm).
-
-    Attributes:
-        plan: To which it is compared, or None.
-        needle: Its covariance is that of the reading and of the frames' tie together.
-        aims: What can be done, the best first.
-    """
+    """A needle in a control CT, in the case's frame (LPS mm)."""
 
     context: CaseContext
     plan: Plan | None
+    """To which it is compared, or None."""
     volume: Volume
     tie: Tie
     needle: FoundNeedle
+    """Its covariance is that of the reading and of the frames' tie together."""
     line: LineCheck
     aims: tuple[Aim, ...]
+    """What can be done, the best first."""
     findings: tuple[Finding, ...]
     read: tuple[Input, ...]
     files: tuple[Path, ...] = ()
@@ -324,23 +321,20 @@ PICTURE_TEXT = (
 
 
 class Learned(NamedTuple):
-    """By how much errors exceed what was predicted, of n needles.
-
-    Attributes:
-        factor: Of every standard deviation: 1 where the declaration is right; `low` to `high` is its 95 % interval.
-        mean_mm: Shape (3,), the mean error, LPS.
-        rms_mm: Realised.
-        inside: How many were in their 95 % region.
-    """
+    """By how much errors exceed what was predicted, of n needles."""
 
     needles: int
     factor: float
+    """Of every standard deviation: 1 where the declaration is right; `low` to `high` is its 95 % interval."""
     low: float
     high: float
     mean_mm: tuple[float, ...]
+    """Shape (3,), the mean error, LPS."""
     rms_mm: float
+    """Realised."""
     predicted_rms_mm: float
     inside: int
+    """How many were in their 95 % region."""
     inputs: tuple[Input, ...]
 
     def summary(self) -> dict[str, Any]:

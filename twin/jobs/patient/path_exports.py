@@ -60,17 +60,14 @@ AIMED = ("by_mm", "turn_deg", "p_hit", "lateral_mm")
 
 @dataclass(frozen=True, repr=False)
 class Written(Shown):
-    """The files of one export.
-
-    Attributes:
-        facts: What they hold, as plain values.
-        said: For a person: the same, and what whoever opens them should know.
-    """
+    """The files of one export."""
 
     format_name: str
     files: tuple[Path, ...]
     facts: Mapping[str, Any]
+    """What they hold, as plain values."""
     said: Sequence[Section]
+    """For a person: the same, and what whoever opens them should know."""
     inputs: tuple[Input, ...]
 
     @property

@@ -73,26 +73,23 @@ RANDOM_SETS = 50
 
 @dataclass(frozen=True, eq=False)
 class SelfcalRun:
-    """What the command did.
-
-    Attributes:
-        trials: In the twin, one per seed; empty for a recording.
-        warnings: What the recording leaves open, one sentence each.
-        shots: What came of each shot after the recording.
-    """
+    """What the command did."""
 
     name: str
     calibration: Calibration
     recording: Recording
     inputs: tuple[Input, ...]
     trials: tuple[SelfcalTrial, ...] = ()
+    """In the twin, one per seed; empty for a recording."""
     case: SelfcalCase | None = None
     candidates: CandidatePoses | None = None
     choice: dict[str, Any] | None = None
     stages: Stages = field(default_factory=Stages)
     files: tuple[Path, ...] = ()
     warnings: tuple[str, ...] = ()
+    """What the recording leaves open, one sentence each."""
     shots: tuple[Shot, ...] = ()
+    """What came of each shot after the recording."""
 
     @property
     def punctures(self) -> tuple[Puncture, ...]:

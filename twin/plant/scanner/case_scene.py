@@ -99,17 +99,14 @@ class TrueRod:
 
 
 class Part(NamedTuple):
-    """One body outside of a patient; a later one fills the place of an earlier one.
-
-    Attributes:
-        place: ``beneath`` the patient, as the bed; ``upon`` them, as arms and lines, which the body displaces;
-            ``within`` an arm, as its bones, which displace the body.
-    """
+    """One body outside of a patient; a later one fills the place of an earlier one."""
 
     name: str
     mesh: TriangleMesh
     hu: float
     place: Literal["beneath", "upon", "within"] = "upon"
+    """``beneath`` the patient, as the bed; ``upon`` them, as arms and lines, which the body displaces; ``within`` an
+    arm, as its bones, which displace the body."""
 
 
 Placer = Callable[[TriangleMesh, float, np.random.Generator], tuple[Part, ...]]
@@ -118,19 +115,16 @@ Placer = Callable[[TriangleMesh, float, np.random.Generator], tuple[Part, ...]]
 
 @dataclass(frozen=True, eq=False)
 class CaseScene:
-    """Content of the scanner, in its frame (LPS of the scan, mm).
-
-    Attributes:
-        T_scan_ct: Shape (4, 4): the case's frame to the scanner's; a rotation, never a mirror.
-        cut: Shape (3, 2): at which ends the body goes on beyond its surface.
-        tables: Shape (2, 3): the box about what the patient lies on; infinite without any.
-    """
+    """Content of the scanner, in its frame (LPS of the scan, mm)."""
 
     solids: tuple[Solid, ...]
     T_scan_ct: Floats
+    """Shape (4, 4): the case's frame to the scanner's; a rotation, never a mirror."""
     skin: TriangleMesh
     cut: Bools
+    """Shape (3, 2): at which ends the body goes on beyond its surface."""
     tables: Floats
+    """Shape (2, 3): the box about what the patient lies on; infinite without any."""
     outside_objects: tuple[Part, ...]
     markers: NamedPoints | None
     listed: NamedPoints | None

@@ -29,12 +29,7 @@ BLUR_ENDS = 3.0
 
 @dataclass(frozen=True)
 class ScanSettings:
-    """Settings of a scan: noise of each voxel on its own, full width at half maximum of the blur in the plane.
-
-    Attributes:
-        fov_mm: Side of the square image; None shows the whole body, as no ``length_mm`` along the bed does.
-        turn: By which the patient is rotated about the bed's direction, rad.
-    """
+    """Settings of a scan: noise of each voxel on its own, full width at half maximum of the blur in the plane."""
 
     spacing_mm: float = 2.5
     pixel_mm: float = 0.8
@@ -42,21 +37,20 @@ class ScanSettings:
     blur_mm: float = 1.0
     seed: int = 0
     fov_mm: float | None = None
+    """Side of the square image; None shows the whole body, as no ``length_mm`` along the bed does."""
     length_mm: float | None = None
     turn: float = 0.0
+    """By which the patient is rotated about the bed's direction, rad."""
 
 
 @dataclass(frozen=True, eq=False)
 class CtImage:
-    """A scan, with its ground truth.
-
-    Attributes:
-        labels: Shape (layers, nx, ny, nz): what is labelled at each voxel's centre, in each label map, and the parts of
-            whole solids that the centres miss; `thin` counts these by the solid's name.
-    """
+    """A scan, with its ground truth."""
 
     hu: NDArray[np.int16]
     labels: NDArray[Any]
+    """Shape (layers, nx, ny, nz): what is labelled at each voxel's centre, in each label map, and the parts of whole
+    solids that the centres miss; `thin` counts these by the solid's name."""
     grid: VolumeGrid
     thin: Mapping[str, int]
 
@@ -150,19 +144,16 @@ SIDES = 64
 
 
 class Solid(NamedTuple):
-    """One body in the scanner, Hounsfield units; a later one fills the place of an earlier one.
-
-    Attributes:
-        label: Its number in its label map (bodies that hold others have one of their own); 0 where none names it.
-        whole: Its label leaves out no part of it, however thin.
-    """
+    """One body in the scanner, Hounsfield units; a later one fills the place of an earlier one."""
 
     name: str
     mesh: TriangleMesh
     hu: float
     label: int = 0
+    """Its number in its label map (bodies that hold others have one of their own); 0 where none names it."""
     layer: int = 0
     whole: bool = False
+    """Its label leaves out no part of it, however thin."""
 
 
 def check_closed(solid: Solid, where: str) -> Solid:

@@ -43,19 +43,7 @@ class Uncertainty(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What a page shows.
-
-    Attributes:
-        film: Name of the rehearsal's film, which lies beside the page and is linked.
-        uncertainty: None where the case declares no errors.
-        pick: The planned candidate, or the one to be shown; None shows the best.
-        subject: What the slices show first.
-        T_base_ct: Shape (4, 4), mm, where the arm was checked; else None.
-        regions_ct: Shape (n, 3, 3), mm^2: of the tip, as `CaseContext.regions_ct`.
-        facts: How the planned or shown path is found at the patient.
-        refusal: Why there is no plan although one was requested.
-        notes: What else must be known of the plan; `failures` say why the rehearsal's answer is no.
-    """
+    """What a page shows."""
 
     case: Any
     anatomy: Any
@@ -64,15 +52,24 @@ class Shown:
     rehearsal: Any | None = None
     registration: Mapping[str, Any] | None = None
     film: str | None = None
+    """Name of the rehearsal's film, which lies beside the page and is linked."""
     uncertainty: Uncertainty | None = None
+    """None where the case declares no errors."""
     pick: Pick | None = None
+    """The planned candidate, or the one to be shown; None shows the best."""
     subject: Subject | None = None
+    """What the slices show first."""
     T_base_ct: Floats | None = None
+    """Shape (4, 4), mm, where the arm was checked; else None."""
     regions_ct: Floats | None = None
+    """Shape (n, 3, 3), mm^2: of the tip, as `CaseContext.regions_ct`."""
     facts: EntryFacts | None = None
+    """How the planned or shown path is found at the patient."""
     refusal: str = ""
+    """Why there is no plan although one was requested."""
     raster: MapRaster | None = None
     notes: Sequence[str] = ()
+    """What else must be known of the plan; `failures` say why the rehearsal's answer is no."""
     failures: Sequence[str] = ()
 
     @property

@@ -14,19 +14,16 @@ from puncture_twin.planning.geometry.rigid import frame_along
 
 @dataclass(frozen=True, eq=False)
 class ViewCamera:
-    """A virtual camera in the CT frame.
-
-    Attributes:
-        eye: Shape (3,), mm.
-        look_at: Shape (3,), mm.
-        up: Shape (3,), any vector not along the view.
-        fov: Vertical opening angle, rad.
-    """
+    """A virtual camera in the CT frame."""
 
     eye: Floats
+    """Shape (3,), mm."""
     look_at: Floats
+    """Shape (3,), mm."""
     up: Floats
+    """Shape (3,), any vector not along the view."""
     fov: float
+    """Vertical opening angle, rad."""
     width: int
     height: int
 

@@ -54,19 +54,16 @@ BAND = 60_000
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A mesh with its look.
-
-    Attributes:
-        mesh: In the frame of the layer it belongs to, mm.
-        colour: RGB, 0..255.
-        alpha: Opacity where one looks straight at it; only translucent surfaces use it.
-        rim: How much more opaque it is where one sees it edge-on.
-    """
+    """A mesh with its look."""
 
     mesh: TriangleMesh
+    """In the frame of the layer it belongs to, mm."""
     colour: Rgb
+    """RGB, 0..255."""
     alpha: float = 1.0
+    """Opacity where one looks straight at it; only translucent surfaces use it."""
     rim: float = 2.5
+    """How much more opaque it is where one sees it edge-on."""
 
 
 class Layer:

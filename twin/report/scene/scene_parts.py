@@ -137,20 +137,17 @@ LEAST_NEEDLE_MM = 1.0
 
 @dataclass(frozen=True, eq=False)
 class SceneBody:
-    """One thing of the scene.
-
-    Attributes:
-        group: "organ", "skin", "safe", "needle", "arm", "room" or "target".
-        mesh: CT frame, mm.
-        frame: Of an arm's link: with which of ``link_poses`` it moves.
-    """
+    """One thing of the scene."""
 
     name: str
     group: str
+    """"organ", "skin", "safe", "needle", "arm", "room" or "target"."""
     mesh: TriangleMesh
+    """CT frame, mm."""
     colour: Rgb
     alpha: float = 1.0
     frame: int = 0
+    """Of an arm's link: with which of ``link_poses`` it moves."""
 
     @property
     def surface(self) -> Surface:

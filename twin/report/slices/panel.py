@@ -56,18 +56,15 @@ class Near(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """One direction, as the slices show it.
-
-    Attributes:
-        pick: The candidate; None for the image alone, in which nobody has proposed a needle yet.
-        region_ct: Shape (3, 3), mm^2: the tip is expected within x' inv(region) x <= 1 in 95 of 100; None without
-            declared errors.
-    """
+    """One direction, as the slices show it."""
 
     case: Any
     anatomy: Any
     pick: Pick | None
+    """The candidate; None for the image alone, in which nobody has proposed a needle yet."""
     region_ct: Floats | None = None
+    """Shape (3, 3), mm^2: the tip is expected within x' inv(region) x <= 1 in 95 of 100; None without declared
+    errors."""
 
     @property
     def outward_ct(self) -> Floats:

@@ -25,20 +25,17 @@ OBLIQUE = 0.38  # a direction within 22 degrees of an axis is named by that axis
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """One square picture.
-
-    Attributes:
-        at_ct: Shape (3,), a point of the plane, the target.
-        right: Shape (3,), unit, CT frame: what lies to the right in the picture.
-        up: Shape (3,), unit.
-        centre: Shape (2,), the picture's middle from the target, mm to the right and up.
-    """
+    """One square picture."""
 
     name: str
     at_ct: Floats
+    """Shape (3,), a point of the plane, the target."""
     right: Floats
+    """Shape (3,), unit, CT frame: what lies to the right in the picture."""
     up: Floats
+    """Shape (3,), unit."""
     centre: Floats
+    """Shape (2,), the picture's middle from the target, mm to the right and up."""
     half_mm: float
 
     @cached_property

@@ -73,63 +73,60 @@ NO_NOISE = Noise(0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Calibration(Shown):
-    """X, Y and the needle in its flange frame, from A X P = Y B Q.
-
-    Attributes:
-        X: T_end1_image, shape (4, 4), mm; Y: T_base1_base2.
-        tip_end2: t_Q, the needle's tip, shape (3,), mm, frame end2.
-        needle_direction_end2: V, unit, toward the tip, shape (3,), frame end2.
-        scale: mm per unit of P along u and v, shape (2,); ones where it was not wanted.
-        residuals: Y B Q - A X P, shape (n, 3), mm, base1, of every pose.
-        rms_mm: Root mean square length of the residuals of the poses that were used.
-        weights: One per pose, shape (n,): 1 used, 0 set aside; the latter's names are the ``outliers``.
-        image: What errors of the image the residuals show, significant or not; None where the poses cannot show them.
-        findings: What the recording says against itself.
-        iterations: Steps of the refinement, all rounds together.
-        condition: Least over largest singular value of the Jacobian, lengths in 100 mm.
-        covariance: Shape (p, p), of the ``parameters``, whose names hold their units; rotations are R exp([w]x).
-        freedom: Residuals minus unknowns.
-        noise: What the weights were made from: given, or found from the residuals (``Spread``).
-        shaft_unit: Root mean square of the directions' spreads by their shafts' lengths; 1 where those were not read.
-        lean_rad: How far the needle leans out of the image, as the residuals show it.
-        noise_ratio: Size of the residuals over what ``noise`` and ``arms`` let expect; far above 1: they are larger.
-        tip_bias_mm: How far the detected tip lies beyond the true one along the shaft; None without a needle length.
-        orientations: M, rotation from end2 to image, shape (n, 3, 3): how the needle stood in the image.
-        cannot_show: What the data cannot tell, in words.
-        arms: Both arms' declared errors, which ``covariance`` then counts; None where they were not declared.
-        arm_errors: Posterior mean of their parameters, in declared standard deviations; shape (46,), or (52,) and
-            (58,) with the play of one arm and of both; (0,) without.
-        joint_covariance: Of parameters and arms' errors together, shape (p + m, p + m); ``covariance`` without.
-        small_sample: Region with the uncertainty of an estimated noise, where arms are declared.
-    """
+    """X, Y and the needle in its flange frame, from A X P = Y B Q."""
 
     X: Floats
+    """T_end1_image, shape (4, 4), mm; Y: T_base1_base2."""
     Y: Floats
     tip_end2: Floats
+    """t_Q, the needle's tip, shape (3,), mm, frame end2."""
     needle_direction_end2: Floats
+    """V, unit, toward the tip, shape (3,), frame end2."""
     scale: Floats
+    """mm per unit of P along u and v, shape (2,); ones where it was not wanted."""
     residuals: Floats
+    """Y B Q - A X P, shape (n, 3), mm, base1, of every pose."""
     rms_mm: float
+    """Root mean square length of the residuals of the poses that were used."""
     weights: Floats
+    """One per pose, shape (n,): 1 used, 0 set aside; the latter's names are the ``outliers``."""
     outliers: tuple[str, ...]
     image: ImageErrors | None
+    """What errors of the image the residuals show, significant or not; None where the poses cannot show them."""
     findings: tuple[Finding, ...]
+    """What the recording says against itself."""
     iterations: int
+    """Steps of the refinement, all rounds together."""
     condition: float
+    """Least over largest singular value of the Jacobian, lengths in 100 mm."""
     covariance: Floats
+    """Shape (p, p), of the ``parameters``, whose names hold their units; rotations are R exp([w]x)."""
     parameters: tuple[str, ...]
     freedom: int
+    """Residuals minus unknowns."""
     noise: Noise | Spread
+    """What the weights were made from: given, or found from the residuals (``Spread``)."""
     shaft_unit: float
+    """Root mean square of the directions' spreads by their shafts' lengths; 1 where those were not read."""
     lean_rad: float
+    """How far the needle leans out of the image, as the residuals show it."""
     noise_ratio: float
+    """Size of the residuals over what ``noise`` and ``arms`` let expect; far above 1: they are larger."""
     tip_bias_mm: float | None
+    """How far the detected tip lies beyond the true one along the shaft; None without a needle length."""
     orientations: Floats
+    """M, rotation from end2 to image, shape (n, 3, 3): how the needle stood in the image."""
     cannot_show: tuple[str, ...]
+    """What the data cannot tell, in words."""
     arms: DeclaredArms | None
+    """Both arms' declared errors, which ``covariance`` then counts; None where they were not declared."""
     arm_errors: Floats
+    """Posterior mean of their parameters, in declared standard deviations; shape (46,), or (52,) and (58,) with the
+    play of one arm and of both; (0,) without."""
     joint_covariance: Floats
+    """Of parameters and arms' errors together, shape (p + m, p + m); ``covariance`` without."""
     small_sample: SmallSample | None
+    """Region with the uncertainty of an estimated noise, where arms are declared."""
 
     @brief
     def __repr__(self) -> str:

@@ -554,19 +554,17 @@ class ImageErrors(NamedTuple):
     A direction read as v points along S v, rotated by w. The residuals' derivatives by (a, b, k, w) join the Jacobian,
     and the F-test of all of them together says whether residuals that are only noise would be so well explained: once
     in a hundred recordings. The calibration does not use them; what they leave at the tips counts in its error.
-
-    Attributes:
-        names: Of those that were tested, keys of `ERRORS`.
-        found: a, b, k (per mm) and w (rad), with their standard deviations; shape (k,).
-        probability: Chance of residuals so well explained where there are none: F(k, freedom).
-        rms_mm: What they leave at the recorded tips, whatever the calibration does to make up for them.
     """
 
     names: tuple[str, ...]
+    """Of those that were tested, keys of `ERRORS`."""
     found: Floats
+    """a, b, k (per mm) and w (rad), with their standard deviations; shape (k,)."""
     sd: Floats
     probability: float
+    """Chance of residuals so well explained where there are none: F(k, freedom)."""
     rms_mm: float
+    """What they leave at the recorded tips, whatever the calibration does to make up for them."""
 
     @property
     def significant(self) -> bool:

@@ -50,38 +50,35 @@ SPEC_NOISE = Noise(robot_mm=0.1, robot_rad=np.radians(0.03), image_mm=0.3, direc
 class Recording(Shown):
     """Poses of both arms with the needle seen in the image. Checked when made; the arrays are read-only.
 
-    Attributes:
-        A: T_base1_end1, shape (n, 4, 4), mm: flange of the probe's arm; B: T_base2_end2, flange of the needle's arm.
-        P: The tip in the image, shape (n, 2), mm (pixels where ``pixels`` is set: mm per pixel is to be found); shape
-            (n, 3), mm, where a volume or a camera measures it out of a plane too.
-        v: Direction of the needle toward its tip, in the image, made unit. Shape (n, 2) where the image alone says it,
-            (n, 3) where the part across the image is measured too; None where it was not measured.
-        names: One per pose; numbers where nothing is given.
-        q_probe: Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; those of the needle's arm
-            in ``q_needle``; None where they were not recorded: errors of the arms are then not told from noise.
-        turn_probe: Direction of each probe joint's last rotation before it stopped, shape (n, 6): 1, -1, or 0 where
-            nobody knows; the needle's in ``turn_needle``. None where they were not recorded: the play's sign is then
-            unknown.
-        shaft_mm: How much of the shaft shows, shape (n,): the more, the better its direction is known; None where it
-            was not measured: all directions then count the same.
-        missed: Name and reason of each picture in which no needle was found.
-
     Raises:
         InputError: Shapes that do not match, values that are not finite, matrices that are not rigid motions.
     """
 
     A: Floats
+    """T_base1_end1, shape (n, 4, 4), mm: flange of the probe's arm; B: T_base2_end2, flange of the needle's arm."""
     B: Floats
     P: Floats
+    """The tip in the image, shape (n, 2), mm (pixels where ``pixels`` is set: mm per pixel is to be found); shape (n,
+    3), mm, where a volume or a camera measures it out of a plane too."""
     v: Floats | None = None
+    """Direction of the needle toward its tip, in the image, made unit. Shape (n, 2) where the image alone says it, (n,
+    3) where the part across the image is measured too; None where it was not measured."""
     names: tuple[str, ...] = ()
+    """One per pose; numbers where nothing is given."""
     pixels: bool = False
     q_probe: Floats | None = None
+    """Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; those of the needle's arm in
+    ``q_needle``; None where they were not recorded: errors of the arms are then not told from noise."""
     q_needle: Floats | None = None
     turn_probe: Floats | None = None
+    """Direction of each probe joint's last rotation before it stopped, shape (n, 6): 1, -1, or 0 where nobody knows;
+    the needle's in ``turn_needle``. None where they were not recorded: the play's sign is then unknown."""
     turn_needle: Floats | None = None
     shaft_mm: Floats | None = None
+    """How much of the shaft shows, shape (n,): the more, the better its direction is known; None where it was not
+    measured: all directions then count the same."""
     missed: tuple[tuple[str, str], ...] = ()
+    """Name and reason of each picture in which no needle was found."""
 
     @brief
     def __repr__(self) -> str:
