@@ -174,10 +174,10 @@ def _layout(data: Dataset, where: str) -> tuple[int, tuple[slice, slice], tuple[
     if len(slices) != 1:
         refuse(f"{len(slices)} regions of tissue in cm", where, "one region", "unsupported_feature")
     (region,) = slices
-    x0, y0, x1, y1 = (
+    x0, x1, y0, y1 = (
         whole(region, f"RegionLocation{key}{axis}{i}", low=0, high=most - 1, where=where)
-        for i, key in enumerate(("Min", "Max"))
         for axis, most in (("X", columns), ("Y", rows))
+        for i, key in enumerate(("Min", "Max"))
     )
     if x1 <= x0 or y1 <= y0:
         refuse(f"a region from {x0}, {y0} to {x1}, {y1}", where, "a region with an area", "bad_tag")

@@ -113,7 +113,7 @@ class Scan:
         return () if self.skin is not None else self._ct.found.tables
 
     def attached_limbs(self, target_ct: NDArray[np.float64], structures: Sequence[Named] = ()) -> TriangleMesh | None:
-        """The surface of limbs that are pressed against the part of the body that holds the target, LPS mm, or None.
+        """The surface of limbs that are pressed against the body part that holds the target (3,), LPS mm, or None.
 
         Bones that the case's structures name are no evidence of a limb.
         """
@@ -226,7 +226,10 @@ def _to_meshes(stored: Arrays) -> list[TriangleMesh | None]:
 
 
 def nearest(values: NDArray[np.float32], T_index_ct: Floats, points_ct: Floats) -> Floats:
-    """Values of the nearest voxels, NaN outside of the image; half way between two it is the one of even index."""
+    """Values (nx, ny, nz) of the voxels nearest to points (n, 3), LPS mm, by the map (4, 4) of these to an index.
+
+    NaN outside of the image; half way between two voxels it is the one of even index.
+    """
     order = np.argsort(values.strides)[::-1]  # as it lies in memory: the kernel is compiled for one order alone
     plain = np.ascontiguousarray(values.transpose(order))
     return np.asarray(_nearest(plain, T_index_ct[order], np.ascontiguousarray(points_ct)))

@@ -88,7 +88,7 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
 
 
 def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
-    """The skin of a mesh (LPS mm): of a whole body, or of one that was cut flat at some sides, named as in `SIDES`."""
+    """The skin of a mesh, LPS mm: of a whole body (local mm too), or of one cut flat at some sides, as in `SIDES`."""
     mesh = split_at_creases(mesh)
     warnings = () if mesh.closed else ("the skin mesh is open: its inside, and where skin is missing, are not known",)
     if not cut:
@@ -107,7 +107,7 @@ def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
 
 
 def flat_ends(mesh: TriangleMesh) -> tuple[str, ...]:
-    """The sides at which a surface ends in a plane of its bounding box, as a body does that a scan has cut.
+    """The sides at which a surface, LPS mm, ends in a plane of its bounding box, as a body does that a scan has cut.
 
     A round body of straight voxel steps ends so too, but half as wide again one step before; across the bed, where
     bodies end seldom and are cut mostly, that is not asked.
@@ -154,14 +154,15 @@ class SkinPaths:
     """The skin along n paths; mm, radians, NaN where there is none."""
 
     entry_ct: Floats
-    """Shape (n, 3), where the path from outside first meets the skin for good, seen from the target. path_length,
-    skin_angle: Target to entry, and between the path and the skin's inward normal."""
+    """Shape (n, 3), where the path from outside first meets the skin for good, seen from the target."""
     path_length: Floats
+    """Shape (n,), target to entry."""
     skin_angle: Floats
+    """Shape (n,), between the path and the skin's inward normal."""
     reentry_depth: Floats
-    """Where the needle would meet skin again, before where its flange waits."""
+    """Shape (n,), where the needle would meet skin again, before where its flange waits."""
     unknown_depth: Floats
-    """Where the path leaves the body through a cut, or 0 where the skin's crossings do not add up."""
+    """Shape (n,), where the path leaves the body through a cut, or 0 where the skin's crossings do not add up."""
 
 
 def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, farthest: float) -> SkinPaths:

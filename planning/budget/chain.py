@@ -30,7 +30,7 @@ class BentPath:
 
     case: Case
     anatomy: Anatomy
-    outward_ct: Floats
+    outward_ct: Floats  # from the target along the needle
     path_length: float
     bending: Bending
 
@@ -83,18 +83,18 @@ class Chain:
     """The chain from a target in the CT to a needle's tip: registration, arm, errors."""
 
     model: UrModel
-    tip_mm: float
+    tip_mm: float  # flange to tip
     method: str
     errors: ErrorModel
     """As declared, times ``scale``."""
     scale: float
     """By which the markers' residuals multiply every declared error: 1 where they agree."""
-    points_ct: Floats
-    q_touch: Floats
+    points_ct: Floats  # shape (N, 3), the markers
+    q_touch: Floats  # shape (N, 6), how the arm touches them
     T_base_ct: Floats
     target_ct: Floats
-    q_insertion: Floats
-    path: BentPath | None = None
+    q_insertion: Floats  # shape (6,), the tip on the target
+    path: BentPath | None = None  # of a needle that bends; None for a straight one
     breathing: Breathing | None = None
     motion_base: Floats | None = None
     """Shape (3, 3), mm^2, of the target since the scan, base axes; None where it is not declared."""

@@ -95,10 +95,11 @@ class ArmUncertainty:
     """Standard deviations of an arm and the needle on it; mm and radians."""
 
     link_mm: float
-    """Of every Denavit-Hartenberg length a_i and d_i. twist, joint: Of every twist alpha_i, and of every joint's
-    zero."""
+    """Of every Denavit-Hartenberg length a_i and d_i."""
     twist: float
+    """Of every twist alpha_i."""
     joint: float
+    """Of every joint's zero."""
     repeatability: float
     """Of every joint, anew at each arrival."""
     drift: float
@@ -122,7 +123,7 @@ class ArmUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """All declared errors of a case."""
+    """All declared errors of a case; covariances (3, 3), mm^2, of one marker and of the target as read in the CT."""
 
     marker_cov_ct: Floats
     touch_mm: float

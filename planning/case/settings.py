@@ -90,15 +90,17 @@ class CtSettings:
     air_hu: float = tables.AIR_HU
     """Outside of the body, what is denser is not air."""
     dense_hu: float = tables.DENSE_HU
-    """Inside the body, what is at least so dense must belong to a structure, or to one that demands ``margin_mm`` and
-    is ``unknown``, or ``free``, as ``unnamed`` says."""
+    """Inside the body, what is at least so dense must belong to a structure."""
     margin_mm: float = 2.0
+    """Clearance that what the CT adds demands."""
     unnamed: str = "unknown"
+    """What the CT shows inside the body and no structure names: ``unknown``, or ``free``."""
     trust_labels: bool = False
-    """Whether a person has seen that the structures lie right: no check of that refuses them. arms, table: Whether the
-    image shows limbs beside the trunk, and what the body lies on, if a person states it."""
+    """Whether a person has seen that the structures lie right: no check of that refuses them."""
     arms: tables.Stated | None = None
+    """Whether the image shows arms or other limbs beside the trunk, where a person states it."""
     table: tables.Stated | None = None
+    """Whether it shows what the body lies on, where a person states it."""
     beyond_mm: float | None = None
     """How much wider than where the image cuts it the body may be beyond, where a person states it; infinite for all
     that lies beyond the plane of the cut."""
@@ -166,16 +168,21 @@ class Stereo:
 
 @dataclass(frozen=True, eq=False)
 class Ultrasound:
-    """A probe on an arm of its own, whose base is at T_base_ct_mount (4, 4), mm; None where that is to be proposed."""
+    """A probe on an arm of its own, whose base is at T_base_ct_mount (4, 4), mm; None where that is to be proposed.
+
+    Standard deviations of the readings of target and tip: per axis of the image plane, and across it.
+    """
 
     model: UrModel
     T_base_ct_mount: Floats | None
     target_sd_mm: tuple[float, float]
     tip_sd_mm: tuple[float, float]
     calibration_sd_mm: float
-    """Of the image's place on its arm, per axis. depth_mm, width_mm: How deep the probe sees, and its footprint."""
+    """Of the image's place on its arm, per axis."""
     depth_mm: float
+    """How deep the probe sees."""
     width_mm: float
+    """Of its footprint."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,7 +38,9 @@ class Cells:
     """n cells of the entry frame, rad."""
 
     theta: Floats
+    """Shape (n, 2), lowest and highest puncture angle."""
     beta: Floats
+    """Shape (n, 2), lowest and highest azimuth."""
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -95,6 +97,7 @@ class Cones:
     radius: Floats
     """Shape (n,), half-angle of the cone about it that encloses the cell, rad; π where none is known."""
     corners: Floats
+    """Shape (n, 4, 3), unit."""
     bulge: Floats
     """Shape (n,), every direction of the cell is a sum of its corners, with weights that are not negative and add up to
     at least 1, and of a vector no longer than this."""

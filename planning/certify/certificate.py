@@ -276,6 +276,7 @@ def parse_certificate(data: bytes, path: Path) -> Certificate:
 
 def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     names, standoff, touch = tuple(document["margins_mm"]), document["standoff_mm"], document["touch"]
+    margins = [document["margins_mm"][name] for name in names]
     question = Question(
         case_name=field(document, "case", text),
         inputs=field(document, "inputs", read_inputs),
@@ -291,7 +292,7 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
         longest=field(document, "longest_path_mm", number),
         max_skin_angle=field(document, "max_skin_angle_rad", number),
         structures=names,
-        margins=array([document["margins_mm"][name] for name in names], (len(names),)),
+        margins=array(margins, (len(names),)),
         touch=None if touch is None else number(touch),
     )
     tree = field(document, "tree", texts)

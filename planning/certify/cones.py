@@ -18,9 +18,9 @@ class Zones:
     """For m triangles, the directions to which each matters: a cone about the target."""
 
     axis: Floats
-    """Shape (m, 3), unit. cosine, sine: Shape (m,), of the half-angle, below a right angle; (-1, 0) for all
-    directions."""
+    """Shape (m, 3), unit."""
     cosine: Floats
+    """Shape (m,), of the half-angle, below a right angle, as ``sine``; (-1, 0) for all directions."""
     sine: Floats
     farthest: Floats
     """Shape (m,), largest distance of the triangle from the target, mm."""
@@ -52,6 +52,7 @@ def zones(corners: Floats, limit: Floats | float) -> Zones:
     """Zones of triangles seen from the origin, grown so that a needle within ``limit`` of a triangle points into it.
 
     Args:
+        corners: Shape (m, 3, 3), mm from the target.
         limit: Shape (m,) or a number; 0 for the directions that hit the triangle, mm.
     """
     limits = np.ascontiguousarray(np.broadcast_to(np.asarray(limit, dtype=np.float64), len(corners)))
@@ -105,6 +106,7 @@ def narrowed(zone: Zones, lists: Lists, parent: Ints, centres: Floats, radius: F
 
     Args:
         parent: Shape (n,), row of each cell's parent.
+        centres: Shape (n, 3), unit.
         radius: Shape (n,), rad, at most π/2.
     """
     cone = np.ascontiguousarray(centres), np.cos(radius), np.sin(radius)

@@ -27,8 +27,11 @@ class Question:
     case_name: str
     inputs: tuple[Input, ...]
     target_ct: Floats
+    """Shape (3,)."""
     R_ct_entry: Floats
+    """Shape (3, 3)."""
     theta: tuple[float, float]
+    """The cap's lowest and highest angle, as ``beta``."""
     beta: tuple[float, float]
     length: float
     standoff: float | None

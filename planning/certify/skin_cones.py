@@ -34,9 +34,10 @@ class SkinBounds:
     least_skin: Floats
     """Shape (n,), no skin is hit at a smaller depth; inf where none is hit within the range."""
     farthest: Floats
-    """Shape (n,), no crossing within the needle's length is deeper. least_angle, largest_angle: Shape (n,), bounds of
-    the angle to the normal at every skin crossing that is no deeper than the longest path."""
+    """Shape (n,), no crossing within the needle's length is deeper."""
     least_angle: Floats
+    """Shape (n,), a bound, as ``largest_angle``, of the angle to the normal at every skin crossing that is no deeper
+    than the longest path."""
     largest_angle: Floats
 
 

@@ -95,7 +95,10 @@ def too_near(
     distance: Floats,
     limit: float,
 ) -> NDArray[np.bool_]:
-    """Whether axes come nearer to a structure's surface than a limit, shape (n,); FCL decides ties.
+    """Whether axes come nearer to a structure's surface than a limit, shape (n,).
+
+    Nearer than limit - 1e-9 mm is too near, farther than limit + 1e-4 mm is not; between them, a tie, FCL's capsule
+    collision decides. So FCL can accept an axis that is at most 1e-9 mm too near.
 
     Args:
         target_ct: Shape (3,), mm.
@@ -105,7 +108,7 @@ def too_near(
         limit: Needle radius plus margin, mm.
     """
     nearer, lengths = distance < limit, np.broadcast_to(length, len(outward_ct))
-    for row in np.flatnonzero(np.abs(distance - limit) < NEAR_THRESHOLD_MM):  # a tie: FCL may reject, never accept
+    for row in np.flatnonzero(np.abs(distance - limit) < NEAR_THRESHOLD_MM):
         nearer[row] = distance[row] < limit - ROUNDING_MM or engine.collides(
             structure, target_ct, outward_ct[row], float(lengths[row]), limit
         )

@@ -77,7 +77,7 @@ class Fit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EdgeImage:
-    """A CT on voxels of at most `COPY_MM`, clipped and smoothed by one voxel."""
+    """A CT (nx, ny, nz) on voxels of at most `COPY_MM`, clipped and smoothed by one voxel."""
 
     values: NDArray[np.float32]
     T_ct_index: Floats
@@ -130,7 +130,7 @@ def _between(values, x, y, z):  # type: ignore[no-untyped-def]
 
 
 def edge_image(hu: NDArray[np.generic], T_ct_index: Floats) -> EdgeImage:
-    """The CT (nx, ny, nz), HU of any type that holds `HU_RANGE`, as the edge test sees it."""
+    """The CT (nx, ny, nz), HU of any type that holds `HU_RANGE`, as the edge test sees it; T (4, 4) to LPS mm."""
     spacing = np.linalg.norm(T_ct_index[:3, :3], axis=0)
     factor = np.maximum(1, np.floor(COPY_MM / spacing + 1e-6)).astype(int)
     count = np.array(hu.shape) // factor

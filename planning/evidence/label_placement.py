@@ -143,12 +143,13 @@ class Assessed(NamedTuple):
     middle_ct: Floats
     """Shape (3,), of the surfaces as they are."""
     open: tuple[str, ...]
-    """The kinds of placements that are not excluded. odd, unconfirmed: Structures that lie, or may lie, better shifted
-    by themselves."""
+    """The kinds of placements that are not excluded."""
     odd: tuple[str, ...]
+    """Structures that lie better shifted by themselves."""
     agreeing: tuple[str, ...]
     """Structures of which two or more lie better at one place, whatever it is."""
     unconfirmed: tuple[str, ...]
+    """Structures that may lie better shifted by themselves."""
     unseen: tuple[str, ...]
     """Structures of which the image shows less than half."""
     uneven: float

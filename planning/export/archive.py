@@ -61,8 +61,8 @@ class Region(NamedTuple):
     """A region that becomes one segment: every voxel that holds one of its points."""
 
     name: str
-    kind: str
-    points_ct: Floats
+    kind: str  # one of `KINDS`
+    points_ct: Floats  # shape (n, 3), LPS mm, denser than the voxels
 
 
 class Quantity(NamedTuple):

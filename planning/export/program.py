@@ -46,7 +46,7 @@ class Program:
 
     tcp_mm: float
     """Needle tip in the flange frame, along z."""
-    start_q: Floats
+    start_q: Floats  # shape (6,), as are the other two of the arm's joints
     moves: tuple[JointMove, ...]
     """The approach as moves from rest to rest, or empty."""
     stream_q: Floats

@@ -211,8 +211,8 @@ class EntryArea:
 
     points_ct: Floats
     """Shape (n, 3), LPS mm: where the paths enter."""
-    faces: Ints
-    window: Ints
+    faces: Ints  # shape (m, 3), indices of points
+    window: Ints  # shape (n,), the number of each point's window
     safe_cone_deg: Floats
     """Shape (n,), degrees by which each direction may err all round; 0 where nothing is known."""
 

@@ -164,7 +164,7 @@ def guard_mesh(vertices: ArrayLike, faces: ArrayLike, *, where: str | Path) -> T
         hint = "looks like metres declared as mm" if diagonal > 0.0 else "all corners in one place"
         refuse(f"bounding box diagonal of {diagonal:.4g} mm: {hint}", where, _EXTENT_ALLOWED, "implausible_size")
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[:FIRST]], 1, 0)
-    if not (np.cross(b - a, c - a).any() or mesh.areas.any()):
+    if not (np.linalg.norm(np.cross(b - a, c - a), axis=1).any() or mesh.areas.any()):
         what = f"none of the {len(indices)} triangles has an area"
         refuse(what, where, "at least one triangle with an area", "no_area")
     return mesh

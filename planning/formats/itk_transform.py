@@ -22,7 +22,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.errors import InputError, refuse, require_extra
 from puncture_twin.planning.base.files import decode_text
 from puncture_twin.planning.formats.guard import guard_transform
-from puncture_twin.planning.geometry.rigid import exp_rotation, pose
+from puncture_twin.planning.geometry.rigid import pose
 
 TEXT_ENDINGS, HDF5_ENDINGS = (".tfm", ".txt"), (".h5", ".hdf5")
 MAX_TEXT_BYTES = 100_000
@@ -59,7 +59,7 @@ def parse_transform(data: bytes, path: Path) -> Floats:
 
 def _text_transforms(lines: list[str], where: str) -> list[StatedTransform]:
     """The transforms of a text in its order; a key that is not stated has no numbers."""
-    blocks: list[tuple[str, dict[str, Floats]]] = []
+    blocks: list[tuple[str, dict[str, str]]] = []
     for line in lines:
         key, mark, value = (part.strip() for part in line.partition(":"))
         if line.startswith("#"):
@@ -69,13 +69,16 @@ def _text_transforms(lines: list[str], where: str) -> list[StatedTransform]:
         elif not blocks or key not in _KEYS or not mark or key in blocks[-1][1]:
             refuse(f"line {line[:60]!r}", where, ALLOWED, "unknown_line")
         else:
-            try:
-                numbers = [float(one if _NUMBER.fullmatch(one) else f"not a number: {one}") for one in value.split()]
-            except ValueError as error:
-                what = f"{key} are not numbers ({str(error)[:80]})"
-                raise InputError(what, where=where, allowed=ALLOWED, code="not_a_number") from error
-            blocks[-1][1][key] = np.array(numbers)
-    return [StatedTransform(kind, *(one.get(key, np.empty(0)) for key in _KEYS)) for kind, one in blocks]
+            blocks[-1][1][key] = value
+    return [StatedTransform(kind, *(_numbers(one.get(key, ""), key, where) for key in _KEYS)) for kind, one in blocks]
+
+
+def _numbers(stated: str, key: str, where: str) -> Floats:
+    try:
+        return np.array([float(one if _NUMBER.fullmatch(one) else f"not a number: {one}") for one in stated.split()])
+    except ValueError as error:
+        what = f"{key} are not numbers ({str(error)[:80]})"
+        raise InputError(what, where=where, allowed=ALLOWED, code="not_a_number") from error
 
 
 def transform_text(T: Floats) -> str:
@@ -146,7 +149,7 @@ def _motion(stated: StatedTransform, where: str) -> Floats:
             allowed = " or ".join(f"{one}" for one in counts) + " numbers"
             refuse(f"{len(numbers)} {key}", where, allowed, "wrong_count")
     if name == "Euler3DTransform":
-        x, y, z = map(exp_rotation, np.diag(stated.parameters[:3]))
+        x, y, z = (_about(axis, angle) for axis, angle in enumerate(stated.parameters[:3]))
         M = z @ y @ x if stated.fixed[3:].any() else z @ x @ y
     elif name == "VersorRigid3DTransform":
         M = _versor(stated.parameters[:3], where)
@@ -154,6 +157,14 @@ def _motion(stated: StatedTransform, where: str) -> Floats:
         M = stated.parameters[:9].reshape(3, 3)
     centre = stated.fixed[:3]
     return pose(M, stated.parameters[-3:] + centre - M @ centre)
+
+
+def _about(axis: int, angle: float) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    R = np.eye(3)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    R[i, i], R[i, j], R[j, i], R[j, j] = c, -s, s, c
+    return R
 
 
 def _versor(v: Floats, where: str) -> Floats:

@@ -194,21 +194,19 @@ def read_csv_points(data: bytes, where: str) -> RawPoints:
     text = units["x"]
     unit = parse_unit(text, where=f"{where}, header") if text else None
     columns = {name.partition("_")[0]: index for index, name in enumerate(header)}
-    names, points, kinds, turned = [], [], [], []
-    for line, fields in rows[1:]:
-        place = f"{where}, line {line}"
+    placed = [(f"{where}, line {line}", fields) for line, fields in rows[1:]]
+    for place, fields in placed:
         if len(fields) != len(header):
             refuse(f"{len(fields)} fields instead of {len(header)}", place, _ALLOWED, "ragged_row")
         if not fields[columns["name"]].strip():
             refuse("the name is empty", place, _ALLOWED, "bad_name")
-        names.append(fields[columns["name"]].strip())
+    names, points = [fields[columns["name"]].strip() for _, fields in placed], []
+    for place, fields in placed:
         x, y, z = (parse_coordinate(fields[columns[axis]], place) for axis in "xyz")
         points.append((x, y, z))
-        if "kind" in columns:
-            kinds.append(fields[columns["kind"]].strip())
-        if joints:
-            turned.append(tuple(row_numbers(fields, header, JOINTS_DEG, place)))
-    return RawPoints(names, points, unit, None, tuple(kinds) if "kind" in columns else None, turned or None)
+    kinds = tuple(fields[columns["kind"]].strip() for _, fields in placed) if "kind" in columns else None
+    turned = [tuple(row_numbers(fields, header, JOINTS_DEG, place)) for place, fields in placed] if joints else None
+    return RawPoints(names, points, unit, None, kinds, turned)
 
 
 def csv_lines(data: bytes, where: str, allowed: str) -> Iterator[CsvLine]:
@@ -246,13 +244,14 @@ def read_markups_points(data: bytes, where: str) -> RawPoints:
         refuse("no control point", where, _MARKUPS_ALLOWED, "empty")
     if kind == "Line" and len(listed) != 2:
         refuse(f"a line of {len(listed)} control points", where, "both ends of a line: 2 control points", "wrong_count")
+    placed = [(f"{where}, control point {number}", point) for number, point in enumerate(listed, start=1)]
     names, points = [], []
-    for number, point in enumerate(listed, start=1):
-        place = f"{where}, control point {number}"
+    for place, point in placed:
         label = point.get("label") if isinstance(point, dict) else None
         if not isinstance(label, str) or not label.strip():
             refuse(f"label {str(label)[:40]!r}", place, "a label that is not empty", "bad_name")
         names.append(label.strip())
+    for place, point in placed:
         status, position = point.get("positionStatus", "defined"), point.get("position")
         if status != "defined":
             refuse(f"positionStatus is {str(status)[:40]!r}", place, '"defined"', "point_undefined")

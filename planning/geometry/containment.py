@@ -37,7 +37,7 @@ class Side(Enum):
 
 
 def side_of(mesh: TriangleMesh, point: NDArray[np.float64]) -> Side:
-    """Inside or outside of a closed surface, whatever its orientation; unknown for an open one.
+    """Whether a point (3,) is in or out of a closed surface, whatever its orientation; unknown for an open one.
 
     Where triangles are given twice or wound against their neighbours, the winding number means nothing: it may be 0
     deep inside. Then a point is inside if rays from it cross the surface an odd number of times.
@@ -133,7 +133,7 @@ def _solid_angles(vertices, faces, points, found):  # type: ignore[no-untyped-de
 
 
 def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
-    """Fraction of all directions from a point in which a ray crosses the surface an odd number of times.
+    """Fraction of all directions from a point (3,) in which a ray crosses the surface an odd number of times.
 
     0 outside of a closed surface, 1 inside, in between for an open one; a triangle that is given twice counts once.
     """
@@ -142,7 +142,7 @@ def odd_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
 
 
 def hit_fraction(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
-    """Fraction of all directions from a point in which a ray hits the surface.
+    """Fraction of all directions from a point (3,) in which a ray hits the surface.
 
     1 inside a closed surface, and also in a hollow of it, of which `winding_number` is 0.
     """

@@ -56,8 +56,9 @@ class Fit(NamedTuple, Generic[X]):
 
     estimate: X
     system: System[X]
-    """Linearised where the last step (p,), in the unknowns' units, began; 0 where none was left to make."""
+    """Linearised where the last step began."""
     step: Floats
+    """Shape (p,): the last step, in the unknowns' units; 0 where none was left to make."""
     iterations: int
     settled: bool
     """Whether it arrived within the steps it was given."""
@@ -136,13 +137,17 @@ class Lacking(NamedTuple):
     """Explanation of a linear model's residuals by k unknowns that it lacks."""
 
     found: Floats
+    """Shape (k,): their values."""
     sd: Floats
+    """Shape (k,): their standard deviations, by the residuals that they leave."""
     probability: float
     """Chance of residuals that they explain so well, where all are zero: F(k, freedom)."""
     freedom: int
-    """Residuals less p and k. variance, variance_without: Of one residual, with them and in the model without them."""
+    """Residuals less p and k."""
     variance: float
+    """Of one residual, with them."""
     variance_without: float
+    """Of one residual, in the model without them."""
 
 
 def lacking(z: Floats, A: Floats, more: Floats, *, count: int | None = None) -> Lacking | None:

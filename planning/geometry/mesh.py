@@ -135,7 +135,7 @@ class TriangleMesh(Shown):
         return float(_volume(self.vertices, self.faces, self.bounds.mean(axis=0)))
 
     def transformed(self, T_b_a: NDArray[np.float64]) -> TriangleMesh:
-        """The surface in frame b, of this mesh in frame a."""
+        """The surface in frame b, by the map (4, 4), mm, of this mesh's frame a to it."""
         return TriangleMesh(apply(T_b_a, self.vertices), self.faces)
 
 

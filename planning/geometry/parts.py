@@ -26,7 +26,7 @@ of a surface that was made on the same grid. A line that does all the same flips
 
 
 def voxels_inside(mesh: TriangleMesh, T_ct_index: Floats, shape: tuple[int, ...]) -> Bools:
-    """Voxels of a grid whose centres lie inside a surface, or through which it passes where it is open."""
+    """Voxels, by the map (4, 4) of an index to LPS mm, with centres inside a surface, or of an open one its own."""
     mask = np.zeros(shape, bool)
     mark_inside(mesh, T_ct_index, mask)
     return mask

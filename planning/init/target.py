@@ -190,6 +190,10 @@ def typed_target(
         point_ct: Shape (3,), LPS mm.
         outlines: The body's, with all segmentations that may hold the point.
         hit_radius_mm: Stated where the target is a ball of its own, whatever holds it; else None.
+
+    Raises:
+        InputError: It is a likelier target in the other space, and nobody said which is meant; it lies in no structure,
+            but there in a lesion, and nobody said that none is meant; or it lies in what no path may cross.
     """
     holders = _holders(point_ct, outlines)
     names = [name for name in holders if default_role(name, "other") not in {BODY, NOT_ANNOTATED}]
@@ -197,7 +201,7 @@ def typed_target(
     # What would hold the point if its numbers were meant in the other space, and what to say where that is likelier.
     elsewhere: list[str] = []
     reading = ""
-    if space is not Space.LOCAL:
+    if space is not Space.LOCAL and (hit_radius_mm is None or not space_stated):  # else nobody asks
         found = _holders(to_lps(point_ct[None], Space.RAS)[0], outlines)
         elsewhere = [name for name in found if not named_like_body(name)]
         if likely_target(elsewhere) > likely_target(names):

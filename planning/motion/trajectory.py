@@ -33,8 +33,8 @@ class Trajectory:
         InputError: If shapes, times or numbers make no sense.
     """
 
-    times_s: Floats
-    q: Floats
+    times_s: Floats  # shape (m,), from 0, strictly rising
+    q: Floats  # shape (m, 6), rad
 
     def __post_init__(self) -> None:
         times, q = np.array(self.times_s, dtype=np.float64), np.array(self.q, dtype=np.float64)

@@ -68,10 +68,12 @@ class Verdict:
     reached: int
     count: int
     margin: float
+    """Mean reach margin of the reached ones, 0..1; 0 for none."""
     reasons: Mapping[str, int]
     home_contact: str
     """What the arm touches in its home configuration, or ""."""
     q_insertion: Floats
+    """Shape (reached, 6), rad, the tip on the target."""
     answers: tuple[ReachAnswer, ...]
     """Of each checked direction; where all were checked, in the order of the candidates."""
 
@@ -100,6 +102,7 @@ class PlacementCheck:
     target_ct: Floats
     wanted: WantedDirections
     home: Floats
+    """Shape (6,), rad."""
 
     def checked(self, piece: tuple[Floats, NDArray[np.int64]]) -> Checked:
         """Check some directions from a pose ``T_base_ct`` (4, 4); a base in the patient or the unseen reaches none."""

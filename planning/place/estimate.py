@@ -101,7 +101,8 @@ def clear_branches(
 ) -> NDArray[np.bool_]:
     """Which motions keep clear of the surroundings, and the arm of itself, at each of their states.
 
-    The base is checked against the arm alone.
+    The base is checked against the arm alone. ``frames``: Shape (k, m, 7, 4, 4), mm, base frame, ``link_poses`` of k
+    motions of m states; the result is (k,).
     """
     arm = (spheres.centres, spheres.radii + surroundings.padding_mm, spheres.starts[1:], spheres.frames[1:])
     clear = np.empty(len(frames), np.bool_)
@@ -343,6 +344,7 @@ class Estimator:
     tool: Tool
     surroundings: Surroundings
     T_ct_bed: Floats
+    """Its origin is the target."""
     wanted: WantedDirections
 
     def estimate(self, site: Site) -> ReachEstimate:

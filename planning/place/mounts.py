@@ -53,7 +53,9 @@ class Region:
     mount: MountName
     facing: str
     axis: tuple[int, int, int]
+    """The base's z axis, unit."""
     low: tuple[float, float, float]
+    """Lowest position of the base's origin, mm."""
     high: tuple[float, float, float]
 
     @property
@@ -83,6 +85,7 @@ class Site:
 
     region: Region
     position: tuple[float, float, float]
+    """The base's origin in the bed frame: along, across, up from the target, mm."""
 
     def T_bed_base(self) -> Floats:  # noqa: N802  # the field writes T_a_b
         """The base's pose, mm: its x axis leads away from the target, so that the arm reaches for it at q1 = 0."""
@@ -179,8 +182,11 @@ class WantedDirections:
     """n directions to be reached, each with the solid angle that it represents."""
 
     outward_ct: Floats
+    """Shape (n, 3), unit, from the target outward."""
     standoff_mm: Floats
+    """Shape (n,), tip to target before the insertion."""
     weight: Floats
+    """Shape (n,), fraction of the organ-safe solid angle that each stands for."""
 
     def __len__(self) -> int:
         return len(self.weight)

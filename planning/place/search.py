@@ -78,9 +78,10 @@ class RatedPlacement:
     """A placement, checked and rated."""
 
     site: Site | None
-    """Position of the base, and by which estimate it was chosen; None for the case's own placement."""
+    """Position of the base; None for the case's own placement."""
     mount: MountSection
     estimate: ReachEstimate | None
+    """The estimate that it was chosen by; None for the case's own."""
     verdict: Verdict
     """The result of the exact check, in some directions or all."""
     expected_mm: float | None
@@ -100,7 +101,9 @@ class PlaceSearch(Shown):
     T_ct_bed: Floats
     coarse: tuple[tuple[Site, ReachEstimate], ...]
     refined: int
+    """How many more sites were estimated."""
     resolution_mm: float
+    """The step between sites at the end."""
     possible: float
     """Fraction of directions, 0..1, in which the needle may wait at its standoff: no placement reaches more."""
     directions: int

@@ -37,9 +37,9 @@ class Plan(Shown):
     beta: float
     entry_ct: Floats
     target_ct: Floats
-    outward_ct: Floats
+    outward_ct: Floats  # shape (3,), unit, from the target along the needle
     roll: float
-    standoff_mm: float
+    standoff_mm: float  # tip to target before the insertion
     needle_length_mm: float
     approach: Trajectory
     insertion: Trajectory

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -169,7 +171,7 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
         needle_length_mm=field(document, "needle_length_mm", number),
         approach=field(document, "approach", _trajectory),
         insertion=field(document, "insertion", _trajectory),
-        clearance_mm={phase: number_or_nan(one) for phase, one in field(document, "clearance_mm", dict).items()},
+        clearance_mm=field(document, "clearance_mm", _clearances),
         speeds=field(document, "speed_limits", _speed_limits),
         warnings=field(document, "warnings", texts),
         guidance=tuple(_way(one) for one in document.get("guidance", [])),
@@ -179,6 +181,10 @@ def _plan(document: dict[str, Any], path: Path) -> Plan:
 def _way(value: Any) -> WayChance:
     error, hit, stop = (field(value, name, number_or_nan) for name in ("expected_error_mm", "p_hit", "p_stop"))
     return WayChance(field(value, "way", text), error, hit, stop, field(value, "lost_sight", text))
+
+
+def _clearances(value: Any) -> Mapping[str, float]:
+    return MappingProxyType({phase: number_or_nan(one) for phase, one in value.items()})
 
 
 def _speed_limits(value: Any) -> SpeedLimits:

@@ -45,10 +45,11 @@ class Verdict(Columns):
     depth: Floats
     """Shape (n,), distance from the target along the needle, mm; NaN where it means nothing."""
     amount: Floats
-    """Shape (n,), the number that fell short: clearance for ``too_close``, path length for ``too_long``, the skin angle
-    in degrees for ``skin_angle``, the chance for ``hit_unlikely``, ``touch_likely``; NaN otherwise."""
+    """Shape (n,), the number that fell short: clearance for ``too_close``, ``needle_bends``, ``unsafe_when_breathing``
+    and an ``unknown_region`` of a structure, path length for ``too_long``, degrees for ``skin_angle``, the
+    chance for ``hit_unlikely`` and ``touch_likely``; NaN otherwise."""
     detail: Texts
-    """Shape (n,), what kept the arm, in one sentence; "" for the organs' reasons."""
+    """Shape (n,), why the arm cannot execute it, in one sentence; "" for the organs' reasons."""
 
     @property
     def safe(self) -> Bools:

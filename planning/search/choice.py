@@ -101,8 +101,8 @@ def choose(context: CaseContext, candidates: Candidates | None, choice: Choice) 
     rows = candidates.ranked
     if not len(rows):
         raise NoAnswerError("no candidate is safe", counts=candidates.counts(), code="no_safe_direction")
-    windows = candidates.windows
-    numbers = (choice.rank, len(rows), "--rank", "safe candidate"), (choice.window, len(windows), "--window", "window")
+    windows = 0 if choice.window is None else len(candidates.windows)
+    numbers = (choice.rank, len(rows), "--rank", "safe candidate"), (choice.window, windows, "--window", "window")
     for number, count, where, what in numbers:
         if number is not None and not 1 <= number <= count:
             there = "there is" if count == 1 else "there are"
@@ -110,7 +110,7 @@ def choose(context: CaseContext, candidates: Candidates | None, choice: Choice) 
     if choice.rank is not None:
         rows = rows[choice.rank - 1 : choice.rank]
     elif choice.window is not None:
-        rows = rows[windows.of_row[rows] == choice.window]
+        rows = rows[candidates.windows.of_row[rows] == choice.window]
     return Chosen(candidates, rows)
 
 

@@ -52,7 +52,7 @@ def first_broken(
     unset = np.ones(count, bool)
 
     def give(reason: Reason, where: Bools, names: Column, depth: Column, amount: Column = np.nan) -> None:
-        rows = np.flatnonzero(where & unset)  # who has a reason keeps it
+        rows = np.flatnonzero(where & unset)  # a row that has a reason already is not changed
         unset[rows] = False
         reasons[rows] = reason.value
         columns: tuple[tuple[NDArray[Any], Column], ...]

@@ -39,7 +39,7 @@ class SafeMap(Shown):
     directions: Directions
     structures: tuple[str, ...]
     """Names of all that is checked; ``structure`` are places in it."""
-    blocked: Bools
+    blocked: Bools  # shape (n,), whether the needle comes nearer to some structure than its margin
     structure: Ints32
     """Shape (n,), the first in the case's order that blocks the direction; -1 where none does."""
 

@@ -118,8 +118,7 @@ class Blocking(NamedTuple):
     structure: Ints32
     """The first of ``anatomy.checked`` whose margin a direction breaks; -1 where none."""
     enters: Bools
-    """Which of the directions that no structure of the body blocks enter through the skin as the case demands: seen,
-    short enough, at a small enough angle."""
+    """Whether the constraints of the skin are satisfied; False where a structure of the body blocks already."""
 
     @property
     def open(self) -> Bools:
@@ -128,13 +127,17 @@ class Blocking(NamedTuple):
 
 
 def first_blocking(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Blocking:
-    """What blocks the directions of a grid at a case's target: structures in the order of ``anatomy.checked``."""
-    outward, grid, inside, radius = directions.outward_ct, directions.grid, anatomy.structures, case.needle.radius_mm
+    """What blocks the directions of a grid at a case's target: the first structure in the order of ``anatomy.checked``.
+
+    It accepts what `organ_candidates` accepts of a straight needle in a patient at rest, by maps of verdicts where the
+    engine has them and by distances elsewhere (`tests/search/test_safe_map.py` compares both).
+    """
+    outward, grid, body, radius = directions.outward_ct, directions.grid, anatomy.structures, case.needle.radius_mm
     if fast := grid is not None and isinstance(engine, FastEngine):
-        found = VerdictMap(case.target_ct, grid, outward, case.T_ct_entry[:3, :3])
-        for number, one in enumerate(inside):
-            found.add(engine, number, one, np.full(len(outward), case.needle.length_mm), radius)
-    free = np.flatnonzero(found.free) if fast else np.arange(len(outward))
+        verdict_map = VerdictMap(case.target_ct, grid, outward, case.T_ct_entry[:3, :3])
+        for number, structure in enumerate(body):
+            verdict_map.add(engine, number, structure, np.full(len(outward), case.needle.length_mm), radius)
+    free = np.flatnonzero(verdict_map.free) if fast else np.arange(len(outward))
     paths = case_paths(case, anatomy.skin, outward[free])
     enters = np.zeros(len(outward), bool)
     enters[free] = skin_allows(paths, case.needle, case.search.max_skin_angle)
@@ -143,9 +146,9 @@ def first_blocking(case: Case, anatomy: Anatomy, engine: ClearanceEngine, direct
     if not fast:
         broken = measure(engine, anatomy.checked, case.target_ct, outward, length=lengths, radius=radius).violated
         return Blocking(np.where(broken.any(axis=1), broken.argmax(axis=1), -1).astype(np.int32), enters)
-    for number, one in enumerate(anatomy.surroundings, start=len(inside)):
-        found.add(engine, number, one, lengths[:, number], radius)
-    return Blocking(found.structure, enters)
+    for number, structure in enumerate(anatomy.surroundings, start=len(body)):
+        verdict_map.add(engine, number, structure, lengths[:, number], radius)
+    return Blocking(verdict_map.structure, enters)
 
 
 def organ_safe(case: Case, anatomy: Anatomy, engine: ClearanceEngine, directions: Directions) -> Bools:

@@ -26,7 +26,7 @@ class Window(Shown):
 
     number: int
     """1 for the window that holds the best candidate, then by the rank of each one's best."""
-    best: int
+    best: int  # row of its best candidate
     directions: int
     square_deg: float
     entry_cm2: float

@@ -43,7 +43,7 @@ class SweepPlan:
     """Shape (3,), mm: where the virtual TCP stays, the target."""
     angles: Floats
     """Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less."""
-    wanted: tuple[float, float]
+    wanted: tuple[float, float]  # theta and beta, rad, where it should have ended
     approach: Trajectory
     sweep: Trajectory
     stopped: str

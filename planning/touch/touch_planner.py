@@ -95,7 +95,7 @@ class _Task:
     context: CaseContext
     markers: MarkerPairs
     method: Method
-    q_insertion: Floats
+    q_insertion: Floats  # shape (6,), rad, the tip on the target
 
     @property
     def model(self) -> UrModel:

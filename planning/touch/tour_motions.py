@@ -45,8 +45,8 @@ class Touch:
     """The touch of one marker."""
 
     name: str
-    point_base: Floats
-    q_touch: Floats
+    point_base: Floats  # shape (3,), where it is believed to be
+    q_touch: Floats  # shape (6,), rad, the tip on it
     come: Trajectory
 
 

@@ -163,8 +163,8 @@ def refined_chances(
         wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
     """
     every = np.ones(first.touch.shape, bool)
-    lengths = case_axis_lengths(model.case, model.anatomy, outward_ct)[:, model.columns]
-    around = [model.engine.blocks[column] for column in model.columns], lengths, model.case.target_ct
+    blocks, lengths = model.engine.blocks, case_axis_lengths(model.case, model.anatomy, outward_ct)[:, model.columns]
+    around = [blocks[column] for column in model.columns], lengths, model.case.target_ct
     needles = model.needles(outward_ct, q)
     touch = refined(*around, needles, model.touching, first.touch, every if wanted is None else wanted)
     margin = first.margin if wanted is not None else refined(*around, needles, model.breaking, first.margin, every)

@@ -173,8 +173,8 @@ class GuidedModel:
     error: PoseError
     """Of the needle by its registration, the touches known or assumed."""
     markers: tuple[str, ...]
-    points_base: Floats
-    q_insertion: Floats
+    points_base: Floats  # shape (N, 3), mm, by the registration
+    q_insertion: Floats  # shape (6,), rad, the tip on the target
     looks: Sequence[Look]
     motion: Floats
     """Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan."""

@@ -160,7 +160,7 @@ def _series(weight, e1, e2, x):  # type: ignore[no-untyped-def]
 class TargetRays:
     """A target's mesh as its point sees it."""
 
-    directions: Floats
+    directions: Floats  # shape (n, 3), unit vectors, CT frame
     ray: Ints
     """Shape (c,), row of each crossing's direction."""
     depth: Floats
@@ -189,7 +189,11 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
 
 
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
-    """A ball about the target for a tip that is believed elsewhere: a known mean error besides the covariance."""
+    """A ball about the target for a tip that is believed elsewhere: a known mean error besides the covariance.
+
+    Args:
+        offset: Shape (3,), mm, believed tip minus target, in the covariance's axes.
+    """
     directions = even_directions(DIRECTIONS)
     along = directions @ offset
     inside = along**2 - offset @ offset + radius_mm**2  # below 0 the ray misses the ball

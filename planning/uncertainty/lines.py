@@ -223,7 +223,7 @@ class NeedleUncertainty:
 
     origin: Floats
     """Shape (3,), the tip's own place, where the axis starts."""
-    outward: Floats
+    outward: Floats  # shape (3,), unit
     root: Floats
     """Shape (6, 5), B: shift and lean of each of five standard normals."""
     surface_mm: float

@@ -69,8 +69,8 @@ class PoseError:
     """The needle's pose error in any configuration that puts its tip on the target."""
 
     model: UrModel
-    tip_mm: float
-    target_base: Floats
+    tip_mm: float  # flange to tip
+    target_base: Floats  # shape (3,), mm
     errors: ErrorModel
     fit: FitUncertainty
     """What the registration makes of them; its test's scale multiplies every covariance but that of the bend."""

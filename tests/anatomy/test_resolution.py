@@ -44,12 +44,15 @@ def test_a_skin_from_thick_slices_is_a_warning(tmp_path, spacing, warned):
 @pytest.mark.parametrize(
     ("high", "step", "last"), [(90.0, 7.0, 84.0), (90.0, 0.7, 89.6), (90.0, 0.3, None), (0.0, 10.0, None)]
 )
-def test_a_step_that_does_not_divide_the_range_is_a_warning(high, step, last):
-    """The last angle that is checked is named."""
+def test_a_step_that_does_not_divide_the_range_is_a_warning(tmp_path, high, step, last):
+    """The last angle that is checked is named; of a whole case too."""
     search = SimpleNamespace(theta=(0.0, np.radians(high)), beta=(0.0, 0.0), step=np.radians(step))
     found = [one.sentence for one in short_grid(SimpleNamespace(search=search))]
     said = f"theta_deg [0, 90] is not a whole number of steps of {step:g}: the last angle checked is {last}"
     assert found == [f"search.{said.removesuffix('.0')}"] * (last is not None)
+    if step == 7.0:
+        path = write_case(tmp_path, ("[0, 10]", "[0, 90]\nbeta_deg = [0, 0]"), ("step_deg = 10.0", "step_deg = 7.0"))
+        assert any(found[0] in one for one in warnings_of(path))
 
 
 @pytest.mark.parametrize(("theta", "step"), [("[0, 10]", "45.0"), ("[0, 10]", "10.1")])

@@ -80,7 +80,6 @@ def patched(data, offset, new):
     return data[:offset] + new + data[offset + len(new) :]
 
 
-ONES = struct.pack("<3f", 1.0, 1.0, 1.0)
 AT, ORIGIN = "[registration]", "[0.0, 0.0, 0.0]"
 NO_WEIGHT = "clearance = 0\npath_length = 0\nskin_angle = 0\ntissue = 0\nreach = 0\nsafe_cone = 0"
 

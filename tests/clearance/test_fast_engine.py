@@ -52,6 +52,16 @@ def agrees(mesh, target, directions, length=LENGTH):
     return found
 
 
+def test_distance_and_depth_equal_fcl(rng, ball, box):
+    """Distances to 1e-9 mm and depths to 1e-6 mm are those of the FCL engine, structure by structure."""
+    meshes = [ball(20, (60, 0, 0)), box([30, 20, 10], (0, 50, 20)), ball(4, (5, 5, -30), 1), soup(rng, 300)]
+    directions, target = units(rng, 300), np.array([1.0, 2.0, 3.0])
+    fast, fcl = (kind(meshes).measure(target, directions, LENGTH) for kind in (FastEngine, FclEngine))
+    np.testing.assert_allclose(fast.distance, fcl.distance, atol=TIGHT_MM)
+    np.testing.assert_allclose(fast.depth, fcl.depth, atol=1e-6)
+    assert (fast.distance == 0).sum() > 20
+
+
 def test_zero_area_triangles_are_segments_and_points(rng):
     """A triangle without area is its longest edge, or a point: neither lost nor a false hit."""
     found = agrees(slivers(rng, 60), [1.0, 2.0, 3.0], units(rng, 60))

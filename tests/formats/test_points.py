@@ -163,6 +163,7 @@ BROKEN: list[tuple[str, str, str | bytes, str]] = [
     ("csv-not-utf8", ".csv", HEADER.encode() + b"\xe4,1,2,3\n", "not_text 20"),
     ("csv-with-nul", ".csv", HEADER + "A\0,1,2,3\n", "bad_name A\\x00"),
     ("markups-cut", ".mrk.json", markups()[:200], "not_json"),
+    ("markups-nested-without-end", ".mrk.json", "[" * 100_000, "not_json"),
     ("markups-key-twice", ".mrk.json", markups().replace('"locked"', '"coordinateSystem"'), "not_json"),
     ("markups-of-another-kind", ".mrk.json", "[1, 2]", "wrong_count"),
     ("markups-curve", ".mrk.json", markups(type="Curve"), "unknown_type Curve"),

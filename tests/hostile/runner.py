@@ -23,7 +23,7 @@ from puncture_twin.planning.geometry.spaces import Space, Unit
 from puncture_twin.planning.plan.plan_document import read_plan
 from puncture_twin.run_twin import main
 
-LOADED = ("patient.main_job", "patient.pictures", "selfcal.report", "servo.job", "live.mirror", "batch.jobs")
+LOADED = ("patient.main_job", "patient.pictures", "selfcal.selfcal", "servo.job", "live.mirror", "batch.jobs")
 """What commands load by themselves: once here, where each child would else spend a second on it."""
 
 for name in ("planning.search.context", *(f"twin.jobs.{one}" for one in LOADED)):

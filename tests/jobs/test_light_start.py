@@ -12,7 +12,8 @@ CODE = f"""
 import sys
 from puncture_twin.run_twin import main
 for command in {COMMANDS!r}:
-    print(sorted({HEAVY!r} & set(sys.modules)), main(command))
+    code = main(command)
+    print(sorted({HEAVY!r} & set(sys.modules)), code)
 """
 
 

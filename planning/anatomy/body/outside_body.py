@@ -55,7 +55,7 @@ RIM_MM = 50.0
 
 @dataclass(frozen=True, eq=False)
 class OutsideImage:
-    """A CT beside its body, axes running to the left, back and head."""
+    """A CT (nx, ny, nz), HU, its body, and what was not measured; axes running to the left, back and head."""
 
     hu: NDArray[Any]
     body: Bools

@@ -171,7 +171,7 @@ def table_beside(dense: Bools, side: TableSide, spacing_mm: Floats) -> Bools:
 
 
 def surface_ends(hu: NDArray[Any], body: Bools, level: float = 0.0) -> dict[Face, Floats]:
-    """By face, where a body's surface is at a level, voxels along its axis, shape (n, nz).
+    """By face, where a body's surface is at a level of values (nx, ny, nz), voxels along its axis, shape (n, nz).
 
     NaN where there is no body, and where the image cuts it.
     """
@@ -232,11 +232,12 @@ def _side(
     within = (across >= first) & (across <= last)
     known = np.isfinite(at) & within
     line = np.interp(across, across[known], at[known])
-    # A table's ends keep to one another but for the noise of all; those of a straight back do so less.
-    noise_mm = float(np.nanmedian(np.abs(np.diff(ends_mm, 2, axis=1))))
-    apart_mm = np.abs(off_mm[drawn] - _medians(off_mm[drawn].T))
-    alike = apart_mm <= max(ONE_PIECE_MM, 3.0 * noise_mm)
-    firm = not touching or bool(alike.sum() >= ONE_PIECE * np.isfinite(apart_mm).sum())
+    firm = not touching
+    if touching:  # a table's ends keep to one another but for the noise of all; those of a straight back do so less
+        noise_mm = float(np.nanmedian(np.abs(np.diff(ends_mm, 2, axis=1))))
+        apart_mm = np.abs(off_mm[drawn] - _medians(off_mm[drawn].T))
+        alike = apart_mm <= max(ONE_PIECE_MM, 3.0 * noise_mm)
+        firm = bool(alike.sum() >= ONE_PIECE * np.isfinite(apart_mm).sum())
     line[~within] -= outward * ((EDGE_MM if firm else 0.0) if touching else -np.inf)
     steady = np.interp(across, across[drawn], slope[drawn])[:, None] * along_bed
     lines, of_bed = runs | (known & drawn), float(np.median(slope[drawn]))

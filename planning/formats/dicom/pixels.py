@@ -143,10 +143,10 @@ def _padding(data: Dataset, stored: int, signed: bool, where: str) -> tuple[int,
     """The range of stored values that mean "not measured"."""
     if value(data, "PixelPaddingValue", where=where) is None:
         return None
-    stated = [
-        one for one in ("PixelPaddingValue", "PixelPaddingRangeLimit") if value(data, one, where=where) is not None
-    ]
+    stated = [number(data, "PixelPaddingValue", where=where)]
+    if value(data, "PixelPaddingRangeLimit", where=where) is not None:
+        stated.append(number(data, "PixelPaddingRangeLimit", where=where))
     # As so many bits hold them: writers state a padding with the sign of another type.
-    ends = [int(number(data, keyword, where=where)) % (1 << stored) for keyword in stated]
+    ends = [int(end) % (1 << stored) for end in stated]
     plain = [end - (1 << stored) if signed and end >= 1 << (stored - 1) else end for end in ends]
     return min(plain), max(plain)

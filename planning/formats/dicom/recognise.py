@@ -83,17 +83,19 @@ def described(data: Dataset, path: Path) -> DicomFile:
     with dicom_file.refused_if_damaged(path):
         called = UID(sop_class).name if sop_class else "no SOP class"
     text = partial(dicom_file.text, data, where=where)
+    number, description = text("SeriesNumber"), text("SeriesDescription")
     types = {part.upper() for part in dicom_file.texts(data, "ImageType", where=where)}
     placed = "ImagePositionPatient" in data or "ImageOrientationPatient" in data or "SECONDARY" not in types
-    dates = [text(keyword) for keyword in ("AcquisitionDate", "SeriesDate", "StudyDate")]
+    series_uid, frame_of_reference = text("SeriesInstanceUID"), text("FrameOfReferenceUID")
+    dates = map(text, ("AcquisitionDate", "SeriesDate", "StudyDate"))  # read as far as the first that is one
     date = next((one for one in dates if len(one) == DATE_DIGITS and one.isascii() and one.isdigit()), "")
     return DicomFile(
         name=path.name,
         kind=kind,
         sop_class=called,
-        series_uid=text("SeriesInstanceUID"),
-        series=f"{text('SeriesNumber') or '?'} {text('SeriesDescription') or 'without description'}",
-        frame_of_reference=text("FrameOfReferenceUID"),
+        series_uid=series_uid,
+        series=f"{number or '?'} {description or 'without description'}",
+        frame_of_reference=frame_of_reference,
         is_slice=kind is storage.Kind.CT and placed and not types & NO_SLICES,
         date=date and f"{date[:4]}-{date[4:6]}-{date[6:]}",
     )

@@ -182,12 +182,13 @@ def select(
         unknown: Patterns of structures of which it is unknown whether a path may cross them.
         all_named: Whether ``names`` holds every name that can occur, so that a pattern of none is a slip.
     """
-    free = (dict.fromkeys(listed, 0.0) for listed in (traverse, target, ignore))
-    tables = zip(RuleKind, (avoid, unknown, *free), strict=True)
-    patterns = [LabelRule(0, "", kind, float(mm), one) for kind, table in tables for one, mm in table.items()]
+    free = ([(one, 0.0) for one in listed] for listed in (traverse, target, ignore))
+    tables = zip(RuleKind, (avoid.items(), unknown.items(), *free), strict=True)
+    patterns = [LabelRule(0, "", kind, float(mm), one) for kind, table in tables for one, mm in table]
     for rule in patterns:
         if not (math.isfinite(rule.margin_mm) and rule.margin_mm >= 0):
             refuse(f"margin {rule.margin_mm} of pattern {rule.pattern!r}", where, "mm, 0 or more", "out_of_range")
+    for rule in patterns:
         if all_named and rule.pattern != REST and not any(fnmatchcase(name, rule.pattern) for name in names.values()):
             near = difflib.get_close_matches(rule.pattern.strip("*?"), names.values(), n=3, cutoff=0.4)
             allowed = f"names like {', '.join(near)}" if near else f"one of {_listed(sorted(names.values()))}"

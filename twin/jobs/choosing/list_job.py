@@ -61,10 +61,9 @@ def check_list(
     rows = []
     for done, row in enumerate(listed.rows, start=1):
         try:
-            found = outcome(context, row)
+            rows.append(_document(row, outcome(context, row)))
         except InputError as error:
-            found = Outcome(None, REFUSED, str(error))
-        rows.append(_document(row, found))
+            rows.append(_document(row, Outcome(None, REFUSED, str(error))))
         context.watcher.count("rows", done, len(listed.rows))
     inputs, warnings = (listed.input, *context.case.inputs), (*listed.warnings, *context.anatomy.warnings)
     checked = CheckedList(context.case.name, context.arm, inputs, tuple(rows), warnings)

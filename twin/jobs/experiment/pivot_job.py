@@ -185,14 +185,14 @@ def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats |
         InputError: The case declares no errors or has no arm, or so many poses are not planned.
         NoAnswerError: No place can be touched in so many poses, or too few were touched.
     """
-    from puncture_twin.twin.plant.touching import execute_touches
-    from puncture_twin.twin.plant.true_needle import draw_pivot_truth
-
     case = context.case
     if not LEAST_POSES <= poses <= MOST_POSES:
         refuse(f"{poses} poses", "--poses", f"{LEAST_POSES} to {MOST_POSES}", "out_of_range")
     if case.errors is None:
         refuse("no noise is declared", case.path, "[errors] touch_mm", "no_noise")
+    from puncture_twin.twin.plant.touching import execute_touches
+    from puncture_twin.twin.plant.true_needle import draw_pivot_truth
+
     with writing(out, "pivot", inputs=case.inputs, names=(PIVOT, SUMMARY), note=context.watcher.note) as draft:
         with context.stages.time("pivot plan"):
             count = partial(context.watcher.count, "motions")

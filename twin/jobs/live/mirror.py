@@ -20,7 +20,6 @@ from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.formats.points import parse_joint_recording
 from puncture_twin.planning.registration.checks.checked_placement import checked_placement
 from puncture_twin.planning.search.context import ALLOWED_BASE, NO_BASE
-from puncture_twin.twin.guidance.ct.needle import needle_error
 from puncture_twin.twin.jobs.live.rtde import RecordedState, connect, live_states
 
 MAX_RECORDING_BYTES = 200_000_000
@@ -70,9 +69,11 @@ class Mirror:
     def show(self, state: RecordedState) -> Mirrored:
         """One joint state."""
         T = np.linalg.inv(self.T_base_ct) @ flange_pose(self.model, state.q)
-        tip = T[:3, 3] + self.needle_length_mm * T[:3, 2]
-        error = needle_error(tip, T[:3, 2], self.target_ct)
-        return Mirrored(state.time_s, state.q, T, tip, error.tip_to_target_mm, error.lateral_mm)
+        forward = T[:3, 2]
+        tip = T[:3, 3] + self.needle_length_mm * forward
+        to_target = self.target_ct - tip
+        off = np.linalg.norm(to_target - to_target @ forward * forward)
+        return Mirrored(state.time_s, state.q, T, tip, float(np.linalg.norm(to_target)), float(off))
 
 
 class Readings(NamedTuple):

@@ -67,13 +67,16 @@ def registration_report(path: Path) -> dict[str, Any]:
     odd = odd_branches(registration, case.robot.model)
     touched = f"{', '.join(odd)} touched in another branch of the arm than the rest: arm errors do not cancel there"
     along = np.linspace(case.target_ct, case.target_ct + case.needle.shaft_mm * case.T_ct_entry[:3, 2], 4)
-    report = _report(registration, case.target_ct, None if case.errors is None else case.errors.target_cov_ct)
-    report["findings"] += [one.document() for one in checked.findings]
-    return {
-        **report,
+    stated = {
         "case": case.name,
         "inputs": inputs_document(case.inputs),
         "expected_tre_target_mm": checked.placement.target_error_mm,
+    }
+    read_cov_ct = None if case.errors is None else case.errors.target_cov_ct
+    report = _report(registration, stated, case.target_ct, read_cov_ct)
+    report["findings"] += [one.document() for one in checked.findings]
+    return {
+        **report,
         "expected_tre_along_shaft_mm": registration.expected_tre_mm(along).tolist(),
         "warnings": [*case.warnings, *warned, *([touched] if odd else [])],
         **_advice_of_case(case, registration),
@@ -95,13 +98,15 @@ def lists_report(
     registration = register(pairs, method="rigid", target_ct=target_ct, where=str(markers_base), **given)
     named = zip(("markers_ct", "markers_base"), paths, content, strict=True)
     inputs = [Input(role, str(path), hashlib.sha256(data).hexdigest()) for role, path, data in named]
-    return {
-        **_report(registration, target_ct, None),
+    stated = {
         "case": f"{markers_ct} and {markers_base}",
         "target_mm": list(numbers),
         "space": str(space),
         "inputs": inputs_document(inputs),
         "expected_tre_target_mm": float(registration.expected_tre_mm(target_ct[None])[0]),
+    }
+    return {
+        **_report(registration, stated, target_ct, None),
         "expected_tre_along_shaft_mm": [],
         **_advice_of_lists(registration, target_ct, space),
         "warnings": [],
@@ -109,9 +114,12 @@ def lists_report(
     }
 
 
-def _report(registration: Registration, target_ct: Floats, read_cov_ct: Floats | None) -> dict[str, Any]:
+def _report(
+    registration: Registration, stated: dict[str, Any], target_ct: Floats, read_cov_ct: Floats | None
+) -> dict[str, Any]:
     return {
         **registration_summary(registration),
+        **stated,
         "expected_tre_target_interval_mm": list(registration.expected_tre_interval_mm(target_ct)),
         **one_insertion(registration, target_ct, read_cov_ct),
     }
@@ -164,8 +172,7 @@ def _advice_of_lists(registration: Registration, target_ct: Floats, space: Space
         "budget": None,
         "fle_source": "estimated from the FRE of the rigid fit" if test.scaled else "stated by --fle",
         "declaration": {**registration_summary(registration)["declaration"], "text": found if test.scaled else stated},
-        "share": {"the markers in both lists": 1.0},
-        **_advice(registration, target_ct, space, target_ct + far * sides),
+        **_advice(registration, target_ct, space, target_ct + far * sides, {"the markers in both lists": 1.0}),
     }
 
 
@@ -174,16 +181,18 @@ def _advice_of_case(case: Case, registration: Registration) -> dict[str, Any]:
     if registration.uncertainty is None:
         return {}
     read, touched = map(np.trace, registration.uncertainty.parts_at(apply(registration.T_base_ct, case.target_ct)))
+    share = {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))}
     touchable = touchable_points(case, load_skin(case, user_cache()).mesh, registration.T_base_ct)
     return {
         "budget": budget_facts(case, registration, touchable, partial(load_anatomy, case, cache=user_cache())),
         **({} if registration.aim is None else {"correction": correction_facts(case, registration)}),
-        "share": {"markers_ct": float(read / (read + touched)), "touch": float(touched / (read + touched))},
-        **_advice(registration, case.target_ct, case.space, touchable),
+        **_advice(registration, case.target_ct, case.space, touchable, share),
     }
 
 
-def _advice(registration: Registration, target_ct: Floats, space: Space, places_ct: Floats) -> dict[str, Any]:
+def _advice(
+    registration: Registration, target_ct: Floats, space: Space, places_ct: Floats, share: dict[str, float]
+) -> dict[str, Any]:
     """The target's ellipsoid, the rest without each marker, and at which of the places (n, 3) one more helps most."""
     assert registration.uncertainty is not None
     cov = registration.uncertainty.cov_at(apply(registration.T_base_ct, target_ct))[:3, :3]
@@ -196,6 +205,7 @@ def _advice(registration: Registration, target_ct: Floats, space: Space, places_
         "half_axes_95_mm": (
             registration.uncertainty.test.region_factor * np.sqrt(np.linalg.eigvalsh(cov)[::-1])
         ).tolist(),
+        "share": share,
         "without": {one.name: {"rms_mm": one.rms_mm, "probability": one.probability} for one in without},
         "one_more": best,
     }

@@ -249,9 +249,9 @@ def confirm_needle(context: CaseContext, scanner: Scanner, plan_path: Path | Non
 
 def confirm_case(context: CaseContext, scan: Path, out: Path, plan_path: Path | None = None) -> Confirmed:
     """`confirm_needle`, with its page, picture and report as one set of files."""
-    from puncture_twin.twin.jobs.patient.pictures import draw_confirmed  # with matplotlib
-
     done = confirm_needle(context, ScanFiles(scan), plan_path)
+    from puncture_twin.twin.jobs.patient.pictures import draw_confirmed  # with matplotlib: not before a refusal
+
     planned = next((one for one in done.read if one.role == "plan"), None)
     with writing_of(context, out, "confirm", FILES, done.read, planned) as draft:
         draw_confirmed(done, draft.folder / PICTURE)

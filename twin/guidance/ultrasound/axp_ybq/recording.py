@@ -97,10 +97,12 @@ class Recording(Shown):
             checked["shaft_mm"] = _lengths(self.shaft_mm, self.v, names)
         if (self.q_probe is None) != (self.q_needle is None):
             refuse("joints of only one arm", "recording", "joints of both arms, or of none", "joints_of_one_arm")
+        if self.joints:
+            checked |= {key: _angles(getattr(self, key), key, names) for key in ("q_probe", "q_needle")}
         if (self.turn_probe is None) != (self.turn_needle is None) or (self.turn_probe is not None and not self.joints):
             refuse("turns without joints, or of only one arm", "recording", "both, with joints", "joints_of_one_arm")
-        for check, keys in ((_angles, ("q_probe", "q_needle")), (_signs, ("turn_probe", "turn_needle"))):
-            checked |= {key: check(getattr(self, key), key, names) for key in keys if getattr(self, key) is not None}
+        if self.turn_probe is not None:
+            checked |= {key: _signs(getattr(self, key), key, names) for key in ("turn_probe", "turn_needle")}
         for key, value in checked.items():
             object.__setattr__(self, key, value)
 
