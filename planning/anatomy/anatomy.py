@@ -68,7 +68,7 @@ class Anatomy:
         return self.structures + self.surroundings
 
     def structure(self, name: str) -> Structure:
-        """The structure of this name; none is an error."""
+        """The structure of this name. Raises InputError: There is none."""
         names = [structure.name for structure in self.structures]
         if name not in names:
             what = f"no structure '{name}'{did_you_mean(name, names)}"
@@ -173,12 +173,16 @@ def _unnamed(case: Case, scan: Scan, structures: Sequence[Structure]) -> Iterato
 
 
 def load_skin(case: Case, cache: Cache = NO_CACHE) -> Skin:
-    """The skin of a case alone."""
+    """The skin of a case alone. Raises InputError: A file that cannot be trusted."""
     return StructureSources(case, lambda _: None, cache).skin(case.skin_section)
 
 
 def load_couch(case: Case, skin: Skin, cache: Cache = NO_CACHE) -> TriangleMesh | None:
-    """Load the surfaces beyond what the body lies on in the case's CT, as `Anatomy.couch`."""
+    """Load the surfaces beyond what the body lies on in the case's CT, as `Anatomy.couch`.
+
+    Raises:
+        InputError: A CT that cannot be trusted, or does not show the target.
+    """
     scan = StructureSources(case, lambda _: None, cache).scan(case.skin_section, skin)
     return None if scan is None else scan.outside(case.ct.air_hu).couch
 

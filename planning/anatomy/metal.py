@@ -37,7 +37,7 @@ class Metal(NamedTuple):
 
     box: Box
     voxels: Bools
-    middle_ct: Floats
+    middle_ct: Floats  # shape (3,), of its voxels, LPS mm
     size_mm: float
 
 

@@ -73,7 +73,11 @@ def skin_of_image(image: CtImage) -> Skin:
 
 
 def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> Skin:
-    """The outer surface of one label in a box, holes filled in each axial slice (it may be a shell of skin only)."""
+    """The outer surface of one label in a box, holes filled in each axial slice (it may be a shell of skin only).
+
+    Raises:
+        InputError: If no voxel has this label, or every voxel is inside.
+    """
     where = f"{labelmap.path}, label {label}"
     if label not in labelmap.boxes:
         allowed = f"labels present: {', '.join(map(str, labelmap.labels_present()))}"
@@ -88,7 +92,11 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
 
 
 def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
-    """The skin of a mesh, LPS mm: of a whole body (local mm too), or of one cut flat at some sides, as in `SIDES`."""
+    """The skin of a mesh, LPS mm: of a whole body (local mm too), or of one cut flat at some sides, as in `SIDES`.
+
+    Raises:
+        InputError: If no triangle lies in the plane where a side was cut.
+    """
     mesh = split_at_creases(mesh)
     warnings = () if mesh.closed else ("the skin mesh is open: its inside, and where skin is missing, are not known",)
     if not cut:

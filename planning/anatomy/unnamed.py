@@ -57,9 +57,13 @@ class Unnamed(NamedTuple):
 def unnamed_surfaces(
     ct: CtImage, body: Bools, structures: Sequence[Named], *, dense_hu: float, slack_mm: float = 0.0
 ) -> Unnamed:
-    """Find dense components, from an HU on, and gas inside a CT's body outside of all structures grown by one voxel.
+    """Find dense components and gas inside the body outside of all structures grown by one voxel.
 
-    So deep below the body's surface as ``slack_mm`` there may still be the ambient air, where that is from elsewhere.
+    Args:
+        body: The CT's body, shape (nx, ny, nz).
+        dense_hu: From here on a voxel is dense.
+        slack_mm: So deep below the body's surface there may still be the ambient air, because the surface is from
+            elsewhere and was widened.
     """
     gas, named = ct.hu < GAS_HU, np.zeros(body.shape, bool)
     if gas.any():

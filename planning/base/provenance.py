@@ -39,7 +39,11 @@ def inputs_document(inputs: Iterable[Input]) -> list[dict[str, str]]:
 
 
 def read_inputs(document: Any) -> tuple[Input, ...]:
-    """The list of a result that was read from a file; TypeError, KeyError or ValueError for what is no such list."""
+    """The list of a result that was read from a file; TypeError, KeyError or ValueError for what is no such list.
+
+    Raises:
+        TypeError, KeyError, ValueError: It is no such list, or an input has two hashes in it.
+    """
     if not isinstance(document, list):
         raise TypeError("inputs is not a list")
     inputs = tuple(Input(*(text(one[key]) for key in ("role", "path", "sha256"))) for one in document)
@@ -111,6 +115,9 @@ class InputFiles:
         Args:
             name: As ``where`` states it.
             key: Of ``where``, for errors.
+
+        Raises:
+            InputError: It is missing, no plain file, empty, too large or not readable.
         """
         content = self._held.get(name)
         if content is None:

@@ -51,7 +51,11 @@ def parse_document(data: bytes, version: int, *, where: str | Path, allowed: str
 
 @contextmanager
 def fitting(where: str | Path, allowed: str) -> Iterator[None]:
-    """Whatever a value of the wrong kind raises within (a missing key, another type, shape, size), as one line."""
+    """Whatever a value of the wrong kind raises within (a missing key, another type, shape, size), as one line.
+
+    Raises:
+        InputError: A key that is missing, or a value of another type, shape or size.
+    """
     try:
         yield
     except KeyError as error:
@@ -103,7 +107,11 @@ def number_or_nan(value: Any) -> float:
 
 
 def array(value: Any, shape: tuple[int, ...]) -> Floats:
-    """Numbers within ±`MAX_NUMBER` of a known shape, read-only; ValueError for anything else."""
+    """Numbers within ±`MAX_NUMBER` of a known shape, read-only; ValueError for anything else.
+
+    Raises:
+        ValueError: Another shape, a larger number, or something else than numbers.
+    """
     if not _numbers_only(value):
         raise ValueError("an array with values other than numbers")
     try:

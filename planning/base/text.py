@@ -25,7 +25,11 @@ ALLOWED_NAME = f"printable characters on one line, {MAX_NAME} at most: no escape
 
 
 def check_name(name: str, what: str, *, where: str | Path) -> str:
-    """Check a name that is printed as it is, and return it; ``what`` it names, as "label 3", is in the error."""
+    """Check a name that is printed as it is, and return it; ``what`` it names, as "label 3", is in the error.
+
+    Raises:
+        InputError: An empty name, one of more than `MAX_NAME` characters, or one with a control or format character.
+    """
     if not name.strip():
         refuse(f"{what} has an empty name", where, ALLOWED_NAME, "bad_name")
     if len(name) > MAX_NAME:

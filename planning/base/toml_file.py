@@ -74,7 +74,11 @@ def parse_toml(
     keys: str,
     change: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> Model:
-    """Validate the bytes of such a file, after ``change`` stated some values otherwise; it is not opened again."""
+    """Validate the bytes of such a file, after ``change`` stated some values otherwise; it is not opened again.
+
+    Raises:
+        InputError: Not TOML, or not of the schema: names the first key that is wrong.
+    """
     try:
         text = content.decode("utf-8")
         check_toml_bounds(text, path, allowed)

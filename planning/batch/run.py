@@ -319,7 +319,7 @@ class CohortState:
 
 
 def cohort_state(out: Path, progress: Count) -> CohortState:
-    """The state of every case of a folder's plan."""
+    """The state of every case of a folder's plan. Raises InputError: The folder has no plan."""
     plan, state = plans.read_plan_table(out), CohortState()
     for number, one in enumerate(plan.cases, start=1):
         state.add(one, out)

@@ -50,7 +50,11 @@ class BentPath:
 
 
 def bent_path(case: Case, anatomy: Anatomy, outward_ct: Floats) -> BentPath | None:
-    """The path of one direction; None where the needle is straight, or the direction enters no skin."""
+    """The path of one direction; None where the needle is straight, or the direction enters no skin.
+
+    Args:
+        outward_ct: Shape (3,), unit.
+    """
     if case.bending is None:
         return None
     paths = case_paths(case, anatomy.skin, outward_ct[None])
@@ -91,8 +95,8 @@ class Chain:
     """By which the markers' residuals multiply every declared error: 1 where they agree."""
     points_ct: Floats  # shape (N, 3), the markers
     q_touch: Floats  # shape (N, 6), how the arm touches them
-    T_base_ct: Floats
-    target_ct: Floats
+    T_base_ct: Floats  # shape (4, 4), mm
+    target_ct: Floats  # shape (3,), mm
     q_insertion: Floats  # shape (6,), the tip on the target
     path: BentPath | None = None  # of a needle that bends; None for a straight one
     breathing: Breathing | None = None
@@ -136,7 +140,13 @@ class Chain:
 
 
 def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: BentPath | None = None) -> Chain:
-    """The chain of a case, with its breathing and motion."""
+    """The chain of a case, with its breathing and motion.
+
+    Args:
+        registration: Of its markers, with the case's own declaration, to whose residuals the errors are scaled.
+        q_insertion: Shape (6,), rad, the tip on the target.
+        path: Of the needle there, where it bends.
+    """
     assert case.errors is not None and registration.uncertainty is not None
     scale, R = registration.uncertainty.test.scale, registration.T_base_ct[:3, :3]
     return Chain(

@@ -197,6 +197,10 @@ def guided_model(
     """What guidance knows of one insertion.
 
     Args:
+        case: Declares the devices, and what moves.
+        error: Of the needle, as rehearsed.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q: Shape (6,), rad, the tip on the target.
         sight: What the devices see of it; None hides nothing, and has the picture along the body.
         steps: After each of so many a control scan is read, and nothing else looks; None scans nothing.
     """
@@ -276,7 +280,13 @@ def _drawn_back(model: UrModel, q: Floats, outs: Sequence[float] | Floats) -> Fl
 def way_chances(
     context: CaseContext, outward_ct: Floats, q: Floats, sight: Sight | None = None
 ) -> tuple[guided.WayChance, ...]:
-    """What each way would leave of an insertion, ct first, by the devices of a case; nothing where it declares none."""
+    """What each way would leave of an insertion, ct first, by the devices of a case; nothing where it declares none.
+
+    Args:
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q: Shape (6,), rad, the tip on the target.
+        sight: What the devices see; None hides nothing.
+    """
     case, chance = context.case, context.chance
     ways = declared_ways(case)
     if len(ways) == 1 or chance is None or context.placement is None or context.placement.registration is None:

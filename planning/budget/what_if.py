@@ -68,7 +68,12 @@ def source_costs(chain: Chain) -> tuple[SourceCost, ...]:
 
 
 def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tuple[Change, ...]:
-    """The changes of a chain, each alone."""
+    """The changes of a chain, each alone.
+
+    Args:
+        skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
+        bed_ct: Shape (3,), unit, across the CT's slices; None where it is not stated, and slices are left out.
+    """
     return (
         *([] if bed_ct is None else _slices(chain, bed_ct)),
         *_touches(chain),

@@ -40,8 +40,8 @@ GRID_SLACK, SAME_ANGLE = 1e-9, 1e-9
 class Directions:
     """A set of entry directions."""
 
-    theta: Floats
-    beta: Floats
+    theta: Floats  # shape (n,), puncture angle from the entry frame's +z, rad
+    beta: Floats  # shape (n,), azimuth from +x in its xy plane, rad
     outward_ct: Floats
     """Shape (n, 3), unit vectors in the CT frame, from the target outward."""
     grid: AngleGrid | None = None
@@ -125,9 +125,13 @@ def direction(theta: Floats | float, beta: Floats | float, R_ct_entry: Floats) -
 
 
 def grid(theta: tuple[float, float], beta: tuple[float, float], step: float, R_ct_entry: Floats) -> Directions:
-    """Every (θ, β) of a regular grid, rad, θ outermost; the highest belong to it where the step meets them.
+    """Every (θ, β) of a regular grid, θ outermost; β = 360° is left out where the range is the full circle.
 
-    β = 360° is left out where the range is the full circle.
+    Args:
+        theta: Lowest and highest puncture angle, rad; both belong to the grid where the step meets them.
+        beta: Lowest and highest azimuth, rad.
+        step: Grid step of both angles, rad.
+        R_ct_entry: Rotation of the entry frame, shape (3, 3).
     """
     azimuths = _steps(beta, step)
     full_circle = bool(len(azimuths) > 1 and azimuths[-1] - azimuths[0] >= 2 * np.pi - GRID_SLACK)
@@ -154,8 +158,8 @@ class AngleGrid:
     ``full_circle``: the last azimuth's next neighbour is the first.
     """
 
-    theta: Floats
-    beta: Floats
+    theta: Floats  # shape (m,), ascending
+    beta: Floats  # shape (k,), ascending
     step: float
     full_circle: bool
 

@@ -125,10 +125,10 @@ class ArmUncertainty:
 class ErrorModel:
     """All declared errors of a case; covariances (3, 3), mm^2, of one marker and of the target as read in the CT."""
 
-    marker_cov_ct: Floats
+    marker_cov_ct: Floats  # shape (3, 3), mm^2: of one marker read in the CT
     touch_mm: float
     """Of one touch, per axis of the base frame, besides the arm."""
-    target_cov_ct: Floats
+    target_cov_ct: Floats  # shape (3, 3), mm^2: of the target read in the CT
     arm: ArmUncertainty
     surface_mm: float | None
     """By which a whole structure's surface may lie off, along its normal; None where every structure's own voxels say

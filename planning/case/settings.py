@@ -130,7 +130,7 @@ class Obstacle:
 class Gantry:
     """A wall that reaches so far outward from a round bore, whose axis is z of its frame, its top x; mm."""
 
-    T_ct_gantry: Floats
+    T_ct_gantry: Floats  # shape (4, 4), mm: the bore's centre; its axis is z, its top x
     bore_diameter_mm: float
     wall_mm: float
     thickness_mm: float
@@ -161,7 +161,7 @@ class Stereo:
     The balls by their distance behind the needle's tip, ascending; ``sd_mm`` is of a point that both see, per axis.
     """
 
-    cameras_ct: Floats | None
+    cameras_ct: Floats | None  # shape (2, 3), mm: where the cameras are, or None where they are to be proposed
     balls_mm: tuple[float, ...]
     sd_mm: float
 
@@ -279,7 +279,11 @@ def mount_pose(mount: tables.MountSection, space: Space, path: Path, *, key: str
 
 
 def axes_frame(z: Axis, x: Axis, space: Space, path: Path, key: str) -> Floats:
-    """R_ct_frame, shape (3, 3), of a frame whose z axis is given and whose x axis is what of ``x`` is square to it."""
+    """R_ct_frame, shape (3, 3), of a frame whose z axis is given and whose x axis is what of ``x`` is square to it.
+
+    Raises:
+        InputError: The two are parallel or zero; names ``key``.
+    """
     try:
         return entry_frame(tables.EntryAxes(z=z, x=x), space, where=path)
     except InputError as error:

@@ -65,7 +65,12 @@ class Cells:
         return np.asarray(2 * np.sin(middle) * np.sin(half) * np.ptp(self.beta, axis=1))
 
     def splits(self, radius: Floats, size: float = 0.0) -> NDArray[np.str_]:
-        """How each cell is best halved, letters of `SPLITS`; no quarters where a half is about of ``size``, rad."""
+        """How each cell is best halved, letters of `SPLITS`, shape (n,).
+
+        Args:
+            radius: Of the cells, shape (n,), rad.
+            size: The wanted angular diameter, rad: where one half is about as small, no quarters are made.
+        """
         tall = self.theta[:, 1] - self.theta[:, 0]
         widest = np.clip(np.pi / 2, self.theta[:, 0], self.theta[:, 1])
         wide = self.beta[:, 1] - self.beta[:, 0]

@@ -190,7 +190,16 @@ def normals_of(triangles: Sequence[Floats], target_ct: Floats, outward_ct: Float
 
 @nb.njit(cache=True)
 def axis_normals(triangles, nearest, distance, depth, target, outward, normal):  # type: ignore[no-untyped-def]  # numba infers
-    """Fill ``normal`` (n, 3) with the unit vectors of one surface: see `normals_of`; NaN on contact."""
+    """Fill ``normal`` (n, 3) with the unit vectors of one surface: see `normals_of`; NaN on contact.
+
+    Args:
+        triangles: Shape (m, 9), corners in rows, mm.
+        nearest: Shape (n,), row of each axis' nearest triangle.
+        distance: Shape (n,), mm.
+        depth: Shape (n,), of the nearest axis point, mm.
+        target: Shape (3,), where the axes start, mm.
+        outward: Shape (n, 3), unit vectors.
+    """
     for i in range(len(outward)):
         if distance[i] <= 0.0:
             normal[i] = math.nan

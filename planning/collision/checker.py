@@ -112,7 +112,15 @@ class CellChecker:
         return np.concatenate([apply(T, corners) for T, corners in pieces])
 
     def contact(self, q: Floats, *, needle_may_touch_patient: bool) -> Contact | None:
-        """As `StateChecker.contact`, refusing what is not finite; the holder may never touch."""
+        """The first contact found, or None when the arm is clear.
+
+        Args:
+            q: Shape (6,), rad.
+            needle_may_touch_patient: True while the needle goes in. The holder may never touch.
+
+        Raises:
+            InputError: If ``q`` is not finite: FCL would call it free.
+        """
         self._place(q)
         for check in self._checks:
             allowed = needle_may_touch_patient and check.contact == NEEDLE_IN_PATIENT
@@ -123,11 +131,19 @@ class CellChecker:
     def contacts(
         self, q: Floats, *, needle_may_touch_patient: bool, round_clear: Bools | None = None
     ) -> list[Contact | None]:
-        """As `StateChecker.contacts`."""
+        """First contact of each of many states, shape (n, 6), rad; known contacts are checked first.
+
+        Raises:
+            InputError: If a state is not finite.
+        """
         return [self.contact(state, needle_may_touch_patient=needle_may_touch_patient) for state in q]
 
     def folded(self, q: Floats) -> Bools:
-        """As `StateChecker.folded`."""
+        """Which of many states (n, 6), rad, have contact between links before the last joint: at any q6.
+
+        Raises:
+            InputError: If a state is not finite.
+        """
         before = [check for check in self._checks if check.before_last_joint]
         found = np.zeros(len(q), np.bool_)
         for row, state in enumerate(q):
@@ -136,7 +152,14 @@ class CellChecker:
         return found
 
     def first_contact(self, q_path: Floats, *, needle_may_touch_patient: bool) -> FirstContact | None:
-        """As `StateChecker.first_contact`."""
+        """The first state of a path with a contact, and the contact; None when all are clear.
+
+        Args:
+            q_path: Shape (m, 6), rad.
+
+        Raises:
+            InputError: If a state is not finite.
+        """
         for index, q in enumerate(q_path):
             contact = self.contact(q, needle_may_touch_patient=needle_may_touch_patient)
             if contact is not None:
@@ -144,7 +167,16 @@ class CellChecker:
         return None
 
     def nearest(self, q: Floats, pair: str, body: str | None = None) -> Nearest:
-        """As `StateChecker.nearest`; refuses another kind or body."""
+        """The smallest of one kind of distance.
+
+        Args:
+            q: Shape (6,), rad.
+            pair: One of ``DISTANCE_PAIRS``.
+            body: Only from this one of the pair's bodies.
+
+        Raises:
+            InputError: If ``q`` is not finite, or there is no such kind or body.
+        """
         names = DISTANCE_PAIRS.get(pair, ())
         if not names or (body is not None and body not in names):
             where, allowed = f"distance {pair!r} of {body!r}", ", ".join(names or DISTANCE_PAIRS)
@@ -155,11 +187,25 @@ class CellChecker:
         return _nearest(bodies, self._boxes if pair == "boxes" else skin, self._bounds)
 
     def distances(self, q: Floats) -> Distances:
-        """As `StateChecker.distances`."""
+        """Least distances of moving links and tool from patient and boxes.
+
+        Args:
+            q: Shape (6,), rad.
+
+        Raises:
+            InputError: If ``q`` is not finite.
+        """
         return Distances(*(self.nearest(q, pair) for pair in DISTANCE_PAIRS))
 
     def sweep_mm(self, q_path: Floats) -> Floats:
-        """As `StateChecker.sweep_mm`; see :meth:`SweptBodies.bounds_mm`."""
+        """Bound on every body's motion along each segment of a path.
+
+        Args:
+            q_path: Shape (m, 6), rad.
+
+        Returns:
+            Shape (m - 1,), mm; see :meth:`SweptBodies.bounds_mm`.
+        """
         return np.asarray(self.swept.bounds_mm(q_path).max(axis=1))
 
     def body_sweeps_mm(self, q_path: Floats) -> dict[str, Floats]:

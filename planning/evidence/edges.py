@@ -61,7 +61,7 @@ class Placement(NamedTuple):
     """Another place of the surfaces: shift, turn, scale, axes, grid or unit, and the map (4, 4) there, LPS mm."""
 
     kind: str
-    T: Floats
+    T: Floats  # shape (4, 4), maps the surfaces as they are to where they would lie, LPS mm
 
 
 class Fit(NamedTuple):
@@ -79,8 +79,8 @@ class Fit(NamedTuple):
 class EdgeImage:
     """A CT (nx, ny, nz) on voxels of at most `COPY_MM`, clipped and smoothed by one voxel."""
 
-    values: NDArray[np.float32]
-    T_ct_index: Floats
+    values: NDArray[np.float32]  # shape (nx, ny, nz)
+    T_ct_index: Floats  # shape (4, 4), voxel index to LPS mm
 
     def strength(self, points_ct: Floats, normals_ct: Floats) -> Floats:
         """|g . n| at points (n, 3) with unit normals (n, 3), HU/mm, shape (n,); NaN outside of the image.
@@ -148,9 +148,9 @@ def edge_image(hu: NDArray[np.generic], T_ct_index: Floats) -> EdgeImage:
 class Sample:
     """Points (n, 3) on several surfaces, unit normals of any sign, and by point the surface and the patch of it."""
 
-    points_ct: Floats
-    normals_ct: Floats
-    structure: NDArray[np.intp]
+    points_ct: Floats  # shape (n, 3), LPS mm
+    normals_ct: Floats  # shape (n, 3), unit; their sign does not matter
+    structure: NDArray[np.intp]  # shape (n,), which surface each lies on
     patch: NDArray[np.intp]
 
     @property
@@ -225,9 +225,11 @@ def turns(about: Floats, axes: Floats) -> Iterator[Placement]:
 
 
 def axis_slips(about: Sequence[Floats], axes: Floats) -> Iterator[Placement]:
-    """Every other way to name and to direct three axes (unit columns), about points (3,) that stay in place.
+    """Every other way to name and to direct three axes: mirror images, half and quarter turns, arrays reversed.
 
-    Mirror images, half and quarter turns, arrays reversed.
+    Args:
+        about: Points (3,) that stay in place.
+        axes: Shape (3, 3), unit columns: of the patient, or of a grid.
     """
     orders, signs_of = itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
     for point, order, signs in itertools.product(about, orders, signs_of):

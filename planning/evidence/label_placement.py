@@ -390,7 +390,7 @@ class Slip(NamedTuple):
     much it is turned besides, rad.
     """
 
-    shift_mm: Floats
+    shift_mm: Floats  # shape (3,), LPS: of the middle of the surfaces
     scale: float
     axes: str
     turn: float

@@ -54,7 +54,15 @@ SAMPLES = 400
 
 
 def blend_radii_mm(checker: StateChecker, waypoints: Floats) -> Floats:
-    """Blend radius of each waypoint between the ends, mm; 0 where no corner may be cut."""
+    """Blend radius of each waypoint between the ends, mm; 0 where no corner may be cut.
+
+    Args:
+        checker: Checks contacts in the plan's own scene; its tool has the needle whose tip is the TCP.
+        waypoints: Shape (k, 6), rad.
+
+    Returns:
+        Shape (k - 2,), mm.
+    """
     radii = np.zeros(max(len(waypoints) - 2, 0))
     for at, (before, corner, after) in enumerate(zip(waypoints, waypoints[1:], waypoints[2:], strict=False)):
         radius = LARGEST_BLEND_MM  # the largest one tried that is free

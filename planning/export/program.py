@@ -55,8 +55,8 @@ class Program:
     """Shape (4, 4), needle tip before the insertion; ``standoff_q`` (6,) the arm there."""
     T_base_target: Floats
     """Shape (4, 4), needle tip after it; ``target_q`` (6,) the arm there."""
-    standoff_q: Floats
-    target_q: Floats
+    standoff_q: Floats  # shape (6,), the arm before the insertion
+    target_q: Floats  # shape (6,), the arm after it
     insertion_mm_s: float
     insertion_mm_s2: float
 

@@ -66,6 +66,9 @@ def velocities(model: UrModel, trajectory: Trajectory) -> Floats:
     Of three parabolas through a sample and two neighbours (both before, one on each side, both after) at least two have
     the motion's own slope when its acceleration changes at samples only, and not at two in a row: the middle one of the
     three slopes is taken. It is kept within what keeps a cubic through the samples between its neighbours.
+
+    Returns:
+        Shape (m, 6), rad/s.
     """
     speeds = np.zeros_like(trajectory.q)
     if len(speeds) < 3:

@@ -106,7 +106,7 @@ class SceneContent:
     """Content of the files for Slicer."""
 
     name: str
-    entry_ct: Floats
+    entry_ct: Floats  # shape (3,), where the path enters the skin, mm
     area: EntryArea
     placement: Placement | None
 

@@ -231,6 +231,9 @@ def triangulate(corners: NDArray[np.int64], counts: NDArray[np.int64], where: st
     Args:
         corners: Shape (k,), the vertex indices of all polygons, one after the other.
         counts: Shape (p,), how many of them each polygon has; they sum to k.
+
+    Raises:
+        InputError: If a polygon has fewer than three corners, or the triangles are too many.
     """
     if len(counts) == 0:
         refuse("no face", where, "at least one triangle", "empty")

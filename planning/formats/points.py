@@ -113,7 +113,11 @@ def _reader(path: Path, where: str) -> Callable[[bytes, str], RawPoints]:
 
 
 def write_points(path: Path, points: NamedPoints) -> None:
-    """Write a CSV ``name,x_mm,y_mm,z_mm`` and joints, whole, in the space of its case; it reads back the same."""
+    """Write a CSV ``name,x_mm,y_mm,z_mm`` and joints, whole, in the space of its case; it reads back the same.
+
+    Raises:
+        InputError: If the place cannot be written to.
+    """
     joints = points.joints is not None
     header = ["name", *(["kind"] if points.kinds else []), "x_mm", "y_mm", "z_mm"]
     header += JOINTS_DEG if joints else []
@@ -347,6 +351,9 @@ def joint_readings(values: ArrayLike, unit: AngleUnit, *, where: str | Path, nam
 
     Args:
         values: Shape (n, 6), in the unit.
+
+    Raises:
+        InputError: Not six finite angles each, beyond what a joint can read, or plainly in the other unit.
     """
     given = np.asarray(values)
     if given.dtype.kind not in "iuf" or given.ndim != 2 or given.shape[1] != 6 or not np.isfinite(given).all():
@@ -383,6 +390,9 @@ def parse_joint_recording(data: bytes, path: Path, *, timed: bool) -> JointRecor
 
     Args:
         timed: Whether it must hold times.
+
+    Raises:
+        InputError: A column is missing, something is no number, or the angles or times are of no arm.
     """
     lines = [line for line in decode_text(data, str(path)).splitlines() if line.strip() and not line.startswith("#")]
     comma = bool(lines) and "," in lines[0]

@@ -52,6 +52,9 @@ def parse_table(
         fits: Whether the groups that are there belong together.
         example: Groups of a usual file, for the error.
         texts: Groups of one column that is text.
+
+    Raises:
+        InputError: Another header, no row, a row of another length, or a field that is no finite number.
     """
     allowed = ", ".join((first, *(column for group in example for column in groups[group])))
     lines = [one for one in csv_lines(content, str(path), allowed) if not one.fields[0].startswith("#")]
@@ -101,7 +104,11 @@ def pose_values(T: Floats) -> Floats:
 
 
 def finite_rows(values: Floats, what: str, names: Sequence[str], *, widths: tuple[int, ...]) -> Floats:
-    """A read-only copy of an array with a row per pose, shape (n, k), k one of ``widths``, all finite and in range."""
+    """A read-only copy of an array with a row per pose, shape (n, k), k one of ``widths``, all finite and in range.
+
+    Raises:
+        InputError: Another shape, or a number that is not finite or out of range; names the pose.
+    """
     array = np.array(values, dtype=np.float64)
     if array.ndim != 2 or len(array) != len(names) or array.shape[1] not in widths:
         wanted = " or ".join(f"({len(names)}, {width})" for width in widths)

@@ -101,6 +101,10 @@ def winding_number(mesh: TriangleMesh, point: NDArray[np.float64]) -> float:
     30(2), 1983, Eq. 8):
 
         tan(angle / 2) = a.(b x c) / (|a||b||c| + (a.b)|c| + (b.c)|a| + (c.a)|b|)
+
+    Args:
+        mesh: The surface, mm.
+        point: Shape (3,), mm, in the mesh's frame.
     """
     return float(winding_numbers(mesh, point[None])[0])
 
@@ -175,7 +179,7 @@ class Crossings:
 
     ray: Ints
     depth: Floats
-    face: Ints
+    face: Ints  # shape (c,), triangle that is crossed
     sense: Ints
     """1 where the ray comes out through the triangle's front (its corners run counterclockwise seen from there), -1
     where it goes in, 0 where it does both at once (two surfaces touch there, or one is folded) or the triangle is

@@ -36,8 +36,8 @@ MOST_IN_ONE = 2_000_000
 class TriangleMesh(Shown):
     """Vertices (n, 3), mm, and triangles (m, 3) of a surface. Any instance may be trusted: the guard has passed it."""
 
-    vertices: Floats
-    faces: Faces
+    vertices: Floats  # shape (n, 3), float64, mm
+    faces: Faces  # shape (m, 3), int32, indices into ``vertices``
 
     @brief
     def __repr__(self) -> str:

@@ -93,7 +93,7 @@ class Parts:
     """
 
     shape: tuple[int, ...]
-    runs: Ints32
+    runs: Ints32  # shape (n, 4), of each run the line's two indices, its first voxel and the one after its last
     part: Ints32
 
     @cached_property

@@ -300,7 +300,11 @@ class _Looker:
 
 
 def volume_kind(volume: Volume) -> tuple[str, str]:
-    """A volume's kind: ``ct`` (Hounsfield units), ``labels`` (few whole numbers from 0 on), or ``other``, and why."""
+    """A volume's kind: ``ct`` (Hounsfield units), ``labels`` (few whole numbers from 0 on), or ``other``, and why.
+
+    Raises:
+        InputError: A label map that was blended by an interpolation.
+    """
     low, high = float(volume.values.min()), float(volume.values.max())
     if low <= AIR_HU:
         return ("ct", "") if high > 0 else (OTHER, f"no CT: nothing is above 0, from {low:g} to {high:g}")

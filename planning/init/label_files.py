@@ -105,6 +105,9 @@ def label_file(place: Place, source: str, surfaces: VolumeSurfaces, naming: str 
 
     Args:
         naming: As the user states it, or None.
+
+    Raises:
+        InputError: No names are found, or they do not name every label.
     """
     present = surfaces.present().labels
     if naming is None and surfaces.names is None:
@@ -158,6 +161,9 @@ def is_named_by_table(place: Place, source: str, label: int, only: bool) -> bool
     Args:
         label: The only one in it.
         only: Whether no other map or mask lies beside it, so that the table may have any name.
+
+    Raises:
+        InputError: It is one organ by the file's name, and another by a table of another name.
     """
     tables = [one for one in _tables_beside(place.folder, source) if only or _is_named_like(one, source)]
     table, _ = _one_table(place, source, [label], tables)
@@ -225,6 +231,9 @@ def file_masks(place: Place, source: str, key: str, ct: str | None) -> Segmentat
     Args:
         key: Of the case: ``seg`` or ``rtstruct``.
         ct: The CT of the case, read before, or None.
+
+    Raises:
+        InputError: Structures that cannot be trusted, or were drawn on another CT.
     """
     place.content(source)
     place.volumes.read_masks(StructuresSection.model_validate({key: source}), ct)

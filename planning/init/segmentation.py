@@ -161,7 +161,11 @@ def mesh_name(file: str) -> str:
 def mesh_folder(
     place: Place, source: str, names: Sequence[str], space: Space, stated: Unit | None, up: Up | None
 ) -> Segmentation:
-    """The meshes of a folder, in the unit that their extent tells where none is stated; of GLB ``up`` must be."""
+    """The meshes of a folder, in the unit that their extent tells where none is stated; of GLB ``up`` must be.
+
+    Raises:
+        InputError: A mesh that cannot be read, two of one name, or a unit that is not told by their extent.
+    """
     if len({mesh_name(one) for one in names}) < len(names):
         refuse("two meshes have the same name", place.folder / source, "one mesh per structure", "duplicate_name")
     if up is None and any(name.lower().endswith(".glb") for name in names):

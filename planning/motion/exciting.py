@@ -48,10 +48,12 @@ class Series:
 def exciting_motion(
     model: UrModel, down_base: Floats, home: Floats, free: Callable[[Floats], bool], seed: int
 ) -> Series:
-    """The motion of one arm at one mount, within its limits of angle, speed and acceleration.
+    """The motion of one arm at one mount.
 
     Args:
+        model: Its limits of angle, speed and acceleration are kept.
         down_base: Shape (3,), unit vector of gravity, base frame.
+        home: Shape (6,), rad.
         free: Whether the arm is free of contact along a path (m, 6).
 
     Raises:

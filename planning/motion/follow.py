@@ -88,9 +88,14 @@ def rounded(corner: Floats, before: Floats, after: Floats, cut: float, fraction:
     """The curve past a corner, as in the module's equations.
 
     Args:
-        before: Shape (6,), unit direction of the segment that leads to the corner; ``after`` of the one that leads on.
+        corner: Shape (6,), rad.
+        before: Shape (6,), unit direction of the segment that leads to it.
+        after: Shape (6,), unit direction of the one that leads on.
         cut: How far from the corner the curve begins and ends, rad.
         fraction: Shape (m,), 0..1: of the time on the curve.
+
+    Returns:
+        Shape (m, 6), rad.
     """
     covered = fraction**3 - fraction**4 / 2.0  # of f, from 0 to the fraction
     along, across = -1.0 + 2.0 * (fraction - covered), 2.0 * covered  # of the two directions, over the cut

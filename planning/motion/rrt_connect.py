@@ -240,7 +240,12 @@ UNSCALED = 1.0
 def shortened(joint_limits: Floats, contact_of: SegmentContact, waypoints: Floats) -> Floats:
     """A path with the same ends that is no longer, with every joint counted in full.
 
-    ``waypoints`` (k, 6), rad, are joined by straight free segments.
+    Args:
+        joint_limits: Shape (6, 2), rad.
+        waypoints: Shape (k, 6), rad: straight free segments.
+
+    Returns:
+        Shape (m, 6), rad.
     """
     space = JointSpace(joint_limits, UNSCALED)
     space.set_up(_ShortcutValidator(space.information, contact_of))

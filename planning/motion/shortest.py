@@ -75,6 +75,10 @@ def direct_path(contact_of: SegmentContact, home: Floats, goals: Floats) -> Path
     """The straight path to the nearest goal that has a free one, where no other goal is worth a search; else None.
 
     It ends where its check has found no contact: whether goals are free need not be known.
+
+    Args:
+        home: Shape (6,), rad, free.
+        goals: Shape (g, 6), rad.
     """
     away = _distances(home, goals)
     found = _straight(contact_of, home, goals, away)

@@ -99,7 +99,7 @@ class PlacementCheck:
     carried: tuple[Box, ...]
     """Boxes that stand with the arm, base frame."""
     padding_mm: float
-    target_ct: Floats
+    target_ct: Floats  # shape (3,), mm
     wanted: WantedDirections
     home: Floats
     """Shape (6,), rad."""
@@ -137,6 +137,10 @@ def expected_tip_error_mm(case: Case, placement: Placement | None, T_base_ct: Fl
 
     How the arm will touch the markers from there nobody has said, so that the arm's own errors do not cancel (2 J_f
     Sigma_eta J_f' stands for them); the residuals of the old touches say nothing of the new ones.
+
+    Args:
+        T_base_ct: Shape (4, 4), mm: where the arm is to stand.
+        q: Joints (rad) with the tip on the target from there.
     """
     registration = None if placement is None else placement.registration
     if case.errors is None or registration is None or not len(q):
@@ -161,7 +165,18 @@ def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -
 def needle_can_start(
     tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: WantedDirections, padding_mm: float
 ) -> NDArray[np.bool_]:
-    """Whether the padded needle at standoff is clear of the skin, (n,): else no placement reaches the direction."""
+    """Whether the padded needle at standoff is clear of the skin: else no placement can reach the direction.
+
+    Args:
+        tool: With the needle.
+        skin: CT frame.
+        target_ct: Shape (3,), mm.
+        wanted: n directions.
+        padding_mm: What the arm's checker keeps from the patient.
+
+    Returns:
+        Shape (n,).
+    """
     start, end = tool.needle_span_mm
     radius, length = tool.needle_diameter_mm / 2 + padding_mm, end - start + 2 * padding_mm
     needle, half = Solid(partial(fcl.Cylinder, radius, length)), np.array([radius, radius, length / 2])

@@ -101,8 +101,14 @@ def clear_branches(
 ) -> NDArray[np.bool_]:
     """Which motions keep clear of the surroundings, and the arm of itself, at each of their states.
 
-    The base is checked against the arm alone. ``frames``: Shape (k, m, 7, 4, 4), mm, base frame, ``link_poses`` of k
-    motions of m states; the result is (k,).
+    The base is checked against the arm alone.
+
+    Args:
+        T_ct_base: Shape (4, 4), mm.
+        frames: Shape (k, m, 7, 4, 4), mm, base frame: ``link_poses`` of k motions of m states.
+
+    Returns:
+        Shape (k,).
     """
     arm = (spheres.centres, spheres.radii + surroundings.padding_mm, spheres.starts[1:], spheres.frames[1:])
     clear = np.empty(len(frames), np.bool_)
@@ -283,7 +289,7 @@ class Boxes:
     """Boxes of one frame: ``T_box_frame`` (k, 4, 4), mm, and half sizes (k, 3), mm."""
 
     T_box_frame: Floats
-    halves: Floats
+    halves: Floats  # shape (k, 3), half sizes, mm
 
     @classmethod
     def of(cls, boxes: Sequence[Box]) -> Boxes:
@@ -326,6 +332,8 @@ def insertion_branches(
     """Every branch of many insertions, by kinematics alone; joint limits are not tested.
 
     Args:
+        target_base: Shape (3,), mm.
+        outward_base: Shape (n, 3), unit.
         distances_mm: Shape (n, m): target to flange at each state.
         at_least: Each singularity must be farther than this.
     """

@@ -88,7 +88,11 @@ class Site:
     """The base's origin in the bed frame: along, across, up from the target, mm."""
 
     def T_bed_base(self) -> Floats:  # noqa: N802  # the field writes T_a_b
-        """The base's pose, mm: its x axis leads away from the target, so that the arm reaches for it at q1 = 0."""
+        """The base's pose: its x axis leads away from the target, so that the arm reaches for it at q1 = 0.
+
+        Returns:
+            Shape (4, 4), mm.
+        """
         z, at = np.array(self.region.axis, dtype=float), np.array(self.position)
         x = at - z * (z @ at)
         if np.linalg.norm(x) < STRAIGHT_UP_MM:
@@ -152,7 +156,11 @@ def _rails(case: Case, table: Obstacle, T_ct_bed: Floats, reach: float) -> list[
 
 
 def mount_section(T_ct_base: Floats, space: Space) -> MountSection:
-    """The section that states this pose in the case's space, rounded."""
+    """The section that states this pose in the case's space, rounded.
+
+    Args:
+        T_ct_base: Shape (4, 4), mm.
+    """
     # LPS to RAS is its own inverse.
     position, x, z = to_lps(np.stack([T_ct_base[:3, 3], T_ct_base[:3, 0], T_ct_base[:3, 2]]), space)
     return MountSection(
@@ -228,7 +236,12 @@ def wanted_directions(case: Case, candidates: Candidates) -> WantedDirections:
 
 
 def ring_weights(theta: Floats, step: float) -> Floats:
-    """The solid angle of each cell of a grid of (θ, β), up to a common factor: a grid is denser near θ = 0."""
+    """The solid angle of each cell of a grid of (θ, β), up to a common factor: a grid is denser near θ = 0.
+
+    Args:
+        theta: Shape (n,), rad.
+        step: Of the grid, rad.
+    """
     low, high = np.maximum(theta - step / 2, 0.0), np.minimum(theta + step / 2, np.pi)
     _, ring, sizes = np.unique(np.round(theta, SAME_RING_DIGITS), return_inverse=True, return_counts=True)
     return np.asarray((np.cos(low) - np.cos(high)) / sizes[ring])

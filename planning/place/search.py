@@ -98,7 +98,7 @@ class RatedPlacement:
 class PlaceSearch(Shown):
     """Result of a search for placements."""
 
-    T_ct_bed: Floats
+    T_ct_bed: Floats  # shape (4, 4), mm: the frame of the sites
     coarse: tuple[tuple[Site, ReachEstimate], ...]
     refined: int
     """How many more sites were estimated."""

@@ -35,8 +35,8 @@ class Plan(Shown):
     TRE alone; NaN for a stated mount or transform."""
     theta: float
     beta: float
-    entry_ct: Floats
-    target_ct: Floats
+    entry_ct: Floats  # shape (3,), skin entry
+    target_ct: Floats  # shape (3,)
     outward_ct: Floats  # shape (3,), unit, from the target along the needle
     roll: float
     standoff_mm: float  # tip to target before the insertion

@@ -87,7 +87,11 @@ def write_plan(plan: Plan, path: Path) -> None:
 
 
 def read_plan(path: Path) -> Plan:
-    """Read a plan, from a whole output set or from outside of any, and check it as `parse_plan` does."""
+    """Read a plan, from a whole output set or from outside of any, and check it as `parse_plan` does.
+
+    Raises:
+        InputError: It cannot be read, its folder's manifest lists other bytes, or see `parse_plan`.
+    """
     return parse_plan(read_output(path, max_bytes=MAX_PLAN_BYTES).data, path)
 
 

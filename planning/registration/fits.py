@@ -108,7 +108,9 @@ def rms(vectors: Floats) -> float:
 def rigid_fre_mm(points_ct: Floats, points_base: Floats) -> float:
     """The fiducial registration error (rms residual) of `fit_rigid`, mm: the chi-squared test is about that.
 
-    The arguments are those of `fit_rigid`, of one set.
+    Args:
+        points_ct: Shape (n, 3), n >= 3, not collinear, mm.
+        points_base: Shape (n, 3), the same markers.
     """
     return rms(apply(fit_rigid(points_ct, points_base), points_ct) - points_base)
 

@@ -171,7 +171,13 @@ def aimed(registration: Registration, aim: Aim) -> Registration:
 def aimed_uncertainty(
     fit: FitUncertainty, points_ct: Floats, T_base_ct: Floats, target_base: Floats, aim: Aim
 ) -> FitUncertainty:
-    """The uncertainty of a joint fit of points (N, 3) that was corrected to T_base_ct, turned about the target."""
+    """The uncertainty of a joint fit whose pose was corrected.
+
+    Args:
+        points_ct: Shape (N, 3), mm, its markers.
+        T_base_ct: Shape (4, 4), the corrected pose.
+        target_base: Shape (3,), mm, where the pose was turned about.
+    """
     A = design(apply(T_base_ct, points_ct), fit.center_base)
     M = np.eye(len(A)) - A @ fit.fit_map
     weights = np.asarray(np.linalg.inv(fit.noise.covariance(fit.R_base_ct).whole), dtype=np.float64)

@@ -112,7 +112,12 @@ def slice_numbers(grid: VolumeGrid) -> tuple[Floats, int]:
 def entry_facts(
     case: Case, markers: Sequence[Landmark], entry_ct: Floats, outward_ct: Floats, grid: VolumeGrid | None = None
 ) -> EntryFacts:
-    """Skin entry, nearest landmark and scanner angles of one path."""
+    """Skin entry, nearest landmark and scanner angles of one path.
+
+    Args:
+        entry_ct: Shape (3,), mm; NaN without a skin entry.
+        outward_ct: Shape (3,), unit, from the target outward.
+    """
     landmarks = markers or (Landmark("the target", np.asarray(case.target_ct)),)
     planes = None if case.space is Space.LOCAL else needle_planes(outward_ct)
     entry_mm = to_lps(entry_ct[None], case.space)[0]  # the change of signs undoes itself

@@ -44,7 +44,12 @@ def with_bending(anatomy: Anatomy, candidates: Candidates, bound: DeflectionBoun
 
 
 def bent_verdict(verdict: Verdict, structures: tuple[Structure, ...], clearance: Floats, deflection: Floats) -> Verdict:
-    """A verdict with candidates rejected whose clearance is less than margin + deflection; others keep theirs."""
+    """A verdict with candidates rejected whose clearance is less than margin + deflection; others keep theirs.
+
+    Args:
+        clearance: Shape (n, k), of the straight needle, mm.
+        deflection: Shape (n,), the greatest, mm.
+    """
     demanding = np.flatnonzero([one.demands_margin for one in structures])
     if not len(demanding):
         return verdict
@@ -91,7 +96,13 @@ class Insertion(NamedTuple):
 def insertion_along(
     bending: Bending, anatomy: Anatomy, end_ct: Floats, outward_ct: Floats, path_length: float
 ) -> Insertion:
-    """Deflection, forces and buckling of the insertion along one direction."""
+    """Deflection, forces and buckling of the insertion along one direction.
+
+    Args:
+        end_ct: Shape (3,), mm, where the path ends: the target.
+        outward_ct: Shape (3,), unit.
+        path_length: From there to the skin, mm.
+    """
     layers = path_layers(bending, anatomy, end_ct, outward_ct, path_length)
     stiffest = max(layer.tissue.stiffness_n_mm2 for layer in layers)
     count = max(1, int(np.ceil(path_length / step_for(bending.shaft, stiffest))))
@@ -128,6 +139,12 @@ def path_layers(
     """The tissue layers of a path, skin first; in nested structures the smallest box counts.
 
     A surface is a capsule where it is entered. That of the rest is the skin: coming out of an organ there is none.
+
+    Args:
+        anatomy: The case's structures; only closed ones have an inside.
+        target_ct: Shape (3,), mm.
+        outward_ct: Shape (3,), unit.
+        path_length: Target to skin, mm.
     """
     count = max(1, round(path_length / STEP_MM))
     edges = np.linspace(0.0, path_length, count + 1)
@@ -164,7 +181,13 @@ class Stretch(NamedTuple):
 
 
 def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_length: float) -> tuple[Stretch, ...]:
-    """Follow a path from the target to ``BEYOND_SKIN_MM`` outside of the skin; empty without a CT."""
+    """Follow a path from the target to ``BEYOND_SKIN_MM`` outside of the skin; empty without a CT.
+
+    Args:
+        target_ct: Shape (3,), LPS mm.
+        outward_ct: Shape (3,), unit.
+        path_length: Target to skin, mm; NaN without an entry: nothing is followed.
+    """
     if anatomy.scan is None or not np.isfinite(path_length):
         return ()
     depths = np.arange(0.0, path_length + BEYOND_SKIN_MM, PROFILE_STEP_MM)
@@ -182,7 +205,13 @@ def stretches(anatomy: Anatomy, target_ct: Floats, outward_ct: Floats, path_leng
 
 
 def inside_at(structure: Structure, target_ct: Floats, outward_ct: Floats, depths: Floats) -> NDArray[np.bool_]:
-    """Which depths of a path, from the target outward, are inside a closed structure, by parity of its crossings."""
+    """Which depths of a path are inside a closed structure, by the parity of the crossings before.
+
+    Args:
+        target_ct: Shape (3,), mm.
+        outward_ct: Shape (3,), unit.
+        depths: Shape (n,), from the target outward, mm.
+    """
     points = target_ct + depths[:, None] * outward_ct
     low, high = structure.mesh.bounds
     if not np.any(np.all((low <= points) & (points <= high), axis=1)):

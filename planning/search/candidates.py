@@ -158,8 +158,8 @@ class BreathingColumns(Columns):
 class Candidates(Columns, Shown):
     """Every direction of the grid: n rows in groups of columns; mm, radians, points in the CT frame."""
 
-    theta: Floats
-    beta: Floats
+    theta: Floats  # shape (n,), puncture angle
+    beta: Floats  # shape (n,), azimuth
     outward_ct: Floats
     """Shape (n, 3), unit vectors from the target outward."""
     verdict: Verdict
@@ -269,7 +269,11 @@ class Candidates(Columns, Shown):
         return find_windows(self)
 
     def to_pandas(self) -> Any:
-        """The table that `write` writes, as a pandas DataFrame: a row a direction, mm and degrees."""
+        """The table that `write` writes, as a pandas DataFrame: a row a direction, mm and degrees.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
         require_extra("pandas", "to_pandas")
         from puncture_twin.planning.search.table import to_table
 
@@ -303,7 +307,7 @@ class Candidates(Columns, Shown):
         return polar_map(cells, legend, min(steps) / 2)  # the cells' edges lie at halves of a step
 
     def pick(self, row: int) -> Pick:
-        """One candidate by its row."""
+        """One candidate by its row. Raises InputError: There is no such row."""
         if isinstance(row, bool) or not isinstance(row, int | np.integer) or not 0 <= row < len(self):
             refuse(f"row {row!r}", "pick", f"a row number from 0 to {len(self) - 1}", "out_of_range")
         return Pick(self, int(row))

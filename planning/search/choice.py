@@ -115,7 +115,11 @@ def choose(context: CaseContext, candidates: Candidates | None, choice: Choice) 
 
 
 def choose_stated(context: CaseContext, choice: Choice) -> Chosen:
-    """The one candidate of a choice by angles or by entry, without a search; errors as of `choose`."""
+    """The one candidate of a choice by angles or by entry, without a search; errors as of `choose`.
+
+    Raises:
+        InputError: A point that is no skin entry, or its file. Raises NoAnswerError: It is rejected: says why.
+    """
     choice = with_file_read(context.case, choice)
     checked = context.check(*chosen_angles(context.case, choice))
     refuse_other_entry(context.case, checked, choice)
@@ -139,7 +143,7 @@ def explain_choice(context: CaseContext, choice: Choice, candidates: Candidates 
 
 
 def chosen_angles(case: Case, choice: Choice) -> tuple[float, float]:
-    """θ and β (rad) of a choice by angles or by entry."""
+    """θ and β (rad) of a choice by angles or by entry. Raises InputError: An entry on the target itself."""
     if choice.angles is not None:
         return choice.angles
     lever = _entry_ct(case, choice) - case.target_ct

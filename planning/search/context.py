@@ -127,7 +127,11 @@ class CaseContext(Shown):
         return f"not checked: {NO_BASE if self.placement is None else 'switched off (--no-arm)'}"
 
     def require_arm(self) -> ArmReach:
-        """The checker of the arm, for what cannot do without it."""
+        """The checker of the arm, for what cannot do without it.
+
+        Raises:
+            InputError: Says what the case lacks, or that the arm was switched off.
+        """
         if self.placement is None:
             refuse(NO_BASE, self.case.path, ALLOWED_BASE, "no_base")
         if self.reach is None:
@@ -218,7 +222,11 @@ class CaseContext(Shown):
         return regions
 
     def cross_check(self, count: int) -> CrossChecked:
-        """Measure random directions of the grid again with FCL."""
+        """Measure random directions of the grid again with FCL.
+
+        Raises:
+            CrossCheckError: A distance differs by more than rounding.
+        """
         with self.stages.time("cross-check"):
             case, outward = self.case, self.case.directions().outward_ct
             meshes = tuple(structure.mesh for structure in self.anatomy.checked)

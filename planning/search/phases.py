@@ -164,7 +164,12 @@ class BreathingBody:
         return Phase(s, rows, verdict, clearance, clearance - self.margins, deflection)
 
     def excess_at(self, rows: Ints, s: float, columns: Ints) -> Floats:
-        """Clearance beyond the margins of some structures at a position, shape (m, c), mm."""
+        """Clearance beyond the margins of some structures at a position, shape (m, c), mm.
+
+        Args:
+            rows: Shape (m,), which candidates.
+            columns: Shape (c,), which of the structures with a margin.
+        """
         case, which = self.case, self.demanding[columns]
         distance, weights = np.empty((len(rows), len(columns))), self.weights.structures[which]
         for weight in np.unique(weights):
@@ -216,7 +221,11 @@ CLEARANCES = (Reason.TOO_CLOSE.value, Reason.UNKNOWN_REGION.value, Reason.NEEDLE
 
 
 def rejected_at(verdict: Verdict, rows: Ints, at_phase: Verdict, breathing: Breathing, s: float) -> Verdict:
-    """A verdict with candidates rejected that are unsafe at one phase; those rejected already keep their reason."""
+    """A verdict with candidates rejected that are unsafe at one phase; those rejected already keep their reason.
+
+    Args:
+        rows: Shape (m,), those that were checked at the phase.
+    """
     new = ~at_phase.safe & verdict.of(rows).safe
     at_phase = at_phase.of(np.flatnonzero(new))
     reasons = zip(at_phase.reason, at_phase.detail, strict=True)

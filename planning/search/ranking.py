@@ -33,10 +33,10 @@ TERMS = ("clearance", "path_length", "skin_angle", "tissue", "reach", "safe_cone
 class Order(NamedTuple):
     """Terms (n, 6) in 0..1 of n safe candidates, their weighted mean, the ranks by it, and `pareto_front`."""
 
-    terms: Floats
-    cost: Floats
-    rank: Ints32
-    pareto: Bools
+    terms: Floats  # shape (n, 6), each in 0..1, 0 is best, columns as `TERMS`
+    cost: Floats  # shape (n,), weighted mean of the terms
+    rank: Ints32  # shape (n,), 1 is best; equal costs keep their order
+    pareto: Bools  # shape (n,), no other candidate is at least as good in every term and better in one
 
 
 def ranked(case: Case, candidates: Candidates) -> Candidates:
@@ -157,6 +157,9 @@ def grid_cone(grid: AngleGrid, safe: Bools) -> Floats:
     diagonal. A disc as wide as that diagonal holds a direction of the grid; so where such a disc fits into what is not
     safe, at its border, the cone ends before it. What is thinner may pass between the directions: only a
     certificate excludes that.
+
+    Args:
+        safe: Shape (n,), row by row.
     """
     theta, beta = np.repeat(grid.theta, len(grid.beta)), np.tile(grid.beta, len(grid.theta))
     border = _border(grid, safe)

@@ -35,7 +35,7 @@ NOT_TESTED = f"skin entry and angle, {NOT_TESTED_OF_WINDOWS}"
 class SafeMap(Shown):
     """Which directions the margins of the structures block."""
 
-    target_ct: Floats
+    target_ct: Floats  # shape (3,), mm, LPS
     directions: Directions
     structures: tuple[str, ...]
     """Names of all that is checked; ``structure`` are places in it."""

@@ -166,7 +166,12 @@ WAY_HEAD = ("guidance", "expected tip error (rms), mm", "chance to hit", "to be 
 
 
 def uncertainty_breakdown(model: ChanceModel, outward_ct: Floats, q: Floats) -> UncertaintyBreakdown:
-    """The uncertainty breakdown of one candidate, its chances line-sampled as those of the table's best are."""
+    """The uncertainty breakdown of one candidate, its chances line-sampled as those of the table's best are.
+
+    Args:
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q: Shape (6,), rad, the tip on the target.
+    """
     needle = (outward_ct[None], q[None])
     chances = refined_chances(model, *needle, model.chances(*needle))
     touch = dict(zip(chances.structures, map(float, chances.touch[0]), strict=True))

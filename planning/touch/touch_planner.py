@@ -174,7 +174,12 @@ def _in_order(context: CaseContext, read: NamedPoints) -> NamedPoints:
 
 
 def registered(context: CaseContext, read: NamedPoints) -> Registration:
-    """The registration by touched markers."""
+    """The registration by touched markers.
+
+    Args:
+        context: For which markers were touched, and what is declared of them.
+        read: Their names, points (N, 3), mm, and joints (N, 6), rad, in any order.
+    """
     placement, case = context.placement, context.case
     assert placement is not None and placement.registration is not None and case.errors is not None
     found, read = placement.registration.markers, _in_order(context, read)

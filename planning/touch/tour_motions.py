@@ -165,7 +165,12 @@ class ApproachCheckers:
 
 
 def line_to(model: UrModel, tip_mm: float, q_touch: Floats, from_mm: float, to_mm: float) -> Floats | None:
-    """Joints along the needle's line through a touch, shape (m, 6), rad; None where the arm cannot follow it."""
+    """Joints along the needle's line through a touch, shape (m, 6), rad; None where the arm cannot follow it.
+
+    Args:
+        q_touch: Shape (6,), rad, the tip on the marker.
+        from_mm: Where the tip starts, mm before the marker; negative beyond it.
+    """
     count = max(2, int(np.ceil(abs(from_mm - to_mm) / STEP_MM)) + 1)
     distances = np.linspace(from_mm, to_mm, count)
     poses = np.tile(flange_pose(model, q_touch), (count, 1, 1))
@@ -209,7 +214,15 @@ def why_not(checkers: ApproachCheckers, tip_mm: float, q_touch: Floats) -> str:
 def registered_joints(
     model: UrModel, tip_mm: float, q_insertion: Floats, target_ct: Floats, T_base_ct: tuple[Floats, Floats]
 ) -> Floats:
-    """Joints (6,) that put the needle as planned in the CT, by a new registration, in the branch nearest to the plan's.
+    """Joints that put the needle as planned in the CT, by a new registration.
+
+    Args:
+        q_insertion: Shape (6,), rad, the tip on the target as it was planned.
+        target_ct: Shape (3,), mm.
+        T_base_ct: The belief of that plan and the new one, shape (4, 4) each, mm.
+
+    Returns:
+        Shape (6,), rad, in the branch nearest to the plan's.
 
     Raises:
         NoAnswerError: The arm does not reach there.
@@ -227,6 +240,11 @@ def registered_joints(
 
 def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats, registration: Registration) -> Plan:
     """Plan the puncture along a direction by a new registration, free of contact where that puts the patient.
+
+    Args:
+        context: The case; what it believes of patient and arm is what the touches were planned by.
+        outward_ct: Shape (3,), unit, from the target along the needle.
+        q_insertion: Shape (6,), rad, the tip on the target as the touches were planned for.
 
     Raises:
         NoAnswerError: The arm does not reach there, or not without contact.

@@ -113,6 +113,7 @@ class ChanceModel:
         """The chances of some needles to first order, the joint one unknown.
 
         Args:
+            outward_ct: Shape (n, 3), unit.
             q: Shape (n, 6), rad, the tip on the target.
             axes: What the engine has measured of the needles already; None measures them.
         """
@@ -160,6 +161,9 @@ def refined_chances(
     """Chances to touch, to break a margin and to touch any, by line sampling; the others as they are.
 
     Args:
+        outward_ct: Shape (n, 3), as in `ChanceModel.chances`.
+        q: Shape (n, 6).
+        first: Of these needles, to first order.
         wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
     """
     every = np.ones(first.touch.shape, bool)
@@ -173,7 +177,12 @@ def refined_chances(
 
 
 def satisfies_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
-    """Whether needles satisfy the case's limits, shape (n,); arguments as of `ChanceModel.chances`."""
+    """Whether needles satisfy the case's limits in any configuration that reaches the target, shape (n,).
+
+    Args:
+        outward_ct: Shape (n, 3), unit.
+        q: Shape (n, 6), rad, the tip on the target.
+    """
     kept, least, limits = np.ones(len(q), bool), model.case.search.min_hit, model.limits
     if least is not None:
         kept &= model.hit_chance(model.error.covariance_ct(q)) >= least

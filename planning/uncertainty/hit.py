@@ -305,8 +305,10 @@ def proximity(
     """The first-order model of every needle and structure.
 
     Args:
+        distance: Shape (n, k), mm.
         depth: Shape (n, k), of the nearest axis point, from the target, mm.
         normal: Shape (n, k, 3), unit, from the structure to that point.
+        outward_ct: Shape (n, 3), unit.
         cov_ct: Shape (n, 6, 6), Sigma6, CT axes, its point of reference the target.
         surface_mm: By which each structure's surface may lie off as a whole along that normal: one number or (n, k).
     """
@@ -368,8 +370,11 @@ def touch_bound(
 
     Args:
         slack_mm: Shape (n, k), distance beyond the threshold.
+        outward_ct: Shape (n, 3), unit.
+        cov_ct: Shape (n, 6, 6), Sigma6, CT axes, its point of reference the target.
         length_mm: Of the axis.
         surface_mm: The most that each structure's surface may lie off by along any normal: one number or (k,).
+        freedom: As in `touch_chance`.
     """
     lever = np.concatenate([np.broadcast_to(np.eye(3), (len(cov_ct), 3, 3)), -length_mm * skew(outward_ct)], axis=-1)
     ends = np.stack([cov_ct[:, :3, :3], lever @ cov_ct @ np.swapaxes(lever, -1, -2)])

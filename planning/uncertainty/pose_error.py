@@ -194,7 +194,12 @@ def expected_error_mm(error: PoseError, q: Floats) -> float:
 
 
 def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudget:
-    """The budget of one configuration."""
+    """The budget of one configuration.
+
+    Args:
+        q: Shape (6,), rad, the tip on the target.
+        outward_base: Shape (3,), unit, from the target along the needle.
+    """
     parts, whole = error.mean_squares(q), error.tip_covariance(q[None])[0]
     variance, along = float(np.trace(whole)), float(outward_base @ whole @ outward_base)
     return ErrorBudget(

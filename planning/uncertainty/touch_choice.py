@@ -42,6 +42,8 @@ def choose_touches(error: PoseError, points_base: Floats, q_insertion: Floats) -
     """Joints that touch each marker, shape (N, 6), rad, and leave the least error at the target.
 
     Args:
+        error: Of the case; its registration's map is kept, its touches are replaced.
+        points_base: Shape (N, 3), mm, in the order of the registration's markers.
         q_insertion: Shape (6,), rad, the tip on the target.
 
     Raises:
@@ -63,7 +65,9 @@ def least_error(error: PoseError, candidates: Sequence[Floats], q_insertion: Flo
     Marker by marker the candidate of the least trace(Sigma_dd) is taken, given the others, until nothing changes.
 
     Args:
+        error: Of the case; its registration's map is kept, its touches are replaced.
         candidates: Of each of the registration's markers, shape (n, 6), rad.
+        q_insertion: Shape (6,), rad, the tip on the target.
         worst: The most error instead, to compare with.
     """
     maps = error.fit.map_at(error.target_base)[:3].reshape(3, -1, 3)
@@ -89,6 +93,8 @@ def touch_candidates(model: UrModel, tip_mm: float, point_base: Floats, q_insert
     """Configurations within the joint limits and away from singularities that touch a point, near the insertion's.
 
     Args:
+        tip_mm: Flange to tip.
+        point_base: Shape (3,), mm.
         q_insertion: Shape (6,), rad: by its orientation, or leaning from it by up to `TILTS_DEG`.
     """
     R = flange_pose(model, q_insertion)[:3, :3]

@@ -62,7 +62,11 @@ def measured() -> tuple[Floats, ...]:
 
 
 def printed_errors(touched: tuple[Floats, ...]) -> dict[str, Floats]:
-    """Every printed error of n experiments, by name, each of shape (n,), mm."""
+    """Every printed error of n experiments, by name, each of shape (n,), mm.
+
+    Args:
+        touched: Of each setup, shape (n, 8, 3), rows as `NAMES`, mm.
+    """
     by_triad = list(triad_errors(touched, READ).items())
     residuals = _misses(_fitted(fit_triad, touched[0], READ, "ABC"), touched[0], READ, "ABC")
     found = dict([*by_triad[:2], ("mean residual of A-B-C, setup 1", residuals.mean(axis=1)), *by_triad[2:]])
@@ -293,7 +297,12 @@ TRIPLES = tuple("".join(one) for one in combinations(MARKERS, 3))
 
 
 def several_triads(touched: Floats, read: Floats = READ, lesion: str = "M") -> dict[str, Floats]:
-    """Errors of a lesion by several triads of the markers of the second setup, of n experiments, (n,) each, mm."""
+    """Errors of a lesion by several triads of the markers of the second setup, of n experiments, (n,) each, mm.
+
+    Args:
+        touched: Shape (n, 8, 3), rows as `NAMES`, mm.
+        read: Shape (8, 3), mm, in the CT.
+    """
     at = read[rows_of(lesion)]
     poses = np.array([_fitted(fit_triad, touched, read, names) for names in TRIPLES])
     points, there = poses[..., :3, :3] @ at[0] + poses[..., :3, 3], touched[:, rows_of(lesion)[0]]

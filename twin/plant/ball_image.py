@@ -32,12 +32,12 @@ OCCLUDER_SIZE = 4.0
 class BallScene:
     """A ball on its rod as a camera may see it, frame C, mm. Directions need not be unit; greys are from 0 to 255."""
 
-    center_c: Floats
+    center_c: Floats  # the ball's centre, shape (3,), mm, frame C
     radius_mm: float = 4.0
-    rod_c: Floats | tuple[float, float, float] = (0.0, -1.0, 0.0)
+    rod_c: Floats | tuple[float, float, float] = (0.0, -1.0, 0.0)  # shape (3,)
     rod_radius_mm: float = 1.5
     rod_length_mm: float = 60.0
-    light_c: Floats | tuple[float, float, float] = (0.3, -0.8, -0.6)
+    light_c: Floats | tuple[float, float, float] = (0.3, -0.8, -0.6)  # shape (3,): toward the light
     diffuse: float = 0.8
     """Fraction of the light that comes from everywhere, 0 to 1; directed light obeys Lambert's law."""
     ball_grey: float = 200.0

@@ -56,14 +56,14 @@ UNIT = 1e-6
 class NeedleInImage(NamedTuple):
     """The needle in the frame ``image``: its tip (3,), mm, and its direction (3,), unit, from the hub to the tip."""
 
-    tip_image: Floats
-    direction_image: Floats
+    tip_image: Floats  # shape (3,), mm; z is how far the tip is off the plane
+    direction_image: Floats  # unit, shape (3,): from the hub to the tip
 
 
 class Lesion(NamedTuple):
     """A ball about (3,), mm, whose scatterers have so much of the others' amplitude."""
 
-    centre_image: Floats
+    centre_image: Floats  # shape (3,), mm
     radius_mm: float
     gain: float = 0.25
 

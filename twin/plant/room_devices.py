@@ -22,7 +22,7 @@ class RoomCameras:
     """Two cameras, calibrated to each other, anywhere in each of n rooms."""
 
     device: Stereo
-    T_cameras_base: Floats
+    T_cameras_base: Floats  # shape (n, 4, 4), mm
     rng: np.random.Generator
 
     @classmethod
@@ -70,7 +70,7 @@ class RoomScanner:
 
     T_ct_base: Floats
     """Shape (4, 4), mm: where the couch really is."""
-    tip_root: Floats
+    tip_root: Floats  # shape (3, 3), mm, CT axes: S with S S' the covariance of a tip's reading
     target_off: Floats
     """Shape (n, 3), mm: what target readings are off by."""
     rng: np.random.Generator

@@ -52,17 +52,17 @@ class SimulatedTruth(NamedTuple):
 
     X: Floats
     Y: Floats
-    tip_end2: Floats
-    direction_end2: Floats
+    tip_end2: Floats  # shape (3,), mm
+    direction_end2: Floats  # shape (3,), unit, toward the tip
     A_mean: Floats
 
 
 class ImagePose(NamedTuple):
     """The needle in the image at n poses: the tip (n, 2); angles (n,), rad, ``lean`` out of the slice."""
 
-    tip_mm: Floats
-    insertion: Floats
-    roll: Floats
+    tip_mm: Floats  # shape (n, 2)
+    insertion: Floats  # shape (n,), rad
+    roll: Floats  # shape (n,), rad
     lean: Floats
 
 
@@ -91,7 +91,11 @@ def draw_image_poses(rng: np.random.Generator, n: int, ranges: PoseRanges = USUA
 
 
 def exact_recording(truth: SimulatedTruth, A: Floats, seen: ImagePose) -> Recording:
-    """The recording without noise: B such that the needle shows in the image as wished."""
+    """The recording without noise: B such that the needle shows in the image as wished.
+
+    Args:
+        A: Shape (n, 4, 4).
+    """
     n = len(A)
     shown = np.column_stack([np.cos(seen.insertion), np.sin(seen.insertion)])
     along = np.column_stack([shown * np.cos(seen.lean)[:, None], np.sin(seen.lean)])

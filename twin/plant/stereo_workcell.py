@@ -39,23 +39,23 @@ POINTED_MM = 3.0
 class TrueNeedle(NamedTuple):
     """True tip minus true target (3,), mm, image axes; and the needle's axes as columns (3, 3), z to the tip."""
 
-    error_m: Floats
-    R_m_needle: Floats
+    error_m: Floats  # shape (3,), mm: true tip minus true target
+    R_m_needle: Floats  # shape (3, 3): its axes as columns, z to the tip
 
 
 class ShownBall(NamedTuple):
     """A true ball or marker, C, mm, and the direction (3,) along its rod; a marker has none."""
 
-    center_c: Floats
+    center_c: Floats  # shape (3,)
     radius_mm: float
-    rod_c: Floats | None
+    rod_c: Floats | None  # shape (3,): along the rod; None for a marker, which has none
 
 
 class TrueTool(NamedTuple):
     """Errors (3,) of rod and needle, flange axes: ball against belief, tip against ball, mm; lean about x, y, rad."""
 
-    ball_offset: Floats
-    tip_offset: Floats
+    ball_offset: Floats  # shape (3,), mm: the ball's centre against where the controller has it
+    tip_offset: Floats  # shape (3,), mm: the needle's tip against the ball's centre
     lean: Floats
 
 
@@ -65,10 +65,10 @@ class StereoWorkcell:
 
     case: ServoCase
     arm: TrueArm
-    T_c_base: Floats
+    T_c_base: Floats  # shape (4, 4), mm: the true arm's base in C
     cameras: tuple[Camera, ...]
     T_c_m: Floats
-    T_c_m_after: Floats
+    T_c_m_after: Floats  # shape (4, 4), mm: where it is from then on
     tool: TrueTool
 
     @property

@@ -143,10 +143,10 @@ class TouchTruth:
     """
 
     seed: int
-    T_base_ct: Floats
+    T_base_ct: Floats  # shape (4, 4), mm: true pose of the patient
     eta: Floats
-    aim_ct: dict[str, Floats]
-    arrival: dict[str, Floats]
+    aim_ct: dict[str, Floats]  # marker to shape (3,), mm
+    arrival: dict[str, Floats]  # marker to shape (6,), rad: true joints minus what the encoders say there
 
     def q_contact(self, model: UrModel, tip_mm: float, touch: Touch) -> Floats:
         """Encoder angles, shape (6,), rad, when the true tip is on the marker, the needle as planned."""
@@ -158,7 +158,13 @@ class TouchTruth:
 def draw_touch_truth(
     T_base_ct: Floats, names: tuple[str, ...], points_ct: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw the true patient, markers and arm of touches."""
+    """Draw the true patient, markers and arm of touches.
+
+    Args:
+        T_base_ct: Shape (4, 4), mm: where the patient lies.
+        names: The N markers.
+        points_ct: Shape (N, 3), mm, as read.
+    """
     rng = np.random.default_rng(seed)
     eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
     values, axes = np.linalg.eigh(errors.marker_cov_ct)
@@ -171,7 +177,13 @@ def draw_touch_truth(
 def draw_pivot_truth(
     T_base_ct: Floats, names: tuple[str, ...], place_base: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw the errors of an arm that sets its tip onto one place n times; the patient lies as believed."""
+    """Draw the errors of an arm that sets its tip onto one place n times; the patient lies as believed.
+
+    Args:
+        T_base_ct: Shape (4, 4), mm.
+        names: Of the touches.
+        place_base: Shape (3,), mm.
+    """
     rng = np.random.default_rng(seed)
     eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
     aim_base = place_base + rng.normal(0.0, errors.touch_mm, (len(names), 3))
@@ -188,7 +200,12 @@ class AtTarget(NamedTuple):
 
 
 def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget:
-    """Draw the arrival: joints drifted since the touches with an error of their own; the target's reading error."""
+    """Draw the arrival: joints drifted since the touches with an error of their own; the target's reading error.
+
+    Args:
+        target_ct: Shape (3,), mm, as read.
+        seed: Of the truth.
+    """
     rng = np.random.default_rng([seed, 2])
     arrival = rng.normal(size=6) * np.hypot(errors.arm.arriving, errors.arm.drift)
     values, axes = np.linalg.eigh(errors.target_cov_ct)

@@ -33,7 +33,7 @@ COLLINEAR = 0.01
 class Truth:
     """Ground truth of a rehearsal; the bevel of a needle that bends points to its side about the needle's z, rad."""
 
-    T_base_ct_true: Floats
+    T_base_ct_true: Floats  # shape (4, 4), mm: the patient in the true base frame
     joint_offsets: Floats
     """Shape (6,), rad: true joint angle minus what the encoder says. They stand for all that changed or was not seen
     since the markers were touched."""
@@ -55,6 +55,11 @@ def draw_truth(case: Case, T_base_ct: Floats, *, seed: int | None = None) -> Tru
 
     Where the case names a file of true positions, the patient lies where that file says. Otherwise marker errors are
     drawn such that the belief is a plausible registration of this truth. Without markers belief and truth agree.
+
+    Args:
+        case: The case; its ``[rehearsal]`` table says how large the errors are.
+        T_base_ct: The belief, shape (4, 4), mm.
+        seed: Instead of the case's own.
 
     Raises:
         InputError: The file of true positions cannot be used.
@@ -106,6 +111,12 @@ def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "
 
     The rotation is the rigid least-squares fit of all points. Where the target is among them, the translation puts
     it exactly on its true place: what the twin measures is the distance from there.
+
+    Args:
+        points: Markers and target by name, in the CT and at their true positions in the base frame.
+
+    Returns:
+        T_base_ct, shape (4, 4), mm.
     """
     allowed = "3 or more points, named as the markers and the target, not on a line"
     named = ", ".join(points.names) or "none"
@@ -145,7 +156,7 @@ class Gears(NamedTuple):
 
     amplitude: float
     cycles: float
-    phase: Floats
+    phase: Floats  # shape (6,), rad
 
     def off(self, q: Floats) -> Floats:
         """By how much each joint of (..., 6), rad, is turned too far."""

@@ -23,7 +23,7 @@ class WorkcellTruth(NamedTuple):
     needle_arm: TrueArm
     X: Floats
     Y: Floats
-    tip_end2: Floats
+    tip_end2: Floats  # shape (3,), mm
     V: Floats
 
     def image_pose(self, q_probe: Floats) -> Floats:
@@ -48,6 +48,15 @@ def jog_into_slice(
 
     It stands for the operator, or a servo on the image, that jogs until the needle shows: what is left is in
     ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
+
+    Args:
+        q_probe: Where the probe's joints rest, shape (6,), rad.
+        q_needle: Where the needle's arm begins, shape (6,), rad.
+        wanted: The needle in the image, after the jog.
+        roll: About the needle, rad.
+
+    Returns:
+        What the arm is commanded, shape (6,), rad; NaN where no configuration reaches it.
     """
     nominal = truth.needle_arm.nominal
     T_base2_image = (np.linalg.inv(truth.Y) @ truth.image_pose(q_probe))[None]

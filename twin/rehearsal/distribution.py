@@ -88,14 +88,14 @@ class Distribution:
     """Further trials, whose registration put the pose out of the arm's reach; `stopped` by the corridor."""
     puncture: Puncture
     trials: Trials
-    cov_ct: Floats
-    in_region: Bools
-    hit: Bools
+    cov_ct: Floats  # shape (3, 3), predicted of it, mm^2
+    in_region: Bools  # shape (n,), whether it lies in the predicted 95 % ellipsoid, about the mean where one is known
+    hit: Bools  # shape (n,)
     p_hit: float
     """Predicted; of a guided needle that it is not stopped, and hits."""
     structures: tuple[str, ...]
-    touched: Bools
-    p_touch: Floats
+    touched: Bools  # shape (n, k)
+    p_touch: Floats  # shape (k,), predicted
     wrong_belief: bool
     """Whether the truth was drawn from other errors than the belief declares, on purpose."""
     budget: ErrorBudget
@@ -185,9 +185,13 @@ def rehearse_trials(
     """Rehearse one direction in many trials, each with a truth of its own.
 
     Args:
+        context: Of a case with declared errors and markers.
+        outward_ct: Shape (3,), unit, from the target along the needle.
         q_insertion: Shape (6,), rad, the tip on the target.
+        count: Trials, at least 1.
         guidance: One of `WAYS`, in bodies that move as the case declares: every way has the same patients by a seed.
             None is by registration, in bodies at rest. Devices that the case does not declare are assumed.
+        sight: What its devices see of the insertion; None hides nothing.
         steps: Of ct: after each of so many equal ones, the last at the target, a control scan is read and the needle
             corrected.
 
@@ -276,7 +280,11 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
 
 
 def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
-    """Deflection along one direction, if the bevel never rotates; None for a straight needle."""
+    """Deflection along one direction, if the bevel never rotates; None for a straight needle.
+
+    Args:
+        outward_ct: Shape (3,), unit, from the target along the needle.
+    """
     path = bent_path(context.case, context.anatomy, outward_ct)
     return None if path is None else path.bend
 

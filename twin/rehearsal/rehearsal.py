@@ -183,13 +183,19 @@ def true_tissue(plan: Plan, case: Case, anatomy: Anatomy, truth: Truth) -> TrueT
 class Swept:
     """Measurements of a sweep without its approach; `off_mm` (m,) is the virtual TCP's distance from its point."""
 
-    times_s: Floats
+    times_s: Floats  # shape (m,)
     off_mm: Floats
     contacts: tuple[tuple[str, str], ...]
 
 
 def execute_sweep(plan: SweepPlan, case: Case, anatomy: Anatomy, T_base_ct: Floats) -> Swept:
-    """Execute a sweep in the believed workcell: what is measured is control, by `[rehearsal] control` of the case."""
+    """Execute a sweep in the believed workcell: what is measured is control, by `[rehearsal] control` of the case.
+
+    Args:
+        plan: The motion.
+        case: For tool, boxes, gravity and control.
+        T_base_ct: Shape (4, 4), mm: where the patient lies.
+    """
     done, _ = _executed(case, anatomy, T_base_ct, plan, plan.sweep, SETTLE_S, np.zeros(6))
     begun_s = TIME_STEP_S * (len(steps(plan.approach)) + SETTLE_STEPS - ROUNDING)
     sweeping = done.times_s >= begun_s

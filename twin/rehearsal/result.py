@@ -81,25 +81,25 @@ class Rehearsal(Shown):
 
     seed: int
     truth_source: str
-    T_base_ct_true: Floats
-    times_s: Floats
-    q: Floats
-    q_command: Floats
-    phase: NDArray[np.str_]
-    T_base_flange_true: Floats
-    tip_true_ct: Floats
-    clearance_times_s: Floats
+    T_base_ct_true: Floats  # shape (4, 4), true pose of the patient
+    times_s: Floats  # shape (m,), from the start of the approach
+    q: Floats  # shape (m, 6), encoder angles
+    q_command: Floats  # shape (m, 6), commanded joints
+    phase: NDArray[np.str_]  # shape (m,), "approach", "settle", "insertion" or "hold"
+    T_base_flange_true: Floats  # shape (m, 4, 4), true pose of the flange
+    tip_true_ct: Floats  # shape (m, 3), the needle's true tip in the patient
+    clearance_times_s: Floats  # shape (k,), moments of the insertion and its end
     clearance_mm: MappingProxyType[str, Floats]
     """Structure to shape (k,): true needle's axis to true structure, minus the needle's radius."""
     contacts: tuple[RehearsalContact, ...]
-    max_joint_speed: Floats
-    speed_limits: Floats
+    max_joint_speed: Floats  # shape (6,), rad/s
+    speed_limits: Floats  # shape (6,), rad/s
     tip_error_mm: float
     """True tip to true target at the end; `depth_mm` along the needle, positive when too deep."""
     lateral_mm: float
     depth_mm: float
     predicted_error_mm: float
-    target_true_ct: Floats
+    target_true_ct: Floats  # shape (3,), true target in the CT
     truth_is_belief: bool
     """Whether the patient lay exactly where it was believed, so that the error says little."""
     control: str

@@ -41,7 +41,7 @@ class Puncture(NamedTuple):
     """
 
     candidate: int
-    target_image: Floats
+    target_image: Floats  # true target in the true image, shape (3,), mm; it lies in the plane, for it is seen
     needle: NeedleInImage
     predicted_mm: float
     click_mm: float

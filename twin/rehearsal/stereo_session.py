@@ -148,8 +148,8 @@ class Reached(NamedTuple):
 
     row: TargetRow
     servoed: Servoed
-    rests: tuple[Floats, ...]
-    q_true: Floats
+    rests: tuple[Floats, ...]  # true joints, (6,), rad, at each of the servo's visits
+    q_true: Floats  # shape (6,), rad: true joints at the end
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,12 +46,12 @@ class Puncture:
     tip_mm: float
     method: str
     noise: ReadingNoise
-    points_ct: Floats
-    q_touch: Floats
-    T_base_ct: Floats
-    target_ct: Floats
-    outward_ct: Floats
-    q_insertion: Floats
+    points_ct: Floats  # shape (N, 3), mm, the markers
+    q_touch: Floats  # shape (N, 6), rad, how the arm touches them
+    T_base_ct: Floats  # shape (4, 4), mm: where the patient lies
+    target_ct: Floats  # shape (3,), mm
+    outward_ct: Floats  # shape (3,), unit, from the target along the needle
+    q_insertion: Floats  # shape (6,), rad, the tip on the target
     bend: Bend | None = None
     aim: Aim | None = None
     push: Pushed | None = None
@@ -64,17 +64,17 @@ class Trials(NamedTuple):
     have moved the target by the last three, (n, 3); positions are relative to it.
     """
 
-    tip_ct: Floats
-    outward_ct: Floats
-    target_ct: Floats
+    tip_ct: Floats  # shape (n, 3), where the tip ended
+    outward_ct: Floats  # shape (n, 3), unit, from there along the needle
+    target_ct: Floats  # shape (n, 3), true target
     T_base_ct: Floats
-    reached: Bools
+    reached: Bools  # shape (n,), whether the arm could reach the pose that followed
     R_ct_needle: Floats
-    chi_squared: Floats
-    bevel_side: Floats
-    motion_ct: Floats
-    breath_ct: Floats
-    pushed_ct: Floats
+    chi_squared: Floats  # shape (n,), of the weighted residuals of each trial's markers against the believed noise
+    bevel_side: Floats  # shape (n,), rad, whereto the bevel points about the needle's z; 0 where it has none
+    motion_ct: Floats  # shape (n, 3), by how much the body about the target has moved since the scan
+    breath_ct: Floats  # shape (n, 3), and by how much the breath has moved the target
+    pushed_ct: Floats  # shape (n, 3), and by how much the needle has
 
     def of(self, rows: Bools | Ints) -> Trials:
         """The results of some trials."""
@@ -84,7 +84,7 @@ class Trials(NamedTuple):
 class Moving(NamedTuple):
     """What moves between scan and insertion: target and surroundings (3, 3), mm^2; markers by so much of its breath."""
 
-    cov_ct: Floats
+    cov_ct: Floats  # shape (3, 3), mm^2, of the target and its surroundings
     breathing: Breathing | None
     skin_weight: float
 
@@ -96,9 +96,9 @@ class Truths(NamedTuple):
     true joints less the encoders', drift since the touches included.
     """
 
-    eta: Floats
-    read_ct: Floats
-    touched_base: Floats
+    eta: Floats  # shape (n, 28), the arm's errors
+    read_ct: Floats  # shape (n, N, 3), what the CT shows of the markers
+    touched_base: Floats  # shape (n, N, 3), what the touches read
     arrival: Floats
     target_ct: Floats
     side: Floats
@@ -147,7 +147,13 @@ def open_loop(puncture: Puncture, truths: Truths) -> Trials:
 
 
 def ended(puncture: Puncture, truths: Truths, T_base_ct: Floats, needle: TrueNeedle, reached: Bools) -> Trials:
-    """Trials whose straight needles ended so; `reached` (n,) is whether the arm could reach what was commanded."""
+    """Trials whose straight needles ended so.
+
+    Args:
+        T_base_ct: Shape (n, 4, 4), as registered.
+        needle: Of each trial; it bends if the puncture's does.
+        reached: Shape (n,), whether the arm could reach what was commanded.
+    """
     T_ct_base = np.linalg.inv(puncture.T_base_ct)
     if puncture.bend is not None:
         needle = bent(needle, puncture.bend, truths.side)
@@ -224,7 +230,14 @@ def commanded(
     puncture: Puncture, T_base_ct: Floats, moved_base: Floats | float = 0.0, out_mm: float = 0.0,
     q_near: Floats | None = None,
 ) -> tuple[Floats, Bools]:  # fmt: skip
-    """The joints (n, 6) that bring the nominal arm before the target, in the planned branch and roll, and whether."""
+    """The joints (n, 6) that the nominal arm takes to the target, in the planned branch and roll, and whether.
+
+    Args:
+        T_base_ct: Shape (n, 4, 4), as registered.
+        moved_base: Shape (n, 3), mm: by how much the needle is corrected.
+        out_mm: How far before the target.
+        q_near: Shape (6,), rad, as planned there; None at the target.
+    """
     q_near = puncture.q_insertion if q_near is None else q_near
     R_ct_flange = puncture.T_base_ct[:3, :3].T @ flange_pose(puncture.model, puncture.q_insertion)[:3, :3]
     poses = np.zeros((len(T_base_ct), 4, 4))

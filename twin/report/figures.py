@@ -39,7 +39,12 @@ def halo(width: float, colour: str = "white") -> list[Any]:
 def picture_axes(
     figure: Figure, image: NDArray[np.uint8], at: tuple[float, float, float, float] = (0, 0, 1, 1)
 ) -> Axes:
-    """Axes in an image's own pixels (right, down; 0 is its upper left corner); `at`: left, low, wide, high."""
+    """Axes in an image's own pixels (right, down; 0 is its upper left corner) that hold it.
+
+    Args:
+        image: Shape (h, w) or (h, w, 3).
+        at: Left, lower edge, width and height, of the figure's.
+    """
     axes, (high, wide) = figure.add_axes(at), image.shape[:2]
     axes.set_axis_off()
     axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, wide, high, 0), interpolation="lanczos", aspect="auto")

@@ -142,8 +142,8 @@ VELOCITY_GAIN = 1.0
 class JointState(NamedTuple):
     """Angles (6,), rad, and speeds (6,), rad/s, of the joints."""
 
-    q: Floats
-    speed: Floats
+    q: Floats  # shape (6,), rad
+    speed: Floats  # shape (6,), rad/s
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Arm:
     body: int
     joints: tuple[int, ...]
     links: MappingProxyType[str, int]
-    max_torque: tuple[float, ...]
+    max_torque: tuple[float, ...]  # shape (6,), N m
 
     def link_name(self, index: int) -> str:
         """Name of a link."""
@@ -205,7 +205,14 @@ class Arm:
 
 
 def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | None = None) -> Arm:
-    """Load the arm with holder and needle, its base fixed."""
+    """Load the arm with holder and needle, its base fixed.
+
+    Args:
+        T_world_base: Pose of the controller's base, shape (4, 4), mm; None for the world's origin.
+
+    Raises:
+        InputError: There is no body of that model.
+    """
     urdf = model_urdf(model)
     T_world_urdf = urdf.T_base_root if T_world_base is None else T_world_base @ urdf.T_base_root
     position, quaternion = pose_to_m(T_world_urdf)

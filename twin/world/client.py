@@ -29,6 +29,12 @@ def physics_client(down: NDArray[np.float64] | None = None) -> Iterator[int]:
     """Open a DIRECT client (no window), yield its id, and disconnect it whatever happens.
 
     Bodies, contacts and solver run in a fixed order, so the same calls give the same numbers.
+
+    Args:
+        down: Shape (3,), unit vector of gravity in the world frame; None for -z.
+
+    Raises:
+        ConnectionError: PyBullet has no client left.
     """
     client = pybullet.connect(pybullet.DIRECT)
     if client < 0:

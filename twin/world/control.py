@@ -60,7 +60,7 @@ class Insertion:
 
     model: UrModel
     tool: Tool
-    down_base: Floats
+    down_base: Floats  # shape (3,), unit vector of gravity, base frame
     trajectory: Trajectory
     hold_s: float
 
@@ -76,7 +76,16 @@ def insert(
     workcell: SimulatedWorkcell, insertion: Insertion, control: TipControl, joint_offsets: Floats, *,
     start_s: float = 0.0, resistance: Resistance | None = None,
 ) -> Inserted:  # fmt: skip
-    """Run an insertion from where the arm is; refused where no time step carries the stiffness on the path."""
+    """Run an insertion from where the arm is.
+
+    Args:
+        workcell: An open workcell, its arm at rest at the trajectory's start.
+        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
+        resistance: Of tissue; None for none.
+
+    Raises:
+        InputError: No time step carries the stiffness at some pose of the path.
+    """
     model, tip_m = insertion.model, float(to_m(insertion.tool.needle_length_mm))
     with rigid_model(model, insertion.tool, insertion.down_base) as rigid:
         controller = _controller(rigid, control, insertion.trajectory.q)
@@ -230,7 +239,13 @@ def allowed_step(stiffness: Stiffness, J: Floats, M: Floats) -> float:
 
 
 def refuse_unstable(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> None:
-    """Refuse a stiffness that this time step cannot carry at this pose."""
+    """Refuse a stiffness that this time step cannot carry at this pose.
+
+    Args:
+        J: Jacobian of the tip, shape (6, 6).
+        M: Mass matrix of the joints, shape (6, 6).
+        dt: Time step, s.
+    """
     ratio = stability_ratio(stiffness, J, M, dt)
     if not ratio < MOST_RATIO:
         what = f"a stiffness of {stiffness.translation_n_m:g} N/m at steps of {1e3 * dt:g} ms would diverge"
@@ -245,10 +260,10 @@ class Reference:
     model: UrModel
     tip_m: float
     q: Floats
-    speed: Floats
-    acceleration: Floats
-    position_m: Floats
-    R_base_tip: Floats
+    speed: Floats  # shape (n, 6), rad/s
+    acceleration: Floats  # shape (n, 6), rad/s^2
+    position_m: Floats  # shape (n, 3), of the tip, base frame
+    R_base_tip: Floats  # shape (n, 3, 3)
     twist: Floats
 
 
@@ -270,14 +285,19 @@ def reference_of(model: UrModel, tip_m: float, trajectory: Trajectory, dt: float
 class Tip(NamedTuple):
     """The tip (n, 3) at n configurations, base frame, and the flange's axes (n, 3, 3), z to the tip."""
 
-    position_m: Floats
-    R_base_tip: Floats
+    position_m: Floats  # shape (n, 3)
+    R_base_tip: Floats  # shape (n, 3, 3), the flange's axes; z points along the needle to its tip
     J: Floats
     """Shape (n, 6, 6): tip velocity (m/s), then angular velocity (rad/s), from joint speeds (rad/s)."""
 
 
 def tips(model: UrModel, tip_m: float, q: Floats) -> Tip:
-    """The tip and its Jacobian."""
+    """The tip and its Jacobian.
+
+    Args:
+        tip_m: Flange to tip, along the flange's z.
+        q: Shape (n, 6), rad.
+    """
     frames, J = np.empty((len(q), 7, 4, 4)), np.empty((len(q), 6, 6))
     link_frames(model.lengths, np.array(q, order="C"), frames)
     jacobians(frames, J)
@@ -294,22 +314,22 @@ TIP_LINK = "needle"
 class Measured(NamedTuple):
     """A controller's measurements at one step: encoders (6,), rad, rad/s; contact force at the tip (3,), base frame."""
 
-    q: Floats
-    speed: Floats
-    force_n: Floats
+    q: Floats  # shape (6,), rad, what the encoders say
+    speed: Floats  # shape (6,), rad/s
+    force_n: Floats  # shape (3,), of contact at the tip, base frame
 
 
 class Torques(NamedTuple):
     """Joint torques (6,), N m, for the next step, the motors off."""
 
-    torque_nm: Floats
+    torque_nm: Floats  # shape (6,)
 
 
 class Goals(NamedTuple):
     """Goals of the position motors: encoders (6,), rad, and rad/s."""
 
-    q: Floats
-    speed: Floats
+    q: Floats  # shape (6,), rad, encoders
+    speed: Floats  # shape (6,), rad/s
 
 
 class Controller(Protocol):
@@ -324,8 +344,8 @@ class Controller(Protocol):
 class Push(NamedTuple):
     """A force (3,) on the rigid needle, and the point (3,) of its shaft where it acts, base frame."""
 
-    force_n: Floats
-    point_m: Floats
+    force_n: Floats  # shape (3,), base frame
+    point_m: Floats  # shape (3,), base frame
 
 
 Resistance = Callable[[Tip], Sequence[Push]]
@@ -337,9 +357,9 @@ class Run:
     """Records of a run, a row a step: encoders (n, 6), rad, at its start, and the force (n, 3) of the step before."""
 
     dt: float
-    q: Floats
-    tip_m: Floats
-    force_n: Floats
+    q: Floats  # shape (n, 6), rad, encoders
+    tip_m: Floats  # shape (n, 3), true tip, base frame
+    force_n: Floats  # shape (n, 3), N, on the tip
     stopped: bool
 
 
@@ -413,7 +433,14 @@ class RigidModel:
 
 @contextmanager
 def rigid_model(model: UrModel, tool: Tool, down_base: Floats) -> Iterator[RigidModel]:
-    """Open the model of an arm, and close it again."""
+    """Open the model of an arm, and close it again.
+
+    Args:
+        down_base: Shape (3,), unit vector of gravity in the controller's base frame: any mount is a direction.
+
+    Raises:
+        InputError: There is no body of that arm.
+    """
     T_base_root = model_urdf(model).T_base_root
     with physics_client(down=T_base_root[:3, :3].T @ down_base) as client:
         # T_world_urdf = T_world_base T_base_urdf = identity

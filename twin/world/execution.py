@@ -29,12 +29,12 @@ class Touch(NamedTuple):
 class Execution:
     """Records of an execution, m rows: q (m, 6), rad, is true angle minus offset; speeds are over every step."""
 
-    times_s: Floats
-    q_command: Floats
+    times_s: Floats  # shape (m,), of each record, from the first command
+    q_command: Floats  # shape (m, 6), rad, commanded joints
     q: Floats
-    T_base_flange: Floats
+    T_base_flange: Floats  # shape (m, 4, 4), mm, true pose of the flange
     touches: tuple[Touch, ...]
-    max_speed: Floats
+    max_speed: Floats  # shape (6,), rad/s, over every step
 
 
 class Recorder:
@@ -69,7 +69,12 @@ class Recorder:
 
 
 def execute(workcell: SimulatedWorkcell, q_command: Floats, joint_offsets: Floats) -> Execution:
-    """Move the arm by its position motors from rest at the first command (n, 6) through all, one a physics step."""
+    """Move the arm by its position motors from rest at the first command through all of them, one a physics step.
+
+    Args:
+        q_command: Shape (n, 6), rad, spaced by the physics time step.
+        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
+    """
     arm, recorder = workcell.arm, Recorder(workcell, q_command, joint_offsets, TIME_STEP_S)
     speeds = np.gradient(q_command, TIME_STEP_S, axis=0) if len(q_command) > 1 else np.zeros_like(q_command)
     arm.place(q_command[0] + joint_offsets)
@@ -88,9 +93,9 @@ def joined(first: Execution, then: Execution) -> Execution:
 
 
 def touches(workcell: SimulatedWorkcell, time_s: float = 0.0) -> tuple[Touch, ...]:
-    """Contacts of the last physics step with bodies that have a name, at most one for each link and body, in order.
+    """Contacts of the last physics step with bodies that have a name (pads of markers have none), in order.
 
-    Bullet takes the arm's links as the convex hulls of their meshes.
+    At most one for each link and body. Bullet takes the arm's links as the convex hulls of their meshes.
     """
     arm, deepest = workcell.arm, dict[tuple[int, int], float]()
     for point in pybullet.getContactPoints(bodyA=arm.body, physicsClientId=arm.client):

@@ -38,6 +38,15 @@ def open_workcell(
     """Build the workcell, yield it, and take it down.
 
     The needle's shaft passes the skin without resistance; its holder and the arm collide with it.
+
+    Args:
+        model: A UR3, UR5 or UR10.
+        skin: The patient's surface, CT frame, mm.
+        T_base_ct: Where the patient lies, shape (4, 4), mm.
+        down_ct: Unit vector of gravity in the CT frame, shape (3,).
+
+    Raises:
+        InputError: There is no body of that arm.
     """
     with physics_client(down=T_base_ct[:3, :3] @ down_ct) as client:
         arm = load_arm(client, model, tool)
@@ -126,6 +135,10 @@ def pinhole_picture(
     """An image of the workcell by a calibrated camera, without its lens's distortion, (height, width, 3), RGB.
 
     For looking at, not for measuring: the renderer samples pixel corners and has no anti-aliasing.
+
+    Args:
+        K: Intrinsic matrix, shape (3, 3), px; pixel centres at integers.
+        T_camera_world: Shape (4, 4), mm; the camera's x right, y down, z forward.
     """
     width, height = size
     left, right = -(K[0, 2] + 0.5) / K[0, 0], (width - 0.5 - K[0, 2]) / K[0, 0]

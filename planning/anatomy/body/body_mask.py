@@ -112,7 +112,7 @@ class CtImage:
     hu: NDArray[Any]
     """Shape (nx, ny, nz), Hounsfield units of `measured_hu`, axes running to the left, back and head; of 16 bits where
     the file has such, else of single precision."""
-    T_ct_index: Floats
+    T_ct_index: Floats  # shape (4, 4), voxel index to LPS mm
     where: Path
     shown: Shown = PATIENT
     as_stored: NDArray[Any] | None = None
@@ -172,11 +172,14 @@ def body_mask(
     unscanned: Bools | None = None,
     at: Ints | None = None,
 ) -> BodyMask:
-    """The patient, or the phantom, in a CT (nx, ny, nz) of `measured_hu`, axis 2 along the patient.
+    """The patient, or the phantom, in a CT.
 
-    Threshold, opening, largest part (or the one with the voxel ``at``) without the table that touches it, and all
-    others that look like a limb; then air that each encloses in an axial slice is filled, and air at the image's border
-    that does not look like the room's.
+    Threshold, opening, largest part without the table that touches it, and all others that look like a limb; then air
+    that each encloses in an axial slice is filled, and air at the image's border that does not look like the room's.
+
+    Args:
+        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
+        at: Shape (3,), a voxel of the part that is meant, where that need not be the largest.
 
     Raises:
         InputError: No body, an implausibly small one, or no air around it.
@@ -265,7 +268,9 @@ def thick_parts(mask: Bools, spacing_mm: Floats, at: Ints | None = None) -> Iter
 def nearest_parts(mask: Bools, radius_mm: float, spacing_mm: Floats, most_mm: float = np.inf) -> Ints32:
     """Number the parts of a mask into which a ball fits, 1 the largest, and what lies nearest to each; 0 elsewhere.
 
-    Beyond its border it goes on; ``most_mm`` is how far from where the ball's middle may lie.
+    Args:
+        mask: Shape (nx, ny, nz); beyond its border it goes on.
+        most_mm: So far from where the ball's middle may lie.
     """
     reach = np.ceil(radius_mm / spacing_mm).astype(int)
     padded = np.pad(mask, [(r, r) for r in reach], mode="edge")

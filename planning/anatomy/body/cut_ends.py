@@ -77,9 +77,9 @@ class Content:
     """
 
     shape: tuple[int, int, int]
-    T_ct_index: Floats
+    T_ct_index: Floats  # shape (4, 4), voxel index to LPS mm
     last: NDArray[np.int64]
-    area_mm2: Floats
+    area_mm2: Floats  # shape (3, 2), how much that is
     thick: Bools
     wide: Bools
 

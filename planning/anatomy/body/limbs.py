@@ -71,7 +71,7 @@ class LimbSearch(NamedTuple):
     """
 
     parts: Ints32
-    T_ct_index: Floats
+    T_ct_index: Floats  # shape (4, 4), LPS mm
     pieces: Callable[[int], tuple[Piece, ...]]
 
     def chosen(self, target_ct: Floats) -> tuple[int, ...]:

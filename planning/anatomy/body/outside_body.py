@@ -57,10 +57,10 @@ RIM_MM = 50.0
 class OutsideImage:
     """A CT (nx, ny, nz), HU, its body, and what was not measured; axes running to the left, back and head."""
 
-    hu: NDArray[Any]
+    hu: NDArray[Any]  # shape (nx, ny, nz), Hounsfield units
     body: Bools
     unscanned: Bools
-    T_ct_index: Floats
+    T_ct_index: Floats  # shape (4, 4), voxel index to LPS mm
     spacing_mm: Floats
     slopes: tuple[float, float] = (0.0, 0.0)
     """How what lies there moves along axes 0 and 1 beyond the image's ends, mm per mm along the bed."""

@@ -190,9 +190,12 @@ def surface_ends(hu: NDArray[Any], body: Bools, level: float = 0.0) -> dict[Face
 def drawn_sides(
     surfaces: dict[Face, Floats], body: Bools, spacing_mm: Floats, *, touching: bool = True
 ) -> tuple[TableSide, ...]:
-    """The sides at which surfaces, as of `surface_ends`, end in one section along the bed, beyond a body's middle.
+    """The sides at which surfaces end in one section along the bed, beyond the middle of a body.
 
-    ``touching``: the body itself ends there; what is apart from it is known to a voxel.
+    Args:
+        surfaces: By face, as `surface_ends` gives them.
+        body: Shape (nx, ny, nz).
+        touching: Whether the body itself ends there, or what is apart from it: that is known to a voxel.
     """
     if body.shape[2] * spacing_mm[2] < LEAST_LENGTH_MM:
         return ()

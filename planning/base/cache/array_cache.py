@@ -58,7 +58,11 @@ class StoredFile(NamedTuple):
 
 
 def store(folder: Path, entry: StoredFile, content: bytes, most_bytes: int) -> None:
-    """Write an entry, whole or not at all (OSError, InputError where it cannot be); then make the folder fit again."""
+    """Write an entry, whole or not at all (OSError, InputError where it cannot be); then make the folder fit again.
+
+    Raises:
+        OSError, InputError: The folder cannot be written to.
+    """
     if len(content) > most_bytes:
         return
     path = folder / entry.file
@@ -239,7 +243,11 @@ NO_CACHE = Cache(None)
 
 
 def user_cache() -> Cache:
-    """This user's: ``$PUNCTURE_TWIN_CACHE``, else ``puncture-twin`` in ``$XDG_CACHE_HOME`` or ``~/.cache``."""
+    """This user's: ``$PUNCTURE_TWIN_CACHE``, else ``puncture-twin`` in ``$XDG_CACHE_HOME`` or ``~/.cache``.
+
+    Raises:
+        InputError: ``$PUNCTURE_TWIN_CACHE_MB`` is no number.
+    """
     named = os.environ.get(FOLDER_VARIABLE)
     if named is not None:
         return Cache(Path(named) if named else None, _most_bytes())

@@ -32,7 +32,11 @@ ALLOWED = "a complete DICOM file"
 
 @contextmanager
 def refused_if_damaged(where: str | Path) -> Iterator[None]:
-    """One InputError for whatever the library raises for damaged values, and none of its warnings on the terminal."""
+    """One InputError for whatever the library raises for damaged values, and none of its warnings on the terminal.
+
+    Raises:
+        InputError: The library could not read the file.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

@@ -102,6 +102,9 @@ def decoded_frames(data: Dataset, where: str, *, raw: bool) -> Iterator[NDArray[
         data: An image whose sizes have been checked.
         where: The file.
         raw: Stored values as they are; else luminance and chrominance become RGB.
+
+    Raises:
+        InputError: A transfer syntax that no installed decoder reads, or pixels that are damaged.
     """
     syntax = data.file_meta.TransferSyntaxUID
     decoder = _decoder(syntax, where)

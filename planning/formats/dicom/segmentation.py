@@ -61,6 +61,9 @@ def parse_segmentation(path: Path, file: str, content: Content, ct: CtSeries | N
     Args:
         file: The file's key in ``content``.
         ct: The CT on which it was drawn, where that is DICOM too: masks lie on its grid where they fit it.
+
+    Raises:
+        InputError: No segmentation, one that cannot be trusted, or one of another frame of reference.
     """
     data = dicom_file.parse_dicom(content(file), path)
     where = path.name

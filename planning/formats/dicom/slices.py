@@ -65,6 +65,9 @@ def slices_of(data: Dataset, file: str, frames: int) -> list[Slice]:
 
     Args:
         frames: How many images it holds.
+
+    Raises:
+        InputError: A position, an axis, a spacing or a rescaling is missing, contradictory or not in Hounsfield units.
     """
     if sop_class_of(data, where=file) == CLASSIC_CT:
         if frames != 1:
@@ -189,7 +192,12 @@ class Stack:
 
 
 def stack_of(slices: Sequence[Slice], where: Path) -> Stack:
-    """The stack that slices make."""
+    """The stack that slices make.
+
+    Raises:
+        InputError: Fewer than two, other orientations or pixel sizes, several at one place, a step that is missing, or
+            uneven steps; the slices are named.
+    """
     if len(slices) < 2:
         refuse(f"{len(slices)} slice", where, "a series of at least 2 slices", "too_few_slices")
     first = slices[0]

@@ -58,6 +58,10 @@ def parse_structure_set(path: Path, file: str, content: Content, ct: CtSeries) -
 
     Args:
         file: The file's key in ``content``.
+
+    Raises:
+        InputError: No structure set, one that cannot be trusted, of another frame of reference, or with contours that
+            lie off the CT's slices.
     """
     data = dicom_file.parse_dicom(content(file), path)
     where = path.name

@@ -52,6 +52,9 @@ def mask_files(folder: Path, known: Callable[[Path], bool], *, where: str | Path
     Args:
         known: Whether a path in it is something else that the case names.
         where: The file and key that name the folder, for errors.
+
+    Raises:
+        InputError: No folder, no mask in it, too many, two of one structure, or entries that would be passed over.
     """
     allowed = f"a folder of 1 to {MAX_MASKS} masks ({', '.join(MASK_ENDINGS)}), one per structure"
     if not is_folder(folder):

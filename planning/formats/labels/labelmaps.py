@@ -82,7 +82,12 @@ class LabelMap:
 
 
 def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
-    """The label map that a volume is, in LPS mm; one with background only may be the mask of an organ not there."""
+    """The label map that a volume is, in LPS mm; one with background only may be the mask of an organ not there.
+
+    Raises:
+        InputError: Values that are negative, not whole or above ``MAX_LABEL``; a map with background only; segment
+            names that contradict each other.
+    """
     names = segment_names(volume.fields, volume.path)
     labels, rounded_by = whole_labels(volume.values, volume.path)
     if not may_be_empty and not labels.any():
@@ -91,7 +96,12 @@ def labelmap_of(volume: Volume, *, may_be_empty: bool = False) -> LabelMap:
 
 
 def whole_labels(values: NDArray[Any], path: Path) -> tuple[NDArray[np.integer], float]:
-    """Voxels as whole numbers, and how far they were off, at most: `ROUNDED_BY`; a blended map has its own code."""
+    """Voxels as whole numbers, and how far they were off, at most: `ROUNDED_BY`; a blended map has its own code.
+
+    Raises:
+        InputError: Values that are negative, too large, or farther from whole numbers than `ROUNDED_BY`; those of a map
+            that was blended by an interpolation have a code of their own.
+    """
     low, high = values.min(), values.max()
     if low < -ROUNDED_BY or high > MAX_LABEL:
         refuse(f"values from {low} to {high} are not labels", path, ALLOWED, "no_labels")
@@ -164,6 +174,9 @@ def label_mesh(labelmap: LabelMap, label: int, *, where: str | Path) -> Triangle
 
     A label that touches the border of the volume is closed there, on the outer face of its border voxels. The
     result does not depend on the axis order or the flips in which the map is stored.
+
+    Raises:
+        InputError: If no voxel has this label.
     """
     box = labelmap.boxes.get(label)
     if box is None:

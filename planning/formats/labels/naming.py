@@ -144,6 +144,9 @@ def names_for(naming: str | None, folder: Path, content: Callable[[str], bytes],
         naming: ``"totalsegmentator-v1"``, ``"totalsegmentator-v2"``, the path of a table of names (CSV,
             JSON, ITK-SNAP's or Slicer's list), or None or ``"seg.nrrd"`` for the names that a .seg.nrrd holds.
         content: Gives the bytes of a table by its path.
+
+    Raises:
+        InputError: An unknown naming, a map without names of its own, or a table that cannot be used.
     """
     allowed = f"{', '.join(BUILT_IN)}, a table of names ({', '.join(NAME_ENDINGS)}), or a .seg.nrrd with names"
     if naming is None or naming == OWN_NAMES:
@@ -181,6 +184,11 @@ def select(
         avoid: Pattern to margin in mm.
         unknown: Patterns of structures of which it is unknown whether a path may cross them.
         all_named: Whether ``names`` holds every name that can occur, so that a pattern of none is a slip.
+
+    Raises:
+        InputError: A label present that has no name or that no pattern names, one that two equally specific patterns of
+            different kinds name, a pattern that matches no name although all are known, or a margin that is negative or
+            not finite.
     """
     free = ([(one, 0.0) for one in listed] for listed in (traverse, target, ignore))
     tables = zip(RuleKind, (avoid.items(), unknown.items(), *free), strict=True)

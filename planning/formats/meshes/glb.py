@@ -181,7 +181,11 @@ _VERTEX_BYTES, _TRIANGLE_BYTES = 12, 3
 
 
 def read_glb(data: bytes, where: str) -> RawMesh:
-    """The triangles of a GLB file's scene, in the unit of the file and its axes, y up by the standard (section 3.4)."""
+    """The triangles of a GLB file's scene, in the unit of the file and its axes, y up by the standard (section 3.4).
+
+    Raises:
+        InputError: If it is cut, contradicts itself, or uses what is not supported.
+    """
     written, binary = _chunks(data, where)
     document = _parse(written, where)
     if not document.asset.version.startswith("2."):

@@ -193,6 +193,9 @@ def read_mesh(
         unit: The unit of its coordinates.
         space_is_default: Whether a patient space that the file states holds instead of ``space``.
         up: Its axis that is up in the file; without it, z of all but GLB.
+
+    Raises:
+        InputError: If it is missing, cut, contradicts itself or the caller, is empty, or fails the guard.
     """
     _reader(path)  # an unknown ending is refused before anything is read
     data = read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path))

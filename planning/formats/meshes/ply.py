@@ -56,7 +56,11 @@ _Columns = dict[str, NDArray[Any] | _Lists]
 
 
 def read_ply(data: bytes, where: str) -> RawMesh:
-    """The faces of a PLY file; polygons are cut into fans, other elements are passed over."""
+    """The faces of a PLY file; polygons are cut into fans, other elements are passed over.
+
+    Raises:
+        InputError: If header and data do not fit each other, or there are no faces.
+    """
     elements, body = _split(data, where)
     cursor = _Cursor(body, where)
     vertices: NDArray[np.float64] | None = None

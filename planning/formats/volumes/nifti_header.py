@@ -62,6 +62,9 @@ def parse_nifti_header(content: bytes, path: Path) -> volume_header.VolumeHeader
 
     Where sform and qform are both given they must agree, so that it does not matter which one a program takes
     (SimpleITK takes the sform if its code is 1, else the qform).
+
+    Raises:
+        InputError: Whatever is wrong with the header.
     """
     compressed = path.name.lower().endswith(".gz")
     head = content[:HEADER_BYTES]

@@ -156,7 +156,11 @@ def parse_layered_header(content: bytes, path: Path) -> VolumeHeader:
 
 
 def is_layered(content: bytes, path: Path) -> bool:
-    """Whether a file has a fourth axis, of layers: one of Slicer's segmentations whose segments overlap."""
+    """Whether a file has a fourth axis, of layers: one of Slicer's segmentations whose segments overlap.
+
+    Raises:
+        InputError: No NRRD header.
+    """
     return _without_last(split_header(content, path)).fields.get("dimension") == "4"
 
 
@@ -197,7 +201,11 @@ def _header(raw: NrrdText, path: Path, layers: int = 1) -> VolumeHeader:
 
 
 def data_file(content: bytes, path: Path) -> str | None:
-    """The name of the file beside a detached header that holds its data; None where header and data are one file."""
+    """The name of the file beside a detached header that holds its data; None where header and data are one file.
+
+    Raises:
+        InputError: A damaged header, or data elsewhere than in the file or beside it.
+    """
     raw = split_header(content, path)
     return None if raw.data_path == path else raw.data_path.name
 

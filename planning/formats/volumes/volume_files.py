@@ -60,7 +60,11 @@ class Volume(Shown):
 
 
 def data_file(content: bytes, path: Path) -> str | None:
-    """The name of the file beside this one that holds its voxels; None for a volume in one file."""
+    """The name of the file beside this one that holds its voxels; None for a volume in one file.
+
+    Raises:
+        InputError: A header that is damaged, or names data elsewhere.
+    """
     return nrrd_header.data_file(content, path) if path.name.lower().endswith(NRRD_ENDINGS) else None
 
 
@@ -73,6 +77,9 @@ def read_volume(path: Path) -> Volume:
     """A volume from .nii, .nii.gz, .nrrd, .nhdr (data beside it) or .seg.nrrd, in LPS mm.
 
     NIfTI is RAS and turned here; NRRD says its space. Units of metre and micrometre in NIfTI become mm.
+
+    Raises:
+        InputError: Anything wrong with the file; nothing else comes out, whatever its bytes.
     """
     if not is_plain_file(path):
         refuse(f"the file {absence(path)}", path, "a volume file", "no_such_file")

@@ -91,6 +91,9 @@ def check_affine(T_ct_index: NDArray[np.float64], *, where: Path) -> NDArray[np.
 
     Args:
         T_ct_index: Shape (4, 4), maps voxel index to mm.
+
+    Raises:
+        InputError: Named: not finite, zero or singular, implausible spacing, sheared, implausible origin.
     """
     T = np.array(T_ct_index, dtype=np.float64)
     if not np.isfinite(T).all():
@@ -164,6 +167,9 @@ def inflated(content: memoryview, promised: int, *, where: Path) -> NDArray[np.u
 
     Returns:
         Shape (promised,).
+
+    Raises:
+        InputError: Damaged, truncated, or of another length.
     """
     if promised > len(content) * DEFLATE_RATIO:
         what = f"{len(content)} compressed bytes cannot hold the {promised} bytes that the header states"
@@ -216,6 +222,9 @@ def decoded(content: memoryview, header: VolumeHeader) -> NDArray[Any]:
 
     Returns:
         Shape (ni, nj, nk), axis i running fastest in memory; (layers, ni, nj, nk) where there are several layers.
+
+    Raises:
+        InputError: The data are damaged, or shorter or longer than the header says.
     """
     cells, where = header.cells, header.data_path
     data, count = content[cells.start :], header.count * header.layers

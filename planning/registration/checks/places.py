@@ -289,6 +289,10 @@ def place_warnings(
 
     They say in words where the base is, and have no other reading that could be meant, so they are not refused: without
     an arm the verdicts are about the organs alone, and with one nothing is reached from there.
+
+    Args:
+        skin: CT frame.
+        T_base_ct: Shape (4, 4), mm.
     """
     place = base_place(case, skin, T_base_ct, memory)
     if what := place.impossible or place.unlikely:

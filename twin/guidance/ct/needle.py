@@ -108,7 +108,15 @@ def read_needle(
     planned: tuple[Floats, Floats] | None = None,
     markers: Floats | None = None,
 ) -> tuple[FoundNeedle, tuple[Finding, ...]]:
-    """Read the one needle that enters a body; another is reported, and none is guessed. At markers (n, 3) is none.
+    """Read the one needle that enters a body; another is reported, and none is guessed.
+
+    Args:
+        volume: The CT.
+        target_ct: Shape (3,), LPS mm, for what is said of a tip that is not seen.
+        diameter_mm: Of the needle.
+        inside: Which points lie in the body.
+        planned: Tip and unit direction (3,) of the plan, which may tell one needle from another.
+        markers: Shape (n, 3), where markers lie: what is seen there is no needle.
 
     Raises:
         InputError: No needle, two of which none is plainly the plan's, a tip outside of the image, at other metal, or

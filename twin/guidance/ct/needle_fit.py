@@ -93,7 +93,7 @@ class Line(NamedTuple):
 class FoundNeedle(NamedTuple):
     """A needle in a CT, LPS mm."""
 
-    tip_ct: Floats
+    tip_ct: Floats  # shape (3,)
     forward_ct: Floats
     """Shape (3,), unit, the direction in which it ends."""
     width_mm: float
@@ -126,7 +126,12 @@ class FoundNeedle(NamedTuple):
         return float(np.sqrt(np.linalg.eigvalsh(self.cov_ct[3:, 3:])[-1]))
 
     def moved(self, T_b_ct: Floats, cov_T: Floats | None = None) -> FoundNeedle:
-        """The needle in frame b; cov_T (6, 6) is of that motion at the moved tip, shift (mm) and rotation (rad)."""
+        """The needle in another frame.
+
+        Args:
+            T_b_ct: Shape (4, 4).
+            cov_T: Shape (6, 6), of that motion at the moved tip, shift (mm) and rotation (rad), axes of b.
+        """
         R = np.kron(np.eye(2), T_b_ct[:3, :3])
         path = apply(T_b_ct, self.path_ct)
         covs = R @ self.covs_ct @ R.T + (0.0 if cov_T is None else carried_along(path, cov_T))
@@ -146,12 +151,12 @@ class _Seen(NamedTuple):
     """Shape (3, 3), rows: the needle's direction, and two across it."""
     local: Floats
     """Shape (n, 3), mm, in these axes from where the needle begins."""
-    parts: Floats
+    parts: Floats  # shape (n,), of metal
     slices: Ints
     """Shape (n,), in which slice each lies."""
     thick: Floats
     """Shape (3,), from one slice to the next, in these axes."""
-    bends: Floats
+    bends: Floats  # shape (4, 2), the curve through what is seen, as `_about` has it
     length: float
     """Of the needle, mm."""
 

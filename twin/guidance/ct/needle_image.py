@@ -47,7 +47,7 @@ class CurveImage(NamedTuple):
     """Shape (3, 3), mm², in these axes: the assumed blur in the image's plane, which is fitted, and"""
     fixed: Floats
     """the same, of one layer of a slice and of the needle's own width."""
-    layers: Floats
+    layers: Floats  # shape (m, 3), mm, in these axes: where a slice's layers lie, once for each half of the needle
     diameter_mm: float
     full: float
     """Part of metal from which a voxel is clipped."""

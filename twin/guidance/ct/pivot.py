@@ -37,10 +37,19 @@ WORST_FACTOR = 30.0
 
 
 def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, *, where: str) -> None:
-    """Refuse touches that no tip near the stated one brings to one place; the flange's axes (n, 3, 3) are columns.
+    """Refuse touches that no tip near the stated one brings to one place.
 
     A tip that is wrong by d parts two touches of one place by 2 sin(angle / 2) d at most, with the angle between the
     two needles, and by twice d where the flange turns about them.
+
+    Args:
+        names: Of the n touches.
+        tips_base: Shape (n, 3), mm: where the stated tip was.
+        axes_base: Shape (n, 3, 3): the flange's axes as columns.
+        where: What the error names.
+
+    Raises:
+        InputError: Two of them are farther apart.
     """
     worst, two = 0.0, (0, 0)
     for i, j in combinations(range(len(names)), 2):
@@ -61,11 +70,11 @@ def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, 
 class Pivot:
     """A calibrated tip, flange frame, and its place, base frame; mm."""
 
-    tip_flange: Floats
-    place_base: Floats
+    tip_flange: Floats  # shape (3,), mm, in the flange frame
+    place_base: Floats  # shape (3,), mm: where it stood
     cov_tip: Floats
     """Shape (3, 3), mm^2, from all that is declared."""
-    misses_mm: Floats
+    misses_mm: Floats  # shape (n,): the distance of each tip from their place
     expected_mm: float
     """Rms of the misses as declared touch noise leaves it; `expected_whole_mm` with the arm's errors too."""
     expected_whole_mm: float
@@ -109,7 +118,17 @@ def pivot_calibration(
 
 
 def arm_covariance(errors: ErrorModel, model: UrModel, tip_mm: float, q: Floats) -> Floats:
-    """Covariance (3 n, 3 n), mm^2, of n touches of one place by all that is declared but touch noise and the tip."""
+    """Covariance of n touches of one place by all that is declared but touch noise and the tip itself.
+
+    Args:
+        errors: As declared.
+        model: The arm.
+        tip_mm: Flange to tip.
+        q: Shape (n, 6), rad.
+
+    Returns:
+        Shape (3 n, 3 n), mm^2.
+    """
     noise = reading_noise(errors, model, tip_mm, q, known=True)
     variances = noise.eta_variances.copy()
     variances[PARAMETERS["tip_offset"]] = variances[PARAMETERS["needle_direction"]] = 0.0

@@ -93,8 +93,8 @@ class Body:
     sample: Sample
     organs: Sample
     markers: NamedPoints | None
-    marker_cov: Floats
-    target_ct: Floats
+    marker_cov: Floats  # shape (3, 3), mm², of their reading in the case's CT
+    target_ct: Floats  # shape (3,), where the tie must be known
 
 
 def body_of(
@@ -109,7 +109,7 @@ def body_of(
 class Tie:
     """Where the case's frame lies in a scan."""
 
-    T_scan_ct: Floats
+    T_scan_ct: Floats  # shape (4, 4)
     cov_ct: Floats
     """Shape (6, 6), of its inverse at the target: shift (mm) and rotation (rad), axes of the case."""
     target_ct: Floats

@@ -50,8 +50,8 @@ class TouchReading(NamedTuple):
     """
 
     name: str
-    point_base: Floats
-    q: Floats
+    point_base: Floats  # shape (3,), mm: what the controller computes from its joints
+    q: Floats  # shape (6,), rad: its joints
     seconds: float
     force_n: float
     aside_mm: float
@@ -98,8 +98,8 @@ def touch_tour(tour: TouchTour, arm: TouchingArm, checkers: ApproachCheckers, pr
 class _Line(NamedTuple):
     """Joints (m, 6), rad, from the standoff to where the slow part begins, and (k, 6) from there past the marker."""
 
-    far: Floats
-    near: Floats
+    far: Floats  # shape (m, 6), rad: from the standoff to where the slow part begins
+    near: Floats  # shape (k, 6): from there past the believed marker
     aside_mm: float
 
 

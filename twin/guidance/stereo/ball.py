@@ -141,7 +141,7 @@ TUKEY = 4.685
 class Circle(NamedTuple):
     """A circle in the stereographic plane, in radians of view near its origin."""
 
-    center: Floats
+    center: Floats  # shape (2,)
     radius: float
 
 
@@ -199,7 +199,14 @@ def _through(triples: Floats) -> tuple[Floats, Floats]:
 
 
 def refit(points: Floats, scales: Floats, start: Circle, tolerance_px: float) -> Refit:
-    """Least squares of the edges' distances with Tukey's weights, from a start near the answer; arguments as above."""
+    """Least squares of the edges' distances with Tukey's weights, from a start near the answer.
+
+    Args:
+        points: Shape (n, 2), edges in the stereographic plane.
+        scales: Shape (n,), px per radian across the outline.
+        start: From ``consensus``.
+        tolerance_px: The spread is not believed to be larger than this.
+    """
     center, radius = np.array(start.center), start.radius
     spread, floor = tolerance_px, 1e-3
     for _ in range(REFIT_ROUNDS):
@@ -254,8 +261,8 @@ MODEL_PX = 0.014
 class DetectedBall(NamedTuple):
     """A detected ball: the projection of its centre, px, and the edges of `SPOKES` on it, 0 for Hough alone."""
 
-    pixel: Floats
-    covariance: Floats
+    pixel: Floats  # shape (2,): the projection of the ball's centre, px
+    covariance: Floats  # shape (2, 2), px^2
     inliers: int
 
 
@@ -355,7 +362,7 @@ class _Fitted(NamedTuple):
 
     spokes: Spokes
     covariance: Floats
-    on_circle: Bools
+    on_circle: Bools  # shape (n,): whose edge lies on the circle
     contrast: float
 
 
@@ -413,7 +420,12 @@ MOST = 8
 
 
 def find_circles(grey: NDArray[np.uint8], radius_px: float) -> Floats:
-    """Centres (n, 2), px, best first, of circles of about a radius, by OpenCV's gradient method (Yuen et al. 1990)."""
+    """Circles of about a radius, by the gradient method of OpenCV (Yuen et al. 1990).
+
+    Args:
+        grey: Shape (h, w).
+        radius_px: As predicted.
+    """
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
     circles = cv2.HoughCircles(
         smooth,
@@ -441,7 +453,7 @@ class Search(NamedTuple):
     """Search region of a ball: the camera as it is believed, the ball predicted at (3,), mm, and its radius."""
 
     camera: Camera
-    predicted_c: Floats
+    predicted_c: Floats  # shape (3,), mm
     radius_mm: float
     search_px: float
 

@@ -105,6 +105,10 @@ class Camera:
         """Radius of the circle as large as a ball's outline: sqrt of the two half axes' product, px.
 
         A ball of radius R at distance D fills a cone of half angle asin(R / D); the local scale takes it to pixels.
+
+        Args:
+            point_c: The ball's centre, shape (3,), mm.
+            radius_mm: The ball's radius.
         """
         toward = np.asarray(point_c, dtype=np.float64) - self.center_c
         distance = float(np.linalg.norm(toward))

@@ -44,7 +44,7 @@ CONVERGED_MM = 1e-9
 class Points(NamedTuple):
     """Points (n, 3) in C, mm, NaN where a camera had no pixel; covariance (n, 3, 3), mm^2, from the pixels' alone."""
 
-    points_c: Floats
+    points_c: Floats  # shape (n, 3), mm; NaN where a camera had no pixel
     covariance: Floats
 
 
@@ -194,7 +194,7 @@ class CameraCalibration:
     """A refined camera, its residuals (n, 2), found minus predicted, and its covariance (14, 14), zero where fixed."""
 
     camera: Camera
-    residuals_px: Floats
+    residuals_px: Floats  # shape (n, 2), found minus predicted
     covariance: Floats
 
     @property

@@ -63,10 +63,10 @@ class Observed:
     errors: ServoErrors
     q_command: Floats
     pixels: Floats
-    pixel_covariance: Floats
+    pixel_covariance: Floats  # shape (c, s, 2, 2), px^2
     measured_c: Floats
     marker_pixels: Floats
-    marker_covariance: Floats
+    marker_covariance: Floats  # shape (c, n, 2, 2), px^2
     markers_m: Floats
 
 
@@ -75,7 +75,7 @@ class Guess(NamedTuple):
 
     T_c_base: Floats
     T_c_m: Floats
-    balls_c: Floats
+    balls_c: Floats  # shape (s, 3)
 
 
 class Unknowns(NamedTuple):
@@ -89,8 +89,8 @@ class Unknowns(NamedTuple):
     base: Floats
     arm: Floats
     head: Floats
-    markers_m: Floats
-    balls_c: Floats
+    markers_m: Floats  # shape (n, 3), mm
+    balls_c: Floats  # shape (s, 3), mm
 
     def vector(self) -> Floats:
         """All unknowns as one vector, shape (N,)."""
@@ -271,10 +271,10 @@ class Offset(NamedTuple):
     ``covariance`` is that of target minus ball; less than the sum where both err together.
     """
 
-    ball_c: Floats
-    target_c: Floats
-    ball_covariance: Floats
-    target_covariance: Floats
+    ball_c: Floats  # shape (3,), mm
+    target_c: Floats  # shape (3,), mm
+    ball_covariance: Floats  # shape (3, 3), mm^2
+    target_covariance: Floats  # shape (3, 3), mm^2
     covariance: Floats
 
     def rms_mm(self) -> float:
@@ -349,7 +349,7 @@ class RodPoses(NamedTuple):
 
     ball: Floats
     slopes: Floats
-    R_base_flange: Floats
+    R_base_flange: Floats  # shape (s, 3, 3)
 
 
 def rod_poses(rod: CarriedRod, eta: Floats, q: Floats) -> RodPoses:
@@ -449,7 +449,13 @@ def servoed_error(found: Adjusted, stay: int, target_m: Floats) -> NeedleError:
 
 
 def open_loop_error(found: Adjusted, q_command: Floats, target_m: Floats) -> NeedleError:
-    """The needle's error where the arm is sent, joints (6,), rad, without an image; target as the image has it."""
+    """The needle's error where the arm is sent without an image.
+
+    Args:
+        found: The joint estimate of what was measured before.
+        q_command: Shape (6,), rad.
+        target_m: Shape (3,), mm, as the image has it.
+    """
     rod = _Flange.of(found, q_command)
     Jq = rod.arrival_slopes
     arrival = found.model.observed.errors.arrival**2 * Jq @ Jq.T
@@ -463,8 +469,8 @@ class _Flange:
     ``rows`` (6, N) are by the unknowns, ``arrival_slopes`` (6, 6) per rad of each joint.
     """
 
-    ball_c: Floats
-    R_c_flange: Floats
+    ball_c: Floats  # shape (3,), mm
+    R_c_flange: Floats  # shape (3, 3)
     rows: Floats
     arrival_slopes: Floats
 

@@ -91,7 +91,7 @@ class Step(NamedTuple):
     ``position_only``: whether some piece gave the orientation up.
     """
 
-    q_path: Floats
+    q_path: Floats  # shape (m, 6), rad: from the arm's configuration; one row where it may not move
     stop: ServoStop | None
     position_only: bool
 
@@ -101,7 +101,7 @@ class CarriedRod(NamedTuple):
 
     model: UrModel
     rod_mm: float
-    R_base_flange: Floats
+    R_base_flange: Floats  # shape (3, 3): the orientation to keep
 
 
 def ball_base(rod: CarriedRod, q: Floats) -> Floats:
@@ -171,7 +171,12 @@ def _piece(rod: CarriedRod, q: Floats, move: Floats, joints: int) -> tuple[Float
 
 
 def damped(J: Floats, goal: Floats) -> Floats:
-    """Damped least squares J^T (J J^T + lambda^2 I)^-1 goal; lambda grows from 0 where sigma_min is below its limit."""
+    """Damped least squares J^T (J J^T + lambda^2 I)^-1 goal; lambda grows from 0 where sigma_min falls below its limit.
+
+    Args:
+        J: Shape (m, n), m <= n, scaled.
+        goal: Shape (m,).
+    """
     sigma = float(np.linalg.svd(J, compute_uv=False)[-1])
     squared = DAMPING**2 * max(0.0, 1.0 - (sigma / MIN_SIGMA) ** 2)  # lambda^2
     return np.asarray(J.T @ np.linalg.solve(J @ J.T + squared * np.eye(len(J)), goal))
@@ -189,7 +194,7 @@ CONVERGED = 1e-12
 class SeenMarkers(NamedTuple):
     """Markers as triangulated by the cameras: points (n, 3), mm, covariances (n, 3, 3), mm^2."""
 
-    points_c: Floats
+    points_c: Floats  # shape (n, 3), mm
     covariances: Floats
 
 
@@ -203,7 +208,7 @@ class Mapping:
 
     T_c_m: Floats
     covariance: Floats
-    center_c: Floats
+    center_c: Floats  # shape (3,), the markers' centre, mm
     residuals: Floats
     conditioning: Conditioning
 
@@ -296,7 +301,7 @@ class Posture(NamedTuple):
     An arm's errors differ from branch to branch by millimetres, so what was calibrated on one is to be used on it.
     """
 
-    q: Floats
+    q: Floats  # shape (n, 6), rad
     branch: int
 
 
@@ -391,7 +396,7 @@ class Servoed:
 
     stop: ServoStop
     visits: tuple[Visit, ...]
-    q_command: Floats
+    q_command: Floats  # shape (6,), rad: the last command
     detail: str = ""
     position_only: bool = False
 
@@ -412,7 +417,12 @@ class Servoed:
 
 
 def servo(task: Task, q_command: Floats, look: Look, arm: Arm) -> Servoed:
-    """Move the ball onto the target: look, measure the error, move a step; until it converges or must stop."""
+    """Move the ball onto the target: look, measure the error, move a step; until it converges or must stop.
+
+    Args:
+        q_command: Shape (6,), rad: where the arm was sent.
+        arm: Moves the ball.
+    """
     visits: list[Visit] = []
     position_only = False
 

@@ -284,8 +284,8 @@ class JointGuide(Guide):
 class ImageReading(NamedTuple):
     """Markers (n, 3) and targets (k, 3) as they are read in the CT, image frame, mm."""
 
-    markers_m: Floats
-    targets_m: Floats
+    markers_m: Floats  # shape (n, 3), mm
+    targets_m: Floats  # shape (k, 3), mm
 
 
 class Mapped(NamedTuple):
@@ -383,8 +383,11 @@ def follow(
 ) -> Iterator[dict[str, Any]]:
     """What a session's looks at the ball say, stop by stop, as plain values: mm and degrees; None of a lost ball.
 
-    ``T_base_c`` is as calibrated, targets (k, 3), mm, are as in the image; a stop is a target's name, and joints (6,),
-    rad.
+    Args:
+        T_base_c: Shape (4, 4), mm, as calibrated.
+        targets_m: Shape (k, 3), mm, in the image.
+        stops: Name of the target, and joints (6,), rad.
+        arm: Moves to each.
     """
     rod, limits, last, radius = carried_rod(case), step_limits(case), "", case.file.target.hit_radius_mm
     for name, q in stops:
@@ -423,7 +426,7 @@ class RecordedTable(NamedTuple):
     """One table of a recording: the first column's names, and what follows them, (n, k)."""
 
     names: tuple[str, ...]
-    values: Floats
+    values: Floats  # shape (n, k): what follows the name
 
 
 @dataclass

@@ -65,7 +65,14 @@ class Touching(StrEnum):
 
 
 def between_arms(case: SelfcalCase, T_end1_image: Floats, T_base1_base2: Floats, clearance_mm: float) -> BetweenArms:
-    """Both arms of a case, with the probe's head and the needle's arm where they are, to stay a clearance apart."""
+    """Both arms of a case, with the probe's head and the needle's arm where they are.
+
+    Args:
+        case: Arms, probe and needle.
+        T_end1_image: Where the probe's head is, shape (4, 4), mm.
+        T_base1_base2: Where the needle's arm stands, shape (4, 4), mm.
+        clearance_mm: How far apart they must stay.
+    """
     head = head_body(head_pose(case, T_end1_image), np.array(case.content.probe.head_mm), clearance_mm)
     tools = (probe_tool(case), needle_tool(case))
     return BetweenArms(case.models, tools, head, T_base1_base2, clearance_mm)
@@ -196,8 +203,8 @@ class CandidatePoses(NamedTuple):
     needle about itself.
     """
 
-    q_probe: Floats
-    q_needle: Floats
+    q_probe: Floats  # shape (n, 6), rad
+    q_needle: Floats  # shape (n, 6), rad
     poses: Recording
     roll: Floats
     counts: dict[str, int]

@@ -134,7 +134,7 @@ class _Seen(NamedTuple):
 
     P: Floats
     v: Floats
-    shaft_mm: Floats
+    shaft_mm: Floats  # shape (n,)
     missed: tuple[str, ...]
     warnings: tuple[str, ...]
 

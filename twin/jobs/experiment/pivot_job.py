@@ -148,8 +148,8 @@ class PivotTourRun:
 
     found: PivotRun
     seed: int
-    place_base: Floats
-    true_tip_flange: Floats
+    place_base: Floats  # shape (3,), mm: the place as it was planned
+    true_tip_flange: Floats  # shape (3,), mm
     touched: Touched
     files: tuple[Path, ...]
 

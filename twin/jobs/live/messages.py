@@ -203,7 +203,13 @@ def image_content(values: NDArray[np.uint16], first: tuple[float, float], step: 
 
 
 def mesh_content(points: Floats, cells: bytes, scalars: Mapping[str, NDArray[Any]]) -> bytes:
-    """Of a POLYDATA of quads (`quad_bytes`) with scalars."""
+    """Of a POLYDATA of quads with scalars.
+
+    Args:
+        points: Shape (p, 3).
+        cells: From `quad_bytes`.
+        scalars: Shape (p,) each, by name.
+    """
     count = len(cells) // (5 * 4)
     names = b"".join(name.encode() + b"\0" for name in scalars)
     head = MESH.pack(len(points), 0, 0, 0, 0, count, len(cells), 0, 0, len(scalars))

@@ -49,7 +49,7 @@ class RecordedState(NamedTuple):
     """The joints (6,), rad, at one time."""
 
     time_s: float
-    q: Floats
+    q: Floats  # shape (6,), rad
 
 
 def connect(host: str, command: str = "mirror") -> Receiver:

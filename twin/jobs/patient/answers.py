@@ -241,7 +241,7 @@ def registration_text(report: dict[str, Any]) -> str:
 
 
 def parse_noise(words: str | None) -> HandEyeNoise | None:
-    """The noise as it is typed, ``MM,DEG,MM,DEG``; None where nothing is."""
+    """The noise as it is typed, ``MM,DEG,MM,DEG``; None where nothing is. Raises InputError: It is not four numbers."""
     return None if words is None else noise_of([parse_coordinate(one.strip(), "--noise") for one in words.split(",")])
 
 

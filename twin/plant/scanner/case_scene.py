@@ -128,7 +128,7 @@ class CaseScene:
     outside_objects: tuple[Part, ...]
     markers: NamedPoints | None
     listed: NamedPoints | None
-    target: Floats
+    target: Floats  # shape (3,)
 
 
 def case_scene(

@@ -25,7 +25,7 @@ LEAST_LINES = 3
 class Cut(NamedTuple):
     """Mean value of each voxel (nx, ny, nz), and (layers, nx, ny, nz) the label at its centre; 0 for nothing."""
 
-    values: NDArray[np.float32]
+    values: NDArray[np.float32]  # shape (nx, ny, nz), float32, the mean over each voxel
     labels: NDArray[Any]
 
 
@@ -37,7 +37,12 @@ def cut_solids(
 
     Args:
         corners: Triangles of all solids, shape (m, 3, 3), in voxels: a voxel's centre has whole coordinates.
+        owners: Which solid each triangle belongs to, shape (m,).
         fills: Value of each solid, shape (n,); a later one fills the place of an earlier one.
+        labels: Of each solid in each label map, shape (layers, n); 0 where a map does not show it.
+        shape: Of the grid.
+        spacing_mm: Of the voxels, shape (3,); it says how many lines there are.
+        empty: Value where no solid is.
     """
     nx, ny, nz = shape
     lines, planes = (max(LEAST_LINES, 2 * int(np.ceil(mm / LINE_MM / 2)) + 1) for mm in spacing_mm[1:])

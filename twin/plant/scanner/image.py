@@ -47,7 +47,7 @@ class ScanSettings:
 class CtImage:
     """A scan, with its ground truth."""
 
-    hu: NDArray[np.int16]
+    hu: NDArray[np.int16]  # shape (nx, ny, nz), int16
     labels: NDArray[Any]
     """Shape (layers, nx, ny, nz): what is labelled at each voxel's centre, in each label map, and the parts of whole
     solids that the centres miss; `thin` counts these by the solid's name."""
@@ -115,7 +115,13 @@ def passed_voxels(corners: Floats, shape: tuple[int, int, int]) -> Ints:
 
 
 def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bools) -> Ints:
-    """Voxels (m, 3) that a structure passes though neither they nor neighbours have its label, nor they a later one."""
+    """Voxels that a structure passes while neither they nor their neighbours have its label, shape (m, 3).
+
+    Args:
+        labels: Shape (nx, ny, nz), what is labelled at each centre.
+        corners: Its triangles, shape (n, 3, 3), in voxels.
+        later: Shape (largest label + 1,), which labels fill the place of this one: their voxels are not missed.
+    """
     shape = (labels.shape[0], labels.shape[1], labels.shape[2])
     at = passed_voxels(corners, shape)
     if not len(at):

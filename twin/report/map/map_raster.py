@@ -33,8 +33,8 @@ HATCHES, HATCH_LEAST = 80, 5  # lines across the picture, and pixels between two
 class MapRaster:
     """The square picture of the cap, (n, n, 4), clear outside the grid; and each pixel's candidate, (n, n), or -1."""
 
-    rgba: NDArray[np.uint8]
-    rows: NDArray[np.int64]
+    rgba: NDArray[np.uint8]  # shape (n, n, 4), transparent outside the grid
+    rows: NDArray[np.int64]  # shape (n, n), the candidate under each pixel's centre, -1 outside the grid
 
 
 class ClearanceScale(NamedTuple):
@@ -116,7 +116,7 @@ SAME = 1e-6
 class ShownFront(NamedTuple):
     """The candidates (k,) that get a dot, best rank first, and of how many different directions on the front."""
 
-    rows: Ints
+    rows: Ints  # shape (k,), the candidates that get one, best rank first
     of: int
 
     @property

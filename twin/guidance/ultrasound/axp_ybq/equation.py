@@ -207,7 +207,7 @@ class SeenDirection(NamedTuple):
     """
 
     V: Floats
-    agrees: Bools
+    agrees: Bools  # shape (n,)
     spread_rad: float
     lean_rad: float
     reversed: Bools
@@ -238,6 +238,11 @@ def agreed_direction(estimate: Estimate, recording: Recording, kept: Bools) -> S
 
     An axis alone does not say which way it points. The tip lies ahead of the flange, and where it lies along the
     needle that says it; else most of the directions do.
+
+    Args:
+        estimate: R_X, R_Y and t_Q.
+        recording: With directions.
+        kept: Shape (n,): poses whose tip is trusted; only these make the mean.
 
     Raises:
         InputError: The directions have no common axis, or most of them point from the tip to the hub.
@@ -319,8 +324,8 @@ def direction_from_plane(estimate: Estimate, recording: Recording) -> Floats:
 class Linearised(NamedTuple):
     """Residuals (n, k), and their derivatives (n, k, 19) by `PARAMETERS`."""
 
-    residuals: Floats
-    jacobian: Floats
+    residuals: Floats  # shape (n, k)
+    jacobian: Floats  # shape (n, k, 19), by the parameters of ``parameters.PARAMETERS``
 
 
 def linearised_tip(estimate: Estimate, recording: Recording) -> Linearised:
@@ -638,6 +643,10 @@ def flange_slopes(estimate: Estimate, recording: Recording, v_image: Floats | No
     A motion is a shift and a turn about the flange's origin, along the axes of the arm's own base:
     dF = -(dt_A - [R_A p1]x dw_A) + R_Y (dt_B - [R_B t_Q]x dw_B), p1 = R_X S p + t_X, and of the direction
     dm = (R_A R_X)^T [R_Y R_B V]x dw_A - (R_A R_X)^T R_Y [R_B V]x dw_B.
+
+    Args:
+        estimate: Where to linearise.
+        v_image: The measured directions, unit, shape (n, 3), where they are used.
     """
     n, size = len(recording), 3 if v_image is None else 5
     R_A, R_B = recording.A[:, :3, :3], recording.B[:, :3, :3]

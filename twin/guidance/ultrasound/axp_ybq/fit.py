@@ -66,9 +66,9 @@ def whitener(sigma: Floats, weights: Floats) -> Floats:
 class Whitening(NamedTuple):
     """C^-1/2: the whitener of each pose alone (n, k, k), S (n k, m) or None, and V diag(1 / (s (s + 1))) V^T (m, m)."""
 
-    own: Floats
-    shared: Floats | None
-    inner: Floats
+    own: Floats  # whitener of each pose alone, shape (n, k, k)
+    shared: Floats | None  # s, shape (n k, m); None where nothing is shared
+    inner: Floats  # v diag(1 / (s (s + 1))) V^T, shape (m, m)
 
     @classmethod
     def of(cls, sigma: Floats, slopes: Floats | None, weights: Floats) -> Whitening:
@@ -97,8 +97,8 @@ class RobustFit(NamedTuple):
     """A fit, and the poses whose tip and whose direction it used, each of shape (n,)."""
 
     estimate: Estimate
-    tip_kept: Bools
-    direction_kept: Bools
+    tip_kept: Bools  # shape (n,): the tip of this pose was used
+    direction_kept: Bools  # shape (n,): its direction was used
     iterations: int
 
 
@@ -480,7 +480,7 @@ class SmallSample(NamedTuple):
     ``freedom``: of Fisher's F's denominator. ``factor``: what e^T C^-1 e / p is multiplied by to follow that F.
     """
 
-    covariance: Floats
+    covariance: Floats  # shape (p, p), with the uncertainty of the noise in it
     freedom: float
     factor: float
 

@@ -178,8 +178,8 @@ class PoseChange(NamedTuple):
     """
 
     reference: str
-    probe_turn_image: Floats
-    tip_shift_mm: Floats
+    probe_turn_image: Floats  # shape (3,), rad: rotation vector of the probe about the tip, axes of the image
+    tip_shift_mm: Floats  # shape (2,): where the tip goes in the image
     insertion_change: float
     needle_roll: float
     A: Floats

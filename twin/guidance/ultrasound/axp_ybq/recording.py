@@ -56,7 +56,7 @@ class Recording(Shown):
 
     A: Floats
     """T_base1_end1, shape (n, 4, 4), mm: flange of the probe's arm; B: T_base2_end2, flange of the needle's arm."""
-    B: Floats
+    B: Floats  # t_base2_end2, shape (n, 4, 4), mm: flange of the needle's arm
     P: Floats
     """The tip in the image, shape (n, 2), mm (pixels where ``pixels`` is set: mm per pixel is to be found); shape (n,
     3), mm, where a volume or a camera measures it out of a plane too."""
@@ -69,7 +69,7 @@ class Recording(Shown):
     q_probe: Floats | None = None
     """Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; those of the needle's arm in
     ``q_needle``; None where they were not recorded: errors of the arms are then not told from noise."""
-    q_needle: Floats | None = None
+    q_needle: Floats | None = None  # joints of the needle's arm, shape (n, 6), rad
     turn_probe: Floats | None = None
     """Direction of each probe joint's last rotation before it stopped, shape (n, 6): 1, -1, or 0 where nobody knows;
     the needle's in ``turn_needle``. None where they were not recorded: the play's sign is then unknown."""
