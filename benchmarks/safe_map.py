@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.shared import REPOSITORY, least_seconds, options, real_ct, versions
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.case.entry import Directions, grid
-from puncture_twin.planning.clearance.engine import measure
+from puncture_twin.planning.clearance.engine import measure_clearances
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.verdict_map import VerdictMap
 from puncture_twin.planning.reach.standoff import case_axis_lengths
@@ -42,7 +42,7 @@ def differing(
     """How many verdicts of one structure are not the engine's."""
     found = VerdictMap(target, directions.grid, directions.outward_ct, R)
     found.add(engine, 0, one, lengths, 0.0)
-    axes = measure(engine, (one,), target, directions.outward_ct, length=lengths[:, None], radius=0.0)
+    axes = measure_clearances(engine, (one,), target, directions.outward_ct, length=lengths[:, None], radius=0.0)
     return int((found.free == axes.violated[:, 0]).sum())
 
 
@@ -86,7 +86,7 @@ def of_case(context: CaseContext, rng: np.random.Generator) -> tuple[int, int]:
     for target in targets(context, rng):
         directions = random_grid(rng, R, rng.choice(STEPS_DEG))
         lengths = case_axis_lengths(case, context.anatomy, directions.outward_ct)
-        axes = measure(context.engine, checked, target, directions.outward_ct, length=lengths, radius=radius)
+        axes = measure_clearances(context.engine, checked, target, directions.outward_ct, length=lengths, radius=radius)
         for column, one in enumerate(checked):
             found = VerdictMap(target, directions.grid, directions.outward_ct, R)
             found.add(context.engine, column, one, lengths[:, column], radius)
@@ -106,7 +106,7 @@ def times(name: str, context: CaseContext) -> None:
     def whole() -> None:
         engine._placed = None
         radius, outward = case.needle.radius_mm, directions.outward_ct
-        measure(engine, anatomy.checked, case.target_ct, outward, length=lengths, radius=radius)
+        measure_clearances(engine, anatomy.checked, case.target_ct, outward, length=lengths, radius=radius)
 
     ours = least_seconds(lambda: first_blocking(case, anatomy, engine, directions), 7)
     theirs = least_seconds(whole, 3)

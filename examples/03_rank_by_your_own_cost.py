@@ -17,7 +17,7 @@ SMOOTHED_MM = 0.5
 
 
 class SmoothedEngine(FastEngine):
-    """Clearance to surfaces that may lie nearer than they are drawn: any class that keeps `ClearanceEngine` will do."""
+    """Clearance to surfaces that may lie nearer than they are drawn: any class that implements `ClearanceEngine`."""
 
     def measure(self, target_ct, outward_ct, length, *, shown=True):
         """The exact distances, less what smoothing may have taken."""

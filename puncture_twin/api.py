@@ -128,10 +128,10 @@ def prepare(case: Case | Path | str, *, arm: bool | None = None, engine: str | E
 
     Args:
         case: A case, such as ``load_case(...).replace(...)``, its file, or the folder that holds ``case.toml``.
-        arm: Whether a candidate must be reachable too; None asks it where the case says where the robot's base is.
-        engine: Who measures clearance: ``fast``, ``fcl`` (the plain reference), or a class of your own that keeps the
-            protocol `puncture_twin.planning.clearance.engine.ClearanceEngine`. The fast engine measures again what it
-            measures: where it finds more clearance than there is, the search ends with an error.
+        arm: Whether a candidate must be reachable too; None: where the case states the robot's base.
+        engine: Who measures clearance: ``fast``, ``fcl`` (the plain reference), or a class of your own that
+            implements the protocol `puncture_twin.planning.clearance.engine.ClearanceEngine`. Its distances are
+            compared with the fast engine's: where one is larger, the search ends with an error.
     """
     from puncture_twin.planning.search.context import prepare
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.clearance.engine import measure
+from puncture_twin.planning.clearance.engine import measure_clearances
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from tools.hostile_scenes import KINDS, HostileScene, make_scene
 from tools.plain_distance import Inside, distances, exact_distance, least_distances
@@ -107,7 +107,7 @@ def product_verdicts(engine: FastEngine, scene: HostileScene, outward: Floats, t
     """Whether the product says too close, shape (n,)."""
     radius = min(MAX_RADIUS_MM, threshold)
     structure = Structure("surface", Role.AVOID, threshold - radius, scene.mesh, "made")
-    found = measure(engine, (structure,), scene.target, outward, length=scene.length, radius=radius)
+    found = measure_clearances(engine, (structure,), scene.target, outward, length=scene.length, radius=radius)
     return found.violated[:, 0]
 
 

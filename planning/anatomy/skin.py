@@ -18,7 +18,7 @@ from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.formats.labels.labelmaps import LabelMap, box_in, frame, framed_surface, mask_surface
 from puncture_twin.planning.formats.volumes.volume_files import canonical
-from puncture_twin.planning.geometry.containment import settled_crossings
+from puncture_twin.planning.geometry.containment import consistent_crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, smooth_normals, split_at_creases
 from puncture_twin.planning.geometry.rigid import pose
 
@@ -170,12 +170,12 @@ class SkinPaths:
     reentry_depth: Floats
     """Shape (n,), where the needle would meet skin again, before where its flange waits."""
     unknown_depth: Floats
-    """Shape (n,), where the path leaves the body through a cut, or 0 where the skin's crossings do not add up."""
+    """Shape (n,), where the path leaves the body through a cut, 0 where crossings of a closed skin are inconsistent."""
 
 
 def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, farthest: float) -> SkinPaths:
     """Follow every path from the target (3,) outward along unit vectors (n, 3), as far as the flange can be, mm."""
-    found, settled = settled_crossings(skin.mesh, target_ct, outward_ct)
+    found, consistent = consistent_crossings(skin.mesh, target_ct, outward_ct)
     has = found.count > 0
     first = found.first[has]
     depth, face = np.full(len(outward_ct), np.nan), np.zeros(len(outward_ct), np.int64)
@@ -186,8 +186,8 @@ def skin_paths(skin: Skin, target_ct: Floats, outward_ct: Floats, farthest: floa
     reentry[reentry > farthest] = np.nan
     cut = has & skin.cut_faces[face]
     unknown = np.where(cut, depth, np.nan)
-    if skin.mesh.closed:
-        unknown[~settled] = 0.0
+    if skin.mesh.closed:  # of an open one inconsistent rays are not rejected: the case warns of it
+        unknown[~consistent] = 0.0
     depth[cut] = np.nan
     entry = target_ct + depth[:, None] * outward_ct
     cosine = np.abs(np.einsum("ij,ij->i", smooth_normals(skin.mesh, face, entry), outward_ct))

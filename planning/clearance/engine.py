@@ -127,7 +127,7 @@ class Clearances:
     """Shape (n, k), whether the clearance is less than the structure's margin; FCL decides ties."""
 
 
-def measure(
+def measure_clearances(
     engine: ClearanceEngine,
     structures: tuple[Structure, ...],
     target_ct: Floats,

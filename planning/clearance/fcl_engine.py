@@ -65,9 +65,9 @@ class FclEngine:
             touching = distance[:, column] <= 0
             distance[touching, column] = 0.0
             if touching.any():
-                own = lengths[touching, column]
-                first = first_crossing(mesh, target_ct, outward_ct[touching], float(own.max()))
-                depth[touching, column] = np.minimum(first, own)
+                lengths_here = lengths[touching, column]
+                first = first_crossing(mesh, target_ct, outward_ct[touching], float(lengths_here.max()))
+                depth[touching, column] = np.minimum(first, lengths_here)
         return AxisDistances(distance, depth, nearest)
 
     def distances(self, target_ct: Floats, outward_ct: Floats, length: float) -> Floats:
@@ -127,15 +127,15 @@ def _tree(vertices: Floats, faces: np.ndarray) -> fcl.BVHModel:
     return tree
 
 
-OWN_MM = 1e-3
-"""By so much an engine of one's own may measure more than there is: single precision, 0.5 m from the origin."""
+CUSTOM_TOLERANCE_MM = 1e-3
+"""By so much a distance of a custom engine may exceed the exact one: single precision, 0.5 m from the origin."""
 
 
 @dataclass(frozen=True, eq=False)
-class HeldEngine:
-    """An engine of one's own, held to an exact one: it may measure less than there is, and never more."""
+class VerifiedEngine:
+    """A custom engine, verified against an exact one: its distances may be smaller than the true ones, never larger."""
 
-    own: ClearanceEngine
+    custom: ClearanceEngine
     exact: ClearanceEngine
     """Measures the same axes again, and answers all else."""
 
@@ -155,30 +155,29 @@ class HeldEngine:
         """The lesser of both distances, at the exact engine's depths and triangles; see `ClearanceEngine`.
 
         Raises:
-            InputError: The own engine gives another shape, no number, or more than there is.
+            InputError: The custom engine gives another shape, no number, or more than there is.
         """
         exact = self.exact.measure(target_ct, outward_ct, length, shown=False)
-        own = np.asarray(self.own.measure(target_ct, outward_ct, length, shown=shown).distance)
-        name, allowed = type(self.own).__name__, "never more than there is"
-        if own.shape != exact.distance.shape:
-            refuse(f"distances of shape {own.shape}", name, f"{exact.distance.shape}", "wrong_shape")
-        wrong = ~(own <= exact.distance + OWN_MM)  # NaN too
+        distances = np.asarray(self.custom.measure(target_ct, outward_ct, length, shown=shown).distance)
+        name, allowed = type(self.custom).__name__, "never more than there is"
+        if distances.shape != exact.distance.shape:
+            refuse(f"distances of shape {distances.shape}", name, f"{exact.distance.shape}", "wrong_shape")
+        wrong = ~(distances <= exact.distance + CUSTOM_TOLERANCE_MM)  # NaN too
         if wrong.any():
             row, column = np.argwhere(wrong)[0]
-            what = (
-                f"measures {own[row, column]:.4g} mm to a structure that is {exact.distance[row, column]:.4g} mm away"
-            )
+            stated, away = distances[row, column], exact.distance[row, column]
+            what = f"measures {stated:.4g} mm to a structure that is {away:.4g} mm away"
             refuse(what, name, allowed, "engine_contradicted")
-        return AxisDistances(np.minimum(own, exact.distance), exact.depth, exact.nearest)
+        return AxisDistances(np.minimum(distances, exact.distance), exact.depth, exact.nearest)
 
     def collides(self, structure: int, target_ct: Floats, outward_ct: Floats, length: float, radius: float) -> bool:
         """Whether either engine finds a contact; see `ClearanceEngine`."""
         asked = structure, target_ct, outward_ct, length, radius
-        return self.exact.collides(*asked) or self.own.collides(*asked)
+        return self.exact.collides(*asked) or self.custom.collides(*asked)
 
-    def of(self, columns: Ints) -> HeldEngine:
+    def of(self, columns: Ints) -> VerifiedEngine:
         """Both engines for some of their structures; see `ClearanceEngine`."""
-        return HeldEngine(self.own.of(columns), self.exact.of(columns))
+        return VerifiedEngine(self.custom.of(columns), self.exact.of(columns))
 
 
 AGREE_MM = 1e-6

@@ -7,7 +7,7 @@ A needle of direction u from the target comes within r of a ball (centre c from 
 So each triangle visits only the directions of the grid in its own cone; those that are blocked already are passed by,
 and a block of 16 triangles in whose cone all are is passed by as a whole. A direction that is left is tested exactly,
 by the distance that the fast engine ends with (`segment_triangle`); within `NEAR_THRESHOLD_MM` of a limit the engine's
-`collides` decides, as in `engine.too_near`. So every verdict is that of `engine.measure`.
+`collides` decides, as in `engine.too_near`. So every verdict is that of `measure_clearances`.
 """
 
 from __future__ import annotations

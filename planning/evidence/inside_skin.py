@@ -24,7 +24,7 @@ from puncture_twin.planning.base.cache.array_cache import Cache
 from puncture_twin.planning.base.cache.entry_file import Arrays
 from puncture_twin.planning.base.errors import Finding, Severity
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.geometry.containment import crossings, settled_crossings
+from puncture_twin.planning.geometry.containment import consistent_crossings, crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, spread_on
 from puncture_twin.planning.geometry.parts import voxels_inside
 from puncture_twin.planning.geometry.triangle_distance import squared_distance
@@ -256,7 +256,7 @@ def _before_skin(points: Floats, skin: Skin) -> Bools:
     away = points - inner_ct
     distance = np.linalg.norm(away, axis=1)
     away[distance == 0] = (0.0, 0.0, 1.0)
-    found, _ = settled_crossings(skin.mesh, inner_ct, away / np.where(distance == 0, 1.0, distance)[:, None])
+    found, _ = consistent_crossings(skin.mesh, inner_ct, away / np.where(distance == 0, 1.0, distance)[:, None])
     before = found.ray[found.depth < distance[found.ray]]
     return np.bincount(before, minlength=len(points)) % 2 == 0
 

@@ -170,7 +170,7 @@ DOUBTFUL = 1e-12
 crossed is not known."""
 
 NUDGE = 1e-7
-"""Radians by which a ray through an edge or corner is rotated when its crossings do not add up."""
+"""Radians by which a ray through an edge or corner is rotated when its crossings are inconsistent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -440,7 +440,7 @@ def _along(p, u):  # type: ignore[no-untyped-def]  # numba infers
     return p[0] * u[0] + p[1] * u[1] + p[2] * u[2]
 
 
-def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
+def consistent_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) -> tuple[Crossings, Bools]:
     """Crossings of rays from inside a closed surface, and for which rays, shape (n,), they are consistent.
 
     Such a ray has an odd number of crossings. Where triangles are wound alike it comes out and goes in alternately: if
@@ -449,16 +449,16 @@ def settled_crossings(mesh: TriangleMesh, origin: Floats, directions: Floats) ->
     A ray through an edge or corner may count twice or touch without crossing; it is rotated by `NUDGE` and tried again.
     """
     found = crossings(mesh, origin, directions)
-    settled = _adds_up(mesh, found)
-    if mesh.closed and not settled.all():
+    consistent = _is_consistent(mesh, found)
+    if mesh.closed and not consistent.all():
         rotated = directions.copy()
-        rotated[~settled] = _rotated(directions[~settled])
+        rotated[~consistent] = _rotated(directions[~consistent])
         found = crossings(mesh, origin, rotated)
-        settled = _adds_up(mesh, found)
-    return found, settled
+        consistent = _is_consistent(mesh, found)
+    return found, consistent
 
 
-def _adds_up(mesh: TriangleMesh, found: Crossings) -> Bools:
+def _is_consistent(mesh: TriangleMesh, found: Crossings) -> Bools:
     """Which rays have an odd number of crossings and, on a closed surface wound alike, alternate out and in."""
     odd = found.count % 2 == 1
     if not (mesh.closed and mesh.wound_alike):

@@ -125,7 +125,7 @@ class ArmReach:
     """The arm in its workcell, as the check of candidates needs it, and where the patient is."""
 
     own_checker: Callable[[], CellChecker]
-    """Gives the thread that asks its checker: none is for several at once."""
+    """Returns the calling thread's own checker; checkers are not thread-safe."""
     T_base_ct: Floats
 
     @property

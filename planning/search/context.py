@@ -30,7 +30,7 @@ from puncture_twin.planning.case.case import Case, load_case
 from puncture_twin.planning.case.entry import Directions
 from puncture_twin.planning.clearance.engine import ClearanceEngine
 from puncture_twin.planning.clearance.fast_engine import FastEngine
-from puncture_twin.planning.clearance.fcl_engine import CrossChecked, FclEngine, HeldEngine, cross_check
+from puncture_twin.planning.clearance.fcl_engine import CrossChecked, FclEngine, VerifiedEngine, cross_check
 from puncture_twin.planning.collision.workcell import own_checker, with_surroundings
 from puncture_twin.planning.evidence.checks import findings
 from puncture_twin.planning.reach.standoff import axis_lengths, case_axis_lengths
@@ -50,14 +50,14 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError, pose_error
 ENGINES: Mapping[str, Callable[..., ClearanceEngine]] = MappingProxyType({"fast": FastEngine, "fcl": FclEngine})
 """Clearance engines by name: the fast exact engine, and FCL alone as the plain reference."""
 EngineChoice = str | Callable[..., ClearanceEngine]
-"""A name of `ENGINES`, or a class of one's own that is made of (meshes, progress) and keeps `ClearanceEngine`.
+"""A name of `ENGINES`, or a custom class, made of (meshes, progress), that implements `ClearanceEngine`.
 
-It is held to the fast engine (`HeldEngine`): it may find less clearance, and never more."""
+Its distances are verified against the fast engine's (`VerifiedEngine`): they may be smaller, and never larger."""
 
 COUNTED: Mapping[str, str] = MappingProxyType({"fast": "structures", "fcl": "directions"})
 """The unit of each engine's progress."""
-AT_BYTES = 2_000_000_000
-"""What a context keeps for other targets at most, from the first one on."""
+TARGET_CACHE_BYTES = 2_000_000_000
+"""Upper limit of the cache that a context shares with those that `at` makes of it for other targets."""
 NO_BASE = "the case does not state where the robot's base is"
 ALLOWED_BASE = "[registration] with markers or a transform, or [robot.mount]"
 
@@ -92,12 +92,12 @@ class CaseContext(Shown):
             yield "warning", warning
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """For another process: what was read; what answers is made there, since compiled libraries are not sent."""
-        return _answering, (self.case, self.anatomy, self.placement, self._engine_choice, self.reach is not None)
+        """For another process, which builds engine and checkers anew: compiled objects cannot be pickled."""
+        return _build_context, (self.case, self.anatomy, self.placement, self._engine_choice, self.reach is not None)
 
     @property
     def _engine_choice(self) -> EngineChoice:
-        kind = type(self.engine.own if isinstance(self.engine, HeldEngine) else self.engine)
+        kind = type(self.engine.custom if isinstance(self.engine, VerifiedEngine) else self.engine)
         return next((name for name, known in ENGINES.items() if kind is known), kind)
 
     def at(self, target_ct: ArrayLike) -> CaseContext:
@@ -296,10 +296,10 @@ def prepare(
                 LOG.warning(warning)
         check_tissues(case, anatomy)
         case.files.release()  # image and labels are read: their memory is given back
-    return _answering(case, anatomy, placement, engine, arm is not False, watcher, stages, cache)
+    return _build_context(case, anatomy, placement, engine, arm is not False, watcher, stages, cache)
 
 
-def _answering(
+def _build_context(
     case: Case,
     anatomy: Anatomy,
     placement: Placement | None,
@@ -311,14 +311,14 @@ def _answering(
 ) -> CaseContext:
     watcher, cache = watcher or Silent(), cache or user_cache()
     stages = stages or Stages(announce=partial(watcher.step, "stage"))
-    memory = Memory(AT_BYTES) if cache.memory is NO_MEMORY else cache.memory
+    memory = Memory(TARGET_CACHE_BYTES) if cache.memory is NO_MEMORY else cache.memory
     with stages.time("trees"):
         meshes = [structure.mesh for structure in anatomy.checked]
         count = partial(watcher.count, COUNTED[engine] if isinstance(engine, str) else COUNTED["fast"])
         clearance_engine: ClearanceEngine
         clearance_engine = FclEngine(meshes, count) if engine == "fcl" else FastEngine(meshes, count, cache.memory)
         if not isinstance(engine, str) and engine is not FastEngine:
-            clearance_engine = HeldEngine(engine(meshes, count), clearance_engine)
+            clearance_engine = VerifiedEngine(engine(meshes, count), clearance_engine)
         reach = None
         if arm and placement is not None:
             T_base_ct = placement.T_base_ct

@@ -23,7 +23,7 @@ from puncture_twin.planning.base.reasons import REASON_TEXT, Reason
 from puncture_twin.planning.base.text import plural
 from puncture_twin.planning.breathing.breathing import Breathing, fraction_within
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.clearance.engine import ClearanceEngine, Clearances, measure
+from puncture_twin.planning.clearance.engine import ClearanceEngine, Clearances, measure_clearances
 from puncture_twin.planning.collision.workcell import GANTRY, OF_CASE_FILE, case_checker
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import pose
@@ -189,7 +189,7 @@ class BreathingBody:
             columns = np.flatnonzero((shifts_ct == shift).all(axis=1) & moved)
             structures, length = tuple(checked[column] for column in columns), self.lengths[np.ix_(rows, columns)]
             target, outward, part = self.case.target_ct + shift, candidates.outward_ct[rows], self.engine.of(columns)
-            at = measure(part, structures, target, outward, length=length, radius=radius)
+            at = measure_clearances(part, structures, target, outward, length=length, radius=radius)
             clearance[:, columns], depth[:, columns], violated[:, columns] = at.clearance, at.depth, at.violated
         return Clearances(clearance, depth, violated)
 

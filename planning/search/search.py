@@ -16,7 +16,7 @@ from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import Directions
-from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine, measure
+from puncture_twin.planning.clearance.engine import AxisDistances, ClearanceEngine, measure_clearances
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.verdict_map import VerdictMap
 from puncture_twin.planning.geometry.containment import contains, crossings
@@ -85,7 +85,9 @@ def organ_candidates(
     paths = case_paths(case, anatomy.skin, outward)  # where each path crosses the skin, and at which angle
     tissue = tissue_crossed(checked, case.target_structure, case.target_ct, outward, paths.path_length)
     lengths = axis_lengths(case, checked, paths.path_length, paths.skin_angle)  # how far out each axis is checked
-    clearances = measure(engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm, axes=axes)
+    clearances = measure_clearances(
+        engine, checked, case.target_ct, outward, length=lengths, radius=needle.radius_mm, axes=axes
+    )
     demanding, count = np.array([s.demands_margin for s in checked], bool), len(directions)
     candidates = Candidates(  # a straight needle, the patient as the CT shows them
         theta=directions.theta,
@@ -144,7 +146,9 @@ def first_blocking(case: Case, anatomy: Anatomy, engine: ClearanceEngine, direct
     lengths = np.full((len(outward), len(anatomy.checked)), case.needle.length_mm)
     lengths[free] = axis_lengths(case, anatomy.checked, paths.path_length, paths.skin_angle)
     if not fast:
-        broken = measure(engine, anatomy.checked, case.target_ct, outward, length=lengths, radius=radius).violated
+        broken = measure_clearances(
+            engine, anatomy.checked, case.target_ct, outward, length=lengths, radius=radius
+        ).violated
         return Blocking(np.where(broken.any(axis=1), broken.argmax(axis=1), -1).astype(np.int32), enters)
     for number, structure in enumerate(anatomy.surroundings, start=len(body)):
         verdict_map.add(engine, number, structure, lengths[:, number], radius)

@@ -19,7 +19,7 @@ import numpy as np
 from puncture_twin.planning.anatomy.skin import SkinPaths, skin_paths
 from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.planning.base.strict_json import or_null
-from puncture_twin.planning.clearance.engine import Clearances, measure, normals_of
+from puncture_twin.planning.clearance.engine import Clearances, measure_clearances, normals_of
 from puncture_twin.planning.registration.fits import carried_along
 from puncture_twin.planning.search.constraints import first_broken
 from puncture_twin.planning.search.context import CaseContext
@@ -125,7 +125,9 @@ def _nearest(context: CaseContext, path_ct: Floats, covs_ct: Floats, starts: Flo
         last = row == len(sizes) - 1
         length = max(case.needle.length_mm - starts[row], sizes[row]) if last else sizes[row]
         axes = engine.measure(begin, outward[None], np.full((1, k), length), shown=False)
-        own = measure(engine, checked, begin, outward[None], length=length, radius=case.needle.radius_mm, axes=axes)
+        own = measure_clearances(
+            engine, checked, begin, outward[None], length=length, radius=case.needle.radius_mm, axes=axes
+        )
         normal = normals_of(engine.triangles, begin, outward[None], axes)
         surface = np.sqrt(np.einsum("nka,kab,nkb->nk", np.nan_to_num(normal), surfaces, np.nan_to_num(normal)))
         bare, whole = (

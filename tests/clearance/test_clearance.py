@@ -5,7 +5,7 @@ import pytest
 from oracles import units
 
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.clearance.engine import measure
+from puncture_twin.planning.clearance.engine import measure_clearances
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 
@@ -19,7 +19,7 @@ def organ(mesh, margin=0.0, role=Role.AVOID):
 
 def clearances(mesh, target, directions, *, radius=0.6, margin=0.0, role=Role.AVOID):
     """Measured by FCL."""
-    return measure(
+    return measure_clearances(
         FclEngine([mesh]),
         (organ(mesh, margin, role),),
         np.asarray(target, float),

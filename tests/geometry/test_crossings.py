@@ -7,10 +7,10 @@ from oracles import ray_crossings
 
 from puncture_twin.planning.geometry.containment import (
     Side,
+    consistent_crossings,
     contains,
     crossings,
     inside_each,
-    settled_crossings,
     side_of,
     winding_number,
 )
@@ -207,7 +207,7 @@ def test_the_first_crossing_is_the_way_out_or_nothing_is_settled(solids, ways, s
     mesh = soup_of(*(solid[:, ::-1] if turned else solid for solid in solids))
     directions = np.array([[0.01, -1.0, 0.02], [-0.1, -1.0, 0.03]])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    found, adds_up = settled_crossings(mesh, np.zeros(3), directions)
+    found, adds_up = consistent_crossings(mesh, np.zeros(3), directions)
     assert mesh.closed and mesh.wound_alike
     assert adds_up.tolist() == [settled] * 2
     assert found.sense.tolist() == [-way if turned else way for way in ways] * 2
@@ -226,7 +226,7 @@ def test_a_sliver_that_closes_a_gap_does_not_say_where_a_ray_leaves(rng, height)
         mesh = TriangleMesh(np.concatenate([points, middle[None]]), faces)
         toward = rng.dirichlet([1, 1, 1], 200) @ mesh.vertices[[a, b, new]]
         directions = toward / np.linalg.norm(toward, axis=1, keepdims=True)
-        found, settled = settled_crossings(mesh, np.zeros(3), directions)
+        found, settled = consistent_crossings(mesh, np.zeros(3), directions)
         assert mesh.closed and mesh.wound_alike
         assert found.count[settled].max() == 1
         depth = found.depth[found.first[settled]]

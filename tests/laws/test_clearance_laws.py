@@ -6,7 +6,7 @@ from oracles import PlainEngine, ray_crossings, segment_mesh_distance, units
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.anatomy.structure import Role, Structure
-from puncture_twin.planning.clearance.engine import measure
+from puncture_twin.planning.clearance.engine import measure_clearances
 from puncture_twin.planning.clearance.fast_engine import FastEngine
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
@@ -238,7 +238,9 @@ def aimed(rng, mesh, count):
 def verdicts(engine, mesh, target, directions, *, radius=0.6, margin=0.0):
     """Clearance and violation, structure by structure, as the search has them."""
     structures = (Structure("organ", Role.AVOID, margin, mesh, "test"),)
-    return measure(engine([mesh]), structures, np.asarray(target, float), directions, length=LENGTH, radius=radius)
+    return measure_clearances(
+        engine([mesh]), structures, np.asarray(target, float), directions, length=LENGTH, radius=radius
+    )
 
 
 def test_thicker_needles_and_wider_margins_never_free(judged, mesh, rng):

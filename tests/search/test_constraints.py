@@ -10,7 +10,7 @@ from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.anatomy.unseen import beyond_image
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.settings import Needle
-from puncture_twin.planning.clearance.engine import measure
+from puncture_twin.planning.clearance.engine import measure_clearances
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.search.constraints import first_broken
@@ -24,7 +24,7 @@ def verdict(skin, structures=(), direction=UP, needle=NEEDLE):
     direction = np.asarray(direction, float).reshape(-1, 3)
     paths = skin_paths(skin, target, direction, needle.length_mm)
     engine = FclEngine([s.mesh for s in structures])
-    found = measure(engine, structures, target, direction, length=needle.length_mm, radius=needle.radius_mm)
+    found = measure_clearances(engine, structures, target, direction, length=needle.length_mm, radius=needle.radius_mm)
     rated = first_broken(paths, found, structures, needle=needle, max_skin_angle=np.radians(60.0))
     return str(rated.reason[0]), str(rated.structure[0]), rated.depth[0], rated.amount[0]
 

@@ -33,9 +33,9 @@ from puncture_twin.twin.guidance.ultrasound.recording_file import read_recording
 from puncture_twin.twin.plant.simulated_recording import simulate_recording
 from puncture_twin.twin.plant.ultrasound_workcell import draw_workcell
 
-ROOMS = 12
+ROOMS = 16
 """A covariance that is a third too small, or a half too large, moves the mean of e^T C^-1 e / p out of its bounds: 18
-parameters leave a room a standard deviation of .33, the mean of twelve .10."""
+parameters leave a room a standard deviation of .33, the mean of sixteen .08."""
 PICTURED = 3
 """Rooms of rendered pictures, a second and a half each: their mean of e^T C^-1 e / p is known to .19."""
 ALL = active_columns(scale=False, direction=True)
