@@ -131,7 +131,7 @@ def test_a_program_that_is_itself_imported_can_be_interrupted(tmp_path, monkeypa
     (tmp_path / "started_by_import.py").write_text(
         "import signal, time\nfrom puncture_twin.twin.jobs.exit_codes import exit_code_of\n"
         "def command():\n    signal.raise_signal(signal.SIGINT)\n    time.sleep(20)\n"
-        "began = time.monotonic()\ncode = exit_code_of(command, print)\nseconds = time.monotonic() - began\n"
+        "began = time.monotonic()\ncode = exit_code_of(command, str)\nseconds = time.monotonic() - began\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     started = __import__("started_by_import")
