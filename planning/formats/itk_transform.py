@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Collection
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -252,20 +253,25 @@ def hdf5_transforms(content: bytes, where: str) -> list[StatedTransform]:
             if _GROUP not in file:
                 refuse(f"HDF5 without {_GROUP}", where, ALLOWED, "wrong_format")
             parent = own(file, _GROUP, h5py.Group)
-            if not 0 < len(parent) <= MAX_PARTS + 1:
-                what = f"{len(parent)} transforms"
-                refuse(what, where, f"1, or at most {MAX_PARTS} parts of a CompositeTransform", "wrong_count")
-            names = [str(number) for number in range(len(parent))]
-            if set(parent) != set(names):
-                what = f"{_GROUP} with {', '.join(sorted(parent))[:60]}"
-                refuse(what, where, f"transforms numbered {', '.join(names)}", "wrong_format")
-            groups = [own(parent, name, h5py.Group) for name in names]
+            groups = [own(parent, name, h5py.Group) for name in _numbered(parent, where)]
             return [
                 StatedTransform(text(one, _TYPE), numbers(one, _PARAMETERS), numbers(one, _FIXED)) for one in groups
             ]
     except _DAMAGED as error:
         what = f"not a complete HDF5 file ({str(error)[:120]})"
         raise InputError(what, where=where, allowed=ALLOWED, code="file_damaged") from error
+
+
+def _numbered(parent: Collection[str], where: str) -> list[str]:
+    """The names of a file's transforms, ``0``, ``1``, ...: all that its group holds."""
+    if not 0 < len(parent) <= MAX_PARTS + 1:
+        allowed = f"1, or at most {MAX_PARTS} parts of a CompositeTransform"
+        refuse(f"{len(parent)} transforms", where, allowed, "wrong_count")
+    names = [str(number) for number in range(len(parent))]
+    if set(parent) != set(names):
+        what = f"{_GROUP} with {', '.join(sorted(parent))[:60]}"
+        refuse(what, where, f"transforms numbered {', '.join(names)}", "wrong_format")
+    return names
 
 
 def heap_text(content: bytes, offset: int | None) -> str:

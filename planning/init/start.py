@@ -20,6 +20,7 @@ from puncture_twin.planning.evidence.target import readings_inside
 from puncture_twin.planning.formats.points import NamedPoints
 from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.containment import Side, side_of
+from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.spaces import Space, point_text
 from puncture_twin.planning.init import segmentation
 from puncture_twin.planning.init.case_text import CaseParts, case_text
@@ -91,16 +92,7 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     seen, of_seen = _seen_in_ct(request.folder, found, ct, skin)
     progress("structures")
     if point is not None and ct is not None:
-        grid = ct.surfaces.source.grid
-
-        def in_body(one: Floats) -> bool:
-            return grid.holds(one) and side_of(skin.mesh, one) is not Side.OUTSIDE
-
-        if not in_body(point):
-            place = "the body in" if grid.holds(point) else "the CT"
-            hint = readings_inside(point, space, in_body)
-            what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
-            refuse(what, "--target", OUTSIDE_WAYS, "target_outside_body")
+        _refuse_outside(point, space, ct, skin.mesh)
     stated = dict(overrides.roles) | ({} if own is None else {own.name: "skin"})
     gone = frozenset(name for name, kind in stated.items() if kind != "unknown")
     outlines = segmentation.Outlines(found.segmentations, skin, gone)
@@ -135,6 +127,20 @@ def start_case(request: Request, cache: Cache, progress: Names) -> Start:
     notes = [*_notes(request, found, target.notes, parts, holding), *of_seen]
     notes += segmentation.carved_notes(parts.rows, holding.target, border)
     return Start(case_text(parts), parts, (*notes, *outlines.notes(target.point_ct)), seen)
+
+
+def _refuse_outside(point: Floats, space: Space, ct: Ct, skin: TriangleMesh) -> None:
+    """Refuse a typed target that the CT or its body does not hold."""
+    grid = ct.surfaces.source.grid
+
+    def in_body(one: Floats) -> bool:
+        return grid.holds(one) and side_of(skin, one) is not Side.OUTSIDE
+
+    if not in_body(point):
+        place = "the body in" if grid.holds(point) else "the CT"
+        hint = readings_inside(point, space, in_body)
+        what = f"target ({point_text(point, space)}) lies outside {place} {ct.source}{hint}"
+        refuse(what, "--target", OUTSIDE_WAYS, "target_outside_body")
 
 
 def _checked(

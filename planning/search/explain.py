@@ -97,29 +97,7 @@ class Explanation(Shown):
 
     def summary(self) -> dict[str, Any]:
         """Plain values for JSON: mm and degrees; null where there is no number."""
-        row, found, insertion = self.candidates, self.candidates.breathing, self.insertion
-        optional: dict[str, Any] = {}
-        if self.case.errors is not None:
-            optional["chances"] = None if self.breakdown is None else self.breakdown.summary()
-        if row.deflection is not None:
-            optional["bending"] = {
-                "deflection_bound_mm": finite(row.deflection[0]),
-                "deflection_mm": None if insertion is None else insertion.tip_mm,
-                "peak_force_n": None if insertion is None else insertion.force.peak_n,
-                "buckling_free_n": None if insertion is None else insertion.buckling_free_n,
-                "buckling_pinned_n": None if insertion is None else insertion.buckling_pinned_n,
-            }
-        if found is not None:
-            optional["breathing"] = {
-                "safe_all_phases": bool(found.safe_all_phases[0]),
-                "worst_phase": finite(found.worst_phase[0]),
-                "breathing_clearance_mm": finite(found.clearance[0]),
-                "safe_means": row.safe_text,
-            }
-        if self.guidance:
-            optional["guidance"] = [one.document() for one in self.guidance]
-        if self.sight:
-            optional["sight"] = dict(self.sight)
+        row = self.candidates
         return {
             "case": self.case.name,
             "inputs": inputs_document((*self.read, *self.case.inputs)),
@@ -154,8 +132,35 @@ class Explanation(Shown):
             ],
             "warnings": list(self.anatomy.warnings),
             "findings": [one.document() for one in self.anatomy.findings],
-            **optional,
+            **self._declared(),
         }
+
+    def _declared(self) -> dict[str, Any]:
+        """What a case has only where it declares errors, bending, breathing, guidance or lines of sight."""
+        row, found, insertion = self.candidates, self.candidates.breathing, self.insertion
+        optional: dict[str, Any] = {}
+        if self.case.errors is not None:
+            optional["chances"] = None if self.breakdown is None else self.breakdown.summary()
+        if row.deflection is not None:
+            optional["bending"] = {
+                "deflection_bound_mm": finite(row.deflection[0]),
+                "deflection_mm": None if insertion is None else insertion.tip_mm,
+                "peak_force_n": None if insertion is None else insertion.force.peak_n,
+                "buckling_free_n": None if insertion is None else insertion.buckling_free_n,
+                "buckling_pinned_n": None if insertion is None else insertion.buckling_pinned_n,
+            }
+        if found is not None:
+            optional["breathing"] = {
+                "safe_all_phases": bool(found.safe_all_phases[0]),
+                "worst_phase": finite(found.worst_phase[0]),
+                "breathing_clearance_mm": finite(found.clearance[0]),
+                "safe_means": row.safe_text,
+            }
+        if self.guidance:
+            optional["guidance"] = [one.document() for one in self.guidance]
+        if self.sight:
+            optional["sight"] = dict(self.sight)
+        return optional
 
     def _at_target(self) -> dict[str, list[float]] | None:
         """Joints, and both ends of the needle as the robot's controller prints them, when the tip is at the target."""

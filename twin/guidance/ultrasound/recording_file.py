@@ -202,13 +202,7 @@ def _seen(table: GroupedTable, file: Path, case: SelfcalCase | None, inputs: lis
                 first = f"{imager.columns} x {imager.rows} of {imager.pixel_mm:g} mm, as {files[0]}"
                 refuse(what, path, first, "wrong_size")
             imager, found = own, detect(grey, own)
-            covered = False
-            if isinstance(found, Detection) and colour is not None:
-                offset, (along_u, along_v) = colour - found.tip_image, found.direction_image
-                along, across = offset @ found.direction_image, offset @ np.array([-along_v, along_u])
-                at_tip = (np.abs(across) < RIDGE_MM) & (along > -SHAFT_MM) & (along < ENDS_AGREE_MM)
-                covered = bool(at_tip.any())
-            if covered:
+            if isinstance(found, Detection) and colour is not None and _covers(colour, found):
                 missed[row] = COVERED
             elif isinstance(found, Detection):
                 P[row], v[row], shaft[row] = found.tip_image, found.direction_image, found.shaft_mm
@@ -220,6 +214,13 @@ def _seen(table: GroupedTable, file: Path, case: SelfcalCase | None, inputs: lis
     extent = f"at most {100 * coloured[most]:.1f} % of one, {most}"
     warning = f"colour in {len(coloured)} pictures ({extent}): not searched for the needle"
     return _Seen(P, v, shaft, tuple(missed), (warning,))
+
+
+def _covers(colour: Floats, found: Detection) -> bool:
+    """Whether coloured pixels (n, 2), mm, lie on the needle's ridge near its tip."""
+    offset, (along_u, along_v) = colour - found.tip_image, found.direction_image
+    along, across = offset @ found.direction_image, offset @ np.array([-along_v, along_u])
+    return bool(((np.abs(across) < RIDGE_MM) & (along > -SHAFT_MM) & (along < ENDS_AGREE_MM)).any())
 
 
 def _pixel_mm(

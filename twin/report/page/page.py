@@ -86,10 +86,6 @@ def write_page(shown: Shown, path: Path) -> None:
     point = ", ".join(f"{mm:.1f}" for mm in to_lps(np.asarray(case.target_ct)[None], case.space)[0])
     warned = (*(one.sentence for one in found.findings), *shown.anatomy.warnings)
     noted = tuple(one.sentence for one in shown.anatomy.findings if one.severity is Severity.NOTE)
-    refused = ""
-    if not found.safe.any():
-        counts = ", ".join(f"{k.replace('_', ' ')}: {v:,}" for k, v in found.counts().items())
-        refused = f"{plural(len(found), 'direction')} searched, all rejected ({counts})."
     rehearsed: list[present.Block] = []
     if done is not None:
         alt = "True tip to true target, and true needle to true structures, over time"
@@ -115,7 +111,7 @@ def write_page(shown: Shown, path: Path) -> None:
         tones=() if scan is None else tuple(TONES),
         methods=methods_text(case, shown.anatomy, found),
         notice=numbers.TRUTH_IS_BELIEF if done is not None and done.truth_is_belief else "",
-        refused=refused,
+        refused="" if found.safe.any() else _all_rejected(found),
         cards=_cards(shown),
         counts=present.blocks_html(patient.counts(found)),
         best=present.blocks_html(patient.windows(found, scan)),
@@ -135,6 +131,11 @@ def write_page(shown: Shown, path: Path) -> None:
         plotly=plotly_script(),
         **_uncertain_sections(shown.uncertainty, shown.registration),
     )
+
+
+def _all_rejected(found: Candidates) -> str:
+    counts = ", ".join(f"{k.replace('_', ' ')}: {v:,}" for k, v in found.counts().items())
+    return f"{plural(len(found), 'direction')} searched, all rejected ({counts})."
 
 
 def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[str, Any] | None) -> dict[str, Any]:
