@@ -340,13 +340,12 @@ def touch(
     """Plan the marker touches and execute them in the twin, or read a UR's. Writes touch.csv. Exit 1 on too few."""
     if host is not None:
         from puncture_twin.planning.case.case import load_case
-        from puncture_twin.twin.jobs.live import led_touches
-        from puncture_twin.twin.jobs.live.rtde import LedArm, connect
+        from puncture_twin.twin.jobs.live.mirror import LedArm, connect, led_text, refuse_of_twin, touch_by_hand
 
-        led_touches.refuse_of_twin(choice, seed)
+        refuse_of_twin(choice, seed)
         told, arm = load_case(case), LedArm(connect(host, "touch --host"))
-        read = led_touches.touch_by_hand(told, arm, _led_to, out_folder(out_dir, case, "touch"))
-        finish("touch", read, read.summary(), led_touches.led_text(read), as_json)
+        read = touch_by_hand(told, arm, _led_to, out_folder(out_dir, case, "touch"))
+        finish("touch", read, read.summary(), led_text(read), as_json)
         return
     require_extra("twin", "touch")
     from puncture_twin.twin.jobs.experiment.touch_job import touch_case, touch_text
@@ -511,7 +510,10 @@ def register(
     """Register markers; print residuals and expected error. They are a case's, or two lists."""
     from puncture_twin.twin.jobs.patient import answers
 
-    report = answers.register_report(source, markers_base, target, space, fle)
+    if markers_base is None:
+        report = answers.registration_report(source)
+    else:
+        report = answers.lists_report(source, markers_base, target, space, fle)
     if picture is not None:
         from puncture_twin.twin.jobs.patient.pictures import write_budget_picture
 

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from puncture_twin.twin.jobs.experiment.dynamics_job import Dynamics
     from puncture_twin.twin.jobs.experiment.touch_job import TouchRun
     from puncture_twin.twin.jobs.patient.confirm_job import Confirmed
+    from puncture_twin.twin.jobs.patient.export_jobs import Written
     from puncture_twin.twin.jobs.patient.markers_job import MarkersRun
-    from puncture_twin.twin.jobs.patient.path_exports import Written
     from puncture_twin.twin.rehearsal.result import Rehearsal
 
     Points = NamedPoints | Mapping[str, ArrayLike]

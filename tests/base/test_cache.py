@@ -27,7 +27,7 @@ MAKERS = (
     "puncture_twin.planning.clearance.fast_engine",
     "puncture_twin.planning.collision.packed",
     "puncture_twin.planning.collision.proofs",
-    "puncture_twin.twin.report.page.page_scene",
+    "puncture_twin.twin.report.page.page_data",
 )
 """Every module whose results are kept."""
 

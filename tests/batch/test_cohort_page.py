@@ -9,7 +9,7 @@ from page_browser import chromium, opened, serious_findings
 from PIL import Image
 
 from puncture_twin.planning.batch.merge import SCHEMA
-from puncture_twin.twin.jobs.batch.report import histogram, write_cohort_page
+from puncture_twin.twin.jobs.batch.jobs import histogram, write_cohort_page
 
 HITS = [0.5, 1.0, None, 1e-9, 0.93]
 """Chances of five cases, the third without a safe direction."""

@@ -32,7 +32,7 @@ def test_each_side_is_what_check_says_of_it(context):
         np.testing.assert_allclose(told["entry_mm"], alone["entry_mm"], atol=1e-6)
         assert told["clearance_mm"] == pytest.approx(alone["clearance_mm"], abs=1e-6)
         assert told["verdict"] == alone["verdict"]
-    assert done.a.grid.rank == 1 and done.b.grid.window is not None
+    assert done.a.grid["rank"] == 1 and done.b.grid["window"] is not None
     cosine = float(found.outward_ct[first] @ found.outward_ct[second])
     assert done.apart_deg == pytest.approx(np.degrees(np.arccos(cosine)), abs=1e-4)
     apart = np.linalg.norm(found.path.entry_ct[first] - found.path.entry_ct[second])

@@ -10,7 +10,7 @@ from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.search.choice import Choice
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.twin.jobs.patient import main_job
-from puncture_twin.twin.jobs.patient.path_exports import export_path
+from puncture_twin.twin.jobs.patient.export_jobs import export_path
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from puncture_twin.planning.search.choice import BEST, Choice
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.windows import find_windows
 from puncture_twin.run_twin import main
-from puncture_twin.twin.jobs.patient.path_exports import export_path
+from puncture_twin.twin.jobs.patient.export_jobs import export_path
 
 TURN = np.array([0.4, -1.1, 2.0])
 T_BASE_CT = pose(exp_rotation(TURN), left_jacobian(TURN) @ [310.0, -120.0, 240.0])

@@ -48,7 +48,7 @@ def planner(context):
 
 def asked(planner, kind, name, content, session=None, stamp=STAMP):
     """The answers to one message, by name; a new target's needle is answered too."""
-    subject, session = planner.subject(Header(2, kind, name, 0, 0, len(content), 0)), session or planner.session()
+    subject, session = planner.subject(Header(kind, name, STAMP, len(content), 0)), session or planner.session()
     question, found = Question(1, session, subject, stamp, Message(kind, name, stamp, content)), {}
     while question is not None:
         try:
@@ -283,7 +283,7 @@ def test_a_signalling_nan_is_refused_without_a_warning(planner):
 
 def test_of_a_stranger_nothing_is_wanted(planner):
     for kind, name in (("IMAGE", "Target"), ("POINT", "Needle"), ("POINT", "F"), ("STRING", "Text"), ("STATUS", "x")):
-        assert planner.subject(Header(1, kind, name, 0, 0, 0, 0)) is None
+        assert planner.subject(Header(kind, name, STAMP, 0, 0)) is None
 
 
 def test_a_case_in_a_frame_of_its_own_is_refused():

@@ -129,7 +129,7 @@ def no_encoder(monkeypatch):
     def absent(*arguments, **options):
         raise RuntimeError("no ffmpeg")
 
-    monkeypatch.setattr("puncture_twin.twin.report.scene.film_text.imageio_ffmpeg.write_frames", absent)
+    monkeypatch.setattr("puncture_twin.twin.report.scene.film.imageio_ffmpeg.write_frames", absent)
 
 
 @pytest.mark.usefixtures("no_encoder")

@@ -27,7 +27,7 @@ from puncture_twin.planning.reach.reach import assess_reach_all
 from puncture_twin.planning.reach.survey import ReachRequest
 from puncture_twin.planning.registration.fit_uncertainty import touches
 from puncture_twin.planning.registration.placement import load_placement
-from puncture_twin.twin.jobs.live import led_touches, mirror, rtde
+from puncture_twin.twin.jobs.live import mirror
 
 ABDOMEN = folder() / "abdomen"
 HOST = "127.0.0.47"  # a loopback address of its own, so that a controller's ports are free there
@@ -75,31 +75,31 @@ def test_the_tip_comes_straight_to_the_target(drive):
     """Along an insertion the target stays on the needle's line, and the distance is the standoff less the depth."""
     shown = mirror.Mirror.of(load_case(ABDOMEN))
     for q, depth in zip(drive.insertion_q, drive.insertion_depth_mm, strict=True):
-        one = shown.show(rtde.RecordedState(0.0, q))
+        one = shown.show(mirror.RecordedState(0.0, q))
         assert one.off_axis_mm < 1e-6 and one.to_target_mm == pytest.approx(120.0 - depth, abs=1e-6)
 
 
 def test_a_live_arm_is_read_until_its_time_is_over(drive):
     """By the robot's clock: four readings in 1.5 seconds."""
     arm = FakeArm([list(drive.insertion_q[0])] * 9)
-    states = list(rtde.live_states(arm, period_s=0.0, seconds=1.5))
+    states = list(mirror.live_states(arm, period_s=0.0, seconds=1.5))
     assert [state.time_s for state in states] == [100.5, 101.0, 101.5, 102.0]
 
 
 def test_joint_angles_that_are_none_are_refused():
     for row in ([0.0] * 5, [0.0] * 5 + [np.nan]):
         with refused("joints"):
-            next(rtde.live_states(FakeArm([row]), period_s=0.0, seconds=None))
+            next(mirror.live_states(FakeArm([row]), period_s=0.0, seconds=None))
 
 
 @pytest.mark.parametrize("connected", [False, True])
 def test_an_old_state_is_not_shown_again(monkeypatch, connected):
     """The last word of a robot that is gone must not look like an arm that stands still."""
-    monkeypatch.setattr(rtde, "SILENCE_S", 0.05)
+    monkeypatch.setattr(mirror, "SILENCE_S", 0.05)
     silent = FakeArm(
         [[0.0] * 6] * 1000, time=7.5, step_s=0.0, connected=connected
     )  # as the library once the line is gone
-    states = rtde.live_states(silent, period_s=0.001, seconds=None)
+    states = mirror.live_states(silent, period_s=0.001, seconds=None)
     assert next(states).time_s == 7.5
     with refused("robot_silent", "7.500"):
         next(states)
@@ -110,7 +110,7 @@ def test_before_the_first_word_nothing_is_shown():
     arm = FakeArm([[0.0] * 6, [0.1] * 6])
     times = iter([0.0, 3.0])
     arm.getTimestamp = lambda: next(times)
-    state = next(rtde.live_states(arm, period_s=0.0, seconds=None))
+    state = next(mirror.live_states(arm, period_s=0.0, seconds=None))
     assert state.time_s == 3.0 and state.q[0] == 0.1
 
 
@@ -147,7 +147,7 @@ def test_a_controller_is_mirrored_as_its_recording_is(rows, tmp_path, run):
 @pytest.mark.parametrize("order", ["hang up", "hang"])
 def test_a_controller_that_stops_ends_the_mirror(rows, order):
     with rtde_server(HOST, rows) as controller:
-        states = rtde.live_states(rtde.connect(HOST), period_s=0.02, seconds=None)
+        states = mirror.live_states(mirror.connect(HOST), period_s=0.02, seconds=None)
         assert len(list(itertools.islice(states, 3))) == 3
         controller.order(order)
         with refused("robot_silent"):
@@ -231,20 +231,20 @@ def test_a_led_arm_is_read_at_rest():
     """Not while it moves: the mean of half a second in which no joint turned; `move_jp` passes over other rests."""
     moving = np.linspace(0.0, 1.0, 50)[:, None] * np.ones(6)
     rest, noise = np.full(6, 1.2), np.random.default_rng(0).uniform(-1e-4, 1e-4, (60, 6))
-    arm = rtde.LedArm(FakeArm([*moving, *(rest + noise), rest], step_s=0.01, stays=True), period_s=0.0)
+    arm = mirror.LedArm(FakeArm([*moving, *(rest + noise), rest], step_s=0.01, stays=True), period_s=0.0)
     q = arm.measured_jp()
     assert 0.0 < np.abs(q - rest).max() < 2e-5  # of the mean of fifty readings
     elsewhere = np.full((80, 6), 0.3)
-    arm = rtde.LedArm(FakeArm([*elsewhere, *moving, rest], step_s=0.01, stays=True), period_s=0.0)
+    arm = mirror.LedArm(FakeArm([*elsewhere, *moving, rest], step_s=0.01, stays=True), period_s=0.0)
     arm.move_jp(rest + np.radians(0.4))
     np.testing.assert_allclose(arm.measured_jp(), rest, atol=1e-12)
 
 
 def test_an_arm_that_nobody_leads_is_not_waited_for_without_end(monkeypatch):
-    monkeypatch.setattr(rtde, "LED_S", 3.0)
+    monkeypatch.setattr(mirror, "LED_S", 3.0)
     for rows in ([np.zeros(6)], np.linspace(0.0, 5.0, 400)[:, None] * np.ones(6)):
         with pytest.raises(NoAnswerError) as error:
-            rtde.LedArm(FakeArm(rows, step_s=0.01, stays=True), period_s=0.0).move_jp(np.ones(6) * 2.0)
+            mirror.LedArm(FakeArm(rows, step_s=0.01, stays=True), period_s=0.0).move_jp(np.ones(6) * 2.0)
         assert error.value.code == "not_led"
 
 
@@ -260,10 +260,10 @@ def touched_q():
 def test_markers_are_read_off_a_controller(touched_q, tmp_path, run, monkeypatch):
     """Through ur-rtde: `touch.csv` is what the nominal arm computes of the joints, and registers; nothing is sent."""
     case, markers, q = touched_q
-    monkeypatch.setattr(rtde, "STILL_S", 0.2)
+    monkeypatch.setattr(mirror, "STILL_S", 0.2)
     called, lines = [], iter(q)
 
-    def connected(*args, connect=rtde.connect):
+    def connected(*args, connect=mirror.connect):
         called.append(connect(*args))
         return called[0]
 
@@ -274,7 +274,7 @@ def test_markers_are_read_off_a_controller(touched_q, tmp_path, run, monkeypatch
                 time.sleep(0.005)
             return "\n"
 
-    monkeypatch.setattr(rtde, "connect", connected)
+    monkeypatch.setattr(mirror, "connect", connected)
     monkeypatch.setattr(sys, "stdin", Terminal())
     with rtde_server(HOST, np.repeat(q, 250, axis=0)) as controller:
         code, said = run("touch", ABDOMEN, "--host", HOST, "--out", tmp_path)
@@ -293,11 +293,11 @@ def test_too_few_touches_by_hand(touched_q, tmp_path):
     case, markers, q = touched_q
     arm, answers = SimpleNamespace(measured_jp=iter(q).__next__), iter([True, True, False])
     with refused("empty"):
-        led_touches.touch_by_hand(case, arm, lambda _: False, tmp_path)
+        mirror.touch_by_hand(case, arm, lambda _: False, tmp_path)
     assert not list(tmp_path.iterdir())
-    read = led_touches.touch_by_hand(case, arm, lambda _: next(answers), tmp_path)
+    read = mirror.touch_by_hand(case, arm, lambda _: next(answers), tmp_path)
     assert not read.suffices and len(read.left_out) == len(markers.names) - 2
-    assert read.summary()["fre_mm"] is None and f"not touched: {read.left_out[0]}" in led_touches.led_text(read)
+    assert read.summary()["fre_mm"] is None and f"not touched: {read.left_out[0]}" in mirror.led_text(read)
 
 
 def test_no_tour_is_planned_for_an_arm_that_is_led(capsys):

@@ -12,23 +12,8 @@ from typing import Any, get_args
 
 import typer
 
-from puncture_twin.planning.base.errors import (
-    MOST_WHAT,
-    CacheWarning,
-    InputError,
-    NoAnswerError,
-    PlanningError,
-    one_line,
-    schema_words,
-)
-from puncture_twin.twin.jobs.terminal import (
-    flush_output,
-    insistent_ctrl_c,
-    leave_unread,
-    print_answer,
-    reader_is_gone,
-    refusal_of,
-)
+from puncture_twin.planning.base import errors
+from puncture_twin.twin.jobs import terminal
 
 OK, ANSWER_IS_NO, BAD_INPUT, PROGRAM_FAILED, INTERRUPTED, UNREAD = 0, 1, 2, 3, 130, 141
 """The last two as the shell gives them for a program that Ctrl-C, or a closed pipe, has ended."""
@@ -52,18 +37,16 @@ RULES: Mapping[str, Callable[[Any], bool]] = {
 }
 """Whether what a command found is the answer yes, by its name; the others have no other. In words, where it is no:
 ``docs/reference/command-line.md``."""
+PrintLine = Callable[[str], None]  # shows one line, on stderr
+NUMBERS = {int: "a whole number", float: "a number"}
 
 
 def finish(command: str, found: Any, summary: dict[str, Any], text: str, as_json: bool) -> None:
     """Print what a command found, and end it with the code that its rule gives, by `typer.Exit` where that is not 0."""
-    print_answer(summary, text, as_json)
+    terminal.print_answer(summary, text, as_json)
     if command in RULES and not RULES[command](found):
         failed = command == "batch run" and found.ended[PROGRAM_FAILED] > 0
         raise typer.Exit(PROGRAM_FAILED if failed else ANSWER_IS_NO)
-
-
-PrintLine = Callable[[str], None]
-"""Shows one line, on stderr."""
 
 
 def exit_code_of(command: Callable[[], object], print_line: PrintLine, *, as_json: bool = False) -> int:
@@ -82,7 +65,7 @@ def _exit_code_of(command: Callable[[], object], print_line: PrintLine, as_json:
 
         def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
             """What was made anew, in one line, once; other warnings are Python's."""
-            if not issubclass(category, CacheWarning):
+            if not issubclass(category, errors.CacheWarning):
                 usual(message, category, *rest, **more)
             elif str(message) not in said:
                 said.add(str(message))
@@ -90,12 +73,12 @@ def _exit_code_of(command: Callable[[], object], print_line: PrintLine, as_json:
 
         warnings.showwarning = show
         try:
-            with insistent_ctrl_c():
+            with terminal.insistent_ctrl_c():
                 result = _answered(command) if as_json else command()
-                flush_output()
+                terminal.flush_output()
         except (KeyboardInterrupt, typer.Abort):
             result = INTERRUPTED
-        except (PlanningError, typer.TyperException) as error:
+        except (errors.PlanningError, typer.TyperException) as error:
             line, code = _line_and_code(error)
             print_line(line)
             return code
@@ -113,18 +96,18 @@ def _unread(error: BaseException) -> int:
     if isinstance(error, SystemExit) and not error.code:  # typer has completed a shell's word, or said how
         return OK
     in_help = traceback.extract_tb(error.__traceback__)[-1].name == "on_broken_pipe"  # rich; stdout goes nowhere then
-    if not (in_help or reader_is_gone(sys.stdout)):
+    if not (in_help or terminal.reader_is_gone(sys.stdout)):
         traceback.print_exc()
         return PROGRAM_FAILED
-    leave_unread(sys.stdout)
+    terminal.leave_unread(sys.stdout)
     return UNREAD
 
 
 def _failed(error: Exception, print_line: PrintLine) -> int:
     """What broke is shown whole, unless it is that stdout takes nothing, or a disk no more."""
-    why = refusal_of(sys.stdout) if isinstance(error, OSError) else None
+    why = terminal.refusal_of(sys.stdout) if isinstance(error, OSError) else None
     if why is not None:
-        leave_unread(sys.stdout)
+        terminal.leave_unread(sys.stdout)
         print_line(f"stdout: {why}; allowed: an output that can be written to")
     elif isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         place = error.filename or "a file of --out, of a cache (such as that of kernels) or in $TMPDIR"
@@ -134,23 +117,23 @@ def _failed(error: Exception, print_line: PrintLine) -> int:
     return PROGRAM_FAILED
 
 
-def _line_and_code(error: PlanningError | typer.TyperException) -> tuple[str, int]:
+def _line_and_code(error: errors.PlanningError | typer.TyperException) -> tuple[str, int]:
     if isinstance(error, typer.TyperException):
         what, cause = error.format_message(), error.__cause__
         for first in getattr(cause, "errors", list)():  # typer's words are Pydantic's
-            what = what.replace(first["msg"], schema_words(first))
-        what = one_line(what, MOST_WHAT).rstrip(".")
+            what = what.replace(first["msg"], errors.schema_words(first))
+        what = errors.one_line(what, errors.MOST_WHAT).rstrip(".")
         return f"command line: {what}; allowed: {allowed_text(error)}", BAD_INPUT
-    if isinstance(error, NoAnswerError):
-        return one_line(str(error)), ANSWER_IS_NO
-    return str(error), BAD_INPUT if isinstance(error, InputError) else PROGRAM_FAILED
+    if isinstance(error, errors.NoAnswerError):
+        return errors.one_line(str(error)), ANSWER_IS_NO
+    return str(error), BAD_INPUT if isinstance(error, errors.InputError) else PROGRAM_FAILED
 
 
 def _answered(command: Callable[[], object]) -> object:
     """Run a command; what it raises on purpose stands on stdout too, as the one object that ``--json`` promises."""
     try:
         return command()
-    except (PlanningError, typer.TyperException) as error:
+    except (errors.PlanningError, typer.TyperException) as error:
         what, _, allowed = _line_and_code(error)[0].partition("; allowed: ")
         document = {
             "code": getattr(error, "code", "command_line"),
@@ -159,12 +142,9 @@ def _answered(command: Callable[[], object]) -> object:
             "allowed": getattr(error, "allowed", allowed),
             "numbers": getattr(error, "numbers", None) or getattr(error, "counts", {}),
         }
-        print_answer({"error": document}, "", as_json=True)
-        flush_output()
+        terminal.print_answer({"error": document}, "", as_json=True)
+        terminal.flush_output()
         raise
-
-
-NUMBERS = {int: "a whole number", float: "a number"}
 
 
 def allowed_text(error: typer.TyperException) -> str:

@@ -66,7 +66,7 @@ def prepared(case: Path, *, arm: bool | None = None, engine: str = "fast") -> It
         yield prepare(case, arm=arm, engine=engine, watcher=progress)
 
 
-CHOICE_OPTIONS = {
+CHOICE_OPTIONS = {  # what names a candidate, in the order in which `parse_choice` takes it
     "theta": Annotated[float | None, Option("--theta", min=0, max=180, help="Puncture angle, degrees.")],
     "beta": Annotated[float | None, Option("--beta", min=0, max=360, help="Azimuth, degrees.")],
     "rank": Annotated[int | None, Option("--rank", min=1, help="Rank in the search; 1 is the best candidate.")],
@@ -76,7 +76,6 @@ CHOICE_OPTIONS = {
         Option("--entry", metavar="X,Y,Z", help="Entry point on the skin, mm, in the case's space; or a Slicer line."),
     ],
 }
-"""What names a candidate, in the order in which `parse_choice` takes it."""
 
 
 def with_choice(command: Callable[..., None]) -> Callable[..., None]:

@@ -1,13 +1,9 @@
-"""What a person sees: lines on stdout that no width breaks, and a reader who went away.
-
-Ctrl-C that arrives: raised again where compiled code has swallowed it.
+"""What a person sees: lines on stdout that no width breaks, a reader who went away, and Ctrl-C that arrives.
 
 Python raises ``KeyboardInterrupt`` at whatever line runs when the signal comes. Where that line is called from a
 library's callback, a destructor or a lookup in C, or where a library catches whatever the import of another raises, the
-exception is dropped there, and the command would run to its end.
-
-And put off where it would break what is not made for it: a compiled module that is half imported stays so, and LLVM's
-memory is freed twice where its Python side learns not that it was freed, which ends the process without a word.
+exception is dropped there: it is raised again. It is put off where it would break what is not made for it: a compiled
+module that is half imported stays so, and LLVM's memory is freed twice where its Python side does not learn of it.
 """
 
 from __future__ import annotations
@@ -31,6 +27,11 @@ from puncture_twin.planning.base.files import atomic
 
 UNNAMED_CASES = frozenset({"case.toml", "servo.toml", "selfcal.toml", "plan.json"})
 """Files that are named by their folder."""
+AGAIN_S = 0.02  # how soon an interruption that was swallowed, or put off, comes again
+UNBREAKABLE = frozenset({"importlib", "llvmlite"})  # packages whose functions an interruption does not leave
+LOOKS_EVERY = 20_000
+"""New objects between Python's searches for circles of them: at its own 700 a first command, for which numba makes
+millions, spends a fifth of its time in looking."""
 
 
 class Answer(NamedTuple):
@@ -98,13 +99,6 @@ def flush_output() -> None:
     """Hand over everything that was printed; a `BrokenPipeError` where nobody reads it."""
     if sys.stdout is not None and not sys.stdout.closed:
         sys.stdout.flush()
-
-
-AGAIN_S = 0.02
-"""How soon an interruption that was swallowed, or put off, comes again."""
-
-UNBREAKABLE = frozenset({"importlib", "llvmlite"})
-"""Packages whose functions are not left by an interruption, nor what they have called."""
 
 
 @contextmanager
@@ -193,11 +187,6 @@ def _silent(_: Any) -> None:
     """In place of the traceback of an exception that nobody can catch."""
 
 
-LOOKS_EVERY = 20_000
-"""New objects between Python's searches for circles of them. At its own 700 a demo spends 0.5 s of a processor in
-looking through the 250,000 that stay, and a first command, for which numba makes millions, a fifth of its time."""
-
-
 def look_seldom() -> None:
     """Let Python look for circles of objects every `LOOKS_EVERY` new ones."""
     gc.set_threshold(LOOKS_EVERY)
@@ -206,7 +195,6 @@ def look_seldom() -> None:
 def leave(code: int) -> NoReturn:
     """End this process with an exit code, without taking apart what its memory, handed back at once, takes along.
 
-    That is 0.6 s of a processor after a demo on an idle machine, 1.2 s on a busy one, and nobody sees what it does.
     Threads are waited for and what was registered for the end is called, as at Python's own end; what was printed is
     written, and where nobody takes it, that is the code of Python's own: 120. Ctrl-C ends what is still waited for.
     """

@@ -1,7 +1,4 @@
-"""Words on pictures of pixels with Pillow: text with a halo, the body's axes, a scale bar, a legend.
-
-The font is matplotlib's own DejaVu Sans, so that no system font is needed and all pictures have one.
-"""
+"""Words on pictures of pixels with Pillow, in matplotlib's own font: text with a rim, body axes, scale, legend."""
 
 from __future__ import annotations
 
@@ -11,9 +8,9 @@ from typing import Literal
 
 import matplotlib as mpl
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.twin.report.map_view import body_directions
@@ -24,13 +21,10 @@ INK: Rgb = (25, 27, 32)
 FAINT: Rgb = (110, 114, 122)
 WHITE: Rgb = (255, 255, 255)
 RED: Rgb = (190, 0, 20)
-
-SHORT_AXIS = 0.45
-"""Axes that appear shorter than this share of their length point at the viewer; their labels would collide."""
-
+SHORT_AXIS = 0.45  # axes that appear shorter point at the viewer; their labels would collide
 LEGEND_SIZE = 15  # pixels: a legend's letters and patches
 SCALE_BARS_MM = (5, 10, 20, 50, 100, 200, 500)
-
+Place = tuple[float, float]  # right and down, pixels
 Anchor = Literal["lm", "rm", "mm", "la", "ra", "ma", "lb", "mb", "ls", "rs", "ms"]
 """Which point of a line of text stands at its place, as Pillow names it."""
 
@@ -50,7 +44,7 @@ def write_image(image: Image.Image, path: Path) -> None:
 
 def write(
     draw: ImageDraw.ImageDraw,
-    at: tuple[float, float],
+    at: Place,
     text: str,
     *,
     size: int = 16,
@@ -63,18 +57,8 @@ def write(
     draw.text(at, text, fill=colour, font=font(size, bold), anchor=anchor, stroke_width=halo, stroke_fill=WHITE)
 
 
-def width_of(text: str, size: int) -> float:
-    """Width of a line of text in pixels."""
-    return float(font(size).getlength(text))
-
-
 def body_axes(
-    draw: ImageDraw.ImageDraw,
-    camera: ViewCamera,
-    space: str,
-    centre: tuple[float, float],
-    length: float,
-    size: int = 15,
+    draw: ImageDraw.ImageDraw, camera: ViewCamera, space: str, centre: Place, length: float, size: int = 15
 ) -> None:
     """A small cross of the body's directions in this view, far ends pale; one in its plane is `length` pixels long."""
     reach = length + 3.6 * size
@@ -113,7 +97,7 @@ def body_axes(
 def scale_bar(
     draw: ImageDraw.ImageDraw,
     camera: ViewCamera,
-    at_ct: NDArray[np.float64],
+    at_ct: Floats,
     left: float,
     bottom: float,
     width_px: float,
@@ -136,7 +120,7 @@ def legend(draw: ImageDraw.ImageDraw, items: list[tuple[str, Rgb]], left: float,
     x, y, size = left, top, LEGEND_SIZE
     for name, colour in items:
         text = name.replace("_", " ")
-        need = size + 8 + width_of(text, size) + 22
+        need = size + 8 + float(font(size).getlength(text)) + 22
         if x + need > right and x > left:
             x, y = left, y + size + 11
         draw.rectangle([x, y, x + size, y + size], fill=colour, outline=INK)

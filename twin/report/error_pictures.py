@@ -21,23 +21,16 @@ from puncture_twin.twin.report.figures import png, write_png
 WIDTH_INCHES, HEAD_INCHES, ROW_INCHES, DPI = 13.2, 1.6, 0.25, 110
 LEAST_ROWS = 16  # of changes; more of them make the picture higher
 ROOM_FOR_NUMBERS = 1.12  # beside the longest bar
-ALONE, BETTER, WORSE = "#0072b2", "#009e73", "#d55e00"
-"""Okabe and Ito's blue, green and vermilion; better and worse lie on two sides of a line besides."""
-
+ALONE, BETTER, WORSE = "#0072b2", "#009e73", "#d55e00"  # Okabe and Ito's; better and worse lie on two sides of a line
 SHOWN_MM = 0.005
+PANEL_INCHES = (3.0, 3.5)
+MOST_STRUCTURES = 6  # curves of clearance: so many of the nearest structures; the table has the rest
+NAMED_PHASE = 0.07  # fraction of the time that a phase must last to carry its name; shorter ones would overlap
+CURVES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")  # Okabe and Ito's, one for each curve
 
 
-def draw_budget(facts: Mapping[str, Any], path: Path) -> None:
-    """Write the picture of facts as ``register --json`` has them under ``budget``."""
-    write_png(_budget(facts), path)
-
-
-def budget_png(facts: Mapping[str, Any]) -> bytes:
-    """The picture as a PNG, of facts as of `draw_budget`."""
-    return png(_budget(facts))
-
-
-def _budget(facts: Mapping[str, Any]) -> Figure:
+def budget_figure(facts: Mapping[str, Any]) -> Figure:
+    """The picture of facts as ``register --json`` has them under ``budget``."""
     inches = (WIDTH_INCHES, HEAD_INCHES + ROW_INCHES * max(LEAST_ROWS, len(facts["changes"])))
     figure = Figure(figsize=inches, dpi=DPI, facecolor="white", layout="constrained")
     sources, what_if = figure.subplots(1, 2)
@@ -88,15 +81,11 @@ EDGES = {"left": 0.036, "right": 0.994, "bottom": 0.175, "top": 0.865, "wspace":
 """Of the four plots, in the picture: to find out what room their words need takes longer than to draw them."""
 
 MOST_POINTS = 4000  # of a cloud: more hide one another
-WITHIN, BEYOND, PREDICTED = "#0072b2", "#d55e00", "#000000"
-"""Okabe and Ito's blue and vermilion; what lies beyond is a cross too."""
-
+WITHIN, BEYOND, PREDICTED = "#0072b2", "#d55e00", "#000000"  # Okabe and Ito's; what lies beyond is a cross too
 BINS = 40
 REGION = 0.95
 CROWDED = 0.6  # radii of the ellipse that stay free around it
-LEVELS = np.linspace(0.05, 0.95, 19)
-"""Predicted chances at which the rooms are counted: so far from the target the tip should be within this often."""
-
+LEVELS = np.linspace(0.05, 0.95, 19)  # chances at which rooms are counted: the tip is so near this often
 TWO_SIDED = 1.96  # standard errors that hold 95 % of what chance alone does
 
 
@@ -140,18 +129,13 @@ def _cloud(axes: Axes, error: Floats, cov: Floats, within: Any, pair: tuple[int,
     axes.set_axisbelow(True)
 
 
-PANEL_INCHES = (3.0, 3.5)
-
-
 def draw_clouds(
     ways: Sequence[tuple[Any, str, str]], outward_ct: Floats, path: Path, hit_mm: float | None = None, columns: int = 2
 ) -> None:
     """Error clouds of ways of guidance, all to one scale, in the plane of the needle where they are widest.
 
-    Args:
-        ways: The trials of each, a word beside its name, and its colour.
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        hit_mm: Radius of a hit, drawn as a ring.
+    Of each way its trials, a word beside its name, and its colour; the needle's direction outward, (3,), unit; `hit_mm`
+    is the radius of a hit, drawn as a ring.
     """
     R, reach = frame_about(-outward_ct).T, 0.0
     widest = np.sum([R[:2] @ found.cov_ct @ R[:2].T for found, _, _ in ways], axis=0)
@@ -177,7 +161,6 @@ def draw_clouds(
 
 
 def _histogram(axes: Axes, found: Any) -> None:
-    """How far the tips ended from the true target, over the predicted density."""
     sizes = found.tip_error_mm
     top = 1.02 * max(float(sizes.max()), 2.5 * found.predicted_rms_mm)
     edges = np.linspace(0, top, BINS + 1)
@@ -211,11 +194,6 @@ def _reliability(axes: Axes, found: Any) -> None:
     axes.set(xlabel="predicted chance", ylabel="observed fraction of trials")
     axes.set_title("predicted and observed chances", fontsize=10)
     axes.legend(fontsize=7.5, loc="upper left")
-
-
-MOST_STRUCTURES = 6  # curves of clearance: so many of the nearest structures; the table has the rest
-NAMED_PHASE = 0.07  # fraction of the time that a phase must last to carry its name; shorter ones would overlap
-CURVES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")  # Okabe and Ito's, one for each curve
 
 
 def rehearsal_png(rehearsal: Any, keep_away: frozenset[str]) -> bytes:

@@ -1,7 +1,6 @@
-"""Flat pictures by matplotlib: a figure of so many pixels, its pixels, and the PNG that is the same for the same input.
+"""Flat pictures by matplotlib, without pyplot and its state: a figure of so many pixels, its pixels, and its PNG.
 
-A `Figure` on Agg, without pyplot and its state. What has coordinates is drawn so; words on pictures of pixels (scenes,
-films, camera images) are those of `annotate`, in the same font.
+What has coordinates is drawn so; words on pictures of pixels (scenes, films) are those of `annotate`, in the same font.
 """
 
 from __future__ import annotations
@@ -36,16 +35,9 @@ def halo(width: float, colour: str = "white") -> list[Any]:
     return [withStroke(linewidth=width, foreground=colour)]
 
 
-def picture_axes(
-    figure: Figure, image: NDArray[np.uint8], at: tuple[float, float, float, float] = (0, 0, 1, 1)
-) -> Axes:
-    """Axes in an image's own pixels (right, down; 0 is its upper left corner) that hold it.
-
-    Args:
-        image: Shape (h, w) or (h, w, 3).
-        at: Left, lower edge, width and height, of the figure's.
-    """
-    axes, (high, wide) = figure.add_axes(at), image.shape[:2]
+def picture_axes(figure: Figure, image: NDArray[np.uint8]) -> Axes:
+    """Axes in pixels (right, down; 0 is the upper left corner) of an image, (h, w) or (h, w, 3), that fills them."""
+    axes, (high, wide) = figure.add_axes((0, 0, 1, 1)), image.shape[:2]
     axes.set_axis_off()
     axes.imshow(image, cmap="gray", vmin=0, vmax=255, extent=(0, wide, high, 0), interpolation="lanczos", aspect="auto")
     axes.set_autoscale_on(False)

@@ -12,28 +12,20 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.case.entry import ANATOMICAL_LPS, angles
 from puncture_twin.planning.search.candidates import Candidates
 
 NAMES_LPS = {"left": "patient's left", "right": "patient's right", "posterior": "back", "anterior": "front"}
 """Head and feet are called so."""
 
-IN_PLANE = 0.5
-"""Least sine of the angle to the view axis at which a body direction gets a place at the rim (30 degrees)."""
-
+IN_PLANE = 0.5  # least sine to the view axis at which a body direction has a place at the rim (30 degrees)
 BEYOND = np.radians(92.0)  # a map whose rim lies beyond this shows directions from the far side, and says so
-SAME_PLACE = np.radians(20.0)
-"""Rim labels nearer than this share one line."""
-
-RING_SLACK = 1e-7
-"""Two θ nearer than this (rad) are one ring of the grid."""
-
+SAME_PLACE = np.radians(20.0)  # rim labels nearer than this share one line
+RING_SLACK = 1e-7  # two θ nearer than this (rad) are one ring of the grid
 RING = 8.0  # more than a turn: by it rings lie beside one another where all cells are in one order
-HALF_CELL_SLACK = 1e-6
-"""Share by which rounding may widen half a cell."""
+HALF_CELL_SLACK = 1e-6  # share by which rounding may widen half a cell
 
 
 class RimLabel(NamedTuple):
@@ -47,14 +39,10 @@ class RimLabel(NamedTuple):
 class MapView:
     """The map's geometry."""
 
-    turn: float
-    """Angle on the picture, counter-clockwise from the right, at which β = 0 lies."""
-    theta_max: float
-    """θ at the rim, rad."""
-    rim: tuple[RimLabel, ...]
-    """Body directions around the rim."""
-    centre: str
-    """What the viewer looks at: the body direction that θ = 0 points to, or ""."""
+    turn: float  # angle on the picture, counter-clockwise from the right, at which β = 0 lies
+    theta_max: float  # θ at the rim, rad
+    rim: tuple[RimLabel, ...]  # body directions around the rim
+    centre: str  # what the viewer looks at: the body direction that θ = 0 points to, or ""
 
     def place(self, theta: Floats, beta: Floats) -> Floats:
         """Points of the unit disc (x right, y up), shape (n, 2), of directions."""
@@ -118,18 +106,12 @@ def step_of(candidates: Candidates) -> float:
 class MapCells:
     """The grid's cells, ring after ring of equal θ, and in each ring by β in 0..2π."""
 
-    rows_in_order: NDArray[np.int64]
-    """Shape (n,), the candidate of each cell."""
-    beta: Floats
-    """Shape (n,), rad, in 0..2π."""
-    starts: NDArray[np.int64]
-    """Shape (k + 1,), where each ring begins."""
-    heights: Floats
-    """Shape (k,), θ of each ring, ascending, rad."""
-    half_theta: float
-    """Half a cell, rad."""
-    half_beta: Floats
-    """Shape (k,), half a cell of each ring, rad."""
+    rows_in_order: Ints  # shape (n,), the candidate of each cell
+    beta: Floats  # shape (n,), rad, in 0..2π
+    starts: Ints  # shape (k + 1,), where each ring begins
+    heights: Floats  # shape (k,), θ of each ring, ascending, rad
+    half_theta: float  # half a cell, rad
+    half_beta: Floats  # shape (k,), half a cell of each ring, rad
 
     @classmethod
     def of(cls, candidates: Candidates) -> MapCells:
@@ -151,7 +133,7 @@ class MapCells:
                 half_beta[i] = np.inf  # one cell at the pole
         return cls(order, beta, starts, heights, half, half_beta)
 
-    def rows(self, theta: Floats, beta: Floats) -> NDArray[np.int64]:
+    def rows(self, theta: Floats, beta: Floats) -> Ints:
         """The candidate at each direction (rad, β in 0..2π), -1 outside the grid; same shape as ``theta``."""
         theta, beta = np.asarray(theta, dtype=float), np.asarray(beta, dtype=float)
         last, heights = len(self.heights) - 1, self.heights
@@ -166,7 +148,7 @@ class MapCells:
         near = (np.minimum(ahead, behind) <= self.half_beta[ring]) & (np.abs(theta - heights[ring]) <= self.half_theta)
         return np.where(near, self.rows_in_order[np.where(ahead < behind, after, before)], -1)
 
-    def picture(self, view: MapView, size: int) -> NDArray[np.int64]:
+    def picture(self, view: MapView, size: int) -> Ints:
         """The candidate under the middle of each pixel of a square picture of the disc, shape (size, size)."""
         middles = (np.arange(size) + 0.5) / size * 2 - 1
         return self.rows(*view.angles_at(np.stack(np.meshgrid(middles, -middles), axis=-1)))

@@ -8,16 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from puncture_twin.planning.base import reasons
 from puncture_twin.planning.base.arrays import Bools, Floats
-from puncture_twin.planning.base.reasons import (
-    REASON_COLOURS,
-    REASON_TEXT,
-    SAFE,
-    UNSEEN_AIR,
-    UNSEEN_AIR_TEXT,
-    Reason,
-    Rgb,
-)
 from puncture_twin.planning.place.mounts import Region, ring_weights
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.twin.report.map_view import body_directions, step_of
@@ -27,6 +19,7 @@ TRUTH_IS_BELIEF = (
     "in this rehearsal the patient is exactly where the belief puts them: the tip error comes from the joints "
     "alone and says nothing about the registration"
 )
+NEARLY = 0.985  # cosine from which a direction carries a body direction's name (10 degrees)
 
 
 @dataclass(frozen=True)
@@ -35,7 +28,7 @@ class ReasonCount:
 
     text: str
     code: str
-    colour: Rgb
+    colour: reasons.Rgb
     count: int
     solid_angle: float
 
@@ -43,21 +36,21 @@ class ReasonCount:
 def reason_counts(candidates: Candidates) -> tuple[ReasonCount, ...]:
     """Safe first, then the reasons that occur, most frequent first."""
     weights = ring_weights(candidates.theta, step_of(candidates))
-    lines: list[tuple[str, str, Rgb, Bools]] = []
+    lines: list[tuple[str, str, reasons.Rgb, Bools]] = []
     air = candidates.unseen_air
     for value in np.unique(candidates.verdict.reason):
         here = (candidates.verdict.reason == value) & ~air
-        reason = Reason(str(value))
-        text = REASON_TEXT[reason] if reason else candidates.safe_text
-        lines.append((text, reason.value or "safe", REASON_COLOURS.get(reason, SAFE), here))
-    lines.append((UNSEEN_AIR_TEXT, Reason.UNKNOWN_REGION.value, UNSEEN_AIR, air))
+        reason = reasons.Reason(str(value))
+        text = reasons.REASON_TEXT[reason] if reason else candidates.safe_text
+        lines.append((text, reason.value or "safe", reasons.REASON_COLOURS.get(reason, reasons.SAFE), here))
+    lines.append((reasons.UNSEEN_AIR_TEXT, reasons.Reason.UNKNOWN_REGION.value, reasons.UNSEEN_AIR, air))
     counts = [
         ReasonCount(text, code, colour, int(here.sum()), float(weights[here].sum() / weights.sum()))
         for text, code, colour, here in lines
         if here.any()
     ]
     if not candidates.safe.any():
-        counts.append(ReasonCount(candidates.safe_text, "safe", SAFE, 0, 0.0))
+        counts.append(ReasonCount(candidates.safe_text, "safe", reasons.SAFE, 0, 0.0))
     return tuple(sorted(counts, key=lambda line: (line.code != "safe", -line.count)))
 
 
@@ -126,10 +119,6 @@ def target_text(case: Any) -> str:
 def demanding(anatomy: Any) -> frozenset[str]:
     """The structures that a needle must keep away from; it may be inside the others."""
     return frozenset(s.name for s in anatomy.structures if str(s.role) in {"avoid", "unknown"})
-
-
-NEARLY = 0.985
-"""Cosine from which a direction carries a body direction's name (10 degrees)."""
 
 
 def direction_text(direction_ct: Floats, space: str) -> str:

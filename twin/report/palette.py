@@ -7,6 +7,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb
 
 PNG_LEVEL = 3  # how hard pictures are packed: a tenth larger than at Pillow's own 6, in half the time
@@ -19,18 +20,13 @@ TABLE: Rgb = (120, 110, 98)
 OUTSIDE: Rgb = (128, 128, 140)
 SKIN: Rgb = (226, 176, 148)
 TARGET_POINT: Rgb = (214, 0, 30)
+NEEDLE_COLOUR, REGION_COLOUR, BENT_COLOUR = (0, 229, 255), (255, 77, 240), (182, 255, 0)
+"""Of the slices: on grey none is near a structure's colour."""
 
-ORGAN_COLOURS: tuple[Rgb, ...] = (
-    (178, 168, 220),
-    (208, 190, 150),
-    (118, 92, 62),
-    (226, 140, 160),
-    (206, 140, 124),
-    (122, 98, 128),
-    (232, 226, 232),
-    (140, 124, 60),
-)
-"""For structures without a colour of custom, in order of appearance; right and left are one."""
+ORGAN_COLOURS: tuple[Rgb, ...] = (  # for structures without a colour of custom, in order; right and left are one
+    (178, 168, 220), (208, 190, 150), (118, 92, 62), (226, 140, 160),
+    (206, 140, 124), (122, 98, 128), (232, 226, 232), (140, 124, 60),
+)  # fmt: skip
 
 LESION, ARTERY, VEIN, PORTAL = (255, 215, 6), (178, 54, 10), (0, 140, 226), (125, 60, 190)
 """What a needle is aimed at, and what bleeds: these are told from everything at a glance, by every reader."""
@@ -95,7 +91,7 @@ def organ_colours(names: tuple[str, ...]) -> dict[str, Rgb]:
     return colours
 
 
-def safe_shades(fraction: NDArray[np.float64]) -> NDArray[np.uint8]:
+def safe_shades(fraction: Floats) -> NDArray[np.uint8]:
     """Greens for a share 0..1 of the clearance range, shape (n,) to (n, 3)."""
     fraction = np.clip(np.nan_to_num(fraction, nan=0.0), 0.0, 1.0)[..., None]
     return np.round(np.array(SAFE_LOW) * (1 - fraction) + np.array(SAFE_HIGH) * fraction).astype(np.uint8)

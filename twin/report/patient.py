@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from puncture_twin.planning.base.reasons import UNSEEN_AIR, Reason, css
-from puncture_twin.planning.base.text import plural
+from puncture_twin.planning.base.text import Facts, plural
 from puncture_twin.planning.plan.plan import CLEARANCE_TEXT
 from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.explain import deep_text
@@ -26,11 +26,10 @@ from puncture_twin.planning.uncertainty.sources import SOURCES
 from puncture_twin.twin.report import numbers
 from puncture_twin.twin.report.present import Block, Field, Table, Warn, bold, facts, grid, number, percent, vector
 
-CONE_TEXT = {
+CONE_TEXT = {  # where the safe cone comes from
     "grid": "from the directions of the search, to one step; a certificate can prove it",
     "certificate": "proven by the certificate",
 }
-"""Where the safe cone comes from."""
 
 LEAST_SHOWN = 5e-5  # a chance or share below it rounds to nothing
 SHOWN_MM = 0.005  # a source that costs less would be 0.00
@@ -98,18 +97,12 @@ def _window_fields(candidates: Candidates, digits: int, told: str) -> list[Field
 
 
 def plan(
-    plan: Any | None,
-    at_patient: Iterable[tuple[str, str]] = (),
-    refusal: str = "",
-    *,
-    declared: bool = False,
-    notes: Sequence[str] = (),
+    plan: Any | None, at_patient: Facts = (), refusal: str = "", *, declared: bool = False, notes: Sequence[str] = ()
 ) -> list[Block]:
     """The plan's numbers, or why there is none, and how its path, or that of the best direction, is found.
 
-    Args:
-        refusal: Why there is no plan although one was requested; "" where none was.
-        declared: Whether the case declares the arm's errors, which a plan's expected error then counts.
+    `refusal` says why there is no plan although one was requested; `declared`, whether the case declares the arm's
+    errors, which a plan's expected error then counts.
     """
     if plan is None:
         best = facts(at_patient)
@@ -215,7 +208,6 @@ def _share(fraction: float) -> str:
 
 
 def _reserves(found: Mapping[str, Any]) -> list[str]:
-    """What a reader must know before believing the table."""
     said = []
     if found["wrong_belief"]:
         said.append("The trials were drawn from [rehearsal.errors]: the belief is wrong by design.")
@@ -320,7 +312,6 @@ def registration(report: Mapping[str, Any] | None) -> list[Block]:
 
 
 def _advice(report: Mapping[str, Any]) -> list[Block]:
-    """What one insertion is worth, whether the declared errors hold, and where one more marker helps."""
     said: list[Block] = []
     if "one_insertion_95_mm" in report:
         said.append(

@@ -20,14 +20,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from markupsafe import Markup
 
 from puncture_twin.planning.base.provenance import Input
-
-if TYPE_CHECKING:
-    from puncture_twin.twin.report.page.template import Card
 
 PROJECT = "puncture-twin"
 NOTHING = "–"  # where there is no number
@@ -35,6 +32,8 @@ NOTHING = "–"  # where there is no number
 PLAIN = str.maketrans({"−": "-", "–": "-", "θ": "theta", "β": "beta", "°": " deg", "²": "2", "₂": "2", "₁": "1",
                        "χ": "chi", "σ": "sigma", "’": "'", "≥": ">=", "“": "'", "”": "'", "×": "x"})  # fmt: skip
 """What a terminal shows in place of a page's letters, in tables and sentences; titles and paths stay as they are."""
+FOLDED = 10  # letters: a shorter head is not folded
+TIMES = Markup('<p class="faint">Date and duration of each stage: <a href="timings.json">timings.json</a>.</p>')
 
 
 def number(value: float | None, digits: int = 1, unit: str = "") -> str:
@@ -58,17 +57,13 @@ def vector(values: Iterable[float | None], digits: int, unit: str = "") -> str:
     return f"({inside}) {unit}".rstrip() if inside else ""
 
 
-FOLDED = 10  # letters: a shorter head is not folded
-
-
 class Field(NamedTuple):
     """One fact of a row."""
 
     name: str
     value: str | Callable[[Any], Any]
     """A key, with dots for keys within (of which each may be missing or None), or what finds it in a row."""
-    digits: int | None = None
-    """Of a number; None shows the value as it is."""
+    digits: int | None = None  # of a number; None shows the value as it is
     unit: str = ""
 
     def of(self, row: Any, *, unit: bool = False) -> str:
@@ -122,6 +117,15 @@ class Section(NamedTuple):
 
     title: str
     blocks: Sequence[Block]
+
+
+class Card(NamedTuple):
+    """One of the boxes below a page's title: plain texts, and whether it tells of a failure."""
+
+    name: str
+    value: str
+    detail: str
+    bad: bool = False
 
 
 def grid(fields: Iterable[Field], rows: Iterable[Any], kind: str = "numbers") -> Table:
@@ -231,9 +235,6 @@ def inputs_table(inputs: Iterable[Input]) -> Markup:
     rows = ((one.role, one.path, Markup("<code>{}</code>").format(one.sha256)) for one in inputs)
     table = blocks_html([Table(("role", "file", "SHA-256"), tuple(rows), "")])
     return Markup("<details><summary>Files, each with its SHA-256</summary>{}</details>").format(table)
-
-
-TIMES = Markup('<p class="faint">Date and duration of each stage: <a href="timings.json">timings.json</a>.</p>')
 
 
 def origin_section(seed: int | None) -> Markup:

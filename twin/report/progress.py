@@ -11,6 +11,9 @@ if TYPE_CHECKING:
 
 LINE_EVERY_S = 5.0  # in a log one line in this time says enough
 LONG_S = 3.0  # what took so long is told when it is done
+LEAST_TIME_S = 0.5  # of a rate: with less behind it, it says nothing
+USUALLY_S = {"map": 1.0, "scene": 1.0, "slices": 1.0, "page": 1.0, "rehearsal": 2.0, "film": 3.0}
+"""Stages that take about as long for every case, on two cores; others count, or depend on what there is to read."""
 
 
 def progress_display(stream: TextIO | None = None) -> BarDisplay | LineDisplay:
@@ -54,8 +57,7 @@ class LineDisplay:
     def _write(self, line: str) -> None:
         if time.monotonic() - self._last >= LINE_EVERY_S:
             self._last = time.monotonic()
-            self._stream.write(line + "\n")
-            self._stream.flush()
+            self.note(line)
 
 
 class BarDisplay:
@@ -94,11 +96,6 @@ class BarDisplay:
         if stage not in self._tasks:
             self._tasks[stage] = self._bars.add_task(stage, total=total, far="")
         return self._tasks[stage]
-
-
-LEAST_TIME_S = 0.5  # of a rate: with less behind it, it says nothing
-USUALLY_S = {"map": 1.0, "scene": 1.0, "slices": 1.0, "page": 1.0, "rehearsal": 2.0, "film": 3.0}
-"""Stages that take about as long for every case, on two cores; others count, or depend on what there is to read."""
 
 
 def rate_text(per_second: float) -> str:

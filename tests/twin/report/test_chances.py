@@ -12,12 +12,11 @@ from puncture_twin.planning.search.uncertainty_breakdown import Goal, Remedy, Un
 from puncture_twin.planning.uncertainty.chance_model import Chances
 from puncture_twin.planning.uncertainty.pose_error import ErrorBudget
 from puncture_twin.twin.report.error_pictures import draw_rooms_picture
-from puncture_twin.twin.report.map.map_disc import chance_raster, touch_nothing
 from puncture_twin.twin.report.map.map_picture import draw_map
-from puncture_twin.twin.report.map.map_raster import map_raster
+from puncture_twin.twin.report.map.map_raster import chance_raster, map_raster, touch_nothing
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Shown, Uncertainty, methods_text, write_page
-from puncture_twin.twin.report.page.page_map import map_data
+from puncture_twin.twin.report.page.page_data import map_data
 from puncture_twin.twin.report.patient import rooms
 from puncture_twin.twin.report.present import Section, text
 

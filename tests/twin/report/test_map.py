@@ -10,20 +10,21 @@ from PIL import Image
 
 from puncture_twin.planning.base.reasons import REASON_TEXT, UNSEEN_AIR_TEXT, Reason
 from puncture_twin.planning.search.explain import reason_text
-from puncture_twin.twin.report.map.map_disc import RINGS_CLEAR, ring_labels
 from puncture_twin.twin.report.map.map_picture import draw_map, map_figure
 from puncture_twin.twin.report.map.map_raster import (
     HATCH,
     HATCH_AIR,
     HATCH_NOT_SEARCHED,
     MOST_DOTS,
+    RINGS_CLEAR,
     map_raster,
+    ring_labels,
     row_colours,
     shown_front,
 )
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.numbers import reason_counts
-from puncture_twin.twin.report.page.page_map import map_data
+from puncture_twin.twin.report.page.page_data import map_data
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import scipy
 from hypothesis import given, strategies as st
 
 from puncture_twin.planning.search.candidates import Pick
-from puncture_twin.twin.report.page.page_map import map_data, picked_row
+from puncture_twin.twin.report.page.page_data import map_data, picked_row
 from puncture_twin.twin.report.page.page_slices import block_box, ct_block
 from puncture_twin.twin.report.slices.panel import KNOTS_BYTE, KNOTS_HU
 

@@ -20,7 +20,7 @@ from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.search.candidates import Pick
 from puncture_twin.twin.report.page import page_slices, page_surfaces
 from puncture_twin.twin.report.page.page import Shown, write_page
-from puncture_twin.twin.report.page.page_scene import scene_figure
+from puncture_twin.twin.report.page.page_data import scene_figure
 from puncture_twin.twin.report.page.page_slices import ct_block
 from puncture_twin.twin.report.slices.panel import PIXELS, TONES, Subject, draw_panel
 from puncture_twin.twin.report.slices.planes import needle_planes
@@ -337,7 +337,7 @@ def test_the_arm_follows_what_is_chosen(browser, tmp_path):
     T_base_ct = random_pose(np.random.default_rng(4))
     first, path = found.best, tmp_path / "report.html"
     write_page(Shown(case, anatomy, found, pick=first, T_base_ct=T_base_ct), path)
-    drawn_first = scene_figure(case, anatomy, found, None, pick=first, T_base_ct=T_base_ct)["data"]
+    drawn_first = scene_figure(Shown(case, anatomy, found, pick=first, T_base_ct=T_base_ct))["data"]
     before = [unpacked(one) for one in drawn_first if one.get("meta", {}).get("frame")]
     with ready(browser, path.as_uri(), 1000) as page:
         if page.evaluate("document.getElementById('scene3d').hidden"):

@@ -13,6 +13,7 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.map.map_raster import map_raster, row_colours
 from puncture_twin.twin.report.map_view import MapCells, map_view
 from puncture_twin.twin.report.raster.camera import ViewCamera
+from puncture_twin.twin.report.raster.raster import corner_normals, lit
 from puncture_twin.twin.report.raster.render import (
     LIGHT,
     MAX_SHELLS,
@@ -23,7 +24,6 @@ from puncture_twin.twin.report.raster.render import (
     View,
     picture,
 )
-from puncture_twin.twin.report.raster.shading import corner_normals, lit
 
 SIZE = 90, 120
 

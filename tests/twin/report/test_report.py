@@ -28,19 +28,24 @@ from puncture_twin.twin.report.map.map_picture import DISC, draw_map, map_figure
 from puncture_twin.twin.report.map.map_raster import HATCH, map_raster
 from puncture_twin.twin.report.map_view import map_view, step_of
 from puncture_twin.twin.report.numbers import length_text, nearest_text, reason_counts
-from puncture_twin.twin.report.page import page_scene
+from puncture_twin.twin.report.page import page_data
 from puncture_twin.twin.report.page.page import Shown, write_page
-from puncture_twin.twin.report.page.page_map import map_data
-from puncture_twin.twin.report.page.page_scene import TRIANGLES, lightened
+from puncture_twin.twin.report.page.page_data import TRIANGLES, lightened, map_data
 from puncture_twin.twin.report.palette import SAFE_HIGH, SAFE_LOW
 from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.render import Layer
-from puncture_twin.twin.report.scene import film, film_text, scene_picture
-from puncture_twin.twin.report.scene.film import draw_film
-from puncture_twin.twin.report.scene.film_text import model_note
-from puncture_twin.twin.report.scene.scene_parts import LIFT_MM, SceneBody, corridor, needle_bodies, patient
+from puncture_twin.twin.report.scene import film, scene_picture
+from puncture_twin.twin.report.scene.film import draw_film, model_note
+from puncture_twin.twin.report.scene.scene_parts import (
+    LIFT_MM,
+    SceneBody,
+    corridor,
+    needle_bodies,
+    overview,
+    patient,
+    up_ct,
+)
 from puncture_twin.twin.report.scene.scene_picture import draw_scene, families, render_bodies
-from puncture_twin.twin.report.scene.views import overview, up_ct
 
 FRAMES = {
     "bed": ("LPS", None),
@@ -250,7 +255,7 @@ def test_the_scene_with_and_without_an_answer(anatomy, case, candidates, plan, t
     nothing = world.make_candidates(case, safe=False)
     pictures = []
     for number, (found, motion) in enumerate(((candidates, plan), (candidates, None), (nothing, None))):
-        draw_scene(case, anatomy, found, motion, tmp_path / f"{number}.png")
+        draw_scene(Shown(case, anatomy, found, motion), tmp_path / f"{number}.png")
         pictures.append(np.asarray(Image.open(tmp_path / f"{number}.png"))[90:480, 20:610].astype(int))
     greens = [((p[..., 1] > p[..., 0] + 25) & (p[..., 1] > p[..., 2] + 10)).sum() for p in pictures]
     assert greens[1] > 200 and greens[2] == 0
@@ -278,7 +283,7 @@ def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
         for count in (1, len(cores)):
             os.sched_setaffinity(0, sorted(cores)[:count])
             size = film.WIDTH, film.HEIGHT
-            film_text.write_mp4(frames, size, tmp_path / f"{count}.mp4", film.FRAMES_PER_SECOND)
+            film.write_mp4(frames, size, tmp_path / f"{count}.mp4", film.FRAMES_PER_SECOND)
     finally:
         os.sched_setaffinity(0, cores)
     assert (tmp_path / "1.mp4").read_bytes() == (tmp_path / f"{len(cores)}.mp4").read_bytes()
@@ -287,7 +292,7 @@ def test_a_film_has_the_same_bytes_on_any_number_of_cores(rng, tmp_path):
 def test_a_film_of_which_frames_are_lost_is_no_film(tmp_path, rng, monkeypatch):
     """An encoder on a full disk ends without a word: what it left must not pass for the film."""
     frames, path = [rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)] * 7, tmp_path / "film.mp4"
-    film_text.write_mp4(frames, (64, 48), path, 15)
+    film.write_mp4(frames, (64, 48), path, 15)
     assert len(decoded(path)[1]) == 7
     usual = imageio_ffmpeg.count_frames_and_secs
 
@@ -295,9 +300,9 @@ def test_a_film_of_which_frames_are_lost_is_no_film(tmp_path, rng, monkeypatch):
         FilePath(file).write_bytes(FilePath(file).read_bytes()[:-1000])
         return usual(file)
 
-    monkeypatch.setattr(film_text.imageio_ffmpeg, "count_frames_and_secs", cut_off)
+    monkeypatch.setattr(film.imageio_ffmpeg, "count_frames_and_secs", cut_off)
     with pytest.raises(RuntimeError):
-        film_text.write_mp4(frames, (64, 48), tmp_path / "cut.mp4", 15)
+        film.write_mp4(frames, (64, 48), tmp_path / "cut.mp4", 15)
     assert [one.name for one in tmp_path.iterdir()] == ["film.mp4"]
 
 
@@ -374,7 +379,7 @@ def test_after_a_checked_search_the_arm_is_in_the_scene(anatomy, case, candidate
     reached = replace(candidates, arm=replace(candidates.arm, q_insertion=q))
 
     def arms(pick, T_base_ct):
-        figure = page_scene.scene_figure(case, anatomy, reached, None, pick=pick, T_base_ct=T_base_ct)
+        figure = page_data.scene_figure(Shown(case, anatomy, reached, pick=pick, T_base_ct=T_base_ct))
         return [trace for trace in figure["data"] if trace.get("meta", {}).get("arm")]
 
     assert len(arms(Pick(reached, best.row), plan.T_base_ct)) > 6
@@ -387,7 +392,7 @@ def test_without_an_encoder_there_is_a_gif(anatomy, case, plan, tmp_path, monkey
     def no_encoder(*args, **options):
         raise RuntimeError("no ffmpeg")
 
-    monkeypatch.setattr(film_text.imageio_ffmpeg, "write_frames", no_encoder)
+    monkeypatch.setattr(film.imageio_ffmpeg, "write_frames", no_encoder)
     monkeypatch.setattr(film, "film_times", lambda total: film.FilmTimes((0.0, total), 1.0, 1))
     written = draw_film(world.make_rehearsal(plan), plan, case, anatomy, tmp_path / "film.mp4")
     assert [p.name for p in tmp_path.iterdir()] == ["film.gif"] == [written.name]
@@ -507,7 +512,7 @@ def test_a_failed_plan_is_none_that_nobody_wanted(anatomy, case, candidates, tmp
     for name, refusal in (("searched", ""), ("failed", "no approach was found to any of 12 candidates")):
         parts = (case, anatomy, candidates, None)
         write_page(Shown(*parts, refusal=refusal), tmp_path / f"{name}.html")
-        draw_scene(*parts, tmp_path / f"{name}.png", failed=bool(refusal))
+        draw_scene(Shown(*parts, refusal=refusal), tmp_path / f"{name}.png")
         pages[name] = (tmp_path / f"{name}.html").read_text(encoding="utf-8")
     assert 'class="card bad"' in pages["failed"] and 'class="card bad"' not in pages["searched"]
     failed, searched = visible(pages["failed"]), visible(pages["searched"])
@@ -598,7 +603,7 @@ def test_the_legend_names_the_room(anatomy, case, candidates, tmp_path, monkeypa
     mesh = anatomy.skin.mesh
     stand_in = SceneBody("gantry", "room", mesh, (1, 2, 3), 0.15), SceneBody("table", "room", mesh, (1, 2, 3))
     monkeypatch.setattr(scene_picture.scene_parts, "room", lambda *_: stand_in)
-    draw_scene(case, anatomy, candidates, None, tmp_path / "scene.png")
+    draw_scene(Shown(case, anatomy, candidates), tmp_path / "scene.png")
     assert {"gantry (see-through)", "table"} <= set(written)
 
 

@@ -10,8 +10,8 @@ import jinja2
 import pytest
 from markupsafe import Markup
 
-from puncture_twin.twin.report.page.template import Card, plotly_script, script_json, write_html
-from puncture_twin.twin.report.present import Field, Section, Warn, facts, grid, html, text
+from puncture_twin.twin.report.page.template import plotly_script, script_json, write_html
+from puncture_twin.twin.report.present import Card, Field, Section, Warn, facts, grid, html, text
 
 EVIL = "</script><script>alert('1')</script>{{ title }}"
 JOB = ("under", "sections", "inputs", "origin")

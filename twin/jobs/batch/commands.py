@@ -28,8 +28,7 @@ def _plan(
     as_json: JsonOption = False,
 ) -> None:
     """List every case of a cohort. Stores the hash of its inputs, options and version."""
-    from puncture_twin.twin.jobs.batch.jobs import plan_cohort
-    from puncture_twin.twin.jobs.batch.report import plan_text
+    from puncture_twin.twin.jobs.batch.jobs import plan_cohort, plan_text
 
     with progress_display() as progress:
         run = plan_cohort(cohort, out_dir, arm=False if no_arm else None, dry=dry_run, watcher=progress)
@@ -51,8 +50,7 @@ def _run(
 ) -> None:
     """Run the cases that have no result yet. Finished cases are kept if the run is stopped."""
     from puncture_twin.planning.batch.run_case import Limits
-    from puncture_twin.twin.jobs.batch.jobs import run_part, run_summary
-    from puncture_twin.twin.jobs.batch.report import run_text
+    from puncture_twin.twin.jobs.batch.jobs import run_part, run_summary, run_text
 
     with progress_display() as progress:
         limits = Limits(memory_mb, timeout_s)
@@ -64,7 +62,7 @@ def _run(
 def _status(out_dir: CohortOption, as_json: JsonOption = False) -> None:
     """Count done, failed, missing and stale cases. Hashes every input again."""
     from puncture_twin.planning.batch.run import cohort_state
-    from puncture_twin.twin.jobs.batch.report import state_text
+    from puncture_twin.twin.jobs.batch.jobs import state_text
 
     with progress_display() as progress:
         state = cohort_state(out_dir, partial(progress.count, "cases"))
@@ -81,8 +79,7 @@ def _merge(
     as_json: JsonOption = False,
 ) -> None:
     """Write a table, a dataset and a page of all cases. The dataset has all candidates."""
-    from puncture_twin.twin.jobs.batch.jobs import merge_cohort
-    from puncture_twin.twin.jobs.batch.report import merge_text
+    from puncture_twin.twin.jobs.batch.jobs import merge_cohort, merge_text
 
     with progress_display() as progress:
         merged = merge_cohort(out_dir, expect, tolerance, progress)
@@ -97,8 +94,7 @@ def _compare(
 ) -> None:
     """Compare two merged cohorts. Reports which cases became safe or were lost, and how far best entries moved."""
     from puncture_twin.planning.batch.merge import compare, read_cases
-    from puncture_twin.twin.jobs.batch.jobs import change_summary
-    from puncture_twin.twin.jobs.batch.report import compare_text
+    from puncture_twin.twin.jobs.batch.jobs import change_summary, compare_text
 
     found = compare(read_cases(before), read_cases(after))
     summary = {"counts": dict(found.counts), "cases": [change_summary(one) for one in found.changes]}

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,27 +20,23 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.choice import Choice, explain_choice, parse_choice
 from puncture_twin.planning.search.context import CaseContext, prepare
 from puncture_twin.planning.search.explain import Explanation, decimals, finite, reason_text
-from puncture_twin.planning.search.windows import Window, nearest_row
+from puncture_twin.planning.search.windows import nearest_row
 from puncture_twin.twin.jobs.patient.main_job import is_plan, read_noted_plan
 from puncture_twin.twin.jobs.patient.run import plan_summary
 from puncture_twin.twin.report.present import NOTHING, Block, Field, Section, Table, facts, number, text
 
-SAME_DIRECTION = 1e-9
-"""Radians within which a direction is one of the grid: rounding of typed degrees."""
-
+SAME_DIRECTION = 1e-9  # radians within which a direction is one of the grid: rounding of typed degrees
 MOST_ROLES = 4  # of inputs that differ, so many are named
 BEST_OF_ALL = Choice(rank=1)
-
-
-Stated = tuple[Sequence[float], Sequence[float], Sequence[int], Sequence[int], Sequence[str]]
+Stated = tuple[list[float], list[float], list[int], list[int], list[str]]
+GRID_KEYS = ("rank", "safe_cone_deg", "window", "window_square_deg", "window_entry_cm2")
+NEAREST = 5  # structures of either side whose clearances stand beside each other
+LEAST_CHANCE = 1e-4  # what is shown of a chance: a smaller one is no number that anybody can rely on
+NOT_CHECKED = "values as the plans state them; --case CASE checks them again, with chances and windows"
 
 
 def parse_two(
-    theta_deg: Sequence[float],
-    beta_deg: Sequence[float],
-    rank: Sequence[int],
-    window: Sequence[int],
-    entry: Sequence[str],
+    theta_deg: list[float], beta_deg: list[float], rank: list[int], window: list[int], entry: list[str]
 ) -> tuple[Choice, Choice]:
     """Two choices from options that may be repeated, in their order in the help; of one the best stands beside it."""
     if len(theta_deg) != len(beta_deg):
@@ -89,11 +85,8 @@ def compare_choices(context: CaseContext, choices: tuple[Choice, Choice]) -> Com
     return compare_paths(context, found, a, b)
 
 
-Titled = tuple[str, Explanation | Plan]  # a path, and how it was chosen or where its plan is
-
-
-def compare_paths(context: CaseContext, found: Candidates, *paths: Titled) -> Comparison:
-    """Two directions or plans of a case, beside what its search says of them; a plan is checked again."""
+def compare_paths(context: CaseContext, found: Candidates, *paths: tuple[str, Explanation | Plan]) -> Comparison:
+    """Two directions or plans of a case, each with its title, beside what its search says; a plan is checked again."""
     a, b = (_checked_side(context, found, title, path) for title, path in paths)
     read = [one for side in (a, b) if side.explained is not None for one in side.explained.read]
     return Comparison(context.case.name, (*read, *context.case.inputs), a, b, tuple(context.anatomy.warnings))
@@ -107,20 +100,14 @@ def compare_plans(paths: tuple[Path, Path], context: CaseContext | None, note: C
     if context is None:
         a, b = (Side(f"{path}", one.outward_ct, one.entry_ct, plan=one) for path, one in zip(paths, plans, strict=True))
         names = sorted({plan.case_name for plan in plans})
+        ours, theirs = ({one.role: one.sha256 for one in plan.inputs} for plan in plans)
+        roles = sorted(role for role in ours.keys() | theirs.keys() if ours.get(role) != theirs.get(role))
+        files = f"the plans were made from different files ({first_few(roles, MOST_ROLES)}): are they of one case?"
         read_by_both = (*inputs, *plans[0].inputs, *plans[1].inputs)
-        return Comparison(" and ".join(names), read_by_both, a, b, _differing(*plans))
+        return Comparison(" and ".join(names), read_by_both, a, b, (files,) if roles else ())
     titled = zip(map(str, paths), plans, strict=True)
     compared = compare_paths(context, context.search(), *titled)
     return replace(compared, inputs=(*inputs, *compared.inputs))
-
-
-def _differing(a: Plan, b: Plan) -> tuple[str, ...]:
-    """That two plans were made from different files: of another patient, or before and after a change."""
-    ours, theirs = ({one.role: one.sha256 for one in plan.inputs} for plan in (a, b))
-    roles = sorted(role for role in ours.keys() | theirs.keys() if ours.get(role) != theirs.get(role))
-    if not roles:
-        return ()
-    return (f"the plans were made from different files ({first_few(roles, MOST_ROLES)}): are they of one case?",)
 
 
 def _checked_side(context: CaseContext, candidates: Candidates, title: str, path: Explanation | Plan) -> Side:
@@ -136,30 +123,19 @@ def _checked_side(context: CaseContext, candidates: Candidates, title: str, path
     return Side(title, row.outward_ct[0], row.path.entry_ct[0], path, grid)
 
 
-def _on_grid(candidates: Candidates, outward_ct: Floats, *, safe: bool) -> OnGrid:
+def _on_grid(candidates: Candidates, outward_ct: Floats, *, safe: bool) -> dict[str, Any]:
+    """What a search says of a path, plain values; of one beside its grid there is neither rank nor cone."""
+    found: dict[str, Any] = dict.fromkeys(GRID_KEYS)
     row = nearest_row(candidates, outward_ct)
     if row is None or not (safe and candidates.safe[row]):
-        return OnGrid(None, float("nan"), None)
+        return found
     windows = candidates.windows
     window = windows.windows[int(windows.of_row[row]) - 1]
+    found |= {"window": window.number, "window_square_deg": window.square_deg, "window_entry_cm2": window.entry_cm2}
     if np.linalg.norm(candidates.outward_ct[row] - outward_ct) > SAME_DIRECTION:
-        return OnGrid(None, float("nan"), window)
-    return OnGrid(int(candidates.ranking.rank[row]), float(candidates.safe_cone[row]), window)
-
-
-NEAREST = 5  # structures of either side whose clearances stand beside each other
-LEAST_CHANCE = 1e-4
-"""What is shown of a chance: a smaller one is no number that anybody can rely on."""
-
-NOT_CHECKED = "values as the plans state them; --case CASE checks them again, with chances and windows"
-
-
-class OnGrid(NamedTuple):
-    """What a search says of a path on its grid; of one beside it the rank is None, and the cone, rad, NaN."""
-
-    rank: int | None
-    safe_cone: float
-    window: Window | None
+        return found
+    cone_deg = finite(np.degrees(float(candidates.safe_cone[row])))
+    return found | {"rank": int(candidates.ranking.rank[row]), "safe_cone_deg": cone_deg}
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +146,7 @@ class Side:
     outward_ct: Floats
     entry_ct: Floats
     explained: Explanation | None = None
-    grid: OnGrid | None = None
+    grid: Mapping[str, Any] | None = None
     plan: Plan | None = None
 
     @property
@@ -180,22 +156,12 @@ class Side:
 
     def summary(self) -> dict[str, Any]:
         """Plain values: mm and degrees; null where there is no number."""
-        grid = None
-        if self.grid is not None:
-            window = self.grid.window
-            grid = {
-                "rank": self.grid.rank,
-                "safe_cone_deg": finite(np.degrees(self.grid.safe_cone)),
-                "window": None if window is None else window.number,
-                "window_square_deg": None if window is None else window.square_deg,
-                "window_entry_cm2": None if window is None else window.entry_cm2,
-            }
         own = ("case", "inputs", "warnings")
         checked = {} if self.explained is None else self.explained.summary()
         return {
             "title": self.title,
             "check": {key: value for key, value in checked.items() if key not in own} or None,
-            "search": grid,
+            "search": self.grid,
             "plan": None if self.plan is None else plan_summary(self.plan),
         }
 
@@ -295,7 +261,7 @@ def _percent(chance: float) -> str:
     return f"{100 * chance:.2f}" if chance >= LEAST_CHANCE else "below 0.01"
 
 
-FIELDS = (
+FIELDS = (  # what stands in each row; rows that neither side has are left out
     Field("chosen by", "title"),
     Field("theta, beta, deg", "spoken.angles"),
     Field("verdict", "spoken.verdict"),
@@ -320,4 +286,3 @@ FIELDS = (
     Field("arm on the insertion", "plan.clearance_mm.insertion", 2, "mm"),
     Field("least clearance", "spoken.least", 2, "mm"),
 )
-"""What stands in each row; rows that neither side has are left out."""

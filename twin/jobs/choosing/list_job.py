@@ -6,7 +6,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,14 +53,14 @@ def check_list(
     out = None if out_dir is None else check_writable(out_dir)
     context = prepare(path, arm=arm, watcher=watcher)
     if entries is not None:
-        listed, outcome = read_entries(entries, context.case), _of_entry
+        listed = read_entries(entries, context.case)
     else:
         assert targets is not None
-        listed, outcome = read_targets(targets, context.case, choice), _of_target
+        listed = read_targets(targets, context.case, choice)
     rows = []
     for done, row in enumerate(listed.rows, start=1):
         try:
-            rows.append(_document(row, outcome(context, row)))
+            rows.append(_document(row, _outcome(context, row, of_target=entries is None)))
         except InputError as error:
             rows.append(_document(row, Outcome(None, REFUSED, str(error))))
         context.watcher.count("rows", done, len(listed.rows))
@@ -73,18 +72,19 @@ def check_list(
 CSV, PARQUET = "checked.csv", "checked.parquet"
 REFUSED = "refused"  # the verdict of a row that could not be checked: neither safe nor rejected
 
-TYPES: Mapping[str, str] = MappingProxyType(
-    {"row": "int64", "reachable": "bool", "safe_directions": "int64", "windows": "int64"}
-    | dict.fromkeys(("name", "verdict", "reason", "reason_structure", "detail", "on_the_skin", "nearest"), "string")
-)
-"""Of the columns that are no numbers with a fraction."""
-COLUMNS = (
+TYPES: Mapping[str, str] = {  # of the columns that are no numbers with a fraction
+    "row": "int64",
+    "reachable": "bool",
+    "safe_directions": "int64",
+    "windows": "int64",
+    **dict.fromkeys(("name", "verdict", "reason", "reason_structure", "detail", "on_the_skin", "nearest"), "string"),
+}
+COLUMNS = (  # of the table, in this order; what has no number is empty
     *("row", "name", "x_mm", "y_mm", "z_mm", "verdict", "reason", "reason_structure", "detail"),
     *("theta_deg", "beta_deg", "entry_x_mm", "entry_y_mm", "entry_z_mm", "on_the_skin"),
     *("path_length_mm", "skin_angle_deg", "min_clearance_mm", "nearest", "reachable", "p_hit", "p_touch_any"),
     *("safe_directions", "windows"),
 )
-"""Of the table, in this order; what has no number is empty."""
 
 
 class Outcome(NamedTuple):
@@ -138,13 +138,11 @@ class CheckedList:
         return text([head, *footer(self.files, self.warnings)])
 
 
-def _of_entry(context: CaseContext, row: Listed) -> Outcome:
-    explained = explain_choice(context, row.choice, None)
-    return Outcome(explained, explained.verdict)
-
-
-def _of_target(context: CaseContext, row: Listed) -> Outcome:
-    """The case searched again about a listed target, and the choice there, or the best."""
+def _outcome(context: CaseContext, row: Listed, *, of_target: bool) -> Outcome:
+    """An entry explained; or the case searched again about a listed target, and the choice there, or the best."""
+    if not of_target:
+        explained = explain_choice(context, row.choice, None)
+        return Outcome(explained, explained.verdict)
     there = context.at(to_lps(np.array([row.point_mm]), context.case.space)[0])
     found = there.search()
     counts = int(found.safe.sum()), len(found.windows)

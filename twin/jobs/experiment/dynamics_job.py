@@ -46,8 +46,8 @@ from puncture_twin.twin.report.present import Block, Field, Section, Warn, facts
 from puncture_twin.twin.world.client import to_m, to_mm
 from puncture_twin.twin.world.control import Stiffness, damping, reference_of, tips
 
-STEP_RAD = 0.02
-"""Between two states of an exciting motion that are checked for contact."""
+STEP_RAD = 0.02  # between two states of an exciting motion that are checked for contact
+HOLD_S = 0.5  # after the insertion
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,6 +67,7 @@ class Dynamics(Shown):
         found, worst = self.identified, self.tip_cov[np.trace(self.tip_cov, axis1=1, axis2=2).argmax()]
         path_mm, end_mm = (float(np.sqrt(np.trace(one))) for one in (worst, self.tip_cov[-1]))
         costs = None if self.budget is None else {"the identified dynamics": end_mm, **self.budget}
+        friction = found.friction.transpose(1, 0, 2).tolist()
         return {
             "rows": found.rows,
             "base_parameters": len(found.values),
@@ -84,9 +85,7 @@ class Dynamics(Shown):
                     "viscous_sd_nm_s": viscous_sd,
                     "torque_sd_nm": float(found.torque_sd_nm[joint]),
                 }
-                for joint, ((viscous, viscous_sd), (coulomb, coulomb_sd)) in enumerate(
-                    found.friction.transpose(1, 0, 2).tolist()
-                )
+                for joint, ((viscous, viscous_sd), (coulomb, coulomb_sd)) in enumerate(friction)
             ],
             "tip_path_mm": path_mm,
             "tip_path_95_mm": path_mm * radius_for_chance(worst / path_mm**2, 0.95),
@@ -98,10 +97,8 @@ class Dynamics(Shown):
 
     def _facts(self) -> Facts:
         yield from self.identified._facts()
-        yield (
-            "tip off its path, mm (rms at most, at the end)",
-            "{tip_path_mm:.4f}, {tip_end_mm:.4f}".format_map(self.summary()),
-        )
+        off = "{tip_path_mm:.4f}, {tip_end_mm:.4f}".format_map(self.summary())
+        yield "tip off its path, mm (rms at most, at the end)", off
 
     def text(self) -> str:
         """For a person."""
@@ -137,9 +134,7 @@ JOINTS = (
 def calibrate_dynamics(context: CaseContext, recording: Path) -> Dynamics:
     """Identify the dynamics of a case's arm, and say what their error costs at the tip.
 
-    Raises:
-        InputError: The case does not say where the arm's base is, no insertion is reached, or a recording that cannot
-            be used.
+    Raises InputError: Base or reach of the arm is not known, or a recording cannot be used.
     """
     case, T_base_ct = context.case, context.require_arm().T_base_ct
     found = identify(case.robot.model, read_torques(recording), gravity(case, T_base_ct), where=recording)
@@ -190,10 +185,6 @@ def _loop(model: UrModel, found: Identified, q: Floats, J: Floats, down_base: Fl
     return stepped[0], stepped[1]
 
 
-HOLD_S = 0.5
-"""After the insertion."""
-
-
 def tip_covariances(case: Case, found: Identified, insertion: Trajectory, down_base: Floats) -> Floats:
     """Covariance of the tip about its path, shape (m, 3, 3), mm^2, base frame, by the equation above."""
     model, tip_m = case.robot.model, float(to_m(case.needle.length_mm))
@@ -223,9 +214,7 @@ def recorded_or_given(context: CaseContext, recording: Path | None, record: Path
 def record_dynamics(context: CaseContext, path: Path, seed: int) -> Path:
     """Record torques of the simulated arm in an exciting motion, twice over, into a new CSV; the seed draws both.
 
-    Raises:
-        InputError: The case does not say where the arm's base is, or the file cannot be written.
-        NoAnswerError: No exciting motion is free of contact.
+    Raises InputError: No base of the arm, or no such file. NoAnswerError: No exciting motion is free of contact.
     """
     case, reach = context.case, context.require_arm()
     model, down, checker = slowed(case.robot.model, case.robot.speeds), gravity(case, reach.T_base_ct), reach.checker

@@ -1,7 +1,4 @@
-"""`pivot CASE JOINTS`: the needle's tip from touches of one place, beside what the case says of it.
-
-`pivot CASE`: the tip set onto one place in several poses in the twin, found from the joints, beside the truth.
-"""
+"""`pivot`: the needle's tip from touches of one place, that were read or are executed in the twin, beside the truth."""
 
 from __future__ import annotations
 
@@ -41,8 +38,8 @@ from puncture_twin.twin.report.present import Section, footer, text, vector
 if TYPE_CHECKING:  # a list is read where the simulator is not installed
     from puncture_twin.twin.guidance.ct.touching import Touched
 
-STANDS_OUT = 2.0
-"""A touch that misses by so many times the others' root mean square is named."""
+STANDS_OUT = 2.0  # a touch that misses by so many times the others' root mean square is named
+PIVOT, SUMMARY = "pivot.csv", "pivot.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +79,7 @@ def refuse_of_twin(*options: object) -> None:
 def pivot_case(case: Case, joints: Path) -> PivotRun:
     """Calibrate the tip from a CSV of touches of one place, a line a pose, with q1_deg to q6_deg among its columns.
 
-    Raises:
-        InputError: The case declares no errors, or the list has no joints, too few, too much alike, or of several
-            places.
+    Raises InputError: The case declares no errors, or there are no joints, too few, too much alike, of several places.
     """
     data = read_input(joints, max_bytes=MAX_FILE_BYTES, where=str(joints))
     read = parse_joint_recording(data, joints, timed=False)
@@ -125,7 +120,6 @@ def _pivot_said(run: PivotRun) -> list[Section]:
 
 
 def _doubt(run: PivotRun) -> list[str]:
-    """What a large residual is likely to come from."""
     pivot = run.pivot
     if not pivot.large:
         arm = pivot.expected_whole_mm > LARGE * pivot.expected_mm
@@ -137,9 +131,6 @@ def _doubt(run: PivotRun) -> list[str]:
         one = f"{run.names[worst]} misses by {pivot.misses_mm[worst]:.2f} mm, the others by {rest:.2f} (rms)"
         return [f"{head}: {one}: the tip slipped there, or touched another point"]
     return [f"{head}, in all touches alike: arm errors larger than declared, or touches of several points"]
-
-
-PIVOT, SUMMARY = "pivot.csv", "pivot.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,9 +172,7 @@ def parse_place(text: str | None) -> Floats | None:
 def pivot_tour(context: CaseContext, out: Path, poses: int, place_base: Floats | None, seed: int) -> PivotTourRun:
     """Plan a pivot calibration about a place (3,), mm, or one that is found, execute it in the twin, write its result.
 
-    Raises:
-        InputError: The case declares no errors or has no arm, or so many poses are not planned.
-        NoAnswerError: No place can be touched in so many poses, or too few were touched.
+    Raises InputError: No declared errors, no arm, or such a number of poses. NoAnswerError: Too few can be touched.
     """
     case = context.case
     if not LEAST_POSES <= poses <= MOST_POSES:

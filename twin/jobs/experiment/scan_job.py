@@ -1,7 +1,4 @@
-"""The job ``scan``: a case scanned, its markers, its lesion and a needle found again, and how far off each was.
-
-What ``scan`` prints: how it scanned, both readings of each marker beside the truth, and the next command.
-"""
+"""The job ``scan``: a case scanned, its markers, its lesion and a needle found again, and how far off each was."""
 
 from __future__ import annotations
 
@@ -32,57 +29,42 @@ from puncture_twin.twin.guidance.ct.markers import READING_MM, Markers, find_mar
 from puncture_twin.twin.guidance.ct.needle import find_needle, needle_error
 from puncture_twin.twin.guidance.ct.needle_fit import FoundNeedle
 from puncture_twin.twin.jobs.terminal import write_result
-from puncture_twin.twin.plant.scanner.case_scene import (
-    CaseScene,
-    MarkerKind,
-    Placer,
-    TrueRod,
-    VirtualScanner,
-    case_scene,
-    label_layers,
-)
+from puncture_twin.twin.plant.scanner import case_scene as scenes
 from puncture_twin.twin.plant.scanner.image import CtImage, ScanSettings
 from puncture_twin.twin.plant.scanner.writers import write_nifti, write_series
 from puncture_twin.twin.report.present import Block, Field, Section, facts, grid, text
 
 SERIES = "dicom"
-CT, LABELS, CROSSED, FOUND, REPORT, PICTURE = (
-    *("ct.nii.gz", "labels", "crossed"),
-    *("markers_ct.csv", "scan.json", "scan.png"),
-)
+CT, LABELS, CROSSED = "ct.nii.gz", "labels", "crossed"
+FOUND, REPORT, PICTURE = "markers_ct.csv", "scan.json", "scan.png"
 MAX_REHEARSAL_BYTES = 50_000_000
-HALF_MM = 50.0
-"""Of a slice's side in the picture."""
-SUB_VOXEL_SD = 0.03
-"""Of a drawn marker along the bed, over the spacing: what the detector is held to where metal is clipped."""
+HALF_MM = 50.0  # of a slice's side in the picture
+SUB_VOXEL_SD = 0.03  # of a drawn marker along the bed, over the spacing: the limit where metal is clipped
 
 
 class ScanRequest(NamedTuple):
     """What the user asks for; ``beside`` places what lies outside of the patient, nothing where None."""
 
     settings: ScanSettings
-    marker: MarkerKind = "disc"
+    marker: scenes.MarkerKind = "disc"
     rehearsal: Path | None = None
-    beside: Placer | None = None
+    beside: scenes.Placer | None = None
 
 
-def parse_marker(text: str) -> MarkerKind:
+def parse_marker(text: str) -> scenes.MarkerKind:
     """What stands at the markers' places; refused where nothing is known by that name."""
-    for kind in get_args(MarkerKind):
+    for kind in get_args(scenes.MarkerKind):
         if text == kind:
             return kind
     what = f"marker '{text[:40]}' is not known"
-    raise InputError(what, where="--marker", allowed=", ".join(get_args(MarkerKind)), code="unknown_choice")
+    raise InputError(what, where="--marker", allowed=", ".join(get_args(scenes.MarkerKind)), code="unknown_choice")
 
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """A needle in a control CT: where it truly is, where it was found, and the target that it was meant for.
+    """A needle in a control CT: where it truly is, where it was found, or None and why not; its target."""
 
-    ``found`` is None where it cannot be read; ``why_not`` says why.
-    """
-
-    true: TrueRod
+    true: scenes.TrueRod
     found: FoundNeedle | None
     target: Floats
     why_not: str = ""
@@ -94,7 +76,7 @@ class ScanRun:
 
     context: CaseContext
     request: ScanRequest
-    scene: CaseScene
+    scene: scenes.CaseScene
     image: CtImage
     markers: Markers | None
     lesion: tuple[Floats, Floats]
@@ -157,8 +139,7 @@ def control_summary(control: Control) -> dict[str, Any]:
 def scan_case(context: CaseContext, out: Path, request: ScanRequest) -> ScanRun:
     """Scan a case; write the series, NIfTI, the label map of the truth, the markers as found, and the report.
 
-    Raises:
-        InputError: A surface that is open, a field of view without the markers, or a rehearsal that cannot be used.
+    Raises InputError: An open surface, a field of view without the markers, or a rehearsal that cannot be used.
     """
     with context.stages.time("scan"):
         run = _scanned(context, request)
@@ -178,14 +159,16 @@ def _scanned(context: CaseContext, request: ScanRequest) -> ScanRun:
     rng = np.random.default_rng(settings.seed)
     needle, read = _rehearsed(request.rehearsal)
     rod = None if needle is None else needle[0]
-    scene = case_scene(case, context.anatomy, settings, rng, marker=request.marker, needle=rod, outside=request.beside)
-    image = VirtualScanner(scene, settings, rng).image()
+    scene = scenes.case_scene(
+        case, context.anatomy, settings, rng, marker=request.marker, needle=rod, outside=request.beside
+    )
+    image = scenes.VirtualScanner(scene, settings, rng).image()
     volume = Volume(image.hu, image.grid.T_ct_index, case.path)
     markers = None if scene.listed is None else find_markers(volume, scene.listed)
     lesion = _lesion(context, scene, image, volume)
     control, T = None, scene.T_scan_ct
     if needle is not None:
-        true, target = TrueRod(apply(T, needle[0].tip_ct), T[:3, :3] @ needle[0].forward_ct), apply(T, needle[1])
+        true, target = scenes.TrueRod(apply(T, needle[0].tip_ct), T[:3, :3] @ needle[0].forward_ct), apply(T, needle[1])
         try:
             control = Control(true, find_needle(volume, target, case.needle.diameter_mm), target)
         except InputError as error:
@@ -193,7 +176,7 @@ def _scanned(context: CaseContext, request: ScanRequest) -> ScanRun:
     return ScanRun(context, request, scene, image, markers, lesion, control, (*read, *case.inputs))
 
 
-def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volume) -> tuple[Floats, Floats]:
+def _lesion(context: CaseContext, scene: scenes.CaseScene, image: CtImage, volume: Volume) -> tuple[Floats, Floats]:
     """The target's structure, where it truly is and where it was read; of a rod of metal the end, else the middle."""
     name = context.case.target_structure
     solid = next(one for one in scene.solids if one.name == name)
@@ -202,17 +185,12 @@ def _lesion(context: CaseContext, scene: CaseScene, image: CtImage, volume: Volu
     mask = image.labels[solid.layer] == solid.label
     if not mask.any():
         refuse(f"'{name}' is not in the image", "scan", "a field of view that contains the target", "outside_image")
-    return middle_of(solid.mesh.triangles), read_lesion(volume, mask)
-
-
-def middle_of(triangles: Floats) -> Floats:
-    """The centroid of what closed triangles (m, 3, 3) enclose, shape (3,): tetrahedra from the origin."""
+    triangles = solid.mesh.triangles  # the centroid of what they enclose: of tetrahedra from the origin
     volumes = np.einsum("ti,ti->t", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2]))
-    return np.asarray(volumes @ triangles.sum(axis=1) / 4 / volumes.sum())
+    return np.asarray(volumes @ triangles.sum(axis=1) / 4 / volumes.sum()), read_lesion(volume, mask)
 
 
-def _rehearsed(path: Path | None) -> tuple[tuple[TrueRod, Floats] | None, tuple[Input, ...]]:
-    """The needle at the end of a rehearsal, and the true target, in the case's frame."""
+def _rehearsed(path: Path | None) -> tuple[tuple[scenes.TrueRod, Floats] | None, tuple[Input, ...]]:
     if path is None:
         return None, ()
     allowed = "a rehearsal.json of this version"
@@ -221,7 +199,7 @@ def _rehearsed(path: Path | None) -> tuple[tuple[TrueRod, Floats] | None, tuple[
     with fitting(path, allowed):
         end = document["needle_end"]
         tip, forward, target = (array(end[key], (3,)) for key in ("tip_ct_mm", "direction_ct", "target_ct_mm"))
-    return (TrueRod(tip, forward / np.linalg.norm(forward)), target), (read.input("rehearsal"),)
+    return (scenes.TrueRod(tip, forward / np.linalg.norm(forward)), target), (read.input("rehearsal"),)
 
 
 def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
@@ -230,7 +208,7 @@ def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
     identity = hashlib.sha256(made_from.encode()).hexdigest()
     yield from write_series(folder / SERIES, image, run.request.settings, identity, case.name)
     yield write_nifti(folder / CT, image.hu, image.grid.T_ct_index)
-    layers = label_layers(case, run.context.anatomy)
+    layers = scenes.label_layers(case, run.context.anatomy)
     for file, names, labels in zip((LABELS, CROSSED), layers, image.labels, strict=False):
         yield from _write_labels(folder, file, names, run, labels)
     if run.markers is not None:
@@ -240,7 +218,6 @@ def _write(run: ScanRun, folder: Path) -> Iterator[Path]:
 
 
 def _draw(run: ScanRun, path: Path) -> Path:
-    """Slices through the target, and through each marker and the needle's tip where they were read."""
     from puncture_twin.twin.report.slices.sheet import Mark, write_points_sheet  # with matplotlib
 
     marks, control = [Mark("target", run.scene.target, "true place")], run.control

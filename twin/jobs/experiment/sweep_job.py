@@ -64,11 +64,8 @@ class SweepRun:
 def sweep_case(context: CaseContext, out: Path, choice: Choice, to: Angles | None) -> SweepRun:
     """Plan a sweep to theta and beta, rad, execute it in the twin, write what was measured.
 
-    None goes to the farthest direction of the start's window.
-
-    Raises:
-        InputError: The case does not say where the robot stands.
-        NoAnswerError: Nothing is safe, or the sweep cannot start; says why.
+    None goes to the farthest direction of the start's window. Raises InputError: The case does not say where the robot
+    stands. NoAnswerError: Nothing is safe, or the sweep cannot start; says why.
     """
     case, count = context.case, context.watcher.count
     with writing(out, "sweep", inputs=case.inputs, names=(SWEEP,), note=context.watcher.note) as draft:
@@ -90,13 +87,11 @@ def sweep_end(source: Path, to: str | None, *, sweep: bool, alone: bool) -> Angl
         refuse("--to needs --sweep", "--to", "--sweep --to THETA,BETA", "conflicting_options")
     if is_plan(source) or not alone:
         refuse("a sweep needs one case", "--sweep", "a case, without plan and --seeds", "conflicting_options")
-    return parse_angles(to)
+    return None if to is None else parse_angles(to)
 
 
-def parse_angles(text: str | None) -> Angles | None:
+def parse_angles(text: str) -> Angles:
     """Theta and beta (rad) of "THETA,BETA" in degrees."""
-    if text is None:
-        return None
     numbers = [parse_coordinate(part.strip(), "--to") for part in text.split(",")]
     if len(numbers) != 2 or not (0 <= numbers[0] <= 180 and 0 <= numbers[1] <= 360):
         refuse(f"'{text[:40]}'", "--to", "THETA,BETA in degrees, 0 to 180 and 0 to 360", "not_a_number")

@@ -1,7 +1,7 @@
 """Markers touched in the twin: planned, executed where everything truly is, written as `registration` reads them.
 
-A reading of the simulator lies some hundredths of a millimetre from the joints that put the true tip on the true
-marker, so a physical run and its drawn twin err alike; and drawn ones cost milliseconds.
+A reading lies some hundredths of a millimetre from the joints that put the true tip on the true marker: a physical run
+and its drawn twin err alike.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from puncture_twin.twin.rehearsal.plan_truth import rehearse_touched
 from puncture_twin.twin.report.present import Field, Section, footer, grid, text
 
 TOUCH, SUMMARY = "touch.csv", "touch.json"
+DRAWS = 400  # where one axis errs most their rms is known to 3.5 %
 
 
 class Use(NamedTuple):
@@ -114,9 +115,7 @@ class TouchRun(Shown):
 def touch_case(context: CaseContext, out: Path, choice: Choice, seed: int) -> TouchRun:
     """Plan the touches of a case's markers for a chosen puncture, execute them in the twin, write what they read.
 
-    Raises:
-        InputError: The case declares no errors, or has no markers.
-        NoAnswerError: Nothing is safe, or too few markers can be touched, with the reasons.
+    Raises InputError: No declared errors, or no markers. NoAnswerError: Nothing is safe, or too few can be touched.
     """
     with writing(out, "touch", inputs=context.case.inputs, names=(TOUCH, SUMMARY), note=context.watcher.note) as draft:
         run = touch(context, choice, seed)
@@ -252,33 +251,24 @@ def touch_text(run: TouchRun) -> str:
         failed, worst = ", ".join(touched.failed), f"with the worst poses {plan.worst_mm:.2f} mm"
         without = f" without {failed}, {plan.expected_mm:.2f} with them" if failed else ""
         truth = f"error in this trial (seed {run.seed}): {use.tip_error_mm:.2f} mm"
+        flags = [flag.sentence for flag in use.registration.flags]
         said = [
             Section(f"expected tip error: {use.expected_mm:.2f} mm rms{without}; {worst}", []),
-            Section(
-                f"{truth}; FRE {use.registration.fre_mm:.2f} mm", [flag.sentence for flag in use.registration.flags]
-            ),
+            Section(f"{truth}; FRE {use.registration.fre_mm:.2f} mm", flags),
         ]
     return text([Section(head, [grid(TOUCHED, run.summary()["touches"]), *left]), *said, *footer(run.files)])
 
 
 def _per_touch(touched: Touched) -> float | None:
-    """Seconds for each that was read."""
     return touched.seconds / len(touched.readings) if touched.readings else None
-
-
-DRAWS = 400
-"""Where one axis errs most their rms is known to 3.5 %."""
 
 
 def physical_runs(context: CaseContext, runs: int) -> dict[str, Any]:
     """Run the experiment of a case's best candidate, each run with a truth of its own; returns plain values.
 
     They are the tip's rms error that the declaration predicts for these touches and that of the runs that ended, each
-    of these, why others were refused, and the errors of truths without physics, the same and many.
-
-    Raises:
-        InputError: The case declares no errors, or has no markers.
-        NoAnswerError: Nothing is safe, or too few markers can be touched.
+    of these, why others were refused, and the errors of truths without physics, the same and many. Raises as
+    `touch_case`.
     """
     tour, ended, refused = plan_tour(context, BEST, seed=0), [], {}
     for seed in range(runs):

@@ -20,30 +20,23 @@ from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.numba_kernels import nb
 
 HEADER = struct.Struct(">H12s20sIIQQ")
-EXTENDED = struct.Struct(">HHII")
-"""Size of the extended header, of the metadata's index and of the metadata, and the message's number."""
+EXTENDED = struct.Struct(">HHII")  # sizes of this header, of the metadata's index and the metadata; number
 NO_METADATA = b"\0\0"
 VERSIONS = (1, 2)
-MOST_BODY = 1 << 30
-"""Bytes that a header may claim: an image that somebody sends by mistake is passed over, nonsense is not waited for."""
+MOST_BODY = 1 << 30  # bytes that a header may claim: nonsense is not waited for, an image is passed over
 KIND = re.compile(rb"[A-Z][A-Z0-9_]*\0*")
-MOST_TEXT = 65_535
-"""Bytes of a STRING: its length has two."""
-ASCII, UTF8 = 3, 106
-"""A text's encoding, by its number at IANA."""
-ORTHOGONAL = 1e-3
-"""How far R^T R may be from 1: a tracker's own rounding; only the axis is used."""
+MOST_TEXT = 65_535  # bytes of a STRING: its length has two
+ASCII, UTF8 = 3, 106  # a text's encoding, by its number at IANA
+ORTHOGONAL = 1e-3  # how far R^T R may be from 1: a tracker's own rounding; only the axis is used
 POINT = struct.Struct(">64s32s4B3ff20s")
 TRACKED = struct.Struct(">20sBB48s")
 IMAGE = struct.Struct(">HBBBB3H12f6H")
-UINT16, LITTLE, RAS = 5, 2, 1
-"""An image's type of numbers, their order, and its space."""
+UINT16, LITTLE, RAS = 5, 2, 1  # an image's type of numbers, their order, and its space
 MESH = struct.Struct(">10I")
 SCALAR = struct.Struct(">BBI")
 POINT_SCALAR = 0x00
 STATUS = struct.Struct(">Hq20s")
-READY, TIMED_OUT = 1, 7
-"""Codes of a STATUS."""
+READY, TIMED_OUT = 1, 7  # codes of a STATUS
 
 
 class Stamp(NamedTuple):
@@ -51,8 +44,7 @@ class Stamp(NamedTuple):
 
     version: int
     seconds: int
-    fraction: int
-    """Of a second, in 2^-32."""
+    fraction: int  # of a second, in 2^-32
     number: int
 
     @property
@@ -64,18 +56,11 @@ class Stamp(NamedTuple):
 class Header(NamedTuple):
     """What is known of a message before its body has come."""
 
-    version: int
     kind: str
     name: str
-    seconds: int
-    fraction: int
+    stamp: Stamp  # without the number, which the body has
     size: int
     checksum: int
-
-    @property
-    def stamp(self) -> Stamp:
-        """Without the number, which the body has."""
-        return Stamp(self.version, self.seconds, self.fraction, 0)
 
 
 class Message(NamedTuple):
@@ -89,21 +74,20 @@ class Message(NamedTuple):
 
 def read_header(data: bytes) -> Header:
     """A header of 58 bytes; none is refused: whatever follows it cannot be told apart any more."""
-    version, kind, name, *rest = HEADER.unpack(data)
+    version, kind, name, seconds, fraction, size, code = HEADER.unpack(data)
     if version not in VERSIONS or not KIND.fullmatch(kind):
         what = f"no header of a message (version {version}, type {kind!r})"
         refuse(what, "OpenIGTLink", f"version {' or '.join(map(str, VERSIONS))}, a type in capitals", "bad_header")
-    header = Header(version, _word(kind), _word(name), *rest)
-    if header.size > MOST_BODY:
-        refuse(f"a body of {header.size} bytes", "OpenIGTLink", f"at most {MOST_BODY}", "too_large")
-    return header
+    if size > MOST_BODY:
+        refuse(f"a body of {size} bytes", "OpenIGTLink", f"at most {MOST_BODY}", "too_large")
+    return Header(_word(kind), _word(name), Stamp(version, seconds, fraction, 0), size, code)
 
 
 def read_message(header: Header, body: bytes) -> Message:
     """The message of a header and its body; another checksum, or parts that do not fit, are refused."""
     if checksum(body) != header.checksum:
         refuse("its checksum is another", f"{header.kind} {header.name}", "the CRC-64 of its body", "file_damaged")
-    if header.version == 1:
+    if header.stamp.version == 1:
         return Message(header.kind, header.name, header.stamp, body)
     first, index, metadata, number = EXTENDED.unpack(body[: EXTENDED.size].ljust(EXTENDED.size, b"\0"))
     if not EXTENDED.size <= first <= len(body) - index - metadata:
@@ -114,11 +98,7 @@ def read_message(header: Header, body: bytes) -> Message:
 
 
 def read_place(message: Message) -> Floats:
-    """The point (3,) of a POINT with one point, or the origin of a TRANSFORM.
-
-    Raises:
-        InputError: Not one point, or a coordinate that is no finite number.
-    """
+    """The point (3,) of a POINT with one point, or the origin of a TRANSFORM; an `InputError` if that is not finite."""
     if message.kind == "TRANSFORM":
         return _finite(_matrix(message.content, message)[:, 3], message)
     if len(message.content) != POINT.size:
@@ -129,8 +109,7 @@ def read_place(message: Message) -> Floats:
 def read_pose(message: Message, name: str) -> tuple[Floats, Floats]:
     """Origin (3,) and z-axis (3,), unit, of a TRANSFORM, or of the tool of this name of a TDATA.
 
-    Raises:
-        InputError: No such tool, a number that is not finite, or axes that no rotation has.
+    Raises InputError: No such tool, a number that is not finite, or axes that no rotation has.
     """
     content = message.content
     if message.kind == "TDATA":
@@ -203,13 +182,7 @@ def image_content(values: NDArray[np.uint16], first: tuple[float, float], step: 
 
 
 def mesh_content(points: Floats, cells: bytes, scalars: Mapping[str, NDArray[Any]]) -> bytes:
-    """Of a POLYDATA of quads with scalars.
-
-    Args:
-        points: Shape (p, 3).
-        cells: From `quad_bytes`.
-        scalars: Shape (p,) each, by name.
-    """
+    """Of a POLYDATA of points (p, 3), quads as of `quad_bytes`, and scalars (p,) by name."""
     count = len(cells) // (5 * 4)
     names = b"".join(name.encode() + b"\0" for name in scalars)
     head = MESH.pack(len(points), 0, 0, 0, 0, count, len(cells), 0, 0, len(scalars))

@@ -36,35 +36,16 @@ from puncture_twin.planning.search.choice import Choice, explain_choice
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation, finite
 from puncture_twin.planning.search.safe_map import NOT_TESTED, SafeMap, safe_map
-from puncture_twin.twin.jobs.live.messages import (
-    READY,
-    TIMED_OUT,
-    Header,
-    Message,
-    Stamp,
-    image_content,
-    mesh_content,
-    packed,
-    point_content,
-    quad_bytes,
-    read_place,
-    read_pose,
-    status_content,
-    text_content,
-)
+from puncture_twin.twin.jobs.live import messages
 
-AIMED_MM = 2.0
-"""A hand and a tracker together keep a needle on a line to about this."""
-NOT_AIMED = "not aimed"
-"""The path is safe, and the needle is not on it."""
+AIMED_MM = 2.0  # a hand and a tracker together keep a needle on a line to about this
+NOT_AIMED = "not aimed"  # the path is safe, and the needle is not on it
 LEFT_OUT = ("case", "inputs", "entry_ct_mm", "warnings", "findings")
 """Of a direction's summary: Status has them, or they are in the case's space."""
-FREE, NO_STRUCTURE = 0, 65_535
-"""Values of SafeGrid where nothing blocks, and where no structure can be named."""
-ELSEWHERE_MM = 1e-6
-"""Within this of the case's target another is as good."""
-WARM = 64
-"""Directions that are checked before the first client comes: kernels are compiled then."""
+FREE, NO_STRUCTURE = 0, 65_535  # values of SafeGrid where nothing blocks, and where no structure can be named
+ELSEWHERE_MM = 1e-6  # within this of the case's target another is as good
+WARM = 64  # directions that are checked before the first client comes: kernels are compiled then
+SUBJECTS = ("status", "target", "needle")  # as they are answered: a needle is checked against the newest target
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,22 +70,20 @@ class MapMesh:
         beta = directions.beta[:, None] + half * np.array([-1, 1, 1, -1])
         units = outward(theta.ravel(), beta.ravel()) @ case.T_ct_entry[:3, :3].T
         quads = np.arange(len(units)).reshape(-1, 4)
-        return cls(directions.grid, to_lps(units, Space.RAS), quad_bytes(quads), case.needle.length_mm)
+        return cls(directions.grid, to_lps(units, Space.RAS), messages.quad_bytes(quads), case.needle.length_mm)
 
     def content(self, target_ras: list[float], scalars: Mapping[str, NDArray[Any]]) -> bytes:
         """Of a POLYDATA about a target, with values (n,) by name."""
         points = np.array(target_ras) + self.radius_mm * self.corners
-        return mesh_content(points, self.cells, {name: np.repeat(values, 4) for name, values in scalars.items()})
+        return messages.mesh_content(
+            points, self.cells, {name: np.repeat(values, 4) for name, values in scalars.items()}
+        )
 
     def image(self, values: Ints) -> bytes:
         """Of an IMAGE: a value (n,) a direction; beta along its rows, theta along its columns, in degrees."""
         shape = len(self.grid.theta), len(self.grid.beta)
         first = float(np.degrees(self.grid.beta[0])), float(np.degrees(self.grid.theta[0]))
-        return image_content(values.astype(np.uint16).reshape(shape), first, float(np.degrees(self.grid.step)))
-
-
-SUBJECTS = ("status", "target", "needle")
-"""In the order in which they are answered: a needle is checked against the newest target."""
+        return messages.image_content(values.astype(np.uint16).reshape(shape), first, float(np.degrees(self.grid.step)))
 
 
 @dataclass(eq=False)
@@ -121,8 +100,8 @@ class Question(NamedTuple):
     client: int
     session: Session
     subject: str
-    stamp: Stamp
-    message: Message | None = None
+    stamp: messages.Stamp
+    message: messages.Message | None = None
     fault: PlanningError | None = None
 
 
@@ -145,7 +124,7 @@ class Planner:
             context.at(context.case.target_ct + ELSEWHERE_MM * np.random.default_rng().uniform(size=3))
         self._context = at = context.at(context.case.target_ct)  # shows no progress
         free = safe_map(at)
-        deque(self._map(free, Stamp(1, 0, 0, 0)), maxlen=0)  # packed and summed, as an answer is
+        deque(self._map(free, messages.Stamp(1, 0, 0, 0)), maxlen=0)  # packed and summed, as an answer is
         rows = np.append(np.flatnonzero(~free.blocked), 0)[:: 1 + len(free.blocked) // WARM]
         checked = at.check(free.directions.theta[rows], free.directions.beta[rows])  # compilers run now, not later
         best = 0 if checked.best is None else checked.best.row
@@ -160,7 +139,7 @@ class Planner:
         """Of a client that has said nothing yet: the case's target."""
         return Session(self._context)
 
-    def subject(self, header: Header) -> str | None:
+    def subject(self, header: messages.Header) -> str | None:
         """What a message is about; see the head of this module."""
         kind, name = header.kind, header.name
         if kind == "GET_STATUS" or (kind, name) == ("STRING", "Query"):
@@ -186,7 +165,7 @@ class Planner:
         if question.subject == "status":
             yield self._status(session, message.kind, message.stamp)
         elif question.subject == "target":
-            target_ras = read_place(message)
+            target_ras = messages.read_place(message)
             target_ct = to_lps(target_ras[None], Space.RAS)[0]
             try:
                 session.context = self._context.at(target_ct)
@@ -194,27 +173,27 @@ class Planner:
                 raise error.at(f"{message.kind} Target ({point_text(target_ct, Space.RAS)})") from error
             yield from self._map(safe_map(session.context), message.stamp)
         else:
-            tip_ras, axis_ras = read_pose(message, "Needle")
+            tip_ras, axis_ras = messages.read_pose(message, "Needle")
             yield from self._verdict(session, tip_ras, axis_ras, message.stamp)
 
-    def refused(self, subject: str | None, stamp: Stamp, error: PlanningError) -> Iterator[Answer]:
+    def refused(self, subject: str | None, stamp: messages.Stamp, error: PlanningError) -> Iterator[Answer]:
         """What stands in place of answers: no cells, no free direction, no entry, and why."""
         document = {"error": {"code": error.code, "sentence": str(error)}}
         if subject == "target":
-            yield _answer("POLYDATA", "SafeMap", stamp, mesh_content(np.zeros((0, 3)), b"", {}))
+            yield _answer("POLYDATA", "SafeMap", stamp, messages.mesh_content(np.zeros((0, 3)), b"", {}))
             yield _answer("IMAGE", "SafeGrid", stamp, self._mesh.image(np.full(len(self._mesh.grid), NO_STRUCTURE)))
             yield _text("SafeMapInfo", stamp, document)
         if subject in ("target", "needle"):
             yield _text("Verdict", stamp, {"verdict": "refused", **document})
-            yield _answer("POINT", "Entry", stamp, point_content(None, ""))
+            yield _answer("POINT", "Entry", stamp, messages.point_content(None, ""))
         else:
             yield _text("Error", stamp, document)
 
-    def _status(self, session: Session, kind: str, stamp: Stamp) -> Answer:
+    def _status(self, session: Session, kind: str, stamp: messages.Stamp) -> Answer:
         fault = None if session.needle is None else session.needle.fault
         if kind == "GET_STATUS":
-            content = status_content(READY, "ready") if fault is None else status_content(TIMED_OUT, str(fault))
-            return _answer("STATUS", "Status", stamp, content)
+            code, text = (messages.READY, "ready") if fault is None else (messages.TIMED_OUT, str(fault))
+            return _answer("STATUS", "Status", stamp, messages.status_content(code, text))
         context = session.context
         document = {
             "case": self._context.case.name,
@@ -226,7 +205,7 @@ class Planner:
         }
         return _text("Status", stamp, document)
 
-    def _map(self, found: SafeMap, stamp: Stamp) -> Iterator[Answer]:
+    def _map(self, found: SafeMap, stamp: messages.Stamp) -> Iterator[Answer]:
         mesh, target_ras = self._mesh, _ras(found.target_ct)
         scalars: dict[str, NDArray[Any]] = {"blocked": found.blocked.astype(np.int64), "structure": found.structure}
         yield _answer("POLYDATA", "SafeMap", stamp, mesh.content(target_ras, scalars))
@@ -242,7 +221,7 @@ class Planner:
         }
         yield _text("SafeMapInfo", stamp, document)
 
-    def _verdict(self, session: Session, tip_ras: Floats, axis_ras: Floats, stamp: Stamp) -> Iterator[Answer]:
+    def _verdict(self, session: Session, tip_ras: Floats, axis_ras: Floats, stamp: messages.Stamp) -> Iterator[Answer]:
         """What `check` says of the needle's direction, and whether its line is the one that was checked."""
         if session.context is None:
             refuse("the last target was refused", "Needle", "a Target first", "no_target")
@@ -274,7 +253,7 @@ class Planner:
             "check": {key: value for key, value in found.summary().items() if key not in LEFT_OUT},
         }
         yield _text("Verdict", stamp, document)
-        yield _answer("POINT", "Entry", stamp, point_content(point, verdict))
+        yield _answer("POINT", "Entry", stamp, messages.point_content(point, verdict))
 
 
 def explained(context: CaseContext, theta: float, beta: float) -> Explanation:
@@ -299,11 +278,11 @@ def _ras(point_ct: Floats) -> list[float]:
     return [float(one) for one in to_lps(point_ct[None], Space.RAS)[0]]
 
 
-def _text(name: str, stamp: Stamp, document: dict[str, Any]) -> Answer:
+def _text(name: str, stamp: messages.Stamp, document: dict[str, Any]) -> Answer:
     answered = {"time_s": stamp.time_s, "number": stamp.number}
     text = json.dumps({"answers": answered, **document}, allow_nan=False)
-    return _answer("STRING", name, stamp, text_content(text))
+    return _answer("STRING", name, stamp, messages.text_content(text))
 
 
-def _answer(kind: str, name: str, stamp: Stamp, content: bytes) -> Answer:
-    return Answer(f"{kind} {name}", packed(kind, name, stamp, content))
+def _answer(kind: str, name: str, stamp: messages.Stamp, content: bytes) -> Answer:
+    return Answer(f"{kind} {name}", messages.packed(kind, name, stamp, content))

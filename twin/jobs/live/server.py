@@ -24,31 +24,22 @@ from puncture_twin.twin.jobs.live.planner import SUBJECTS, Answer, Planner, Ques
 
 LOG = logging.getLogger(__name__)
 MOST_CLIENTS = 8
-MOST_KEPT = 65_536
-"""Bytes of a body that is kept: 900 tracked tools. A larger one is passed over."""
+MOST_KEPT = 65_536  # bytes of a body that is kept: 900 tracked tools. A larger one is passed over
 CHUNK = 65_536
-MOST_AT_ONCE, REST_S = 20, 0.005
-"""So many messages, or as many bytes as a chunk, before a client is not read for a while: 4,000 in a second, 13 MB."""
-MESSAGE_S = 5.0
-"""A message that has begun is whole after this time, or its sender is gone."""
-STALL_S = 10.0
-"""An answer that is not taken in this time has no reader."""
-VANISHED_S, PROBES = 20.0, 4
-"""A client whose machine acknowledges nothing in this time is gone; one that is silent is probed so often in it."""
-POSE_S = 2.0
-"""A pose counts so long: a tracker that stopped leaves no verdict behind."""
-SEND_BUFFER = 262_144
-"""Bytes that the system keeps for a client: what waits there cannot be replaced by what is newer."""
-MOST_LINES, LINES_S = 20, 60.0
-"""So many lines in the log in this time."""
+MOST_AT_ONCE, REST_S = 20, 0.005  # messages, or chunks of bytes, before a client is not read for a while
+MESSAGE_S = 5.0  # a message that has begun is whole after this time, or its sender is gone
+STALL_S = 10.0  # an answer that is not taken in this time has no reader
+VANISHED_S, PROBES = 20.0, 4  # without a word of its machine, probed so often, a client is gone
+POSE_S = 2.0  # a pose counts so long: a tracker that stopped leaves no verdict behind
+SEND_BUFFER = 262_144  # bytes that the system keeps for a client: what waits there cannot be replaced by what is newer
+MOST_LINES, LINES_S = 20, 60.0  # so many lines in the log in this time
 USED = "the messages of docs/reference/live.md"
 
 
 class Exchange:
     """What waits between clients and planner: the newest question of each subject, in turn for each client.
 
-    Args:
-        pose_s: A needle without a newer pose for so long is asked about by the exchange itself, as one that is refused.
+    A needle without a newer pose for `pose_s` is asked about by the exchange itself, as one that is refused.
     """
 
     def __init__(self, pose_s: float = POSE_S) -> None:
@@ -221,7 +212,6 @@ def _compute(exchange: Exchange, planner: Planner) -> None:
 
 
 def _answer(exchange: Exchange, planner: Planner, question: Question) -> None:
-    """Give the answers, or why there are none."""
     fault = None
     try:
         for answer in planner.answers(question):
@@ -302,17 +292,16 @@ class Client:
 
     def _read(self) -> None:
         try:
-            while first := self._first():
+            while True:
+                self._in.settimeout(None)
+                if not (first := self._in.recv(1)):
+                    break
                 self._read_message(first, time.monotonic() + MESSAGE_S)
             self._end("gone", "")
         except InputError as error:  # what follows is not known to be a message
             self._end(error.code, str(error))
         except OSError as error:
             self._broken(error, "half_a_message", f"a message is not whole after {MESSAGE_S:g} s")
-
-    def _first(self) -> bytes:
-        self._in.settimeout(None)
-        return self._in.recv(1)
 
     def _broken(self, error: OSError, code: str, late: str) -> None:
         """End it after an error; that of a wait which was too long has no number of the system's."""
@@ -326,7 +315,9 @@ class Client:
         subject = self._planner.subject(header)
         try:
             if subject is None or header.size > MOST_KEPT:
-                self._pass_over(header.size)
+                left = header.size
+                while left > 0:  # nothing is kept; each part has the time of a message
+                    left -= len(self._exactly(min(left, CHUNK), time.monotonic() + MESSAGE_S))
                 what = f"{header.kind} '{header.name}' of {header.size} bytes is not used"
                 refuse(what, "OpenIGTLink", USED, "unknown_message")
             message = read_message(header, self._exactly(header.size, until))
@@ -355,17 +346,8 @@ class Client:
             if not more:
                 raise ConnectionError("ended within a message")
             data += more
-        self._rest(size)
-        return bytes(data)
-
-    def _rest(self, size: int) -> None:
-        """Wait a while, where enough was read since the last time: a body as large as a chunk is enough alone."""
         self._read_since += max(size / CHUNK, 0.5 / MOST_AT_ONCE)  # a message has two parts
-        if self._read_since >= 1.0:
+        if self._read_since >= 1.0:  # enough was read since the last rest: a body as large as a chunk is enough alone
             self._read_since = 0.0
             time.sleep(REST_S)
-
-    def _pass_over(self, size: int) -> None:
-        """Read so many bytes and keep none; each part has the time of a message."""
-        while size > 0:
-            size -= len(self._exactly(min(size, CHUNK), time.monotonic() + MESSAGE_S))
+        return bytes(data)

@@ -15,16 +15,8 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.rigid import log_rotation
+from puncture_twin.twin.guidance.ultrasound.axp_ybq import equation
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import (
-    UNWEIGHTED,
-    Estimate,
-    Problem,
-    active_columns,
-    closed_form,
-    mean_direction,
-    tip_residuals,
-)
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.fit import plain_fit
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import SPEC_NOISE, Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import expected_tre_mm
@@ -48,21 +40,19 @@ TABLE: Mapping[int, tuple[float, float, float, float]] = {
 
 COMPARED_WITH = "this project's specification, from a simulation; the patent application states no figure"
 
-LIMITS: Mapping[tuple[int, str], float] = {
+LIMITS: Mapping[tuple[int, str], float] = {  # what must be reached, mm
     (20, "Gauss-Newton"): 0.34,
     (30, "closed form"): 0.30,
     (30, "Gauss-Newton"): 0.24,
     (50, "Gauss-Newton"): 0.18,
 }
-"""What must be reached, mm."""
 
 OVER_BOUND: Mapping[str, float] = {"Gauss-Newton": 1.2, "weighted": 1.05}
 """How far above the Cramer-Rao bound of the same recordings a method may be."""
 
 MOST_STEPS = 10  # steps of the refinement from 20 poses on
 OUTLIER_FRACTION, OUTLIER_MM = 0.1, 5.0
-SCALE_LIMIT_MM = 0.25
-"""With the pixel size estimated; the known number is 0.239."""
+SCALE_LIMIT_MM = 0.25  # with the pixel size estimated; the known number is 0.239
 
 
 def _row(what: str, known: float | None, ours: float, limit: float | None, unit: str) -> dict[str, Any]:
@@ -83,7 +73,7 @@ def reproduce(seeds: int | None) -> Answer:
     runs, worst = seeds or RUNS, 0.0
     for n in (16, 20, 50):  # the closed form without noise: the largest error of any unknown
         recording, truth = simulate_recording(np.random.default_rng([SEED, n]), n, noise=None)
-        found, exact = closed_form(recording), truth_estimate(truth)
+        found, exact = equation.closed_form(recording), truth_estimate(truth)
         turns = [log_rotation(a.T @ b) for a, b in ((found.R_X, exact.R_X), (found.R_Y, exact.R_Y))]
         moves = [found.t_X - exact.t_X, found.t_Y - exact.t_Y, found.t_Q - exact.t_Q]
         worst = max(worst, float(np.degrees(np.abs(turns).max())), float(np.abs(moves).max()))
@@ -99,10 +89,10 @@ def summary(rows: Sequence[Mapping[str, Any]], runs: int) -> dict[str, Any]:
     return {"compared_with": COMPARED_WITH, "rows": list(rows), "runs": runs, "seed": SEED, "holds": holds}
 
 
-def truth_estimate(truth: SimulatedTruth) -> Estimate:
+def truth_estimate(truth: SimulatedTruth) -> equation.Estimate:
     """The truth in the form of an estimate."""
     X, Y = truth.X, truth.Y
-    return Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], truth.tip_end2, np.ones(2), truth.direction_end2)
+    return equation.Estimate(X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3], truth.tip_end2, np.ones(2), truth.direction_end2)
 
 
 def _table(runs: int) -> list[dict[str, Any]]:
@@ -138,19 +128,19 @@ def widened(squares: Floats) -> float:
 def _run(rng: np.random.Generator, n: int) -> _Run:
     recording, truth = simulate_recording(rng, n)
     unseen, _ = simulate_recording(rng, UNSEEN, truth, noise=None)
-    start = closed_form(recording)
-    active = active_columns(scale=False, direction=False)
-    plain = plain_fit(Problem(recording, UNWEIGHTED, active), start)
-    weighted = plain_fit(Problem(recording, SPEC_NOISE, active), start)
+    start = equation.closed_form(recording)
+    active = equation.active_columns(scale=False, direction=False)
+    plain = plain_fit(equation.Problem(recording, equation.UNWEIGHTED, active), start)
+    weighted = plain_fit(equation.Problem(recording, SPEC_NOISE, active), start)
     squared = [_squared(estimate, unseen) for estimate in (start, plain.estimate, weighted.estimate)]
     bound = expected_tre_mm(recording, SPEC_NOISE, truth_estimate(truth), unseen) ** 2
-    V = mean_direction(plain.estimate, recording)
+    V = equation.mean_direction(plain.estimate, recording)
     angle = float(np.degrees(np.arccos(np.clip(V @ truth.direction_end2, -1.0, 1.0))))
     return _Run(np.array([*squared, bound]), max(plain.iterations, weighted.iterations), angle)
 
 
-def _squared(estimate: Estimate, unseen: Recording) -> float:
-    return float(np.mean(np.sum(tip_residuals(estimate, unseen) ** 2, axis=1)))
+def _squared(estimate: equation.Estimate, unseen: Recording) -> float:
+    return float(np.mean(np.sum(equation.tip_residuals(estimate, unseen) ** 2, axis=1)))
 
 
 def _outliers(runs: int) -> list[dict[str, Any]]:
@@ -160,8 +150,8 @@ def _outliers(runs: int) -> list[dict[str, Any]]:
         recording, truth = simulate_recording(rng, 30)
         unseen, _ = simulate_recording(rng, UNSEEN, truth, noise=None)
         broken = with_outliers(rng, recording, OUTLIER_FRACTION, OUTLIER_MM)
-        active = active_columns(scale=False, direction=False)
-        plain = plain_fit(Problem(broken, UNWEIGHTED, active), closed_form(broken))
+        active = equation.active_columns(scale=False, direction=False)
+        plain = plain_fit(equation.Problem(broken, equation.UNWEIGHTED, active), equation.closed_form(broken))
         unweighted, weighted = (calibrate(broken, noise=noise, direction=False) for noise in (None, SPEC_NOISE))
         return [_squared(found.estimate, unseen) for found in (plain, unweighted, weighted)]
 

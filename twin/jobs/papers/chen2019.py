@@ -23,41 +23,38 @@ from puncture_twin.twin.experiment import chen2019 as chen
 from puncture_twin.twin.jobs.terminal import Answer
 from puncture_twin.twin.report.present import Field, Section, Table, grid, text
 
-TOLERANCE_MM = 0.01
-"""The paper prints two decimals; so much may rounding its inputs and outputs differ."""
+TOLERANCE_MM = 0.01  # the paper prints two decimals; so much may rounding its inputs and outputs differ
+_ROUNDING = 1e-9  # binary against decimal fractions, when a difference is exactly the tolerance
 
-_ROUNDING = 1e-9
-"""Binary against decimal fractions, when a difference is exactly the tolerance."""
-
-TABLE_3: Mapping[str, tuple[chen.Point, float]] = {
+TABLE_3: Mapping[str, tuple[chen.Point, float]] = {  # lesions by the triad A-B-C of setup 1, and their error
     "L": ((544.83, -338.12, 643.33), 2.99),
     "M": ((528.96, -325.92, 619.34), 2.94),
     "H": ((521.03, -319.82, 606.35), 2.99),
 }
-"""Lesions by the triad A-B-C of setup 1, and their error."""
 
-TABLE_5: Mapping[str, tuple[chen.Point, float]] = {
+TABLE_5: Mapping[str, tuple[chen.Point, float]] = {  # lesion M by different triads of setup 2, and its error
     "ABC": ((555.87, -370.49, 619.19), 2.38),
     "ABE": ((555.81, -371.97, 617.94), 2.47),
     "ACD": ((560.82, -367.30, 617.43), 7.17),
 }
-"""Lesion M by different triads of setup 2, and its error."""
 
 TABLE_6: Mapping[str, float] = {"ABC": 2.38, "ABCE": 3.55, "ABCDE": 2.48}
 """Error of lesion M in setup 2: triad for three markers, the paper's (affine) least squares for more."""
 
-TABLE_7: Mapping[str, tuple[chen.Point, float]] = {
+TABLE_7: Mapping[str, tuple[chen.Point, float]] = {  # markers by their own triad in setup 1, residuals
     "A": ((417.33, -290.59, 535.40), 1.09),
     "B": ((557.55, -272.17, 535.38), 1.06),
     "C": ((424.00, -232.71, 602.44), 2.14),
 }
-"""Markers by their own triad in setup 1, and their residuals."""
 
 TABLE_7_MEAN = 1.43  # Eq. 16 for setup 1
 WORKED_THETA, WORKED_BETA = np.radians(10.0), np.radians(45.0)  # section 3.3: setup 1, A-B-C, lesion M
 WORKED_STANDOFF_MM, WORKED_LENGTH_MM = 150.0, 401.0
 WORKED_TIP: chen.Point = (554.75, -322.40, 471.62)
 WORKED_TOP: chen.Point = (623.69, -313.01, 76.70)
+DRAWS, SEED = 1000, 2019
+SETUP_2 = "carton/case_m_setup2.toml"  # the embedded case of the paper's second setup, five markers
+SEVERAL = (Field("by", "what"), Field("paper", "paper_mm", 2), Field("drawn", "drawn_rms_mm", 2))
 
 
 def reproduce() -> Answer:
@@ -159,10 +156,6 @@ def reproduction_text(found: Mapping[str, Any]) -> str:
     return text([Section("Chen et al. 2019, and ours", [grid(FIELDS, found["rows"]), reach]), Section(verdict, [])])
 
 
-DRAWS, SEED = 1000, 2019
-SETUP_2 = "carton/case_m_setup2.toml"  # the embedded case of the paper's second setup, five markers
-
-
 def experiment(draws: int | None, runs: int, watcher: Watcher) -> Answer:
     """The experiment drawn anew under two declarations, and so many physical runs of its second setup.
 
@@ -241,9 +234,6 @@ def experiment_text(facts: Mapping[str, Any]) -> str:
                 [grid(SEVERAL, facts["several_triads"])]),
         Section(open_, []), Section(touches, []),
     ])  # fmt: skip
-
-
-SEVERAL = (Field("by", "what"), Field("paper", "paper_mm", 2), Field("drawn", "drawn_rms_mm", 2))
 
 
 def _ranks(stated: Sequence[Mapping[str, Any]], found: Sequence[Mapping[str, Any]]) -> Table:

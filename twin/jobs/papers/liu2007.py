@@ -20,47 +20,29 @@ from puncture_twin.meshes import folder
 from puncture_twin.planning.base.output.output_set import writing
 from puncture_twin.planning.base.text import plural
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
-from puncture_twin.twin.jobs.servo.job import (
-    NAMES,
-    TARGET,
-    Sessions,
-    hold_sessions,
-    servo_facts,
-    servo_text,
-    session_files,
-)
+from puncture_twin.twin.jobs.servo import job
 from puncture_twin.twin.jobs.terminal import Answer
 from puncture_twin.twin.rehearsal.stereo_session import ServoTrial, TargetRow
 from puncture_twin.twin.report.present import Field, Section, Table, grid, number
 
 TABLE_1 = (0.33, 0.31, 0.19, 0.27, 0.21, 0.26, 0.34, 0.33, 0.38, 0.35)  # error of the stereo at ten points
 
-TABLE_2 = (
+TABLE_2 = (  # error of the mapping, before and after the servo, at sixteen targets
     (0.73, 1.19, 0.76), (1.76, 2.29, 1.67), (0.88, 1.45, 0.68), (1.37, 1.25, 1.39), (1.49, 1.49, 1.25),
     (1.67, 1.77, 1.61), (0.94, 0.93, 0.97), (1.12, 1.67, 0.97), (0.96, 0.99, 0.53), (0.98, 1.72, 0.91),
     (0.79, 1.27, 0.78), (0.61, 2.41, 0.59), (1.25, 1.89, 1.41), (1.39, 1.47, 1.35), (0.74, 0.96, 0.60),
     (0.23, 0.91, 0.58),
 )  # fmt: skip
-"""Error of the mapping, before and after the servo, at sixteen targets."""
 
 TABLE_1_PRINTED = (0.30, 0.38)  # mean and maximum
 TABLE_2_PRINTED = ((1.06, 1.76), (1.47, 2.41), (1.00, 1.67))
 """Mean and maximum of mapping, before, after. The mean before is 1.477 by the rows: 1.48, not 1.47."""
 
 COLUMNS = ("stereo", "mapping", "before", "after")
-
-ROUNDING_MM = 0.005
-"""The paper prints two decimals."""
-
-MOST_OVER_MAPPING = 1.1
-"""After the servo, over the mapping's error, which is the floor: what is allowed beyond chance. The paper: 0.94."""
-
-MOST_NOT_CONFIRMED = 0.1
-"""Fraction of the targets at which the servo may end without confirming; the paper reports none of sixteen."""
-
-CHANCE = 2.0
-"""Standard errors that a condition allows for."""
-
+ROUNDING_MM = 0.005  # the paper prints two decimals
+MOST_OVER_MAPPING = 1.1  # after the servo, over the mapping's error, its floor, beyond chance. The paper: 0.94
+MOST_NOT_CONFIRMED = 0.1  # of the targets at which the servo may end so; the paper reports none of sixteen
+CHANCE = 2.0  # standard errors that a condition allows for
 CASE = "liu2007.toml"
 DEFAULT_SEEDS = 8
 Facts = Mapping[str, Any]  # what `reproduction_facts` returns: mm, shares 0..1
@@ -68,14 +50,14 @@ Facts = Mapping[str, Any]  # what `reproduction_facts` returns: mm, shares 0..1
 
 def reproduce(out_dir: Path, seeds: int | None) -> Answer:
     """Hold so many of the paper's sessions in the twin, print its tables beside ours, and write pictures and page."""
-    with writing(out_dir, "reproduce", names=NAMES) as draft:
+    with writing(out_dir, "reproduce", names=job.NAMES) as draft:
         case, count = paper_case(), seeds or DEFAULT_SEEDS
         draft.inputs = case.inputs
-        erring, smooth = hold_sessions(case, count), hold_sessions(with_smooth_gears(case), count)
+        erring, smooth = job.hold_sessions(case, count), job.hold_sessions(with_smooth_gears(case), count)
         facts = reproduction_facts(erring, smooth)
-        written = session_files(erring, facts, draft.folder, paper_sections(facts))
+        written = job.session_files(erring, facts, draft.folder, paper_sections(facts))
     facts["files"] = [str(path) for path in draft.final(written)]
-    return Answer(facts["holds"], facts, servo_text(facts, paper_sections(facts)))
+    return Answer(facts["holds"], facts, job.servo_text(facts, paper_sections(facts)))
 
 
 def paper_case() -> ServoCase:
@@ -89,7 +71,7 @@ def with_smooth_gears(case: ServoCase) -> ServoCase:
     return replace(case, file=case.file.model_copy(update={"errors": errors}))
 
 
-def reproduction_facts(erring: Sessions, smooth: Sessions) -> dict[str, Any]:
+def reproduction_facts(erring: job.Sessions, smooth: job.Sessions) -> dict[str, Any]:
     """The paper's tables, and our sessions in a room like the paper's; in the same rooms without errors of gears."""
     errors, demanded = erring.case.errors, conditions(erring)
     rows = np.array(TABLE_2)
@@ -105,7 +87,7 @@ def reproduction_facts(erring: Sessions, smooth: Sessions) -> dict[str, Any]:
         "paper_table_1_mm": list(TABLE_1),
         "paper_table_2_mm": [list(row) for row in TABLE_2],
         "paper_servo_only_at_least_mm": paper_servo_only_at_least(),
-        **servo_facts(erring.case, erring.trials, erring.ours),
+        **job.servo_facts(erring.case, erring.trials, erring.ours),
     }
 
 
@@ -126,7 +108,7 @@ def paper_servo_only_at_least() -> list[float]:
     return [abs(after - mapping) for mapping, _, after in TABLE_2]
 
 
-def conditions(sessions: Sessions) -> list[dict[str, Any]]:
+def conditions(sessions: job.Sessions) -> list[dict[str, Any]]:
     """What must be so for the paper's finding to hold in our room; each allows for two standard errors."""
     ours, fall = sessions.ours, gain(sessions.trials)
     over = mean_of_seeds(sessions.trials, lambda row: row.after_mm - row.mapping_mm)["error"]
@@ -199,12 +181,11 @@ _PAPER_ROW = (
     *(Field(name, f"theirs.{name}", 2) for name in COLUMNS[1:]),
     Field("servo-only", lambda row: f"≥ {row['least']:.2f}"),
     Field("ours: mapping", "mapping_mm", 2),
-    *TARGET[3:8],
+    *job.TARGET[3:8],
 )
 
 
 def _means(facts: Facts) -> Table:
-    """Mean and maximum of each column: as printed, by the paper's own rows, and over all targets of all our seeds."""
     ours, rows = facts["statistics"], [row for one in facts["sessions"] for row in one["targets"]]
     lines = []
     for column in facts["paper"]:

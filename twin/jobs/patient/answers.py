@@ -41,17 +41,6 @@ from puncture_twin.twin.report import patient
 from puncture_twin.twin.report.present import Field, Section, Table, Warn, facts, text, vector
 
 
-def register_report(
-    source: Path, markers_base: Path | None, target: str | None, space: Space, fle_mm: float | None
-) -> dict[str, Any]:
-    """The report of a case's markers, or of two lists of markers, which need a target."""
-    if markers_base is None:
-        return registration_report(source)
-    if target is None:
-        refuse("two lists of markers were given without a target", "register", "--target X,Y,Z in mm", "missing_option")
-    return lists_report(source, markers_base, target, space, fle_mm)
-
-
 def registration_report(path: Path) -> dict[str, Any]:
     """Everything known about a case's registration, as plain values."""
     case = load_case(path)
@@ -85,9 +74,11 @@ def registration_report(path: Path) -> dict[str, Any]:
 
 
 def lists_report(
-    markers_ct: Path, markers_base: Path, target: str, space: Space, fle_mm: float | None
+    markers_ct: Path, markers_base: Path, target: str | None, space: Space, fle_mm: float | None
 ) -> dict[str, Any]:
-    """The registration of two lists of markers alone, as plain values."""
+    """The registration of two lists of markers alone, which need a target, as plain values."""
+    if target is None:
+        refuse("two lists of markers were given without a target", "register", "--target X,Y,Z in mm", "missing_option")
     numbers, paths = parse_triple(target, "--target"), (markers_ct, markers_base)
     content = [read_input(path, max_bytes=MAX_FILE_BYTES, where=str(path)) for path in paths]
     read = [parse_points(content[0], markers_ct, default_space=space), parse_points(content[1], markers_base)]
@@ -126,11 +117,9 @@ def _report(
 
 
 def one_insertion(registration: Registration, target_ct: Floats, read_cov_ct: Floats | None) -> dict[str, Any]:
-    """Within which of its true place a target is sent to in 95 of 100 registrations, its own reading in it.
+    """Within which of its true place a target (3,), mm, is sent to in 95 of 100 registrations, its own reading in it.
 
-    Args:
-        target_ct: Shape (3,), mm.
-        read_cov_ct: Of the target's reading, as declared; None where it is read as a marker is, in both lists.
+    That is as declared; of None it is read as a marker is, in both lists.
     """
     cov, R = registration.tre_covariance(target_ct), registration.T_base_ct[:3, :3]
     read, how = registration.fle_mm**2 / 3.0 * np.eye(3), "like a marker, in both lists"
@@ -149,17 +138,11 @@ def noise_of_lists(pairs: MarkerPairs, fle_mm: float | None) -> ReadingNoise | N
     # Fitzpatrick 1998: FRE^2 = (1 - 2 / N) FLE^2
     found_mm = rigid_fre_mm(pairs.points_ct, pairs.points_base) * np.sqrt(count / (count - 2))
     each = np.eye(3) * (found_mm if fle_mm is None else fle_mm) ** 2 / 6.0
-    return ReadingNoise(
-        cov_ct=each,
-        cov_base=np.broadcast_to(each, (count, 3, 3)),
-        arm_jacobian=np.zeros((3 * count, 1)),
-        eta_variances=np.zeros(1),
-        touches_known=True,
-    )
+    arm_jacobian, eta_variances = np.zeros((3 * count, 1)), np.zeros(1)
+    return ReadingNoise(each, np.broadcast_to(each, (count, 3, 3)), arm_jacobian, eta_variances, touches_known=True)
 
 
 def _advice_of_lists(registration: Registration, target_ct: Floats, space: Space) -> dict[str, Any]:
-    """By the readings alone: which marker to drop, and to which side one more would help most."""
     if registration.uncertainty is None:
         return {}
     far = np.linalg.norm(registration.markers.points_ct - target_ct, axis=1).max()
@@ -177,7 +160,6 @@ def _advice_of_lists(registration: Registration, target_ct: Floats, space: Space
 
 
 def _advice_of_case(case: Case, registration: Registration) -> dict[str, Any]:
-    """By the declared errors: their sources at the target, and what would make it better."""
     if registration.uncertainty is None:
         return {}
     read, touched = map(np.trace, registration.uncertainty.parts_at(apply(registration.T_base_ct, case.target_ct)))

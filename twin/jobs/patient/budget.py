@@ -23,23 +23,17 @@ from puncture_twin.planning.uncertainty.hit import radius_for_chance
 from puncture_twin.planning.uncertainty.pose_error import expected_error_mm, pose_error
 from puncture_twin.planning.uncertainty.sources import SOURCES, not_modelled
 
-POLE = 1e-6
-"""Puncture angle below which an azimuth says nothing, rad."""
+POLE = 1e-6  # puncture angle below which an azimuth says nothing, rad
+AnatomyOf = Callable[[], Anatomy]  # of a case; called only where structures bend a needle
 
 
 def budget_facts(
-    case: Case,
-    registration: Registration,
-    skin_points_ct: Floats,
-    anatomy: Callable[[], Anatomy],
-    q_insertion: Floats | None = None,
+    case: Case, registration: Registration, places_ct: Floats, anatomy: AnatomyOf, q_insertion: Floats | None = None
 ) -> dict[str, Any] | None:
     """The budget of one insertion, mm; None where the arm reaches none, or no errors are declared.
 
-    Args:
-        skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
-        anatomy: Its structures; called where they bend a needle alone.
-        q_insertion: Shape (6,), rad, the tip on the target; None takes one that the arm reaches.
+    A further marker could sit at the places (n, 3), mm; `q_insertion`, (6,), rad, has the tip on the target, and None
+    takes one that the arm reaches.
     """
     chain = budget_chain(case, registration, anatomy, q_insertion)
     if chain is None:
@@ -48,7 +42,7 @@ def budget_facts(
     bed = None if case.space is Space.LOCAL else np.array([0.0, 0.0, 1.0])
     if values[2] > values[1] * (1 + 1e-9):  # across the slices a marker is read worst
         bed = np.asarray(axes[:, 2])
-    found, square = changes(chain, skin_points_ct, bed), chain.tip_mean_square()
+    found, square = changes(chain, places_ct, bed), chain.tip_mean_square()
     along_base = flange_pose(chain.model, chain.q_insertion)[:3, 2]
     depth = float(along_base @ square @ along_base)
     counted = {"breathing": chain.breathing, "bending": chain.path, "motion": chain.motion_base}
@@ -69,7 +63,7 @@ def budget_facts(
 
 
 def budget_chain(
-    case: Case, registration: Registration, anatomy: Callable[[], Anatomy], q_insertion: Floats | None = None
+    case: Case, registration: Registration, anatomy: AnatomyOf, q_insertion: Floats | None = None
 ) -> Chain | None:
     """The chain of one insertion; arguments as of `budget_facts`."""
     if registration.uncertainty is None:

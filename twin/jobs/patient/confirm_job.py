@@ -34,8 +34,7 @@ from puncture_twin.twin.jobs.patient.main_job import read_noted_plan
 from puncture_twin.twin.jobs.patient.run import writing_of
 from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.report import present
-from puncture_twin.twin.report.page.template import Card
-from puncture_twin.twin.report.present import Field, Section, facts, grid, number, percent, vector
+from puncture_twin.twin.report.present import Card, Field, Section, facts, grid, number, percent, vector
 
 PAGE, PICTURE, REPORT = FILES = ("confirm.html", "confirm.png", "confirm.json")
 MAX_REPORT_BYTES = 5_000_000
@@ -143,15 +142,12 @@ class Confirmed(Shown):
     def sections(self, most: int | None = None) -> list[Section]:
         """What terminal and page show; of structures so many, or all."""
         needle, tie, line, said = self.needle, self.tie, self.line, self.predicted()
-        at_target = self.against(self.context.case.target_ct, needle.forward_ct)
+        at_target, off = self.against(self.context.case.target_ct, needle.forward_ct), f"± {tie.sd_mm:.2f} mm"
         rows = [
             ("tip", f"{vector(needle.tip_ct.tolist(), 1, 'mm')}, ± {needle.tip_sd_mm:.2f} mm (sd, worst direction)"),
             ("direction", f"{vector(needle.forward_ct.tolist(), 3)}, ± {np.degrees(needle.axis_sd):.2f}°"),
             ("shape", f"bent, sagitta {needle.sagitta_mm:.1f} mm" if needle.sagitta_mm > 0 else "straight"),
-            (
-                "frames",
-                f"tied by {tie.how}, residual {tie.residual_mm:.2f} mm (rms), ± {tie.sd_mm:.2f} mm at the target",
-            ),
+            ("frames", f"tied by {tie.how}, residual {tie.residual_mm:.2f} mm (rms), {off} at the target"),
             ("against the target", _off_text(at_target)),
         ]
         if self.plan is not None:
@@ -283,7 +279,6 @@ def _frame_of(source: object) -> str:
 
 
 def _body(context: CaseContext) -> Body:
-    """Skin, bones and markers of a case, by which a scan is tied to it."""
     case, anatomy = context.case, context.anatomy
     rigid = [bool(BONES & set(plain_name(one.name).split("_"))) or "spine" in one.name for one in anatomy.structures]
     meshes = [one.mesh for one in anatomy.structures]
@@ -324,17 +319,13 @@ class Learned(NamedTuple):
     """By how much errors exceed what was predicted, of n needles."""
 
     needles: int
-    factor: float
-    """Of every standard deviation: 1 where the declaration is right; `low` to `high` is its 95 % interval."""
+    factor: float  # of every standard deviation: 1 where the declaration is right; `low` to `high` is its 95 % interval
     low: float
     high: float
-    mean_mm: tuple[float, ...]
-    """Shape (3,), the mean error, LPS."""
-    rms_mm: float
-    """Realised."""
+    mean_mm: tuple[float, ...]  # shape (3,), the mean error, LPS
+    rms_mm: float  # realised
     predicted_rms_mm: float
-    inside: int
-    """How many were in their 95 % region."""
+    inside: int  # how many were in their 95 % region
     inputs: tuple[Input, ...]
 
     def summary(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from puncture_twin.planning.base.cache.array_cache import Memory, user_cache
 from puncture_twin.planning.base.errors import InputError, refuse
 from puncture_twin.planning.base.files import atomic, is_folder, is_plain_file
 from puncture_twin.planning.base.progress import Watcher
-from puncture_twin.planning.base.provenance import inputs_document
+from puncture_twin.planning.base.provenance import Input, inputs_document
 from puncture_twin.planning.base.toml_file import parse_toml
 from puncture_twin.planning.case.case import ALLOWED_CASE
 from puncture_twin.planning.case.case_file import CaseFile, Region
@@ -27,9 +27,7 @@ from puncture_twin.planning.search.sides import grid_of, sides_text
 from puncture_twin.twin.jobs.patient.run import SLICES
 
 CASE = "case.toml"
-
-READING_BYTES = 3_000_000_000
-"""What was read to find out is read once: a CT of 1,000 slices of 512 x 512, and its labels."""
+READING_BYTES = 3_000_000_000  # what was read is read once: 1,000 slices of 512 x 512, and their labels
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +49,7 @@ class InitRun:
         """Plain values for JSON: mm, in the case's space."""
         parts = self.start.parts
         position = to_lps(parts.target_ct[None], parts.space)[0]
+        written = Input("case", CASE, hashlib.sha256(self.start.text.encode()).hexdigest())
         return {
             "case": str(self.path),
             "space": str(parts.space),
@@ -64,12 +63,7 @@ class InitRun:
             "sides": [side.document() for side in self.context.sides],
             "warnings": list(self.warnings),
             "findings": self.context.provenance()["findings"],
-            "inputs": inputs_document(
-                replace(one, path=CASE, sha256=hashlib.sha256(self.start.text.encode()).hexdigest())  # as it is written
-                if one.role == "case"
-                else one
-                for one in self.context.case.inputs
-            ),
+            "inputs": inputs_document(written if one.role == "case" else one for one in self.context.case.inputs),
             "files": [str(path) for path in (self.path, self.picture, self.markers) if path is not None],
         }
 
@@ -121,7 +115,6 @@ def _refuse_options(request: Request) -> None:
 
 
 def _with_seen(start: Start, request: Request, context: CaseContext) -> str:
-    """The case's text with what only the whole anatomy tells: what its CT shows, and where a search should look."""
     text, where = with_image_seen(start.text, context.anatomy), grid_of(context.sides)
     looked = f"entry sides: {sides_text(context.sides)}"
     keys = {"search.frame": where.frame, "search.theta_deg": "[{:g}, {:g}]".format(*where.theta_deg)}

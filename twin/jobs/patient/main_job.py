@@ -147,6 +147,7 @@ def _answered(run: Run, draft: Draft, out: Path) -> Run:
 def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomCount | None = None) -> Run:
     """Check a written plan again and rehearse it; the scene is left out where the plan's own stands beside it."""
     from puncture_twin.twin.jobs.patient.rehearsed import begin_rehearsal
+    from puncture_twin.twin.report.scene.scene_parts import Scene
     from puncture_twin.twin.report.scene.scene_picture import draw_scene
 
     source, plan, candidates = checked_plan(context, plan_path)
@@ -154,7 +155,7 @@ def rehearse_plan(context: CaseContext, plan_path: Path, out: Path, rooms: RoomC
         run = begin_rehearsal(Run(context, candidates, (), plan, read=(source,)), rooms, partial).ended(draft.folder)
         if not draft.source_has("scene.png"):
             with context.stages.time("scene"):
-                draw_scene(context.case, context.anatomy, candidates, plan, draft.folder / "scene.png")
+                draw_scene(Scene(context.case, context.anatomy, candidates, plan), draft.folder / "scene.png")
             run = run.with_files(draft.folder / "scene.png")
     return replace(run, files=draft.final(run.files))
 
@@ -187,7 +188,6 @@ def report_case(run: Run, out: Path) -> Run:
 
 
 def _certified(run: Run, wanted: CertifyOptions, out: Path) -> Run:
-    """Certify the cap to a cell size, and a chance to touch, and rank again with the safe cones."""
     from puncture_twin.planning.certify.certificate import with_safe_cone, write_certificate
     from puncture_twin.planning.certify.subdivision import certify
 

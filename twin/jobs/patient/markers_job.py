@@ -39,8 +39,7 @@ from puncture_twin.twin.report.present import Field, Section, Table, facts, foot
 FOUND, PROPOSED, MARKUPS = "markers_ct.csv", "markers_proposed.csv", ".mrk.json"
 """Never one name for both: a person puts a marker some mm beside its proposed place."""
 PICTURE, REPORT = "markers.png", "markers.json"
-NEAR_MM, WIDE_MM = 40.0, 160.0
-"""Half a side of each slice: of a marker that is there, and of a place that a person must find on the body."""
+NEAR_MM, WIDE_MM = 40.0, 160.0  # half a side of each slice: of a marker, and of a place to be found on the body
 CASE = "case.toml"
 Run = TypeVar("Run", "MarkersRun", "ProposalRun")
 ALLOWED = "a folder with one CT, a CT file (NIfTI, NRRD, a DICOM folder), or a case with one"
@@ -194,14 +193,11 @@ def find_markers(source: Path, out: Path, stated: Stated, layout: Path | None, w
     """`look_for_markers`; write their list, the list for Slicer, a picture and the report."""
     wanted = None if layout is None else read_points(layout, default_unit=Unit.MM)
     run = look_for_markers(source, stated, wanted, layout or source, watcher)
-    shapes, volume, source_ct = [one.reading.shape for one in run.seen.fiducials], run.source.volume, run.source
+    ct, volume = run.source, run.source.volume
     hu_at = partial(nearest, volume.values, np.asarray(np.linalg.inv(volume.T_ct_index)))
-    lines, points = (
-        [f"{one.kind} {one.diameter_mm:.1f} mm" for one in shapes],
-        replace(run.points, space=source_ct.space),
-    )
-    sheet = _Sheet(source_ct.name, points, lines, hu_at, source_ct.skin, NEAR_MM)
-    return _written(run, sheet, out, FOUND, source_ct.inputs, watcher)
+    lines = [f"{one.reading.shape.kind} {one.reading.shape.diameter_mm:.1f} mm" for one in run.seen.fiducials]
+    sheet = _Sheet(ct.name, replace(run.points, space=ct.space), lines, hu_at, ct.skin, NEAR_MM)
+    return _written(run, sheet, out, FOUND, ct.inputs, watcher)
 
 
 class _Sheet(NamedTuple):
@@ -214,26 +210,22 @@ class _Sheet(NamedTuple):
     skin: Skin
     half_mm: float
 
-    def write(self, folder: Path, lists: Sequence[str]) -> None:
-        """The points as the case reads them, as Slicer does, and as a picture."""
-        from puncture_twin.twin.report.slices.sheet import Mark, write_points_sheet  # with matplotlib
-
-        names, points, space = self.points.names, self.points.points, self.points.space or Space.LPS
-        write_points(folder / lists[0], replace(self.points, points=to_lps(points, space)))
-        for name in lists[1:]:
-            (folder / name).write_text(markups_text("Fiducial", "markers", names, points), encoding="utf-8")
-        marks = [Mark(*one) for one in zip(names, points, self.lines, strict=True)]
-        title = f"{self.name}: {len(marks)} markers"
-        write_points_sheet(folder / PICTURE, title, marks, self.hu_at, self.skin.mesh, self.half_mm)
-
 
 def _written(run: Run, sheet: _Sheet, out: Path, csv: str, inputs: tuple[Input, ...], watcher: Watcher) -> Run:
     """A run with its files; Slicer knows no space of a case's own, and gets no list of it."""
-    lists: tuple[str, ...] = (csv,) if sheet.points.space is Space.LOCAL else (csv, csv.replace(".csv", MARKUPS))
-    names = (*lists, PICTURE, REPORT)
-    with writing(out, "markers", inputs=inputs, names=names, note=watcher.note) as draft:
-        sheet.write(draft.folder, lists)
-        run = replace(run, files=draft.final([draft.folder / name for name in names]))
+    names, points, space = sheet.points.names, sheet.points.points, sheet.points.space or Space.LPS
+    markups = [] if space is Space.LOCAL else [csv.replace(".csv", MARKUPS)]
+    files = (csv, *markups, PICTURE, REPORT)
+    with writing(out, "markers", inputs=inputs, names=files, note=watcher.note) as draft:
+        from puncture_twin.twin.report.slices.sheet import Mark, write_points_sheet  # with matplotlib
+
+        write_points(draft.folder / csv, replace(sheet.points, points=to_lps(points, space)))
+        for name in markups:
+            (draft.folder / name).write_text(markups_text("Fiducial", "markers", names, points), encoding="utf-8")
+        marks = [Mark(*one) for one in zip(names, points, sheet.lines, strict=True)]
+        title = f"{sheet.name}: {len(marks)} markers"
+        write_points_sheet(draft.folder / PICTURE, title, marks, sheet.hu_at, sheet.skin.mesh, sheet.half_mm)
+        run = replace(run, files=draft.final([draft.folder / name for name in files]))
         write_result(run.summary(), draft.folder / REPORT, out)
     return run
 
@@ -279,11 +271,9 @@ class ProposalRun:
     def text(self) -> str:
         """For the terminal."""
         found = self.summary()
-        names, places = [one["name"] for one in found["proposed"]], []
-        for one in found["proposed"]:
-            places.append(
-                (one["name"], one["text"] + (f"; slice {one['slice']} from the feet" if "slice" in one else ""))
-            )
+        names = [one["name"] for one in found["proposed"]]
+        slices = [f"; slice {one['slice']} from the feet" if "slice" in one else "" for one in found["proposed"]]
+        places = [(one["name"], one["text"] + at) for one, at in zip(found["proposed"], slices, strict=True)]
         known = [
             ("expected error", f"{found['expected_error_mm']:.2f} mm (rms) at the target, of the markers alone"),
             ("errors", found["errors"]),

@@ -25,17 +25,23 @@ from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.search.explain import Explanation
 from puncture_twin.twin.jobs.patient.budget import budget_facts
 from puncture_twin.twin.jobs.patient.run import FILM, PAGE, ROOMS, SLICES, Run, registration_summary, writing_of
-from puncture_twin.twin.report.error_pictures import draw_budget
+from puncture_twin.twin.report.error_pictures import budget_figure
 from puncture_twin.twin.report.figures import halo, write_png
 from puncture_twin.twin.report.map.map_picture import draw_map
 from puncture_twin.twin.report.map.map_raster import MapRaster, map_raster
 from puncture_twin.twin.report.map_view import map_view
 from puncture_twin.twin.report.page.page import Shown, Uncertainty, write_page
 from puncture_twin.twin.report.palette import SKIN, organ_colours
+from puncture_twin.twin.report.scene.scene_parts import Scene
 from puncture_twin.twin.report.scene.scene_picture import draw_scene
 from puncture_twin.twin.report.slices.panel import Subject
 from puncture_twin.twin.report.slices.planes import Plane, letters, needle_planes, outline
 from puncture_twin.twin.report.slices.sheet import draw_slices, write_sheet
+
+EDGES = {(0.06, 0.56): (-1, 0), (0.94, 0.56): (1, 0), (0.5, 0.03): (0, -1), (0.5, 0.97): (0, 1)}
+"""Where the patient's directions are written on a panel, as fractions of it, and along which of its axes."""
+SLICE_PIXELS, INCHES, DPI = 320, 9.0, 100
+WINDOW_HU = (-160.0, 240.0)
 
 
 class Drawn(NamedTuple):
@@ -57,10 +63,11 @@ def draw_pictures(run: Run, out: Path) -> Drawn:
     case, anatomy, stages = context.case, context.anatomy, context.stages
     with stages.time("map"):
         raster = map_raster(found, map_view(case, found))
-        draw_map(found, case, out / "map.png", run.pick, raster, anatomy.scan)
+        draw_map(found, case, out / "map.png", run.pick, raster=raster, scan=anatomy.scan)
     with stages.time("scene"):
-        T_base_ct = _checked_base(run)
-        draw_scene(case, anatomy, found, run.plan, out / "scene.png", run.pick, T_base_ct, failed=bool(run.refusal))
+        base = _checked_base(run)
+        scene = Scene(case, anatomy, found, run.plan, pick=run.pick, T_base_ct=base, refusal=run.refusal)
+        draw_scene(scene, out / "scene.png")
     with stages.time("slices"):
         pick = run.pick or found.best
         subject = None if pick is None else _subject(context, pick, run.plan)
@@ -117,7 +124,7 @@ def write_budget_picture(report: Mapping[str, Any], path: Path) -> Path:
         refuse("no error budget to draw", "--picture", "a case with [errors] and an arm", "no_error_budget")
     inputs = read_inputs(report["inputs"])
     with writing(path.parent, f"register {path.name}", inputs=inputs, names=(path.name,), note=lambda _: None) as draft:
-        draw_budget(budget, draft.folder / path.name)
+        write_png(budget_figure(budget), draft.folder / path.name)
     return path
 
 
@@ -155,7 +162,6 @@ def _uncertainty(run: Run) -> Uncertainty | None:
 
 
 def _budget(context: CaseContext, q_insertion: Floats) -> Mapping[str, Any] | None:
-    """Of one insertion; None where markers or the arm do not say."""
     registration = context.placement.registration if context.placement is not None else None
     if registration is None or not np.isfinite(q_insertion).all():
         return None
@@ -170,12 +176,6 @@ def _check_png(path: Path) -> None:
         refuse(f"'{path.name}' is not the name of a PNG file", "--picture", "FILE.png", "bad_file_name")
     if not path.parent.is_dir():
         refuse("there is no such folder", path.parent, "an existing folder", "not_a_folder")
-
-
-EDGES = {(0.06, 0.56): (-1, 0), (0.94, 0.56): (1, 0), (0.5, 0.03): (0, -1), (0.5, 0.97): (0, 1)}
-"""Where the patient's directions are written on a panel, as fractions of it, and along which of its axes."""
-SLICE_PIXELS, INCHES, DPI = 320, 9.0, 100
-WINDOW_HU = (-160.0, 240.0)
 
 
 def draw_confirmed(done: Any, path: Path) -> Path:
@@ -195,7 +195,6 @@ def draw_confirmed(done: Any, path: Path) -> Path:
 
 
 def _draw_scan(axes: Axes, done: Any, plane: Plane) -> None:
-    """The scan in a plane, with the outlines of the planning CT's structures carried to it."""
     index = apply(np.linalg.inv(done.volume.T_ct_index) @ done.tie.T_scan_ct, plane.points_ct(SLICE_PIXELS)).T
     shown = ndimage.map_coordinates(done.volume.values, index, np.float64, order=1, cval=-1024.0)
     (x, y), half, (low, high) = plane.centre, plane.half_mm, WINDOW_HU
@@ -221,7 +220,6 @@ def _draw_lines(axes: Axes, done: Any, plane: Plane) -> None:
 
 
 def _draw_frame(axes: Axes, done: Any, plane: Plane) -> None:
-    """A plane's name, its millimetres and the patient's directions at its edges."""
     axes.set_title(plane.name.replace("target", "tip"), fontsize=9)
     axes.set_xlabel("mm", fontsize=7, labelpad=1)
     axes.tick_params(labelsize=7)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,6 +24,9 @@ from puncture_twin.twin.report.numbers import direction_text, mounting_text
 from puncture_twin.twin.report.present import Field, Section, Warn, footer, grid, text
 
 Ranked = tuple[str, place.RatedPlacement]
+QUICK_S = 30.0  # as long as a person waits
+PICTURES_S = 2.0  # what drawing takes, about
+HALF_A_DIGIT = 5e-4  # of a fraction that is printed in % with one digit
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +42,6 @@ class PlaceRun:
         """Plain values for JSON: mm; fractions 0..1."""
         seconds = {stage: round(spent, 3) for stage, spent in self.context.stages.seconds.items()}
         return {**self.document, "seconds": seconds, "files": [str(path) for path in self.files]}
-
-
-QUICK_S = 30.0  # as long as a person waits
-PICTURES_S = 2.0  # what drawing takes, about
 
 
 class _Clock:
@@ -80,13 +78,9 @@ def place_case(
 ) -> PlaceRun:
     """Search; write ``placements.csv``, ``place.json`` and, if wanted, the two pictures.
 
-    Args:
-        quick_s: End after about so many seconds, with what is known then; None searches to the end.
-        began: `time.perf_counter` from which they count; now, if None.
-
-    Raises:
-        NoAnswerError: No direction is safe for the organs, or no placement reaches one; the files are written in
-            the second case.
+    It ends about `quick_s` seconds after `began`, a `time.perf_counter` (None: now), with what is known then; None
+    searches to the end. Raises NoAnswerError: No direction is safe for the organs, or no placement reaches one; in the
+    second case the files are written.
     """
     names = ("placements.csv", "place.json", *(("placements.png", "map_best_place.png") if pictures else ()))
     try:
@@ -119,11 +113,18 @@ class Places(NamedTuple):
 def find_places(context: CaseContext, jobs: int, until: float = np.inf) -> Places:
     """Search for the best position of the arm's base, until a `time.perf_counter`, or to its end if infinite."""
     case, stages = context.case, context.stages
+
+    def tell(one: place.RatedPlacement) -> None:
+        verdict, where = one.verdict, list(one.mount.position_mm)
+        reached = f"it reaches {verdict.reached} of {plural(verdict.count, 'checked direction')}"
+        fraction = f"about {100 * verdict.fraction:.0f} % of all"
+        context.watcher.note(f"best so far: {one.name}, base at {where} mm: {reached}, {fraction}")
+
     with stages.time("organs"):
         candidates = organ_candidates(case, context.anatomy, context.engine, case.directions())
     with stages.time("placements"):
         goes_on, parts = _Clock(context, until), (case, context.anatomy, candidates, context.placement)
-        found = place.search_placements(*parts, jobs=jobs, goes_on=goes_on, first=partial(_tell_first, context))
+        found = place.search_placements(*parts, jobs=jobs, goes_on=goes_on, first=tell)
     return Places(candidates, found)
 
 
@@ -132,7 +133,13 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: f
     candidates, found = find_places(context, jobs, until - PICTURES_S * pictures)
     document = place.place_document(found, context.provenance() | {"arm": ARM_CHECKED})
     if not found.complete:
-        document["warnings"] = [*document["warnings"], _ended_text(found)]
+        whole = sum(one.verdict.count == found.directions for one in found.rated)
+        ended = (
+            f"the time is over: {whole} of {plural(len(found.rated), 'placement')} were checked in all directions; the "
+            f"fractions of the others are estimates. The search stopped at steps of {found.resolution_mm:.0f} mm. "
+            "Another run may check more or fewer; --full searches to the end"
+        )
+        document["warnings"] = [*document["warnings"], ended]
     place.write_placements(found, out / "placements.csv")
     place.write_place_document(document, out / "place.json")
     files = [out / "placements.csv", out / "place.json"]
@@ -152,26 +159,6 @@ def _placed(context: CaseContext, out: Path, jobs: int, pictures: bool, until: f
             draw_map(reached, shown, out / "map_best_place.png", scan=context.anatomy.scan)
             files.append(out / "map_best_place.png")
     return PlaceRun(context, found, document, tuple(files))
-
-
-def _tell_first(context: CaseContext, one: place.RatedPlacement) -> None:
-    verdict, where = one.verdict, list(one.mount.position_mm)
-    reached = f"it reaches {verdict.reached} of {plural(verdict.count, 'checked direction')}"
-    fraction = f"about {100 * verdict.fraction:.0f} % of all"
-    context.watcher.note(f"best so far: {one.name}, base at {where} mm: {reached}, {fraction}")
-
-
-def _ended_text(found: place.PlaceSearch) -> str:
-    whole = sum(one.verdict.count == found.directions for one in found.rated)
-    return (
-        f"the time is over: {whole} of {plural(len(found.rated), 'placement')} were checked in all directions; the "
-        f"fractions of the others are estimates. The search stopped at steps of {found.resolution_mm:.0f} mm. Another "
-        "run may check more or fewer; --full searches to the end"
-    )
-
-
-HALF_A_DIGIT = 5e-4
-"""Of a fraction that is printed in % with one digit."""
 
 
 def place_text(run: PlaceRun) -> str:

@@ -26,11 +26,8 @@ if TYPE_CHECKING:
     from puncture_twin.twin.rehearsal.result import Rehearsal
 
 
-Wait = Callable[[], Any]
-"""Gives what a stage makes, once."""
-
-Begin = Callable[..., Wait]
-"""Begins a stage, a function with its arguments: in another process, or, as `partial` does, when it is waited for."""
+Wait = Callable[[], Any]  # gives what a stage makes, once
+Begin = Callable[..., Wait]  # begins a stage with its arguments: in a process, or, by `partial`, when it is waited for
 
 
 @contextmanager
@@ -84,9 +81,8 @@ class PendingRehearsal:
     def ended(self, out: Path, with_page: Callable[[Run], Run] | None = None) -> Run:
         """The run with what was measured and the film, once they are there; the numbers and the rooms are written.
 
-        Args:
-            with_page: Adds the page that shows them all to a run; while the film is made, which has the usual name
-                but where no encoder can be started.
+        `with_page` adds the page that shows them all to a run; while the film is made, which has the usual name but
+        where no encoder can be started.
         """
         from puncture_twin.twin.report.error_pictures import draw_rooms_picture
 

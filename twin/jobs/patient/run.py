@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 
 
 PAGE, SLICES = "report.html", "slices.png"
-PICTURES = ("map.png", "scene.png", SLICES, PAGE)
-"""What a search writes beside its table; slices only where there is a direction to show."""
-
+PICTURES = ("map.png", "scene.png", SLICES, PAGE)  # what a search writes; slices only where there is a direction
 FILM, ROOMS = "rehearsal.mp4", "rooms.png"
+NOTABLE = 0.05  # of an expected error: by as much two configurations' differ before people are told
+SAME_AIM = 0.02  # rad: joints that differ by less are of one insertion, an arm's errors alike to a fiftieth
 
 
 def writing_of(
@@ -226,13 +226,6 @@ class Run:
                 f"cross-check: FCL measured {checked.directions} directions again; {checked.pairs} distances agree,"
                 f" largest difference {checked.largest_mm:.1e} mm", []))  # fmt: skip
         return done
-
-
-NOTABLE = 0.05
-"""Of an expected error: by as much two configurations' differ before people are told."""
-
-SAME_AIM = 0.02
-"""rad: joints that differ by less are of one insertion; an arm's errors do the same there within a fiftieth."""
 
 
 def plain_of(one: Any, *names: str) -> dict[str, Any]:

@@ -31,18 +31,12 @@ from puncture_twin.twin.jobs.terminal import write_result
 from puncture_twin.twin.rehearsal.distribution import Distribution, rehearse_trials
 from puncture_twin.twin.report import present
 from puncture_twin.twin.report.error_pictures import ALONE, BETTER, WORSE, draw_clouds
-from puncture_twin.twin.report.page.template import Card
-from puncture_twin.twin.report.present import Field, Section, Table, Warn, grid, number, percent
+from puncture_twin.twin.report.present import Card, Field, Section, Table, Warn, grid, number, percent
 
 PAGE, PICTURE, TABLE = FILES = ("ways.html", "ways.png", "ways.json")
-
 SAME = "one plan, the same patients for every way."
-CLEAR = 2.0
-"""Standard errors of a difference that make it clear."""
-
-LOOK_S = {"camera_pairs": 5.0, "pictures": 30.0}
-"""Seconds of a look until the needle goes on. Assumed: cameras are read by the program, a picture by a person."""
-
+CLEAR = 2.0  # standard errors of a difference that make it clear
+LOOK_S = {"camera_pairs": 5.0, "pictures": 30.0}  # of a look; assumed: a program reads cameras, a person a picture
 COLOURS = {"best": BETTER, "as good": ALONE, "worse": WORSE}
 
 
@@ -207,7 +201,7 @@ EFFORT_TEXT = (
     "calibration, and the touches that give every way its registration, direction and corridor. No way takes another "
     "CT while it guides; a control scan would add its own dose."
 )
-BY_HAND = Table(
+BY_HAND = Table(  # means of the needles by hand, as the abstracts print them
     ("published of", "tip error (mean), mm", "corrections after a first pass", "dose, mGy cm", "time, min", "source"),
     (
         ("abdominal phantom, CT scans", "4.6", "1.7", "–", "21.0", "Eur J Radiol 2023;162:110753 (PubMed 36863276)"),
@@ -217,7 +211,6 @@ BY_HAND = Table(
          "Beyer et al., Int J CARS 2016;11:253 (doi 10.1007/s11548-015-1286-y)"),
     ), "",
 )  # fmt: skip
-"""Means of the needles by hand, as the abstracts print them."""
 HAND_TEXT = (
     "Published means, of other targets, depths and operators: an order of size, not rehearsed here. A dash is not "
     "stated there; the second prints its dose as mGy/cm. Their times are of whole procedures or placements, ours of "

@@ -17,14 +17,8 @@ from puncture_twin.planning.base.arrays import Floats, Pixels
 from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import pose
+from puncture_twin.twin.guidance.ultrasound import pose_choice
 from puncture_twin.twin.guidance.ultrasound.needle_detector import Detection, Imager
-from puncture_twin.twin.guidance.ultrasound.pose_choice import (
-    head_pose,
-    needle_tool,
-    phantom_mesh,
-    probe_tool,
-    table_box,
-)
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase
 from puncture_twin.twin.plant.bmode_image import NeedleInImage
 from puncture_twin.twin.rehearsal.selfcal_trial import Puncture, SelfcalTrial, puncture_image
@@ -35,22 +29,16 @@ from puncture_twin.twin.report.raster.camera import camera_around
 from puncture_twin.twin.report.raster.render import Layer, Surface, picture
 from puncture_twin.twin.report.scene.scene_parts import bar
 
-PX_PER_MM = 8
-"""Of the sheet."""
-MARGIN, CAPTION, LEGEND, COLUMNS = 14, 58, 40, 3
-"""Pixels about a picture, below it and below all; pictures side by side."""
-MARKED_MM = 14.0
-"""Of the detected shaft that is marked."""
-TARGET_MM = 2.0
-"""Radius of the ring about a target."""
+PX_PER_MM = 8  # of the sheet
+MARGIN, CAPTION, LEGEND, COLUMNS = 14, 58, 40, 3  # pixels about a picture, below it, below all; side by side
+MARKED_MM = 14.0  # of the detected shaft that is marked
+TARGET_MM = 2.0  # radius of the ring about a target
 DETECTED: Rgb = (86, 220, 255)
 TRUE: Rgb = (255, 214, 64)
 TARGET: Rgb = (255, 96, 96)
-DARK = ("#0082af", "#be8c00", "#c82828")
-"""The same on white."""
+DARK = ("#0082af", "#be8c00", "#c82828")  # the same on white
 WORKCELL_SIZE = (1180, 720)
-OPACITY = 0.45
-"""Opacity of the phantom, so that the needle shows in it."""
+OPACITY = 0.45  # opacity of the phantom, so that the needle shows in it
 
 
 class Panel(NamedTuple):
@@ -161,23 +149,24 @@ def workcell_picture(case: SelfcalCase, q_probe: Floats, q_needle: Floats, path:
 
 def workcell_surfaces(case: SelfcalCase, q_probe: Floats, q_needle: Floats) -> tuple[list[Surface], list[Surface]]:
     """Table, arms, probe and needle; and, see-through, the phantom and the slice. base1, mm."""
-    table, (width, depth) = table_box(case.content.phantom), case.content.image.imager().size_mm
+    table, (width, depth) = pose_choice.table_box(case.content.phantom), case.content.image.imager().size_mm
     T1, T2 = link_poses(case.models[0], q_probe), case.T_base1_base2 @ link_poses(case.models[1], q_needle)
     opaque = [Surface(box(table.T_base_box, table.size_mm), palette.TABLE)]
     for model, poses in zip(case.models, (T1, T2), strict=True):
         opaque += [Surface(link.mesh.transformed(poses[link.frame]), palette.ARM) for link in visual_links(model)]
-    handle, tool, end2 = probe_tool(case), needle_tool(case), T2[6]
+    handle, tool, end2 = pose_choice.probe_tool(case), pose_choice.needle_tool(case), T2[6]
     shaft = _cylinder(end2, tool.holder_length_mm, tool.needle_length_mm, max(tool.needle_diameter_mm, 3.0))
+    T_head = T1[6] @ pose_choice.head_pose(case, case.T_end1_image)
     opaque += [
         Surface(_cylinder(T1[6], 0.0, handle.needle_length_mm, handle.holder_diameter_mm), (235, 236, 240)),
-        Surface(box(T1[6] @ head_pose(case, case.T_end1_image), case.content.probe.head_mm), (90, 110, 150)),
+        Surface(box(T_head, case.content.probe.head_mm), (90, 110, 150)),
         Surface(_cylinder(end2, 0.0, tool.holder_length_mm, tool.holder_diameter_mm), palette.HOLDER),
         Surface(shaft, palette.NEEDLE),
     ]
     T_slice = pose(np.eye(3), [width / 2.0, depth / 2.0, 0.0])
     slab = box(T1[6] @ case.T_end1_image @ T_slice, (width, depth, 0.6))
     return opaque, [
-        Surface(phantom_mesh(case.content.phantom), palette.SKIN, OPACITY),
+        Surface(pose_choice.phantom_mesh(case.content.phantom), palette.SKIN, OPACITY),
         Surface(slab, (86, 180, 233), 0.55, 0.0),
     ]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -17,58 +16,28 @@ from puncture_twin.planning.base.files import new_folder
 from puncture_twin.planning.base.output.output_set import withdraw, writing
 from puncture_twin.planning.base.progress import Stages, Watcher
 from puncture_twin.planning.base.provenance import Input, inputs_document
+from puncture_twin.twin.guidance.ultrasound import pose_choice, recording_file
 from puncture_twin.twin.guidance.ultrasound.acquisition import Acquisition, choice_noise, keep_pictures
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, Shot, ShotByShot
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
-from puncture_twin.twin.guidance.ultrasound.pose_choice import (
-    CandidatePoses,
-    TwoArms,
-    drawing,
-    expected_tre_mm,
-    find_candidates,
-    predicted_tre,
-)
-from puncture_twin.twin.guidance.ultrasound.recording_file import (
-    FILE_NAME,
-    checked_calibration,
-    held_length_mm,
-    open_recording,
-    recording_file,
-    write_recording,
-)
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
 from puncture_twin.twin.jobs.selfcal.pictures import detection_sheet, workcell_picture
 from puncture_twin.twin.jobs.terminal import write_json
-from puncture_twin.twin.rehearsal.selfcal_trial import (
-    Puncture,
-    SelfcalTrial,
-    puncture_summary,
-    run_trial,
-    trial_summary,
-)
+from puncture_twin.twin.rehearsal import selfcal_trial
+from puncture_twin.twin.report import present
 from puncture_twin.twin.report.figures import png
-from puncture_twin.twin.report.page.template import Card
-from puncture_twin.twin.report.present import (
-    Block,
-    Field,
-    Section,
-    Table,
-    Warn,
-    facts as facts_table,
-    footer,
-    grid,
-    number,
-    origin_section,
-    picture,
-    text,
-    vector,
-    write_page as write_job_page,
-)
+from puncture_twin.twin.report.present import Block, Card, Field, Section, Table, Warn, grid, number
 
 NO_JOINTS = "{file}: no joints (columns A_q1_deg to B_q6_deg): the declared arm errors of the case are not counted"
 MOST_MISSED = "{file}: no needle in {missed} pictures, and one in {shown}: is the display that of the case's machine?"
-RANDOM_SETS = 50
-"""Random choices that the informative one is compared with."""
+RANDOM_SETS = 50  # random choices that the informative one is compared with
+PARAMETERS = "w: a small rotation, R exp([w]×); t: a shift; V: the needle’s direction."
+EQUATION = "A X p = Y B q: X probe flange to image, Y base 1 to base 2, q the tip in the needle's flange frame."
+RESIDUALS = (
+    "Y B q − A X p of every pose, in the axes of the image. Small residuals do not prove a small error at a target."
+)
+COLOURS = ("#0072b2", "#e69f00", "#009e73")  # Okabe and Ito's blue, orange, green
+SET_ASIDE = "#d6001e"
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,20 +48,17 @@ class SelfcalRun:
     calibration: Calibration
     recording: Recording
     inputs: tuple[Input, ...]
-    trials: tuple[SelfcalTrial, ...] = ()
-    """In the twin, one per seed; empty for a recording."""
+    trials: tuple[selfcal_trial.SelfcalTrial, ...] = ()  # in the twin, one per seed; empty for a recording
     case: SelfcalCase | None = None
-    candidates: CandidatePoses | None = None
+    candidates: pose_choice.CandidatePoses | None = None
     choice: dict[str, Any] | None = None
     stages: Stages = field(default_factory=Stages)
     files: tuple[Path, ...] = ()
-    warnings: tuple[str, ...] = ()
-    """What the recording leaves open, one sentence each."""
-    shots: tuple[Shot, ...] = ()
-    """What came of each shot after the recording."""
+    warnings: tuple[str, ...] = ()  # what the recording leaves open, one sentence each
+    shots: tuple[Shot, ...] = ()  # what came of each shot after the recording
 
     @property
-    def punctures(self) -> tuple[Puncture, ...]:
+    def punctures(self) -> tuple[selfcal_trial.Puncture, ...]:
         """Of all seeds."""
         return tuple(one for trial in self.trials for one in trial.punctures)
 
@@ -100,56 +66,44 @@ class SelfcalRun:
 def selfcal_twin(case: SelfcalCase, seeds: int, watcher: Watcher) -> SelfcalRun:
     """Draw ``seeds`` rooms from the case's seed on; record, calibrate and puncture in each.
 
-    Raises:
-        Degenerate: The poses cannot show every unknown.
-        NoAnswerError: Not enough poses can be taken or show the needle.
+    Raises Degenerate: The poses cannot show every unknown. NoAnswerError: Too few can be taken or show the needle.
     """
     stages, seed = Stages(), case.content.seed
     with stages.time("room"):
-        workcell = TwoArms(case)
+        workcell = pose_choice.TwoArms(case)
     with stages.time("candidates"):
-        candidates = find_candidates(case, workcell, np.random.default_rng(seed))
-    trials = tuple(run_trial(case, workcell, candidates, seed + k, stages, watcher) for k in range(seeds))
+        candidates = pose_choice.find_candidates(case, workcell, np.random.default_rng(seed))
+    trials = tuple(selfcal_trial.run_trial(case, workcell, candidates, seed + k, stages, watcher) for k in range(seeds))
     first = trials[0]
     with stages.time("comparison with random choice"):
         choice = compare_choice(case, candidates, first.acquisition)
+    name, found, recording = case.content.name, first.calibration, first.acquisition.recording
     return SelfcalRun(
-        case.content.name,
-        first.calibration,
-        first.acquisition.recording,
-        case.inputs,
-        trials,
-        case,
-        candidates,
-        choice,
-        stages,
-        warnings=first.calibration.warnings(),
+        name, found, recording, case.inputs, trials, case, candidates, choice, stages, warnings=found.warnings()
     )
 
 
 def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None = None) -> SelfcalRun:
     """Calibrate from a recording's CSV, or a folder with ``recording.csv``; a case says noise and needle length.
 
-    Each pose of ``shots``, what was seen afterwards, updates the calibration.
-
-    Raises:
-        InputError: A recording that cannot be used, or that fits only in another reading (inverse, swapped, metres).
-        Degenerate: The poses cannot show every unknown.
+    Each pose of ``shots``, what was seen afterwards, updates the calibration. Raises InputError: A recording that
+    cannot be used, or that fits only in another reading (inverse, swapped, metres). Degenerate: It cannot show every
+    unknown.
     """
-    file = recording_file(path)
+    file = recording_file.recording_file(path)
     stages = Stages()
     with stages.time("read"):
-        recording, inputs, warnings = open_recording(path, case)
+        recording, inputs, warnings = recording_file.open_recording(path, case)
     with stages.time("calibrate"):
-        calibration = checked_calibration(recording, case, file, hold=shots is None)
+        calibration = recording_file.checked_calibration(recording, case, file, hold=shots is None)
     tried: tuple[Shot, ...] = ()
     if shots is not None:
         with stages.time("shots"):
             following = ShotByShot.of(calibration)
-            more, files, notes = open_recording(shots, case)
+            more, files, notes = recording_file.open_recording(shots, case)
             for row in range(len(more)):
                 following = following.with_shot(more.subset(slice(row, row + 1)))
-            calibration = following.calibration(needle_length_mm=held_length_mm(case))
+            calibration = following.calibration(needle_length_mm=recording_file.held_length_mm(case))
         tried, inputs, warnings = following.shots, (*inputs, *files), (*warnings, *notes)
     inputs = (*inputs, *(() if case is None else case.inputs))
     warnings = (*warnings, *calibration.warnings())
@@ -162,15 +116,13 @@ def selfcal_recording(path: Path, case: SelfcalCase | None, shots: Path | None =
     )
 
 
-def compare_choice(case: SelfcalCase, candidates: CandidatePoses, taken: Acquisition) -> dict[str, Any]:
+def compare_choice(case: SelfcalCase, candidates: pose_choice.CandidatePoses, taken: Acquisition) -> dict[str, Any]:
     """The gain by choosing poses: Cramer-Rao bounds over all candidates of those recorded and of random ones, mm."""
     poses, rows = candidates.poses, [shot.candidate for shot in taken.shots]
     rng = np.random.default_rng(case.content.seed)
     sets = [np.array(rows), *(rng.choice(len(poses), len(rows), replace=False) for _ in range(RANDOM_SETS))]
-    chosen, *drawn = (
-        expected_tre_mm(poses.subset(some), choice_noise(case), drawing(case), poses, case.declared_arms)
-        for some in sets
-    )
+    known = choice_noise(case), pose_choice.drawing(case), poses, case.declared_arms
+    chosen, *drawn = (pose_choice.expected_tre_mm(poses.subset(some), *known) for some in sets)
     return {
         "chosen_bound_mm": chosen,
         "random_bound_median_mm": float(np.median(drawn)),
@@ -203,7 +155,7 @@ def calibration_summary(found: Calibration, recording: Recording) -> dict[str, A
         "iterations": found.iterations,
         "condition": found.condition,
         "noise": in_degrees(noise),
-        "predicted_tre_mm": predicted_tre(found, recording),
+        "predicted_tre_mm": pose_choice.predicted_tre(found, recording),
         "tip_bias_mm": found.tip_bias_mm,
         "arms": arms,
         "cannot_show": list(found.cannot_show),
@@ -218,39 +170,31 @@ def in_degrees(values: Mapping[str, float]) -> dict[str, float]:
     }
 
 
-Facts = Mapping[str, Any]
-"""What `selfcal_facts` returns: mm and degrees."""
+Facts = Mapping[str, Any]  # what `selfcal_facts` returns: mm and degrees
 
-REASON_TEXT = MappingProxyType(
-    {
-        "ok": "can be taken",
-        "tip_outside_phantom": "tip outside the phantom",
-        "probe_out_of_reach": "probe arm cannot reach",
-        "needle_out_of_reach": "needle arm cannot reach",
-        "probe_arm_collision": "probe arm would touch itself, the table or the phantom",
-        "needle_arm_collision": "needle arm would touch itself, the table or (except with the needle) the phantom",
-        "arms_collide": "the arms, or probe and needle, would touch",
-    }
-)
-"""Of the reasons for which a drawn pose is not taken."""
+REASON_TEXT: Mapping[str, str] = {  # for which a drawn pose is not taken
+    "ok": "can be taken",
+    "tip_outside_phantom": "tip outside the phantom",
+    "probe_out_of_reach": "probe arm cannot reach",
+    "needle_out_of_reach": "needle arm cannot reach",
+    "probe_arm_collision": "probe arm would touch itself, the table or the phantom",
+    "needle_arm_collision": "needle arm would touch itself, the table or (except with the needle) the phantom",
+    "arms_collide": "the arms, or probe and needle, would touch",
+}
 
-NOISE_TEXT = MappingProxyType(
-    {
-        "robot_mm": "stated noise of each flange, mm per axis",
-        "robot_deg": "stated noise of each flange, ° per axis",
-        "image_mm": "stated noise of the tip in the image, mm per axis",
-        "off_plane_mm": "stated deviation of the tip from the slice, mm",
-        "direction_deg": "noise of the direction in the image, °",
-        "inside_image_mm": "spread of the residuals in the image, mm per axis",
-        "across_image_mm": "spread of the residuals across the slice, mm",
-    }
-)
+NOISE_TEXT: Mapping[str, str] = {
+    "robot_mm": "stated noise of each flange, mm per axis",
+    "robot_deg": "stated noise of each flange, ° per axis",
+    "image_mm": "stated noise of the tip in the image, mm per axis",
+    "off_plane_mm": "stated deviation of the tip from the slice, mm",
+    "direction_deg": "noise of the direction in the image, °",
+    "inside_image_mm": "spread of the residuals in the image, mm per axis",
+    "across_image_mm": "spread of the residuals across the slice, mm",
+}
 HELD_OUT = "Held-out: predicted minus true tip at poses that were not recorded, with the remaining errors of the arms."
-COMMAND = "selfcal"
 ANSWERS = ("calibration.json", "report.html")
 PICTURES = ("bmode.png", "room.png")
-VERSION = 2
-"""Of ``calibration.json``. 2: ``inputs`` lists each file with its role."""
+VERSION = 2  # of ``calibration.json``. 2: ``inputs`` lists each file with its role
 
 
 def run_selfcal(
@@ -262,45 +206,39 @@ def run_selfcal(
     record: Path | None = None,
     shots: Path | None = None,
 ) -> SelfcalRun:
-    """Simulate a case, or calibrate a recording, and write everything into a folder.
+    """Simulate a case, or calibrate a recording, and write everything into a folder; raises what these raise.
 
     The first seed's pictures and joints go into the folder ``record``, which is not there yet.
-
-    Raises:
-        InputError: Something that cannot be used, or poses that cannot show every unknown.
-        NoAnswerError: Not enough poses can be taken or show the needle.
     """
     if (recording is not None and record is not None) or (recording is None and shots is not None):
         allowed = "--record without --recording, and --shots with it"
         refuse("--record or --shots", "selfcal", allowed, "conflicting_options")
     case = None if case_path is None else load_selfcal_case(case_path)
-    names = ANSWERS if recording is not None else (*ANSWERS, *PICTURES, FILE_NAME)
+    names = ANSWERS if recording is not None else (*ANSWERS, *PICTURES, recording_file.FILE_NAME)
     try:
-        with new_folder(record) as kept, writing(out, COMMAND, names=names, note=watcher.note) as draft:
+        with new_folder(record) as kept, writing(out, "selfcal", names=names, note=watcher.note) as draft:
             if recording is not None:
                 run = selfcal_recording(recording, case, shots)
-                draft.keep(FILE_NAME)  # one that an earlier run wrote into the folder may be this one
+                draft.keep(recording_file.FILE_NAME)  # one that an earlier run wrote into the folder may be this one
                 files = [write_json(calibration_file(run), draft.folder / ANSWERS[0])]
             else:
                 assert case is not None  # the command line gives one of the two
                 run = selfcal_twin(case, seeds, watcher)
-                files = [write_json(calibration_file(run), draft.folder / ANSWERS[0]), draft.folder / FILE_NAME]
-                write_recording(run.recording, files[1])
+                files = [draft.folder / ANSWERS[0], draft.folder / recording_file.FILE_NAME]
+                write_json(calibration_file(run), files[0])
+                recording_file.write_recording(run.recording, files[1])
                 with run.stages.time("pictures"):
-                    files += _pictures(case, run.trials[0], draft.folder)
+                    shot, (sheet, room) = run.trials[0].acquisition.shots[0], PICTURES
+                    files.append(detection_sheet(case, run.trials[0], draft.folder / sheet))
+                    files.append(workcell_picture(case, shot.q_probe, shot.q_needle, draft.folder / room))
                 if kept is not None:
                     keep_pictures(run.trials[0].acquisition, case.content.image.pixel_mm, kept)
             files.append(write_page(run, files[2:], draft.folder / ANSWERS[1]))
             draft.inputs, draft.seconds = run.inputs, run.stages.seconds
     except PlanningError:
-        withdraw(out, COMMAND, keep=(FILE_NAME,))
+        withdraw(out, "selfcal", keep=(recording_file.FILE_NAME,))
         raise
     return replace(run, files=draft.final(files))
-
-
-def _pictures(case: SelfcalCase, trial: SelfcalTrial, folder: Path) -> list[Path]:
-    sheet, shot = detection_sheet(case, trial, folder / PICTURES[0]), trial.acquisition.shots[0]
-    return [sheet, workcell_picture(case, shot.q_probe, shot.q_needle, folder / PICTURES[1])]
 
 
 def calibration_file(run: SelfcalRun) -> dict[str, Any]:
@@ -329,8 +267,8 @@ def selfcal_facts(run: SelfcalRun) -> dict[str, Any]:
         "candidates": None if run.candidates is None else run.candidates.counts,
         "choice": run.choice,
         "shots": [shot._asdict() for shot in run.shots],
-        "trials": [trial_summary(trial) for trial in run.trials],
-        "punctures": puncture_summary(run.punctures),
+        "trials": [selfcal_trial.trial_summary(trial) for trial in run.trials],
+        "punctures": selfcal_trial.puncture_summary(run.punctures),
         "seconds": {stage: round(seconds, 3) for stage, seconds in run.stages.seconds.items()},
         "files": [str(path) for path in run.files],
         "warnings": list(run.warnings),
@@ -341,33 +279,33 @@ def selfcal_text(found: Facts) -> str:
     """The sections for a terminal, then the files."""
     notes = tuple(f"note: {one['sentence']}" for one in found["findings"] if one["severity"] == "note")
     head = Section(f"{'case' if found['trials'] else 'recording'} {found['name']}", [Warn(notes)] if notes else [])
-    return text([head, *sections(found), *footer(found["files"], found["warnings"], found["seconds"])])
+    return present.text([head, *sections(found), *present.footer(found["files"], found["warnings"], found["seconds"])])
 
 
 def write_page(run: SelfcalRun, pictures: Sequence[Path], path: Path) -> Path:
     """Write the page, with the sheet of pictures and the workcell where the twin drew them."""
     found, seed = selfcal_facts(run), run.trials[0].seed if run.trials else None
-    residuals = picture(residual_picture(run.calibration, run.recording), "Residual of each pose, and v over u")
+    residuals = present.picture(residual_picture(run.calibration, run.recording), "Residual of each pose, and v over u")
+    X, Y = _matrix(run.calibration.X), _matrix(run.calibration.Y)
+    matrices = present.facts([("T_end1_image (X), mm", X), ("T_base1_base2 (Y), mm", Y)])
+    sigma = np.sqrt(np.maximum(np.diag(run.calibration.covariance), 0.0)).tolist()
+    deviations = in_degrees(dict(zip(run.calibration.parameters, sigma, strict=True)))
+    known = Table(("parameter", "sd"), tuple((name, f"{value:.4f}") for name, value in deviations.items()))
+    uncertainty = Section("uncertainty of each parameter", [matrices, known, PARAMETERS])
     shown = [*sections(found)]
-    shown[2:2] = [_numbers(run.calibration), Section("residuals", [RESIDUALS, residuals])]
+    shown[2:2] = [uncertainty, Section("residuals", [RESIDUALS, residuals])]
     if pictures:
         if run.punctures:
-            errors = picture(puncture_picture(run.punctures), "Error of every target, and the expected error")
+            errors = present.picture(puncture_picture(run.punctures), "Error of every target, and the expected error")
             shown.insert(5, Section("", [errors]))
-        sheet = picture(pictures[0], "B-mode pictures with detected and true tips")
+        sheet = present.picture(pictures[0], "B-mode pictures with detected and true tips")
         words = "One recorded pose. The needle is drawn 3 mm thick; blue: the slice in the image."
         shown += [
             Section("B-mode pictures", [f"Seed {seed}. The detector sees only the grey picture.", sheet]),
-            Section("the workcell", [picture(pictures[1], "Both arms about the phantom"), words]),
+            Section("the workcell", [present.picture(pictures[1], "Both arms about the phantom"), words]),
         ]
-    title, origin = f"{run.name}: ultrasound self-calibration", origin_section(seed)
-    return write_job_page(path, title, EQUATION, _cards(found), shown, run.inputs, origin=origin)
-
-
-EQUATION = "A X p = Y B q: X probe flange to image, Y base 1 to base 2, q the tip in the needle's flange frame."
-RESIDUALS = (
-    "Y B q − A X p of every pose, in the axes of the image. Small residuals do not prove a small error at a target."
-)
+    title, origin = f"{run.name}: ultrasound self-calibration", present.origin_section(seed)
+    return present.write_page(path, title, EQUATION, _cards(found), shown, run.inputs, origin=origin)
 
 
 def sections(found: Facts) -> list[Section]:
@@ -377,7 +315,7 @@ def sections(found: Facts) -> list[Section]:
         known.insert(0, ("χ² of the residuals per degree of freedom", number(arms["chi2_per_freedom"], 2)))
     shown = [
         Section("what the data cannot determine", [Warn(tuple(found["cannot_show"]))]),
-        Section("calibration", [facts_table([*CALIBRATION, *known], found)]),
+        Section("calibration", [present.facts([*CALIBRATION, *known], found)]),
     ]
     if found["shots"]:
         words = "Each updated the calibration where it fits; residuals above are those of the recording."
@@ -385,7 +323,7 @@ def sections(found: Facts) -> list[Section]:
     if found["trials"]:
         reached: list[Block] = ["No target could be reached without contact."]
         if found["punctures"] is not None:
-            reached = [PUNCTURED, facts_table(PUNCTURES, found["punctures"])]
+            reached = [PUNCTURED, present.facts(PUNCTURES, found["punctures"])]
         shown += [
             Section("insertions to targets in the image", reached),
             Section("seeds, each its own trial", [grid(TRIAL, found["trials"]), HELD_OUT]),
@@ -406,8 +344,8 @@ CALIBRATION = (
     Field("pictures without a needle", lambda one: _named(one["without_needle"])),
     Field("residuals, rms", "residual_rms_mm", 3, "mm"),
     Field("expected tip error, rms", lambda one: f"{one['predicted_tre_mm']:.3f} mm, {counted(one)}"),
-    Field("tip in the needle's flange frame", lambda one: vector(one["tip_end2_mm"], 3, "mm")),
-    Field("needle direction there", lambda one: vector(one["needle_direction_end2"], 5)),
+    Field("tip in the needle's flange frame", lambda one: present.vector(one["tip_end2_mm"], 3, "mm")),
+    Field("needle direction there", lambda one: present.vector(one["needle_direction_end2"], 5)),
     Field("iterations", "iterations"),
     Field("condition σ_min/σ_max, lengths in 100 mm", lambda one: f"{one['condition']:.2e}"),
 )
@@ -461,26 +399,12 @@ def _poses(found: Facts) -> list[Block]:
         Field("at random, the best of them", "random_bound_best_mm", 3, "mm"),
     )
     drawn = Table(("outcome of the drawn poses", "draws"), tuple(counts))
-    return [(drawn, facts_table(bounds, choice)), "Cramér-Rao bounds over all candidates, with the usual noise."]
-
-
-def _numbers(found: Calibration) -> Section:
-    """Both transforms, and how well each number is known."""
-    matrices = facts_table([("T_end1_image (X), mm", _matrix(found.X)), ("T_base1_base2 (Y), mm", _matrix(found.Y))])
-    known = Table(("parameter", "sd"), tuple((name, f"{value:.4f}") for name, value in deviations(found).items()))
-    note = "w: a small rotation, R exp([w]×); t: a shift; V: the needle’s direction."
-    return Section("uncertainty of each parameter", [matrices, known, note])
+    return [(drawn, present.facts(bounds, choice)), "Cramér-Rao bounds over all candidates, with the usual noise."]
 
 
 def _matrix(T: Any) -> Markup:
     lines = ["  ".join(f"{value:10.5f}" for value in row[:3]) + f"  {row[3]:9.3f}" for row in T[:3]]
     return Markup("<pre>{}</pre>").format("\n".join(lines))
-
-
-def deviations(found: Calibration) -> dict[str, float]:
-    """Standard deviation of every parameter, by name; rotations in degrees."""
-    sigma = np.sqrt(np.maximum(np.diag(found.covariance), 0.0)).tolist()
-    return in_degrees(dict(zip(found.parameters, sigma, strict=True)))
 
 
 def _cards(found: Facts) -> list[Card]:
@@ -498,11 +422,6 @@ def _cards(found: Facts) -> list[Card]:
         )
         cards.insert(0, Card("tip to target, true", number(reached["error_rms_mm"], 2, "mm"), detail))
     return cards
-
-
-COLOURS = ("#0072b2", "#e69f00", "#009e73")
-"""Okabe and Ito's blue, orange, green."""
-SET_ASIDE = "#d6001e"
 
 
 def residual_picture(found: Calibration, recording: Recording) -> bytes:
@@ -523,7 +442,7 @@ def residual_picture(found: Calibration, recording: Recording) -> bytes:
     return _finished(figure)
 
 
-def puncture_picture(reached: Sequence[Puncture]) -> bytes:
+def puncture_picture(reached: Sequence[selfcal_trial.Puncture]) -> bytes:
     """A PNG of every target's error, in the order reached, beside what calibration and reading let expect."""
     x = np.arange(1, len(reached) + 1)
     figure = Figure(figsize=(12.0, 3.6), dpi=110, layout="constrained")

@@ -20,55 +20,27 @@ from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.guidance.stereo.ball import image_detector
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, load_servo_case
 from puncture_twin.twin.guidance.stereo.servo_law import Posture
-from puncture_twin.twin.guidance.stereo.session import (
-    calibrate_by_robot,
-    follow,
-    map_markers,
-    read_recording,
-)
+from puncture_twin.twin.guidance.stereo.session import calibrate_by_robot, follow, map_markers, read_recording
 from puncture_twin.twin.jobs.servo.pictures import draw_cameras, draw_convergence
 from puncture_twin.twin.jobs.terminal import Answer
-from puncture_twin.twin.rehearsal.stereo_session import (
-    ServoTrial,
-    Session,
-    declaration_test,
-    needle_statistics,
-    run_session,
-    run_trials,
-    statistics,
-)
-from puncture_twin.twin.report.page.template import Card
-from puncture_twin.twin.report.present import (
-    Block,
-    Field,
-    Section,
-    Table,
-    Warn,
-    facts as facts_table,
-    footer,
-    grid,
-    number,
-    percent,
-    picture,
-    text,
-    write_page,
-)
+from puncture_twin.twin.rehearsal import stereo_session
+from puncture_twin.twin.report import present
+from puncture_twin.twin.report.present import Block, Card, Field, Section, Table, Warn, grid, number
 
 PHASES = {"open_loop": "by mapping and robot alone", "servoed": "after the servo"}
-"""By mapping and robot alone, and after the servo."""
-NO_TOUCH = "not computed: the case has no structures"
-"""Of ``p_touch``: which is something else than 0."""
+NO_TOUCH = "not computed: the case has no structures"  # of ``p_touch``: which is something else than 0
 NOT_MODELLED = "bending of the rod, cameras moved after the calibration, tissue"
-DOUBTED = 0.01
-"""Chance of residuals so large below which the declaration is doubted, as in the CT case."""
-Facts = Mapping[str, Any]
-"""What `servo_facts` returns: mm, shares 0..1."""
+DOUBTED = 0.01  # chance of residuals so large below which the declaration is doubted, as in the CT case
+Facts = Mapping[str, Any]  # what `servo_facts` returns: mm, shares 0..1
+NAMES = ("servo.html", "convergence.png", "camera_1.png", "camera_2.png")
 
 
-def servo_facts(case: ServoCase, trials: Sequence[ServoTrial], ours: Facts) -> dict[str, Any]:
+def servo_facts(case: ServoCase, trials: Sequence[stereo_session.ServoTrial], ours: Facts) -> dict[str, Any]:
     """A case's sessions, each seed and all together, and the needle against the anatomy, predicted beside realised."""
-    test, rows = declaration_test(trials), [row for one in trials for row in one.targets]
-    found = {phase: needle_statistics([getattr(row, f"needle_{phase}") for row in rows]) for phase in PHASES}
+    test, rows = stereo_session.declaration_test(trials), [row for one in trials for row in one.targets]
+    found = {
+        phase: stereo_session.needle_statistics([getattr(row, f"needle_{phase}") for row in rows]) for phase in PHASES
+    }
     return {
         "case": case.name,
         "inputs": inputs_document(case.inputs),
@@ -106,14 +78,14 @@ def recording_text(facts: Facts) -> str:
         ("markers", f"residual of {number(facts['fre_mm'], 3, 'mm')} (rms)"),
     ]
     looks = grid(LOOK, facts["looks"])
-    head = Section(f"case {facts['case']}, recorded in {facts['recording']}", [facts_table(rows)])
-    return text([head, Section("every look at the ball", [looks])])
+    head = Section(f"case {facts['case']}, recorded in {facts['recording']}", [present.facts(rows)])
+    return present.text([head, Section("every look at the ball", [looks])])
 
 
 def servo_text(facts: Facts, paper: Sequence[Section] = ()) -> str:
     """The sections for a terminal, those of a paper first, then the files."""
     head = Section(f"case {facts['case']}", [])
-    return text([head, *paper, *sections(facts), *footer(facts["files"])])
+    return present.text([head, *paper, *sections(facts), *present.footer(facts["files"])])
 
 
 def write_servo_page(
@@ -131,15 +103,15 @@ def write_servo_page(
         f"estimate: {'joint' if servo.estimate == 'joint' else 'the chain'}."
     )
     title = f"{case.name}: visual servoing to {plural(len(facts['sessions'][0]['targets']), 'target')}"
-    return write_page(path, title, setup, _cards(facts), [*paper, *sections(facts, pictures)], case.inputs)
+    return present.write_page(path, title, setup, _cards(facts), [*paper, *sections(facts, pictures)], case.inputs)
 
 
 def sections(facts: Facts, pictures: Sequence[Path] = ()) -> list[Section]:
     """Everything that is shown: the first seed, all seeds, needle, calibration; pictures of convergence and cameras."""
     first, shown = facts["sessions"][0], list[Section]()
     if pictures:
-        plot = picture(pictures[0], "Distance from ball to estimated target against corrections")
-        cameras = [picture(one, one.stem) for one in pictures[1:]]
+        plot = present.picture(pictures[0], "Distance from ball to estimated target against corrections")
+        cameras = [present.picture(one, one.stem) for one in pictures[1:]]
         shown = [Section("convergence of the servo", [plot]), Section("through the cameras", cameras)]
     targets: list[Block] = [Warn((f"not possible: {first['refused']}",))]
     if not first["refused"]:
@@ -151,9 +123,9 @@ def sections(facts: Facts, pictures: Sequence[Path] = ()) -> list[Section]:
     return [
         Section(f"every target of seed {first['seed']}, true errors in mm", targets),
         *shown,
-        Section("all seeds", [facts_table(STATISTICS, facts["statistics"])]),
+        Section("all seeds", [present.facts(STATISTICS, facts["statistics"])]),
         Section("the needle against the anatomy", _needle_blocks(facts["needle"], first)),
-        Section("calibration", [facts_table(CALIBRATION, first), *stereo]),
+        Section("calibration", [present.facts(CALIBRATION, first), *stereo]),
     ]
 
 
@@ -197,7 +169,7 @@ STATISTICS = (
     Field("after over mapping (its floor is 1)", "after_over_mapping", 3),
     Field("servo-only, mean and maximum", lambda ours: _mean_and_most(ours, "servo_only")),
     Field("corrections, median", "median_steps", 1),
-    Field("not confirmed", lambda ours: percent(ours["not_confirmed"])),
+    Field("not confirmed", lambda ours: present.percent(ours["not_confirmed"])),
 )  # fmt: skip
 CALIBRATION = (
     Field("residual of each camera (rms)", lambda one: " and ".join(
@@ -207,11 +179,11 @@ CALIBRATION = (
 )  # fmt: skip
 
 
-def _of_needle(key: str, digits: int = 2) -> Any:
-    return lambda row: None if row["needle_servoed"] is None else number(row["needle_servoed"][key], digits)
+def _of_needle(key: str) -> Any:
+    return lambda row: None if row["needle_servoed"] is None else number(row["needle_servoed"][key], 2)
 
 
-NEEDLE = (
+NEEDLE = (  # of a target's needle at the servo's last look, mm
     Field("target", "target"),
     Field("expected", lambda row: "unknown" if row["needle_servoed"] is None else _of_needle("predicted_rms_mm")(row)),
     Field("95 % half axes", lambda row: (one := row["needle_servoed"]) and " x ".join(
@@ -222,11 +194,9 @@ NEEDLE = (
     Field("chance to hit", lambda row: (one := row["needle_servoed"]) and one["p_hit"] and chance_text(one["p_hit"])),
     Field("realised", _of_needle("realised_mm")),
 )  # fmt: skip
-"""Of a target's needle at the servo's last look, mm."""
 
 
 def _needle_blocks(needle: Facts, first: Facts) -> list[Block]:
-    """Over all seeds by each way, realised beside predicted; what must be known before; each needle of one seed."""
     radius = needle["hit_radius_mm"]
     rows = [
         ("tip error, rms, mm", *_both(needle, "realised_rms_mm", "predicted_rms_mm")),
@@ -273,45 +243,37 @@ def _cards(facts: Facts) -> list[Card]:
         Card("before the servo", number(ours["before_mean"], 2, "mm"), "mean, true ball to true target"),
         Card("after the servo", number(ours["after_mean"], 2, "mm"), f"{ratio} times the mapping's"),
         Card("servo-only", number(ours["servo_only_mean"], 3, "mm"), f"mean; at most {most} mm"),
-        Card("not confirmed", percent(ours["not_confirmed"]), f"within {tolerance:g} mm; median {steps:g} steps"),
+        Card(
+            "not confirmed", present.percent(ours["not_confirmed"]), f"within {tolerance:g} mm; median {steps:g} steps"
+        ),
     ]
-
-
-NAMES = ("servo.html", "convergence.png", "camera_1.png", "camera_2.png")
 
 
 class Sessions(NamedTuple):
     """A case's sessions: that of the first seed in full, the trial of every seed, and the statistics over all."""
 
     case: ServoCase
-    first: Session
-    trials: tuple[ServoTrial, ...]
+    first: stereo_session.Session
+    trials: tuple[stereo_session.ServoTrial, ...]
     ours: dict[str, Any]
 
 
 def hold_sessions(case: ServoCase, seeds: int, done: Count = uncounted, record: Path | None = None) -> Sessions:
     """Hold the sessions of a case, from its own seed on; all that the first one's devices say goes into ``record``."""
     seed = case.file.seed
-    first = run_session(case, seed, record=record)
+    first = stereo_session.run_session(case, seed, record=record)
     done(1, seeds)
-    others = run_trials(case, range(seed + 1, seed + seeds), lambda at, of: done(at + 1, seeds))
+    others = stereo_session.run_trials(case, range(seed + 1, seed + seeds), lambda at, of: done(at + 1, seeds))
     trials = (first.trial, *others)
-    return Sessions(case, first, trials, statistics(trials))
+    return Sessions(case, first, trials, stereo_session.statistics(trials))
 
 
 def run_servo(
-    path: Path,
-    out_dir: Path,
-    seeds: int,
-    done: Count = uncounted,
-    note: Callable[[str], None] | None = None,
-    record: Path | None = None,
+    path: Path, out_dir: Path, seeds: int, done: Count, note: Callable[[str], None] | None, record: Path | None
 ) -> Answer:
     """Hold the sessions of a case, write pictures, plot and page, and what the first one's devices say into ``record``.
 
-    Raises:
-        InputError: The case cannot be used.
-        NoAnswerError: The first session could not be held.
+    Raises InputError: The case cannot be used. NoAnswerError: The first session could not be held.
     """
     case = load_servo_case(path)
     with writing(out_dir, "servo", inputs=case.inputs, names=NAMES, note=note) as draft:
@@ -333,9 +295,8 @@ def refuse_with_recording(out_dir: Path | None, record: Path | None, seeds: int)
 def follow_recording(path: Path, recording: Path) -> Answer:
     """Calibrate and map from a recorded session, and say what each of its looks at the ball says.
 
-    Raises:
-        InputError: Case or recording cannot be used.
-        NoAnswerError: A point or a marker is not found in its pictures.
+    Raises InputError: Case or recording cannot be used. NoAnswerError: A point or a marker is not found in its
+    pictures.
     """
     case = load_servo_case(path)
     replay = read_recording(recording, case.file.cameras.size_px)

@@ -23,13 +23,10 @@ from puncture_twin.twin.report.annotate import INK
 from puncture_twin.twin.report.figures import cross, figure_of, halo, picture_axes, ring, write_png
 from puncture_twin.twin.world.workcell import load_ball, open_workcell, pinhole_picture
 
-BALL, TARGET, MARKER = (214, 96, 0), (0, 120, 60), (30, 80, 200)
-"""Colours of what is drawn over the picture."""
-WIDTH_PX = 1280
-"""Of the pictures that are written, whatever the camera's size."""
+BALL, TARGET, MARKER = (214, 96, 0), (0, 120, 60), (30, 80, 200)  # colours of what is drawn over the picture
+WIDTH_PX = 1280  # of the pictures that are written, whatever the camera's size
 INSET_HALF_PX = 24
-INSET_SCALE = 6
-"""The inset shows so many camera pixels to each side of the ball, so many times enlarged."""
+INSET_SCALE = 6  # the inset shows so many camera pixels to each side of the ball, so many times enlarged
 DOWN = np.array([0.0, 0.0, -1.0])
 
 

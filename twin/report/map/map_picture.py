@@ -1,7 +1,4 @@
-"""``map.png``: every entry direction, seen from outside, with the reason for each refusal.
-
-Beside the disc a column: what its colours and marks mean, and the chosen direction in numbers.
-"""
+"""``map.png``: every entry direction, seen from outside, with the reason for each refusal; beside it their key."""
 
 from __future__ import annotations
 
@@ -25,52 +22,42 @@ from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.uncertainty_breakdown import chance_text
 from puncture_twin.twin.report import numbers
 from puncture_twin.twin.report.figures import figure_of, write_png
-from puncture_twin.twin.report.map import map_disc, map_raster
+from puncture_twin.twin.report.map import map_raster
+from puncture_twin.twin.report.map.map_raster import RADIUS, MapRaster
 from puncture_twin.twin.report.map_view import BEYOND, MapView, map_view, step_of
 from puncture_twin.twin.report.palette import safe_shades
 from puncture_twin.twin.report.present import number, percent
 
 WIDTH, HEIGHT = 1690, 1222
-
-DISC = (
-    (583 - map_disc.RADIUS) / WIDTH,
-    1 - (642 + map_disc.RADIUS) / HEIGHT,
-    2 * map_disc.RADIUS / WIDTH,
-    2 * map_disc.RADIUS / HEIGHT,
-)
+DISC = ((583 - RADIUS) / WIDTH, 1 - (642 + RADIUS) / HEIGHT, 2 * RADIUS / WIDTH, 2 * RADIUS / HEIGHT)
 SIDE_WIDE, SIDE_HIGH = 515, 1039
 SIDE = (1158 / WIDTH, 1 - (122 + SIDE_HIGH) / HEIGHT, SIDE_WIDE / WIDTH, SIDE_HIGH / HEIGHT)
 """Of the picture: left, lower edge, width and height of the disc and of the column beside it; labels stand around the
 disc."""
 
 SMALL = 9.5  # points: letters of the column
+GAP = 0.025  # between the parts of the column, of its height
+LETTERS, MOST_LINES = 46, 19  # of the key of reasons: letters a line, lines at full size; more of them are smaller
+PALE: Rgb = (205, 235, 220)  # below the legend's hatching
 
 
-def draw_map(
-    candidates: Candidates,
-    case: Any,
-    path: Path,
-    pick: Pick | None = None,
-    raster: map_raster.MapRaster | None = None,
-    scan: Any | None = None,
-) -> None:
-    """Write the map of a search, of a raster that somebody has already; lengths in the digits of a scan's voxels."""
-    write_png(map_figure(candidates, case, pick, raster, scan), path)
+def draw_map(candidates: Candidates, case: Any, path: Path, pick: Pick | None = None, **known: Any) -> None:
+    """Write the map of a search; arguments as of `map_figure`."""
+    write_png(map_figure(candidates, case, pick, **known), path)
 
 
 def map_figure(
-    candidates: Candidates,
-    case: Any,
-    pick: Pick | None = None,
-    raster: map_raster.MapRaster | None = None,
-    scan: Any | None = None,
+    candidates: Candidates, case: Any, pick: Pick | None = None, raster: MapRaster | None = None, scan: Any = None
 ) -> Figure:
-    """The map, arguments as of `draw_map`; the disc is the first of its axes, the column the second."""
+    """The map, of a raster that somebody has already; lengths in the digits of a scan's voxels.
+
+    The disc is the first of its axes, the column the second.
+    """
     pick = pick or candidates.best
     view = map_view(case, candidates)
-    figure = figure_of(WIDTH, HEIGHT, dpi=map_disc.DPI)
+    figure = figure_of(WIDTH, HEIGHT, dpi=map_raster.DPI)
     raster = map_raster.map_raster(candidates, view) if raster is None else raster
-    map_disc.draw_disc(figure.add_axes(DISC), candidates, view, raster, pick)
+    map_raster.draw_disc(figure.add_axes(DISC), candidates, view, raster, pick)
     _column(figure.add_axes(SIDE), candidates, view, pick, scan)
     title = f"{case.name}: entry directions to {numbers.target_text(case)}"
     figure.text(0.02, 0.955, title, fontsize=19, weight="bold")
@@ -105,11 +92,6 @@ def _column(axes: Axes, candidates: Candidates, view: MapView, pick: Pick | None
         f"{outside}{toward}{textwrap.fill(numbers.arm_text(candidates), 52)}"
     )
     axes.text(0.0, 1.0, text, fontsize=SMALL, va="bottom", linespacing=1.4, color="0.25")
-
-
-GAP = 0.025  # between the parts of the column, of its height
-LETTERS, MOST_LINES = 46, 19
-"""Of the key of reasons: letters in a line, and lines at its full size; with more of them it is smaller."""
 
 
 def _key(axes: Axes, y: float, handles: Sequence[Artist], title: str = "", **look: Any) -> float:
@@ -162,19 +144,16 @@ def _scale(axes: Axes, candidates: Candidates, y: float) -> float:
     return y + 0.045 + GAP
 
 
-PALE: Rgb = (205, 235, 220)  # below the legend's hatching
-
-
 def _chance_key(axes: Axes, candidates: Candidates, y: float) -> float:
-    if map_disc.touch_nothing(candidates) is None:
+    if map_raster.touch_nothing(candidates) is None:
         return y
-    low, *_, high = map_disc.LEVELS
-    text = (f"< {low:g}", *(f"{a:g}–{b:g}" for a, b in pairwise(map_disc.LEVELS)), f"> {high:g}")
+    low, *_, high = map_raster.LEVELS
+    text = (f"< {low:g}", *(f"{a:g}–{b:g}" for a, b in pairwise(map_raster.LEVELS)), f"> {high:g}")
     hatched = [
-        Patch(facecolor=css(PALE), edgecolor=map_disc.HATCH_INK, hatch=hatch, label=name)
-        for name, hatch in zip(text, map_disc.HATCHES, strict=True)
+        Patch(facecolor=css(PALE), edgecolor=map_raster.HATCH_INK, hatch=hatch, label=name)
+        for name, hatch in zip(text, map_raster.HATCHES, strict=True)
     ]
-    levels = zip(map_disc.LEVELS, map_disc.STYLES, strict=True)
+    levels = zip(map_raster.LEVELS, map_raster.STYLES, strict=True)
     lines = [Line2D([], [], color="black", ls=style, label=f"at {level:g}") for level, style in levels]
     by_column = [one for pair in zip_longest(hatched, lines) for one in pair if one is not None]
     return _key(axes, y, by_column, "chance to touch no structure to avoid: hatched, and lines", ncols=len(hatched))
@@ -183,15 +162,14 @@ def _chance_key(axes: Axes, candidates: Candidates, y: float) -> float:
 def _mark_key(axes: Axes, candidates: Candidates, view: MapView, y: float) -> float:
     if not candidates.safe.any():
         return y
-    marks = [(map_disc.CHOSEN, "chosen"), (map_disc.BEST, "best of a window")]
+    marks = [(map_raster.CHOSEN, "chosen"), (map_raster.BEST, "best of a window")]
     front = map_raster.shown_front(candidates, view)
-    marks += [(map_disc.FRONT, front.text)] if front.of else []
+    marks += [(map_raster.FRONT, front.text)] if front.of else []
     handles = [Line2D([], [], ls="none", label=text, **mark) for mark, text in marks]
     return _key(axes, y, handles, ncols=3, handlelength=1.2)
 
 
 def _chosen(axes: Axes, candidates: Candidates, pick: Pick | None, y: float, scan: Any | None) -> None:
-    """The chosen direction in a box; or, in a box of warning, that there is none."""
     box = {"boxstyle": "round,pad=0.45", "facecolor": "#eef7f2", "edgecolor": "#00684a"}
     look: dict[str, Any] = {"fontsize": 10, "linespacing": 1.4, "va": "top", "bbox": box}
     if pick is None:

@@ -31,18 +31,14 @@ DPI = 110
 PANEL_INCHES = 4.3
 MOST_COLUMNS = 4
 SHADES = colormaps["viridis"]
-NOTHING: tuple[float, float, float] = (0.9, 0.9, 0.9)
-"""Where no direction is reached, or the base would be inside something."""
-
-SEEN_FROM_ABOVE = (1, 0)
-"""The bed's axes to the right and up: across, along. The first runs to the left, as seen from above."""
-
+NOTHING: tuple[float, float, float] = (0.9, 0.9, 0.9)  # where nothing is reached, or the base is in something
+SEEN_FROM_ABOVE = (1, 0)  # the bed's axes to the right and up: across (to the left from above), along
 EDGE_CELLS = 1.6  # white about the cells of the widest panel, for the body directions
 TICKS_MM = 500.0
 ALL_OF_IT = 1.0 - 5e-4  # a fraction that is printed as the whole
 HALO = halo(2.5)
-SAME_AXIS = 0.94
-"""Cosine from which the case's own base axis is a panel's (20 degrees)."""
+SAME_AXIS = 0.94  # cosine from which the case's own base axis is a panel's (20 degrees)
+LABELS_ALONG_MM, LABELS_ACROSS_MM = 200.0, 900.0  # nearer marks have the upper one's label above it
 
 
 def draw_placements(found: PlaceSearch, case: Any, skin: TriangleMesh, path: Path) -> None:
@@ -107,9 +103,6 @@ def _directions(axes: Axes, found: PlaceSearch, space: str) -> None:
         (-R[:, 1], 0.985, 0.5, "right", "center", -90),
     ):
         axes.text(x, y, direction_text(direction, space), ha=ha, va=va, rotation=turn, **look)
-
-
-LABELS_ALONG_MM, LABELS_ACROSS_MM = 200.0, 900.0  # nearer marks have the upper one's label above it
 
 
 def _marks(axes: Axes, regions: Sequence[Region], found: PlaceSearch, case: Any) -> None:

@@ -22,14 +22,18 @@ from puncture_twin.planning.search.bedside import EntryFacts
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.planning.search.uncertainty_breakdown import UncertaintyBreakdown, chance_text
 from puncture_twin.twin.report import numbers, patient, present
-from puncture_twin.twin.report.error_pictures import budget_png, rehearsal_png
+from puncture_twin.twin.report.error_pictures import budget_figure, rehearsal_png
+from puncture_twin.twin.report.figures import png
 from puncture_twin.twin.report.map.map_raster import MapRaster
 from puncture_twin.twin.report.map_view import step_of
-from puncture_twin.twin.report.page.page_map import map_data, picked_row
-from puncture_twin.twin.report.page.page_scene import arm_data, scene_figure
+from puncture_twin.twin.report.page.page_data import arm_data, map_data, picked_row, scene_figure
 from puncture_twin.twin.report.page.page_slices import slices_data
-from puncture_twin.twin.report.page.template import Card, base64_text, plotly_script, script_json, write_html
+from puncture_twin.twin.report.page.template import base64_text, plotly_script, script_json, write_html
+from puncture_twin.twin.report.present import Card
+from puncture_twin.twin.report.scene.scene_parts import Scene
 from puncture_twin.twin.report.slices.panel import TONES, Subject
+
+EPOCH = "SOURCE_DATE_EPOCH"  # seconds since 1970 that stand for "now", for the same bytes on every day
 
 
 class Uncertainty(NamedTuple):
@@ -42,40 +46,19 @@ class Uncertainty(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class Shown(Scene):
     """What a page shows."""
 
-    case: Any
-    anatomy: Any
-    candidates: Candidates
-    plan: Any | None = None
     rehearsal: Any | None = None
     registration: Mapping[str, Any] | None = None
-    film: str | None = None
-    """Name of the rehearsal's film, which lies beside the page and is linked."""
-    uncertainty: Uncertainty | None = None
-    """None where the case declares no errors."""
-    pick: Pick | None = None
-    """The planned candidate, or the one to be shown; None shows the best."""
-    subject: Subject | None = None
-    """What the slices show first."""
-    T_base_ct: Floats | None = None
-    """Shape (4, 4), mm, where the arm was checked; else None."""
-    regions_ct: Floats | None = None
-    """Shape (n, 3, 3), mm^2: of the tip, as `CaseContext.regions_ct`."""
-    facts: EntryFacts | None = None
-    """How the planned or shown path is found at the patient."""
-    refusal: str = ""
-    """Why there is no plan although one was requested."""
+    film: str | None = None  # name of the rehearsal's film, which lies beside the page and is linked
+    uncertainty: Uncertainty | None = None  # None where the case declares no errors
+    subject: Subject | None = None  # what the slices show first
+    regions_ct: Floats | None = None  # shape (n, 3, 3), mm^2: of the tip, as `CaseContext.regions_ct`
+    facts: EntryFacts | None = None  # how the planned or shown path is found at the patient
     raster: MapRaster | None = None
-    notes: Sequence[str] = ()
-    """What else must be known of the plan; `failures` say why the rehearsal's answer is no."""
+    notes: Sequence[str] = ()  # what else must be known of the plan; `failures` say why the rehearsal's answer is no
     failures: Sequence[str] = ()
-
-    @property
-    def chosen(self) -> Pick | None:
-        """The pick, or the best direction."""
-        return self.pick or self.candidates.best
 
 
 def write_page(shown: Shown, path: Path) -> None:
@@ -84,7 +67,7 @@ def write_page(shown: Shown, path: Path) -> None:
     at_patient, away = () if shown.facts is None else shown.facts.rows(), numbers.demanding(shown.anatomy)
     declared, pick, scan = shown.uncertainty is not None, shown.chosen, shown.anatomy.scan
     point = ", ".join(f"{mm:.1f}" for mm in to_lps(np.asarray(case.target_ct)[None], case.space)[0])
-    warned = (*(one.sentence for one in found.findings), *shown.anatomy.warnings)
+    study, warned = scan_date(case), (*(one.sentence for one in found.findings), *shown.anatomy.warnings)
     noted = tuple(one.sentence for one in shown.anatomy.findings if one.severity is Severity.NOTE)
     rehearsed: list[present.Block] = []
     if done is not None:
@@ -95,8 +78,8 @@ def write_page(shown: Shown, path: Path) -> None:
     slices, ct, surfaces = slices_data(subject, found, picked_row(found, pick), shown.regions_ct)
     data = {
         "map": map_data(case, found, pick, shown.raster),
-        "scene": scene_figure(case, shown.anatomy, found, plan, pick, shown.T_base_ct),
-        "arm": arm_data(case, found, plan, pick, shown.T_base_ct),
+        "scene": scene_figure(shown),
+        "arm": arm_data(shown),
         "slices": slices,
         "target": [float(v) for v in case.target_ct],
         "probe_mm": float(case.needle.length_mm),
@@ -106,7 +89,7 @@ def write_page(shown: Shown, path: Path) -> None:
         path,
         title=f"{case.name}: puncture of {numbers.target_text(case)}",
         stands=f"Case {case.name}; target {numbers.target_text(case)} at ({point}) mm {case.space};",
-        dates=dates_text(case),
+        dates=dates_text(study),
         needle=numbers.needle_text(case),
         tones=() if scan is None else tuple(TONES),
         methods=methods_text(case, shown.anatomy, found),
@@ -119,7 +102,7 @@ def write_page(shown: Shown, path: Path) -> None:
         planned="Plan" if plan is not None or shown.refusal else "The best path at the patient",
         registration=present.blocks_html(patient.registration(shown.registration)) if shown.registration else "",
         rehearsal=present.blocks_html(rehearsed) if rehearsed else "",
-        study=scan_date(case),
+        study=study,
         warnings=present.blocks_html(
             [present.Warn(warned) if warned else Markup("<p>None.</p>"), present.Warn(noted, f"Notes ({len(noted)})")]
         ),
@@ -139,13 +122,12 @@ def _all_rejected(found: Candidates) -> str:
 
 
 def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[str, Any] | None) -> dict[str, Any]:
-    """What the page says of chances, budget and rooms; nothing where the case declares no errors."""
     if uncertainty is None:
         return {"chances": None, "budget": None, "rooms": None}
     facts, tips = uncertainty.budget, uncertainty.picture
     costs = "Error sources, and the effect of single changes"
     budget = patient.budget(facts)
-    budget[1:1] = [] if facts is None else [present.picture(budget_png(facts), costs)]
+    budget[1:1] = [] if facts is None else [present.picture(png(budget_figure(facts)), costs)]
     rooms = patient.rooms(uncertainty.rooms)
     if rooms and tips is not None:
         rooms.append(present.picture(tips, "Tips of all trials in the frame of the needle"))
@@ -156,21 +138,19 @@ def _uncertain_sections(uncertainty: Uncertainty | None, registration: Mapping[s
     }
 
 
-def chance_card(breakdown: UncertaintyBreakdown, of: str) -> Card:
-    """Both chances and the expected error of a direction, for the top of the page."""
-    detail = (
-        f"{of}; touches a structure to avoid {chance_text(breakdown.p_touch_any)}; expected tip error "
-        f"{present.number(breakdown.budget.rms_mm, 2, 'mm')} (rms); not modelled: {breakdown.not_modelled}"
-    )
-    return Card("chance to hit", chance_text(breakdown.p_hit), detail)
-
-
 def _cards(shown: Shown) -> list[Card]:
     candidates, rehearsal, refusal = shown.candidates, shown.rehearsal, shown.refusal
     if not candidates.safe.any():
         return []
     breakdown = None if shown.uncertainty is None else shown.uncertainty.breakdown
-    cards = [] if breakdown is None or shown.chosen is None else [chance_card(breakdown, _angles(*shown.chosen))]
+    cards = []
+    if breakdown is not None and shown.chosen is not None:
+        touched, rms = chance_text(breakdown.p_touch_any), present.number(breakdown.budget.rms_mm, 2, "mm")
+        detail = (
+            f"{_angles(*shown.chosen)}; touches a structure to avoid {touched}; expected tip error {rms} (rms); "
+            f"not modelled: {breakdown.not_modelled}"
+        )
+        cards.append(Card("chance to hit", chance_text(breakdown.p_hit), detail))
     cards.append(_window_card(candidates))
     if shown.chosen is not None:
         (found, row), scan = shown.chosen, shown.anatomy.scan
@@ -248,21 +228,11 @@ def methods_text(case: Any, anatomy: Any, candidates: Candidates) -> str:
     )
 
 
-EPOCH = "SOURCE_DATE_EPOCH"
-"""Seconds since 1970 that stand for "now", as tools take them that make the same bytes on every day."""
-
-
-def dates_text(case: Any) -> str:
-    """The day of the page and of its scan."""
-    scan = scan_date(case)
-    return f"Made on {made_on()} (UTC); {f'scan of {scan}' if scan else 'scan date not stated'}."
-
-
-def made_on() -> str:
-    """Today, UTC."""
+def dates_text(scan: str) -> str:
+    """The day of the page, today in UTC, and that of its scan."""
     stated = os.environ.get(EPOCH, "")
     at = datetime.fromtimestamp(int(stated), UTC) if stated.isascii() and stated.isdigit() else datetime.now(UTC)
-    return at.date().isoformat()
+    return f"Made on {at.date().isoformat()} (UTC); {f'scan of {scan}' if scan else 'scan date not stated'}."
 
 
 def scan_date(case: Any) -> str:

@@ -26,9 +26,7 @@ from puncture_twin.twin.report.slices.planes import letters, toward_text
 
 AROUND_MM = 60.0  # what the block holds beyond target and entries, to every side
 FINE_MM = 1.0  # where the CT's own voxels do not fit the page, finer ones become means over this
-MOST_CT, MOST_TOGETHER = 1_600_000, 2_800_000
-"""Bytes of the packed CT, and of CT and surfaces: in base64 2.1 and 3.7 MB of the page."""
-
+MOST_CT, MOST_TOGETHER = 1_600_000, 2_800_000  # bytes of packed CT; with surfaces: 3.7 MB in base64
 MOST_VOXELS = 30_000_000  # a browser holds a byte for each; more of them are not tried as they are
 SAMPLE = 16  # slices by which it is seen at once that all will not fit
 WORST, BEST = 15, 95  # qualities of a JPEG. Below the first, edges ring; then voxels grow by a quarter
@@ -42,10 +40,8 @@ def slices_data(
 ) -> tuple[dict[str, Any], bytes, bytes]:
     """What the page's slices are made of: facts, and the bytes of CT and surfaces.
 
-    Args:
-        candidates: Of the search; their entries say how far the block reaches.
-        picked: The row of that direction on the page.
-        regions_ct: Shape (n, 3, 3), mm^2, of the tip, NaN where it is not known; None without declared errors.
+    Entries of the search's candidates say how far the block reaches; `picked` is the direction's row on the page. The
+    regions of the tip are (n, 3, 3), mm^2, NaN where not known; None without declared errors.
     """
     case, anatomy = subject.case, subject.anatomy
     box = block_box(case.target_ct, candidates)
@@ -103,12 +99,8 @@ def block_box(target_ct: Floats, candidates: Candidates) -> Floats:
 def ct_block(hu: NDArray[Any], T_ct_index: Floats, box_ct: Floats, most: int = MOST_CT) -> Packed:
     """The CT in a box, in bytes of `stored`: its own voxels without loss, or where these are too many as JPEG.
 
-    Voxels of a JPEG are means over at least `FINE_MM`; its quality is the best that fits.
-
-    Args:
-        hu: Shape (nx, ny, nz), Hounsfield units.
-        T_ct_index: Shape (4, 4), voxel index to LPS mm.
-        box_ct: Shape (2, 3), mm.
+    Voxels of a JPEG are means over at least `FINE_MM`; its quality is the best that fits. HU (nx, ny, nz), voxel index
+    to LPS mm (4, 4), and the box's low and high corner (2, 3), mm.
     """
     corners = np.array(list(itertools.product(*box_ct.T)))
     index = apply(np.linalg.inv(T_ct_index), corners)

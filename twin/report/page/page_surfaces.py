@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from puncture_twin.planning.base.arrays import Bools, Floats
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints, Ints32
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.triangle_distance import lower_squares, squared_distance
 
@@ -49,23 +49,18 @@ class Packed(NamedTuple):
 class _Part(NamedTuple):
     """A surface in whole units; the first triangles, so many, reach the box."""
 
-    corners: NDArray[np.int64]
-    faces: NDArray[np.int64]
+    corners: Ints
+    faces: Ints
     drawn: int
 
 
 def surfaces(parts: Iterable[tuple[str, str, TriangleMesh]], target_ct: Floats, box_ct: Floats) -> Packed:
-    """Surfaces in a box; corners from the target, in whole units.
+    """Surfaces, each with name and role, in a box (2, 3), mm; corners from the target (3,), in whole units.
 
-    Where they have more than `MOST_TRIANGLES`, lighter ones; the facts state as ``off_mm`` how far any point of them
-    is from the checked surface, and back. None vanishes but what is smaller than a unit. What lies beyond the box is
-    only kept as far as it tells what is inside of a closed surface; the first triangles of each, ``drawn`` of them,
-    are those that reach the box. Packed are differences of corners, and of each index how far it is from a new one.
-
-    Args:
-        parts: Name, role and mesh.
-        target_ct: Shape (3,), mm.
-        box_ct: Shape (2, 3), mm.
+    Where they have more than `MOST_TRIANGLES`, lighter ones; the facts state as ``off_mm`` how far any point of them is
+    from the checked surface, and back. None vanishes but what is smaller than a unit. What lies beyond the box is only
+    kept as far as it tells what is inside of a closed surface; the first triangles of each, ``drawn`` of them, are
+    those that reach the box. Packed are differences of corners, and of each index how far it is from a new one.
     """
     box = box_ct - target_ct
     named = [
@@ -103,24 +98,19 @@ def surfaces(parts: Iterable[tuple[str, str, TriangleMesh]], target_ct: Floats, 
     return Packed({"unit_mm": unit, "off_mm": off, "parts": facts}, content)
 
 
-def _planes(values: NDArray[np.int64], count: int) -> bytes:
+def _planes(values: Ints, count: int) -> bytes:
     """The lowest byte of all values, then the next of all: so they pack better."""
     return np.ascontiguousarray(values).astype("<i8").view(np.uint8).reshape(-1, 8)[:, :count].T.tobytes()
 
 
-def _lightened(
-    vertices: Floats, faces: NDArray[np.int32], unit: float, box: Floats, apart_mm: float
-) -> tuple[_Part, float]:
+def _lightened(vertices: Floats, faces: Ints32, unit: float, box: Floats, apart_mm: float) -> tuple[_Part, float]:
     """A surface of fewer triangles, and how far it is at most from the given one in the box, and back, mm."""
     within = apart_mm
     for _ in range(TRIES if len(faces) > 1 else 0):
         scale = np.sqrt(LAST_QUADRIC) / (QUADRIC * within)
+        smooth = _smoothed(vertices, faces, SMOOTH * within) * scale
         found, left, collapsed = fast_simplification.simplify(
-            _smoothed(vertices, faces, SMOOTH * within) * scale,
-            faces,
-            target_count=1,
-            agg=AGGRESSION,
-            return_collapses=True,
+            smooth, faces, target_count=1, agg=AGGRESSION, return_collapses=True
         )
         found, place = np.round(found / (scale * unit)) * unit, _places(faces, len(vertices), collapsed)
         gone = (place[faces] < 0).all(axis=1)  # an island of few voxels stays as it is
@@ -135,7 +125,7 @@ def _lightened(
     return _rounded(moved / unit, left, drawn), max(off, ROUNDED * unit)
 
 
-def _smoothed(vertices: Floats, faces: NDArray[np.int32], most_mm: float) -> Floats:
+def _smoothed(vertices: Floats, faces: Ints32, most_mm: float) -> Floats:
     """Each corner toward the mean of its neighbours, by so much along each axis at most."""
     times = np.maximum(1, 2 * np.bincount(faces.ravel(), minlength=len(vertices)))[:, None]
     found = vertices
@@ -146,7 +136,7 @@ def _smoothed(vertices: Floats, faces: NDArray[np.int32], most_mm: float) -> Flo
     return found
 
 
-def _places(faces: NDArray[np.int32], count: int, collapsed: NDArray[np.int64]) -> NDArray[np.int64]:
+def _places(faces: Ints32, count: int, collapsed: Ints) -> Ints:
     """Where each corner is among those left, -1 where its triangles are all gone."""
     root = np.arange(count)
     root[collapsed[:, 1]] = collapsed[:, 0]
@@ -160,13 +150,7 @@ def _places(faces: NDArray[np.int32], count: int, collapsed: NDArray[np.int64]) 
 
 
 def _farthest(
-    vertices: Floats,
-    faces: NDArray[np.int32],
-    found: Floats,
-    left: NDArray[np.int32],
-    place: NDArray[np.int64],
-    box: Floats,
-    near_mm: float,
+    vertices: Floats, faces: Ints32, found: Floats, left: Ints32, place: Ints, box: Floats, near_mm: float
 ) -> float:
     """How far corners of either surface are at most from the other, mm, in the box: a bound.
 
@@ -200,14 +184,7 @@ def _in(points: Floats, box: Floats) -> Bools:
     return ((points >= box[0]) & (points <= box[1])).all(axis=1)
 
 
-def _lower(
-    corners: Floats,
-    triangles: NDArray[Any],
-    points: Floats,
-    rows: NDArray[np.int64],
-    place: NDArray[np.int64],
-    squares: Floats,
-) -> None:
+def _lower(corners: Floats, triangles: NDArray[Any], points: Floats, rows: Ints, place: Ints, squares: Floats) -> None:
     """Lower the squared distances of some points to those from the triangles about one corner each."""
     order = np.argsort(place, kind="stable")
     starts = np.searchsorted(place[order], np.arange(len(corners) + 1))
@@ -215,7 +192,7 @@ def _lower(
     lower_squares(corners[about], about, starts, rows[order], points, squares)
 
 
-def _boxed(vertices: Floats, faces: NDArray[np.int32], box: Floats) -> tuple[Floats, NDArray[np.int32], int]:
+def _boxed(vertices: Floats, faces: Ints32, box: Floats) -> tuple[Floats, Ints32, int]:
     """Triangles that reach a box first, and their number; the corners of all others drawn near, and coarse.
 
     Each of these others lies beyond one face of the box with all of its corners, before and after: what is inside of a
@@ -231,7 +208,7 @@ def _boxed(vertices: Floats, faces: NDArray[np.int32], box: Floats) -> tuple[Flo
     return moved, np.concatenate([faces[reach], faces[~reach]]), int(reach.sum())
 
 
-def _rounded(vertices: Floats, faces: NDArray[np.int32], drawn: int) -> _Part:
+def _rounded(vertices: Floats, faces: Ints32, drawn: int) -> _Part:
     """Whole corners, each once and in the order of first use; the triangles left of these, and of those to be drawn.
 
     Of the others two in one place cancel out.

@@ -13,7 +13,7 @@ import json
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from jinja2 import Environment, FunctionLoader, StrictUndefined
 from markupsafe import Markup
@@ -26,15 +26,6 @@ PLOTLY = "plotly_js/plotly-gl3d.min.js"
 
 
 PACKED = 4  # of gzip's levels: at 6 it takes two and a half times as long for six parts in a hundred
-
-
-class Card(NamedTuple):
-    """One of the boxes below a page's title: plain texts, and whether it tells of a failure."""
-
-    name: str
-    value: str
-    detail: str
-    bad: bool = False
 
 
 def write_html(template: str, path: Path, **parts: object) -> None:

@@ -11,19 +11,17 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.geometry.mesh import box_of
 from puncture_twin.planning.geometry.rigid import frame_along
 
+SPARE = 1.05  # how much wider than what must be seen a picture is
+
 
 @dataclass(frozen=True, eq=False)
 class ViewCamera:
     """A virtual camera in the CT frame."""
 
-    eye: Floats
-    """Shape (3,), mm."""
-    look_at: Floats
-    """Shape (3,), mm."""
-    up: Floats
-    """Shape (3,), any vector not along the view."""
-    fov: float
-    """Vertical opening angle, rad."""
+    eye: Floats  # shape (3,), mm
+    look_at: Floats  # shape (3,), mm
+    up: Floats  # shape (3,), any vector not along the view
+    fov: float  # vertical opening angle, rad
     width: int
     height: int
 
@@ -52,18 +50,8 @@ class ViewCamera:
         return np.stack([column, row, z], axis=1)
 
 
-SPARE = 1.05  # how much wider than what must be seen a picture is
-
-
 def camera_around(points_ct: Floats, toward: Floats, up: Floats, *, fov: float, width: int, height: int) -> ViewCamera:
-    """A camera that looks along ``toward`` and has every point in view.
-
-    Args:
-        points_ct: Shape (n, 3), what must be seen.
-        toward: Shape (3,), the direction of view.
-        up: Shape (3,).
-        fov: Vertical opening, rad.
-    """
+    """A camera that looks along `toward`, (3,), with all points (n, 3) in view; `fov` is the vertical opening, rad."""
     points = np.asarray(points_ct, dtype=float)
     toward = np.asarray(toward, dtype=float) / np.linalg.norm(toward)
     centre = box_of(points).sum(axis=0) / 2

@@ -1,13 +1,10 @@
 # mypy: disable-error-code="no-untyped-def"
 """Pictures without a screen: triangles drawn into a sample grid with depth, and shaded, by compiled code.
 
-Opaque surfaces give one hit per sample; translucent surfaces (skin, corridor) are seen through, with up to
-``MAX_SHELLS`` hits. A film keeps the triangles that its samples show of what stands still, and draws what moves over
-them.
-
-The pixels of a picture, from the triangles that its samples show: lit, and blended from back to front by the "over"
-operator of Porter and Duff, Compositing Digital Images (SIGGRAPH 1984); compiled. A pixel whose samples show the same
-smooth surfaces is lit and blended once.
+Opaque surfaces give one hit per sample; translucent ones (skin, corridor) are seen through, with up to ``MAX_SHELLS``.
+A film keeps the triangles that its samples show of what stands still, and draws what moves over them. Pixels are lit,
+and blended from back to front by the "over" operator of Porter and Duff, Compositing Digital Images (SIGGRAPH 1984).
+A pixel whose samples show the same smooth surfaces is lit and blended once.
 """
 
 from __future__ import annotations
@@ -22,48 +19,35 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats, Ints32, Pixels
+from puncture_twin.planning.base.arrays import Bools, Floats, Ints32, Pixels
 from puncture_twin.planning.base.numba_kernels import allocation_free, nb
 from puncture_twin.planning.base.reasons import Rgb
 from puncture_twin.planning.geometry.containment import crossings
 from puncture_twin.planning.geometry.mesh import TriangleMesh
+from puncture_twin.twin.report.raster import raster
 from puncture_twin.twin.report.raster.camera import ViewCamera
-from puncture_twin.twin.report.raster.raster import TIE, draw, outlines
-from puncture_twin.twin.report.raster.shading import all_alike, corner_normals, flat_normals, lit, rotated
 
 Floats32 = NDArray[np.float32]
 T = TypeVar("T")
-
-SAMPLES = 2
-"""Samples per pixel side."""
-
-MAX_SHELLS = 4
-"""Layers of a translucent surface that are drawn: skin in, skin out, twice."""
-
-LINE_OF_SIGHT_SLACK_MM = 2.0
-"""A point this close behind a surface still counts as seen: points on the needle lie inside its bar."""
-
+SAMPLES = 2  # samples per pixel side
+MAX_SHELLS = 4  # layers of a translucent surface that are drawn: skin in, skin out, twice
+LINE_OF_SIGHT_SLACK_MM = 2.0  # a point so close behind a surface is seen: those of a needle lie in its bar
 BACKGROUND = np.array([246.0, 247.0, 249.0], dtype=np.float32)
-
 LIGHT = np.array([-0.45, 0.6, -1.0]) / np.linalg.norm([-0.45, 0.6, -1.0])
 """Over the viewer's left shoulder: right, up, forward."""
 
-BAND = 60_000
-"""Samples that are worked on at once: their arrays stay in the cache, and the bands share the processors."""
+BAND = 60_000  # samples that are worked on at once: their arrays stay in the cache, and the bands share the processors
+ALL = SAMPLES * SAMPLES  # samples of a pixel
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
     """A mesh with its look."""
 
-    mesh: TriangleMesh
-    """In the frame of the layer it belongs to, mm."""
-    colour: Rgb
-    """RGB, 0..255."""
-    alpha: float = 1.0
-    """Opacity where one looks straight at it; only translucent surfaces use it."""
-    rim: float = 2.5
-    """How much more opaque it is where one sees it edge-on."""
+    mesh: TriangleMesh  # in the frame of the layer it belongs to, mm
+    colour: Rgb  # RGB, 0..255
+    alpha: float = 1.0  # opacity where one looks straight at it; only translucent surfaces use it
+    rim: float = 2.5  # how much more opaque it is where one sees it edge-on
 
 
 class Layer:
@@ -83,9 +67,9 @@ class Layer:
     @cached_property
     def normals(self) -> Floats32:
         """Of the corners, shape (n, 3)."""
-        return np.asarray(corner_normals(self.vertices, self.faces))
+        return np.asarray(raster.corner_normals(self.vertices, self.faces))
 
-    def sees(self, eye: Floats, points: Floats) -> NDArray[np.bool_]:
+    def sees(self, eye: Floats, points: Floats) -> Bools:
         """Whether nothing of this layer lies between an eye and each point (n, 3), in the layer's frame."""
         way = points - eye
         far = np.linalg.norm(way, axis=1)
@@ -122,22 +106,14 @@ class Drawn(NamedTuple):
 class Look(NamedTuple):
     """A layer as a camera has it before it, as `finish` takes it; b bodies."""
 
-    points: Floats
-    """Shape (n, 3), of the corners, camera's frame, mm."""
-    faces: Ints32
-    """Shape (m, 3)."""
-    bodies: Ints32
-    """Shape (m,), the body of each triangle; ascending."""
-    normals: Floats32
-    """Shape (n, 3), of the corners."""
-    flats: Floats32
-    """Shape (m, 3), of the triangles."""
-    colours: Floats32
-    """Shape (b, 3), 0..255."""
-    alphas: Floats32
-    """Shape (b,), opacity where one looks straight at them."""
-    rims: Floats32
-    """Shape (b,), how much more opaque where one sees them edge-on."""
+    points: Floats  # shape (n, 3), of the corners, camera's frame, mm
+    faces: Ints32  # shape (m, 3)
+    bodies: Ints32  # shape (m,), the body of each triangle; ascending
+    normals: Floats32  # shape (n, 3), of the corners
+    flats: Floats32  # shape (m, 3), of the triangles
+    colours: Floats32  # shape (b, 3), 0..255
+    alphas: Floats32  # shape (b,), opacity where one looks straight at them
+    rims: Floats32  # shape (b,), how much more opaque where one sees them edge-on
 
     def with_more(self, other: Look) -> Look:
         """Both; of two in one place the bodies of this one are seen."""
@@ -147,11 +123,9 @@ class Look(NamedTuple):
 
 
 class View:
-    """A layer before a camera, and where each of its triangles lies in the picture.
+    """A layer before a camera, whose pixels are samples, and where each of its triangles lies in the picture.
 
-    Args:
-        camera: The samples are its pixels.
-        T_ct_layer: Pose of the layer, shape (4, 4), mm; None is the CT frame itself.
+    `T_ct_layer` is the pose of the layer, shape (4, 4), mm; None is the CT frame itself.
     """
 
     def __init__(self, layer: Layer, camera: ViewCamera, T_ct_layer: Floats | None = None) -> None:
@@ -159,18 +133,17 @@ class View:
         if T_ct_layer is not None:
             turn, eye = camera.axes @ T_ct_layer[:3, :3], (eye - T_ct_layer[:3, 3]) @ T_ct_layer[:3, :3]
         self.grid = camera.scale, camera.height, camera.width
-        points = rotated(layer.vertices, turn, eye)
-        normals, flats = rotated(layer.normals, turn, np.zeros(3)), flat_normals(points, layer.faces)
+        points = raster.rotated(layer.vertices, turn, eye)
+        normals, flats = raster.rotated(layer.normals, turn, np.zeros(3)), raster.flat_normals(points, layer.faces)
         look = layer.faces, layer.bodies, normals, flats, layer.colours, layer.alphas, layer.rims
         self.look = Look(points, *look)
-        self.spans: Ints32 = outlines(points, layer.faces, self.grid)
+        self.spans: Ints32 = raster.outlines(points, layer.faces, self.grid)
 
 
 def picture(opaque: Layer, translucents: Layer, camera: ViewCamera) -> Pixels:
-    """A scene in the CT frame in pixels, shape (h, w, 3): what is opaque, and what is see-through over it.
+    """A scene in the CT frame in the camera's pixels (h, w, 3): what is opaque, and what is see-through over it.
 
-    Args:
-        camera: Its pixels are the picture's; each is the mean of ``SAMPLES`` by ``SAMPLES``.
+    Each is the mean of ``SAMPLES`` by ``SAMPLES``.
     """
     fine = camera.finer(SAMPLES)
     solid, glass = View(opaque, fine), View(translucents, fine)
@@ -189,15 +162,14 @@ def _drawn_band(solid: View, glass: View, rows: slice) -> _Band:
     corner, size = (rows.start, 0), (rows.stop - rows.start, solid.grid[2])
     behind, shells = Drawn.empty(1, size), Drawn.empty(MAX_SHELLS, size)
     nothing = np.zeros(size, dtype=np.float32)
-    draw(*solid.look[:3], solid.spans, solid.grid, corner, nothing, *behind)
-    draw(*glass.look[:3], glass.spans, glass.grid, corner, behind.inverse[0], *shells)
+    raster.draw(*solid.look[:3], solid.spans, solid.grid, corner, nothing, *behind)
+    raster.draw(*glass.look[:3], glass.spans, glass.grid, corner, behind.inverse[0], *shells)
     return _Band(behind, shells, _finished(solid.look, glass.look, solid.grid, corner, behind, shells.triangle))
 
 
 def _finished(
     solid: Look, glass: Look, grid: tuple[float, int, int], corner: tuple[int, int], behind: Drawn, shells: Ints32
 ) -> Pixels:
-    """The pixels (h, w, 3) of a part of a picture, from the triangles that its samples show."""
     held = np.zeros((1 + MAX_SHELLS, SAMPLES * SAMPLES, 4), dtype=np.float32)  # what is not there is blended at 0
     high, wide = behind.triangle.shape[1:]
     pixels = np.empty((high // SAMPLES, wide // SAMPLES, 3), dtype=np.uint8)
@@ -220,12 +192,9 @@ def _joined(arrays: Sequence[NDArray[Any]], dtype: type) -> NDArray[Any]:
 
 
 class MovingPicture:
-    """One view of what stands still, with bodies that move; several threads may ask it at once.
+    """One view of what stands still, CT frame, with bodies that move; several threads may ask it at once.
 
-    Args:
-        opaque: What stands still, CT frame.
-        layers: What moves, each in its own frame. Of two in one place the first is seen, and what stands before all.
-        camera: Its pixels are the picture's.
+    Each layer moves in its own frame. Of two in one place the first is seen, and what stands before all.
     """
 
     def __init__(self, opaque: Layer, translucents: Layer, layers: Sequence[Layer], camera: ViewCamera) -> None:
@@ -254,33 +223,24 @@ class MovingPicture:
         behind, shells = self._behind.part(part), self._shells.part(part)
         grid, corner = views[0].grid, (top * SAMPLES, left * SAMPLES)
         nothing = np.zeros(behind.inverse.shape[1:], dtype=np.float32)
-        draw(*look[:3], spans, grid, corner, nothing, *behind)
-        before = shells.inverse > behind.inverse + TIE * shells.inverse**2  # as `draw` hides what is behind
+        raster.draw(*look[:3], spans, grid, corner, nothing, *behind)
+        before = shells.inverse > behind.inverse + raster.TIE * shells.inverse**2  # as `draw` hides what is behind
         seen = np.where(before, shells.triangle, np.int32(-1))
         picture = self.still.copy()
         picture[top:bottom, left:right] = _finished(look, self._glass, grid, corner, behind, seen)
         return picture
 
 
-ALL = SAMPLES * SAMPLES
-"""Samples of a pixel."""
-
-
 @allocation_free(nogil=True, error_model="numpy")
 def finish(solid, glass, light, grid, corner, behind, shells, background, held, pixels):
     """Light and blend every pixel of a part of a picture.
 
-    Args:
-        solid: The parts of the `Look` of the opaque layer.
-        glass: Those of the see-through layer.
-        light: Three numbers, unit, toward the lamp, camera's frame.
-        grid: Samples per unit of x and y, rows, columns of the whole picture.
-        corner: Row and column of the picture at which the part begins, in samples; multiples of ``SAMPLES``.
-        behind: Shape (1, h, w), the triangle of ``solid`` that each sample shows, -1 for none.
-        shells: Shape (k, h, w), those of ``glass`` before it, nearest first.
-        background: Three float32, the colour where nothing is.
-        held: Shape (k + 1, ALL, 4), float32, to work in.
-        pixels: Shape (h / SAMPLES, w / SAMPLES, 3), uint8, written to.
+    Solid and glass are the parts of the `Look` of the opaque and of the see-through layer; light, three numbers, unit,
+    toward the lamp, camera's frame; grid, samples per unit of x and y, rows, columns of the whole picture; corner, its
+    row and column at which the part begins, in samples, multiples of ``SAMPLES``; behind (1, h, w), the triangle of
+    ``solid`` that each sample shows, -1 for none; shells (k, h, w), those of ``glass`` before it, nearest first;
+    background, three float32; held (k + 1, ALL, 4), float32, to work in. Written to are the pixels (h / SAMPLES, w /
+    SAMPLES, 3), uint8.
     """
     for i in range(pixels.shape[0]):
         for j in range(pixels.shape[1]):
@@ -300,10 +260,9 @@ def finish(solid, glass, light, grid, corner, behind, shells, background, held, 
 
 @allocation_free(nogil=True, error_model="numpy", forceinline=True)
 def _shade(held, layer, look, light, grid, corner, triangle, k, place):
-    """Colour and opacity of what a pixel shows of a layer."""
     top, left = place
     scale, height, width = grid
-    if all_alike(triangle[k], top, top + SAMPLES, left, left + SAMPLES, look[2], look[4]):
+    if raster.all_alike(triangle[k], top, top + SAMPLES, left, left + SAMPLES, look[2], look[4]):
         x = (corner[1] + 0.5 * (left + left + SAMPLES) - width / 2) / scale
         y = (height / 2 - corner[0] - 0.5 * (top + top + SAMPLES)) / scale
         _shade_one(held, layer, 0, look, light, triangle[k, top, left], x, y)
@@ -327,9 +286,8 @@ def _shade(held, layer, look, light, grid, corner, triangle, k, place):
 
 @allocation_free(nogil=True, error_model="numpy", forceinline=True)
 def _shade_one(held, layer, s, look, light, f, x, y):
-    """Colour and opacity of one sample."""
     points, faces, bodies, normals, flats, colours, alphas, rims = look
-    tone, shine, facing = lit(points, normals, flats, faces, f, x, y, light)
+    tone, shine, facing = raster.lit(points, normals, flats, faces, f, x, y, light)
     body, edge_on = bodies[f], 1.0 - facing
     # A shell seen edge-on is thicker along the ray: glass-like outlines help to read its shape.
     held[layer, s, 3] = min(1.0, alphas[body] * (1.0 + rims[body] * edge_on * edge_on * edge_on))

@@ -1,32 +1,38 @@
-"""The scene as coloured meshes in the CT frame, for image, film and page: patient, room, arm, needle, corridor."""
+"""The scene as coloured meshes in the CT frame, for image, film and page: patient, room, arm, needle, corridor.
+
+And views of it: of the workcell with the arm, and close to the needle's path.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from puncture_twin.planning.arm.kinematics import link_poses
 from puncture_twin.planning.arm.links import Link, visual_links
 from puncture_twin.planning.arm.tool import ToolBody
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.reasons import SAFE, Rgb
-from puncture_twin.planning.case.entry import outward
+from puncture_twin.planning.case.entry import ANATOMICAL_LPS, outward
 from puncture_twin.planning.geometry.containment import hit_fraction
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box
 from puncture_twin.planning.geometry.rigid import frame_about, pose
 from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.map_view import step_of
+from puncture_twin.twin.report.raster.camera import ViewCamera, camera_around
 from puncture_twin.twin.report.raster.render import Layer, Surface
 
 SECTIONS = 24  # sides of a round bar
 LIFT_MM = 1.0  # how far the corridor's mouth is drawn outside the skin, so that the two surfaces do not flicker
-KEY = 1e-6
-"""rad; corners of cells nearer than this are one corner."""
+KEY = 1e-6  # rad; corners of cells nearer than this are one corner
+FLANGE = 6  # the frame with which a tool moves
 
 
 def bar(start_ct: Floats, end_ct: Floats, radius: float) -> TriangleMesh:
@@ -72,7 +78,7 @@ def corridor(candidates: Candidates, case: Any) -> list[TriangleMesh]:
     return [mouth, TriangleMesh(np.vstack([points, case.target_ct]), np.hstack([apex, rim]))]
 
 
-def _cells(candidates: Candidates, case: Any, rows: NDArray[np.int64]) -> tuple[Floats, NDArray[np.int64]]:
+def _cells(candidates: Candidates, case: Any, rows: Ints) -> tuple[Floats, Ints]:
     """Corner points (n, 3), shared between cells, and the four corners (m, 4) of the cells of some rows."""
     half = step_of(candidates) / 2
     signs = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
@@ -91,11 +97,9 @@ def _cells(candidates: Candidates, case: Any, rows: NDArray[np.int64]) -> tuple[
 
 
 def revolved(outline: Floats, sections: int) -> TriangleMesh:
-    """The closed surface that an outline draws as it is carried once around z.
+    """The closed surface that an outline draws as it is carried once around z; so many flat sides stand for the circle.
 
-    Args:
-        outline: Shape (k, 2), mm: radius, at least 0, and height of its corners, around the body to the left.
-        sections: How many flat sides stand for the circle.
+    The outline, (k, 2), mm, is radius, at least 0, and height of its corners, around the body to the left.
     """
     angle = 2.0 * np.pi * np.arange(sections) / sections
     radius, height = outline[:, 0, None], outline[:, 1, None]
@@ -119,20 +123,14 @@ MOST_AROUND = 0.7
 the lesion is left out, and one with an opening, as of a vessel."""
 
 UNKNOWN_OPACITY = 0.30
-OUTSIDE_SHOWN_MM = np.array([150.0, 150.0, 0.0])
-"""How far beyond the skin's box what is outside of the body is drawn: to the sides, front and back, along the bed."""
+OUTSIDE_SHOWN_MM = np.array([150.0, 150.0, 0.0])  # drawn beyond the skin's box: to the sides, front and back
 SKIN_OPACITY = 0.20
 GANTRY_OPACITY = 0.15  # opacity of the gantry, so that it does not hide the patient in its bore
-MOUTH_OPACITY = 0.88
-"""Of where a needle may enter: what lies behind it hardly shows, since seen through green it would look safe to hit."""
-
+MOUTH_OPACITY = 0.88  # where a needle may enter: seen through green, what lies behind would look safe to hit
 WALL_OPACITY = 0.10
 TARGET_BALL_MM = 3.0  # radius of the ball that marks the target point
-PLATE_RADIUS_MM, PLATE_THICK_MM = 130.0, 25.0
-"""Of the plate under the arm's base: wider than any base, so that it is seen."""
-
-LEAST_NEEDLE_MM = 1.0
-"""Least radius at which the needle is drawn: thinner ones would be below a pixel. The legend says so."""
+PLATE_RADIUS_MM, PLATE_THICK_MM = 130.0, 25.0  # under the arm: wider than any base, to be seen
+LEAST_NEEDLE_MM = 1.0  # least radius that is drawn: thinner is below a pixel. The legend says so
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,14 +138,11 @@ class SceneBody:
     """One thing of the scene."""
 
     name: str
-    group: str
-    """"organ", "skin", "safe", "needle", "arm", "room" or "target"."""
-    mesh: TriangleMesh
-    """CT frame, mm."""
+    group: str  # "organ", "skin", "safe", "needle", "arm", "room" or "target"
+    mesh: TriangleMesh  # CT frame, mm
     colour: Rgb
     alpha: float = 1.0
-    frame: int = 0
-    """Of an arm's link: with which of ``link_poses`` it moves."""
+    frame: int = 0  # of an arm's link: with which of ``link_poses`` it moves
 
     @property
     def surface(self) -> Surface:
@@ -201,45 +196,8 @@ def needle_bodies(
     return body, SceneBody("needle holder", "needle", holder, palette.HOLDER)
 
 
-def chosen_direction(pick: Pick | None, plan: Any | None) -> Floats | None:
-    """The outward direction of the plan, else of the picked candidate, else None; shape (3,), CT frame."""
-    if plan is not None:
-        direction = np.asarray(plan.entry_ct, dtype=float) - np.asarray(plan.target_ct, dtype=float)
-        return np.asarray(direction / np.linalg.norm(direction))
-    return None if pick is None else pick.candidates.outward_ct[pick.row]
-
-
-def arm_bodies(case: Any, plan: Any | None, pick: Pick | None, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
-    """The arm with the needle on the target: as it is planned, else as the search reaches it; nothing where unknown."""
-    q, base = joints_on_target(plan, pick), T_base_ct if plan is None else plan.T_base_ct
-    return () if q is None or base is None else ArmPicture(case.robot.model, base, case.tool).bodies(q)
-
-
-def joints_on_target(plan: Any | None, pick: Pick | None) -> Floats | None:
-    """Joints (6,), rad, with the needle on the target: of the plan, else of the pick; None where it is not reached."""
-    if plan is not None:
-        return np.asarray(plan.insertion.q[-1])
-    q = None if pick is None else pick.candidates.arm.q_insertion[pick.row]
-    return q if q is not None and np.isfinite(q).all() else None
-
-
-def needle_text(needle: Any) -> str:
-    """The needle in the legend, honest about a drawn thickness."""
-    if needle.radius_mm >= LEAST_NEEDLE_MM:
-        return "needle"
-    return f"needle (drawn ⌀ {2 * LEAST_NEEDLE_MM:g} mm, is ⌀ {needle.diameter_mm:g} mm)"
-
-
-FLANGE = 6  # the frame with which a tool moves
-
-
 class ArmPicture:
-    """The arm's links ready to be drawn at any configuration.
-
-    Args:
-        T_base_ct: Shape (4, 4), where the patient is believed (or known) to be.
-        tool: What its flange carries beside needle and holder, or None.
-    """
+    """The arm's links ready to be drawn at any configuration, with a tool that its flange carries beside the needle."""
 
     def __init__(self, model: UrModel, T_base_ct: Floats, tool: ToolBody | None = None) -> None:
         self._model = model
@@ -284,3 +242,145 @@ def room(case: Any, T_base_ct: Floats | None) -> tuple[SceneBody, ...]:
             T = np.linalg.inv(T_base_ct) @ T
         bodies.append(SceneBody(obstacle.name, "room", box(T, obstacle.size_mm), palette.TABLE))
     return tuple(bodies)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A direction of a search, or its plan, with patient, room and arm."""
+
+    case: Any
+    anatomy: Any
+    candidates: Candidates
+    plan: Any | None = None
+    _: KW_ONLY
+    pick: Pick | None = None  # the planned candidate, or the one to be shown; None shows the best
+    T_base_ct: Floats | None = None  # shape (4, 4), mm, where the arm was checked; else None
+    refusal: str = ""  # why there is no plan although one was requested
+
+    @cached_property
+    def chosen(self) -> Pick | None:
+        """The pick, or the best direction."""
+        return self.pick or self.candidates.best
+
+    @property
+    def base(self) -> Floats | None:
+        """T_base_ct of the plan, else that of the search."""
+        return self.T_base_ct if self.plan is None else self.plan.T_base_ct
+
+    @property
+    def path_ct(self) -> Floats | None:
+        """Target and entry, shape (2, 3), of the plan, else of the chosen candidate."""
+        if self.plan is not None:
+            return np.stack([self.plan.target_ct, self.plan.entry_ct])
+        if self.chosen is None:
+            return None
+        return np.stack([self.case.target_ct, self.chosen.candidates.path.entry_ct[self.chosen.row]])
+
+    @property
+    def outward_ct(self) -> Floats | None:
+        """Shape (3,), unit, of the plan, else of the chosen candidate."""
+        if self.plan is not None:
+            direction = np.asarray(self.plan.entry_ct, dtype=float) - np.asarray(self.plan.target_ct, dtype=float)
+            return np.asarray(direction / np.linalg.norm(direction))
+        return None if self.chosen is None else self.chosen.candidates.outward_ct[self.chosen.row]
+
+    @property
+    def q_target(self) -> Floats | None:
+        """Joints (6,), rad, with the needle on the target: as planned, else as the search reaches it, if it does."""
+        if self.plan is not None:
+            return np.asarray(self.plan.insertion.q[-1])
+        q = None if self.chosen is None else self.chosen.candidates.arm.q_insertion[self.chosen.row]
+        return q if q is not None and np.isfinite(q).all() else None
+
+    @property
+    def needle(self) -> tuple[SceneBody, ...]:
+        """On the target; nothing without a direction."""
+        return () if self.outward_ct is None else needle_bodies(self.case.needle, self.case.target_ct, self.outward_ct)
+
+    @property
+    def arm(self) -> tuple[SceneBody, ...]:
+        """With the needle on the target; nothing where that is not known."""
+        if self.q_target is None or self.base is None:
+            return ()
+        return ArmPicture(self.case.robot.model, self.base, self.case.tool).bodies(self.q_target)
+
+
+Size = tuple[int, int]  # width and height, pixels
+FOV = np.radians(28.0)  # a long lens: little perspective, sizes compare
+UPRIGHT = 0.5  # an entry frame whose z is so near the long axis (60 degrees) does not say what is up
+ALONG_BODY = 0.62  # most cosine of a view along the body: from head or feet little is recognised
+ENTRY_SIDE = 0.35  # least cosine between the needle and the way to whoever looks: from behind the body no entry is seen
+ELEVATIONS = (np.radians(22.0), np.radians(40.0))
+AZIMUTHS = 16
+TILTS = (0.0, np.radians(25.0), np.radians(-25.0))
+EXTENT_WEIGHT = 0.8  # what the focus' length in the picture counts, where all of it being seen counts 1
+PATH_SAMPLES = 24
+TARGET_WEIGHT = 8  # the target counts as so many points of the path when one asks what a view hides
+
+
+def up_ct(case: Any) -> Floats:
+    """Up in the workcell, unit, CT frame: the entry frame's z; the front of a patient whose frame is along the body."""
+    z = np.asarray(case.T_ct_entry)[:3, 2]
+    if str(case.space) != "local" and abs(z @ np.array(ANATOMICAL_LPS["head"])) > UPRIGHT:
+        return np.array(ANATOMICAL_LPS["anterior"])
+    return z
+
+
+def overview(
+    case: Any, content_ct: Floats, focus_ct: Floats, blockers: Layer, size: Size, outward_ct: Floats | None = None
+) -> ViewCamera:
+    """A view of everything from above the table and from the needle's side, from where it is best seen.
+
+    The content, (n, 3), must be in the picture; the focus, (k, 3), should not be hidden. `outward_ct`, (3,), unit, is
+    from the target out of the body along the needle; None looks from any side.
+    """
+    up = up_ct(case)
+    options = [-one for one in _around(up, ELEVATIONS)]
+    if str(case.space) != "local":
+        options = [o for o in options if abs(o @ np.array(ANATOMICAL_LPS["head"])) < ALONG_BODY]
+    if outward_ct is not None:
+        options = [o for o in options if -o @ outward_ct > ENTRY_SIDE] or options
+    return _best(options, up, content_ct, focus_ct, blockers, size)
+
+
+def close_up(case: Any, path_ct: Floats, radius: float, blockers: Layer, size: Size) -> ViewCamera:
+    """A view across a path (2, 3), target and entry, from where the fewest structures hide it; `radius` mm about it."""
+    along = (path_ct[1] - path_ct[0]) / np.linalg.norm(path_ct[1] - path_ct[0])
+    up = up_ct(case)
+    options = [o for o in _around(along, TILTS) if o @ up < 0.35]  # not from below the table
+    steps = np.linspace(0, 1, PATH_SAMPLES)[:, None]
+    focus = path_ct[0] * (1 - steps) + path_ct[1] * steps
+    focus = np.concatenate([focus, np.repeat(path_ct[:1], TARGET_WEIGHT, axis=0)])
+    cube = radius * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3)
+    content = np.concatenate([path_ct[0] + cube, path_ct[1] + cube])
+    return _best(options, up, content, focus, blockers, size)
+
+
+def _around(axis: Floats, tilts: Sequence[float]) -> list[Floats]:
+    """Unit vectors about a unit axis (3,), at so many azimuths, so far toward it from across, rad."""
+    side = -frame_about(axis)[:, 0]
+    turns = (np.arange(AZIMUTHS) + 0.5) * 2 * np.pi / AZIMUTHS
+    levels = [np.cos(turn) * side + np.sin(turn) * np.cross(axis, side) for turn in turns]
+    return [np.cos(tilt) * level + np.sin(tilt) * axis for tilt in tilts for level in levels]
+
+
+def _best(options: list[Floats], up: Floats, content: Floats, focus: Floats, blockers: Layer, size: Size) -> ViewCamera:
+    """The option that sees most of the focus; among equals, the one that sees it longest in the picture."""
+    content = content[ConvexHull(content).vertices]
+    cameras = [
+        camera_around(content, toward, up, fov=FOV, width=size[0], height=size[1])
+        for toward in options
+        if abs(toward @ up) <= 0.95
+    ]
+    if not cameras:
+        return camera_around(content, frame_about(up)[:, 0], up, fov=FOV, width=size[0], height=size[1])
+    spans = [np.ptp(camera.project(focus)[:, :2], axis=0) for camera in cameras]
+    extents = [float(np.linalg.norm(span) / np.hypot(*size)) for span in spans]  # of the picture's diagonal
+    best, best_score = 0, -np.inf
+    for i in np.argsort(-np.array(extents), kind="stable").tolist():
+        if EXTENT_WEIGHT * extents[i] + 1.0 < best_score:  # nor does one after it, were nothing hidden
+            break
+        score = float(blockers.sees(cameras[i].eye, focus).mean()) + EXTENT_WEIGHT * extents[i]
+        if score > best_score or (score == best_score and i < best):
+            best, best_score = i, score
+    return cameras[best]

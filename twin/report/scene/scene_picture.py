@@ -12,15 +12,15 @@ from PIL import Image, ImageDraw
 
 from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import SAFE, Rgb
-from puncture_twin.planning.search.candidates import Candidates, Pick
 from puncture_twin.twin.report import annotate, palette
 from puncture_twin.twin.report.numbers import length_text, nearest_text, target_text
 from puncture_twin.twin.report.raster.camera import ViewCamera
 from puncture_twin.twin.report.raster.render import BACKGROUND, Layer, picture
 from puncture_twin.twin.report.scene import scene_parts
-from puncture_twin.twin.report.scene.views import close_up, overview
+from puncture_twin.twin.report.scene.scene_parts import Scene, SceneBody
 
 WIDTH, HEIGHT = 1720, 1020
+Box = tuple[int, int, int, int]  # left, top, right, bottom, pixels
 LEFT_BOX = (16, 84, 926, 840)
 RIGHT_BOX = (942, 84, 1704, 840)
 LEGEND_TOP = 858
@@ -28,70 +28,45 @@ AXES_LENGTH, AXES_CORNER = 44, 110  # pixels: length of the body's axes, and how
 CORNER_GAIN = 0.1  # how much emptier the upper corner must be for the axes to stand there instead of below
 BODY_RADIUS_MM = 700.0  # the overview shows the patient within this distance of the target, and the whole arm
 CLOSE_RADIUS_MM = 38.0
-HIDDEN_NEARBY = ("room", "safe")
-"""Groups that the close-up leaves out: a rib seen through the green of the skin would look safe to hit."""
-
+HIDDEN_NEARBY = ("room", "safe")  # in the close-up: a rib seen through green would look safe to hit
 NOTHING_RADIUS_MM = 90.0  # around the target, when there is no path to show
+MOST_ENTRIES = 26  # up to so many entries of the legend nothing is folded
 
 
-def draw_scene(
-    case: Any,
-    anatomy: Any,
-    candidates: Candidates,
-    plan: Any | None,
-    path: Path,
-    pick: Pick | None = None,
-    T_base_ct: Floats | None = None,
-    *,
-    failed: bool = False,
-) -> None:
-    """Write the picture of the scene; without a plan the arm is that of the search, and the needle that of the pick.
-
-    Args:
-        pick: The planned candidate, or the one to be shown; None shows the best.
-        T_base_ct: Shape (4, 4), mm, of a search whose arm was checked.
-        failed: Whether a plan was requested, and there is none.
-    """
-    pick = pick or candidates.best
-    T_base_ct = T_base_ct if plan is None else plan.T_base_ct
+def draw_scene(scene: Scene, path: Path) -> None:
+    """Write the picture of the scene; without a plan the arm is that of the search, and the needle that of the pick."""
+    case, path_ct = scene.case, scene.path_ct
     bodies = [
-        *scene_parts.patient(anatomy, case),
-        *scene_parts.safe_region(candidates, case),
-        *scene_parts.room(case, T_base_ct),
+        *scene_parts.patient(scene.anatomy, case),
+        *scene_parts.safe_region(scene.candidates, case),
+        *scene_parts.room(case, scene.base),
+        *scene.needle,
     ]
-    direction = scene_parts.chosen_direction(pick, plan)
-    if direction is not None:
-        bodies.extend(scene_parts.needle_bodies(case.needle, case.target_ct, direction))
-    arm = [] if failed else scene_parts.arm_bodies(case, plan, pick, T_base_ct)
+    arm = () if scene.refusal else scene.arm
     image = Image.new("RGB", (WIDTH, HEIGHT), annotate.WHITE)
     draw = ImageDraw.Draw(image)
-    path_ct = None if pick is None else np.stack([case.target_ct, pick.candidates.path.entry_ct[pick.row]])
-    if plan is not None:
-        path_ct = np.stack([plan.target_ct, plan.entry_ct])
     with_arm = [*bodies, *arm]
-    far = _overview_camera(case, with_arm, path_ct)
     needle = None if path_ct is None else _needle_line(case, path_ct)
     title = "Overview" + (": needle on the target" if arm else "")
-    _view(image, draw, with_arm, far, LEFT_BOX, case, title, needle)
+    _view(image, with_arm, _overview_camera(case, with_arm, path_ct), LEFT_BOX, case, title, needle)
     along, radius = path_ct, CLOSE_RADIUS_MM
     if along is None:
         along, radius = case.target_ct + np.outer([0.0, 1.0], case.T_ct_entry[:3, 2]), NOTHING_RADIUS_MM
     organs = Layer([b.surface for b in bodies if b.alpha >= 1 and b.group in {"organ", "target"}])
-    near = close_up(case, along, radius, organs, _size(RIGHT_BOX))
+    near = scene_parts.close_up(case, along, radius, organs, _size(RIGHT_BOX))
     few = [body for body in bodies if body.name != "needle holder" and body.group not in HIDDEN_NEARBY]
-    _view(image, draw, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
-    bottom = _text(draw, case, candidates, plan, bool(arm), bodies, pick, failed, anatomy.scan)
-    image = image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8)))
-    annotate.write_image(image, path)
+    _view(image, few, near, RIGHT_BOX, case, "Close-up of the path", needle)
+    bottom = _text(draw, scene, bodies, arm=bool(arm))
+    annotate.write_image(image.crop((0, 0, WIDTH, min(HEIGHT, round(bottom) + 8))), path)
 
 
-def render_bodies(bodies: Sequence[scene_parts.SceneBody], camera: ViewCamera) -> NDArray[np.uint8]:
+def render_bodies(bodies: Sequence[SceneBody], camera: ViewCamera) -> NDArray[np.uint8]:
     """One view of a scene, anti-aliased: the opaque bodies, and the see-through ones over them."""
     opaque, glass = ([b.surface for b in bodies if (b.alpha >= 1) == solid] for solid in (True, False))
     return picture(Layer(opaque), Layer(glass), camera)
 
 
-def _overview_camera(case: Any, bodies: Sequence[scene_parts.SceneBody], path_ct: Any) -> ViewCamera:
+def _overview_camera(case: Any, bodies: Sequence[SceneBody], path_ct: Any) -> ViewCamera:
     size = _size(LEFT_BOX)
     points = []
     for body in bodies:
@@ -104,30 +79,29 @@ def _overview_camera(case: Any, bodies: Sequence[scene_parts.SceneBody], path_ct
     focus = np.stack([case.target_ct]) if path_ct is None else _needle_line(case, path_ct)
     blockers = Layer([b.surface for b in bodies if b.alpha >= 1 and b.group in {"arm", "room", "target"}])
     outward = None if path_ct is None else (path_ct[1] - path_ct[0]) / np.linalg.norm(path_ct[1] - path_ct[0])
-    return overview(case, np.concatenate(points), focus, blockers, size, outward)
+    return scene_parts.overview(case, np.concatenate(points), focus, blockers, size, outward)
 
 
-def _needle_line(case: Any, path_ct: NDArray[np.float64]) -> NDArray[np.float64]:
+def _needle_line(case: Any, path_ct: Floats) -> Floats:
     along = path_ct[1] - path_ct[0]
     along = along / np.linalg.norm(along)
     return np.asarray(path_ct[0] + np.linspace(0, case.needle.length_mm, 24)[:, None] * along)
 
 
-def _size(box: tuple[int, int, int, int]) -> tuple[int, int]:
+def _size(box: Box) -> tuple[int, int]:
     return box[2] - box[0], box[3] - box[1]
 
 
 def _view(
     image: Image.Image,
-    draw: ImageDraw.ImageDraw,
-    bodies: Sequence[scene_parts.SceneBody],
+    bodies: Sequence[SceneBody],
     camera: ViewCamera,
-    box: tuple[int, int, int, int],
+    box: Box,
     case: Any,
     title: str,
-    needle: NDArray[np.float64] | None,
+    needle: Floats | None,
 ) -> None:
-    seen = render_bodies(bodies, camera)
+    seen, draw = render_bodies(bodies, camera), ImageDraw.Draw(image)
     image.paste(Image.fromarray(seen), box[:2])
     annotate.panel(draw, box, title)
     on_needle = np.empty((0, 2)) if needle is None else camera.project(needle)[:, :2] + box[:2]
@@ -135,9 +109,7 @@ def _view(
     annotate.scale_bar(draw, camera, case.target_ct, box[0] + 20, box[3] - 22, 200)
 
 
-def _empty_corner(
-    seen: NDArray[np.uint8], box: tuple[int, int, int, int], on_needle: NDArray[np.float64]
-) -> tuple[float, float]:
+def _empty_corner(seen: NDArray[np.uint8], box: Box, on_needle: Floats) -> tuple[float, float]:
     """The middle of the right corner, upper or lower, where no needle is, or else less is to be seen."""
     far = AXES_CORNER
     upper, lower = (box[2] - far, box[1] + far), (box[2] - far, box[3] - far)
@@ -149,26 +121,19 @@ def _empty_corner(
     return upper if emptier else lower
 
 
-def _text(
-    draw: ImageDraw.ImageDraw,
-    case: Any,
-    candidates: Candidates,
-    plan: Any | None,
-    arm: bool,
-    bodies: Sequence[scene_parts.SceneBody],
-    pick: Pick | None,
-    failed: bool,
-    scan: Any | None,
-) -> float:
+def _text(draw: ImageDraw.ImageDraw, scene: Scene, bodies: Sequence[SceneBody], *, arm: bool) -> float:
     """Everything around the views; returns the row below the legend."""
+    case, candidates, plan = scene.case, scene.candidates, scene.plan
     annotate.write(draw, (18, 12), f"{case.name}: needle path to {target_text(case)}", size=28, bold=True)
-    nothing = pick is None and plan is None
-    if nothing:
-        text, colour = "NOTHING IS SAFE: every direction is rejected; no needle is shown", annotate.RED
-    else:
-        text, colour = _path_text(plan, pick, failed, arm, scan), annotate.RED if failed else annotate.FAINT
+    nothing = scene.chosen is None and plan is None
+    text, colour = "NOTHING IS SAFE: every direction is rejected; no needle is shown", annotate.RED
+    if not nothing:
+        text, colour = _path_text(scene, arm=arm), annotate.RED if scene.refusal else annotate.FAINT
     annotate.write(draw, (18, 50), text, size=18, bold=nothing, colour=colour)
-    items = [("target", palette.TARGET_POINT), (scene_parts.needle_text(case.needle), palette.NEEDLE)]
+    least, needle = scene_parts.LEAST_NEEDLE_MM, "needle"
+    if case.needle.radius_mm < least:
+        needle = f"needle (drawn ⌀ {2 * least:g} mm, is ⌀ {case.needle.diameter_mm:g} mm)"
+    items = [("target", palette.TARGET_POINT), (needle, palette.NEEDLE)]
     if candidates.safe.any():
         items.append((f"{candidates.safe_text}: safe entry area and corridor (overview)", SAFE))
     items.append(("skin (see-through)", palette.SKIN))
@@ -184,7 +149,8 @@ def _text(
     return annotate.legend(draw, families(names), 20, below, WIDTH - 20)
 
 
-def _path_text(plan: Any | None, pick: Pick | None, failed: bool, arm: bool, scan: Any | None) -> str:
+def _path_text(scene: Scene, *, arm: bool) -> str:
+    plan, pick, scan = scene.plan, scene.chosen, scene.anatomy.scan
     if plan is not None:
         theta, beta = np.degrees(plan.theta), np.degrees(plan.beta)
         length = float(np.linalg.norm(plan.entry_ct - plan.target_ct))
@@ -197,10 +163,8 @@ def _path_text(plan: Any | None, pick: Pick | None, failed: bool, arm: bool, sca
         text += f"; {nearest_text(*pick, scan)}"
     if arm:
         return text
+    failed = bool(scene.refusal)
     return text + ("  PLANNING FAILED: no arm is shown" if failed else "  (no plan was requested: no arm is shown)")
-
-
-MOST_ENTRIES = 26  # up to so many entries of the legend nothing is folded
 
 
 def families(names: list[tuple[str, Rgb]]) -> list[tuple[str, Rgb]]:

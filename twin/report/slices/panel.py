@@ -1,8 +1,7 @@
 """One slice: the CT in its plane, and over it outlines, needle, margin, region, target, directions and a scale.
 
-How Hounsfield units become grey: the windows that radiologists use, and one scale of bytes that holds them all.
-
-Its subject: one direction, its needle and the structures near it, or an image alone.
+Its subject is one direction, its needle and the structures near it, or an image alone. Hounsfield units become grey in
+the windows that radiologists use, or by one scale of bytes that holds them all.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.base.reasons import Rgb, css
 from puncture_twin.planning.search.bending import insertion_along
 from puncture_twin.planning.search.candidates import Pick
+from puncture_twin.twin.report import palette
 from puncture_twin.twin.report.annotate import SCALE_BARS_MM
 from puncture_twin.twin.report.figures import figure_of, halo, pixels
 from puncture_twin.twin.report.numbers import clearance_text
@@ -31,12 +31,11 @@ from puncture_twin.twin.report.slices.planes import Plane, capsule, ellipse, let
 NEAR_MM = 30.0  # a structure with a margin that lies nearer to the needle is drawn strongly and named
 MOST_NEAR = 8  # so many of them at most, the nearest
 
-BESIDE: dict[str, tuple[str, Rgb]] = {
+BESIDE: dict[str, tuple[str, Rgb]] = {  # of an image alone: what no structure names, for a person, and its colour
     OUTSIDE_BODY: ("beside the body: table, cloths, lines, and their unseen parts", (255, 170, 40)),
     ATTACHED_LIMB: ("what seems to be a limb", (255, 77, 240)),
     BEYOND_IMAGE: ("the body beyond the image", (120, 170, 255)),
 }
-"""Of an image alone: what no structure of the case names, by its name, for a person, and its colour."""
 
 
 class Near(NamedTuple):
@@ -60,8 +59,7 @@ class Subject:
 
     case: Any
     anatomy: Any
-    pick: Pick | None
-    """The candidate; None for the image alone, in which nobody has proposed a needle yet."""
+    pick: Pick | None  # the candidate; None for the image alone, in which nobody has proposed a needle yet
     region_ct: Floats | None = None
     """Shape (3, 3), mm^2: the tip is expected within x' inv(region) x <= 1 in 95 of 100; None without declared
     errors."""
@@ -100,11 +98,6 @@ class Subject:
         names = {one.name for one in self.anatomy.checked}
         return [] if self.pick is not None else [line for name, line in BESIDE.items() if name in names]
 
-    @property
-    def has_unknown(self) -> bool:
-        """Whether there is anything of which nobody knows what it is."""
-        return any(str(one.role) == "unknown" for one in self.anatomy.checked)
-
     @cached_property
     def _demanding(self) -> tuple[Near, ...]:
         if self.pick is None:
@@ -138,24 +131,15 @@ class Subject:
 
 
 PIXELS = 480
-
-NEEDLE_COLOUR: Rgb = (0, 229, 255)
-REGION_COLOUR: Rgb = (255, 77, 240)
-BENT_COLOUR: Rgb = (182, 255, 0)  # on grey none is near a structure's colour
 STRONG, WEAK, OF_SKIN, OF_BEAD = 2.5, 1.1, 1.6, 4.0  # pixels: how wide outlines are, and how large a bead is
 RIM = 1.8  # pixels of black under thin lines, both sides together, so that they show on bright tissue too
-LETTERS, SMALL, LETTERS_RIM = 16, 12, halo(3.2, "black")
-"""Pixels: of the directions and of the scale, in white with a black rim."""
-
-IN_PLANE = 1e-3
-"""A needle whose direction has less than this along a plane's normal lies in it."""
-
+LETTERS, SMALL, LETTERS_RIM = 16, 12, halo(3.2, "black")  # pixels: of directions and scale, in white
+IN_PLANE = 1e-3  # a needle whose direction has less than this along a plane's normal lies in it
 BEADS = 0.025  # between two beads, of half a picture's side
 MOST_BEADS = 1 << 20  # more than beads side by side; numbers their rows and columns as one
 SCALE_FRACTION = 0.34  # of a picture's side, the scale bar at most
 EDGE = 7.0  # pixels between a picture's edge and the letters there
-CLEAR = 24.0
-"""Pixels that letters keep from the needle's line, along their edge."""
+CLEAR = 24.0  # pixels that letters keep from the needle's line, along their edge
 
 
 class Panel(NamedTuple):
@@ -209,7 +193,6 @@ def _line(axes: Axes, points: Floats, width: float, colour: Rgb, style: str = "-
 
 
 def _segments(axes: Axes, segments: Floats, width: float, colour: Rgb) -> None:
-    """Lines from point to point, each alone, shape (n, 2, 2), mm: one path, with gaps between."""
     if len(segments) == 0:
         return
     gaps = np.full((len(segments), 1, 2), np.nan)
@@ -253,10 +236,10 @@ def _needle(axes: Axes, subject: Subject, plane: Plane) -> None:
     radius, shaft = float(needle.radius_mm), needle.shaft_mm
     path = subject.path_mm if np.isfinite(subject.path_mm) else shaft
     if subject.margin_mm > 0:
-        _line(axes, capsule(outward, path, radius + subject.margin_mm, plane), 1.3, NEEDLE_COLOUR, "--")
+        _line(axes, capsule(outward, path, radius + subject.margin_mm, plane), 1.3, palette.NEEDLE_COLOUR, "--")
     if subject.region_ct is not None:
-        _line(axes, ellipse(subject.region_ct, plane), 1.7, REGION_COLOUR, rim=RIM)
-    axes.fill(*capsule(outward, shaft, radius, plane).T, color=css(NEEDLE_COLOUR), linewidth=0, zorder=2)
+        _line(axes, ellipse(subject.region_ct, plane), 1.7, palette.REGION_COLOUR, rim=RIM)
+    axes.fill(*capsule(outward, shaft, radius, plane).T, color=css(palette.NEEDLE_COLOUR), linewidth=0, zorder=2)
     if subject.bent_mm is not None:
         _bent(axes, subject, plane, subject.bent_mm)
 
@@ -266,11 +249,11 @@ def _bent(axes: Axes, subject: Subject, plane: Plane, bent_mm: Floats) -> None:
     outward, off = subject.outward_ct, abs(float(bent_mm[-1, 1]))
     if abs(float(outward @ plane.normal)) > IN_PLANE:
         if off > 0:
-            _line(axes, capsule(outward, subject.path_mm, off, plane), 1.3, BENT_COLOUR)
+            _line(axes, capsule(outward, subject.path_mm, off, plane), 1.3, palette.BENT_COLOUR)
         return
     along = plane.place(plane.at_ct + outward)
     for aside in (np.array([-along[1], along[0]]), np.array([along[1], -along[0]])):
-        _line(axes, bent_mm @ np.stack([along, aside]), 1.7, BENT_COLOUR)
+        _line(axes, bent_mm @ np.stack([along, aside]), 1.7, palette.BENT_COLOUR)
 
 
 def _directions(axes: Axes, subject: Subject, plane: Plane) -> None:

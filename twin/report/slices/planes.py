@@ -13,14 +13,11 @@ from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.twin.report.map_view import body_directions
 
 LEFT, BACK, HEAD = (np.array(ANATOMICAL_LPS[name]) for name in ("left", "posterior", "head"))
-
-ALONG_LEFT = 0.95
-"""A needle within 18 degrees of the left-right axis spans no plane with it: its plane then rises to the front."""
-
-LEAST_HALF_MM, BESIDE_MM, PROBE_HALF_MM = 60.0, 35.0, 40.0
-"""Half a picture's side at least, what it shows beyond target and entry, and half of the probe's-eye view."""
-
+ALONG_LEFT = 0.95  # a needle within 18 degrees of this axis spans no plane with it: that rises to the front
+LEAST_HALF_MM, BESIDE_MM, PROBE_HALF_MM = 60.0, 35.0, 40.0  # half a side: at least, about a path, of the probe's eye
 OBLIQUE = 0.38  # a direction within 22 degrees of an axis is named by that axis alone
+LETTERS = {"patient's left": "L", "patient's right": "R", "back": "P", "front": "A", "head": "H", "feet": "F"}
+CAPSULE_POINTS, ELLIPSE_POINTS = 181, 121  # on each of a capsule's two sides; about an ellipse
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,14 +25,10 @@ class Plane:
     """One square picture."""
 
     name: str
-    at_ct: Floats
-    """Shape (3,), a point of the plane, the target."""
-    right: Floats
-    """Shape (3,), unit, CT frame: what lies to the right in the picture."""
-    up: Floats
-    """Shape (3,), unit."""
-    centre: Floats
-    """Shape (2,), the picture's middle from the target, mm to the right and up."""
+    at_ct: Floats  # shape (3,), a point of the plane, the target
+    right: Floats  # shape (3,), unit, CT frame: what lies to the right in the picture
+    up: Floats  # shape (3,), unit
+    centre: Floats  # shape (2,), the picture's middle from the target, mm to the right and up
     half_mm: float
 
     @cached_property
@@ -61,12 +54,8 @@ def needle_planes(target_ct: Floats, outward_ct: Floats, path_mm: float) -> tupl
     """The axial slice of the target, two planes that hold the needle, and the one across it at the target.
 
     In the first two the patient's right is on the left, as on every axial CT; the third shows the back to the right;
-    the last is what one sees who looks along the needle from outside.
-
-    Args:
-        target_ct: Shape (3,), LPS mm.
-        outward_ct: Shape (3,), unit, from the target to the entry.
-        path_mm: Target to skin; not finite without an entry.
+    the last is what one sees who looks along the needle from outside. The target, (3,), LPS mm; unit vector (3,) to the
+    entry; how far that is, not finite without one.
     """
     far = path_mm if np.isfinite(path_mm) else 0.0
     entry = target_ct + far * outward_ct
@@ -121,9 +110,6 @@ def _unit(vector: Floats) -> Floats:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-LETTERS = {"patient's left": "L", "patient's right": "R", "back": "P", "front": "A", "head": "H", "feet": "F"}
-
-
 def letters(space: str, direction: Floats) -> str:
     """What lies in a direction (3,), unit: R, L, A, P, H, F, two of them where it is oblique; axes of a local frame."""
     return " ".join(LETTERS.get(name, name) for name in _named(space, direction))
@@ -143,7 +129,11 @@ def _named(space: str, direction: Floats) -> list[str]:
 
 def outline(mesh: TriangleMesh, plane: Plane) -> Floats:
     """The cut of a surface, shape (n, 2, 2): segments, mm from the target; none where its box is out of the picture."""
-    if not _is_seen(mesh, plane):
+    low, high = mesh.bounds
+    middle, half = (low + high) / 2, (high - low) / 2
+    axes = np.stack([plane.right, plane.up, plane.normal])
+    shown, reach = np.array([*plane.centre, 0.0]), np.array([plane.half_mm, plane.half_mm, 0.0])
+    if not np.all(np.abs(axes @ (middle - plane.at_ct) - shown) <= np.abs(axes) @ half + reach):
         return np.zeros((0, 2, 2))
     return plane.place(_cut(mesh, plane))
 
@@ -161,27 +151,12 @@ def _cut(mesh: TriangleMesh, plane: Plane) -> Floats:
     return np.asarray(mesh.vertices[tip] * (1 - along) + mesh.vertices[others] * along)
 
 
-def _is_seen(mesh: TriangleMesh, plane: Plane) -> bool:
-    low, high = mesh.bounds
-    middle, half = (low + high) / 2, (high - low) / 2
-    axes = np.stack([plane.right, plane.up, plane.normal])
-    shown, reach = np.array([*plane.centre, 0.0]), np.array([plane.half_mm, plane.half_mm, 0.0])
-    return bool(np.all(np.abs(axes @ (middle - plane.at_ct) - shown) <= np.abs(axes) @ half + reach))
-
-
-def capsule(outward_ct: Floats, length_mm: float, radius_mm: float, plane: Plane, points: int = 181) -> Floats:
-    """The cut of all that lies within a radius of a piece of the needle's axis, a closed line, shape (2 * points, 2).
+def capsule(outward_ct: Floats, length_mm: float, radius_mm: float, plane: Plane) -> Floats:
+    """The cut of all within a radius of a piece of the needle's axis, a closed line (2 k, 2), mm from the target.
 
     With a along the axis' shadow in the plane and b across it, the axis' nearest point to (a, b) is s = a sin(phi),
     kept within 0..length; phi is the angle between axis and normal, and b^2 = radius^2 - (a^2 - 2 a s sin(phi) + s^2).
-
-    Args:
-        outward_ct: From the target along the needle, unit, shape (3,).
-        length_mm: The piece's length; it begins at the target.
-        points: On each of the line's two sides.
-
-    Returns:
-        In the plane, mm to the right and up of the target.
+    The piece begins at the target and goes along the needle, unit, (3,).
     """
     shadow = np.array([outward_ct @ plane.right, outward_ct @ plane.up])
     sine, cosine = min(1.0, float(np.linalg.norm(shadow))), abs(float(outward_ct @ plane.normal))
@@ -190,7 +165,7 @@ def capsule(outward_ct: Floats, length_mm: float, radius_mm: float, plane: Plane
         far = radius_mm / cosine
     else:
         far = length_mm * sine + np.sqrt(max(0.0, radius_mm**2 - (length_mm * cosine) ** 2))
-    turns = np.linspace(0.0, np.pi, points)
+    turns = np.linspace(0.0, np.pi, CAPSULE_POINTS)
     a = (far - radius_mm) / 2 - (far + radius_mm) / 2 * np.cos(turns)
     s = np.clip(a * sine, 0.0, length_mm)
     b = np.sqrt(np.maximum(0.0, radius_mm**2 - (a**2 - 2 * a * s * sine + s**2)))
@@ -198,11 +173,11 @@ def capsule(outward_ct: Floats, length_mm: float, radius_mm: float, plane: Plane
     return np.asarray(a[:, None] * along + b[:, None] * np.array([-along[1], along[0]]))
 
 
-def ellipse(region_ct: Floats, plane: Plane, points: int = 121) -> Floats:
-    """The cut of the ellipsoid x' inv(region) x = 1 about the target, a closed line of shape (points, 2), mm."""
+def ellipse(region_ct: Floats, plane: Plane) -> Floats:
+    """The cut of the ellipsoid x' inv(region) x = 1 about the target, a closed line of shape (k, 2), mm."""
     basis = np.stack([plane.right, plane.up])
     inverse = basis @ np.linalg.pinv(region_ct, hermitian=True) @ basis.T
     values, vectors = np.linalg.eigh(inverse)
-    turns = np.linspace(0.0, 2 * np.pi, points)
+    turns = np.linspace(0.0, 2 * np.pi, ELLIPSE_POINTS)
     half = 1.0 / np.sqrt(np.maximum(values, np.finfo(float).tiny))
     return np.asarray((vectors @ (half[:, None] * np.stack([np.cos(turns), np.sin(turns)]))).T)

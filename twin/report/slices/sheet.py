@@ -1,7 +1,4 @@
-"""``slices.png``: the slices of a direction and the units along its needle, or of an image alone, on one sheet.
-
-And a sheet of small slices about points: each in the axial plane and along the body, with a cross and its name.
-"""
+"""``slices.png``: slices of a direction and the units along its needle, or of an image; small ones about points."""
 
 from __future__ import annotations
 
@@ -21,33 +18,20 @@ from puncture_twin.planning.search.bending import BEYOND_SKIN_MM, Stretch, stret
 from puncture_twin.twin.report.annotate import FAINT, legend, write, write_image
 from puncture_twin.twin.report.figures import figure_of, pixels
 from puncture_twin.twin.report.numbers import target_text
-from puncture_twin.twin.report.palette import SKIN, TARGET_POINT
+from puncture_twin.twin.report.palette import NEEDLE_COLOUR, REGION_COLOUR, SKIN, TARGET_POINT
 from puncture_twin.twin.report.present import number
-from puncture_twin.twin.report.slices.panel import (
-    NEEDLE_COLOUR,
-    PIXELS,
-    REGION_COLOUR,
-    TONES,
-    Panel,
-    Subject,
-    Tone,
-    draw_panel,
-    leaning,
-)
-from puncture_twin.twin.report.slices.planes import (
-    BACK,
-    HEAD,
-    LEFT as TO_LEFT,
-    Plane,
-    body_planes,
-    needle_planes,
-    outline,
-)
+from puncture_twin.twin.report.slices import planes
+from puncture_twin.twin.report.slices.panel import PIXELS, TONES, Panel, Subject, Tone, draw_panel, leaning
 
 WITHOUT_CT: Rgb = (44, 47, 54)  # behind the outlines of a case without CT
 NO_CT = "The case has no CT: only the outlines of the structures."
 RADIOLOGICAL = "The patient's right is on the left. Each slice shows only its own plane: look at all of them."
 GAP, TOP, CAPTION = 16, 92, 50
+TILE, BETWEEN_TILES, HEAD_OF_TILE, ACROSS = 220, 10, 40, 3  # pixels of a slice, between, of a caption; points a row
+CROSS, ARM = (3, 9), 2  # pixels from the point at which its cross begins and ends, and its width
+YELLOW: Rgb = (255, 211, 77)
+SIDES = ((planes.LEFT, -planes.BACK), (planes.BACK, planes.HEAD))  # right and up of both slices
+HuAt = Callable[[Floats], Floats]  # HU at points (n, 3), NaN outside
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +47,8 @@ class Slices:
         """Sentences on what the lines mean, and on what is missing."""
         subject = self.subject
         ct = NO_CT if subject.anatomy.scan is None else "The CT's nearest voxels, not smoothed."
-        beads = " Beads: the edge of what is unknown." if subject.has_unknown else ""
+        unknown = any(str(one.role) == "unknown" for one in subject.anatomy.checked)
+        beads = " Beads: the edge of what is unknown." if unknown else ""
         if subject.pick is None:
             return ct, f"Lines: the skin and the structures.{beads}"
         dashed = f"; dashed: with the greatest margin near it, {number(subject.margin_mm, 1, 'mm')}"
@@ -90,11 +75,11 @@ def draw_slices(subject: Subject) -> Slices:
     """Draw all of one direction, or of the image alone."""
     target = subject.case.target_ct
     if subject.pick is None:
-        planes = body_planes(target, subject.anatomy.skin.mesh.bounds)
+        shown = planes.body_planes(target, subject.anatomy.skin.mesh.bounds)
     else:
-        planes = needle_planes(target, subject.outward_ct, subject.path_mm)
+        shown = planes.needle_planes(target, subject.outward_ct, subject.path_mm)
     units = None if subject.pick is None else _hu_plot(subject)
-    return Slices(subject, tuple(draw_panel(subject, plane) for plane in planes), units)
+    return Slices(subject, tuple(draw_panel(subject, plane) for plane in shown), units)
 
 
 UNITS_SIZE = (976, 330)  # pixels: the plot of the units along the needle
@@ -105,9 +90,7 @@ BAR = 0.74  # height of a structure's bar, of its row
 LEFT, RIGHT, BOTTOM, UPPER, BETWEEN = 0.2, 0.985, 0.14, 0.98, 0.02
 """Edges of the plot in the picture, names stand to the left; and what lies between the units and the bars."""
 
-ROW, MOST_BARS = 20.5 / UNITS_SIZE[1], 0.5
-"""Of the picture: height of a structure's row, and of all of them together at most."""
-
+ROW, MOST_BARS = 20.5 / UNITS_SIZE[1], 0.5  # of the picture: a structure's row, and all together at most
 LETTERS, LEAST_LETTERS = 11.0, 8.0  # pixels: names of many structures are smaller
 
 
@@ -144,7 +127,6 @@ def _units(axes: Axes, subject: Subject) -> None:
 
 
 def _bars(axes: Axes, subject: Subject, parts: tuple[Stretch, ...], names: tuple[str, ...], letters: float) -> None:
-    """A row for each structure that the needle passes, with a bar where it is in it."""
     for row, name in enumerate(names):
         inside = [(part.start_mm, part.end_mm - part.start_mm) for part in parts if name in part.structures]
         colour = css(subject.colours[name])
@@ -192,12 +174,6 @@ def write_sheet(slices: Slices, path: Path) -> None:
     write_image(sheet, path)
 
 
-TILE, BETWEEN_TILES, HEAD_OF_TILE, ACROSS = 220, 10, 40, 3
-"""Pixels of a slice, between slices, and of a caption; points side by side."""
-CROSS, ARM = (3, 9), 2  # pixels from the point at which its cross begins and ends, and its width
-YELLOW: Rgb = (255, 211, 77)
-
-
 class Mark(NamedTuple):
     """A point (3,), LPS mm, its name, and a line about it."""
 
@@ -207,14 +183,9 @@ class Mark(NamedTuple):
 
 
 def write_points_sheet(
-    path: Path,
-    title: str,
-    points: Sequence[Mark],
-    hu_at: Callable[[Floats], Floats] | None,
-    skin: TriangleMesh,
-    half_mm: float,
+    path: Path, title: str, points: Sequence[Mark], hu_at: HuAt | None, skin: TriangleMesh, half_mm: float
 ) -> Path:
-    """Write the sheet, whole or not at all; `hu_at` gives HU at points (n, 3), NaN outside; None without a CT."""
+    """Write the sheet, whole or not at all; `hu_at` is None without a CT."""
     rows = -(-len(points) // ACROSS)
     width, height = 2 * TILE + BETWEEN_TILES, TILE + HEAD_OF_TILE + BETWEEN_TILES
     across = min(ACROSS, len(points))
@@ -230,19 +201,19 @@ def write_points_sheet(
         left, top = BETWEEN_TILES + (place % ACROSS) * (width + 2 * BETWEEN_TILES), 64 + (place // ACROSS) * height
         write(draw, (left, top), one.name, size=15, bold=True)
         write(draw, (left, top + 19), one.line, size=12, colour=FAINT)
-        for column, (right, up) in enumerate(((TO_LEFT, -BACK), (BACK, HEAD))):
-            plane = Plane(one.name, one.point_ct, right, up, np.zeros(2), half_mm)
+        for column, (right, up) in enumerate(SIDES):
+            plane = planes.Plane(one.name, one.point_ct, right, up, np.zeros(2), half_mm)
             sheet.paste(_tile(plane, hu_at, skin), (left + column * (TILE + BETWEEN_TILES), top + HEAD_OF_TILE))
     write_image(sheet, path)
     return path
 
 
-def _tile(plane: Plane, hu_at: Callable[[Floats], Floats] | None, skin: TriangleMesh) -> Image.Image:
+def _tile(plane: planes.Plane, hu_at: HuAt | None, skin: TriangleMesh) -> Image.Image:
     tile = Image.new("RGB", (TILE, TILE), WITHOUT_CT)
     if hu_at is not None:
         tile = Image.fromarray(TONES["bone"].grey(hu_at(plane.points_ct(TILE)).reshape(TILE, TILE))).convert("RGB")
     draw, middle = ImageDraw.Draw(tile), TILE / 2
-    for a, b in outline(skin, plane) * [1.0, -1.0] * middle / plane.half_mm + middle:
+    for a, b in planes.outline(skin, plane) * [1.0, -1.0] * middle / plane.half_mm + middle:
         draw.line([*a, *b], fill=SKIN, width=1)
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         near, far = ((middle + x * away, middle + y * away) for away in CROSS)
