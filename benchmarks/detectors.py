@@ -16,9 +16,10 @@ from time import process_time
 import numpy as np
 
 from benchmarks.shared import versions
-from puncture_twin.twin.guidance.stereo.ball import DetectedBall, LostBall, find_ball
+from puncture_twin.twin.guidance.stereo.ball import find_ball
 from puncture_twin.twin.guidance.stereo.camera import stereo_pair
 from puncture_twin.twin.guidance.stereo.camera_calibration import calibrate, triangulate
+from puncture_twin.twin.guidance.stereo.servo_law import Lost
 from puncture_twin.twin.guidance.ultrasound.needle_detector import Detection, Imager, NeedleEcho, detect
 from puncture_twin.twin.plant.ball_image import BallScene, render as render_ball
 from puncture_twin.twin.plant.bmode_image import NeedleInImage, render
@@ -92,13 +93,13 @@ def look(count, seed, *, noise=2.0, **changes):
         start = process_time()
         found = find_ball(*asked, search_px=SEARCH_PX)
         spent += process_time() - start
-        if isinstance(found, DetectedBall):
+        if not isinstance(found, Lost):
             errors.append(found.pixel - true)
             squared.append(errors[-1] @ np.linalg.solve(found.covariance, errors[-1]) / 2)
         else:
             reasons[found.reason] += 1
         rough = find_ball(*asked, search_px=SEARCH_PX, hough_only=True)
-        if isinstance(rough, DetectedBall):
+        if not isinstance(rough, Lost):
             hough.append(rough.pixel - true)
     return np.array(errors).reshape(-1, 2), np.array(squared), np.array(hough), reasons, 1000 * spent / count
 
@@ -165,7 +166,7 @@ def in_space(
 
 def any_lost(balls):
     """Whether a camera did not find it."""
-    return any(isinstance(ball, LostBall) for ball in balls)
+    return any(isinstance(ball, Lost) for ball in balls)
 
 
 def rms(errors):

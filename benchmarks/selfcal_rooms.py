@@ -26,7 +26,7 @@ from puncture_twin.planning.arm.kinematics import flange_pose
 from puncture_twin.planning.base.arrays import Floats, rms
 from puncture_twin.twin.guidance.ultrasound.acquisition import ProbeDevices, acquire, choose
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.calibration import Calibration, ShotByShot, calibrate
-from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import Estimate
+from puncture_twin.twin.guidance.ultrasound.axp_ybq.equation import DeclaredArms, Estimate
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 from puncture_twin.twin.guidance.ultrasound.pose_choice import CandidatePoses, TwoArms, find_candidates
 from puncture_twin.twin.guidance.ultrasound.selfcal_case import SelfcalCase, load_selfcal_case
@@ -144,7 +144,8 @@ def outcome(kind: Kind, seed: int) -> Outcome:
     recording = with_outliers(recording, kind.outliers, rng)
     off = case.content.truth.off_plane_mm
     sizes = (RENDERED_MM, RENDERED_RAD) if kind.rendered else (IMAGE_MM, DIRECTION_RAD)
-    arms = case.declared_arms.scaled(kind.arms) if kind.arms else None
+    declared = (arm._replace(errors=arm.errors.scaled(kind.arms)) for arm in case.declared_arms)
+    arms = DeclaredArms(*declared) if kind.arms else None
     noise = Noise(0.0, 0.0, *sizes, off_plane_mm=off) if kind.told else None
     found = calibrate(recording, noise=noise, arms=arms)
     held_out = rng.permutation(others)[:HELD_OUT]

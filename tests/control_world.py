@@ -57,7 +57,7 @@ class WithFriction:
 
     def act(self, measured, reference, row):
         action = self._controller.act(measured, reference, row)
-        return action._replace(torque_nm=action.torque_nm - self._friction * np.clip(measured.speed / 2e-3, -1, 1))
+        return action - self._friction * np.clip(measured.speed / 2e-3, -1, 1)
 
 
 class Bench(NamedTuple):

@@ -24,17 +24,13 @@ from puncture_twin.planning.formats.labels.naming import ByName
 class Breathing:
     """The breathing that a case declares; mm."""
 
-    amplitude_mm: float
-    """b, of the target, from exhale to full inhale."""
-    direction_ct: Floats
-    """Shape (3,), unit: whereto inhaling moves it."""
+    amplitude_mm: float  # b, of the target, from exhale to full inhale
+    direction_ct: Floats  # shape (3,), unit: whereto inhaling moves it
     weights: ByName[float]
     phases: int
     exponent: int
-    scanned_at: float
-    """The position s in which the CT shows the body."""
-    gate: float | None
-    """The needle goes in while s is at most this; None for any time."""
+    scanned_at: float  # the position s in which the CT shows the body
+    gate: float | None  # the needle goes in while s is at most this; None for any time
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "direction_ct", read_only(self.direction_ct))

@@ -13,6 +13,7 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.breathing.breathing import Breathing
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
+from puncture_twin.planning.case.settings import SAME_MM
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.needle.deflection import GAUGES, Bending, Shaft
 from puncture_twin.planning.reach.standoff import case_paths
@@ -40,21 +41,9 @@ class BentPath:
         insertion = insertion_along(self.bending, self.anatomy, self.case.target_ct, self.outward_ct, self.path_length)
         return Bend(insertion.tip_mm, self.bending.shaft.length_mm)
 
-    def with_shaft(self, shaft: Shaft) -> BentPath:
-        """The path with another needle of the same bevel."""
-        return replace(self, bending=replace(self.bending, shaft=shaft))
-
-    def without_bevel(self) -> BentPath:
-        """The path with a symmetric tip."""
-        return replace(self, bending=replace(self.bending, alpha=0.0))
-
 
 def bent_path(case: Case, anatomy: Anatomy, outward_ct: Floats) -> BentPath | None:
-    """The path of one direction; None where the needle is straight, or the direction enters no skin.
-
-    Args:
-        outward_ct: Shape (3,), unit.
-    """
+    """The path of one direction (3,), unit; None where the needle is straight, or the direction enters no skin."""
     if case.bending is None:
         return None
     paths = case_paths(case, anatomy.skin, outward_ct[None])
@@ -74,10 +63,6 @@ def other_gauges(shaft: Shaft) -> dict[int, Shaft]:
     }
 
 
-SAME_MM = 0.03
-"""Between the diameters of one gauge, as a case may state them."""
-
-
 GATES = (None, 0.5, 0.25, 0.1)
 """Position s of the breath that the needle waits for; None waits for none."""
 
@@ -89,10 +74,8 @@ class Chain:
     model: UrModel
     tip_mm: float  # flange to tip
     method: str
-    errors: ErrorModel
-    """As declared, times ``scale``."""
-    scale: float
-    """By which the markers' residuals multiply every declared error: 1 where they agree."""
+    errors: ErrorModel  # as declared, times ``scale``
+    scale: float  # by which the markers' residuals multiply every declared error: 1 where they agree
     points_ct: Floats  # shape (N, 3), the markers
     q_touch: Floats  # shape (N, 6), how the arm touches them
     T_base_ct: Floats  # shape (4, 4), mm
@@ -102,8 +85,7 @@ class Chain:
     breathing: Breathing | None = None
     motion_base: Floats | None = None
     """Shape (3, 3), mm^2, of the target since the scan, base axes; None where it is not declared."""
-    aim: Aim | None = None
-    """The insertion that a joint registration is corrected for."""
+    aim: Aim | None = None  # the insertion that a joint registration is corrected for
 
     def pose_error(self) -> PoseError:
         """The pose error of this chain, its errors taken as declared."""
@@ -140,12 +122,9 @@ class Chain:
 
 
 def chain_of(case: Case, registration: Registration, q_insertion: Floats, path: BentPath | None = None) -> Chain:
-    """The chain of a case, with its breathing and motion.
+    """The chain of a case, with its breathing and motion, of an insertion (6,), rad, the tip on the target.
 
-    Args:
-        registration: Of its markers, with the case's own declaration, to whose residuals the errors are scaled.
-        q_insertion: Shape (6,), rad, the tip on the target.
-        path: Of the needle there, where it bends.
+    The registration is by the case's own declaration; its residuals scale the errors. Where the needle bends, its path.
     """
     assert case.errors is not None and registration.uncertainty is not None
     scale, R = registration.uncertainty.test.scale, registration.T_base_ct[:3, :3]

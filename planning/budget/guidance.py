@@ -96,10 +96,7 @@ def ways_of(text: str) -> tuple[str, ...]:
 
 
 def equipped(case: Case, way: str) -> tuple[Case, tuple[str, ...]]:
-    """A case with all devices of a way: undeclared ones have the reference's defaults, and a sentence each.
-
-    Balls that do not fit on the needle are assumed at half of its shaft and at its hub.
-    """
+    """A case with all devices of a way: undeclared ones have the reference's defaults, and a sentence each."""
     needed, said = {_DEVICES[device] for device in guided.READS[way] if device in _DEVICES}, []
     if "stereo" in needed and case.stereo is None:
         cameras = stereo_of(StereoSection(), case.space, case.path)
@@ -194,15 +191,11 @@ def guided_model(
     sight: Sight | None = None,
     steps: int | None = None,
 ) -> guided.GuidedModel:
-    """What guidance knows of one insertion.
+    """What guidance knows of one insertion of a case that declares its devices.
 
-    Args:
-        case: Declares the devices, and what moves.
-        error: Of the needle, as rehearsed.
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        q: Shape (6,), rad, the tip on the target.
-        sight: What the devices see of it; None hides nothing, and has the picture along the body.
-        steps: After each of so many a control scan is read, and nothing else looks; None scans nothing.
+    Joints (6,), rad, have the tip on the target. The direction (3,), unit, is from the target along the needle, whose
+    error is as rehearsed. Sight None hides nothing, and has the picture along the body. With steps a control scan is
+    read after each, and nothing else looks.
     """
     R, breathing = registration.T_base_ct[:3, :3], case.breathing
     breath, skin_weight = np.zeros((3, 2)), 0.0
@@ -282,10 +275,8 @@ def way_chances(
 ) -> tuple[guided.WayChance, ...]:
     """What each way would leave of an insertion, ct first, by the devices of a case; nothing where it declares none.
 
-    Args:
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        q: Shape (6,), rad, the tip on the target.
-        sight: What the devices see; None hides nothing.
+    The direction (3,), unit, is from the target along the needle; joints (6,), rad, have the tip on the target; sight
+    None hides nothing.
     """
     case, chance = context.case, context.chance
     ways = declared_ways(case)
@@ -359,15 +350,12 @@ WATCHED_MM = 1.0
 
 
 def followers(case: Case, anatomy: Anatomy) -> tuple[guided.Follows, ...]:
-    """How each of ``anatomy.checked`` follows the target; what is outside of the body does not but with the breath.
-
-    What the needle pushes is the target's own structure alone.
-    """
+    """How each of ``anatomy.checked`` follows the target; what is outside of the body does not but with the breath."""
     breath = np.ones(len(anatomy.checked))
     pushes = case.bending is not None and any(one.held_n_mm for one in case.bending.tissues.of_pattern.values())
     if case.breathing is not None:
         breath = moving_weights(case, case.breathing, anatomy).structures
-    return tuple(
+    return tuple(  # what the needle pushes is the target's own structure alone
         guided.Follows(0.0 if one.outside else 1.0, weight, float(not pushes or one.name == case.target_structure))
         for one, weight in zip(anatomy.checked, breath.tolist(), strict=True)
     )

@@ -35,22 +35,18 @@ class SourceCost:
     """One source of the expected error."""
 
     source: str
-    alone_mm: float
-    """The tip's rms error, were there no other."""
-    without_mm: float
-    """Expected error with all sources but this one; the registration's weights stay."""
+    alone_mm: float  # the tip's rms error, were there no other
+    without_mm: float  # expected error with all sources but this one; the registration's weights stay
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
     """One change of the chain, and the error that it would leave."""
 
-    group: str
-    """slices, markers, touches, arm, tip, needle, breath or body."""
+    group: str  # slices, markers, touches, arm, tip, needle, breath or body
     what: str
     rms_mm: float
-    point_ct: Floats | None = None
-    """Shape (3,), mm, where the last of further markers sits; None for other changes."""
+    point_ct: Floats | None = None  # shape (3,), mm, where the last of further markers sits; None for other changes
 
 
 def source_costs(chain: Chain) -> tuple[SourceCost, ...]:
@@ -60,19 +56,15 @@ def source_costs(chain: Chain) -> tuple[SourceCost, ...]:
     squares = {source: budget.rms_mm**2 * part for source, part in budget.fraction.items()}
     squares |= {source: float(np.trace(square)) for source, square in chain.body_mean_squares().items()}
     whole = sum(squares.values())
-    costs = [
-        SourceCost(source, float(np.sqrt(square)), float(np.sqrt(max(whole - square, 0.0))))
-        for source, square in squares.items()
-    ]
+    rest = {source: float(np.sqrt(max(whole - square, 0.0))) for source, square in squares.items()}
+    costs = [SourceCost(source, float(np.sqrt(square)), rest[source]) for source, square in squares.items()]
     return tuple(sorted(costs, key=lambda one: -one.alone_mm))
 
 
 def changes(chain: Chain, skin_points_ct: Floats, bed_ct: Floats | None) -> tuple[Change, ...]:
-    """The changes of a chain, each alone.
+    """The changes of a chain, each alone; further markers could sit at skin points (n, 3), mm.
 
-    Args:
-        skin_points_ct: Shape (n, 3), mm, where a further marker could sit.
-        bed_ct: Shape (3,), unit, across the CT's slices; None where it is not stated, and slices are left out.
+    ``bed_ct`` (3,), unit, is across the CT's slices; None where it is not stated, and slices are left out.
     """
     return (
         *([] if bed_ct is None else _slices(chain, bed_ct)),
@@ -128,11 +120,12 @@ def _needles(chain: Chain) -> Iterator[Change]:
     if path is None:
         return
     for number, shaft in other_gauges(path.bending.shaft).items():
-        other = path.with_shaft(shaft)
+        other = replace(path, bending=replace(path.bending, shaft=shaft))
         bends = f"bends by {other.bend.tip_mm:.1f} mm"
         yield Change("needle", f"a {number}G needle ({bends})", replace(chain, path=other).expected_mm())
     if path.bending.alpha > 0:
-        yield Change("needle", "a needle without a bevel", replace(chain, path=path.without_bevel()).expected_mm())
+        symmetric = replace(path, bending=replace(path.bending, alpha=0.0))
+        yield Change("needle", "a needle without a bevel", replace(chain, path=symmetric).expected_mm())
 
 
 def _body(chain: Chain) -> Iterator[Change]:
@@ -151,7 +144,6 @@ def _body(chain: Chain) -> Iterator[Change]:
 
 
 def _fewer_markers(chain: Chain) -> Iterator[Change]:
-    """Fewer markers: without the one that costs least, again and again down to three."""
     found = []
     while len(chain.points_ct) > MIN_MARKERS:
         every = np.arange(len(chain.points_ct))

@@ -35,10 +35,8 @@ ALLOWANCE = 0.25
 """Added to the bevel's part. Tested, not proven: the worst order of layers is a thin stiff one before a gap, the worse
 the more slender the shaft is. With lambda L the shaft's length over 1/lambda it goes 8 % beyond the stiffest tissue
 alone at 40, 14 % at 80, 19 % at 150 and 27 % at 400; the step adds 1.5 % (3 % at first)."""
-
 SHORTEST_BEND_MM = 2.5
 """1/lambda, over which a foundation bends a shaft: no tissue bends a needle within less, that a case was made for."""
-
 MOST_SLENDER = 150.0
 """Length of a shaft over 1/lambda: beyond, the allowance does not hold."""
 
@@ -47,18 +45,14 @@ MOST_SLENDER = 150.0
 class DeflectionBound:
     """Greatest deflection over path length, to any side."""
 
-    depth_mm: Floats
-    """Shape (m,), of the tip in the tissue, from 0, ascending."""
-    bevel_mm: Floats
-    """Shape (m,), that the bevel causes, ascending."""
-    sag_mm: float
-    """That the shaft's own weight causes, held horizontally."""
+    depth_mm: Floats  # shape (m,), of the tip in the tissue, from 0, ascending
+    bevel_mm: Floats  # shape (m,), that the bevel causes, ascending
+    sag_mm: float  # that the shaft's own weight causes, held horizontally
 
     def at(self, path_length: Floats | float) -> Floats:
-        """Bound for paths of these lengths, mm: that of the table's next depth; infinite beyond its end.
+        """Bound for paths of these lengths (any shape), mm: that of the table's next depth; infinite beyond its end.
 
-        Args:
-            path_length: Any shape, mm; NaN where there is none, which stays NaN.
+        NaN, where there is no path, stays NaN.
         """
         length = np.asarray(path_length, dtype=np.float64)
         row = np.searchsorted(self.depth_mm, np.nan_to_num(length))
@@ -67,11 +61,7 @@ class DeflectionBound:
 
 
 def deflection_bound(shaft: Shaft, alpha: float, tissues: Iterable[Tissue], longest_mm: float) -> DeflectionBound:
-    """The bound of a needle in a case's tissues.
-
-    Args:
-        alpha: Of the needle's bevel, rad.
-    """
+    """The bound of a needle with a bevel of alpha, rad, in a case's tissues."""
     stiffest = max((tissue.stiffness_n_mm2 for tissue in tissues), default=0.0)
     step = step_for(shaft, stiffest)
     count = int(np.ceil(longest_mm / step))
@@ -94,10 +84,8 @@ class Bending:
     """A needle with a bevel, and the tissues by the names of their structures."""
 
     shaft: Shaft
-    alpha: float
-    """By which the bevel's cut leaves the shaft's direction, rad."""
-    tissues: ByName[Tissue]
-    """The pattern ``*`` is all that no structure names."""
+    alpha: float  # by which the bevel's cut leaves the shaft's direction, rad
+    tissues: ByName[Tissue]  # the pattern ``*`` is all that no structure names
 
     def bound(self, longest_mm: float) -> DeflectionBound:
         """Bound of the deflection on paths up to a length, mm."""
@@ -109,37 +97,27 @@ BANDS = 4
 
 
 class Shape(NamedTuple):
-    """Bent shape of n nodes: deflection (mm) and slope (rad), shape (n,), and forces, N and N mm.
+    """Bent shape of n nodes."""
 
-    The tip's is that of its support; the clamp's are what it bears of all that presses on the shaft, a moment about
-    itself.
-    """
-
-    deflection: Floats
-    slope: Floats
-    tip_force: float
-    clamp_force: float
-    clamp_moment: float
+    deflection: Floats  # shape (n,), mm
+    slope: Floats  # shape (n,), rad
+    tip_force: float  # of its support, N
+    clamp_force: float  # that it bears of all that presses on the shaft, N
+    clamp_moment: float  # about itself, N mm
 
 
 @dataclass(frozen=True, eq=False)
 class Beam:
     """A shaft cut into equal elements."""
 
-    stiffness: float
-    """EI, N mm^2."""
-    step: float
-    """Length of an element, mm."""
+    stiffness: float  # EI, N mm^2
+    step: float  # length of an element, mm
     elements: int
 
     def bent(self, foundation: Floats, rest: Floats, *, tip_mm: float | None = None, tip_load: float = 0.0) -> Shape:
-        """The shape in a foundation, with the tip's deflection given, or loaded.
+        """The shape in a foundation k (elements,), N/mm^2, 0 in the air, at rest c at the nodes (elements + 1,), mm.
 
-        Args:
-            foundation: k of each element, shape (elements,), N/mm^2; 0 in the air.
-            rest: c at the nodes, shape (elements + 1,), mm, linear between them.
-            tip_mm: The deflection at which something holds the tip; None leaves it free.
-            tip_load: Lateral force on a free tip, N.
+        Something holds the tip at a deflection, mm, or it is free (None), under a lateral load, N.
         """
         bands, h, first, second = self._bands(foundation), self.step, rest[:-1], rest[1:]
         load = np.zeros(2 * (self.elements + 1))  # the integral of k c N over each element
@@ -169,12 +147,8 @@ class Beam:
         """The stiffness matrix in lower banded form, shape (BANDS, 2 (elements + 1))."""
         h, size = self.step, 2 * (self.elements + 1)
         bends = [[12, 6 * h, -12, 6 * h], [0, 4 * h * h, -6 * h, 2 * h * h], [0, 0, 12, -6 * h], [0, 0, 0, 4 * h * h]]
-        beds = [
-            [156, 22 * h, 54, -13 * h],
-            [0, 4 * h * h, 13 * h, -3 * h * h],
-            [0, 0, 156, -22 * h],
-            [0, 0, 0, 4 * h * h],
-        ]
+        beds = [[156, 22 * h, 54, -13 * h], [0, 4 * h * h, 13 * h, -3 * h * h], [0, 0, 156, -22 * h]]
+        beds.append([0, 0, 0, 4 * h * h])
         bending, bedding = self.stiffness / h**3 * np.array(bends), h / 420 * np.array(beds)
         bands = np.zeros((BANDS, size))
         for row in range(4):
@@ -195,7 +169,6 @@ def _shape(found: Floats, force: float, system: tuple[Floats, Floats]) -> Shape:
 
 STEP_MM = 1.0
 """Step of an insertion, at most. Where `step_for` asks for less it is shorter."""
-
 OF_BENDING, OF_LENGTH = 1 / 16, 1 / 64
 """Ratio of a step to the length 1/rate within which a shaft bends in the stiffest tissue, and over the shaft's own.
 Halving it then changes a path by less than 1.5 % from the sixteenth step on, and by less than 3 % before:
@@ -203,11 +176,7 @@ Halving it then changes a path by less than 1.5 % from the sixteenth step on, an
 
 
 def step_for(shaft: Shaft, stiffest: float) -> float:
-    """Step of an insertion's simulation, mm.
-
-    Args:
-        stiffest: The largest k on its path, N/mm^2; rate = (k / 4 EI)^(1/4).
-    """
+    """Step of an insertion's simulation, mm, by the largest k on its path, N/mm^2; rate = (k / 4 EI)^(1/4)."""
     rate = (stiffest / (4 * shaft.bending_stiffness)) ** 0.25
     return float(min(STEP_MM, OF_LENGTH * shaft.length_mm, OF_BENDING / max(rate, OF_BENDING / STEP_MM)))
 
@@ -216,28 +185,19 @@ def step_for(shaft: Shaft, stiffest: float) -> float:
 class BevelPath:
     """A path of m steps, in the plane of the bevel."""
 
-    depth_mm: Floats
-    """Shape (m + 1,), how far the tip is in."""
-    cut_mm: Floats
-    """Shape (m + 1,), how far the path is off the straight line there."""
-    needle_mm: Floats
-    """Shape (m + 1,), how far the shaft is off at those depths, once it is all in."""
-    largest_mm: Floats
-    """Shape (m + 1,), the greatest deflection anywhere along the shaft, up to each depth."""
-    holder_n: Floats
-    """Shape (m + 1,), the lateral force of the tissue that the holder bears at each depth."""
-    holder_n_mm: Floats
-    """Shape (m + 1,), its moment about its clamp."""
+    depth_mm: Floats  # shape (m + 1,), how far the tip is in
+    cut_mm: Floats  # shape (m + 1,), how far the path is off the straight line there
+    needle_mm: Floats  # shape (m + 1,), how far the shaft is off at those depths, once it is all in
+    largest_mm: Floats  # shape (m + 1,), the greatest deflection anywhere along the shaft, up to each depth
+    holder_n: Floats  # shape (m + 1,), the lateral force of the tissue that the holder bears at each depth
+    holder_n_mm: Floats  # shape (m + 1,), its moment about its clamp
 
 
 def bevel_path(shaft: Shaft, stiffness: Floats, alpha: Floats, step_mm: float) -> BevelPath:
-    """Insert a needle step by step.
+    """Insert a needle step by step (`step_for`); its length is rounded to whole steps.
 
-    Args:
-        shaft: Its length is rounded to whole steps.
-        stiffness: k of the tissue in each step of depth, shape (m,), N/mm^2.
-        alpha: The bevel's angle in each, shape (m,), rad; its sign is the side to which the bevel points.
-        step_mm: Length of a step: see `step_for`.
+    In each of m steps of depth: k of the tissue (m,), N/mm^2, and the bevel's angle alpha (m,), rad, whose sign is the
+    side to which it points.
     """
     count = len(stiffness)
     elements = max(round(shaft.length_mm / step_mm), count)  # the path may be as long as the shaft
@@ -260,10 +220,8 @@ def bevel_path(shaft: Shaft, stiffness: Floats, alpha: Floats, step_mm: float) -
 
 STEEL_GPA = 200.0
 """Young's modulus of the austenitic steels of which needles are drawn: 193 to 200."""
-
 STEEL_N_MM3 = 7.93e-6 * 9.81
 """Weight of such steel by volume: 7.93 g/cm^3."""
-
 FREE_TIP, PINNED_TIP = np.pi**2 / 4, 20.1907
 """Euler's load times L^2 / EI of a clamped column with a free, and with a pinned end: the least root of tan x = x."""
 
@@ -275,26 +233,12 @@ class Gauge(NamedTuple):
     inner_mm: float
 
 
-GAUGES: Mapping[int, Gauge] = MappingProxyType(
-    {
-        10: Gauge(3.404, 2.692),
-        11: Gauge(3.048, 2.388),
-        12: Gauge(2.769, 2.159),
-        13: Gauge(2.413, 1.803),
-        14: Gauge(2.108, 1.600),
-        15: Gauge(1.829, 1.372),
-        16: Gauge(1.651, 1.194),
-        17: Gauge(1.473, 1.067),
-        18: Gauge(1.270, 0.838),
-        19: Gauge(1.067, 0.686),
-        20: Gauge(0.908, 0.603),
-        21: Gauge(0.819, 0.514),
-        22: Gauge(0.718, 0.413),
-        23: Gauge(0.641, 0.337),
-        24: Gauge(0.565, 0.311),
-        25: Gauge(0.514, 0.260),
-    }
-)
+GAUGES: Mapping[int, Gauge] = MappingProxyType({
+    10: Gauge(3.404, 2.692), 11: Gauge(3.048, 2.388), 12: Gauge(2.769, 2.159), 13: Gauge(2.413, 1.803),
+    14: Gauge(2.108, 1.600), 15: Gauge(1.829, 1.372), 16: Gauge(1.651, 1.194), 17: Gauge(1.473, 1.067),
+    18: Gauge(1.270, 0.838), 19: Gauge(1.067, 0.686), 20: Gauge(0.908, 0.603), 21: Gauge(0.819, 0.514),
+    22: Gauge(0.718, 0.413), 23: Gauge(0.641, 0.337), 24: Gauge(0.565, 0.311), 25: Gauge(0.514, 0.260),
+})  # fmt: skip
 """The usual chart of nominal diameters of regular-wall needles."""
 
 
@@ -302,13 +246,10 @@ GAUGES: Mapping[int, Gauge] = MappingProxyType(
 class Shaft:
     """A straight round shaft, clamped at its holder."""
 
-    length_mm: float
-    """From the holder to the tip."""
+    length_mm: float  # from the holder to the tip
     outer_mm: float
-    inner_mm: float = 0.0
-    """Of the bore; 0 for a solid shaft."""
-    modulus_gpa: float = STEEL_GPA
-    """Young's."""
+    inner_mm: float = 0.0  # of the bore; 0 for a solid shaft
+    modulus_gpa: float = STEEL_GPA  # Young's
 
     @property
     def bending_stiffness(self) -> float:
@@ -330,16 +271,11 @@ class Shaft:
 class Tissue:
     """Mechanical properties of one tissue."""
 
-    stiffness_n_mm2: float
-    """k, by which it holds the shaft: force by length of shaft and by deflection."""
-    cutting_n: float = 0.0
-    """Force at the tip while it cuts."""
-    friction_n_mm: float = 0.0
-    """Along the shaft, by length of it inside."""
-    capsule_n: float = 0.0
-    """Force at which its surface ruptures; 0 has none."""
-    capsule_mm: float = 0.0
-    """How far the surface is pushed in by then."""
+    stiffness_n_mm2: float  # k, by which it holds the shaft: force by length of shaft and by deflection
+    cutting_n: float = 0.0  # force at the tip while it cuts
+    friction_n_mm: float = 0.0  # along the shaft, by length of it inside
+    capsule_n: float = 0.0  # force at which its surface ruptures; 0 has none
+    capsule_mm: float = 0.0  # how far the surface is pushed in by then
     held_n_mm: float | None = None
     """Force along the needle that moves it as a whole by 1 mm against the body; None moves nothing."""
 

@@ -32,22 +32,17 @@ class Push(NamedTuple):
     start_mm: float
     end_mm: float
     force_n: float
-    reach_mm: float
-    """Of the capsule, also where the target ends the push before its rupture."""
+    reach_mm: float  # of the capsule, also where the target ends the push before its rupture
 
 
 @dataclass(frozen=True, eq=False)
 class InsertionForce:
     """The force over depth; N and mm."""
 
-    depth_mm: Floats
-    """Shape (n,), of the tip from the skin."""
-    capsule_n: Floats
-    """Shape (n,)."""
-    cutting_n: Floats
-    """Shape (n,)."""
-    friction_n: Floats
-    """Shape (n,)."""
+    depth_mm: Floats  # shape (n,), of the tip from the skin
+    capsule_n: Floats  # shape (n,)
+    cutting_n: Floats  # shape (n,)
+    friction_n: Floats  # shape (n,)
 
     @property
     def total_n(self) -> Floats:
@@ -61,11 +56,7 @@ class InsertionForce:
 
 
 def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> InsertionForce:
-    """The force of a needle that goes through layers at a steady speed.
-
-    Args:
-        layers: From the skin on, each beginning where the one before ends.
-    """
+    """The force of a needle that goes at a steady speed through layers, from the skin on without gaps."""
     end = layers[-1].end_mm if layers else 0.0
     depth = np.linspace(0.0, end, round(end / step_mm) + 1) if end > 0 else np.zeros(1)
     pushes = _pushes(layers, end)
@@ -86,12 +77,9 @@ def insertion_force(layers: Sequence[Layer], step_mm: float = SAMPLE_MM) -> Inse
 class Pushed(NamedTuple):
     """By how much the tissue about the target is pushed on along the needle."""
 
-    depth_mm: Floats
-    """Shape (n,), of the tip from the skin."""
-    shift_mm: Floats
-    """Shape (n,)."""
-    target_mm: float
-    """Depth of the target as planned."""
+    depth_mm: Floats  # shape (n,), of the tip from the skin
+    shift_mm: Floats  # shape (n,)
+    target_mm: float  # depth of the target as planned
 
     def at(self, depth_mm: Floats) -> Floats:
         """The shift at depths, mm."""
@@ -99,14 +87,11 @@ class Pushed(NamedTuple):
 
 
 def pushed(layers: Sequence[Layer], target_mm: float) -> Pushed | None:
-    """The shift of the tissue at a depth, where it says by what the body holds it: F / K.
-
-    F is what the needle does to that tissue alone, capsule, cutting and friction; those of other layers move others.
-    """
+    """The shift of the tissue at a depth, where it says by what the body holds it: F / K."""
     own = next(layer.tissue for layer in layers if target_mm <= layer.end_mm + ROUNDING_MM)
     if own.held_n_mm is None:
         return None
-    # of one tissue, whether or not its surface is passed there
+    # what it does to that tissue alone, whether or not its surface is passed there: other layers move others
     same = [replace(one.tissue, capsule_n=own.capsule_n, capsule_mm=own.capsule_mm) == own for one in layers]
     alone = [one if its else one._replace(tissue=Tissue(0.0)) for one, its in zip(layers, same, strict=True)]
     force = insertion_force(alone)

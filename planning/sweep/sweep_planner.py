@@ -39,15 +39,12 @@ class SweepPlan:
     model: UrModel
     needle_length_mm: float
     standoff_mm: float
-    point_base: Floats
-    """Shape (3,), mm: where the virtual TCP stays, the target."""
-    angles: Floats
-    """Shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less."""
+    point_base: Floats  # shape (3,), mm: where the virtual TCP stays, the target
+    angles: Floats  # shape (k, 2), rad: theta and beta of every direction that is passed, a degree apart or less
     wanted: tuple[float, float]  # theta and beta, rad, where it should have ended
     approach: Trajectory
     sweep: Trajectory
-    stopped: str
-    """Where and why it ends before; empty where it does not."""
+    stopped: str  # where and why it ends before; empty where it does not
 
     def off_point_mm(self, T_base_flange: Floats) -> Floats:
         """Distance of the virtual TCP from its point at flange poses (m, 4, 4), mm, shape (m,)."""
@@ -67,11 +64,9 @@ SWEEP_SPEED_MM_S = 30.0
 def plan_sweep(
     context: CaseContext, start: tuple[float, float], end: tuple[float, float], *, seed: int, progress: Count
 ) -> SweepPlan:
-    """Plan from one direction to another, on the straight line in theta and beta, as far as it is allowed.
+    """Plan from one direction to another, on the straight line in theta and beta, rad, as far as it is allowed.
 
-    Args:
-        start: Theta and beta, rad.
-        end: (theta, beta) of the end; beta takes the shorter arc.
+    Beta takes the shorter arc.
 
     Raises:
         InputError: The case does not say where the robot stands, or both directions are one.
@@ -123,8 +118,7 @@ def _place(angles: Floats) -> str:
 
 
 class _SweepPath(NamedTuple):
-    angles: Floats
-    """Shape (k, 2), rad."""
+    angles: Floats  # shape (k, 2), rad
     standoff_mm: float
     stopped: str
 
@@ -170,7 +164,6 @@ def _followed(
 
 
 def _why_not(checker: CellChecker, before: Floats, q: Floats, step: float) -> str:
-    """Reason that the arm cannot go on to the next direction, in words; empty where it can."""
     if not np.isfinite(step):
         return "the arm cannot reach further, or a joint would exceed its limits"
     if step > MOST_JOINT_STEP:

@@ -82,13 +82,10 @@ class MarkerPlace:
     """Where one marker should be put, LPS mm."""
 
     name: str
-    point_ct: Floats
-    """Shape (3,), on the skin."""
+    point_ct: Floats  # shape (3,), on the skin
     normal_ct: Floats
-    head_mm: float
-    """Toward the head from the target's level, negative toward the feet."""
-    tape: Tape | None
-    """Round the body at that level; None where the image cuts the body's sides."""
+    head_mm: float  # toward the head from the target's level, negative toward the feet
+    tape: Tape | None  # round the body at that level; None where the image cuts the body's sides
 
     def words(self, space: Space) -> str:
         """How to find it on the skin; a space of its own has no anatomy, and is told by coordinates."""
@@ -107,14 +104,11 @@ class Proposal:
     """Places for markers."""
 
     places: tuple[MarkerPlace, ...]
-    expected_mm: float
-    """Error (rms) at the target by reading and touching these markers; of the arm's own nothing."""
-    declared: bool
-    """Whether the case declares the errors, or 1 mm a marker is assumed."""
+    expected_mm: float  # error (rms) at the target by reading and touching these markers; of the arm's own nothing
+    declared: bool  # whether the case declares the errors, or 1 mm a marker is assumed
     arm: str
     near_window_mm: float
-    unmet: tuple[str, ...]
-    """What is wanted of places and is not so here, in words."""
+    unmet: tuple[str, ...]  # what is wanted of places and is not so here, in words
 
 
 class _Skin(NamedTuple):
@@ -135,10 +129,7 @@ def check_count(count: int) -> None:
 
 
 def propose_markers(context: CaseContext, candidates: Candidates, count: int) -> Proposal:
-    """Places for some markers.
-
-    Args:
-        context: With its arm, where the case says where its base is: then the arm can touch every place.
+    """Places for some markers, which the arm can touch if the context has one: the case says where its base is.
 
     Raises:
         InputError: A count out of range.
@@ -308,10 +299,7 @@ def tape_to(skin: Skin, point: Floats, up: Floats) -> Tape | None:
     """A tape round the body at a point (3,), mm, from the middle of the body's upper side.
 
     A tape spans hollows: it is the outline's convex hull in the axial slice. The middle is halfway between the body's
-    sides, which a person sees; of a flat belly none sees the highest point.
-
-    Args:
-        up: Shape (3,), LPS, of any length.
+    sides, which a person sees; of a flat belly none sees the highest point. ``up`` (3,), LPS, is of any length.
     """
     vertices, cut = skin.mesh.vertices, np.zeros(len(skin.mesh.vertices), np.bool_)
     cut[skin.mesh.faces[skin.cut_faces]] = True

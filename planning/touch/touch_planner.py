@@ -59,10 +59,7 @@ MOST_MARKERS = 12
 
 
 def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progress: Count) -> TouchPlan:
-    """Plan to touch every marker that can be touched.
-
-    Args:
-        q_insertion: Shape (6,), rad, the tip on the target: where the error of the touches is to be least.
+    """Plan to touch every marker that can be touched, for an insertion: joints (6,), rad, the tip on the target.
 
     Raises:
         InputError: The case declares no errors, or has no markers, or too many.
@@ -80,12 +77,8 @@ def plan_touches(context: CaseContext, q_insertion: Floats, *, seed: int, progre
         except NoMotionError as none:
             touchable = touchable.without(none.place, task.markers.names[none.place], str(none))
             continue
-        return TouchPlan(
-            **vars(tour),
-            left_out=touchable.left_out,
-            expected_mm=task.expected_mm(chosen),
-            worst_mm=task.expected_mm(worst),
-        )
+        expected_mm, worst_mm = task.expected_mm(chosen), task.expected_mm(worst)
+        return TouchPlan(**vars(tour), left_out=touchable.left_out, expected_mm=expected_mm, worst_mm=worst_mm)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,12 +167,7 @@ def _in_order(context: CaseContext, read: NamedPoints) -> NamedPoints:
 
 
 def registered(context: CaseContext, read: NamedPoints) -> Registration:
-    """The registration by touched markers.
-
-    Args:
-        context: For which markers were touched, and what is declared of them.
-        read: Their names, points (N, 3), mm, and joints (N, 6), rad, in any order.
-    """
+    """The registration by touched markers: names, points (N, 3), mm, and joints (N, 6), rad, in any order."""
     placement, case = context.placement, context.case
     assert placement is not None and placement.registration is not None and case.errors is not None
     found, read = placement.registration.markers, _in_order(context, read)
@@ -210,16 +198,10 @@ def approach_checkers(context: CaseContext, needle_padding_mm: float) -> Approac
     tool = case_tool(context.case)
     short = replace(tool, needle_length_mm=tool.needle_length_mm - TIP_MM, shaft_mm=tool.shaft_mm - TIP_MM)
     case, anatomy, T_base_ct = context.case, context.anatomy, context.reach.T_base_ct
+    model, boxes, skin = case.robot.model, case_boxes(case, T_base_ct), anatomy.skin.mesh.transformed(T_base_ct)
     outside = outside_surface(anatomy)
-    blunted = FastChecker(
-        case.robot.model,
-        short,
-        case_boxes(case, T_base_ct),
-        anatomy.skin.mesh.transformed(T_base_ct),
-        outside=None if outside is None else outside.transformed(T_base_ct),
-        padding_mm=needle_padding_mm,
-        cache=user_cache(),
-    )
+    outside = None if outside is None else outside.transformed(T_base_ct)
+    blunted = FastChecker(model, short, boxes, skin, outside=outside, padding_mm=needle_padding_mm, cache=user_cache())
     return ApproachCheckers(context.reach.checker, blunted)
 
 
@@ -260,8 +242,7 @@ RIDGE = 1e-6
 def plan_pivot(context: CaseContext, count: int, *, place_base: Floats | None, seed: int, progress: Count) -> TouchTour:
     """Plan to set the tip onto one place in several poses, named P1, P2 and so on.
 
-    Args:
-        place_base: Shape (3,), mm, where; None for a place that is found next to the patient.
+    The place (3,), mm, base frame, is found next to the patient where none is given.
 
     Raises:
         InputError: The case has no arm.

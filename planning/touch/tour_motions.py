@@ -65,10 +65,8 @@ class TouchPlan(TouchTour):
     """A planned tour of the markers for a puncture."""
 
     left_out: Mapping[str, str]
-    expected_mm: float
-    """Of the tip at the target when the registration comes from these touches (rms), mm."""
-    worst_mm: float
-    """``expected_mm`` with the worst of the poses that could be taken, mm."""
+    expected_mm: float  # of the tip at the target when the registration comes from these touches (rms), mm
+    worst_mm: float  # ``expected_mm`` with the worst of the poses that could be taken, mm
 
 
 RESOLUTION = 1e-9
@@ -122,12 +120,10 @@ def tour_through(context: CaseContext, stops: Stops, *, seed: int, progress: Cou
 def shortest_tour(cost: ArrayLike) -> tuple[int, ...]:
     """The order of n places of least total cost, by dynamic programming over subsets; of equal ones the first in order.
 
-    Where costs are symmetric, a tour and its reverse cost the same: sums of rounded floats would choose between them.
+    The cost (n + 1, n + 1), symmetric or not, is from row to column, the last of each home. Where it is symmetric, a
+    tour and its reverse cost the same: sums of rounded floats would choose between them.
 
     Source: Held and Karp 1962, "A dynamic programming approach to sequencing problems". 2^n n^2 steps: n to a dozen.
-
-    Args:
-        cost: Shape (n + 1, n + 1), symmetric or not: from row to column; the last row and column are home.
     """
     of = np.rint(np.asarray(cost, dtype=np.float64) / RESOLUTION).astype(np.int64).tolist()
     n = len(of) - 1
@@ -165,11 +161,9 @@ class ApproachCheckers:
 
 
 def line_to(model: UrModel, tip_mm: float, q_touch: Floats, from_mm: float, to_mm: float) -> Floats | None:
-    """Joints along the needle's line through a touch, shape (m, 6), rad; None where the arm cannot follow it.
+    """Joints along the needle's line through a touch (6,), rad; shape (m, 6), rad; None where the arm cannot follow it.
 
-    Args:
-        q_touch: Shape (6,), rad, the tip on the marker.
-        from_mm: Where the tip starts, mm before the marker; negative beyond it.
+    The tip moves between distances before the marker, mm, negative beyond it.
     """
     count = max(2, int(np.ceil(abs(from_mm - to_mm) / STEP_MM)) + 1)
     distances = np.linspace(from_mm, to_mm, count)
@@ -214,15 +208,10 @@ def why_not(checkers: ApproachCheckers, tip_mm: float, q_touch: Floats) -> str:
 def registered_joints(
     model: UrModel, tip_mm: float, q_insertion: Floats, target_ct: Floats, T_base_ct: tuple[Floats, Floats]
 ) -> Floats:
-    """Joints that put the needle as planned in the CT, by a new registration.
+    """Joints (6,), rad, that put the needle as planned in the CT, by a new registration, in the plan's branch.
 
-    Args:
-        q_insertion: Shape (6,), rad, the tip on the target as it was planned.
-        target_ct: Shape (3,), mm.
-        T_base_ct: The belief of that plan and the new one, shape (4, 4) each, mm.
-
-    Returns:
-        Shape (6,), rad, in the branch nearest to the plan's.
+    The plan's are ``q_insertion`` (6,), rad, the tip on the target (3,), mm; T_base_ct are its belief and the new one,
+    (4, 4) each, mm.
 
     Raises:
         NoAnswerError: The arm does not reach there.
@@ -241,10 +230,8 @@ def registered_joints(
 def plan_puncture(context: CaseContext, outward_ct: Floats, q_insertion: Floats, registration: Registration) -> Plan:
     """Plan the puncture along a direction by a new registration, free of contact where that puts the patient.
 
-    Args:
-        context: The case; what it believes of patient and arm is what the touches were planned by.
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        q_insertion: Shape (6,), rad, the tip on the target as the touches were planned for.
+    The context believes of patient and arm what the touches were planned by, for ``q_insertion`` (6,), rad, the tip on
+    the target; ``outward_ct`` (3,), unit, is from there along the needle.
 
     Raises:
         NoAnswerError: The arm does not reach there, or not without contact.

@@ -192,7 +192,7 @@ def test_the_tip_is_off_its_path_as_the_covariance_says(moved, rng):
         def act(self, measured, reference, row):
             action = self._controller.act(measured, reference, row)
             motion = JointMotion(measured.q[None], reference.speed[row][None], reference.acceleration[row][None])
-            return action._replace(torque_nm=action.torque_nm + regressor(UR3, motion, DOWN)[0, :, columns].T @ wrong)
+            return action + regressor(UR3, motion, DOWN)[0, :, columns].T @ wrong
 
     columns = found.base.columns
     with bench() as world:

@@ -62,11 +62,7 @@ def measured() -> tuple[Floats, ...]:
 
 
 def printed_errors(touched: tuple[Floats, ...]) -> dict[str, Floats]:
-    """Every printed error of n experiments, by name, each of shape (n,), mm.
-
-    Args:
-        touched: Of each setup, shape (n, 8, 3), rows as `NAMES`, mm.
-    """
+    """Every printed error of n experiments, by name, (n,), mm, of touches (n, 8, 3) in each setup, rows as `NAMES`."""
     by_triad = list(triad_errors(touched, READ).items())
     residuals = _misses(_fitted(fit_triad, touched[0], READ, "ABC"), touched[0], READ, "ABC")
     found = dict([*by_triad[:2], ("mean residual of A-B-C, setup 1", residuals.mean(axis=1)), *by_triad[2:]])
@@ -199,10 +195,8 @@ class Experiment:
     draws: int
     printed: tuple[DrawnRank, ...]
     joint: tuple[DrawnRank, ...]
-    probability: float
-    """Of a chi-squared as large as the paper's, by the law with 24 degrees."""
-    best_strain: float
-    """Fraction of draws in which some strain takes away as much as the paper's best one does."""
+    probability: float  # of a chi-squared as large as the paper's, by the law with 24 degrees
+    best_strain: float  # fraction of draws in which some strain takes away as much as the paper's best one does
     several: Mapping[str, tuple[float, float]]
     """See `several_triads`: mm by the paper's own points, and rms of the draws."""
 
@@ -296,25 +290,20 @@ def unskewed(points: Floats, k: float) -> Floats:
 TRIPLES = tuple("".join(one) for one in combinations(MARKERS, 3))
 
 
-def several_triads(touched: Floats, read: Floats = READ, lesion: str = "M") -> dict[str, Floats]:
-    """Errors of a lesion by several triads of the markers of the second setup, of n experiments, (n,) each, mm.
-
-    Args:
-        touched: Shape (n, 8, 3), rows as `NAMES`, mm.
-        read: Shape (8, 3), mm, in the CT.
-    """
-    at = read[rows_of(lesion)]
-    poses = np.array([_fitted(fit_triad, touched, read, names) for names in TRIPLES])
-    points, there = poses[..., :3, :3] @ at[0] + poses[..., :3, 3], touched[:, rows_of(lesion)[0]]
+def several_triads(touched: Floats) -> dict[str, Floats]:
+    """Errors of lesion M by several triads of the markers of setup 2, (n,), mm, of touches (n, 8, 3) as `NAMES`."""
+    at = READ[rows_of("M")]
+    poses = np.array([_fitted(fit_triad, touched, READ, names) for names in TRIPLES])
+    points, there = poses[..., :3, :3] @ at[0] + poses[..., :3, 3], touched[:, rows_of("M")[0]]
     off = np.linalg.norm(points - there, axis=2)
-    best, *_, worst = sorted(TRIPLES, key=lambda names: spread_of(read[rows_of(names)], at))
-    every = _fitted(fit_rigid, touched, read, MARKERS)
+    best, *_, worst = sorted(TRIPLES, key=lambda names: spread_of(READ[rows_of(names)], at))
+    every = _fitted(fit_rigid, touched, READ, MARKERS)
     return {
         f"the best-placed triad, {'-'.join(best)}": off[TRIPLES.index(best)],
         f"the worst-placed triad, {'-'.join(worst)}": off[TRIPLES.index(worst)],
         f"one of all {len(TRIPLES)} triads, rms": np.sqrt(np.mean(off**2, axis=0)),
         "mean of the points of all triads": np.linalg.norm(points.mean(axis=0) - there, axis=1),
-        "rigid fit of all five markers": _misses(every, touched, read, lesion)[:, 0],
+        "rigid fit of all five markers": _misses(every, touched, READ, "M")[:, 0],
     }
 
 
@@ -341,8 +330,7 @@ class Declaration:
     slice_mm: float = 0.0
     pixel_mm: float = 0.0
     reading_mm: float = 0.0
-    skew: float = 0.0
-    """Standard deviation of each plane's angle, rad: one draw for the whole CT."""
+    skew: float = 0.0  # standard deviation of each plane's angle, rad: one draw for the whole CT
     touch_mm: float = 0.0
 
     def draw_carton(self, read: Floats, count: int, rng: np.random.Generator) -> Floats:

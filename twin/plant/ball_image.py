@@ -38,17 +38,14 @@ class BallScene:
     rod_radius_mm: float = 1.5
     rod_length_mm: float = 60.0
     light_c: Floats | tuple[float, float, float] = (0.3, -0.8, -0.6)  # shape (3,): toward the light
-    diffuse: float = 0.8
-    """Fraction of the light that comes from everywhere, 0 to 1; directed light obeys Lambert's law."""
+    diffuse: float = 0.8  # fraction of the light that comes from everywhere, 0 to 1; directed light obeys Lambert's law
     ball_grey: float = 200.0
     rod_grey: float = 130.0
     background_grey: float = 60.0
     texture_grey: float = 0.0
     texture_px: float = 3.0
-    hidden_fraction: float = 0.0
-    """Fraction of the ball's disc that an occluder covers, 0 to 1."""
-    hidden_from: float = 0.0
-    """Angle in the tangent plane from which it comes, rad."""
+    hidden_fraction: float = 0.0  # fraction of the ball's disc that an occluder covers, 0 to 1
+    hidden_from: float = 0.0  # angle in the tangent plane from which it comes, rad
     occluder_grey: float = 100.0
     ball: bool = True
     rod: bool = True
@@ -222,12 +219,9 @@ def _lit(grey: float, cosine: Floats, scene: BallScene) -> Floats:
 
 
 def _composite(layers: list[_Layer]) -> tuple[Floats, Floats]:
-    """Light from the bodies, and the fraction of the background that is left, per cell: nearer bodies over farther.
-
-    The occluder is at depth 0. Ball and rod swap where one comes out of the other.
-    """
+    """Light from the bodies, and the fraction of the background that is left, per cell: nearer bodies over farther."""
     depths = np.stack([layer.depth for layer in layers])
-    order = np.argsort(depths, axis=0)
+    order = np.argsort(depths, axis=0)  # of each cell: ball and rod swap where one comes out of the other
     covers = np.take_along_axis(np.stack([layer.cover for layer in layers]), order, axis=0)
     greys = np.take_along_axis(np.stack([layer.grey for layer in layers]), order, axis=0)
     ink, clear = np.zeros_like(depths[0]), np.ones_like(depths[0])

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from puncture_twin.planning.base.arrays import Floats, Pixels
-from puncture_twin.planning.base.errors import refuse
 from puncture_twin.twin.guidance.ultrasound.needle_detector import Imager, NeedleEcho, PointSpread
 
 Complexes = NDArray[np.complexfloating]
@@ -49,8 +48,6 @@ def blurred_speckle(
 
 SAMPLE_MM = 0.2
 """Step along the shaft; not wider than the narrowest point spread's sigma (0.21 mm), so the line has no ripple."""
-UNIT = 1e-6
-"""How far a direction's length may be from 1."""
 
 
 class NeedleInImage(NamedTuple):
@@ -72,7 +69,7 @@ def render(
     imager: Imager, needle: NeedleInImage | None, rng: np.random.Generator, *,
     echo: NeedleEcho | None = None, lesion: Lesion | None = None,
 ) -> Pixels:  # fmt: skip
-    """One B-mode image: grey levels, shape (rows, columns). A needle that is not finite, or not unit, is refused."""
+    """One B-mode image: grey levels, shape (rows, columns)."""
     echo, size = echo or NeedleEcho(), (imager.rows, imager.columns)
     reflectivity = np.ones(size)
     if lesion is not None:
@@ -81,7 +78,6 @@ def render(
         inside = (u[None, :] - x) ** 2 + (v[:, None] - y) ** 2 + z**2 < lesion.radius_mm**2
         reflectivity[inside] = lesion.gain
     if needle is not None:
-        _require_usable(needle)
         reflectivity = reflectivity * _shadow(imager, needle, echo)
     signal = blurred_speckle(imager.rows, imager.columns, imager.pixel_mm, imager.spread, reflectivity, rng)
     if needle is not None:
@@ -156,11 +152,3 @@ def _shadow(imager: Imager, needle: NeedleInImage, echo: NeedleEcho) -> Floats:
     v = imager.pixel_mm * np.arange(imager.rows)
     below = (v[:, None] > depth[None, :]) & under[None, :]
     return np.where(below, kept[None, :], left)
-
-
-def _require_usable(needle: NeedleInImage) -> None:
-    tip, direction = np.asarray(needle.tip_image), np.asarray(needle.direction_image)
-    usable = tip.shape == (3,) and direction.shape == (3,) and bool(np.isfinite([*tip, *direction]).all())
-    if not usable or abs(float(np.linalg.norm(direction)) - 1.0) > UNIT:
-        allowed = "a finite tip (3,) in mm and a unit direction (3,)"
-        refuse(f"needle at {tip.tolist()} along {direction.tolist()}", "B-mode picture", allowed, "not_finite")

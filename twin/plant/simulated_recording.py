@@ -15,16 +15,11 @@ from puncture_twin.twin.guidance.ultrasound.pose_choice import needle_orientatio
 class PoseRanges(NamedTuple):
     """Uniform ranges from which poses are drawn (spec 3, section 4)."""
 
-    tilt: float = float(np.radians(25.0))
-    """Each component of the probe's rotation vector about its mean pose, +- rad."""
-    shift_mm: float = 60.0
-    """Each coordinate of the probe's flange about its mean, +-."""
-    roll: float = float(np.pi)
-    """The needle about its own axis, +- rad."""
-    u_mm: tuple[float, float] = (-25.0, 25.0)
-    """Where the tip lies across the image."""
-    v_mm: tuple[float, float] = (5.0, 65.0)
-    """Where the tip lies in depth."""
+    tilt: float = float(np.radians(25.0))  # each component of the probe's rotation vector about its mean pose, +- rad
+    shift_mm: float = 60.0  # each coordinate of the probe's flange about its mean, +-
+    roll: float = float(np.pi)  # the needle about its own axis, +- rad
+    u_mm: tuple[float, float] = (-25.0, 25.0)  # where the tip lies across the image
+    v_mm: tuple[float, float] = (5.0, 65.0)  # where the tip lies in depth
     insertion: tuple[float, float] = (float(np.radians(20.0)), float(np.radians(75.0)))
     """Angle of the needle in the image, from its u axis, rad."""
     lean: float = 0.0
@@ -45,16 +40,13 @@ USUAL = PoseRanges()
 
 
 class SimulatedTruth(NamedTuple):
-    """What a calibration is to find: T_end1_image X, T_base1_base2 Y, tip (3,), mm, direction (3,), unit, to the tip.
+    """What a calibration is to find."""
 
-    About `A_mean`, T_base1_end1 (4, 4), mm, the probe's poses are drawn.
-    """
-
-    X: Floats
-    Y: Floats
+    X: Floats  # T_end1_image, shape (4, 4), mm
+    Y: Floats  # T_base1_base2, shape (4, 4), mm
     tip_end2: Floats  # shape (3,), mm
     direction_end2: Floats  # shape (3,), unit, toward the tip
-    A_mean: Floats
+    A_mean: Floats  # T_base1_end1, shape (4, 4), mm, about which the probe's poses are drawn
 
 
 class ImagePose(NamedTuple):
@@ -91,11 +83,7 @@ def draw_image_poses(rng: np.random.Generator, n: int, ranges: PoseRanges = USUA
 
 
 def exact_recording(truth: SimulatedTruth, A: Floats, seen: ImagePose) -> Recording:
-    """The recording without noise: B such that the needle shows in the image as wished.
-
-    Args:
-        A: Shape (n, 4, 4).
-    """
+    """The recording without noise, of A (n, 4, 4): B such that the needle shows in the image as wished."""
     n = len(A)
     shown = np.column_stack([np.cos(seen.insertion), np.sin(seen.insertion)])
     along = np.column_stack([shown * np.cos(seen.lean)[:, None], np.sin(seen.lean)])

@@ -95,24 +95,17 @@ class StereoWorkcell:
         """True centre of the ball, shape (..., 3), mm, at true configurations (..., 6), rad."""
         return self._on_flange_c(q_true, self.tool.ball_offset)
 
-    def tip_c(self, q_true: Floats) -> Floats:
-        """True tip of the needle, shape (..., 3), mm, at true configurations (..., 6), rad."""
-        return self._on_flange_c(q_true, self.tool.ball_offset + self.tool.tip_offset)
-
     def _on_flange_c(self, q_true: Floats, offset: Floats) -> Floats:
         flange = self.arm.flange_pose(q_true)
         on_flange = offset + np.array([0.0, 0.0, self.case.file.tool.rod_mm])
         return apply(self.T_c_base, flange[..., :3, 3] + flange[..., :3, :3] @ on_flange)
 
-    def needle_c(self, q_true: Floats) -> Floats:
-        """The needle's true axes as columns, z to the tip, shape (3, 3), C, at a true configuration (6,), rad."""
-        R = self.T_c_base[:3, :3] @ self.arm.flange_pose(q_true)[:3, :3]
-        return np.asarray(R @ exp_rotation(self.tool.lean))
-
     def needle_m(self, q_true: Floats, target: int) -> TrueNeedle:
         """The needle against a target of the case, by its number, at a true configuration (6,), rad."""
+        tip_c = self._on_flange_c(q_true, self.tool.ball_offset + self.tool.tip_offset)
+        R_c_needle = self.T_c_base[:3, :3] @ self.arm.flange_pose(q_true)[:3, :3] @ exp_rotation(self.tool.lean)
         R_m_c = self.T_c_m_after[:3, :3].T
-        return TrueNeedle(R_m_c @ (self.tip_c(q_true) - self.targets_c[target]), R_m_c @ self.needle_c(q_true))
+        return TrueNeedle(R_m_c @ (tip_c - self.targets_c[target]), R_m_c @ R_c_needle)
 
     def rod_c(self, q_true: Floats) -> Floats:
         """Unit direction from the ball along the rod to the flange, shape (3,), C."""
@@ -140,12 +133,9 @@ class StereoPlant(PlantArm):
         operator: np.random.Generator,
     ) -> None:  # fmt: skip
         super().__init__(workcell.arm, arm)
-        self.workcell, self.pictures, self._operator, self._head_there = workcell, pictures, operator, False
+        self.workcell, self.pictures, self._operator = workcell, pictures, operator
+        self.head_there = False  # in the workcell
         self._shown: ShownBall | None = None
-
-    def bring_head(self) -> None:
-        """From here on the head is in the workcell."""
-        self._head_there = True
 
     def show(self, ball: ShownBall | None) -> None:
         """Show a ball in place of the arm's; None shows the arm's again."""
@@ -162,7 +152,7 @@ class StereoPlant(PlantArm):
     def nearest(self, number: int, about_px: Floats) -> ShownBall:
         """Of all that a camera may see, the ball or marker that is nearest to a pixel (2,)."""
         head, balls = self.workcell.case.file.head, [self.ball]
-        if self._head_there:
+        if self.head_there:
             balls += [ShownBall(one, head.marker_diameter_mm / 2, None) for one in self.workcell.markers_c]
         away = [np.linalg.norm(self.workcell.cameras[number].project(one.center_c) - about_px) for one in balls]
         return balls[int(np.argmin(np.nan_to_num(away, nan=np.inf)))]
@@ -171,7 +161,7 @@ class StereoPlant(PlantArm):
         """An image with noise, of the part that holds what is queried and the ball; what the head hides is hidden."""
         camera, plan = self.workcell.cameras[number], self.workcell.case.file.cameras
         ball = self.nearest(number, about_px)
-        hidden = self.workcell.hidden_fraction(camera, ball.center_c, ball.radius_mm) if self._head_there else 0.0
+        hidden = self.workcell.hidden_fraction(camera, ball.center_c, ball.radius_mm) if self.head_there else 0.0
         away = np.abs(camera.project(ball.center_c) - about_px).max()
         radius = camera.ball_radius_px(ball.center_c, ball.radius_mm)
         half = int(np.ceil(np.nan_to_num(away, nan=0.0) + reach_px + 2 * radius)) + WINDOW_MARGIN_PX

@@ -77,12 +77,8 @@ class TrueTissue:
     ) -> None:
         self._force, self._bent, self._entry_base, self._into = insertion.force, insertion.path, entry_base, into_base
         self._side, self._shaft_mm = np.array([np.cos(side), np.sin(side), 0.0]), shaft_mm
-        self._deepest, self._held, self._greatest = 0.0, 0.0, TissueForce(0.0, 0.0)
-
-    @property
-    def greatest(self) -> TissueForce:
-        """The greatest force so far."""
-        return self._greatest
+        self._deepest, self._held = 0.0, 0.0
+        self.greatest = TissueForce(0.0, 0.0)  # so far
 
     def __call__(self, tip: Tip) -> tuple[Push, ...]:
         """Forces of the tissue on the needle now."""
@@ -90,7 +86,7 @@ class TrueTissue:
         depth = float((to_mm(at_m) - self._entry_base) @ self._into)
         along, (at_tip, at_holder) = self._along(depth), self._across(depth)
         across = abs(at_tip + at_holder)
-        self._greatest = TissueForce(max(self._greatest.along_n, along), max(self._greatest.across_n, across))
+        self.greatest = TissueForce(max(self.greatest.along_n, along), max(self.greatest.across_n, across))
         holder_m, side = at_m - to_m(self._shaft_mm) * R[:, 2], R @ self._side
         return Push(at_tip * side - along * self._into, at_m), Push(at_holder * side, holder_m)
 
@@ -101,18 +97,15 @@ class TrueTissue:
         self._deepest = max(self._deepest, depth)
         stretch = float(np.clip(depth - self._held, -SHIFT_MM, SHIFT_MM))
         self._held = depth - stretch
-        capsule, cutting, friction = (
-            float(np.interp(self._deepest, self._force.depth_mm, term))
-            for term in (self._force.capsule_n, self._force.cutting_n, self._force.friction_n)
-        )
+        force = self._force
+        terms = force.capsule_n, force.cutting_n, force.friction_n
+        capsule, cutting, friction = (float(np.interp(self._deepest, force.depth_mm, term)) for term in terms)
         return capsule + friction * stretch / SHIFT_MM + cutting * max(stretch, 0.0) / SHIFT_MM
 
     def _across(self, depth: float) -> tuple[float, float]:
         """Forces to the bevel's side at tip and holder, N: together the force and the moment of the beam."""
-        force, moment = (
-            float(np.interp(max(depth, 0.0), self._bent.depth_mm, term))
-            for term in (self._bent.holder_n, self._bent.holder_n_mm)
-        )
+        inside, bent = max(depth, 0.0), self._bent
+        force, moment = (float(np.interp(inside, bent.depth_mm, term)) for term in (bent.holder_n, bent.holder_n_mm))
         at_tip = moment / self._shaft_mm
         return at_tip, force - at_tip
 
@@ -137,15 +130,12 @@ NO_TISSUE_FORCE = "no force of tissue: the case declares no [tissue]"
 
 @dataclass(frozen=True, eq=False)
 class TouchTruth:
-    """Ground truth of touches, one draw of the declared errors; eta (28,) of the arm's parameters, mm and rad.
-
-    By marker: where the tip comes to on it, its touch noise included, and true joints minus the encoders' there.
-    """
+    """Ground truth of touches, one draw of the declared errors."""
 
     seed: int
     T_base_ct: Floats  # shape (4, 4), mm: true pose of the patient
-    eta: Floats
-    aim_ct: dict[str, Floats]  # marker to shape (3,), mm
+    eta: Floats  # shape (28,), of the arm's parameters, mm and rad
+    aim_ct: dict[str, Floats]  # marker to shape (3,), mm: where the tip comes to on it, its touch noise included
     arrival: dict[str, Floats]  # marker to shape (6,), rad: true joints minus what the encoders say there
 
     def q_contact(self, model: UrModel, tip_mm: float, touch: Touch) -> Floats:
@@ -158,13 +148,7 @@ class TouchTruth:
 def draw_touch_truth(
     T_base_ct: Floats, names: tuple[str, ...], points_ct: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw the true patient, markers and arm of touches.
-
-    Args:
-        T_base_ct: Shape (4, 4), mm: where the patient lies.
-        names: The N markers.
-        points_ct: Shape (N, 3), mm, as read.
-    """
+    """Draw the ground truth of touches of N markers (N, 3), mm, as read, of a patient at T_base_ct (4, 4), mm."""
     rng = np.random.default_rng(seed)
     eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
     values, axes = np.linalg.eigh(errors.marker_cov_ct)
@@ -177,13 +161,7 @@ def draw_touch_truth(
 def draw_pivot_truth(
     T_base_ct: Floats, names: tuple[str, ...], place_base: Floats, errors: ErrorModel, seed: int
 ) -> TouchTruth:
-    """Draw the errors of an arm that sets its tip onto one place n times; the patient lies as believed.
-
-    Args:
-        T_base_ct: Shape (4, 4), mm.
-        names: Of the touches.
-        place_base: Shape (3,), mm.
-    """
+    """Draw the errors of an arm that sets its tip onto one place (3,), mm, n times; the patient lies as believed."""
     rng = np.random.default_rng(seed)
     eta = rng.normal(size=28) * np.sqrt(parameter_variances(errors.arm))
     aim_base = place_base + rng.normal(0.0, errors.touch_mm, (len(names), 3))
@@ -200,12 +178,7 @@ class AtTarget(NamedTuple):
 
 
 def draw_at_target(target_ct: Floats, errors: ErrorModel, seed: int) -> AtTarget:
-    """Draw the arrival: joints drifted since the touches with an error of their own; the target's reading error.
-
-    Args:
-        target_ct: Shape (3,), mm, as read.
-        seed: Of the truth.
-    """
+    """Draw the arrival: joints drifted since the touches with an error of their own; the target's reading error, mm."""
     rng = np.random.default_rng([seed, 2])
     arrival = rng.normal(size=6) * np.hypot(errors.arm.arriving, errors.arm.drift)
     values, axes = np.linalg.eigh(errors.target_cov_ct)

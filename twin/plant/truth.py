@@ -14,7 +14,7 @@ import numpy as np
 
 from puncture_twin.planning.arm.kinematics import ErringArm
 from puncture_twin.planning.arm.ur import UrModel
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ArmErrors
@@ -23,7 +23,7 @@ from puncture_twin.planning.formats.points import NamedPoints, parse_points
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
-from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, MarkerPairs, match
+from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS, match
 
 COLLINEAR = 0.01
 """s2/s1 of the true points below which they leave a rotation free."""
@@ -39,27 +39,20 @@ class Truth:
     since the markers were touched."""
     seed: int
     source: str
-    target_ct: Floats | None = None
-    """Shape (3,), mm: true target in the CT; None where it was read without error."""
+    target_ct: Floats | None = None  # shape (3,), mm: true target in the CT; None where it was read without error
     bevel_side: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("T_base_ct_true", "joint_offsets", *(() if self.target_ct is None else ("target_ct",))):
-            array = np.array(getattr(self, name), dtype=np.float64)
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
 def draw_truth(case: Case, T_base_ct: Floats, *, seed: int | None = None) -> Truth:
     """The truth of a case.
 
     Where the case names a file of true positions, the patient lies where that file says. Otherwise marker errors are
-    drawn such that the belief is a plausible registration of this truth. Without markers belief and truth agree.
-
-    Args:
-        case: The case; its ``[rehearsal]`` table says how large the errors are.
-        T_base_ct: The belief, shape (4, 4), mm.
-        seed: Instead of the case's own.
+    drawn such that T_base_ct (4, 4), mm, the belief, is a plausible registration of this truth. Without markers belief
+    and truth agree. The seed is the case's own where none is given.
 
     Raises:
         InputError: The file of true positions cannot be used.
@@ -88,9 +81,7 @@ def registration_error(
 ) -> Floats:  # fmt: skip
     """E with T_believed = T_true E: one registration of noisy markers, shape (4, 4), mm, CT frame.
 
-    Args:
-        T_base_ct: Shape (4, 4): where they are touched, without error.
-        noise_mm: Standard deviations per axis of a marker in the CT and of a touch.
+    They are touched at T_base_ct (4, 4); the noise, standard deviations per axis, is of a marker in the CT and a touch.
     """
     read_ct = points_ct + rng.normal(0.0, noise_mm[0], points_ct.shape)
     touched_base = apply(T_base_ct, points_ct) + rng.normal(0.0, noise_mm[1], points_ct.shape)
@@ -106,44 +97,33 @@ def _drawn(case: Case, registration: MarkerSection, T_base_ct: Floats, rng: np.r
     return np.asarray(T_base_ct @ np.linalg.inv(error))
 
 
-def pose_of_true_points(points: MarkerPairs, target_name: str, *, where: str = "rehearsal.truth_base") -> Floats:
-    """Pose of the patient whose true points these are, from the points of the CT.
-
-    The rotation is the rigid least-squares fit of all points. Where the target is among them, the translation puts
-    it exactly on its true place: what the twin measures is the distance from there.
-
-    Args:
-        points: Markers and target by name, in the CT and at their true positions in the base frame.
-
-    Returns:
-        T_base_ct, shape (4, 4), mm.
-    """
-    allowed = "3 or more points, named as the markers and the target, not on a line"
-    named = ", ".join(points.names) or "none"
-    if len(points) < MIN_MARKERS:
-        refuse(f"names shared with the CT: {named}", where, allowed, "too_few_points")
-    for side in (points.points_ct, points.points_base):
-        spread = np.linalg.svd(side - side.mean(axis=0), compute_uv=False)
-        if spread[1] <= COLLINEAR * spread[0]:
-            refuse(f"{named} are on a line", where, allowed, "points_collinear")
-    T = np.array(fit_rigid(points.points_ct, points.points_base))
-    if target_name in points.names:
-        row = points.names.index(target_name)
-        T[:3, 3] = points.points_base[row] - T[:3, :3] @ points.points_ct[row]
-    return T
-
-
 def _from_file(case: Case, name: str) -> Floats:
+    """T_base_ct, shape (4, 4), mm, of the patient whose true points a file states: the rigid least-squares fit of all.
+
+    Where the target is among them, the translation puts it exactly on its true place: what the twin measures is the
+    distance from there.
+    """
     true_base = read_points(case, name, None)
     in_ct = {case.target_name: case.target_ct}
     if case.registration is not None:
         markers = read_points(case, case.registration.markers_ct, case.space)
         in_ct = dict(zip(markers.names, markers.points, strict=True)) | in_ct
     rows = [row for row, point in enumerate(true_base.names) if point in in_ct]
-    names = tuple(true_base.names[row] for row in rows)
+    names, points_base = [true_base.names[row] for row in rows], true_base.points[rows]
     points_ct = np.array([in_ct[point] for point in names]).reshape(-1, 3)
-    pairs = MarkerPairs(names, points_ct, true_base.points[rows])
-    return pose_of_true_points(pairs, case.target_name, where=f"{case.path}: rehearsal.truth_base")
+    where, named = f"{case.path}: rehearsal.truth_base", ", ".join(names) or "none"
+    allowed = "3 or more points, named as the markers and the target, not on a line"
+    if len(names) < MIN_MARKERS:
+        refuse(f"names shared with the CT: {named}", where, allowed, "too_few_points")
+    for side in (points_ct, points_base):
+        spread = np.linalg.svd(side - side.mean(axis=0), compute_uv=False)
+        if spread[1] <= COLLINEAR * spread[0]:
+            refuse(f"{named} are on a line", where, allowed, "points_collinear")
+    T = np.array(fit_rigid(points_ct, points_base))
+    if case.target_name in names:
+        row = names.index(case.target_name)
+        T[:3, 3] = points_base[row] - T[:3, :3] @ points_ct[row]
+    return T
 
 
 def read_points(case: Case, name: str, space: Space | None) -> NamedPoints:
@@ -209,12 +189,9 @@ class PlantArm:
 
 
 def draw_true_arm(nominal: UrModel, errors: ArmErrors, rng: np.random.Generator) -> TrueArm:
-    """An arm whose errors are drawn from their standard deviations.
-
-    The offset d2 along axis 2 is not drawn with d3: the axes are parallel, and both move the arm alike.
-    """
+    """An arm whose errors are drawn from their standard deviations."""
     d_errors = rng.normal(0.0, errors.link_mm, 6)
-    d_errors[1] = 0.0
+    d_errors[1] = 0.0  # d2 along axis 2: its axis is parallel to d3's, and both move the arm alike
     a, alpha = np.array(nominal.a) + rng.normal(0.0, errors.link_mm, 6), np.array(nominal.alpha)
     alpha = alpha + rng.normal(0.0, errors.twist, 6)
     true = ErringArm(a, np.array(nominal.d) + d_errors, alpha, rng.normal(0.0, errors.joint, 6))

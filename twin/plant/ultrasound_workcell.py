@@ -47,16 +47,9 @@ def jog_into_slice(
     """Move the needle's arm until the true needle is in the true image as wanted.
 
     It stands for the operator, or a servo on the image, that jogs until the needle shows: what is left is in
-    ``wanted``. The commands follow from the nominal kinematics, corrected by what the true arm did before.
-
-    Args:
-        q_probe: Where the probe's joints rest, shape (6,), rad.
-        q_needle: Where the needle's arm begins, shape (6,), rad.
-        wanted: The needle in the image, after the jog.
-        roll: About the needle, rad.
-
-    Returns:
-        What the arm is commanded, shape (6,), rad; NaN where no configuration reaches it.
+    ``wanted``. The probe's joints (6,), rad, rest, the needle's arm begins at ``q_needle`` (6,); roll, rad, is about
+    the needle. Returns what the arm is commanded, (6,), rad, by the nominal kinematics, corrected by what the true arm
+    did before; NaN where no configuration reaches it.
     """
     nominal = truth.needle_arm.nominal
     T_base2_image = (np.linalg.inv(truth.Y) @ truth.image_pose(q_probe))[None]
@@ -108,10 +101,8 @@ class UltrasoundPlant:
 def draw_workcell(case: SelfcalCase, rng: np.random.Generator) -> WorkcellTruth:
     """A workcell whose differences from the drawing are drawn from the case's standard deviations."""
     content, off = case.content, case.content.truth
-    arms = [
-        draw_true_arm(model, arm.errors, rng)
-        for model, arm in zip(case.models, (content.probe_arm, content.needle_arm), strict=True)
-    ]
+    declared = content.probe_arm, content.needle_arm
+    arms = [draw_true_arm(model, arm.errors, rng) for model, arm in zip(case.models, declared, strict=True)]
     X, Y = (_shifted(T, off.mount_mm, np.radians(off.mount_deg), rng) for T in (case.T_end1_image, case.T_base1_base2))
     V = np.array([0.0, 0.0, 1.0])
     tip = case.tip_end2 + [*rng.normal(0.0, off.tip_mm, 2), rng.normal(0.0, off.length_mm)]

@@ -51,20 +51,16 @@ ALLOWED = "a case with [errors] and markers: trials are drawn from them"
 
 
 class Stepwise(NamedTuple):
-    """What control scans on the way in gave and cost, a trial on average; their open loop has the same patients.
-
-    `passes` are the corrections that were executed, `correction_mm` the rms of each step's, of trials not stopped. Dose
-    and seconds are those of the scans, to when the needle goes on; `moving_s` are those of approach and insertion.
-    """
+    """What control scans on the way in gave and cost, a trial on average; their open loop has the same patients."""
 
     steps: int
-    passes: float
-    correction_mm: tuple[float | None, ...]
+    passes: float  # corrections that were executed
+    correction_mm: tuple[float | None, ...]  # rms of each step's, of trials not stopped
     scans: float
-    dose_msv: float
-    seconds: float
+    dose_msv: float  # of the scans
+    seconds: float  # of the scans, to when the needle goes on
     open_loop: Distribution
-    moving_s: float = 0.0
+    moving_s: float = 0.0  # of approach and insertion
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -84,23 +80,19 @@ class Distribution:
     """n trials of one puncture in which the arm reached the pose; mm."""
 
     seed: int
-    unreached: int
-    """Further trials, whose registration put the pose out of the arm's reach; `stopped` by the corridor."""
+    unreached: int  # further trials, whose registration put the pose out of the arm's reach; `stopped` by the corridor
     puncture: Puncture
     trials: Trials
     cov_ct: Floats  # shape (3, 3), predicted of it, mm^2
     in_region: Bools  # shape (n,), whether it lies in the predicted 95 % ellipsoid, about the mean where one is known
     hit: Bools  # shape (n,)
-    p_hit: float
-    """Predicted; of a guided needle that it is not stopped, and hits."""
+    p_hit: float  # predicted; of a guided needle that it is not stopped, and hits
     structures: tuple[str, ...]
     touched: Bools  # shape (n, k)
     p_touch: Floats  # shape (k,), predicted
-    wrong_belief: bool
-    """Whether the truth was drawn from other errors than the belief declares, on purpose."""
+    wrong_belief: bool  # whether the truth was drawn from other errors than the belief declares, on purpose
     budget: ErrorBudget
-    guessed_touches: bool
-    """Whether it is not stated how the arm touched the markers, so that a posture was assumed."""
+    guessed_touches: bool  # whether it is not stated how the arm touched the markers, so that a posture was assumed
     not_modelled: str
     physics: Mapping[str, Any] | None = None
     """What `physics_trials` says of some of the trials in the simulator, if any."""
@@ -182,18 +174,13 @@ def rehearse_trials(
     context: CaseContext, outward_ct: Floats, q_insertion: Floats, count: int, seed: int,
     guidance: str | None = None, sight: Sight | None = None, steps: int | None = None,
 ) -> Distribution:  # fmt: skip
-    """Rehearse one direction in many trials, each with a truth of its own.
+    """Rehearse one direction in many trials, one at least, each with a truth of its own.
 
-    Args:
-        context: Of a case with declared errors and markers.
-        outward_ct: Shape (3,), unit, from the target along the needle.
-        q_insertion: Shape (6,), rad, the tip on the target.
-        count: Trials, at least 1.
-        guidance: One of `WAYS`, in bodies that move as the case declares: every way has the same patients by a seed.
-            None is by registration, in bodies at rest. Devices that the case does not declare are assumed.
-        sight: What its devices see of the insertion; None hides nothing.
-        steps: Of ct: after each of so many equal ones, the last at the target, a control scan is read and the needle
-            corrected.
+    The case declares errors and markers. The direction (3,), unit, is from the target along the needle; joints (6,),
+    rad, have the tip on the target. Guidance is one of `WAYS`, in bodies that move as the case declares: every way has
+    the same patients by a seed; None is by registration, in bodies at rest. Devices that the case does not declare are
+    assumed; sight is what they see of the insertion, None hides nothing. Of ct with steps: after each of so many equal
+    ones, the last at the target, a control scan is read and the needle corrected.
 
     Raises:
         InputError: The case declares no errors, has no markers, or the way is unknown, or has no steps.
@@ -280,11 +267,7 @@ def _query(context: CaseContext, outward_ct: Floats, q_insertion: Floats) -> _Qu
 
 
 def bend_along(context: CaseContext, outward_ct: Floats) -> Bend | None:
-    """Deflection along one direction, if the bevel never rotates; None for a straight needle.
-
-    Args:
-        outward_ct: Shape (3,), unit, from the target along the needle.
-    """
+    """Deflection along one direction (3,), unit, outward, if the bevel never rotates; None for a straight needle."""
     path = bent_path(context.case, context.anatomy, outward_ct)
     return None if path is None else path.bend
 

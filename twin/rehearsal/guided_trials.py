@@ -25,7 +25,7 @@ from puncture_twin.planning.uncertainty.guided import (
     ball_name,
     marker_name,
 )
-from puncture_twin.twin.plant.room_devices import RoomCameras, RoomProbe, RoomScanner
+from puncture_twin.twin.plant.trial_devices import TrialCameras, TrialProbe, TrialScanner
 from puncture_twin.twin.plant.true_needle import TrueNeedle, true_needle
 from puncture_twin.twin.rehearsal.trials import (
     Puncture,
@@ -54,15 +54,12 @@ class Way:
 
 
 class GuidedTrials(NamedTuple):
-    """Trials, which of them were stopped: shape (n,), and how far from its plan each believes to be: (n, 3), mm.
-
-    ``moved_mm``, shape (n, corrections): how far each correction moved the needle; NaN where it was not executed.
-    """
+    """Trials under one way of guidance."""
 
     trials: Trials
-    stopped: Bools
-    aside_base: Floats
-    moved_mm: Floats
+    stopped: Bools  # shape (n,)
+    aside_base: Floats  # shape (n, 3), mm, how far from its plan each believes to be
+    moved_mm: Floats  # shape (n, corrections), by each correction; NaN where it was not executed
 
 
 def guided_trials(
@@ -75,7 +72,7 @@ def guided_trials(
         return GuidedTrials(open_loop(puncture, truths), *none)
     T_base_ct = registered(puncture, truths)
     turned = T_base_ct[:, :3, :3] @ model.error.fit.R_base_ct.T  # the gain is of the nominal patient's axes
-    room = _Room.of(puncture, truths, model, T_base_ct, rng)
+    devices = _Devices.of(puncture, truths, model, T_base_ct, rng)
     drift = _drift(errors, truths.arrival, rng)
     moved, aside, moves = np.zeros((count, 3)), np.zeros((count, 3)), list[Floats]()
     stopped, reached = np.zeros(count, bool), np.ones(count, bool)
@@ -84,14 +81,13 @@ def guided_trials(
         q, there = commanded(puncture, T_base_ct, moved, look.out_mm, look.q)
         arrival = rng.normal(size=(count, 6)) * errors.arm.arriving
         needle = true_needle(puncture.model, q + drift + arrival, truths.eta, puncture.tip_mm)
-        found |= room.look(look, number, q, needle)
+        found |= devices.look(look, number, q, needle)
         reached &= there
         if (known := model.guided(way.name, number)) is not None:
             z = np.hstack([found[one.name, one.look] for one in model.readings if one.look <= number])
             z = (z.reshape(count, -1, 3) @ turned).reshape(count, -1)
-            wanted, off = (
-                np.einsum("nab,nb->na", turned, z @ rows[:, : z.shape[1]].T) for rows in (known.gain[:3], known.aside)
-            )
+            rows = known.gain[:3, : z.shape[1]], known.aside[:, : z.shape[1]]
+            wanted, off = (np.einsum("nab,nb->na", turned, z @ some.T) for some in rows)
             stopped |= np.linalg.norm(off, axis=1) > way.corridor_mm
             moves.append(np.where(stopped, np.nan, np.linalg.norm(wanted - moved, axis=1)))
             moved, aside = np.where(stopped[:, None], (moved, aside), (wanted, off))
@@ -111,26 +107,26 @@ def _drift(errors: ErrorModel, last: Floats, rng: np.random.Generator) -> Floats
 
 
 @dataclass(frozen=True, eq=False)
-class _Room:
+class _Devices:
     puncture: Puncture
     truths: Truths
     model: GuidedModel
     T_base_ct: Floats
-    cameras: RoomCameras | None
-    probe: RoomProbe | None
-    scanner: RoomScanner | None
+    cameras: TrialCameras | None
+    probe: TrialProbe | None
+    scanner: TrialScanner | None
 
     @classmethod
     def of(
         cls, puncture: Puncture, truths: Truths, model: GuidedModel, T_base_ct: Floats, rng: np.random.Generator
-    ) -> _Room:
+    ) -> _Devices:
         count, cameras, probe, scanner = len(truths.eta), None, None, None
         if model.stereo is not None:
-            cameras = RoomCameras.placed(model.stereo, count, rng)
+            cameras = TrialCameras.placed(model.stereo, count, rng)
         if model.ultrasound is not None and model.across is not None:
-            probe = RoomProbe.placed(model.ultrasound, model.across, count, rng)
+            probe = TrialProbe.placed(model.ultrasound, model.across, count, rng)
         if model.scan is not None:
-            scanner = RoomScanner.placed(model.scan, model.error.errors, puncture.T_base_ct, count, rng)
+            scanner = TrialScanner.placed(model.scan, model.error.errors, puncture.T_base_ct, count, rng)
         return cls(puncture, truths, model, T_base_ct, cameras, probe, scanner)
 
     def look(self, look: Look, number: int, q: Floats, needle: TrueNeedle) -> Readings:

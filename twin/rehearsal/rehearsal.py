@@ -29,10 +29,10 @@ from puncture_twin.planning.sweep.sweep_planner import SweepPlan
 from puncture_twin.twin.guidance.ct.needle import needle_error
 from puncture_twin.twin.plant.true_needle import TissueForce, TrueTissue
 from puncture_twin.twin.plant.truth import Truth
-from puncture_twin.twin.rehearsal.result import Rehearsal, RehearsalContact
+from puncture_twin.twin.rehearsal.result import Rehearsal
 from puncture_twin.twin.world.client import TIME_STEP_S
-from puncture_twin.twin.world.control import Insertion, insert
-from puncture_twin.twin.world.execution import Execution, execute, joined
+from puncture_twin.twin.world.control import insert, rigid_model
+from puncture_twin.twin.world.execution import ContactEvent, Execution, execute, joined
 from puncture_twin.twin.world.workcell import open_workcell
 
 CLEARANCE_SAMPLES = 48
@@ -108,25 +108,25 @@ def _clearances(
 
 def _contacts(
     case: Case, anatomy: Anatomy, truth: Truth, done: Execution, phase: NDArray[np.str_]
-) -> tuple[RehearsalContact, ...]:
+) -> tuple[ContactEvent, ...]:
     """Contacts by the physics at every step, and by FCL at every record, arm and patient at their true poses.
 
     Two sources, because each misses some: the physics lets the needle pass the skin and the arm pass itself, and
     simplifies large skins; FCL gives only the first contact of a record.
     """
-    contacts = [RehearsalContact(*one) for one in done.touches]
+    contacts = list(done.touches)
     checker = case_checker(case, anatomy, truth.T_base_ct_true)
     inside = (phase == "insertion") | (phase == "hold")
     for time, q, may_touch in zip(done.times_s.tolist(), done.q + truth.joint_offsets, inside.tolist(), strict=True):
         hit = checker.contact(q, needle_may_touch_patient=may_touch)
         if hit is not None:
-            contacts.append(RehearsalContact(time, hit.body, hit.other, float("nan")))
-    pairs: dict[tuple[str, str], RehearsalContact] = {}  # each with its first time, and its greatest depth
+            contacts.append(ContactEvent(time, hit.body, hit.other, float("nan")))
+    pairs: dict[tuple[str, str], ContactEvent] = {}  # each with its first time, and its greatest depth
     for contact in contacts:
         key = (contact.link, contact.body)
         old = pairs.get(key, contact)
         depth = float(np.fmax(old.depth_mm, contact.depth_mm))
-        pairs[key] = RehearsalContact(min(old.time_s, contact.time_s), *key, depth)
+        pairs[key] = ContactEvent(min(old.time_s, contact.time_s), *key, depth)
     return tuple(sorted(pairs.values(), key=lambda contact: (contact.time_s, contact.link, contact.body)))
 
 
@@ -149,10 +149,10 @@ def _executed(
     boxes, start_s = case_boxes(case, T_base_ct), TIME_STEP_S * len(before)
     with open_workcell(model, tool, anatomy.skin.mesh, T_base_ct, boxes, down_ct=down_ct) as workcell:
         approached = execute(workcell, before, joint_offsets)
-        insertion = Insertion(model, tool, T_base_ct[:3, :3] @ down_ct, motion, hold_s)
-        control = case.rehearsal.control
-        inserted = insert(workcell, insertion, control, joint_offsets, start_s=start_s, resistance=tissue)
-    return joined(approached, inserted.execution), inserted.off_path_mm
+        with rigid_model(model, tool, T_base_ct[:3, :3] @ down_ct) as rigid:
+            how = case.rehearsal.control, joint_offsets, hold_s, start_s, tissue
+            inserted, off_path_mm = insert(workcell, rigid, motion, *how)
+    return joined(approached, inserted), off_path_mm
 
 
 def steps(trajectory: Trajectory) -> Floats:
@@ -189,13 +189,7 @@ class Swept:
 
 
 def execute_sweep(plan: SweepPlan, case: Case, anatomy: Anatomy, T_base_ct: Floats) -> Swept:
-    """Execute a sweep in the believed workcell: what is measured is control, by `[rehearsal] control` of the case.
-
-    Args:
-        plan: The motion.
-        case: For tool, boxes, gravity and control.
-        T_base_ct: Shape (4, 4), mm: where the patient lies.
-    """
+    """Execute a sweep, the patient at T_base_ct (4, 4), mm, as believed: what is measured is the case's control."""
     done, _ = _executed(case, anatomy, T_base_ct, plan, plan.sweep, SETTLE_S, np.zeros(6))
     begun_s = TIME_STEP_S * (len(steps(plan.approach)) + SETTLE_STEPS - ROUNDING)
     sweeping = done.times_s >= begun_s

@@ -15,6 +15,7 @@ from puncture_twin.twin.plant.true_needle import NO_TISSUE_FORCE, TissueForce
 
 if TYPE_CHECKING:
     from puncture_twin.twin.rehearsal.distribution import Distribution
+    from puncture_twin.twin.world.execution import ContactEvent
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,7 @@ class ErrorRank:
     """Percentile of a rehearsal's tip error among trials, or in the predicted distribution."""
 
     percentile: float
-    trials: int = 0
-    """So many trials were drawn, and this is the median one; 0 where the percentile is the prediction's."""
+    trials: int = 0  # so many trials were drawn, and this is the median one; 0 where the percentile is the prediction's
 
     @property
     def place(self) -> str:
@@ -65,16 +65,6 @@ CONTROLS = MappingProxyType(
 """How an insertion is followed, in words."""
 
 
-@dataclass(frozen=True)
-class RehearsalContact:
-    """A body of the arm that touched something; the depth is NaN where only FCL saw it."""
-
-    time_s: float
-    link: str
-    body: str
-    depth_mm: float
-
-
 @dataclass(frozen=True, eq=False)
 class Rehearsal(Shown):
     """Measurements of a rehearsal; m records in time, k samples of clearance. Angles in rad, lengths in mm."""
@@ -91,23 +81,19 @@ class Rehearsal(Shown):
     clearance_times_s: Floats  # shape (k,), moments of the insertion and its end
     clearance_mm: MappingProxyType[str, Floats]
     """Structure to shape (k,): true needle's axis to true structure, minus the needle's radius."""
-    contacts: tuple[RehearsalContact, ...]
+    contacts: tuple[ContactEvent, ...]
     max_joint_speed: Floats  # shape (6,), rad/s
     speed_limits: Floats  # shape (6,), rad/s
-    tip_error_mm: float
-    """True tip to true target at the end; `depth_mm` along the needle, positive when too deep."""
+    tip_error_mm: float  # true tip to true target at the end; `depth_mm` along the needle, positive when too deep
     lateral_mm: float
     depth_mm: float
     predicted_error_mm: float
     target_true_ct: Floats  # shape (3,), true target in the CT
-    truth_is_belief: bool
-    """Whether the patient lay exactly where it was believed, so that the error says little."""
+    truth_is_belief: bool  # whether the patient lay exactly where it was believed, so that the error says little
     control: str
-    off_path_mm: float
-    """The tip from its commanded path, by the encoders, at most from the insertion on."""
+    off_path_mm: float  # the tip from its commanded path, by the encoders, at most from the insertion on
     tissue_force: TissueForce | None
-    standing: ErrorRank | None = None
-    """Where the error stands among others; None where the case declares no errors."""
+    standing: ErrorRank | None = None  # where the error stands among others; None where the case declares no errors
     distribution: Distribution | None = None
 
     @brief

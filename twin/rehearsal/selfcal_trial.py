@@ -35,16 +35,13 @@ LESION_MM = 4.0
 
 
 class Puncture(NamedTuple):
-    """Prediction and ground truth of one puncture; target (3,), mm, and needle in the true image.
-
-    Predicted (rms) is the error of calibration and arms; a click is the reading's deviation per axis of the image.
-    """
+    """Prediction and ground truth of one puncture."""
 
     candidate: int
     target_image: Floats  # true target in the true image, shape (3,), mm; it lies in the plane, for it is seen
-    needle: NeedleInImage
-    predicted_mm: float
-    click_mm: float
+    needle: NeedleInImage  # in the true image
+    predicted_mm: float  # error (rms) of calibration and arms
+    click_mm: float  # the reading's deviation per axis of the image
 
     @property
     def error_image(self) -> Floats:

@@ -17,10 +17,10 @@ from puncture_twin.planning.base.progress import Count, uncounted
 from puncture_twin.planning.collision.state_checker import StateChecker
 from puncture_twin.planning.geometry.rigid import apply, log_rotation
 from puncture_twin.twin.devices import Arm
-from puncture_twin.twin.guidance.stereo.ball import Detector, image_detector, in_space, look_at, searches_of
+from puncture_twin.twin.guidance.stereo.ball import Detector, image_detector, in_space, look_at
 from puncture_twin.twin.guidance.stereo.joint_model import REGION, NeedleError
 from puncture_twin.twin.guidance.stereo.servo_case import ServoCase, carried_rod, grid_points, workcell_checker
-from puncture_twin.twin.guidance.stereo.servo_law import Lost, Mapping, Servoed, ServoStop
+from puncture_twin.twin.guidance.stereo.servo_law import Lost, Mapping, Servoed, ServoStop, servo
 from puncture_twin.twin.guidance.stereo.session import (
     Aims,
     Guide,
@@ -45,23 +45,20 @@ LEAST_VARIANCE = 1e-12
 class NeedleOutcome(NamedTuple):
     """Prediction and truth of one needle; mm and degrees; no hit and no chance of one where the case states no radius.
 
-    The offset is what is known of the error: the tip believed, to the target. The half axes are those of the 95 %
-    ellipsoid about that tip, longest first, which is the region; predicted is the rms angle to where the needle is
-    believed to point. Both squares are errors about what is believed, in deviations: chi-squared of 3 for the tip, of 6
-    with the rotation.
+    Squares are of errors about what is believed, in deviations.
     """
 
     predicted_rms_mm: float
-    offset_mm: float
-    half_axes_mm: tuple[float, float, float]
+    offset_mm: float  # what is known of the error: the tip believed, to the target
+    half_axes_mm: tuple[float, float, float]  # of the 95 % ellipsoid about that tip, longest first: the region
     lateral_mm: float
     depth_mm: float
-    predicted_direction_deg: float
+    predicted_direction_deg: float  # rms angle to where the needle is believed to point
     p_hit: float | None
     realised_mm: float
     realised_direction_deg: float
-    square: float
-    square_of_pose: float
+    square: float  # chi-squared of 3, for the tip
+    square_of_pose: float  # chi-squared of 6, with the rotation
     hit: bool | None
     in_region: bool
 
@@ -95,15 +92,11 @@ class TargetRow(NamedTuple):
 
     seed: int
     target: str
-    mapping_mm: float
-    """Estimated target to true target."""
-    expected_tre_mm: float
-    """Of the mapping (rms)."""
-    before_mm: float
-    """Where the robot alone brought it; the whole distance if it could not start."""
+    mapping_mm: float  # estimated target to true target
+    expected_tre_mm: float  # of the mapping (rms)
+    before_mm: float  # where the robot alone brought it; the whole distance if it could not start
     after_mm: float
-    servo_only_mm: float
-    """True ball to estimated target at the end: what the servo answers for."""
+    servo_only_mm: float  # true ball to estimated target at the end: what the servo answers for
     steps: int
     stop: str
     needle_open_loop: NeedleOutcome | None = None
@@ -127,20 +120,16 @@ class DeclarationTest(NamedTuple):
 
 
 class ServoTrial(NamedTuple):
-    """One seed; without targets where the session failed as a whole, and was refused.
-
-    The stereo is tried at points of the calibrated volume; the robot's residual against C is the mean after the rigid
-    fit; there is no test of the declaration where the joint estimate does not settle.
-    """
+    """One seed; without targets where the session failed as a whole, and was refused."""
 
     seed: int
-    stereo_mm: tuple[float, ...] = ()
+    stereo_mm: tuple[float, ...] = ()  # at points of the calibrated volume
     calibration_rms_px: tuple[float, ...] = ()
     fre_mm: float = float("nan")
-    robot_residual_mm: float = float("nan")
+    robot_residual_mm: float = float("nan")  # against C, mean after the rigid fit
     targets: tuple[TargetRow, ...] = ()
     refused: str | None = None
-    declaration: DeclarationTest | None = None
+    declaration: DeclarationTest | None = None  # none where the joint estimate does not settle
 
 
 class Reached(NamedTuple):
@@ -173,9 +162,8 @@ def run_session(
         NoAnswerError: The calibration, the mapping or a start pose could not be done; says what blocked it.
     """
     # One generator for each part: one part's draws do not shift another's.
-    of_workcell, of_pictures, of_arm, of_image, of_tests = map(
-        np.random.default_rng, np.random.SeedSequence(seed).spawn(5)
-    )
+    spawned = np.random.SeedSequence(seed).spawn(5)
+    of_workcell, of_pictures, of_arm, of_image, of_tests = map(np.random.default_rng, spawned)
     workcell = draw_workcell(case, of_workcell)
     plant = StereoPlant(workcell, of_pictures, of_arm, of_tests)
     recorder = None if record is None else Recorder(plant, record)
@@ -188,9 +176,10 @@ def run_session(
     listed, sd = (case.markers.points, case.targets.points), (case.truth_errors.marker_mm, case.truth_errors.target_mm)
     read = (points + of_image.normal(0.0, mm, points.shape) for points, mm in zip(listed, sd, strict=True))
     reading = ImageReading(*read)  # as somebody reads them in the CT
-    plant.bring_head()
-    mapping, guide = map_markers(case, calibration, detector, devices, reading)
-    aims, reached = aims_of(case, calibration, mapping, reading.targets_m, targets), []
+    plant.head_there = True
+    guide = map_markers(case, calibration, detector, devices, reading)
+    mapping, reached = guide.mapping, []
+    aims = aims_of(case, calibration, mapping, reading.targets_m, targets)
     for row, number in enumerate(aims.numbers):
         devices.move_jp(aims.q_hover[row])
         guide.aim_at(reading.targets_m[number])
@@ -215,14 +204,14 @@ def _try_stereo(
 ) -> Floats:
     """Error of the stereo at points anywhere in the calibrated volume, shape (10,), mm."""
     case, errors = plant.workcell.case, []
+    limits, radius_mm = case.file.servo, case.file.tool.ball_diameter_mm / 2
     T_c_base = np.asarray(np.linalg.inv(calibration.T_base_c), dtype=np.float64)
     grid = grid_points(case)
     rod_c = -T_c_base[:3, :3] @ carried_rod(case).R_base_flange[:, 2]
     for point in rng.uniform(grid.min(axis=0), grid.max(axis=0), (TEST_POINTS, 3)):
-        ball = ShownBall(apply(plant.workcell.T_c_base, point), case.file.tool.ball_diameter_mm / 2, rod_c)
+        ball, predicted = ShownBall(apply(plant.workcell.T_c_base, point), radius_mm, rod_c), apply(T_c_base, point)
         plant.show(ball)
-        searches = searches_of(case, calibration.cameras, apply(T_c_base, point))
-        detections = look_at(detector, searches, case.file.servo.frames)
+        detections = look_at(detector, calibration.cameras, predicted, radius_mm, limits.search_px, limits.frames)
         if isinstance(detections, Lost):
             raise NoAnswerError(f"stereo test: {detections.reason}", code="marker_not_seen")
         errors.append(np.linalg.norm(in_space(calibration.cameras, detections).points_c[0] - ball.center_c))
@@ -241,12 +230,11 @@ def _reach(plant: StereoPlant, arm: Arm, guide: Guide, aims: Aims, row: int, see
             calibrated = float(np.linalg.norm(workcell.ball_c(q) - true_target))
     before = float(np.linalg.norm(workcell.ball_c(plant.rests[-1]) - true_target))
     if done is None:
-        done = aims.correct(row, guide, arm)
+        done = servo(aims.task, aims.q_aim[row], guide.look, arm)
         seen = _outcome(plant, guide.needle_seen(), number) if done.ended_in_sight else None
     ball, estimated = workcell.ball_c(plant.rests[-1]), guide.target_c
-    mapping, after, only = (
-        float(np.linalg.norm(a - b)) for a, b in ((estimated, true_target), (ball, true_target), (ball, estimated))
-    )
+    pairs = (estimated, true_target), (ball, true_target), (ball, estimated)
+    mapping, after, only = (float(np.linalg.norm(a - b)) for a, b in pairs)
     name, expected = workcell.case.targets.names[number], float(aims.expected_tre_mm[row])
     errors = mapping, expected, before, after, only
     found = TargetRow(seed, name, *errors, done.steps, str(done.stop), unseen, seen, calibrated)

@@ -37,15 +37,12 @@ from puncture_twin.twin.plant.true_needle import TrueNeedle, joints_at_points, t
 
 @dataclass(frozen=True, eq=False)
 class Puncture:
-    """Common part of all trials: the belief, and the commands that follow from it, the tip on the target.
-
-    `noise` weighs the method ``weighted``; `aim` is the insertion for which the method ``joint`` corrects every pose.
-    """
+    """Common part of all trials: the belief, and the commands that follow from it, the tip on the target."""
 
     model: UrModel
     tip_mm: float
     method: str
-    noise: ReadingNoise
+    noise: ReadingNoise  # weighs the method ``weighted``
     points_ct: Floats  # shape (N, 3), mm, the markers
     q_touch: Floats  # shape (N, 6), rad, how the arm touches them
     T_base_ct: Floats  # shape (4, 4), mm: where the patient lies
@@ -53,23 +50,19 @@ class Puncture:
     outward_ct: Floats  # shape (3,), unit, from the target along the needle
     q_insertion: Floats  # shape (6,), rad, the tip on the target
     bend: Bend | None = None
-    aim: Aim | None = None
+    aim: Aim | None = None  # for which the method ``joint`` corrects every pose
     push: Pushed | None = None
 
 
 class Trials(NamedTuple):
-    """Results of n trials; CT frame, mm; outward (n, 3) is away from the tip, R_ct_needle (n, 3, 3) has z to it.
-
-    T_base_ct (n, 4, 4) is what each registered, chi-squared that of its weighted residuals. Body, breath and needle
-    have moved the target by the last three, (n, 3); positions are relative to it.
-    """
+    """Results of n trials; CT frame, mm; positions are relative to what body, breath and needle have moved."""
 
     tip_ct: Floats  # shape (n, 3), where the tip ended
     outward_ct: Floats  # shape (n, 3), unit, from there along the needle
     target_ct: Floats  # shape (n, 3), true target
-    T_base_ct: Floats
+    T_base_ct: Floats  # shape (n, 4, 4), as each registered
     reached: Bools  # shape (n,), whether the arm could reach the pose that followed
-    R_ct_needle: Floats
+    R_ct_needle: Floats  # shape (n, 3, 3), z to the tip
     chi_squared: Floats  # shape (n,), of the weighted residuals of each trial's markers against the believed noise
     bevel_side: Floats  # shape (n,), rad, whereto the bevel points about the needle's z; 0 where it has none
     motion_ct: Floats  # shape (n, 3), by how much the body about the target has moved since the scan
@@ -90,16 +83,12 @@ class Moving(NamedTuple):
 
 
 class Truths(NamedTuple):
-    """Ground truth of n trials before the needle goes in, the same for every way of guidance; CT frame, mm, rad.
-
-    The arm's errors (n, 28); N markers as the CT shows them and as they are touched, (n, N, 3); `arrival` (n, 6) are
-    true joints less the encoders', drift since the touches included.
-    """
+    """Ground truth of n trials before the needle goes in, the same for every way of guidance; CT frame, mm, rad."""
 
     eta: Floats  # shape (n, 28), the arm's errors
     read_ct: Floats  # shape (n, N, 3), what the CT shows of the markers
     touched_base: Floats  # shape (n, N, 3), what the touches read
-    arrival: Floats
+    arrival: Floats  # shape (n, 6), true joints less the encoders', drift since the touches included
     target_ct: Floats
     side: Floats
     motion_ct: Floats
@@ -147,13 +136,7 @@ def open_loop(puncture: Puncture, truths: Truths) -> Trials:
 
 
 def ended(puncture: Puncture, truths: Truths, T_base_ct: Floats, needle: TrueNeedle, reached: Bools) -> Trials:
-    """Trials whose straight needles ended so.
-
-    Args:
-        T_base_ct: Shape (n, 4, 4), as registered.
-        needle: Of each trial; it bends if the puncture's does.
-        reached: Shape (n,), whether the arm could reach what was commanded.
-    """
+    """Trials registered at T_base_ct (n, 4, 4) whose straight needles ended so; each bends if the puncture's does."""
     T_ct_base = np.linalg.inv(puncture.T_base_ct)
     if puncture.bend is not None:
         needle = bent(needle, puncture.bend, truths.side)
@@ -232,11 +215,8 @@ def commanded(
 ) -> tuple[Floats, Bools]:  # fmt: skip
     """The joints (n, 6) that the nominal arm takes to the target, in the planned branch and roll, and whether.
 
-    Args:
-        T_base_ct: Shape (n, 4, 4), as registered.
-        moved_base: Shape (n, 3), mm: by how much the needle is corrected.
-        out_mm: How far before the target.
-        q_near: Shape (6,), rad, as planned there; None at the target.
+    By T_base_ct (n, 4, 4), as registered; the needle is corrected by ``moved_base`` (n, 3), mm, and ends so far before
+    the target, near joints (6,), rad, that were planned there.
     """
     q_near = puncture.q_insertion if q_near is None else q_near
     R_ct_flange = puncture.T_base_ct[:3, :3].T @ flange_pose(puncture.model, puncture.q_insertion)[:3, :3]

@@ -37,10 +37,7 @@ NO_WEIGHT = ET.fromstring(
 
 
 def write_arm_urdf(model: UrModel, tool: Tool, folder: Path) -> Path:
-    """Write the arm with holder and needle as a URDF that PyBullet can load, and its collision pieces next to it.
-
-    The collision bodies are the planner's own: convex pieces that contain each link.
-    """
+    """Write the arm with holder and needle as a URDF that PyBullet can load, and its collision pieces next to it."""
     urdf = model_urdf(model)
     robot, flange = ET.fromstring(urdf.text), urdf.chain.flange
     what = "it states no mass and inertia above 0, without which nothing can be simulated"
@@ -205,10 +202,7 @@ class Arm:
 
 
 def load_arm(client: int, model: UrModel, tool: Tool, T_world_base: Floats | None = None) -> Arm:
-    """Load the arm with holder and needle, its base fixed.
-
-    Args:
-        T_world_base: Pose of the controller's base, shape (4, 4), mm; None for the world's origin.
+    """Load the arm with holder and needle, its base fixed: the controller's at T_world_base (4, 4), mm, or the origin.
 
     Raises:
         InputError: There is no body of that model.

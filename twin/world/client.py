@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,10 +28,8 @@ STANDARD_GRAVITY_MM_S2 = 9806.65
 def physics_client(down: NDArray[np.float64] | None = None) -> Iterator[int]:
     """Open a DIRECT client (no window), yield its id, and disconnect it whatever happens.
 
-    Bodies, contacts and solver run in a fixed order, so the same calls give the same numbers.
-
-    Args:
-        down: Shape (3,), unit vector of gravity in the world frame; None for -z.
+    Bodies, contacts and solver run in a fixed order, so the same calls give the same numbers. ``down`` (3,) is the unit
+    vector of gravity in the world frame; None for -z.
 
     Raises:
         ConnectionError: PyBullet has no client left.
@@ -48,11 +46,6 @@ def physics_client(down: NDArray[np.float64] | None = None) -> Iterator[int]:
         yield client
     finally:
         pybullet.disconnect(physicsClientId=client)
-
-
-def set_time_step(client: int, seconds: float) -> None:
-    """Change how long a step is: motors are tuned for `TIME_STEP_S`, torques need shorter ones."""
-    pybullet.setPhysicsEngineParameter(fixedTimeStep=seconds, physicsClientId=client)
 
 
 def step(client: int) -> None:
@@ -80,13 +73,6 @@ pybullet: Any = _imported()
 MM_PER_M = 1000.0
 
 
-class PoseM(NamedTuple):
-    """A pose as PyBullet takes it: x, y, z in m, and a quaternion x, y, z, w."""
-
-    position_m: list[float]
-    quaternion: list[float]
-
-
 def to_m(length_mm: ArrayLike) -> Floats:
     """Lengths or points, any shape, mm to m.
 
@@ -101,10 +87,10 @@ def to_mm(length_m: ArrayLike) -> Floats:
     return np.asarray(length_m, dtype=np.float64) * MM_PER_M
 
 
-def pose_to_m(T_a_b: Floats) -> PoseM:
-    """A rigid pose, shape (4, 4), mm, as position in m and quaternion."""
+def pose_to_m(T_a_b: Floats) -> tuple[list[float], list[float]]:
+    """A rigid pose, shape (4, 4), mm, as PyBullet takes it: x, y, z in m, and a quaternion x, y, z, w."""
     quaternion = Rotation.from_matrix(T_a_b[:3, :3]).as_quat()
-    return PoseM(to_m(T_a_b[:3, 3]).tolist(), quaternion.tolist())
+    return to_m(T_a_b[:3, 3]).tolist(), quaternion.tolist()
 
 
 def pose_to_mm(position_m: Sequence[float], quaternion: Sequence[float]) -> Floats:

@@ -37,16 +37,7 @@ from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import skew
 from puncture_twin.planning.motion.trajectory import Trajectory
 from puncture_twin.twin.world.arm import Arm, load_arm
-from puncture_twin.twin.world.client import (
-    MM_PER_M,
-    TIME_STEP_S,
-    physics_client,
-    pybullet,
-    set_time_step,
-    step,
-    to_m,
-    to_mm,
-)
+from puncture_twin.twin.world.client import MM_PER_M, TIME_STEP_S, physics_client, pybullet, step, to_mm
 from puncture_twin.twin.world.execution import RECORD_S, Execution, Recorder, contact_force
 from puncture_twin.twin.world.workcell import SimulatedWorkcell
 
@@ -54,46 +45,25 @@ TipControl = Literal["impedance", "admittance", "position"]
 """A spring at the tip by joint torques, or by moved goals of the position motors; or those motors alone."""
 
 
-@dataclass(frozen=True, eq=False)
-class Insertion:
-    """A straight motion of the tip."""
-
-    model: UrModel
-    tool: Tool
-    down_base: Floats  # shape (3,), unit vector of gravity, base frame
-    trajectory: Trajectory
-    hold_s: float
-
-
-class Inserted(NamedTuple):
-    """Records of an insertion, and the tip's largest deviation from the reference by the encoders, mm."""
-
-    execution: Execution
-    off_path_mm: float
-
-
 def insert(
-    workcell: SimulatedWorkcell, insertion: Insertion, control: TipControl, joint_offsets: Floats, *,
-    start_s: float = 0.0, resistance: Resistance | None = None,
-) -> Inserted:  # fmt: skip
-    """Run an insertion from where the arm is.
+    workcell: SimulatedWorkcell, rigid: RigidModel, trajectory: Trajectory, control: TipControl, joint_offsets: Floats,
+    hold_s: float, start_s: float, resistance: Resistance | None,
+) -> tuple[Execution, float]:  # fmt: skip
+    """Run a straight motion of the tip from its start, where the arm is at rest, and hold its end.
 
-    Args:
-        workcell: An open workcell, its arm at rest at the trajectory's start.
-        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
-        resistance: Of tissue; None for none.
+    The true joints are the encoders' plus the offsets (6,), rad. Returns its records, and the tip's largest deviation
+    from the reference by the encoders, mm.
 
     Raises:
         InputError: No time step carries the stiffness at some pose of the path.
     """
-    model, tip_m = insertion.model, float(to_m(insertion.tool.needle_length_mm))
-    with rigid_model(model, insertion.tool, insertion.down_base) as rigid:
-        controller = _controller(rigid, control, insertion.trajectory.q)
-        reference = reference_of(model, tip_m, insertion.trajectory, controller.dt, insertion.hold_s)
-        recorder = Recorder(workcell, reference.q, joint_offsets, controller.dt, start_s)
-        done = run(workcell.arm, controller, reference, joint_offsets, resistance=resistance, watch=recorder.see)
+    model, tip_m = rigid.kinematics, rigid.tip_m
+    controller = _controller(rigid, control, trajectory.q)
+    reference = reference_of(model, tip_m, trajectory, controller.dt, hold_s)
+    recorder = Recorder(workcell, reference.q, joint_offsets, controller.dt, start_s)
+    done = run(workcell.arm, controller, reference, joint_offsets, resistance=resistance, watch=recorder.see)
     off_m = np.linalg.norm(tips(model, tip_m, done.q).position_m - reference.position_m, axis=1)
-    return Inserted(recorder.execution(), float(to_mm(off_m.max())))
+    return recorder.execution(), float(to_mm(off_m.max()))
 
 
 def _controller(rigid: RigidModel, control: TipControl, q_path: Floats) -> Controller:
@@ -156,8 +126,8 @@ class Impedance:
         self.dt, self._model, self._stiffness, self._keep_compliance = dt, model, stiffness, keep_compliance
         self._integral, self._D, self._steps = np.zeros(6), np.zeros((6, 6)), 0
 
-    def act(self, measured: Measured, reference: Reference, row: int) -> Torques:
-        """Torques for the next step; a stiffness that would diverge at this pose is refused."""
+    def act(self, measured: Measured, reference: Reference, row: int) -> Floats:
+        """Torques (6,), N m, for the next step; a stiffness that would diverge at this pose is refused."""
         tip = tips(self._model.kinematics, self._model.tip_m, measured.q[None])
         J = tip.J[0]
         if self._steps % REFRESH_STEPS == 0:
@@ -172,7 +142,7 @@ class Impedance:
         spring = self._stiffness.diagonal * (error + self._stiffness.integral_per_s * self._integral)
         wrench = spring + self._D @ (reference.twist[row] - J @ measured.speed)  # damps what differs from the motion
         feedforward = self._model.inverse_dynamics(measured.q, measured.speed, reference.acceleration[row])
-        return Torques(feedforward + J.T @ wrench)
+        return np.asarray(feedforward + J.T @ wrench)
 
 
 def rotation_error(R_reference: Floats, R: Floats) -> Floats:
@@ -239,13 +209,7 @@ def allowed_step(stiffness: Stiffness, J: Floats, M: Floats) -> float:
 
 
 def refuse_unstable(stiffness: Stiffness, J: Floats, M: Floats, dt: float) -> None:
-    """Refuse a stiffness that this time step cannot carry at this pose.
-
-    Args:
-        J: Jacobian of the tip, shape (6, 6).
-        M: Mass matrix of the joints, shape (6, 6).
-        dt: Time step, s.
-    """
+    """Refuse a stiffness that a time step, s, cannot carry at a pose: Jacobian of the tip and joint masses, (6, 6)."""
     ratio = stability_ratio(stiffness, J, M, dt)
     if not ratio < MOST_RATIO:
         what = f"a stiffness of {stiffness.translation_n_m:g} N/m at steps of {1e3 * dt:g} ms would diverge"
@@ -287,17 +251,11 @@ class Tip(NamedTuple):
 
     position_m: Floats  # shape (n, 3)
     R_base_tip: Floats  # shape (n, 3, 3), the flange's axes; z points along the needle to its tip
-    J: Floats
-    """Shape (n, 6, 6): tip velocity (m/s), then angular velocity (rad/s), from joint speeds (rad/s)."""
+    J: Floats  # shape (n, 6, 6): tip velocity (m/s), then angular velocity (rad/s), from joint speeds (rad/s)
 
 
 def tips(model: UrModel, tip_m: float, q: Floats) -> Tip:
-    """The tip and its Jacobian.
-
-    Args:
-        tip_m: Flange to tip, along the flange's z.
-        q: Shape (n, 6), rad.
-    """
+    """The tip, so far from the flange along its z, and its Jacobian, at joints (n, 6), rad."""
     frames, J = np.empty((len(q), 7, 4, 4)), np.empty((len(q), 6, 6))
     link_frames(model.lengths, np.array(q, order="C"), frames)
     jacobians(frames, J)
@@ -319,12 +277,6 @@ class Measured(NamedTuple):
     force_n: Floats  # shape (3,), of contact at the tip, base frame
 
 
-class Torques(NamedTuple):
-    """Joint torques (6,), N m, for the next step, the motors off."""
-
-    torque_nm: Floats  # shape (6,)
-
-
 class Goals(NamedTuple):
     """Goals of the position motors: encoders (6,), rad, and rad/s."""
 
@@ -337,8 +289,8 @@ class Controller(Protocol):
 
     dt: float
 
-    def act(self, measured: Measured, reference: Reference, row: int) -> Torques | Goals:
-        """Torques or goals for the next step."""
+    def act(self, measured: Measured, reference: Reference, row: int) -> Floats | Goals:
+        """Joint torques (6,), N m, for the next step, the motors off, or goals of these."""
 
 
 class Push(NamedTuple):
@@ -371,7 +323,7 @@ def run(
     resistance: Resistance | None = None, stop: Stop | None = None, watch: Callable[[int], None] | None = None,
 ) -> Run:  # fmt: skip
     """Follow a reference from where the arm is, by the controller's step; ``watch`` is called after each row's step."""
-    set_time_step(arm.client, controller.dt)
+    pybullet.setPhysicsEngineParameter(fixedTimeStep=controller.dt, physicsClientId=arm.client)
     arm.release()  # motors that hold on would work against torques; goals switch them on again
     q, places, forces = [], [], []
     for row in range(len(reference.q)):
@@ -388,10 +340,10 @@ def run(
         if stop is not None and stop(measured):
             break
         action = controller.act(measured, reference, row)
-        if isinstance(action, Torques):
-            arm.torque(action.torque_nm)
-        else:
+        if isinstance(action, Goals):
             arm.command(action.q + joint_offsets, action.speed)  # encoders to true joints
+        else:
+            arm.torque(action)
         step(arm.client)
         if watch is not None:
             watch(row)
@@ -435,8 +387,7 @@ class RigidModel:
 def rigid_model(model: UrModel, tool: Tool, down_base: Floats) -> Iterator[RigidModel]:
     """Open the model of an arm, and close it again.
 
-    Args:
-        down_base: Shape (3,), unit vector of gravity in the controller's base frame: any mount is a direction.
+    ``down_base`` (3,) is the unit vector of gravity in the controller's base frame: any mount is a direction.
 
     Raises:
         InputError: There is no body of that arm.
@@ -445,4 +396,4 @@ def rigid_model(model: UrModel, tool: Tool, down_base: Floats) -> Iterator[Rigid
     with physics_client(down=T_base_root[:3, :3].T @ down_base) as client:
         # T_world_urdf = T_world_base T_base_urdf = identity
         arm = load_arm(client, model, tool, np.asarray(np.linalg.inv(T_base_root), np.float64))
-        yield RigidModel(model, tool.needle_length_mm / 1000.0, arm)
+        yield RigidModel(model, tool.needle_length_mm / MM_PER_M, arm)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,8 +15,9 @@ RECORD_S = 4 * TIME_STEP_S
 """Between two records: 60 a second."""
 
 
-class Touch(NamedTuple):
-    """The deepest contact of a link of the arm with a body of the workcell, at one physics step."""
+@dataclass(frozen=True)
+class ContactEvent:
+    """The deepest contact of a link of the arm with a body of the workcell, at one time; NaN where only FCL saw it."""
 
     time_s: float
     link: str
@@ -33,7 +33,7 @@ class Execution:
     q_command: Floats  # shape (m, 6), rad, commanded joints
     q: Floats
     T_base_flange: Floats  # shape (m, 4, 4), mm, true pose of the flange
-    touches: tuple[Touch, ...]
+    touches: tuple[ContactEvent, ...]
     max_speed: Floats  # shape (6,), rad/s, over every step
 
 
@@ -43,20 +43,20 @@ class Recorder:
     def __init__(
         self, workcell: SimulatedWorkcell, q_command: Floats, joint_offsets: Floats, dt: float, start_s: float = 0.0
     ) -> None:
-        self._room, self._q_command, self._joint_offsets = workcell, q_command, joint_offsets
+        self._workcell, self._q_command, self._joint_offsets = workcell, q_command, joint_offsets
         self._dt, self._start_s, self._every = dt, start_s, round(RECORD_S / dt)
         self._rows, self._q, self._poses = list[int](), list[Floats](), list[Floats]()
-        self._touches, self._max_speed = list[Touch](), np.zeros(6)
+        self._touches, self._max_speed = list[ContactEvent](), np.zeros(6)
 
     def see(self, row: int) -> None:
         """Record after the step of a row."""
-        state = self._room.arm.state()
+        state = self._workcell.arm.state()
         self._max_speed = np.maximum(self._max_speed, np.abs(state.speed))
-        self._touches += touches(self._room, self._time(row))
+        self._touches += touches(self._workcell, self._time(row))
         if row % self._every == 0 or row == len(self._q_command) - 1:
             self._rows.append(row)
             self._q.append(state.q - self._joint_offsets)
-            self._poses.append(self._room.arm.flange_pose())
+            self._poses.append(self._workcell.arm.flange_pose())
 
     def execution(self) -> Execution:
         """The records so far."""
@@ -71,9 +71,7 @@ class Recorder:
 def execute(workcell: SimulatedWorkcell, q_command: Floats, joint_offsets: Floats) -> Execution:
     """Move the arm by its position motors from rest at the first command through all of them, one a physics step.
 
-    Args:
-        q_command: Shape (n, 6), rad, spaced by the physics time step.
-        joint_offsets: Shape (6,), rad: true joint angle minus what the encoder says.
+    Commands (n, 6), rad, are spaced by it; offsets (6,), rad, are true joint angles minus the encoders'.
     """
     arm, recorder = workcell.arm, Recorder(workcell, q_command, joint_offsets, TIME_STEP_S)
     speeds = np.gradient(q_command, TIME_STEP_S, axis=0) if len(q_command) > 1 else np.zeros_like(q_command)
@@ -92,7 +90,7 @@ def joined(first: Execution, then: Execution) -> Execution:
     return Execution(times, command, q, T, first.touches + then.touches, np.maximum(first.max_speed, then.max_speed))
 
 
-def touches(workcell: SimulatedWorkcell, time_s: float = 0.0) -> tuple[Touch, ...]:
+def touches(workcell: SimulatedWorkcell, time_s: float = 0.0) -> tuple[ContactEvent, ...]:
     """Contacts of the last physics step with bodies that have a name (pads of markers have none), in order.
 
     At most one for each link and body. Bullet takes the arm's links as the convex hulls of their meshes.
@@ -103,7 +101,7 @@ def touches(workcell: SimulatedWorkcell, time_s: float = 0.0) -> tuple[Touch, ..
         if distance_m <= 0 and other in workcell.bodies:
             deepest[link, other] = max(deepest.get((link, other), 0.0), -float(to_mm(distance_m)))
     found = sorted(deepest.items())
-    return tuple(Touch(time_s, arm.link_name(link), workcell.bodies[other], mm) for (link, other), mm in found)
+    return tuple(ContactEvent(time_s, arm.link_name(link), workcell.bodies[other], mm) for (link, other), mm in found)
 
 
 def contact_force(arm: Arm, link: str) -> Floats:

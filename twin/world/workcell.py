@@ -37,13 +37,8 @@ def open_workcell(
 ) -> Iterator[SimulatedWorkcell]:
     """Build the workcell, yield it, and take it down.
 
-    The needle's shaft passes the skin without resistance; its holder and the arm collide with it.
-
-    Args:
-        model: A UR3, UR5 or UR10.
-        skin: The patient's surface, CT frame, mm.
-        T_base_ct: Where the patient lies, shape (4, 4), mm.
-        down_ct: Unit vector of gravity in the CT frame, shape (3,).
+    The needle's shaft passes the skin without resistance; its holder and the arm collide with it. The skin is in the CT
+    frame, mm; T_base_ct (4, 4), mm: where the patient lies; ``down_ct`` (3,): unit vector of gravity.
 
     Raises:
         InputError: There is no body of that arm.
@@ -51,7 +46,7 @@ def open_workcell(
     with physics_client(down=T_base_ct[:3, :3] @ down_ct) as client:
         arm = load_arm(client, model, tool)
         patient = load_surface(client, skin, T_base_ct)
-        let_pass(client, arm.body, arm.links["needle"], patient)
+        pybullet.setCollisionFilterPair(arm.body, patient, arm.links["needle"], -1, 0, physicsClientId=client)
         names = {patient: PATIENT}
         for box in boxes:
             names[load_box(client, np.asarray(box.size_mm), box.T_base_box)] = box.name
@@ -110,11 +105,6 @@ def soften(client: int, body: int, stiffness_n_m: float) -> None:
     pybullet.changeDynamics(body, -1, **soft, physicsClientId=client)
 
 
-def let_pass(client: int, body: int, link: int, other: int) -> None:
-    """Let one link go through another body (its base) without contact: the needle through the skin."""
-    pybullet.setCollisionFilterPair(body, other, link, -1, 0, physicsClientId=client)
-
-
 def thinned(mesh: TriangleMesh, max_faces: int = MAX_PHYSICS_FACES) -> TriangleMesh:
     """The mesh itself where it is small, else a decimated one of about ``max_faces`` triangles."""
     if len(mesh.faces) <= max_faces:
@@ -134,11 +124,8 @@ def pinhole_picture(
 ) -> NDArray[np.uint8]:
     """An image of the workcell by a calibrated camera, without its lens's distortion, (height, width, 3), RGB.
 
-    For looking at, not for measuring: the renderer samples pixel corners and has no anti-aliasing.
-
-    Args:
-        K: Intrinsic matrix, shape (3, 3), px; pixel centres at integers.
-        T_camera_world: Shape (4, 4), mm; the camera's x right, y down, z forward.
+    For looking at, not for measuring: the renderer samples pixel corners and has no anti-aliasing. K (3, 3), px, has
+    pixel centres at integers; T_camera_world (4, 4), mm: the camera's x right, y down, z forward.
     """
     width, height = size
     left, right = -(K[0, 2] + 0.5) / K[0, 0], (width - 0.5 - K[0, 2]) / K[0, 0]

@@ -21,8 +21,8 @@ from puncture_twin.planning.uncertainty.guided import WAYS
 from puncture_twin.planning.uncertainty.hit import hit_in_ball
 from puncture_twin.planning.uncertainty.pose_error import Bend
 from puncture_twin.twin.jobs.patient.run import room_count
-from puncture_twin.twin.plant import room_devices
-from puncture_twin.twin.plant.room_devices import RoomCameras
+from puncture_twin.twin.plant import trial_devices
+from puncture_twin.twin.plant.trial_devices import TrialCameras
 from puncture_twin.twin.plant.true_needle import true_needle
 from puncture_twin.twin.rehearsal import distribution, guided_trials as guiding, trials
 from puncture_twin.twin.rehearsal.distribution import rehearse_trials
@@ -164,8 +164,8 @@ def test_what_is_predicted_happens_in_another_plant(insertion, way, monkeypatch)
     """Within 5 %: there no error is normal, and those of the cameras differ by direction."""
     for module in (guiding, trials):
         monkeypatch.setattr(module, "true_needle", needle_by_screws)
-    monkeypatch.setattr(guiding, "RoomCameras", PinholePair)
-    monkeypatch.setattr(guiding, "RoomProbe", PicturingProbe)
+    monkeypatch.setattr(guiding, "TrialCameras", PinholePair)
+    monkeypatch.setattr(guiding, "TrialProbe", PicturingProbe)
     query = distribution._query(*insertion)
     one, moving = distribution._way(insertion[0], query, way)
     found = led(query, one, 3000, moving, (1, 2), Uniform).trials
@@ -189,13 +189,13 @@ def test_a_hidden_marker_has_no_say(insertion, monkeypatch):
     way, moving = distribution._way(context, query, "stereo")
     hidden = {f"marker {name}": "the arm is before it" for name in way.model.markers[:2]}
     model = replace(way.model, looks=tuple(look._replace(hidden={**look.hidden, **hidden}) for look in way.model.looks))
-    read = RoomCameras.read
+    read = TrialCameras.read
 
     def ended():
         return led(query, replace(way, model=replace(model)), 50, moving).trials.tip_ct
 
     seen = ended()
-    monkeypatch.setattr(RoomCameras, "read", lambda self, points: read(self, points) + far(points))
+    monkeypatch.setattr(TrialCameras, "read", lambda self, points: read(self, points) + far(points))
     np.testing.assert_array_equal(ended(), seen)
 
 
@@ -419,7 +419,7 @@ def test_scans_leave_their_readings_error_alone(scanned, monkeypatch, steps):
     errors = context.case.errors
     alike = replace(errors, arm=replace(errors.arm, repeatability=0.0))
     context = replace(context, case=replace(context.case, errors=alike))
-    for module in (guided, room_devices):
+    for module in (guided, trial_devices):
         monkeypatch.setattr(module, "scan_roots", lambda scan, errors: (1e-3 * np.eye(3), 1e-3 * np.eye(3)))
     found = rehearse_trials(context, outward, q, 200, 3, "ct", steps=steps)
     if steps == 1:

@@ -19,7 +19,7 @@ from puncture_twin.twin.guidance.stereo.servo_case import (
     planned_cameras,
     workcell_checker,
 )
-from puncture_twin.twin.guidance.stereo.servo_law import configurations, path_contact, path_upward
+from puncture_twin.twin.guidance.stereo.servo_law import configurations, path_contact
 from puncture_twin.twin.plant.stereo_workcell import StereoWorkcell, draw_workcell
 from tools.phantoms.head import FLOOR_MM, MARKERS_MM, RIM_MM, head_field, head_targets
 
@@ -95,9 +95,8 @@ def test_the_arm_reaches_everything_without_a_contact(case):
     rod, T = carried_rod(case), head_pose(case)
     calibrated = configurations(rod, grid_points(case), workcell_checker(case, None)).branch
     targets, checker = apply(T, case.targets.points), workcell_checker(case, T)
-    q = configurations(
-        rod, np.concatenate([targets, path_upward(rod, targets, case.file.servo.hover_mm)]), checker, first=calibrated
-    ).q
+    hovers = targets - case.file.servo.hover_mm * rod.R_base_flange[:, 2]
+    q = configurations(rod, np.concatenate([targets, hovers]), checker, first=calibrated).q
     for aim, hover in zip(q[:16], q[16:], strict=True):
         assert path_contact(checker, np.stack([hover, aim])) is None
         assert not arm_hides_ball(workcell, aim)

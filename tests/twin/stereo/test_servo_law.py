@@ -15,12 +15,12 @@ from puncture_twin.planning.collision.state_checker import Contact, FirstContact
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.fits import fit_rigid, fit_triad
 from puncture_twin.planning.registration.residuals import leverage
+from puncture_twin.twin.guidance.stereo.camera_calibration import Points
 from puncture_twin.twin.guidance.stereo.servo_law import (
     MIN_SIGMA,
     CarriedRod,
     Lost,
     Seen,
-    SeenMarkers,
     ServoStop,
     StepLimits,
     Task,
@@ -301,21 +301,21 @@ T_TRUE[:3, 3] = [12.0, -40.0, 900.0]
 
 def seen(covariances, rng):
     errors = np.array([rng.multivariate_normal(np.zeros(3), cov) for cov in covariances])
-    return SeenMarkers(apply(T_TRUE, MARKERS) + errors, np.asarray(covariances))
+    return Points(apply(T_TRUE, MARKERS) + errors, np.asarray(covariances))
 
 
 def test_equal_round_errors_give_the_plain_fit():
     """Then it is the rigid least squares of the planner, and Fitzpatrick's expected error; of three markers a triad."""
     rng = np.random.default_rng(1)
     markers = seen(np.tile(0.04 * np.eye(3), (5, 1, 1)), rng)
-    found = map_head(NAMES, markers, MARKERS, 0.0, TARGETS)
+    found = map_head(NAMES, markers, MARKERS, 0.0, TARGETS, "mapping")
     assert found.T_c_m == pytest.approx(fit_rigid(MARKERS, markers.points_c), abs=1e-8)
     expected = np.sqrt(3 * 0.04) * leverage(MARKERS, TARGETS)
     assert found.expected_tre_mm(TARGETS) == pytest.approx(expected, rel=0.01)
     alone, with_own = found.expected_tre_mm(TARGETS), found.expected_tre_mm(TARGETS, 0.2)
     assert with_own**2 - alone**2 == pytest.approx(3 * 0.2**2)
-    three = SeenMarkers(apply(T_TRUE, MARKERS[:3]), np.tile(0.01 * np.eye(3), (3, 1, 1)))
-    exact = map_head(NAMES[:3], three, MARKERS[:3], 0.1, TARGETS)
+    three = Points(apply(T_TRUE, MARKERS[:3]), np.tile(0.01 * np.eye(3), (3, 1, 1)))
+    exact = map_head(NAMES[:3], three, MARKERS[:3], 0.1, TARGETS, "mapping")
     assert exact.T_c_m == pytest.approx(fit_triad(MARKERS[:3], three.points_c), abs=1e-8)
     assert found.fre_mm == pytest.approx(np.sqrt(np.mean(np.sum(found.residuals**2, axis=1))))
 
@@ -329,7 +329,7 @@ def test_expected_error_is_the_error_that_comes():
     for _ in range(500):
         markers = seen(covariances, rng)
         read = MARKERS + rng.normal(0.0, 0.1, MARKERS.shape)
-        found = map_head(NAMES, markers, read, 0.1, TARGETS)
+        found = map_head(NAMES, markers, read, 0.1, TARGETS, "mapping")
         ours.append(found.to_c(TARGETS) - truth)
         plain.append(apply(fit_rigid(read, markers.points_c), TARGETS) - truth)
         squared.append(np.einsum("ni,nij,nj->n", ours[-1], np.linalg.inv(found.covariance_at(TARGETS)), ours[-1]))
@@ -344,6 +344,6 @@ def test_expected_error_is_the_error_that_comes():
     [(MARKERS[:2], "too_few_markers"), (MARKERS * [1, 1, -1], "markers_mirrored"), (MARKERS / 10, "wrong_unit")],
 )
 def test_bad_marker_sets_are_refused_by_name(points, what):
-    markers = SeenMarkers(points, np.tile(np.eye(3), (len(points), 1, 1)))
+    markers = Points(points, np.tile(np.eye(3), (len(points), 1, 1)))
     with refused(what):
-        map_head(NAMES[: len(points)], markers, MARKERS[: len(points)], 0.1, TARGETS)
+        map_head(NAMES[: len(points)], markers, MARKERS[: len(points)], 0.1, TARGETS, "mapping")

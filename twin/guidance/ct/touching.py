@@ -43,18 +43,14 @@ SAME_PLACE_MM = 1e-4
 
 
 class TouchReading(NamedTuple):
-    """Reading of one touch: joints (6,), rad, and the point (3,), mm, that the controller computes from them.
-
-    From the last standoff (or home) to this one it took `seconds`, with the largest force on the needle; at the
-    standoff the line was moved `aside_mm`.
-    """
+    """Reading of one touch."""
 
     name: str
     point_base: Floats  # shape (3,), mm: what the controller computes from its joints
     q: Floats  # shape (6,), rad: its joints
-    seconds: float
-    force_n: float
-    aside_mm: float
+    seconds: float  # from the last standoff, or home, to this one
+    force_n: float  # the largest on the needle
+    aside_mm: float  # by which the line was moved at the standoff
 
 
 class FailedTouch(NamedTuple):
@@ -96,7 +92,7 @@ def touch_tour(tour: TouchTour, arm: TouchingArm, checkers: ApproachCheckers, pr
 
 
 class _Line(NamedTuple):
-    """Joints (m, 6), rad, from the standoff to where the slow part begins, and (k, 6) from there past the marker."""
+    """The line along which a marker is approached, and by how much it was moved aside."""
 
     far: Floats  # shape (m, 6), rad: from the standoff to where the slow part begins
     near: Floats  # shape (k, 6): from there past the believed marker

@@ -1,7 +1,7 @@
 """The ball on the tool, found in an image near where the robot's kinematics predict it, and its centre measured.
 
 Hough's transform finds circles; edges on spokes measure them; three edges propose a circle, the others vote, and a
-robust fit refines it. A ball that is absent, mostly hidden or too faint is a ``LostBall``, not a number.
+robust fit refines it. A ball that is absent, mostly hidden or too faint is a ``Lost``, not a number.
 
 A spoke runs over the sphere of viewing directions, from inside the outline to outside, and is projected into the image
 by the camera: so lens and ellipse are in the spoke, and the outline is at the same angle on each. The grey along it is
@@ -21,7 +21,7 @@ for studies of everything behind it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -32,7 +32,6 @@ from puncture_twin.planning.base.arrays import Bools, Floats
 from puncture_twin.twin.devices import Cameras, GreyImage
 from puncture_twin.twin.guidance.stereo.camera import Camera, tangent_axes
 from puncture_twin.twin.guidance.stereo.camera_calibration import Points, triangulate
-from puncture_twin.twin.guidance.stereo.servo_case import ServoCase
 from puncture_twin.twin.guidance.stereo.servo_law import Lost
 
 STEP_PX = 0.25
@@ -57,16 +56,12 @@ class Grey(NamedTuple):
 
 
 class Edges(NamedTuple):
-    """One edge per spoke; arrays of shape (n,): px per radian across the outline, contrast inside minus outside.
+    """One edge per spoke."""
 
-    ``points`` (n, 2) lie in the stereographic plane that touches at the spokes' centre. ``inside`` is False where the
-    steepest place lies at the end of the spoke or outside the image: no edge.
-    """
-
-    points: Floats
-    scales: Floats
-    contrast: Floats
-    inside: Bools
+    points: Floats  # shape (n, 2), in the stereographic plane that touches at the spokes' centre
+    scales: Floats  # shape (n,), px per radian across the outline
+    contrast: Floats  # shape (n,), inside minus outside
+    inside: Bools  # shape (n,); not where the steepest place is at the end of the spoke or outside the image: no edge
 
 
 class Spokes(NamedTuple):
@@ -102,10 +97,7 @@ def find_edges(grey: Grey, camera: Camera, spokes: Spokes) -> Edges:
 def visible_fraction(grey: Grey, camera: Camera, spokes: Spokes, on_circle: Bools, contrast: float) -> float:
     """Fraction of the disc that looks like the ball: as bright as next to its edges, within a part of its contrast.
 
-    Args:
-        spokes: Around the measured ball.
-        on_circle: Shape (n,): the spokes whose edge lies on the circle.
-        contrast: Between ball and surroundings, grey levels.
+    Spokes are about the measured ball; ``on_circle`` (n,): those whose edge lies on the circle; contrast in greys.
     """
     _, read = _read(grey, camera, _rays(spokes, (spokes.half_angle * DISC_RINGS)[:, None]))
     ball = float(np.median(read[-1][on_circle]))
@@ -146,40 +138,28 @@ class Circle(NamedTuple):
 
 
 class Refit(NamedTuple):
-    """A robust least-squares circle.
-
-    ``covariance`` (3, 3) is of centre and radius, for independent edges of the spread found, rad^2.
-    """
+    """A robust least-squares circle."""
 
     circle: Circle
-    covariance: Floats
+    covariance: Floats  # shape (3, 3), rad^2, of centre and radius, for independent edges of the spread found
 
 
 def consensus(points: Floats, valid: Bools, scales: Floats, tolerance_px: float) -> Circle | None:
     """The circle through three edges that most edges lie on (RANSAC, Fischler and Bolles 1981).
 
-    The triples are not drawn: every edge with its neighbours at four spacings, so the answer is the same every time.
-
-    Args:
-        points: Shape (n, 2), edges in the stereographic plane, in order around the ball, evenly spread.
-        valid: Shape (n,), which of them are edges at all.
-        scales: Shape (n,), px per radian across the outline.
-        tolerance_px: How far off an edge may lie.
+    Edges (n, 2) lie in the stereographic plane, in order around the ball, evenly spread; ``valid`` (n,): which are
+    edges at all; scales (n,), px per radian across the outline. The triples are not drawn: every edge with its
+    neighbours at four spacings, so the answer is the same every time.
     """
     count = len(points)
     first = np.arange(count)
-    triples = np.concatenate(
-        [np.stack([first, first + round(s * count), first + 2 * round(s * count)], 1) for s in STEPS]
-    )
-    triples = triples % count
+    triples = np.concatenate([np.stack([first + k * round(s * count) for k in range(3)], 1) for s in STEPS]) % count
     triples = triples[valid[triples].all(axis=1)]
     if len(triples) == 0:
         return None
     centers, radii = _through(points[triples])
     distances = np.linalg.norm(points[None] - centers[:, None], axis=-1)
-    misses = np.abs(distances - radii[:, None]) * scales
-    misses[:, ~valid] = np.inf
-    misses[~np.isfinite(radii)] = np.inf
+    misses = np.where(valid & np.isfinite(radii)[:, None], np.abs(distances - radii[:, None]) * scales, np.inf)
     score = np.sum(1 - np.clip(misses / tolerance_px, 0, 1) ** 2, axis=1)  # MSAC: near edges count more
     best = int(np.argmax(score))
     return Circle(centers[best], float(radii[best])) if np.isfinite(radii[best]) else None
@@ -199,13 +179,10 @@ def _through(triples: Floats) -> tuple[Floats, Floats]:
 
 
 def refit(points: Floats, scales: Floats, start: Circle, tolerance_px: float) -> Refit:
-    """Least squares of the edges' distances with Tukey's weights, from a start near the answer.
+    """Least squares of the edges' distances with Tukey's weights, from a start near the answer (`consensus`).
 
-    Args:
-        points: Shape (n, 2), edges in the stereographic plane.
-        scales: Shape (n,), px per radian across the outline.
-        start: From ``consensus``.
-        tolerance_px: The spread is not believed to be larger than this.
+    Edges (n, 2) lie in the stereographic plane; scales (n,), px per radian across the outline. The spread is not
+    believed to be larger than the tolerance.
     """
     center, radius = np.array(start.center), start.radius
     spread, floor = tolerance_px, 1e-3
@@ -233,7 +210,6 @@ def cone(circle: Circle, direction: Floats, axes: Floats) -> tuple[Floats, float
     return np.cos(tilt) * direction + np.sin(tilt) * (axes @ across), float((far - near) / 2)
 
 
-Reason = Literal["not_in_view", "no_circle", "few_inliers", "wrong_radius", "low_contrast"]
 MARGIN_PX = 8.0
 """Beyond search region and ball: what edges and their smoothing need."""
 HOUGH_SIGMA_PX = 0.4
@@ -258,71 +234,51 @@ MODEL_PX = 0.014
 """Standard deviation, per axis, of what light, blur and rod do to the centre and the edges do not show."""
 
 
-class DetectedBall(NamedTuple):
+class Detection(NamedTuple):
     """A detected ball: the projection of its centre, px, and the edges of `SPOKES` on it, 0 for Hough alone."""
 
     pixel: Floats  # shape (2,): the projection of the ball's centre, px
     covariance: Floats  # shape (2, 2), px^2
-    inliers: int
-
-
-class LostBall(NamedTuple):
-    """A failed search for the ball, with its reason and the edges on the best circle."""
-
-    reason: Reason
     inliers: int = 0
 
 
 def find_ball(
-    image: GreyImage | NDArray[np.uint8],
-    camera: Camera,
-    predicted_c: Floats,
-    radius_mm: float,
-    *,
-    search_px: float,
-    hough_only: bool = False,
-) -> DetectedBall | LostBall:
-    """Find and measure the ball.
+    image: GreyImage, camera: Camera, predicted_c: Floats, radius_mm: float, search_px: float, hough_only: bool = False
+) -> Detection | Lost:
+    """Find and measure the ball, no farther than ``search_px`` from where kinematics predict its centre, (3,), mm.
 
-    Args:
-        image: A whole image, shape (height, width), or a part of one with its offset.
-        camera: As calibrated.
-        predicted_c: Shape (3,), mm: the ball's centre by the robot's kinematics. Its depth predicts the radius.
-        search_px: How far from the prediction the centre may be.
-        hough_only: The paper's method: the centre of the best circle that Hough finds, neither measured nor gated.
+    Its depth predicts the radius. ``hough_only`` is the paper's method: the centre of the best circle that Hough finds,
+    neither measured nor gated.
     """
-    whole = image if isinstance(image, GreyImage) else GreyImage(image)
     predicted = camera.project(predicted_c)
     if not camera.sees(predicted):
-        return LostBall("not_in_view")
+        return Lost("not_in_view")
     radius = camera.ball_radius_px(predicted_c, radius_mm)
-    part = _cut(whole, predicted, search_px + 2 * radius + MARGIN_PX)
+    part = _cut(image, predicted, search_px + 2 * radius + MARGIN_PX)
     if min(part.grey.shape) < 2 * radius:
-        return LostBall("not_in_view")
+        return Lost("not_in_view")
     values = part.grey.astype(np.float64)
     second = values[:, :-2] - 2 * values[:, 1:-1] + values[:, 2:]  # which edges hardly touch
     noise = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6.0) if second.size else 0.0  # 1 + 4 + 1
     grey = Grey(part.grey, np.asarray(spline_filter(values, 3)), np.array(part.offset, dtype=np.float64), noise)
     if _contrast(part.grey) < _threshold(grey):
-        return LostBall("low_contrast")
+        return Lost("low_contrast")
     centers = find_circles(part.grey, radius) + part.offset
     near = np.linalg.norm(centers - predicted, axis=1) <= search_px
     if not near.any():
-        return LostBall("no_circle")
+        return Lost("no_circle")
     if hough_only:
-        best = int(np.flatnonzero(near)[0])
-        return DetectedBall(centers[best], HOUGH_SIGMA_PX**2 * np.eye(2), 0)
+        return Detection(centers[near][0], HOUGH_SIGMA_PX**2 * np.eye(2))
     lost = []
     for center in centers[near]:
         ball = _measure(grey, camera, center, radius)
-        if isinstance(ball, DetectedBall):
+        if isinstance(ball, Detection):
             return ball
         lost.append(ball)
     return max(lost, key=lambda one: one.inliers)
 
 
 def _cut(whole: GreyImage, center: Floats, half: float) -> GreyImage:
-    """The part of an image around a pixel, as far as there is one."""
     size = np.array(whole.grey.shape[::-1])
     low = np.clip(np.floor(center - half).astype(int) - whole.offset, 0, size)
     high = np.clip(np.ceil(center + half).astype(int) + 1 - whole.offset, 0, size)
@@ -338,23 +294,23 @@ def _threshold(grey: Grey) -> float:
     return max(MIN_CONTRAST, NOISE_FACTOR * grey.noise)
 
 
-def _measure(grey: Grey, camera: Camera, center: Floats, radius: float) -> DetectedBall | LostBall:
+def _measure(grey: Grey, camera: Camera, center: Floats, radius: float) -> Detection | Lost:
     """Measure one circle: edges about Hough's place, the vote, then edges about the measured place until they agree."""
     direction = camera.rays(center)
     spokes = Spokes(direction, radius / camera.local_scale(direction), SPOKES, FIRST_REACH_PX)
     fitted = _fit(grey, camera, spokes, radius)
     for _ in range(CLOSER):
-        if not isinstance(fitted, LostBall):
+        if not isinstance(fitted, Lost):
             fitted = _fit(grey, camera, fitted.spokes._replace(reach_px=LAST_REACH_PX), radius)
-    if isinstance(fitted, LostBall):
+    if isinstance(fitted, Lost):
         return fitted
     inliers, spokes = int(fitted.on_circle.sum()), fitted.spokes
     if visible_fraction(grey, camera, spokes, fitted.on_circle, fitted.contrast) < MIN_VISIBLE:
-        return LostBall("few_inliers", inliers)
+        return Lost("few_inliers", inliers)
     slope, radius_px = camera.angle_slope(spokes.direction), spokes.half_angle * camera.local_scale(spokes.direction)
     independent = min(1.0, 2 * np.pi * radius_px / (1.5 * SPOKES))  # edges closer than 1.5 px read the same pixels
     covariance = slope @ (fitted.covariance[:2, :2] / independent) @ slope.T + MODEL_PX**2 * np.eye(2)
-    return DetectedBall(camera.project(camera.center_c + spokes.direction), covariance, inliers)
+    return Detection(camera.project(camera.center_c + spokes.direction), covariance, inliers)
 
 
 class _Fitted(NamedTuple):
@@ -366,36 +322,33 @@ class _Fitted(NamedTuple):
     contrast: float
 
 
-def _fit(grey: Grey, camera: Camera, spokes: Spokes, radius: float) -> _Fitted | LostBall:
+def _fit(grey: Grey, camera: Camera, spokes: Spokes, radius: float) -> _Fitted | Lost:
     edges, least = find_edges(grey, camera, spokes), _threshold(grey)
     steep = edges.inside & (np.abs(edges.contrast) >= least)
     majority = np.sign(np.sum(np.sign(edges.contrast[steep]))) or 1.0
     valid = steep & (edges.contrast * majority > 0)  # of the usual sign
     if np.mean(np.abs(edges.contrast) < least) > 0.5:
-        return LostBall("low_contrast", int(valid.sum()))
+        return Lost("low_contrast", int(valid.sum()))
     circle = consensus(edges.points, valid, edges.scales, INLIER_PX)
     if circle is None:
-        return LostBall("few_inliers")
+        return Lost("few_inliers")
     on_circle = _agree(edges, valid, circle)
     if on_circle.sum() < MIN_INLIERS * SPOKES:
-        return LostBall("few_inliers", int(on_circle.sum()))
+        return Lost("few_inliers", int(on_circle.sum()))
     used = _away_from_others(on_circle)
     fit = refit(edges.points[used], edges.scales[used], circle, INLIER_PX)
     on_circle = _agree(edges, valid, fit.circle)
     if on_circle.sum() < MIN_INLIERS * SPOKES:
-        return LostBall("few_inliers", int(on_circle.sum()))
+        return Lost("few_inliers", int(on_circle.sum()))
     axis, half_angle = cone(fit.circle, spokes.direction, tangent_axes(spokes.direction))
     if abs(half_angle * camera.local_scale(axis) - radius) > RADIUS_FRACTION * radius:
-        return LostBall("wrong_radius", int(on_circle.sum()))
+        return Lost("wrong_radius", int(on_circle.sum()))
     measured = spokes._replace(direction=axis, half_angle=half_angle)
     return _Fitted(measured, fit.covariance, on_circle, float(np.median(edges.contrast[on_circle])))
 
 
 def _away_from_others(on_circle: Bools) -> Bools:
-    """Spokes whose neighbours agree too: next to the rod or an occluder the edge is bent by it.
-
-    Where that would leave fewer than half of them, all stay.
-    """
+    """Spokes whose neighbours agree too: next to the rod or an occluder the edge is bent by it."""
     used = on_circle.copy()
     for shift in range(-KEPT_AWAY, KEPT_AWAY + 1):
         used &= np.roll(on_circle, shift)
@@ -420,12 +373,7 @@ MOST = 8
 
 
 def find_circles(grey: NDArray[np.uint8], radius_px: float) -> Floats:
-    """Circles of about a radius, by the gradient method of OpenCV (Yuen et al. 1990).
-
-    Args:
-        grey: Shape (h, w).
-        radius_px: As predicted.
-    """
+    """Circles (m, 2) of about a radius in greys (h, w), by the gradient method of OpenCV (Yuen et al. 1990)."""
     smooth = cv2.GaussianBlur(grey, (5, 5), 1.0)
     circles = cv2.HoughCircles(
         smooth,
@@ -440,13 +388,6 @@ def find_circles(grey: NDArray[np.uint8], radius_px: float) -> Floats:
     if circles is None:
         return np.zeros((0, 2))
     return np.asarray(circles, dtype=np.float64).reshape(-1, np.shape(circles)[-1])[:MOST, :2]
-
-
-class Detection(NamedTuple):
-    """A ball's centre in one image, px, and its covariance (2, 2), px^2."""
-
-    pixel: Floats
-    covariance: Floats
 
 
 class Search(NamedTuple):
@@ -475,36 +416,29 @@ def image_detector(cameras: Cameras, *, hough_only: bool = False) -> Detector:
     def see(number: int, search: Search) -> Detection | Lost:
         camera, predicted, radius_mm, reach_px = search
         image = cameras.measured_image(number, camera.project(predicted), reach_px)
-        found = find_ball(image, camera, predicted, radius_mm, search_px=reach_px, hough_only=hough_only)
-        return Lost(found.reason) if isinstance(found, LostBall) else Detection(found.pixel, found.covariance)
+        return find_ball(image, camera, predicted, radius_mm, search_px=reach_px, hough_only=hough_only)
 
     return see
 
 
-def look_at(detector: Detector, searches: tuple[Search, ...], frames: int = 1) -> Detections | Lost:
-    """Detect one ball in every camera, several images each; all must show it.
-
-    Pictures of one camera are averaged by their inverse covariances.
-    """
+def look_at(
+    detector: Detector, cameras: tuple[Camera, ...], point_c: Floats, radius_mm: float, search_px: float, frames: int
+) -> Detections | Lost:
+    """Detect one ball, predicted at (3,), mm, in every camera, several images each; all must show it."""
     pixels, covariances = [], []
-    for number, search in enumerate(searches):
-        detections = []
+    for number, camera in enumerate(cameras):
+        detections, search = [], Search(camera, point_c, radius_mm, search_px)
         for _ in range(frames):
             spot = detector(number, search)
             if isinstance(spot, Lost):
                 return Lost(f"camera {number + 1}: {spot.reason}")
             detections.append(spot)
+        # pictures of one camera are averaged by their inverse covariances
         weights = np.linalg.inv([spot.covariance for spot in detections])
         covariance = np.linalg.inv(weights.sum(axis=0))
         pixels.append(covariance @ np.einsum("fij,fj->i", weights, [spot.pixel for spot in detections]))
         covariances.append(covariance)
     return Detections(np.array(pixels), np.array(covariances))
-
-
-def searches_of(case: ServoCase, cameras: tuple[Camera, ...], predicted_c: Floats) -> tuple[Search, ...]:
-    """Where the tool's ball is looked for in each camera, predicted at (3,), mm."""
-    radius_mm, reach_px = case.file.tool.ball_diameter_mm / 2, case.file.servo.search_px
-    return tuple(Search(camera, predicted_c, radius_mm, reach_px) for camera in cameras)
 
 
 def in_space(cameras: tuple[Camera, ...], detections: Detections) -> Points:

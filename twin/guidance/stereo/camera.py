@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.geometry.rigid import apply, frame_about, frame_along, pose
 
@@ -27,10 +27,7 @@ ROTATION_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated camera in the calibration frame C: size, focal lengths and principal point in px, column before row.
-
-    ``distortion``: k1, k2, p1, p2. ``T_camera_c``: shape (4, 4), mm, rigid: frame C to the camera's frame.
-    """
+    """A calibrated camera in the frame C: size, focal lengths and principal point in px, column before row."""
 
     width: int
     height: int
@@ -38,15 +35,14 @@ class Camera:
     fy: float
     cx: float
     cy: float
-    distortion: Floats
-    T_camera_c: Floats
+    distortion: Floats  # k1, k2, p1, p2
+    T_camera_c: Floats  # shape (4, 4), mm, rigid: frame C to the camera's frame
 
     def __post_init__(self) -> None:
         for name, shape in (("distortion", (4,)), ("T_camera_c", (4, 4))):
-            array = np.array(getattr(self, name), dtype=np.float64)
+            array = read_only(getattr(self, name))
             if array.shape != shape or not np.isfinite(array).all():
                 refuse(f"{name} has shape {array.shape} or is not finite", "camera", str(shape), "wrong_shape")
-            array.setflags(write=False)
             object.__setattr__(self, name, array)
         sizes = (self.width, self.height, self.fx, self.fy)
         if not (np.isfinite([*sizes, self.cx, self.cy]).all() and min(sizes) > 0):
@@ -64,11 +60,6 @@ class Camera:
     def K(self) -> Floats:  # noqa: N802
         """The intrinsic matrix, shape (3, 3), px."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
-
-    @property
-    def matrix(self) -> Floats:
-        """The paper's M, shape (3, 4), z [u v 1]^T = M [x y z 1]^T (Liu 2007, Eq. 1), without the lens's distortion."""
-        return np.asarray(self.K @ self.T_camera_c[:3])
 
     def project(self, points_c: Floats) -> Floats:
         """Pixels (..., 2) of points (..., 3), mm; NaN behind the camera and beyond the lens's range."""
@@ -102,13 +93,9 @@ class Camera:
             return np.asarray(np.all((pixels >= low) & (pixels <= high), axis=-1))
 
     def ball_radius_px(self, point_c: Floats, radius_mm: float) -> float:
-        """Radius of the circle as large as a ball's outline: sqrt of the two half axes' product, px.
+        """Radius of the circle as large as a ball's outline: sqrt of the two half axes' product, px; centre (3,), mm.
 
         A ball of radius R at distance D fills a cone of half angle asin(R / D); the local scale takes it to pixels.
-
-        Args:
-            point_c: The ball's centre, shape (3,), mm.
-            radius_mm: The ball's radius.
         """
         toward = np.asarray(point_c, dtype=np.float64) - self.center_c
         distance = float(np.linalg.norm(toward))
@@ -122,10 +109,6 @@ class Camera:
         """Derivative of the pixel by a rotation of the ray about each of the ``tangent_axes``, shape (2, 2), px/rad."""
         return np.asarray(self.jacobian(self.center_c + direction_c) @ tangent_axes(direction_c))
 
-    def moved(self, T_c_other: Floats) -> Camera:
-        """The camera in another frame: ``T_camera_other = T_camera_c T_c_other``."""
-        return replace(self, T_camera_c=self.T_camera_c @ T_c_other)
-
     def pinhole(self) -> Camera:
         """The camera with a perfect lens."""
         return replace(self, distortion=np.zeros(4))
@@ -138,15 +121,11 @@ def tangent_axes(direction: Floats) -> Floats:
 
 DOWN_C = (0.0, 1.0, 0.0)
 """What is down in an image: y of C."""
+NO_LENS = (0.0, 0.0, 0.0, 0.0)
 
 
 def looking_at(
-    centre_c: Floats,
-    target_c: Floats,
-    size: tuple[int, int],
-    focal_px: float,
-    *,
-    distortion: Floats | Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    centre_c: Floats, target_c: Floats, size: tuple[int, int], focal_px: float, distortion: Sequence[float] = NO_LENS
 ) -> Camera:
     """A camera at a place (3,), mm, in C with a point (3,) in the middle of its image; size in px, columns first."""
     z = np.asarray(target_c, dtype=np.float64) - centre_c
@@ -157,28 +136,16 @@ def looking_at(
 
 
 def stereo_pair(
-    width: int,
-    height: int,
-    focal_px: float,
-    baseline_mm: float,
-    distance_mm: float,
-    distortion: Floats | Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    width: int, height: int, focal_px: float, baseline_mm: float, distance_mm: float, lens: Sequence[float] = NO_LENS
 ) -> tuple[Camera, Camera]:
     """Left and right camera, side by side, both looking at the workcell's centre.
 
     The centre is C's origin; x runs from the left camera to the right one, y down, z away from them. The cameras stand
-    at (-+ baseline / 2, 0, -distance). Use ``Camera.moved`` to know them in a frame that lies otherwise.
-
-    Raises:
-        InputError: A size, length or distance that is not above 0.
+    at (-+ baseline / 2, 0, -distance).
     """
-    if not (np.isfinite([baseline_mm, distance_mm]).all() and min(baseline_mm, distance_mm) > 0):
-        refuse(f"baseline {baseline_mm:g} mm, distance {distance_mm:g} mm", "stereo pair", "above 0", "not_positive")
-    left, right = (
-        looking_at(np.array([x, 0.0, -distance_mm]), np.zeros(3), (width, height), focal_px, distortion=distortion)
-        for x in (-baseline_mm / 2, baseline_mm / 2)
-    )
-    return left, right
+    left, right = (np.array([x, 0.0, -distance_mm]) for x in (-baseline_mm / 2, baseline_mm / 2))
+    target, size = np.zeros(3), (width, height)
+    return looking_at(left, target, size, focal_px, lens), looking_at(right, target, size, focal_px, lens)
 
 
 CONVERGED = 1e-14
@@ -194,9 +161,8 @@ def distort(points: Floats, coefficients: Floats) -> Floats:
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + k2 * r2)
     xy = x * y
-    return np.stack(
-        [x * radial + 2 * p1 * xy + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * xy], axis=-1
-    )
+    bent_x = x * radial + 2 * p1 * xy + p2 * (r2 + 2 * x * x)
+    return np.stack([bent_x, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * xy], axis=-1)
 
 
 def distortion_slope(points: Floats, coefficients: Floats) -> Floats:

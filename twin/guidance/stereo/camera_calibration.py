@@ -48,20 +48,9 @@ class Points(NamedTuple):
     covariance: Floats
 
 
-def triangulate(cameras: Sequence[Camera], pixels: Floats, covariances: Floats | None = None) -> Points:
-    """Points that reproject best from pixels (cameras, n, 2) as found, distorted, with covariances (cameras, n, 2, 2).
-
-    None takes 1 px^2 for all, so that ``covariance`` must be multiplied by the pixels' variance.
-
-    Raises:
-        InputError: Fewer than two cameras, or shapes that do not fit.
-    """
-    pixels = np.asarray(pixels, dtype=np.float64)
-    if len(cameras) < 2 or pixels.ndim != 3 or pixels.shape[::2] != (len(cameras), 2):
-        allowed = "two or more cameras and pixels (cameras, n, 2)"
-        refuse(f"{len(cameras)} cameras and pixels of shape {pixels.shape}", "triangulation", allowed, "wrong_shape")
-    unit = np.broadcast_to(np.eye(2), (*pixels.shape, 2))
-    whitening = np.linalg.inv(np.linalg.cholesky(unit if covariances is None else covariances))
+def triangulate(cameras: Sequence[Camera], pixels: Floats, covariances: Floats) -> Points:
+    """Points that reproject best from pixels (cameras, n, 2) as found, distorted, covariances (cameras, n, 2, 2)."""
+    whitening = np.linalg.inv(np.linalg.cholesky(covariances))
     points = _linear(cameras, pixels)
     for _ in range(TRIANGULATION_ROUNDS):
         miss, slope = _errors(cameras, points, pixels, whitening)
@@ -75,7 +64,6 @@ def triangulate(cameras: Sequence[Camera], pixels: Floats, covariances: Floats |
 
 
 def _linear(cameras: Sequence[Camera], pixels: Floats) -> Floats:
-    """The linear start, from pixels freed of distortion by their rays."""
     flat = []
     for camera, seen in zip(cameras, pixels, strict=True):
         rays = camera.rays(seen) @ camera.T_camera_c[:3, :3].T
@@ -105,13 +93,10 @@ class Decomposition(NamedTuple):
 
 
 class LinearFit(NamedTuple):
-    """A camera's matrix (3, 4), scaled such that M x gives depths in the points' unit, positive in front.
-
-    ``condition``: largest over second smallest singular value: infinite where the points leave M free.
-    """
+    """A camera's matrix (3, 4), scaled such that M x gives depths in the points' unit, positive in front."""
 
     M: Floats
-    condition: float
+    condition: float  # largest over second smallest singular value: infinite where the points leave M free
 
 
 def fit_matrix(points: Floats, pixels: Floats) -> LinearFit:
@@ -143,10 +128,7 @@ def _normalising(points: Floats) -> Floats:
 
 
 def decompose(M: Floats) -> Decomposition:
-    """K, R and t of a matrix by RQ decomposition (Hartley and Zisserman, 6.2.4), shape (3, 4) in.
-
-    The focal lengths come out positive and R proper.
-    """
+    """K, its focal lengths positive, R, proper, and t of a matrix (3, 4) by RQ (Hartley and Zisserman, 6.2.4)."""
     M = M * np.sign(np.linalg.det(M[:, :3]))
     K, R = rq(M[:, :3])
     signs = np.diag(np.sign(np.diag(K)))
@@ -214,20 +196,17 @@ def calibrate(
 ) -> CameraCalibration:
     """Calibrate one camera (Liu 2007, section 2, with a refinement that the paper does not have).
 
-    Args:
-        points_c: Shape (n, 3), mm, n >= 6, not in a plane.
-        pixels: Shape (n, 2), where the points were found; NaN for a ball that was not found.
-        size: Width and height of the image, px.
-        names: What errors call the points; None numbers them from 1.
-        distortion: False holds the lens perfect, as the paper does.
+    Points (n, 3), mm, n >= 6, are not in a plane; the pixels (n, 2) are where they were found, in an image of a size
+    (width, height). Errors call them by their names, or number them from 1. Without distortion the lens is perfect, as
+    the paper has it.
 
     Raises:
-        InputError: Too few points, a ball not found, points in a plane or twice, a point behind the camera or that
+        InputError: Too few points, points in a plane or twice, a point behind the camera or that
             does not fit, a set that leaves the camera free.
     """
     points, pixels = np.asarray(points_c, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
     names = [f"point {i + 1}" for i in range(len(points))] if names is None else names
-    _check_points(points, pixels, names, where)
+    _check_points(points, where)
     linear = fit_matrix(points, pixels)
     if linear.condition > CRITICAL:
         allowed = "points not on a plane and a line, nor on a twisted cubic through the camera"
@@ -319,16 +298,7 @@ def _moved(camera: Camera, change: Floats) -> Camera:
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=camera.distortion + change[4:8], T_camera_c=T)
 
 
-def _check_points(points: Floats, pixels: Floats, names: Sequence[str], where: str | Path) -> None:
-    if points.shape != (len(points), 3) or pixels.shape != (len(points), 2) or len(names) != len(points):
-        what = f"points of shape {points.shape}, pixels of shape {pixels.shape}"
-        refuse(what, where, "(n, 3), (n, 2), and n names if any", "wrong_shape")
-    lost = np.asarray(~np.isfinite(pixels).all(axis=1))
-    if lost.any():
-        refuse(f"ball not found: {_listed(names, lost)}", where, "a ball seen at every point", "ball_not_found")
-    wrong = np.asarray(~np.isfinite(points).all(axis=1))
-    if wrong.any():
-        refuse(f"position not finite: {_listed(names, wrong)}", where, "finite mm", "not_finite")
+def _check_points(points: Floats, where: str | Path) -> None:
     distinct = len(np.unique(points, axis=0))
     if distinct < MIN_POINTS:
         refuse(f"{distinct} distinct points", where, f"{MIN_POINTS} or more, not in a plane", "too_few_points")

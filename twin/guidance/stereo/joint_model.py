@@ -51,23 +51,18 @@ FLOOR_MM = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Measurements; n markers, s stays of the arm of which the first k were also read by the measuring arm.
-
-    The arm was commanded to ``q_command`` (s, 6), rad; cameras saw the ball at ``pixels`` (c, s, 2) and the markers at
-    ``marker_pixels`` (c, n, 2), each with covariances, px^2. ``measured_c`` (k, 3), mm; ``markers_m`` (n, 3), mm: the
-    markers in the image.
-    """
+    """Measurements; n markers, s stays of the arm of which the first k were also read by the measuring arm."""
 
     planned: tuple[Camera, ...]
     rod: CarriedRod
     errors: ServoErrors
-    q_command: Floats
-    pixels: Floats
+    q_command: Floats  # shape (s, 6), rad
+    pixels: Floats  # shape (c, s, 2), where cameras saw the ball
     pixel_covariance: Floats  # shape (c, s, 2, 2), px^2
-    measured_c: Floats
-    marker_pixels: Floats
+    measured_c: Floats  # shape (k, 3), mm
+    marker_pixels: Floats  # shape (c, n, 2)
     marker_covariance: Floats  # shape (c, n, 2, 2), px^2
-    markers_m: Floats
+    markers_m: Floats  # shape (n, 3), mm, in the image
 
 
 class Guess(NamedTuple):
@@ -79,16 +74,12 @@ class Guess(NamedTuple):
 
 
 class Unknowns(NamedTuple):
-    """The unknowns of the session: cameras (c, 13) and arm (26,), in declared deviations; markers and balls, mm.
+    """The unknowns of the session; a pose is a turn (rad) about a point and a shift (mm) from the guess."""
 
-    ``base`` (6,): turn (rad) about the first balls' middle and shift (mm) of the base from the guess; ``head``
-    likewise, about the markers' middle.
-    """
-
-    cameras: Floats
-    base: Floats
-    arm: Floats
-    head: Floats
+    cameras: Floats  # shape (c, 13), in declared deviations
+    base: Floats  # shape (6,), about the first balls' middle
+    arm: Floats  # shape (26,), in declared deviations
+    head: Floats  # shape (6,), about the markers' middle
     markers_m: Floats  # shape (n, 3), mm
     balls_c: Floats  # shape (s, 3), mm
 
@@ -117,17 +108,10 @@ def first_unknowns(observed: Observed, guess: Guess) -> Unknowns:
 
 def camera_of(planned: Camera, errors: Floats) -> Camera:
     """A planned camera with its errors (13,): part of the focal length, px, lens, rad, mm."""
-    focal = planned.fx * (1.0 + errors[0])
-    T = pose(exp_rotation(errors[7:10]), errors[10:13])
-    return replace(
-        planned,
-        fx=focal,
-        fy=focal,
-        cx=planned.cx + float(errors[1]),
-        cy=planned.cy + float(errors[2]),
-        distortion=planned.distortion + errors[3:7],
-        T_camera_c=T @ planned.T_camera_c,
-    )
+    focal, lens = planned.fx * (1.0 + errors[0]), planned.distortion + errors[3:7]
+    cx, cy = planned.cx + float(errors[1]), planned.cy + float(errors[2])
+    T = pose(exp_rotation(errors[7:10]), errors[10:13]) @ planned.T_camera_c
+    return replace(planned, fx=focal, fy=focal, cx=cx, cy=cy, distortion=lens, T_camera_c=T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,9 +143,7 @@ class JointModel:
     def linearised(self, x: Unknowns) -> System[Unknowns]:
         """Residuals and slopes at x."""
         o = self.observed
-        drawn = np.r_[
-            x.span("cameras"), x.span("arm")
-        ]  # counted in deviations: the prior's residual is the unknown itself
+        drawn = np.r_[x.span("cameras"), x.span("arm")]  # in deviations: the prior's residual is the unknown itself
         rows = [
             *self._seen(x),
             self._read(x, "balls_c", o.measured_c, o.errors.measuring_arm_mm),
@@ -266,35 +248,24 @@ UNSETTLED = "the joint adjustment does not settle: a measurement is an outlier, 
 
 
 class Offset(NamedTuple):
-    """Target minus ball, what the servo takes to zero: both (3,), mm, C, with their covariances (3, 3), mm^2.
-
-    ``covariance`` is that of target minus ball; less than the sum where both err together.
-    """
+    """Target minus ball, what the servo takes to zero: both (3,), mm, C, with their covariances (3, 3), mm^2."""
 
     ball_c: Floats  # shape (3,), mm
     target_c: Floats  # shape (3,), mm
     ball_covariance: Floats  # shape (3, 3), mm^2
     target_covariance: Floats  # shape (3, 3), mm^2
-    covariance: Floats
-
-    def rms_mm(self) -> float:
-        """Root of the mean squared length of the error of target minus ball, mm."""
-        return float(np.sqrt(np.trace(self.covariance)))
+    covariance: Floats  # of target minus ball; less than the sum where both err together
 
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:
-    """The joint estimate, with the covariance (N, N) of the unknowns by Fisher's information.
-
-    ``chi2``: sum of the squared residuals. ``freedom``: their number, less that of the unknowns.
-    """
+    """The joint estimate."""
 
     model: JointModel
     unknowns: Unknowns
-    covariance: Floats
-    chi2: float
-    freedom: int
-    iterations: int
+    covariance: Floats  # shape (N, N), of the unknowns by Fisher's information
+    chi2: float  # sum of the squared residuals
+    freedom: int  # their number, less that of the unknowns
 
     def offset(self, stay: int, target_m: Floats) -> Offset:
         """Ball at one stay, -1 the last, and a target (3,), mm, of the image, with their covariances."""
@@ -305,9 +276,8 @@ class Adjusted:
         start = x.span("balls_c").start + 3 * stay
         ball_rows[:, start : start + 3] = np.eye(3)
         target_rows[:, x.span("head")] = model.slopes_of("head", x, target[None])[0]
-        ball, aim, both = (
-            rows @ self.covariance @ rows.T for rows in (ball_rows, target_rows, target_rows - ball_rows)
-        )
+        every = ball_rows, target_rows, target_rows - ball_rows
+        ball, aim, both = (rows @ self.covariance @ rows.T for rows in every)
         return Offset(x.balls_c[stay], target, ball, aim, both)
 
 
@@ -332,7 +302,7 @@ def adjust(observed: Observed, guess: Guess, start: Unknowns | None = None) -> A
     covariance = np.asarray(np.linalg.inv(fit.system.information), dtype=np.float64)
     chi2 = float(np.sum((fit.system.residuals + fit.system.slopes @ fit.step) ** 2))  # after the last step
     rows, unknowns = fit.system.slopes.shape
-    return Adjusted(model, fit.estimate, covariance, chi2, rows - unknowns, fit.iterations)
+    return Adjusted(model, fit.estimate, covariance, chi2, rows - unknowns)
 
 
 FLANGE_ERRORS = PARAMETERS["joint"].stop
@@ -342,21 +312,15 @@ N_ROD = PARAMETERS["tip_offset"].stop
 
 
 class RodPoses(NamedTuple):
-    """Ball (s, 3), mm, and flange's rotation (s, 3, 3) of an arm that errs, base frame.
+    """Ball and flange of an arm that errs at s configurations, base frame."""
 
-    ``slopes`` (s, 6, 26): shift of the ball (mm) and turn of the flange (rad) per unit of each parameter's error.
-    """
-
-    ball: Floats
-    slopes: Floats
+    ball: Floats  # shape (s, 3), mm
+    slopes: Floats  # shape (s, 6, 26): shift of the ball (mm) and turn of the flange (rad) by each parameter's error
     R_base_flange: Floats  # shape (s, 3, 3)
 
 
 def rod_poses(rod: CarriedRod, eta: Floats, q: Floats) -> RodPoses:
-    """Ball and flange at configurations (s, 6), rad, of an arm with errors (26,), mm and rad.
-
-    Each error shifts or turns all that follows it (Mooring, Roth, Driels 1991; `error_jacobian`).
-    """
+    """Ball and flange at joints (s, 6), rad, of an arm with errors (26,), mm and rad (Mooring, Roth, Driels 1991)."""
     poses = erring_arm(rod.model, eta[:FLANGE_ERRORS]).link_poses(q)
     origins, axes = poses[..., :3, 3], poses[..., :3, :3]
     R = axes[:, 6]
@@ -377,18 +341,12 @@ REGION = 0.95
 
 @dataclass(frozen=True, eq=False)
 class NeedleError:
-    """Predicted error of a needle in place, image axes.
+    """Predicted error of a needle in place, image axes."""
 
-    ``offset_m`` (3,), mm: the tip as believed, minus the target: what a tolerance or a wrong arm leaves.
-    ``R_m_needle``: the needle's axes as believed, as columns, z to the tip. ``covariance`` (6, 6): Sigma6 about that,
-        shift (mm) of the tip
-    against the anatomy, then rotation (rad). ``target_covariance`` (3, 3), mm^2: of the reading of the target.
-    """
-
-    offset_m: Floats
-    R_m_needle: Floats
-    covariance: Floats
-    target_covariance: Floats
+    offset_m: Floats  # shape (3,), mm: the tip as believed, minus the target: what a tolerance or a wrong arm leaves
+    R_m_needle: Floats  # shape (3, 3): the needle's axes as believed, as columns, z to the tip
+    covariance: Floats  # shape (6, 6), about that: shift (mm) of the tip against the anatomy, then rotation (rad)
+    target_covariance: Floats  # shape (3, 3), mm^2, of the reading of the target
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -449,30 +407,20 @@ def servoed_error(found: Adjusted, stay: int, target_m: Floats) -> NeedleError:
 
 
 def open_loop_error(found: Adjusted, q_command: Floats, target_m: Floats) -> NeedleError:
-    """The needle's error where the arm is sent without an image.
-
-    Args:
-        found: The joint estimate of what was measured before.
-        q_command: Shape (6,), rad.
-        target_m: Shape (3,), mm, as the image has it.
-    """
+    """The needle's error where the arm is sent to joints (6,), rad, without an image; target (3,), mm, in the image."""
     rod = _Flange.of(found, q_command)
     Jq = rod.arrival_slopes
     arrival = found.model.observed.errors.arrival**2 * Jq @ Jq.T
     return _needle(found, target_m, rod.ball_c, rod.R_c_flange, rod.rows, arrival)
 
 
-@dataclass(frozen=True, eq=False)
-class _Flange:
-    """Predicted ball (3,), mm, and flange (3, 3) of the arm, C, and what shifts the one and rotates the other.
-
-    ``rows`` (6, N) are by the unknowns, ``arrival_slopes`` (6, 6) per rad of each joint.
-    """
+class _Flange(NamedTuple):
+    """Predicted ball and flange of the arm, C, and what shifts the one and rotates the other."""
 
     ball_c: Floats  # shape (3,), mm
     R_c_flange: Floats  # shape (3, 3)
-    rows: Floats
-    arrival_slopes: Floats
+    rows: Floats  # shape (6, N), by the unknowns
+    arrival_slopes: Floats  # shape (6, 6), per rad of each joint
 
     @classmethod
     def of(cls, found: Adjusted, q_command: Floats) -> _Flange:
@@ -504,9 +452,7 @@ def _needle(
     tool = np.repeat([errors.tip_offset_mm, errors.needle_direction, 0.0], [3, 2, 1]) ** 2  # no roll
     cov_c = rows @ found.covariance @ rows.T + again + (rotated * tool) @ rotated.T
     moved[:3], moved[3:, :3] = turn_and_shift_slopes((target_m - x.markers_m.mean(axis=0))[None])[0], np.eye(3)
-    head = (
-        np.repeat([errors.head_turn, errors.head_shift_mm], 3) ** 2
-    )  # since its markers were seen, about their middle
+    head = np.repeat([errors.head_turn, errors.head_shift_mm], 3) ** 2  # since its markers were seen, about these
     covariance = turn.T @ cov_c @ turn + (moved * head) @ moved.T
     offset, R_m_needle = T_c_m[:3, :3].T @ (ball_c - apply(T_c_m, target_m)), T_c_m[:3, :3].T @ R_c_flange
     return NeedleError(offset, R_m_needle, covariance, errors.target_mm**2 * np.eye(3))

@@ -269,17 +269,14 @@ class ServoFile(Section):
 
 @dataclass(frozen=True, eq=False)
 class ServoCase:
-    """A servo case, read and checked.
-
-    ``skin``: the head's surface, ``markers`` and ``targets``: their centres in truth; image frame, mm.
-    """
+    """A servo case, read and checked."""
 
     path: Path
     file: ServoFile
     model: UrModel
-    skin: TriangleMesh
-    markers: NamedPoints
-    targets: NamedPoints
+    skin: TriangleMesh  # the head's surface, image frame, mm
+    markers: NamedPoints  # their centres in truth, image frame, mm
+    targets: NamedPoints  # likewise
     inputs: tuple[Input, ...]
 
     @property
@@ -344,10 +341,8 @@ def planned_cameras(case: ServoCase) -> tuple[Camera, ...]:
 
 
 def calibration_frame(case: ServoCase) -> Floats:
-    """T_base_c, shape (4, 4), mm: C at the calibrated volume's middle, z along the cameras' view, y down.
-
-    The cameras stand on the far side of the head, seen from the arm, and look back and down at it.
-    """
+    """T_base_c, shape (4, 4), mm: C at the calibrated volume's middle, z along the cameras' view, y down."""
+    # the cameras are on the far side of the head, seen from the arm, and look back and down at it
     down = np.radians(case.file.cameras.elevation_deg)
     z, y = np.array([-np.cos(down), 0.0, -np.sin(down)]), np.array([np.sin(down), 0.0, -np.cos(down)])
     return pose(frame_yz(y, z), case.file.calibration.center_mm)
@@ -360,13 +355,10 @@ def head_pose(case: ServoCase) -> Floats:
 
 
 def workcell_checker(case: ServoCase, T_base_m: Floats | None) -> FastChecker:
-    """The planner's collision checker; T_base_m (4, 4), mm: where the head is believed to be, None without it.
-
-    The rod is as thick as its ball, and reaches to the ball's far side.
-    """
+    """The planner's collision checker; T_base_m (4, 4), mm: where the head is believed to be, None without it."""
     boxes = [Box(box.name, pose(np.eye(3), box.center_mm), box.size_mm) for box in case.file.box]
     skin, tool = None if T_base_m is None else case.skin.transformed(T_base_m), case.file.tool
-    length = tool.rod_mm + tool.ball_diameter_mm / 2
+    length = tool.rod_mm + tool.ball_diameter_mm / 2  # to the ball's far side, as thick as it
     rod = Tool(length, length - tool.holder_mm, tool.ball_diameter_mm, tool.holder_diameter_mm)
     return FastChecker(case.model, rod, boxes, skin, padding_mm=case.file.servo.padding_mm)
 

@@ -49,6 +49,7 @@ from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residuals import Conditioning
 from puncture_twin.twin.devices import Arm
+from puncture_twin.twin.guidance.stereo.camera_calibration import Points
 
 CHARACTERISTIC_MM = 300.0
 """Length by which millimetres are made comparable with radians: about half of a UR3's reach."""
@@ -73,27 +74,20 @@ class ServoStop(StrEnum):
 
 
 class StepLimits(NamedTuple):
-    """Limits of one step: its length, the largest rotation of any joint, and how far the needle may rotate away.
-
-    It may while only the position is controlled. Of 5 joints that move, the sixth, which turns the rod about itself, is
-    held.
-    """
+    """Limits of one step."""
 
     step_mm: float = 10.0
-    joint_step_rad: float = math.radians(10.0)
-    drift_rad: float = math.radians(1.0)
-    joints: int = 6
+    joint_step_rad: float = math.radians(10.0)  # the largest rotation of any joint
+    drift_rad: float = math.radians(1.0)  # how far the needle may rotate away while only the position is controlled
+    joints: int = 6  # that move: of 5 the sixth, which turns the rod about itself, is held
 
 
 class Step(NamedTuple):
-    """The joint path (m, 6), rad, of one step, from the arm's configuration; one row where it may not move, and why.
-
-    ``position_only``: whether some piece gave the orientation up.
-    """
+    """The joint path of one step."""
 
     q_path: Floats  # shape (m, 6), rad: from the arm's configuration; one row where it may not move
-    stop: ServoStop | None
-    position_only: bool
+    stop: ServoStop | None  # why the arm may not move
+    position_only: bool  # whether some piece gave the orientation up
 
 
 class CarriedRod(NamedTuple):
@@ -130,12 +124,9 @@ def smallest_sigma(J: Floats) -> float:
 
 
 def servo_step(rod: CarriedRod, q: Floats, move_base: Floats, limits: StepLimits) -> Step:
-    """The joint path from joints (6,), rad, that moves the ball by a vector (3,), mm, and keeps its orientation.
-
-    A longer move than the limits allow is cut short: the next look sees what is left.
-    """
+    """The joint path from joints (6,), rad, that moves the ball by a vector (3,), mm, and keeps its orientation."""
     length = float(np.linalg.norm(move_base))
-    move = move_base * min(1.0, limits.step_mm / max(length, 1e-12))
+    move = move_base * min(1.0, limits.step_mm / max(length, 1e-12))  # the next look sees what is left
     count = max(1, math.ceil(min(length, limits.step_mm) / PIECE_MM))
     start, path, position_only = ball_base(rod, q), [np.asarray(q, dtype=np.float64)], False
     for piece in range(1, count + 1):
@@ -171,14 +162,9 @@ def _piece(rod: CarriedRod, q: Floats, move: Floats, joints: int) -> tuple[Float
 
 
 def damped(J: Floats, goal: Floats) -> Floats:
-    """Damped least squares J^T (J J^T + lambda^2 I)^-1 goal; lambda grows from 0 where sigma_min falls below its limit.
-
-    Args:
-        J: Shape (m, n), m <= n, scaled.
-        goal: Shape (m,).
-    """
+    """Damped least squares J^T (J J^T + lambda^2 I)^-1 goal for a scaled J (m, n), m <= n, and a goal (m,)."""
     sigma = float(np.linalg.svd(J, compute_uv=False)[-1])
-    squared = DAMPING**2 * max(0.0, 1.0 - (sigma / MIN_SIGMA) ** 2)  # lambda^2
+    squared = DAMPING**2 * max(0.0, 1.0 - (sigma / MIN_SIGMA) ** 2)  # lambda^2 grows where sigma is small
     return np.asarray(J.T @ np.linalg.solve(J @ J.T + squared * np.eye(len(J)), goal))
 
 
@@ -191,26 +177,15 @@ CONVERGED = 1e-12
 """A step of the fit (mm and rad) below which it has arrived."""
 
 
-class SeenMarkers(NamedTuple):
-    """Markers as triangulated by the cameras: points (n, 3), mm, covariances (n, 3, 3), mm^2."""
-
-    points_c: Floats  # shape (n, 3), mm
-    covariances: Floats
-
-
 @dataclass(frozen=True, eq=False)
 class Mapping:
-    """c_T_m (4, 4), mm, with its covariance (6, 6), of a turn (rad) about the markers' centre and a shift (mm), in C.
+    """The head in C by its markers, n."""
 
-    ``residuals`` (n, 3): T_c_m markers_m - markers_c, mm. ``conditioning``: the flags of an ill-conditioned marker set,
-    at the middle of the targets.
-    """
-
-    T_c_m: Floats
-    covariance: Floats
+    T_c_m: Floats  # shape (4, 4), mm
+    covariance: Floats  # shape (6, 6), of a turn (rad) about the markers' centre and a shift (mm), in C
     center_c: Floats  # shape (3,), the markers' centre, mm
-    residuals: Floats
-    conditioning: Conditioning
+    residuals: Floats  # shape (n, 3): T_c_m markers_m - markers_c, mm
+    conditioning: Conditioning  # the flags of an ill-conditioned marker set, at the middle of the targets
 
     @property
     def fre_mm(self) -> float:
@@ -232,13 +207,7 @@ class Mapping:
 
 
 def map_head(
-    names: tuple[str, ...],
-    seen: SeenMarkers,
-    markers_m: Floats,
-    image_mm: float,
-    targets_m: Floats,
-    *,
-    where: str | Path = "mapping",
+    names: tuple[str, ...], seen: Points, markers_m: Floats, image_mm: float, targets_m: Floats, where: str | Path
 ) -> Mapping:
     """Fit c_T_m to markers in the image (n, 3), n at least 3, and in C, weighted by both covariances; mm.
 
@@ -249,7 +218,7 @@ def map_head(
     """
     pairs = MarkerPairs(names, np.asarray(markers_m, dtype=np.float64), seen.points_c)
     plain = register(pairs, method="rigid", target_ct=np.mean(targets_m, axis=0), where=where)
-    covariances, center = seen.covariances + max(image_mm, 1e-9) ** 2 * np.eye(3), seen.points_c.mean(axis=0)
+    covariances, center = seen.covariance + max(image_mm, 1e-9) ** 2 * np.eye(3), seen.points_c.mean(axis=0)
     roots = np.linalg.inv(np.linalg.cholesky(covariances))  # whiten each marker's residual
 
     def linearised(T: Floats) -> System[Floats]:
@@ -331,11 +300,6 @@ def configurations(rod: CarriedRod, points_base: Floats, checker: StateChecker, 
     raise NoAnswerError(why, code="motion_touches")
 
 
-def path_upward(rod: CarriedRod, points_base: Floats, up_mm: float) -> Floats:
-    """Points (n, 3) farther back along the rod by a distance, mm: where the arm hovers."""
-    return np.asarray(points_base - up_mm * rod.R_base_flange[:, 2])
-
-
 DIVERGING_RATIO = 1.5
 """A step diverges if it leaves more than this times the error before it."""
 DIVERGING_STEPS = 2
@@ -353,9 +317,10 @@ class Seen(NamedTuple):
 
 
 class Lost(NamedTuple):
-    """A ball that was not found."""
+    """A ball that was not found, with the edges on the best circle."""
 
     reason: str
+    inliers: int = 0
 
 
 Look = Callable[[Floats], Seen | Lost]
@@ -364,19 +329,15 @@ Look = Callable[[Floats], Seen | Lost]
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Target, limits and devices of one servo: the rod, and T_base_c as calibrated (Liu's r_T_c).
-
-    It has converged when a look sees no error above the tolerance; a ball counts as lost after so many looks; the
-    checker has the head where it is believed to be.
-    """
+    """Target, limits and devices of one servo."""
 
     rod: CarriedRod
-    T_base_c: Floats
-    tolerance_mm: float
+    T_base_c: Floats  # shape (4, 4), mm, as calibrated (Liu's r_T_c)
+    tolerance_mm: float  # it has converged when a look sees no error above
     max_steps: int
-    looks: int
+    looks: int  # after so many a ball counts as lost
     limits: StepLimits
-    checker: StateChecker
+    checker: StateChecker  # has the head where it is believed to be
 
 
 class Visit(NamedTuple):
@@ -389,16 +350,13 @@ class Visit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Servoed:
-    """Result of a servo: every stop at which the ball was seen, in order, and the last command (6,), rad.
-
-    ``detail``: what was touched or missing, for people. ``position_only``: whether some step gave the orientation up.
-    """
+    """Result of a servo."""
 
     stop: ServoStop
-    visits: tuple[Visit, ...]
+    visits: tuple[Visit, ...]  # at which the ball was seen, in order
     q_command: Floats  # shape (6,), rad: the last command
-    detail: str = ""
-    position_only: bool = False
+    detail: str = ""  # what was touched or missing, for people
+    position_only: bool = False  # whether some step gave the orientation up
 
     @property
     def ended_in_sight(self) -> bool:
@@ -417,12 +375,7 @@ class Servoed:
 
 
 def servo(task: Task, q_command: Floats, look: Look, arm: Arm) -> Servoed:
-    """Move the ball onto the target: look, measure the error, move a step; until it converges or must stop.
-
-    Args:
-        q_command: Shape (6,), rad: where the arm was sent.
-        arm: Moves the ball.
-    """
+    """Move the ball onto the target from where the arm was sent, (6,), rad, until it converges or must stop."""
     visits: list[Visit] = []
     position_only = False
 

@@ -31,9 +31,9 @@ from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.geometry.spaces import Unit
 from puncture_twin.planning.registration.fits import fit_rigid
 from puncture_twin.twin.devices import Arm, Cameras, GreyImage, MeasuringArm, Operator
-from puncture_twin.twin.guidance.stereo.ball import Detections, Detector, Search, in_space, look_at, searches_of
+from puncture_twin.twin.guidance.stereo.ball import Detections, Detector, in_space, look_at
 from puncture_twin.twin.guidance.stereo.camera import Camera
-from puncture_twin.twin.guidance.stereo.camera_calibration import calibrate
+from puncture_twin.twin.guidance.stereo.camera_calibration import Points, calibrate
 from puncture_twin.twin.guidance.stereo.joint_model import (
     Adjusted,
     Guess,
@@ -56,7 +56,6 @@ from puncture_twin.twin.guidance.stereo.servo_law import (
     Mapping,
     Posture,
     Seen,
-    SeenMarkers,
     Servoed,
     ServoStop,
     StepLimits,
@@ -67,8 +66,6 @@ from puncture_twin.twin.guidance.stereo.servo_law import (
     look_again,
     map_head,
     path_contact,
-    path_upward,
-    servo,
     servo_step,
 )
 from puncture_twin.twin.pictures import parse_png, png_bytes
@@ -79,22 +76,17 @@ FIRST_SEARCH_PX = 80.0
 
 @dataclass(frozen=True, eq=False)
 class RobotCalibration:
-    """Result of a calibration with k points: the calibrated cameras, with the residual of each, and T_base_c: r_T_c.
-
-    The arm said that it rests at ``q_command`` (k, 6), rad, on a branch of the inverse kinematics, where its errors are
-    known; the measuring arm read ``measured_c`` (k, 3), mm, the cameras ``pixels`` (c, k, 2), with covariances, px^2.
-    The rigid fit leaves ``robot_residual_mm`` (k,): mostly the robot's own error.
-    """
+    """Result of a calibration with k points."""
 
     cameras: tuple[Camera, ...]
-    T_base_c: Floats
-    q_command: Floats
-    measured_c: Floats
-    pixels: Floats
-    covariances: Floats
-    rms_px: tuple[float, ...]
-    robot_residual_mm: Floats
-    branch: int
+    T_base_c: Floats  # shape (4, 4), mm: r_T_c
+    q_command: Floats  # shape (k, 6), rad, at which the arm said that it rests
+    measured_c: Floats  # shape (k, 3), mm, by the measuring arm
+    pixels: Floats  # shape (c, k, 2)
+    covariances: Floats  # shape (c, k, 2, 2), px^2
+    rms_px: tuple[float, ...]  # of each camera
+    robot_residual_mm: Floats  # shape (k,), of the rigid fit: mostly the robot's own error
+    branch: int  # of the inverse kinematics, where its errors are known
 
 
 def calibration_commands(case: ServoCase, checker: StateChecker) -> Posture:
@@ -103,13 +95,13 @@ def calibration_commands(case: ServoCase, checker: StateChecker) -> Posture:
     Raises:
         NoAnswerError: The arm cannot go there.
     """
-    q_command, branch = configurations(calibrating_rod(case), grid_points(case), checker)
-    for number, (start, end) in enumerate(pairwise(q_command), start=2):
+    commands = configurations(calibrating_rod(case), grid_points(case), checker)
+    for number, (start, end) in enumerate(pairwise(commands.q), start=2):
         contact = path_contact(checker, np.stack([start, end]))
         if contact is not None:
             what = f"calibration: {contact.body} would touch {contact.other} on the way to point {number}"
             raise NoAnswerError(what, code="motion_touches")
-    return Posture(q_command, branch)
+    return commands
 
 
 def calibrate_by_robot(
@@ -127,8 +119,8 @@ def calibrate_by_robot(
         arm.move_jp(q)
         reached.append(arm.measured_jp())
         measured.append(touch.measured_cp())
-        searches = tuple(Search(one, measured[-1], radius_mm, FIRST_SEARCH_PX) for one in planned_cameras(case))
-        seen = look_at(detector, searches, case.file.servo.frames)
+        frames = case.file.servo.frames
+        seen = look_at(detector, planned_cameras(case), measured[-1], radius_mm, FIRST_SEARCH_PX, frames)
         if isinstance(seen, Lost):
             raise NoAnswerError(f"calibration, point {number}: {seen.reason}", code="ball_not_found")
         detections.append(seen)
@@ -154,25 +146,20 @@ def calibrate_by_robot(
     )
 
 
+@dataclass(eq=False)
 class Guide:
-    """The paper's chain: calibrated cameras triangulate the ball; the mapping gives the target.
+    """The paper's chain: calibrated cameras triangulate the ball; the mapping gives the target."""
 
-    ``markers_m`` (n, 3), mm: the markers as the image has them.
-    """
+    case: ServoCase
+    calibration: RobotCalibration
+    mapping: Mapping
+    markers: list[Detections]
+    markers_m: Floats  # shape (n, 3), mm, as the image has them
+    detector: Detector
 
-    def __init__(
-        self,
-        case: ServoCase,
-        calibration: RobotCalibration,
-        mapping: Mapping,
-        markers: list[Detections],
-        markers_m: Floats,
-        detector: Detector,
-    ) -> None:
-        self._case, self._detector = case, detector
-        self._calibration, self._mapping = calibration, mapping
-        self._markers, self._markers_m = markers, markers_m
-        self._held = carried_rod(case)
+    def __post_init__(self) -> None:
+        calibration = self.calibration
+        self._held = carried_rod(self.case)
         self._T_c_base = np.asarray(np.linalg.inv(calibration.T_base_c))
         self._q = [*calibration.q_command]
         self._pixels = [*calibration.pixels.transpose(1, 0, 2)]
@@ -185,13 +172,13 @@ class Guide:
     def aim_at(self, target_m: Floats) -> None:
         """Set the target, shape (3,), mm, image frame."""
         self.target_m = target_m
-        self.target_c = self._mapping.to_c(target_m)
+        self.target_c = self.mapping.to_c(target_m)
 
     def look(self, q_command: Floats) -> Seen | Lost:
         """Measure the ball in new images, searched where the arm was sent, (6,), rad; returns ball and target."""
-        predicted, limits = apply(self._T_c_base, ball_base(self._held, q_command)), self._case.file.servo
-        searches = searches_of(self._case, self._calibration.cameras, predicted)
-        detections = look_at(self._detector, searches, limits.frames)
+        predicted, limits = apply(self._T_c_base, ball_base(self._held, q_command)), self.case.file.servo
+        cameras, radius_mm = self.calibration.cameras, self.case.file.tool.ball_diameter_mm / 2
+        detections = look_at(self.detector, cameras, predicted, radius_mm, limits.search_px, limits.frames)
         if isinstance(detections, Lost):
             return detections
         self._q.append(q_command)
@@ -200,7 +187,7 @@ class Guide:
         return self._assess(detections)
 
     def _assess(self, detections: Detections) -> Seen:
-        points = in_space(self._calibration.cameras, detections)
+        points = in_space(self.calibration.cameras, detections)
         self._balls.append(points.points_c[0])
         return Seen(points.points_c[0], self.target_c, points.covariance[0])
 
@@ -215,7 +202,7 @@ class Guide:
         """
         if (believed := self.needle_unseen(q_command)) is None:
             return None
-        R_base_m = self._calibration.T_base_c[:3, :3] @ self._mapping.T_c_m[:3, :3]
+        R_base_m = self.calibration.T_base_c[:3, :3] @ self.mapping.T_c_m[:3, :3]
         missed = np.append(R_base_m @ believed.offset_m, np.zeros(3))
         return np.asarray(q_command - np.linalg.solve(ball_jacobian(self._held, q_command), missed))
 
@@ -236,7 +223,7 @@ class Guide:
             NoAnswerError: It does not settle.
         """
         if self._found is None or len(self._found.unknowns.balls_c) < len(self._balls):
-            guess, start = Guess(self._T_c_base, self._mapping.T_c_m, np.array(self._balls)), None
+            guess, start = Guess(self._T_c_base, self.mapping.T_c_m, np.array(self._balls)), None
             if self._found is not None:
                 last = self._found.unknowns
                 new = np.array(self._balls[len(last.balls_c) :]).reshape(-1, 3)
@@ -246,7 +233,7 @@ class Guide:
 
     def observed(self) -> Observed:
         """Everything measured so far: the stays of the calibration first, then every look that found the ball."""
-        case, marks = self._case, self._markers
+        case, marks = self.case, self.markers
         return Observed(
             planned_cameras(case),
             self._held,
@@ -254,15 +241,15 @@ class Guide:
             np.array(self._q),
             np.stack(self._pixels, axis=1),
             self._of_pixels(np.stack(self._covariances, axis=1)),
-            self._calibration.measured_c,
+            self.calibration.measured_c,
             np.stack([m.pixels for m in marks], axis=1),
             self._of_pixels(np.stack([m.covariances for m in marks], axis=1)),
-            self._markers_m,
+            self.markers_m,
         )
 
     def _of_pixels(self, measured: Floats) -> Floats:
         """Covariances (c, n, 2, 2), px^2: what is declared, else what the tracker reported of each image."""
-        declared = self._case.errors.ball_px
+        declared = self.case.errors.ball_px
         return measured if declared is None else np.broadcast_to(declared**2 * np.eye(2), measured.shape)
 
 
@@ -288,16 +275,9 @@ class ImageReading(NamedTuple):
     targets_m: Floats  # shape (k, 3), mm
 
 
-class Mapped(NamedTuple):
-    """The head in C, and the estimates of ball and target that the case asks for."""
-
-    mapping: Mapping
-    guide: Guide
-
-
 def map_markers(
     case: ServoCase, calibration: RobotCalibration, detector: Detector, operator: Operator, reading: ImageReading
-) -> Mapped:
+) -> Guide:
     """The head in C, from its markers' pixels, found near where an operator points, and their readings.
 
     Raises:
@@ -306,33 +286,27 @@ def map_markers(
     radius_mm, limits, seen = case.file.head.marker_diameter_mm / 2, case.file.servo, []
     for name in case.markers.names:
         near = operator.pointed_cp(name)
-        searches = tuple(Search(camera, near, radius_mm, limits.search_px) for camera in calibration.cameras)
-        detections = look_at(detector, searches, limits.frames)
+        detections = look_at(detector, calibration.cameras, near, radius_mm, limits.search_px, limits.frames)
         if isinstance(detections, Lost):
             raise NoAnswerError(f"marker {name}: {detections.reason}", code="marker_not_seen")
         seen.append(detections)
     points = [in_space(calibration.cameras, detections) for detections in seen]
-    markers = SeenMarkers(np.concatenate([p.points_c for p in points]), np.concatenate([p.covariance for p in points]))
-    names, where = case.markers.names, f"{case.path}: mapping"
-    mapping = map_head(names, markers, reading.markers_m, case.errors.marker_mm, reading.targets_m, where=where)
+    markers = Points(np.concatenate([p.points_c for p in points]), np.concatenate([p.covariance for p in points]))
+    (markers_m, targets_m), where = reading, f"{case.path}: mapping"
+    mapping = map_head(case.markers.names, markers, markers_m, case.errors.marker_mm, targets_m, where)
     kind = JointGuide if case.file.servo.estimate == "joint" else Guide
-    return Mapped(mapping, kind(case, calibration, mapping, seen, reading.markers_m, detector))
+    return kind(case, calibration, mapping, seen, markers_m, detector)
 
 
 @dataclass(frozen=True, eq=False)
 class Aims:
-    """Where the arm is sent for some of a case's targets, those of these numbers, by calibration and mapping alone.
+    """Where the arm is sent for some of a case's targets, by calibration and mapping alone."""
 
-    ``q_hover`` (n, 6), rad: above each; ``q_aim``: the ball on it. The task holds the servo's limits, and the checker
-    with the head where it is believed to be. ``expected_tre_mm`` (n,) is what the mapping expects of itself there
-    (rms).
-    """
-
-    numbers: tuple[int, ...]
-    q_hover: Floats
-    q_aim: Floats
-    task: Task
-    expected_tre_mm: Floats
+    numbers: tuple[int, ...]  # of the targets
+    q_hover: Floats  # shape (n, 6), rad: above each
+    q_aim: Floats  # shape (n, 6), rad: the ball on it
+    task: Task  # holds the servo's limits
+    expected_tre_mm: Floats  # shape (n,), that the mapping expects of itself there (rms)
 
     def bring(self, row: int, arm: Arm) -> Servoed | None:
         """Move the ball from above a target onto it by the robot alone; where the path touches, say so and stay."""
@@ -341,10 +315,6 @@ class Aims:
             return Servoed(ServoStop.CONTACT, (), self.q_hover[row], f"{contact.body} and {contact.other}")
         arm.move_jp(self.q_aim[row])
         return None
-
-    def correct(self, row: int, guide: Guide, arm: Arm) -> Servoed:
-        """Servo the ball onto a target, from where `bring` left it."""
-        return servo(self.task, self.q_aim[row], guide.look, arm)
 
 
 def step_limits(case: ServoCase) -> StepLimits:
@@ -355,11 +325,7 @@ def step_limits(case: ServoCase) -> StepLimits:
 
 
 def aims_of(
-    case: ServoCase,
-    calibration: RobotCalibration,
-    mapping: Mapping,
-    targets_m: Floats,
-    wanted: Sequence[str] | None = None,
+    case: ServoCase, calibration: RobotCalibration, mapping: Mapping, targets_m: Floats, wanted: Sequence[str] | None
 ) -> Aims:
     """Where the arm is sent for the case's targets (k, 3), mm, as they are read, or for those whose names are wanted.
 
@@ -370,7 +336,7 @@ def aims_of(
     chosen = [i for i, name in enumerate(case.targets.names) if wanted is None or name in wanted]
     checker = workcell_checker(case, calibration.T_base_c @ mapping.T_c_m)
     aims_base = apply(calibration.T_base_c, mapping.to_c(targets_m[chosen]))
-    hovers = path_upward(rod, aims_base, case.file.servo.hover_mm)
+    hovers = aims_base - case.file.servo.hover_mm * rod.R_base_flange[:, 2]  # farther back along the rod
     q = configurations(rod, np.concatenate([aims_base, hovers]), checker, first=calibration.branch).q
     limits, steps = case.file.servo, step_limits(case)
     task = Task(rod, calibration.T_base_c, limits.tolerance_mm, limits.max_steps, limits.looks, steps, checker)
@@ -383,11 +349,8 @@ def follow(
 ) -> Iterator[dict[str, Any]]:
     """What a session's looks at the ball say, stop by stop, as plain values: mm and degrees; None of a lost ball.
 
-    Args:
-        T_base_c: Shape (4, 4), mm, as calibrated.
-        targets_m: Shape (k, 3), mm, in the image.
-        stops: Name of the target, and joints (6,), rad.
-        arm: Moves to each.
+    T_base_c (4, 4), mm, is as calibrated, targets (k, 3), mm, are in the image; a stop is the name of a target and
+    joints (6,), rad.
     """
     rod, limits, last, radius = carried_rod(case), step_limits(case), "", case.file.target.hit_radius_mm
     for name, q in stops:

@@ -36,36 +36,27 @@ class ProbeDevices(NamedTuple):
 
 
 class ProbeShot(NamedTuple):
-    """One image, of a number from 0, with all that belongs to it; arrays of shape (6,).
-
-    ``q_probe``, ``q_needle``: commanded joints, rad, the needle's after the jog. ``turn_probe``, ``turn_needle``:
-    direction in which each joint last rotated: 1, -1, or 0.
-    """
+    """One image, of a number from 0, with all that belongs to it."""
 
     number: int
     candidate: int
-    q_probe: Floats
-    q_needle: Floats
-    turn_probe: Floats
-    turn_needle: Floats
+    q_probe: Floats  # shape (6,), rad, commanded
+    q_needle: Floats  # shape (6,), rad, commanded after the jog
+    turn_probe: Floats  # shape (6,), direction in which each joint last rotated: 1, -1, or 0
+    turn_needle: Floats  # likewise
     image: Pixels
     found: Detection | Missed
 
 
 @dataclass(frozen=True, eq=False)
 class Acquisition:
-    """A recording, its poses as the controllers print them, and how it was made.
-
-    ``shots`` are the images behind it, in the same order; ``missed`` counts pictures without a needle, by reason, and
-    poses that were given up; ``missed_shots`` are those images; ``left`` are indices of candidates that were never gone
-    to.
-    """
+    """A recording, its poses as the controllers print them, and how it was made."""
 
     recording: Recording
-    shots: tuple[ProbeShot, ...]
-    missed: dict[str, int]
-    missed_shots: tuple[ProbeShot, ...]
-    left: Ints
+    shots: tuple[ProbeShot, ...]  # the images behind it, in the same order
+    missed: dict[str, int]  # pictures without a needle, by reason, and poses that were given up
+    missed_shots: tuple[ProbeShot, ...]  # images without a needle
+    left: Ints  # indices of candidates that were never gone to
 
 
 class _SentArm:
@@ -84,20 +75,12 @@ class _SentArm:
 
 
 def acquire(
-    case: SelfcalCase,
-    workcell: TwoArms,
-    candidates: CandidatePoses,
-    devices: ProbeDevices,
-    rng: np.random.Generator,
+    case: SelfcalCase, workcell: TwoArms, candidates: CandidatePoses, devices: ProbeDevices, rng: np.random.Generator,
     count: Count = uncounted,
-) -> Acquisition:
+) -> Acquisition:  # fmt: skip
     """Record as many poses as the case asks for, choosing others for those in which the needle is not found.
 
-    Args:
-        workcell: Its collision checker: the jog is checked too.
-        candidates: Poses that can be taken.
-        devices: Both arms, the probe, and who jogs.
-        rng: For the choice, if it is random.
+    The workcell checks the jog too; ``rng`` is for the choice, if it is random.
 
     Raises:
         NoAnswerError: The candidates are used up before enough images show the needle.
@@ -109,10 +92,9 @@ def acquire(
     left = np.arange(len(candidates.q_probe))
     while len(shots) < wanted:
         if wanted - len(shots) > len(left):
-            what = (
-                f"{len(shots)} of {wanted} poses show the needle. Of {len(candidates.q_probe)} candidates, "
-                f"{len(missed)} did not show it and {given_up.total()} were given up. More [poses] samples would help"
-            )
+            lacking = f"{len(missed)} did not show it and {given_up.total()} were given up"
+            what = f"{len(shots)} of {wanted} poses show the needle. Of {len(candidates.q_probe)} candidates, {lacking}"
+            what += ". More [poses] samples would help"
             raise NoAnswerError(what, counts=candidates.counts, code="too_few_poses")
         chosen = choose(case, candidates, left, wanted - len(shots), rng, shots)
         left = np.setdiff1d(left, chosen)
@@ -145,20 +127,14 @@ def keep_pictures(taken: Acquisition, pixel_mm: float, folder: Path) -> None:
 
 
 def choose(
-    case: SelfcalCase,
-    candidates: CandidatePoses,
-    left: Ints,
-    n: int,
-    rng: np.random.Generator,
-    shots: list[ProbeShot],
+    case: SelfcalCase, candidates: CandidatePoses, left: Ints, n: int, rng: np.random.Generator, shots: list[ProbeShot]
 ) -> Ints:
     """The next n candidates of those left: the most informative given what is recorded, or at random."""
     if case.content.poses.choose == "random":
         return np.sort(rng.choice(left, n, replace=False))
     recorded = candidates.poses.subset(np.array([shot.candidate for shot in shots])) if shots else None
-    noise = choice_noise(case)
     # the arms' lasting errors are not counted here: that gains 3 % of error, and costs the found region 5 % of coverage
-    return left[choose_poses(candidates.poses.subset(left), n, noise, drawing(case), recorded=recorded)]
+    return left[choose_poses(candidates.poses.subset(left), n, choice_noise(case), drawing(case), recorded=recorded)]
 
 
 def choice_noise(case: SelfcalCase) -> Noise:
@@ -167,14 +143,9 @@ def choice_noise(case: SelfcalCase) -> Noise:
 
 
 def _shot(
-    case: SelfcalCase,
-    workcell: TwoArms,
-    candidates: CandidatePoses,
-    devices: ProbeDevices,
-    arms: tuple[_SentArm, _SentArm],
-    row: int,
-    number: int,
-) -> ProbeShot | str:
+    case: SelfcalCase, workcell: TwoArms, candidates: CandidatePoses, devices: ProbeDevices,
+    arms: tuple[_SentArm, _SentArm], row: int, number: int,
+) -> ProbeShot | str:  # fmt: skip
     q_probe, poses = candidates.q_probe[row], candidates.poses
     assert poses.v is not None  # candidates are made with directions
     turn_probe = arms[0].move(q_probe)
@@ -193,15 +164,9 @@ def _shot(
 def _recording(case: SelfcalCase, shots: list[ProbeShot], missed: list[ProbeShot], *, play: bool) -> Recording:
     found = [shot.found for shot in shots if isinstance(shot.found, Detection)]
     keys = ("q_probe", "q_needle", *(("turn_probe", "turn_needle") if play else ()))
-    joints: dict[str, Any] = {key: np.array([getattr(shot, key) for shot in shots]) for key in keys}
-    A, B = (flange_pose(model, joints[key]) for model, key in zip(case.models, keys[:2], strict=True))
-    return Recording(
-        A,
-        B,
-        np.array([one.tip_image for one in found]),
-        np.array([one.direction_image for one in found]),
-        tuple(str(shot.number + 1) for shot in shots),
-        shaft_mm=np.array([one.shaft_mm for one in found]),
-        missed=tuple((str(shot.number + 1), str(shot.found)) for shot in missed),
-        **joints,
-    )
+    parts: dict[str, Any] = {key: np.array([getattr(shot, key) for shot in shots]) for key in keys}
+    A, B = (flange_pose(model, parts[key]) for model, key in zip(case.models, keys[:2], strict=True))
+    P, v = np.array([one.tip_image for one in found]), np.array([one.direction_image for one in found])
+    parts["shaft_mm"] = np.array([one.shaft_mm for one in found])
+    parts["missed"] = tuple((str(shot.number + 1), str(shot.found)) for shot in missed)
+    return Recording(A, B, P, v, tuple(str(shot.number + 1) for shot in shots), **parts)

@@ -61,21 +61,15 @@ class PointSpread(NamedTuple):
 
 @dataclass(frozen=True)
 class Imager:
-    """Probe and machine: pixels along the face and in depth, their edge, and the point spread; lengths in mm.
-
-    ``slice_fwhm_mm``: full width of the slice's amplitude profile across the plane. ``range_db``: this many dB from
-        black to
-    white; ``speckle_db``: grey of mean speckle power, dB below white; ``noise_db``: electronic noise, dB below mean
-    speckle.
-    """
+    """Probe and machine: pixels along the face and in depth, their edge, and the point spread; lengths in mm."""
 
     columns: int = 250
     rows: int = 300
     pixel_mm: float = 0.2
-    slice_fwhm_mm: float = 1.2
-    range_db: float = 60.0
-    speckle_db: float = 34.0
-    noise_db: float = 25.0
+    slice_fwhm_mm: float = 1.2  # full width of the slice's amplitude profile across the plane
+    range_db: float = 60.0  # from black to white
+    speckle_db: float = 34.0  # grey of mean speckle power, below white
+    noise_db: float = 25.0  # electronic noise, below mean speckle
     spread: PointSpread = field(default_factory=PointSpread)
 
     @property
@@ -83,14 +77,9 @@ class Imager:
         """Width and depth: (u, v) of the last pixel's middle."""
         return ((self.columns - 1) * self.pixel_mm, (self.rows - 1) * self.pixel_mm)
 
-    @property
-    def slice_sigma(self) -> float:
-        """Standard deviation of the slice's profile, mm."""
-        return self.slice_fwhm_mm / FWHM_PER_SIGMA
-
     def slice_gain(self, off_plane_mm: Floats) -> Floats:
         """Amplitude of an echo off the plane over that in it; any shape."""
-        return np.asarray(np.exp(-0.5 * (off_plane_mm / self.slice_sigma) ** 2))
+        return np.asarray(np.exp(-0.5 * (off_plane_mm / (self.slice_fwhm_mm / FWHM_PER_SIGMA)) ** 2))
 
     def grey(self, amplitude: Floats) -> Pixels:
         """Log compression: amplitude 1 is mean speckle."""
@@ -105,38 +94,25 @@ class Imager:
 
 @dataclass(frozen=True)
 class NeedleEcho:
-    """Echo of the needle's steel. Amplitudes against mean speckle.
+    """Echo of the needle's steel. Amplitudes against mean speckle."""
 
-    ``contrast_db`` is that of the shaft in the plane and parallel to the face, at the middle depth; straight down it is
-    fainter by ``steep_loss_db``: less comes back to the face. ``roughness``: random part of the shaft's amplitude. The
-    tip is brighter, by ``tip_gain`` over ``tip_length_mm``. Reverberations are echoes between the walls, below the
-    shaft, each fainter than the one before, parallel to the face by ``reverberation_gain``, else by the squared cosine
-    of the inclination
-    too: what bounces between tilted walls is mirrored away. ``shadow``: how much of the sound the needle keeps from
-        what lies
-    below it, 0..1.
-    """
-
-    contrast_db: float = 28.0
-    steep_loss_db: float = 8.0
-    roughness: float = 0.35
-    tip_gain: float = 1.8
-    tip_length_mm: float = 0.6
-    reverberations: int = 2
+    contrast_db: float = 28.0  # of the shaft in the plane and parallel to the face, at the middle depth
+    steep_loss_db: float = 8.0  # straight down: less comes back to the face
+    roughness: float = 0.35  # random part of the shaft's amplitude
+    tip_gain: float = 1.8  # the tip is brighter
+    tip_length_mm: float = 0.6  # over which it is
+    reverberations: int = 2  # echoes between the walls, below the shaft, each fainter than the one before
     reverberation_mm: float = 1.6
-    reverberation_gain: float = 0.3
-    shadow: float = 0.5
+    reverberation_gain: float = 0.3  # parallel to the face, else times the squared cosine of the tilt
+    shadow: float = 0.5  # how much of the sound the needle keeps from what lies below it, 0..1
 
 
 class Segment(NamedTuple):
-    """A straight segment, in pixels of the image that was searched: (column, row) of its shallower and its deeper end.
+    """A straight segment, in pixels of the image that was searched."""
 
-    ``score``: sum of the samples along it, one per pixel of length.
-    """
-
-    start: Floats
-    end: Floats
-    score: float
+    start: Floats  # (column, row) of its shallower end
+    end: Floats  # of its deeper end
+    score: float  # sum of the samples along it, one per pixel of length
 
 
 def brightest_segment(field: Floats, inclinations: Floats) -> Segment:
@@ -241,15 +217,12 @@ INCLINATIONS = (float(np.radians(8.0)), float(np.radians(82.0)))
 
 
 class Detection(NamedTuple):
-    """A detected needle: its tip, (u, v), mm, corrected for the bias; its direction toward the tip, unit.
+    """A detected needle."""
 
-    ``contrast_db``: amplitude of the last piece of shaft over the background. ``shaft_mm``: how much of it shows.
-    """
-
-    tip_image: Floats
-    direction_image: Floats
-    contrast_db: float
-    shaft_mm: float
+    tip_image: Floats  # (u, v), mm, corrected for the bias
+    direction_image: Floats  # shape (2,), unit, toward the tip
+    contrast_db: float  # amplitude of the last piece of shaft over the background
+    shaft_mm: float  # how much of it shows
 
 
 def detect(image: Pixels, imager: Imager, *, tip_bias: float = TIP_BIAS) -> Detection | Missed:
@@ -337,7 +310,6 @@ def _ridge(relative: Floats, imager: Imager, segment: Segment) -> _Line:
 
 
 def _profile(relative: Floats, imager: Imager, line: _Line, s: Floats) -> Floats:
-    """Mean amplitude across the ridge at each s along the line."""
     t = np.arange(-RIDGE_MM / 2.0, RIDGE_MM / 2.0 + STEP_MM / 2.0, STEP_MM)
     return np.asarray(_samples(relative, imager, line, s, t).mean(axis=1))
 

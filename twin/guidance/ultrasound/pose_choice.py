@@ -65,14 +65,7 @@ class Touching(StrEnum):
 
 
 def between_arms(case: SelfcalCase, T_end1_image: Floats, T_base1_base2: Floats, clearance_mm: float) -> BetweenArms:
-    """Both arms of a case, with the probe's head and the needle's arm where they are.
-
-    Args:
-        case: Arms, probe and needle.
-        T_end1_image: Where the probe's head is, shape (4, 4), mm.
-        T_base1_base2: Where the needle's arm stands, shape (4, 4), mm.
-        clearance_mm: How far apart they must stay.
-    """
+    """Both arms of a case, so far apart, with probe's head and needle's arm at these poses (4, 4), mm."""
     head = head_body(head_pose(case, T_end1_image), np.array(case.content.probe.head_mm), clearance_mm)
     tools = (probe_tool(case), needle_tool(case))
     return BetweenArms(case.models, tools, head, T_base1_base2, clearance_mm)
@@ -90,14 +83,12 @@ class TwoArms:
         moved = Box(table.name, T_base2_base1 @ table.T_base_box, table.size_mm)
         tools = (probe_tool(case), needle_tool(case))
         self._probe = FastChecker(self.probe_model, tools[0], [table], phantom, padding_mm=clearance)
-        self._needle = FastChecker(
-            self.needle_model, tools[1], [moved], phantom.transformed(T_base2_base1), padding_mm=clearance
-        )
+        phantom_base2 = phantom.transformed(T_base2_base1)
+        self._needle = FastChecker(self.needle_model, tools[1], [moved], phantom_base2, padding_mm=clearance)
         self._between = between_arms(case, case.T_end1_image, case.T_base1_base2, clearance)
         self._phantom = fcl.CollisionObject(surface(phantom))
-        self._table = fcl.CollisionObject(
-            fcl.Box(*table.size_mm), fcl.Transform(table.T_base_box[:3, :3], table.T_base_box[:3, 3])
-        )
+        placed = fcl.Transform(table.T_base_box[:3, :3], table.T_base_box[:3, 3])
+        self._table = fcl.CollisionObject(fcl.Box(*table.size_mm), placed)
 
     def probe_free(self, q: Floats) -> bool:
         """Whether the probe's arm touches neither itself, table nor phantom at ``q`` (6,), rad."""
@@ -184,30 +175,22 @@ REASONS = (TIP_OUTSIDE, PROBE_REACH, NEEDLE_REACH, *(reason.value for reason in 
 
 
 class ImageGeometry(NamedTuple):
-    """n drawn geometries: the probe's T_base1_image (n, 4, 4), mm, and the needle in its image.
+    """n drawn geometries."""
 
-    ``tip_mm`` (n, 2), ``direction_image`` (n, 2), unit, toward the tip; ``roll`` (n,), rad, of the needle about itself.
-    """
-
-    T_base1_image: Floats
-    tip_mm: Floats
-    direction_image: Floats
-    roll: Floats
+    T_base1_image: Floats  # shape (n, 4, 4), mm
+    tip_mm: Floats  # shape (n, 2), in the image
+    direction_image: Floats  # shape (n, 2), unit, toward the tip
+    roll: Floats  # shape (n,), rad, of the needle about itself
 
 
 class CandidatePoses(NamedTuple):
-    """n poses that can be recorded, by joints (n, 6), rad, and the draws by reason; ``ok`` for those that are here.
-
-    ``poses``: A and B by the drawing's kinematics; the tip and the direction as they should show. ``roll`` (n,), rad:
-        the
-    needle about itself.
-    """
+    """n poses that can be recorded."""
 
     q_probe: Floats  # shape (n, 6), rad
     q_needle: Floats  # shape (n, 6), rad
-    poses: Recording
-    roll: Floats
-    counts: dict[str, int]
+    poses: Recording  # A and B by the drawing's kinematics; the tip and the direction as they should show
+    roll: Floats  # shape (n,), rad, of the needle about itself
+    counts: dict[str, int]  # of the draws, by reason; ``ok`` for those that are here
 
 
 def drawing(case: SelfcalCase) -> Estimate:
@@ -253,10 +236,8 @@ def find_candidates(case: SelfcalCase, workcell: TwoArms, rng: np.random.Generat
     T_base2_image = np.linalg.inv(case.T_base1_base2) @ T_base1_image
     tip, along = (np.column_stack([one, np.zeros(n)]) for one in (tip_mm, direction_image))
     B = needle_flange(T_base2_image, tip, along, roll, belief.t_Q, belief.V)
-    probe, needle = (
-        configurations(model, goal, np.radians(arm.home_deg))
-        for model, goal, arm in zip(case.models, (A, B), (case.content.probe_arm, case.content.needle_arm), strict=True)
-    )
+    homes = (np.radians(arm.home_deg) for arm in (case.content.probe_arm, case.content.needle_arm))
+    probe, needle = (configurations(*one) for one in zip(case.models, (A, B), homes, strict=True))
     tips = np.einsum("nij,nj->ni", T_base1_image[:, :3, :2], tip_mm) + T_base1_image[:, :3, 3]
     inside = inside_phantom(case.content.phantom, tips)
     answers = [_checked_pose(workcell, bool(inside[i]), probe[i], needle[i]) for i in range(n)]
@@ -304,7 +285,6 @@ def configurations(model: UrModel, T_base_flange: Floats, q_home: Floats) -> lis
 
 
 def _checked_pose(workcell: TwoArms, inside: bool, probe: Floats, needle: Floats) -> str | tuple[Floats, Floats]:
-    """The first pair of configurations that is free, or the reason why none is."""
     for stops, reason in ((not inside, TIP_OUTSIDE), (not len(probe), PROBE_REACH), (not len(needle), NEEDLE_REACH)):
         if stops:
             return reason
@@ -331,14 +311,10 @@ WORTH = 1e-4
 
 
 class _Design(NamedTuple):
-    """Information of every candidate, and the quantity to be known; p parameters and arms' errors.
+    """Information of every candidate, and the quantity to be known; p parameters and arms' errors."""
 
-    ``rows`` (n, 3, p): Jacobian of each candidate over its residuals' spread: its information is rows^T rows.
-    ``wanted`` (p, p): mean of J^T J over the workspace: trace(C wanted) is the mean squared error at the tip.
-    """
-
-    rows: Floats
-    wanted: Floats
+    rows: Floats  # shape (n, 3, p), Jacobian of each candidate over its residuals' spread
+    wanted: Floats  # shape (p, p), mean of J^T J over the workspace: trace(C wanted) is the tip's mean squared error
 
     def information(self, index: int) -> Floats:
         """Information of one candidate, shape (p, p)."""
@@ -346,26 +322,20 @@ class _Design(NamedTuple):
 
 
 def choose_poses(
-    candidates: Recording, n: int, noise: Noise, prior: Calibration | Estimate, *, recorded: Recording | None = None
+    candidates: Recording, n: int, noise: Noise, prior: Estimate, *, recorded: Recording | None = None
 ) -> Ints:
     """Choose poses by Fisher information: greedily, then by exchange until no single exchange helps.
 
-    What is minimised is the mean squared error at the tip over all candidates: A-optimal for that error.
-
-    Args:
-        candidates: Poses that could be recorded, with the tip where it would show.
-        prior: A rough calibration, such as the drawing's: 10 deg and 20 mm off will do.
-        recorded: Poses that are recorded already and count.
-
-    Returns:
-        Indices of n candidates, ascending.
+    What is minimised is the mean squared error at the tip over all candidates, poses that could be recorded, with the
+    tip where it would show: A-optimal for that error. The prior is rough, such as the drawing's: 10 deg and 20 mm off
+    will do. Poses that are recorded already count. Returns indices of n candidates, ascending.
 
     Raises:
         InputError: More poses wanted than there are candidates, or none.
     """
     if not 0 < n <= len(candidates):
         refuse(f"{n} poses of {len(candidates)} candidates", "pose choice", "1 to all of them", "out_of_range")
-    belief = _Belief(noise, prior.estimate if isinstance(prior, Calibration) else prior, None)
+    belief = _Belief(noise, prior, None)
     rows = _whitened(candidates, belief)
     H = _with_prior(PRIOR_WEIGHT * np.diag((rows**2).sum(axis=1).mean(axis=0)))  # makes H invertible
     if recorded is not None:
@@ -379,8 +349,6 @@ def choose_poses(
 
 
 class _Belief(NamedTuple):
-    """The belief before anything is recorded."""
-
     noise: Noise
     prior: Estimate
     arms: DeclaredArms | None
@@ -466,10 +434,8 @@ def aim(
 ) -> Floats:
     """Commanded joints of the needle's arm by its nominal kinematics and the calibration: (6,), rad; NaN out of reach.
 
-    Args:
-        row: The candidate whose probe pose, insertion and roll are used.
-        target_mm: In the image, shape (2,).
-        models: The probe's and the needle's arm, as they are drawn.
+    A candidate's row says probe pose, insertion and roll; the target (2,), mm, is in the image; the models are the
+    probe's and the needle's arm, as they are drawn.
     """
     poses = candidates.poses
     assert poses.v is not None  # candidates are made with directions

@@ -149,9 +149,9 @@ def _recording(table: GroupedTable, seen: _Seen | None, case: SelfcalCase | None
         joints = [joint_readings(part, "deg", where="joints", names=names) for part in both]
     turns = np.split(numbers["turn"], 2, axis=1) if "turn" in numbers else [None, None]
     poses = [poses_of(numbers[arm]) for arm in "AB" if arm in numbers]
-    if not poses and case is None:
-        refuse("joints alone", "header", "columns A_r11 .. B_z_mm, or a case that names the arms", "missing_column")
-    if not poses and case is not None:
+    if not poses:
+        if case is None:
+            refuse("joints alone", "header", "columns A_r11 .. B_z_mm, or a case that names the arms", "missing_column")
         poses = [flange_pose(model, q) for model, q in zip(case.models, joints, strict=True) if q is not None]
     P = np.column_stack([numbers[key] for key in ("P_mm", "P_w", "P_px") if key in numbers])
     v = np.column_stack([numbers[key] for key in ("v", "v_z") if key in numbers]) if "v" in numbers else None
@@ -284,10 +284,7 @@ def held_length_mm(case: SelfcalCase | None) -> float | None:
 
 
 def calibrate_case(recording: Recording, case: SelfcalCase | None, *, hold: bool = True) -> Calibration:
-    """Calibrate with the case's noise and, where it is to be held, the needle's length.
-
-    Pixels are solved for where the recording has them.
-    """
+    """Calibrate with the case's noise and, where it is to be held, the needle's length."""
     noise = None if case is None or case.content.noise is None else case.content.noise.noise()
     length = held_length_mm(case) if hold else None
     arms = None if case is None or recording.q_probe is None else case.declared_arms

@@ -11,7 +11,7 @@ from pydantic import Field, Strict, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 from puncture_twin.planning.arm.ur import UrModel, ur_model
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import SchemaError
 from puncture_twin.planning.base.provenance import CASE_ROLE, Input, content_input
 from puncture_twin.planning.base.toml_file import SchemaOne, find_toml, parse_toml, read_toml_bytes
@@ -203,19 +203,15 @@ class SelfcalFile(Section):
 
 @dataclass(frozen=True, eq=False)
 class SelfcalCase:
-    """A validated case: what it says, its file with role and hash, and both arms' models, the probe's first.
-
-    Its drawing, mm: ``T_end1_image`` is X, the face's middle on the flange's z axis, the depth along it;
-    ``T_base1_base2`` is Y; ``tip_end2`` (3,).
-    """
+    """A validated case; its drawing is in mm."""
 
     path: Path
     content: SelfcalFile
-    inputs: tuple[Input, ...]
-    models: tuple[UrModel, UrModel] = field(init=False)
-    T_end1_image: Floats = field(init=False)
-    T_base1_base2: Floats = field(init=False)
-    tip_end2: Floats = field(init=False)
+    inputs: tuple[Input, ...]  # its file with role and hash
+    models: tuple[UrModel, UrModel] = field(init=False)  # the probe's first
+    T_end1_image: Floats = field(init=False)  # X: the face's middle on the flange's z axis, the depth along it
+    T_base1_base2: Floats = field(init=False)  # Y
+    tip_end2: Floats = field(init=False)  # shape (3,)
 
     @property
     def declared_arms(self) -> DeclaredArms:
@@ -237,8 +233,7 @@ class SelfcalCase:
             "tip_end2": np.array([0.0, 0.0, content.needle.length_mm]),
         }
         for name, value in drawn.items():
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, read_only(value))
 
 
 def load_selfcal_case(path: Path | str) -> SelfcalCase:

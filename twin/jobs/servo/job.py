@@ -307,7 +307,7 @@ def follow_recording(path: Path, recording: Path) -> Answer:
     detector = image_detector(replay, hough_only=case.hough_only)
     calibration = calibrate_by_robot(case, Posture(replay.q_points, -1), replay, replay, detector)
     reading = replay.reading(case.markers, case.targets)
-    mapping, guide = map_markers(case, calibration, detector, replay, reading)
+    guide = map_markers(case, calibration, detector, replay, reading)
     looks = list(follow(case, guide, calibration.T_base_c, reading.targets_m, replay.stops, replay))
     tolerance_mm, last = case.file.servo.tolerance_mm, {one["target"]: one["error_mm"] for one in looks}
     facts: dict[str, Any] = {
@@ -318,7 +318,7 @@ def follow_recording(path: Path, recording: Path) -> Answer:
         "calibration_rms_px": list(calibration.rms_px),
         "robot_residual_mm": float(np.mean(calibration.robot_residual_mm)),
         "T_base_c": calibration.T_base_c.tolist(),
-        "fre_mm": mapping.fre_mm,
+        "fre_mm": guide.mapping.fre_mm,
         "looks": looks,
         "converged": all(error_mm is not None and error_mm <= tolerance_mm for error_mm in last.values()),
     }

@@ -118,13 +118,10 @@ class CaseScene:
     """Content of the scanner, in its frame (LPS of the scan, mm)."""
 
     solids: tuple[Solid, ...]
-    T_scan_ct: Floats
-    """Shape (4, 4): the case's frame to the scanner's; a rotation, never a mirror."""
+    T_scan_ct: Floats  # shape (4, 4): the case's frame to the scanner's; a rotation, never a mirror
     skin: TriangleMesh
-    cut: Bools
-    """Shape (3, 2): at which ends the body goes on beyond its surface."""
-    tables: Floats
-    """Shape (2, 3): the box about what the patient lies on; infinite without any."""
+    cut: Bools  # shape (3, 2): at which ends the body goes on beyond its surface
+    tables: Floats  # shape (2, 3): the box about what the patient lies on; infinite without any
     outside_objects: tuple[Part, ...]
     markers: NamedPoints | None
     listed: NamedPoints | None
@@ -135,10 +132,7 @@ def case_scene(
     case: Case, anatomy: Anatomy, settings: ScanSettings, rng: np.random.Generator, *,
     marker: MarkerKind = "disc", needle: TrueRod | None = None, outside: Placer | None = None,
 ) -> CaseScene:  # fmt: skip
-    """Place a case in the scanner.
-
-    Args:
-        rng: Draws each true marker in its cell.
+    """Place a case in the scanner, each true marker drawn in its cell.
 
     Raises:
         InputError: A structure's surface is open.
@@ -156,9 +150,7 @@ def case_scene(
     if needle is not None:
         start = needle.tip_ct - case.needle.shaft_mm * needle.forward_ct
         solids.append(Solid("needle", rod(start, needle.tip_ct, case.needle.diameter_mm), METAL_HU))
-    tables, (body, *rest) = (
-        [one._replace(mesh=one.mesh.transformed(T)) for one in part] for part in (_tables(case), solids)
-    )
+    tables, (body, *rest) = ([s._replace(mesh=s.mesh.transformed(T)) for s in part] for part in (_tables(case), solids))
     beneath, upon, within = (
         [Solid(one.name, one.mesh, one.hu) for one in laid if one.place == place]  # no segmentation names them
         for place in ("beneath", "upon", "within")
@@ -302,10 +294,7 @@ DECIMALS = 4
 
 
 def scan_grid(scene: CaseScene, settings: ScanSettings, rng: np.random.Generator) -> VolumeGrid:
-    """The voxels of a scan, axes along LPS.
-
-    Where the first of them falls is drawn within one voxel: a patient lies anywhere between two slices.
-    """
+    """The voxels of a scan, axes along LPS, the first drawn within one: a patient lies anywhere between two slices."""
     low, high = _shown(scene, settings)
     spacing = np.array([settings.pixel_mm, settings.pixel_mm, settings.spacing_mm])
     first = np.round(low + (0.5 + rng.uniform(0.0, 1.0, 3)) * spacing, DECIMALS)

@@ -33,16 +33,11 @@ def cut_solids(
     corners: Floats, owners: NDArray[np.int64], fills: Floats, labels: NDArray[Any], shape: tuple[int, int, int], *,
     spacing_mm: Floats, empty: float,
 ) -> Cut:  # fmt: skip
-    """Mean of what fills each voxel, and the label at its centre.
+    """Mean of what fills each voxel of a grid, and the label at its centre.
 
-    Args:
-        corners: Triangles of all solids, shape (m, 3, 3), in voxels: a voxel's centre has whole coordinates.
-        owners: Which solid each triangle belongs to, shape (m,).
-        fills: Value of each solid, shape (n,); a later one fills the place of an earlier one.
-        labels: Of each solid in each label map, shape (layers, n); 0 where a map does not show it.
-        shape: Of the grid.
-        spacing_mm: Of the voxels, shape (3,); it says how many lines there are.
-        empty: Value where no solid is.
+    Triangles of all solids, corners (m, 3, 3) in voxels (centres are whole), belong to their owners (m,). Solids are
+    filled (n,), later ones in the place of earlier ones, and labelled (layers, n) in each map, 0 where it does not show
+    them. The voxels' spacing (3,) says how many lines there are.
     """
     nx, ny, nz = shape
     lines, planes = (max(LEAST_LINES, 2 * int(np.ceil(mm / LINE_MM / 2)) + 1) for mm in spacing_mm[1:])

@@ -39,8 +39,7 @@ class ScanSettings:
     fov_mm: float | None = None
     """Side of the square image; None shows the whole body, as no ``length_mm`` along the bed does."""
     length_mm: float | None = None
-    turn: float = 0.0
-    """By which the patient is rotated about the bed's direction, rad."""
+    turn: float = 0.0  # by which the patient is rotated about the bed's direction, rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,12 +114,10 @@ def passed_voxels(corners: Floats, shape: tuple[int, int, int]) -> Ints:
 
 
 def missed_voxels(labels: NDArray[Any], label: int, corners: Floats, later: Bools) -> Ints:
-    """Voxels that a structure passes while neither they nor their neighbours have its label, shape (m, 3).
+    """Voxels (m, 3) that triangles (n, 3, 3), in voxels, pass while neither they nor their neighbours have the label.
 
-    Args:
-        labels: Shape (nx, ny, nz), what is labelled at each centre.
-        corners: Its triangles, shape (n, 3, 3), in voxels.
-        later: Shape (largest label + 1,), which labels fill the place of this one: their voxels are not missed.
+    Labels (nx, ny, nz) are those at the centres; ``later`` (largest label + 1,) are those that fill the place of this
+    one: their voxels are not missed.
     """
     shape = (labels.shape[0], labels.shape[1], labels.shape[2])
     at = passed_voxels(corners, shape)
@@ -155,11 +152,9 @@ class Solid(NamedTuple):
     name: str
     mesh: TriangleMesh
     hu: float
-    label: int = 0
-    """Its number in its label map (bodies that hold others have one of their own); 0 where none names it."""
+    label: int = 0  # its number in its label map (bodies that hold others have one of their own); 0 where none names it
     layer: int = 0
-    whole: bool = False
-    """Its label leaves out no part of it, however thin."""
+    whole: bool = False  # its label leaves out no part of it, however thin
 
 
 def check_closed(solid: Solid, where: str) -> Solid:

@@ -93,12 +93,7 @@ FAST = 1
 
 
 def write_nifti(path: Path, values: NDArray[Any], T_ct_index: Floats) -> Path:
-    """Write a ``.nii.gz``.
-
-    Args:
-        values: Shape (ni, nj, nk), whole numbers or floats.
-        T_ct_index: Shape (4, 4), voxel index to LPS mm; kept in single precision, as the format does.
-    """
+    """Write a ``.nii.gz`` of whole numbers or floats (ni, nj, nk); T_ct_index (4, 4), LPS mm, in single precision."""
     code = CODE_OF_TYPE[values.dtype.str[1:]]
     header = bytearray(FIRST_VOXEL_BYTE)
     struct.pack_into("<i", header, 0, 348)

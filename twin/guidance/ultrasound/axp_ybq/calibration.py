@@ -75,58 +75,40 @@ NO_NOISE = Noise(0.0, 0.0, 0.0, 0.0)
 class Calibration(Shown):
     """X, Y and the needle in its flange frame, from A X P = Y B Q."""
 
-    X: Floats
-    """T_end1_image, shape (4, 4), mm; Y: T_base1_base2."""
+    X: Floats  # T_end1_image, shape (4, 4), mm; Y: T_base1_base2
     Y: Floats
-    tip_end2: Floats
-    """t_Q, the needle's tip, shape (3,), mm, frame end2."""
-    needle_direction_end2: Floats
-    """V, unit, toward the tip, shape (3,), frame end2."""
-    scale: Floats
-    """mm per unit of P along u and v, shape (2,); ones where it was not wanted."""
-    residuals: Floats
-    """Y B Q - A X P, shape (n, 3), mm, base1, of every pose."""
-    rms_mm: float
-    """Root mean square length of the residuals of the poses that were used."""
-    weights: Floats
-    """One per pose, shape (n,): 1 used, 0 set aside; the latter's names are the ``outliers``."""
+    tip_end2: Floats  # t_Q, the needle's tip, shape (3,), mm, frame end2
+    needle_direction_end2: Floats  # V, unit, toward the tip, shape (3,), frame end2
+    scale: Floats  # mm per unit of P along u and v, shape (2,); ones where it was not wanted
+    residuals: Floats  # Y B Q - A X P, shape (n, 3), mm, base1, of every pose
+    rms_mm: float  # root mean square length of the residuals of the poses that were used
+    weights: Floats  # one per pose, shape (n,): 1 used, 0 set aside; the latter's names are the ``outliers``
     outliers: tuple[str, ...]
     image: ImageErrors | None
     """What errors of the image the residuals show, significant or not; None where the poses cannot show them."""
-    findings: tuple[Finding, ...]
-    """What the recording says against itself."""
-    iterations: int
-    """Steps of the refinement, all rounds together."""
-    condition: float
-    """Least over largest singular value of the Jacobian, lengths in 100 mm."""
-    covariance: Floats
-    """Shape (p, p), of the ``parameters``, whose names hold their units; rotations are R exp([w]x)."""
+    findings: tuple[Finding, ...]  # what the recording says against itself
+    iterations: int  # steps of the refinement, all rounds together
+    condition: float  # least over largest singular value of the Jacobian, lengths in 100 mm
+    covariance: Floats  # shape (p, p), of the ``parameters``, whose names hold their units; rotations are R exp([w]x)
     parameters: tuple[str, ...]
-    freedom: int
-    """Residuals minus unknowns."""
-    noise: Noise | Spread
-    """What the weights were made from: given, or found from the residuals (``Spread``)."""
+    freedom: int  # residuals minus unknowns
+    noise: Noise | Spread  # what the weights were made from: given, or found from the residuals (``Spread``)
     shaft_unit: float
     """Root mean square of the directions' spreads by their shafts' lengths; 1 where those were not read."""
-    lean_rad: float
-    """How far the needle leans out of the image, as the residuals show it."""
+    lean_rad: float  # how far the needle leans out of the image, as the residuals show it
     noise_ratio: float
     """Size of the residuals over what ``noise`` and ``arms`` let expect; far above 1: they are larger."""
     tip_bias_mm: float | None
     """How far the detected tip lies beyond the true one along the shaft; None without a needle length."""
-    orientations: Floats
-    """M, rotation from end2 to image, shape (n, 3, 3): how the needle stood in the image."""
-    cannot_show: tuple[str, ...]
-    """What the data cannot tell, in words."""
+    orientations: Floats  # M, rotation from end2 to image, shape (n, 3, 3): how the needle stood in the image
+    cannot_show: tuple[str, ...]  # what the data cannot tell, in words
     arms: DeclaredArms | None
     """Both arms' declared errors, which ``covariance`` then counts; None where they were not declared."""
     arm_errors: Floats
     """Posterior mean of their parameters, in declared standard deviations; shape (46,), or (52,) and (58,) with the
     play of one arm and of both; (0,) without."""
-    joint_covariance: Floats
-    """Of parameters and arms' errors together, shape (p + m, p + m); ``covariance`` without."""
-    small_sample: SmallSample | None
-    """Region with the uncertainty of an estimated noise, where arms are declared."""
+    joint_covariance: Floats  # of parameters and arms' errors together, shape (p + m, p + m); ``covariance`` without
+    small_sample: SmallSample | None  # region with the uncertainty of an estimated noise, where arms are declared
 
     @brief
     def __repr__(self) -> str:
@@ -148,12 +130,9 @@ class Calibration(Shown):
         if not isinstance(self.noise, Noise) or ratio <= LARGEST_RATIO:
             return warnings
         chance = 100.0 * self.chi_squared_chance()
-        return (
-            *warnings,
-            f"chi-squared of the residuals is {ratio:.2f} times their degrees of freedom ({self.freedom}): the "
-            "declared noise or arm errors are probably too small, and so are the stated errors; a correct "
-            f"declaration gives this in {chance:.2g} % of cases",
-        )
+        said = f"chi-squared of the residuals is {ratio:.2f} times their degrees of freedom ({self.freedom})"
+        small = "the declared noise or arm errors are probably too small, and so are the stated errors"
+        return (*warnings, f"{said}: {small}; a correct declaration gives this in {chance:.2g} % of cases")
 
     @property
     def covariance_counts(self) -> Floats:
@@ -218,15 +197,9 @@ class Calibration(Shown):
     def parameter_error(self, other: Estimate) -> Floats:
         """Another estimate minus this one in the order of ``parameters``, shape (p,): the step that leads there."""
         own = self.estimate
-        parts = [
-            log_rotation(own.R_X.T @ other.R_X),
-            other.t_X - own.t_X,
-            log_rotation(own.R_Y.T @ other.R_Y),
-            other.t_Y - own.t_Y,
-            other.t_Q - own.t_Q,
-            other.scale - own.scale,
-            tangent_basis(own.V).T @ other.V,
-        ]
+        parts = [log_rotation(own.R_X.T @ other.R_X), other.t_X - own.t_X]
+        parts += [log_rotation(own.R_Y.T @ other.R_Y), other.t_Y - own.t_Y]
+        parts += [other.t_Q - own.t_Q, other.scale - own.scale, tangent_basis(own.V).T @ other.V]
         return np.concatenate(parts)[self.active]
 
     def region_limit(self, level: float = 0.95) -> float:
@@ -246,13 +219,9 @@ class Calibration(Shown):
 
 
 def calibration_of(
-    problem: Problem,
-    fit: RobustFit,
-    observability: Observability,
-    seen: SeenDirection,
-    cannot_show: tuple[str, ...],
+    problem: Problem, fit: RobustFit, observability: Observability, seen: SeenDirection, cannot_show: tuple[str, ...],
     arms: DeclaredArms | None,
-) -> Calibration:
+) -> Calibration:  # fmt: skip
     """The calibration at a fit, with the needle's direction before it took part and what the poses cannot show."""
     at_fit, estimate, kept, p = weighed(problem, fit), fit.estimate, fit.tip_kept, len(problem.active)
     freedom = 3 * int(kept.sum()) + 2 * int(fit.direction_kept.sum()) * problem.with_direction - p
@@ -315,21 +284,17 @@ SHAFT_BIAS = (
     "a constant error of the detected tip along the shaft shifts the tip in the needle's flange frame but changes no "
     "residual; a known needle length would fix it"
 )
-
 ARMS_TAKEN = (
     "errors of the arms that repeat from pose to pose (lengths, joint zeros): none were declared together with the "
     "joints, so the stated errors count only noise and are too small"
 )
-
 PLAY_SIGN = (
     "on which side of their backlash the joints were: the recording does not state how they rotated, so backlash "
     "counts as noise, and the region is too narrow where the noise was estimated"
 )
-
 DIRECTION_SIGN = (
     "no directions were measured: the needle's axis comes from the image plane alone, pointing from flange to tip"
 )
-
 ADVISED_POSES = 20
 """From 20 poses on the closed form is well conditioned (median 5e2; 6e3 at 16)."""
 
@@ -346,17 +311,16 @@ def calibrate(
     """Solve A X P = Y B Q: closed form, then weighted least squares over the poses that agree.
 
     A: T_base1_end1, B: T_base2_end2, of every pose; P: the tip in the image; X: T_end1_image; Y: T_base1_base2; Q: the
-    tip in end2.
+    tip in end2. At least 16 poses (20 are better); one more where P has three coordinates.
 
     Args:
-        recording: At least 16 poses (20 are better); one more where P has three coordinates.
         noise: Of both arms and the image; None estimates the residuals' spread, inside and across the image.
         needle_length_mm: Distance along the shaft from the flange's origin to the tip: determines a constant error of
             the detected tip along the shaft, which nothing else does.
         scale: Whether mm per unit of P, along both axes of the image, is estimated.
-        direction: Whether measured needle directions take part, where the recording has them.
-        arms: Declared errors of both arms that repeat from pose to pose; the recording then needs joints. None takes
-            all errors of the flanges for noise.
+        direction: Whether measured needle directions take part.
+        arms: Declared errors that repeat from pose to pose; the recording then needs joints. None takes all errors of
+            the flanges for noise.
 
     Raises:
         InputError: Too few poses, or more than half of them disagree; joints that are missing or of another arm.
@@ -397,12 +361,7 @@ def _check(recording: Recording, scale: bool) -> None:
 def _solve(
     problem: Problem, start: Estimate, *, direction: bool
 ) -> tuple[Problem, RobustFit, Observability, SeenDirection]:
-    """Fit the tips, require that all unknowns are observable, then fit again with directions and estimated noise.
-
-    Raises:
-        InputError: Most poses disagree, or the directions contradict them.
-        Degenerate: The poses cannot show every unknown.
-    """
+    """Fit the tips, require that all unknowns are observable, then fit again with directions and estimated noise."""
     recording = problem.recording
     fit = robust_fit(problem, start)
     try:
@@ -438,15 +397,11 @@ class Shot(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ShotByShot(Shown):
-    """A calibration, where everything is linearised, with the shots since, used or not.
-
-    ``information`` (p + m, p + m) is that of parameters and arms' errors, ``vector`` (p + m,) times the step from the
-    start.
-    """
+    """A calibration, where everything is linearised, with the shots since, used or not."""
 
     start: Calibration
-    information: Floats
-    vector: Floats
+    information: Floats  # shape (p + m, p + m), of parameters and arms' errors
+    vector: Floats  # shape (p + m,), the information times the step from the start
     shots: tuple[Shot, ...] = ()
 
     @brief

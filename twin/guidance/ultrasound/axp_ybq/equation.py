@@ -46,25 +46,13 @@ from puncture_twin.planning.case.errors import ArmErrors
 from puncture_twin.planning.geometry.rigid import exp_rotation, nearest_rotation, skew
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Noise, Recording
 
-PARAMETERS = (
-    *(f"w_X_{axis}_rad" for axis in "xyz"),
-    *(f"t_X_{axis}_mm" for axis in "xyz"),
-    *(f"w_Y_{axis}_rad" for axis in "xyz"),
-    *(f"t_Y_{axis}_mm" for axis in "xyz"),
-    *(f"t_Q_{axis}_mm" for axis in "xyz"),
-    "scale_u",
-    "scale_v",
-    "V_1_rad",
-    "V_2_rad",
-)
+PARTS = ("w_X_{}_rad", "t_X_{}_mm", "w_Y_{}_rad", "t_Y_{}_mm", "t_Q_{}_mm")
+PARAMETERS = (*(part.format(axis) for part in PARTS for axis in "xyz"), "scale_u", "scale_v", "V_1_rad", "V_2_rad")
 """Every parameter that may be estimated, in the order of the Jacobians' columns."""
 
 N_PARAMETERS = len(PARAMETERS)
-W_X, T_X, W_Y, T_Y, T_Q, SCALE, DIRECTION = (
-    slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15), slice(15, 17), slice(17, 19),
-)  # fmt: skip
-
-
+W_X, T_X, W_Y, T_Y, T_Q = (slice(start, start + 3) for start in range(0, 15, 3))
+SCALE, DIRECTION = slice(15, 17), slice(17, 19)
 LENGTH_MM = 100.0
 """Lengths are counted in this unit, so that the columns of a system are of one size."""
 
@@ -86,31 +74,22 @@ def parameter_units(active: Ints, scale: Floats) -> Floats:
 
 
 class Estimate(NamedTuple):
-    """One value of every unknown: R_X, t_X of T_end1_image; R_Y, t_Y of T_base1_base2; t_Q, the tip in end2, mm.
-
-    ``scale`` (2,): mm per unit of P. ``V`` (3,), unit: the needle's direction in end2.
-    """
+    """One value of every unknown: R_X, t_X of T_end1_image; R_Y, t_Y of T_base1_base2; t_Q, the tip in end2, mm."""
 
     R_X: Floats
     t_X: Floats  # noqa: N815 - the equation's letter
     R_Y: Floats
     t_Y: Floats  # noqa: N815 - the equation's letter
     t_Q: Floats  # noqa: N815 - the equation's letter
-    scale: Floats
-    V: Floats
+    scale: Floats  # shape (2,), mm per unit of P
+    V: Floats  # shape (3,), unit, the needle's direction in end2
 
     def moved(self, step: Floats) -> Estimate:
         """After a step (19,) in the order of ``PARAMETERS``: R Exp(w), sums of the rest, V on the sphere."""
         V = self.V + tangent_basis(self.V) @ step[DIRECTION]
-        return Estimate(
-            self.R_X @ exp_rotation(step[W_X]),
-            self.t_X + step[T_X],
-            self.R_Y @ exp_rotation(step[W_Y]),
-            self.t_Y + step[T_Y],
-            self.t_Q + step[T_Q],
-            self.scale + step[SCALE],
-            V / np.linalg.norm(V),
-        )
+        R_X, R_Y = self.R_X @ exp_rotation(step[W_X]), self.R_Y @ exp_rotation(step[W_Y])
+        t_X, t_Y, t_Q = self.t_X + step[T_X], self.t_Y + step[T_Y], self.t_Q + step[T_Q]
+        return Estimate(R_X, t_X, R_Y, t_Y, t_Q, self.scale + step[SCALE], V / np.linalg.norm(V))
 
     def moved_by(self, active: Ints, step: Floats) -> Estimate:
         """The estimate after a step (p,) of the free parameters, in `parameter_units`."""
@@ -199,19 +178,14 @@ SLIPS: Mapping[str, Floats] = MappingProxyType(
 
 
 class SeenDirection(NamedTuple):
-    """The needle's direction V (3,), unit, frame end2, as the poses agree on it; which do (n,), or are reversed (n,).
+    """The needle's direction as the poses agree on it, and rms angles between measured ones and those by V."""
 
-    ``spread_rad`` and ``lean_rad`` are root mean square angles between measured directions and those that V gives,
-    inside the image and out of its plane. ``sign_known``: whether the direction from flange to tip says which end is
-    the tip.
-    """
-
-    V: Floats
+    V: Floats  # shape (3,), unit, frame end2
     agrees: Bools  # shape (n,)
-    spread_rad: float
-    lean_rad: float
-    reversed: Bools
-    sign_known: bool
+    spread_rad: float  # inside the image
+    lean_rad: float  # out of its plane
+    reversed: Bools  # shape (n,)
+    sign_known: bool  # whether the direction from flange to tip says which end is the tip
 
 
 def needle_direction(estimate: Estimate, recording: Recording, kept: Bools) -> SeenDirection:
@@ -225,24 +199,16 @@ def needle_direction(estimate: Estimate, recording: Recording, kept: Bools) -> S
 
 
 def mean_direction(estimate: Estimate, recording: Recording) -> Floats:
-    """V = normalise(sum M_i^T v_i), shape (3,), frame end2.
-
-    Every M_i is a rotation from end2 to image, so that M_i^T v_i is the direction itself, seen by pose i.
-    """
+    """V = normalise(sum M_i^T v_i), shape (3,), frame end2, of rotations M_i from end2 to image."""
     total = directions_end2(estimate, recording).sum(axis=0)
     return np.asarray(total / np.linalg.norm(total))
 
 
 def agreed_direction(estimate: Estimate, recording: Recording, kept: Bools) -> SeenDirection:
-    """V from the poses that agree on it: the mean without those far from the median axis, toward the tip.
+    """V from the poses that agree on it: the mean of those whose tip is trusted, kept (n,), toward the tip.
 
-    An axis alone does not say which way it points. The tip lies ahead of the flange, and where it lies along the
-    needle that says it; else most of the directions do.
-
-    Args:
-        estimate: R_X, R_Y and t_Q.
-        recording: With directions.
-        kept: Shape (n,): poses whose tip is trusted; only these make the mean.
+    It is without those far from the median axis. An axis alone does not say which way it points. The tip lies ahead of
+    the flange, and where it lies along the needle that says it; else most of the directions do.
 
     Raises:
         InputError: The directions have no common axis, or most of them point from the tip to the hub.
@@ -277,7 +243,6 @@ def _common_axis(seen: Floats, kept: Bools) -> tuple[Floats, Floats]:
 
 
 def _refuse_scattered(estimate: Estimate, recording: Recording, kept: Bools, middle: float) -> None:
-    """Refuse directions without a common axis, naming the slip with which they would have one."""
     assert recording.v is not None
     what = f"the directions have no common axis in the needle's flange: they scatter by {np.degrees(middle):.0f} deg"
     for slip, undo in SLIPS.items():
@@ -300,10 +265,8 @@ def direction_findings(names: tuple[str, ...], aside: Bools, seen: SeenDirection
             text = f"{_counted(names, rows, problem)}; these directions were set aside"
             yield Finding(code, severity, text, {"count": float(rows.sum())})
     if not seen.sign_known:
-        text = (
-            "the tip is not on the measured axis of the needle: its sense, taken from most directions, could not be "
-            "checked"
-        )
+        said = "the tip is not on the measured axis of the needle"
+        text = f"{said}: its sense, taken from most directions, could not be checked"
         yield Finding("direction_sign", Severity.WARNING, text)
 
 
@@ -450,16 +413,11 @@ class DeclaredArm(NamedTuple):
 
 
 class FlangeMotions(NamedTuple):
-    """How the errors of one arm move its flange at n poses: shift (mm) and turn (rad) along the base's axes.
+    """How the errors of one arm move its flange at n poses: shift (mm) and turn (rad) along the base's axes."""
 
-    ``slopes`` (n, 6, 23) are per standard deviation of each parameter, (n, 6, 29) with play: six more are by how much
-    each joint's play differs from the declared one. ``play`` (n, 6) is by the declared play from where the joints say,
-    ``arrival`` (n, 6, 6) the covariance between arrivals at one pose.
-    """
-
-    slopes: Floats
-    play: Floats
-    arrival: Floats
+    slopes: Floats  # shape (n, 6, 23), per standard deviation of each parameter; (n, 6, 29) with each joint's play
+    play: Floats  # shape (n, 6), by the declared play from where the joints say
+    arrival: Floats  # shape (n, 6, 6), the covariance between arrivals at one pose
 
 
 class DeclaredArms(NamedTuple):
@@ -467,10 +425,6 @@ class DeclaredArms(NamedTuple):
 
     probe: DeclaredArm
     needle: DeclaredArm
-
-    def scaled(self, factor: float) -> DeclaredArms:
-        """Each deviation of both arms times a factor."""
-        return DeclaredArms(*(arm._replace(errors=arm.errors.scaled(factor)) for arm in self))
 
 
 class FlangeErrors(NamedTuple):
@@ -536,15 +490,12 @@ UNWEIGHTED = Spread(1.0, 1.0, 1.0)
 
 
 class Problem(NamedTuple):
-    """A least-squares problem: a recording, its declared errors, and which of the 19 parameters are free.
-
-    ``lean_rad``: how far a needle may lean out of the slice and still be seen; across, the image shows no more of it.
-    """
+    """A least-squares problem: a recording, its declared errors, and which of the 19 parameters are free."""
 
     recording: Recording
     noise: Noise | Spread
     active: Ints
-    lean_rad: float = 0.0
+    lean_rad: float = 0.0  # that a needle may lean out of the slice and still be seen: across, the image shows no more
     arms: FlangeErrors | None = None
 
     @property
@@ -560,16 +511,12 @@ def residual_weights(problem: Problem, tip_weights: Weights, direction_weights: 
 
 
 class LinearModel(NamedTuple):
-    """A problem at an estimate: n residuals of k = 3 parts, or 5 with directions, by p free parameters.
+    """A problem at an estimate: n residuals of k = 3 parts, or 5 with directions, by p free parameters."""
 
-    ``jacobian`` (n, k, p), ``sigma`` (n, k, k) the expected covariance of each pose's own noise, ``shared`` (n, k, m)
-    the derivative by the arms' lasting errors, each in its standard deviation; None undeclared.
-    """
-
-    residuals: Floats
-    jacobian: Floats
-    sigma: Floats
-    shared: Floats | None
+    residuals: Floats  # shape (n, k)
+    jacobian: Floats  # shape (n, k, p)
+    sigma: Floats  # shape (n, k, k), the expected covariance of each pose's own noise
+    shared: Floats | None  # shape (n, k, m), by the arms' lasting errors in standard deviations; None undeclared
 
 
 def linear_model(problem: Problem, estimate: Estimate) -> LinearModel:
@@ -592,11 +539,7 @@ def linear_model(problem: Problem, estimate: Estimate) -> LinearModel:
 
 
 def covariances(
-    estimate: Estimate,
-    recording: Recording,
-    noise: Noise | Spread,
-    v_image: Floats | None = None,
-    lean_rad: float = 0.0,
+    estimate: Estimate, recording: Recording, noise: Noise | Spread, v_image: Floats | None, lean_rad: float
 ) -> Floats:
     """Covariance of each pose's residuals, shape (n, 3, 3) of the tip, or (n, 5, 5) with the direction's two behind it.
 
@@ -644,9 +587,7 @@ def flange_slopes(estimate: Estimate, recording: Recording, v_image: Floats | No
     dF = -(dt_A - [R_A p1]x dw_A) + R_Y (dt_B - [R_B t_Q]x dw_B), p1 = R_X S p + t_X, and of the direction
     dm = (R_A R_X)^T [R_Y R_B V]x dw_A - (R_A R_X)^T R_Y [R_B V]x dw_B.
 
-    Args:
-        estimate: Where to linearise.
-        v_image: The measured directions, unit, shape (n, 3), where they are used.
+    The measured directions ``v_image`` (n, 3) are unit; None where they are not used.
     """
     n, size = len(recording), 3 if v_image is None else 5
     R_A, R_B = recording.A[:, :3, :3], recording.B[:, :3, :3]

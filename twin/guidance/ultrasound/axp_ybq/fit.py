@@ -103,21 +103,15 @@ class RobustFit(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """A problem linearised at its fit; m errors that the poses share stand behind the p free parameters as unknowns.
+    """A problem linearised at its fit; m errors that the poses share stand behind the p free parameters as unknowns."""
 
-    ``residuals`` (n, k) are without what the shared errors explain, ``white`` those of the poses that were used over
-    their spread; ``jacobian`` (n, k, p + m) and ``shared`` (m,), the shared errors' posterior mean, count these in
-    their standard deviations; ``sigma`` (n, k, k) is the expected covariance of each pose's own noise, with its
-    whitener.
-    """
-
-    residuals: Floats
-    jacobian: Floats
-    sigma: Floats
-    white: Floats
+    residuals: Floats  # shape (n, k), without what the shared errors explain
+    jacobian: Floats  # shape (n, k, p + m), shared errors in standard deviations
+    sigma: Floats  # shape (n, k, k), expected covariance of each pose's own noise
+    white: Floats  # shape (n, k), residuals of the poses that were used over their spread
     covariance: Floats
-    shared: Floats
-    whitener: Floats
+    shared: Floats  # shape (m,), the shared errors' posterior mean in standard deviations
+    whitener: Floats  # shape (n, k, k), of sigma
 
     @property
     def chi_squared(self) -> float:
@@ -278,15 +272,12 @@ def agreeing(problem: Problem, fit: RobustFit, *, alarm: bool = False) -> tuple[
 
 
 class Block(NamedTuple):
-    """One kind of residual, with the limit of the squared studentised one for a recording of this size.
-
-    ``least``: variance over the expected one, at least: stated noise is present; less than rounding is not.
-    """
+    """One kind of residual."""
 
     rows: slice
     median: float
-    limit: float
-    least: float
+    limit: float  # of the squared studentised one, for a recording of this size
+    least: float  # variance over the expected one: stated noise is present; less than rounding is not
 
 
 def blocks(problem: Problem) -> list[Block]:
@@ -475,14 +466,11 @@ def _growth(sides: tuple[float, float]) -> float:
 
 
 class SmallSample(NamedTuple):
-    """The confidence region of all p parameters where parts of the noise were found, with its uncertainty in it.
-
-    ``freedom``: of Fisher's F's denominator. ``factor``: what e^T C^-1 e / p is multiplied by to follow that F.
-    """
+    """The confidence region of all p parameters where parts of the noise were found, with its uncertainty in it."""
 
     covariance: Floats  # shape (p, p), with the uncertainty of the noise in it
-    freedom: float
-    factor: float
+    freedom: float  # of Fisher's F's denominator
+    factor: float  # what e^T C^-1 e / p is multiplied by to follow that F
 
     def limit(self, level: float) -> float:
         """Largest e^T C^-1 e inside the region."""
@@ -556,15 +544,11 @@ class ImageErrors(NamedTuple):
     in a hundred recordings. The calibration does not use them; what they leave at the tips counts in its error.
     """
 
-    names: tuple[str, ...]
-    """Of those that were tested, keys of `ERRORS`."""
-    found: Floats
-    """a, b, k (per mm) and w (rad), with their standard deviations; shape (k,)."""
+    names: tuple[str, ...]  # of those that were tested, keys of `ERRORS`
+    found: Floats  # a, b, k (per mm) and w (rad), with their standard deviations; shape (k,)
     sd: Floats
-    probability: float
-    """Chance of residuals so well explained where there are none: F(k, freedom)."""
-    rms_mm: float
-    """What they leave at the recorded tips, whatever the calibration does to make up for them."""
+    probability: float  # chance of residuals so well explained where there are none: F(k, freedom)
+    rms_mm: float  # what they leave at the recorded tips, whatever the calibration does to make up for them
 
     @property
     def significant(self) -> bool:

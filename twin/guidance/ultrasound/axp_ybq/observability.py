@@ -94,9 +94,8 @@ def observe(estimate: Estimate, recording: Recording, active: Ints) -> Observabi
         return Observability(ratio, 0, ())
     text = "the poses do not determine one combination of the unknowns, which has no simple name: vary everything more"
     unnamed = (IllConditionedMotion("unnamed", 1, text),)
-    return Observability(
-        ratio, int((values < limit).sum()), tuple(_named(estimate, recording, J, active, limit)) or unnamed
-    )
+    named = tuple(_named(estimate, recording, J, active, limit))
+    return Observability(ratio, int((values < limit).sum()), named or unnamed)
 
 
 def _named(
@@ -111,9 +110,8 @@ def _named(
         if count == 3:
             yield IllConditionedMotion(f"{arm}_orientation", 3, f"the {arm} hardly rotates: {slides}")
         elif count:
-            yield IllConditionedMotion(
-                f"{arm}_axis", count, f"the {arm} rotates about one axis only: {slides} along it"
-            )
+            text = f"the {arm} rotates about one axis only: {slides} along it"
+            yield IllConditionedMotion(f"{arm}_axis", count, text)
     # w_X = k with t_X so that the mean tip stays: the image turns about the tip, or about the line of all tips
     mean_tip = recording.points_image(estimate.scale).mean(axis=0) / LENGTH_MM
     tip[W_X], tip[T_X] = np.eye(3), estimate.R_X @ skew(mean_tip)
@@ -170,20 +168,15 @@ MAX_POSES = 12
 
 
 class PoseChange(NamedTuple):
-    """One proposed pose, as a change of a recorded one.
-
-    The probe turns about the tip, (3,), rad, axes of the image; the tip goes elsewhere in the image, (2,), mm; the
-    needle's angle there grows, and it turns about itself, rad. A and B, T_base1_end1 and T_base2_end2, mm, are as far
-    as the refused calibration can say: go slowly, look for the needle.
-    """
+    """One proposed pose, as a change of a recorded one."""
 
     reference: str
     probe_turn_image: Floats  # shape (3,), rad: rotation vector of the probe about the tip, axes of the image
     tip_shift_mm: Floats  # shape (2,): where the tip goes in the image
-    insertion_change: float
-    needle_roll: float
-    A: Floats
-    B: Floats
+    insertion_change: float  # rad, of the needle's angle in the image
+    needle_roll: float  # rad, about itself
+    A: Floats  # T_base1_end1, shape (4, 4), mm, as far as the refused calibration can say
+    B: Floats  # T_base2_end2, likewise: go slowly, look for the needle
 
 
 class SuggestedPoses(NamedTuple):

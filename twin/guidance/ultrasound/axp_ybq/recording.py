@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.arrays import Floats, read_only
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.text import Shown, brief
 from puncture_twin.planning.formats.points import joint_readings
@@ -30,16 +30,13 @@ LEAST_IN_PLANE = 0.5
 
 
 class Noise(NamedTuple):
-    """Standard deviations per axis: of each flange's place and small turn, the tip and the direction in the image.
-
-    ``off_plane_mm``: how far the tip lies off the slice and still shows.
-    """
+    """Standard deviations per axis: of each flange's place and small turn, the tip and the direction in the image."""
 
     robot_mm: float
     robot_rad: float
     image_mm: float
     direction_rad: float
-    off_plane_mm: float = 0.0
+    off_plane_mm: float = 0.0  # how far the tip lies off the slice and still shows
 
 
 SPEC_NOISE = Noise(robot_mm=0.1, robot_rad=np.radians(0.03), image_mm=0.3, direction_rad=np.radians(0.5))
@@ -56,15 +53,14 @@ class Recording(Shown):
 
     A: Floats
     """T_base1_end1, shape (n, 4, 4), mm: flange of the probe's arm; B: T_base2_end2, flange of the needle's arm."""
-    B: Floats  # t_base2_end2, shape (n, 4, 4), mm: flange of the needle's arm
+    B: Floats  # T_base2_end2, shape (n, 4, 4), mm: flange of the needle's arm
     P: Floats
     """The tip in the image, shape (n, 2), mm (pixels where ``pixels`` is set: mm per pixel is to be found); shape (n,
     3), mm, where a volume or a camera measures it out of a plane too."""
     v: Floats | None = None
     """Direction of the needle toward its tip, in the image, made unit. Shape (n, 2) where the image alone says it, (n,
     3) where the part across the image is measured too; None where it was not measured."""
-    names: tuple[str, ...] = ()
-    """One per pose; numbers where nothing is given."""
+    names: tuple[str, ...] = ()  # one per pose; numbers where nothing is given
     pixels: bool = False
     q_probe: Floats | None = None
     """Joints of the probe's arm, shape (n, 6), rad, as its controller prints them; those of the needle's arm in
@@ -77,8 +73,7 @@ class Recording(Shown):
     shaft_mm: Floats | None = None
     """How much of the shaft shows, shape (n,): the more, the better its direction is known; None where it was not
     measured: all directions then count the same."""
-    missed: tuple[tuple[str, str], ...] = ()
-    """Name and reason of each picture in which no needle was found."""
+    missed: tuple[tuple[str, str], ...] = ()  # name and reason of each picture in which no needle was found
 
     @brief
     def __repr__(self) -> str:
@@ -141,20 +136,16 @@ class Recording(Shown):
 
 
 def _angles(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
-    array = joint_readings(
-        finite_rows(values, what, names, widths=(6,)), "rad", where=f"recording, {what}", names=names
-    )
-    array.setflags(write=False)
-    return array
+    rows = finite_rows(values, what, names, widths=(6,))
+    return read_only(joint_readings(rows, "rad", where=f"recording, {what}", names=names))
 
 
 def _lengths(values: Floats, v: Floats | None, names: tuple[str, ...]) -> Floats:
     if v is None:
         refuse("shaft_mm without directions", "recording", "together with v, or not at all", "missing_column")
     array = finite_rows(np.reshape(values, (-1, 1)), "shaft_mm", names, widths=(1,))[:, 0]
-    refuse_first(
-        array < LEAST_SHAFT_MM, names, "shaft_mm", "is too little", f"at least {LEAST_SHAFT_MM:g} mm", "out_of_range"
-    )
+    allowed = f"at least {LEAST_SHAFT_MM:g} mm"
+    refuse_first(array < LEAST_SHAFT_MM, names, "shaft_mm", "is too little", allowed, "out_of_range")
     return array
 
 
@@ -166,11 +157,9 @@ def _signs(values: Floats, what: str, names: tuple[str, ...]) -> Floats:
 
 
 def _directions(v: Floats, names: tuple[str, ...]) -> Floats:
-    array = np.array(finite_rows(v, "v", names, widths=(2, 3)))
+    array = finite_rows(v, "v", names, widths=(2, 3))
     lengths = np.linalg.norm(array, axis=1)
     flat = np.linalg.norm(array[:, :2], axis=1) < LEAST_IN_PLANE * lengths
     refuse_first(~np.any(array != 0, axis=1), names, "v", "has no length", "a direction", "zero_direction")
     refuse_first(flat, names, "v", "points out of the image", "a needle that lies in the image", "out_of_image")
-    array /= lengths[:, None]
-    array.setflags(write=False)
-    return array
+    return read_only(array / lengths[:, None])

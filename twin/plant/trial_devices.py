@@ -1,4 +1,4 @@
-"""Devices in the rooms of many trials at once, at the level of positions: cameras, a probe on its arm, a CT."""
+"""Devices of many trials at once, at the level of positions: cameras, a probe on its arm, a CT."""
 
 from __future__ import annotations
 
@@ -18,42 +18,39 @@ FAR_MM = 1500.0
 
 
 @dataclass(frozen=True, eq=False)
-class RoomCameras:
-    """Two cameras, calibrated to each other, anywhere in each of n rooms."""
+class TrialCameras:
+    """Two cameras, calibrated to each other, anywhere in each of n trials."""
 
     device: Stereo
     T_cameras_base: Floats  # shape (n, 4, 4), mm
     rng: np.random.Generator
 
     @classmethod
-    def placed(cls, device: Stereo, count: int, rng: np.random.Generator) -> RoomCameras:
-        """Cameras in so many rooms."""
+    def placed(cls, device: Stereo, count: int, rng: np.random.Generator) -> TrialCameras:
+        """Cameras of so many trials."""
         return cls(device, pose(exp_rotation(rng.normal(size=(count, 3))), FAR_MM * rng.normal(size=(count, 3))), rng)
 
     def read(self, points_base: Floats) -> Floats:
-        """Points (n, m, 3), or (m, 3) in all rooms, as the cameras give them in their own frame: (n, m, 3), mm."""
+        """Points (n, m, 3), or (m, 3) in all trials, as the cameras give them in their own frame: (n, m, 3), mm."""
         R, t = self.T_cameras_base[:, :3, :3], self.T_cameras_base[:, None, :3, 3]
         seen = points_base @ np.swapaxes(R, 1, 2) + t
         return np.asarray(seen + self.rng.normal(size=seen.shape) * self.device.sd_mm)
 
 
 @dataclass(frozen=True, eq=False)
-class RoomProbe:
-    """A probe in each of n rooms; `target_off` and `tip_off` (n, 3), mm, base axes, last all the way in."""
+class TrialProbe:
+    """A probe in each of n trials; `target_off` and `tip_off` (n, 3), mm, base axes, last all the way in."""
 
     target_off: Floats
     tip_off: Floats
 
     @classmethod
-    def placed(cls, device: Ultrasound, across: Floats, count: int, rng: np.random.Generator) -> RoomProbe:
-        """Probes in so many rooms, whose pictures have this normal (3,), base axes."""
+    def placed(cls, device: Ultrasound, across: Floats, count: int, rng: np.random.Generator) -> TrialProbe:
+        """Probes of so many trials, whose pictures have this normal (3,), base axes."""
         calibration, target, tip = rng.normal(size=(3, count, 3))
         shift = device.calibration_sd_mm * calibration
-        read = (
-            shift + off @ picture_root(sd, across)
-            for off, sd in ((target, device.target_sd_mm), (tip, device.tip_sd_mm))
-        )
-        return cls(*read)
+        target_off = shift + target @ picture_root(device.target_sd_mm, across)
+        return cls(target_off, shift + tip @ picture_root(device.tip_sd_mm, across))
 
     def target(self, points_base: Floats) -> Floats:
         """Targets (n, 3) as the pictures show them, mm, base axes."""
@@ -65,21 +62,19 @@ class RoomProbe:
 
 
 @dataclass(frozen=True, eq=False)
-class RoomScanner:
-    """A CT in each of n rooms, its frame that of the first CT; what is taken for the target is so in all its scans."""
+class TrialScanner:
+    """A CT in each of n trials, its frame that of the first CT; what is taken for the target is so in all its scans."""
 
-    T_ct_base: Floats
-    """Shape (4, 4), mm: where the couch really is."""
+    T_ct_base: Floats  # shape (4, 4), mm: where the couch really is
     tip_root: Floats  # shape (3, 3), mm, CT axes: S with S S' the covariance of a tip's reading
-    target_off: Floats
-    """Shape (n, 3), mm: what target readings are off by."""
+    target_off: Floats  # shape (n, 3), mm: what target readings are off by
     rng: np.random.Generator
 
     @classmethod
     def placed(
         cls, device: ControlScanSection, errors: ErrorModel, T_base_ct: Floats, count: int, rng: np.random.Generator
-    ) -> RoomScanner:
-        """Scanners in so many rooms."""
+    ) -> TrialScanner:
+        """Scanners of so many trials."""
         tip, target = scan_roots(device, errors)
         return cls(inverse(T_base_ct), tip, rng.normal(size=(count, 3)) @ target, rng)
 
