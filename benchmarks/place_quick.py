@@ -22,7 +22,7 @@ from benchmarks.shared import versions
 from puncture_twin.meshes import folder
 from puncture_twin.planning.base.progress import Silent
 from puncture_twin.planning.case.settings import mount_pose
-from puncture_twin.planning.place.check import placement_check
+from puncture_twin.planning.place.search import placement_check
 from puncture_twin.planning.search.context import prepare
 from puncture_twin.planning.search.search import organ_candidates
 from puncture_twin.twin.jobs.patient.place_job import place_case

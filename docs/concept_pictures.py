@@ -15,7 +15,7 @@ import puncture_twin as pt
 from benchmarks.placements import meshes_of, phantoms
 from puncture_twin.meshes import folder
 from puncture_twin.planning.anatomy.body.body_mask import body_mask
-from puncture_twin.planning.anatomy.body.outside_body import OutsideImage, outside_mask
+from puncture_twin.planning.anatomy.scan import OutsideImage, outside_mask
 from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import flange_pose, link_poses
 from puncture_twin.planning.arm.links import collision_links

@@ -19,13 +19,17 @@ import unicodedata
 from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 from functools import cache
-from types import MappingProxyType
 from typing import Literal, NamedTuple, get_args
 
 from puncture_twin.planning.formats.labels.naming import specificity
 
 Kind = Literal["avoid", "traverse", "ignore", "unknown"]
-KINDS: Mapping[str, Kind] = MappingProxyType({kind: kind for kind in get_args(Kind)})
+KINDS: Mapping[str, Kind] = {kind: kind for kind in get_args(Kind)}
+
+
+def words(text: str) -> frozenset[str]:
+    """The words of a text."""
+    return frozenset(text.split())
 
 
 class DefaultRole(NamedTuple):
@@ -150,9 +154,8 @@ traverse 0, fat, breast: needles pass fat
 )
 """The lines for every region."""
 
-BY_REGION: Mapping[str, tuple[DefaultRole, ...]] = MappingProxyType(
-    {
-        "brain": _table("""
+BY_REGION: Mapping[str, tuple[DefaultRole, ...]] = {
+    "brain": _table("""
 traverse 0, brain: the path to a target in the brain leads through it
     *brain *cerebrum* *cerebral_hemi* *parenchyma* *white_matter* *grey_matter* *gray_matter*
 traverse 0, skull and face: the path leads through a burr hole
@@ -162,14 +165,13 @@ avoid 3, ventricles of the brain: leak of fluid, bleeding; the needle deflects a
 avoid 5, brainstem: vital centres
     *brainstem* *brain_stem* *truncus_enceph* *pons* *midbrain* *mesenceph* *medulla_oblong*
 """),
-        "head": _table("""
+    "head": _table("""
 avoid 3, ventricles of the brain: leak of fluid, bleeding
     *ventric*
 avoid 5, brainstem: vital centres
     *brainstem* *brain_stem*
 """),
-    }
-)
+}
 """Lines that hold in a region before the general ones; other regions have none of their own."""
 
 
@@ -182,12 +184,7 @@ NEVER_CROSSED = frozenset(
 """Groups that no path crosses because they hold the target too: masks overlap, and a lesion may lie on a vessel."""
 
 OTHER_VESSELS = "other vessels"
-VESSEL_WORDS = frozenset(
-    (
-        *("artery", "arteries", "arteria", "arteriae", "vein", "veins", "vena", "venae", "vessel", "vessels"),
-        *("aorta", "aneurysm"),
-    )
-)
+VESSEL_WORDS = words("artery arteries arteria arteriae vein veins vena venae vessel vessels aorta aneurysm")
 """Words of a vessel's name; ``tumor_artery`` is one, ``hypervascular_lesion`` is none."""
 
 
@@ -239,23 +236,16 @@ def _matching(plain: str, lines: tuple[DefaultRole, ...]) -> Iterator[tuple[floa
             yield max(close), line
 
 
-def words(text: str) -> frozenset[str]:
-    """The words of a text."""
-    return frozenset(text.split())
-
-
 ORGANS = words("""
     liver spleen pancreas kidney kidneys lung lungs adrenal adrenals thyroid parotid submandibular thymus prostate
     uterus ovary testis breast breasts gland glands node nodes brain cerebrum cerebellum hemisphere matter
 """)
 """Organs of solid tissue: a lesion lies in them, and a path to it leads through them."""
-
 LESIONS = words("""
     lesion lesions laesion lasion tumor tumors tumour tumours tumeur nodule nodules metastasis metastases metastase
     metastasen carcinoma neoplasm neoplasia cancer mass gtv ctv itv ptv hcc
 """)
 """Lesions, as whole words: a ``Tumorvene`` is none."""
-
 BONES = words("""
     bone bones rib ribs vertebra vertebrae sternum hip ilium ischium pubis sacrum femur tibia fibula patella humerus
     radius ulna scapula clavicle clavicula skull cranium mandible maxilla
@@ -271,14 +261,12 @@ SOFT_TISSUES = words("""
 
 WALLS = frozenset(("internal", "external", "internus", "externus"))
 """Of muscles of a wall (``external_oblique``); beside a bone they are a vessel's: "internal iliac"."""
-
 LEVELS_OF_CORD = frozenset(("cervical", "thoracic", "lumbar"))
 
 POSITIONS = (
     WALLS | LEVELS_OF_CORD | words("middle superior inferior anterior posterior medial lateral intermediate medius")
 )
 """Said of vessels and nerves, which are then named after an organ without a noun of their own: "superior thyroid"."""
-
 PARTS = words("lobe lobes segment segments section cortex parenchyma tissue hemisphere gland glands node nodes")
 """Parts of an organ: beside one of them a position is its own, as in ``lung_upper_lobe``."""
 
@@ -293,13 +281,11 @@ QUALIFIERS = (
 ) - ORGANS
 """What is said of an organ besides: a side, a part, a kind. Alone it may be said of a vessel: ``middle cerebral``."""
 
-NEEDS: Mapping[str, frozenset[str]] = MappingProxyType(
-    {
-        "rectus": frozenset(("abdominis", "femoris")),
-        "oblique": WALLS | {"abdominis"},
-        "levator": frozenset(("ani", "scapulae")),
-    }
-)
+NEEDS: Mapping[str, frozenset[str]] = {
+    "rectus": frozenset(("abdominis", "femoris")),
+    "oblique": WALLS | {"abdominis"},
+    "levator": frozenset(("ani", "scapulae")),
+}
 """Muscles of which some move the eye: which one it is must be said."""
 
 DIGITS = "0123456789"

@@ -25,7 +25,6 @@ SOLID_HU = 8000.0
 metal a voxel in air and one in tissue count as full: alike, so that a marker on the skin is not drawn to one side."""
 LEAST_PART = 0.02
 """Below this a voxel's noise, not metal, is weighed."""
-
 Box = tuple[slice, slice, slice]
 
 
@@ -117,12 +116,10 @@ def metal_parts(
 ) -> Floats:
     """Part of each voxel of a piece's box that is metal, 0 to 1; none below ``least``.
 
-    What a voxel would show without metal is what the nearest voxel shows that is too far away to be blurred by it:
-    air on one side of a marker and skin on the other. Without that, air would hide the outer edge of a marker.
-
-    Args:
-        level_hu: From where on other voxels of the box are metal too; ``solid_hu`` is that of wholly metal.
-        reach_mm: So far from its voxels metal blurs into others, or fills them in part; one number, or one an axis.
+    What a voxel would show without metal is what the nearest voxel shows that is too far away to be blurred by it: air
+    on one side of a marker and skin on the other. Without that, air would hide the outer edge of a marker. Other voxels
+    are metal from ``level_hu`` on, wholly at ``solid_hu``; ``reach_mm`` (one number, or one an axis) is how far metal
+    blurs.
     """
     values = volume.values[metal.box].astype(np.float64)
     every, outside = _sides(values, volume, metal, level_hu, reach_mm)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from types import MappingProxyType
 from typing import NamedTuple
 
 
@@ -31,10 +30,9 @@ def _rows(text: str) -> Iterator[tuple[str, str]]:
         yield first, rest
 
 
-ORGANS: Mapping[str, Organ] = MappingProxyType(
-    {
-        name: Organ(name, tuple(words.split()), "paired" in kinds, "conduit" in kinds)
-        for first, words in _rows("""
+ORGANS: Mapping[str, Organ] = {
+    name: Organ(name, tuple(words.split()), "paired" in kinds, "conduit" in kinds)
+    for first, words in _rows("""
 liver: liver hepar
 gallbladder: gallbladder vesicafellea
 spleen: spleen lien
@@ -80,15 +78,13 @@ artery, conduit: arter
 vein, conduit: vein vena
 nerve, conduit: nerv
 """)
-        for name, *kinds in [first.split(", ")]
-    }
-)
+    for name, *kinds in [first.split(", ")]
+}
 """By name; after it whether it is paired, or a conduit; then the words."""
 
-USUAL: Mapping[str, tuple[Organ, ...]] = MappingProxyType(
-    {
-        region: tuple(ORGANS[" ".join(name.split())] for name in names.split(";") if name.strip())
-        for region, names in _rows("""
+USUAL: Mapping[str, tuple[Organ, ...]] = {
+    region: tuple(ORGANS[" ".join(name.split())] for name in names.split(";") if name.strip())
+    for region, names in _rows("""
 abdomen: liver; gallbladder; spleen; pancreas; stomach; duodenum; small bowel; colon; kidneys; aorta; inferior vena
     cava; portal vein; lungs; ribs; spine
 chest: lungs; heart; aorta; pulmonary artery; superior vena cava; oesophagus; trachea; ribs; sternum; spine
@@ -101,21 +97,17 @@ limb: bone; artery; vein; nerve
 phantom:
 other:
 """)
-    }
-)
+}
 """Region to its usual organs."""
 
 NOT_THE_ORGAN = re.compile(
     r"arter(y|ies|ia|iae)|veins?|vena|venae|vessels?|nerves?|nervus|ducts?|cysts?|(tumou?r|lesion|nodule)s?"
 )
 """A word that makes a name that of a vessel, a duct or a lesion of an organ: "liver vessels" are no liver."""
-
-_SIDES: Mapping[str, frozenset[str]] = MappingProxyType(
-    {
-        "left": frozenset({"left", "l", "lt", "sin", "sinister", "sinistra"}),
-        "right": frozenset({"right", "r", "rt", "dex", "dexter", "dextra"}),
-    }
-)
+_SIDES: Mapping[str, frozenset[str]] = {
+    "left": frozenset({"left", "l", "lt", "sin", "sinister", "sinistra"}),
+    "right": frozenset({"right", "r", "rt", "dex", "dexter", "dextra"}),
+}
 
 
 def absent_organs(region: str, names: Iterable[str]) -> list[str]:

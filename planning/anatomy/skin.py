@@ -54,11 +54,10 @@ class Skin:
 def skin_of_image(image: CtImage) -> Skin:
     """The body's surface at ``BODY_HU``, between voxels, where air touches the body.
 
-    Every vertex lies between the centres of a voxel inside the body mask and one outside, so the surface is
-    never more than half a voxel (along any axis) from the mask's boundary, like that of a label.
+    Every vertex lies between the centres of a voxel inside the body mask and one outside, so the surface is never more
+    than half a voxel (along any axis) from the mask's boundary, like that of a label.
 
-    Raises:
-        InputError: If no body is found, or no air around it.
+    Raises InputError: If no body is found, or no air around it.
     """
     box = box_in(image.found.body, margin=1)  # beyond it the field is negative
     framed, field = frame([one.stop - one.start for one in box])
@@ -75,8 +74,7 @@ def skin_of_image(image: CtImage) -> Skin:
 def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> Skin:
     """The outer surface of one label in a box, holes filled in each axial slice (it may be a shell of skin only).
 
-    Raises:
-        InputError: If no voxel has this label, or every voxel is inside.
+    Raises InputError: If no voxel has this label, or every voxel is inside.
     """
     where = f"{labelmap.path}, label {label}"
     if label not in labelmap.boxes:
@@ -94,8 +92,7 @@ def skin_from_label(labelmap: LabelMap, label: int, box: Box | None = None) -> S
 def skin_from_mesh(mesh: TriangleMesh, cut: Sequence[str] = ()) -> Skin:
     """The skin of a mesh, LPS mm: of a whole body (local mm too), or of one cut flat at some sides, as in `SIDES`.
 
-    Raises:
-        InputError: If no triangle lies in the plane where a side was cut.
+    Raises InputError: If no triangle lies in the plane where a side was cut.
     """
     mesh = split_at_creases(mesh)
     warnings = () if mesh.closed else ("the skin mesh is open: its inside, and where skin is missing, are not known",)
@@ -163,12 +160,9 @@ class SkinPaths:
 
     entry_ct: Floats
     """Shape (n, 3), where the path from outside first meets the skin for good, seen from the target."""
-    path_length: Floats
-    """Shape (n,), target to entry."""
-    skin_angle: Floats
-    """Shape (n,), between the path and the skin's inward normal."""
-    reentry_depth: Floats
-    """Shape (n,), where the needle would meet skin again, before where its flange waits."""
+    path_length: Floats  # shape (n,), target to entry
+    skin_angle: Floats  # shape (n,), between the path and the skin's inward normal
+    reentry_depth: Floats  # shape (n,), where the needle would meet skin again, before where its flange waits
     unknown_depth: Floats
     """Shape (n,), where the path leaves the body through a cut, 0 where crossings of a closed skin are inconsistent."""
 

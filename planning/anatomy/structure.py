@@ -5,6 +5,7 @@ The grids on which a case's labels lie: of each label map, and one of each folde
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -25,6 +26,15 @@ class Role(StrEnum):
     TARGET = "target"
     SKIN = "skin"
     UNKNOWN = "unknown"
+
+
+GAS_HOLDERS = (
+    "lung", "trachea", "bronch", "airway", "pharyn", "laryn", "nasopharyn", "esophag", "oesophag", "stomach", "duoden",
+    "bowel", "intestin", "jejun", "ileum", "colon", "sigmoid", "rectum", "caecum", "cecum", "appendix", "mastoid",
+)  # fmt: skip
+"""How words begin that name structures which hold gas in a healthy body."""
+GAS_WORDS = ("sinus", "sinuses", "nasal", "nose", "oral", "mouth", "gas", "air", "cavity")
+"""Whole words that do: "oral" is not to be found in "femoral"."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +65,12 @@ class Structure:
         """Whether a needle too close to it is rejected."""
         return self.role in {Role.AVOID, Role.UNKNOWN}
 
+    @property
+    def may_contain_gas(self) -> bool:
+        """Whether its name is that of lung, bowel or another hollow organ that air gets into."""
+        words = re.findall("[a-z]+", self.name.lower())
+        return any(word.startswith(GAS_HOLDERS) or word in GAS_WORDS for word in words)
+
 
 @dataclass(frozen=True, eq=False)
 class LabelGrid:
@@ -70,11 +86,7 @@ class LabelGrid:
 
 
 def label_grids(case: Case) -> tuple[LabelGrid, ...]:
-    """Every grid of a case, by name.
-
-    Raises:
-        InputError: A header that cannot be trusted.
-    """
+    """Every grid of a case, by name. Raises InputError: A header that cannot be trusted."""
     maps = {one.labelmap for one in case.structure} | {many.labelmap for many in case.structures}
     sources = {name: [name] for name in maps if name is not None}
     sets = [one.mask_set for one in case.structures if one.mask_set is not None]

@@ -32,7 +32,6 @@ ENDS = ("last", "area_mm2", "thick", "wide")
 READERS = "puncture_twin.planning.case.named_files"
 """The module that knows every reader of volumes. A surface is made from what they read, and is made anew where one of
 them has changed; nothing here imports them, so that a case without DICOM does not load its library."""
-
 LARGEST, MASK_BYTES = 4, 3
 """Voxels are held in memory where they take one of so many parts of it at most; and bytes of a voxel for what is found
 in a CT: the body, and what was not measured."""
@@ -120,12 +119,10 @@ class VolumeSurfaces:
         shown: Shown = PATIENT,
         stated: Collection[str] | None = None,
     ) -> Imaged:
-        """A scanner's image of a body, without padding around it.
+        """A scanner's image of a body, without padding around it; of a body's label in a map, or of a CT (None).
 
-        Args:
-            label: Of the body, in a label map; None where this is a CT.
-            shown: What a person says of the image; for a phantom see `cut_ends`.
-            stated: The sides at which the body was cut, where a person says so.
+        ``shown`` is what a person says of the image (of a phantom see `cut_ends`), ``stated`` the sides at which it was
+        cut.
         """
 
         def measured() -> Arrays:
@@ -141,7 +138,10 @@ class VolumeSurfaces:
 
         by = ((mesh.digest, voxel_mm) for mesh, voxel_mm in organs)
         key = (*self._key(f"ends {label}"), shown.phantom, *by)
-        cut = self.cache.memory.get(key, found, _nbytes) if stated is None else cut_ends.stated_ends(stated)
+        if stated is None:
+            cut = self.cache.memory.get(key, found, lambda sides: sides.nbytes)
+        else:
+            cut = cut_ends.stated_ends(stated)
         notes = cut_ends.end_warnings(content, cut, shown.phantom and stated is None)
         return Imaged(self, content.box(cut), label, notes, replace(shown, whole=bool(content.inside)))
 
@@ -176,12 +176,9 @@ class Imaged:
     """A scanner's image of a body: a CT, or a body's label, without padding around it."""
 
     surfaces: VolumeSurfaces
-    box: Box
-    """The part that was seen, voxels of the canonical order."""
-    label: int | None
-    """Of the body; None where this is a CT."""
-    notes: tuple[str, ...]
-    """What was left out, one sentence each."""
+    box: Box  # the part that was seen, voxels of the canonical order
+    label: int | None  # of the body; None where this is a CT
+    notes: tuple[str, ...]  # what was left out, one sentence each
     shown: Shown
 
     @cached_property
@@ -252,12 +249,8 @@ def _to_skin(stored: Arrays) -> Skin:
 def cached_mesh(stored: Arrays, number: int | str = "") -> TriangleMesh:
     """A surface, which went through the guard before it was stored, and does again: kept files may be anything.
 
-    Args:
-        stored: With ``vertices``, ``faces`` and ``facts``: whether it is closed and wound alike.
-        number: Behind these names, where there are several.
-
-    Raises:
-        KeyError, TypeError, InputError: It is none.
+    Its ``vertices``, ``faces`` and ``facts`` (closed, wound alike) have a number behind their names where there are
+    several. Raises KeyError, TypeError, InputError: It is none.
     """
     vertices, faces, facts = (stored[f"{name}{number}"] for name in ("vertices", "faces", "facts"))
     if vertices.dtype != np.float64 or faces.dtype != np.int32 or facts.dtype != np.bool_ or facts.shape != (2,):
@@ -286,7 +279,3 @@ def _to_content(stored: Arrays) -> Content:
     if any(array.shape != (3, 2) for array in ends) or (shape.shape, T_ct_index.shape) != ((3,), (4, 4)):
         raise ValueError("three axes with two ends")
     return Content(tuple(shape.tolist()), T_ct_index, *ends)
-
-
-def _nbytes(array: Bools) -> int:
-    return array.nbytes

@@ -70,10 +70,7 @@ class Beyond(NamedTuple):
 
 
 def beyond_images(case: Case, skin: Skin, scan: Scan | None, memory: Memory = NO_MEMORY) -> Beyond:
-    """Solids assumed beyond the image of a case's skin, and beyond a CT that is smaller than a skin from elsewhere.
-
-    Of one patient they are the same for every target.
-    """
+    """Solids assumed beyond the image of a case's skin, and a CT smaller than that; the same for all targets."""
     at_ends = skin.mesh.vertices[np.unique(skin.mesh.faces[skin.cut_faces])]  # their outlines, and nothing before them
     ends = [] if skin.field_of_view is None else [(skin.field_of_view, at_ends)]
     of_scan = None if scan is None else scan.end()
@@ -130,10 +127,9 @@ def _shows_arms(skin: TriangleMesh) -> bool:
 def beyond_image(view: FieldOfView, points_ct: Floats, wider_mm: float, moved_ct: Floats | None = None) -> TriangleMesh:
     """The solid beyond a box that cuts the body at one face at least, closed, LPS mm.
 
-    Args:
-        points_ct: Shape (n, 3), of the body's surface, those of its outlines at the faces among them.
-        wider_mm: To the sides; infinite for all beyond the faces' planes.
-        moved_ct: Shape (3,), how far what lies there may come toward the image as the body breathes, mm.
+    It is drawn about points (n, 3) of the body's surface, those of its outlines at the faces among them, wider to the
+    sides (infinite: all beyond the faces' planes); what lies there may come toward the image by a vector (3,) as the
+    body breathes.
     """
     by = np.zeros(3) if moved_ct is None else np.abs(view.T_ct_box[:3, :3].T @ moved_ct)
     points, solids, everything = view.to_box(points_ct), [], bool(np.isinf(wider_mm))
@@ -209,8 +205,7 @@ def beyond_labels(
     is the largest that the case demands of any label of the map, and half a voxel more: a label that ends at the map's
     face has its edges cut off by so much there.
 
-    Raises:
-        InputError: A map that does not hold the target, or one that ends in a body whose skin is open.
+    Raises InputError: A map that does not hold the target, or one that ends in a body whose skin is open.
     """
     meshes, margins, warnings = list[TriangleMesh](), [0.0], []
     for grid in label_grids(case):

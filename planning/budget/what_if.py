@@ -17,8 +17,7 @@ from puncture_twin.planning.budget.chain import GATES, Chain, other_gauges
 from puncture_twin.planning.case.errors import ARM_KINDS, UNIFORM
 from puncture_twin.planning.geometry.rigid import apply
 from puncture_twin.planning.registration.marker_pairs import MIN_MARKERS
-from puncture_twin.planning.uncertainty.pose_error import error_budget
-from puncture_twin.planning.uncertainty.touch_choice import choose_touches
+from puncture_twin.planning.uncertainty.pose_error import choose_touches, error_budget
 
 SPACINGS_MM = (1.0, 2.0, 3.0, 5.0)
 MOST_MARKERS = 10

@@ -11,39 +11,124 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from puncture_twin.planning.anatomy.anatomy import Anatomy
+from puncture_twin.planning.anatomy.structure import Structure
+from puncture_twin.planning.base import strict_json
 from puncture_twin.planning.base.arrays import Floats, Ints
 from puncture_twin.planning.base.errors import refuse
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.output.manifest import read_output
 from puncture_twin.planning.base.polar_map import Entry, Sectors, polar_map
-from puncture_twin.planning.base.provenance import inputs_document, read_inputs
+from puncture_twin.planning.base.provenance import Input, inputs_document, read_inputs
 from puncture_twin.planning.base.reasons import REASON_COLOURS, REASON_TEXT, SAFE, Reason, Rgb
-from puncture_twin.planning.base.strict_json import (
-    array,
-    field,
-    fitting,
-    number,
-    number_or_nan,
-    parse_document,
-    point,
-    text,
-    texts,
-    whole,
-)
 from puncture_twin.planning.base.text import Facts, Shown, brief
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.entry import angles
 from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
-from puncture_twin.planning.certify.question import Question
+from puncture_twin.planning.reach.standoff import farthest_flange
 from puncture_twin.planning.search.candidates import CONE_CERTIFIED, Candidates
 from puncture_twin.planning.search.ranking import ranked
+from puncture_twin.planning.uncertainty.pose_error import PoseError, any_pose
+
+MOST_TOUCH = 0.5
+"""More than every other needle is no limit."""
+
+
+@dataclass(frozen=True, eq=False)
+class Question:
+    """The question of a certificate: everything but the surfaces that a verdict depends on; mm and rad."""
+
+    case_name: str
+    inputs: tuple[Input, ...]
+    target_ct: Floats  # shape (3,)
+    R_ct_entry: Floats  # shape (3, 3)
+    theta: tuple[float, float]
+    """The cap's lowest and highest angle, as ``beta``."""
+    beta: tuple[float, float]
+    length: float
+    standoff: float | None
+    """Distance tip to target before the insertion where the case states one, else None."""
+    skin_gap: float
+    """The least distance from the waiting tip to the skin, along the needle."""
+    farthest: float
+    """The flange's greatest distance from the target while the tip waits: how far skin matters."""
+    radius: float
+    longest: float
+    max_skin_angle: float
+    structures: tuple[str, ...]
+    """Names of the k structures that demand a margin."""
+    margins: Floats  # shape (k,), their margins; with ``touch`` at least so wide that the chance is kept
+    touch: float | None = None
+    """The chance to touch each structure that no safe cell exceeds; None asks for none."""
+
+    def cap(self) -> Cells:
+        """The whole cap of directions as one cell."""
+        return Cells(np.array([self.theta], float), np.array([self.beta], float))
+
+
+def question_of(
+    case: Case,
+    anatomy: Anatomy,
+    *,
+    theta: tuple[float, float] | None = None,
+    beta: tuple[float, float] | None = None,
+    touch: float | None = None,
+    error: PoseError | None = None,
+) -> Question:
+    """The question that a certificate of a case answers; see `certify`."""
+    for table, declared, straight in (
+        ("breathing", case.breathing, "a body that does not move"),
+        ("tissue", case.bending, "a needle that does not bend"),
+    ):
+        if declared is not None:
+            what = f"[{table}]: a certificate proves {straight}"
+            refuse(what, case.path, f"a case without [{table}]; or a search, which includes it", "not_certifiable")
+    theta, beta = theta or case.search.theta, beta or case.search.beta
+    if not (0 <= theta[0] <= theta[1] <= np.pi + 1e-12 and beta[0] <= beta[1] <= beta[0] + 2 * np.pi + 1e-12):
+        refuse("the cap is not a range of angles", "certify", "theta 0 to 180, beta 0 to 360", "out_of_range")
+    demanding = [s for s in anatomy.checked if s.demands_margin]
+    margins = np.array([s.margin_mm for s in demanding], dtype=np.float64)
+    if touch is not None:  # where it is more than a margin, what keeps the chance in any configuration
+        margins = np.maximum(margins, _kept(case, demanding, touch, error))
+    return Question(
+        case_name=case.name,
+        inputs=case.inputs,
+        target_ct=case.target_ct,
+        R_ct_entry=case.T_ct_entry[:3, :3],
+        theta=(float(theta[0]), float(theta[1])),
+        beta=(float(beta[0]), float(beta[1])),
+        length=case.needle.length_mm,
+        standoff=case.needle.standoff_mm,
+        skin_gap=case.needle.skin_gap_mm,
+        farthest=farthest_flange(case.needle, case.search.max_skin_angle),
+        radius=case.needle.radius_mm,
+        longest=case.needle.longest_path_mm,
+        max_skin_angle=float(case.search.max_skin_angle),
+        structures=tuple(s.name for s in demanding),
+        margins=margins,
+        touch=touch,
+    )
+
+
+def _kept(case: Case, demanding: list[Structure], touch: float, error: PoseError | None) -> Floats:
+    """Clearances, (k,), mm, at which structures are touched no more often than ``touch``."""
+    if not 0.0 < touch <= MOST_TOUCH:
+        refuse(f"chance to touch {touch:g}", "certify", f"above 0, at most {MOST_TOUCH:g}", "out_of_range")
+    if error is None:
+        message = "a chance to touch cannot be certified: the needle's error needs markers and [errors]"
+        refuse(message, case.path, "[registration] with markers, and [errors]; or no such limit", "not_certifiable")
+    farthest = np.array([np.linalg.norm(s.mesh.vertices - case.target_ct, axis=1).max() for s in demanding])
+    waiting = farthest_flange(case.needle, case.search.max_skin_angle)
+    lengths = np.array([waiting if s.outside else case.needle.length_mm for s in demanding])
+    surface_mm = np.sqrt([np.linalg.eigvalsh(error.surface_cov_ct(s.voxel_ct))[-1] for s in demanding])
+    return any_pose(error).margin(touch, error.freedom, farthest, lengths, case.needle.radius_mm, surface_mm)
+
 
 CERTIFICATE_VERSION = 7
 """Version of the file's layout and of what a cell claims. 3: lists its inputs with their roles, files that a file names
 included; a length each structure is checked to. 4: a safe cell keeps the image up to the flange at standoff. 5: a
 chance to touch that no safe cell exceeds, to first order. 6: whatever the structure's shape. 7: what is outside of
 the body, and beyond the image, counts up to each direction's own flange."""
-
 MAX_CERTIFICATE_BYTES = 500_000_000
 """A certificate has some ten thousand cells; a larger file is something else."""
 CERTIFICATE_ALLOWED = f"a certificate of version {CERTIFICATE_VERSION}, as search --certify writes it"
@@ -87,10 +172,8 @@ class Certificate(Shown):
     cells, in order, are the next level."""
     leaves: Cells
     """The leaves, in the order in which the tree names them."""
-    verdict: NDArray[np.str_]
-    """Shape (n,), letter of each leaf."""
-    reason: NDArray[np.str_]
-    """Shape (n,), for a rejected leaf the `Reason` that holds all over it, else ""."""
+    verdict: NDArray[np.str_]  # shape (n,), letter of each leaf
+    reason: NDArray[np.str_]  # shape (n,), for a rejected leaf the `Reason` that holds all over it, else ""
     structure: NDArray[np.str_]
     """Shape (n,), for ``too_close`` the structure that every axis comes too near to, else ""."""
     triangle: Ints
@@ -191,11 +274,10 @@ class Certificate(Shown):
         }
 
 
-def leaves_of(cap: Cells, tree: tuple[str, ...], where: str | Path = "certificate") -> Cells:
+def leaves_of(cap: Cells, tree: tuple[str, ...], where: Path) -> Cells:
     """The leaves that a tree names, level by level; they tile the cap because halves and quarters do.
 
-    Raises:
-        InputError: The tree has a cell too many or too few, or an unknown letter.
+    Raises InputError: The tree has a cell too many or too few, or an unknown letter.
     """
     theta, beta, cells = [], [], cap
     for depth, level in enumerate(tree):
@@ -206,7 +288,7 @@ def leaves_of(cap: Cells, tree: tuple[str, ...], where: str | Path = "certificat
         inner = np.isin(letters, list("tbq"))
         theta.append(cells.theta[~inner])
         beta.append(cells.beta[~inner])
-        cells = split(cells.take(inner), letters[inner]).cells
+        cells, _ = split(cells.take(inner), letters[inner])
     if len(cells):
         refuse(f"the tree ends {len(cells)} cells early", where, "a complete tree", "certificate_damaged")
     return Cells(np.concatenate(theta), np.concatenate(beta))
@@ -249,8 +331,7 @@ def write_certificate(certificate: Certificate, path: Path) -> None:
 def read_certificate(path: Path) -> Certificate:
     """Read a certificate, from a whole output set or from outside of any, and check it as `parse_certificate` does.
 
-    Raises:
-        InputError: It cannot be read, its folder's manifest lists other bytes, or see `parse_certificate`.
+    Raises InputError: It cannot be read, its folder's manifest lists other bytes, or see `parse_certificate`.
     """
     return parse_certificate(read_output(path, max_bytes=MAX_CERTIFICATE_BYTES).data, path)
 
@@ -258,11 +339,10 @@ def read_certificate(path: Path) -> Certificate:
 def parse_certificate(data: bytes, path: Path) -> Certificate:
     """Check that a certificate's bytes are whole and agree with themselves; `checker.verify` proves it.
 
-    Raises:
-        InputError: Not a certificate, another version, missing or contradicting parts.
+    Raises InputError: Not a certificate, another version, missing or contradicting parts.
     """
-    document = parse_document(data, CERTIFICATE_VERSION, where=path, allowed=CERTIFICATE_ALLOWED)
-    with fitting(path, CERTIFICATE_ALLOWED):
+    document = strict_json.parse_document(data, CERTIFICATE_VERSION, where=path, allowed=CERTIFICATE_ALLOWED)
+    with strict_json.fitting(path, CERTIFICATE_ALLOWED):
         certificate = _certificate(document, path)
     for name in sorted(set(document) - NAMES):
         refuse(f"key '{name}' is not known", path, ", ".join(sorted(NAMES)), "unknown_key")
@@ -278,24 +358,24 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     names, standoff, touch = tuple(document["margins_mm"]), document["standoff_mm"], document["touch"]
     margins = [document["margins_mm"][name] for name in names]
     question = Question(
-        case_name=field(document, "case", text),
-        inputs=field(document, "inputs", read_inputs),
-        target_ct=field(document, "target_ct_mm", point),
-        R_ct_entry=array(document["R_ct_entry"], (3, 3)),
-        theta=field(document, "theta_rad", _range),
-        beta=field(document, "beta_rad", _range),
-        length=field(document, "length_mm", number),
-        standoff=None if standoff is None else number(standoff),
-        skin_gap=field(document, "skin_gap_mm", number),
-        farthest=field(document, "farthest_flange_mm", number),
-        radius=field(document, "radius_mm", number),
-        longest=field(document, "longest_path_mm", number),
-        max_skin_angle=field(document, "max_skin_angle_rad", number),
+        case_name=strict_json.field(document, "case", strict_json.text),
+        inputs=strict_json.field(document, "inputs", read_inputs),
+        target_ct=strict_json.field(document, "target_ct_mm", strict_json.point),
+        R_ct_entry=strict_json.array(document["R_ct_entry"], (3, 3)),
+        theta=strict_json.field(document, "theta_rad", _range),
+        beta=strict_json.field(document, "beta_rad", _range),
+        length=strict_json.field(document, "length_mm", strict_json.number),
+        standoff=None if standoff is None else strict_json.number(standoff),
+        skin_gap=strict_json.field(document, "skin_gap_mm", strict_json.number),
+        farthest=strict_json.field(document, "farthest_flange_mm", strict_json.number),
+        radius=strict_json.field(document, "radius_mm", strict_json.number),
+        longest=strict_json.field(document, "longest_path_mm", strict_json.number),
+        max_skin_angle=strict_json.field(document, "max_skin_angle_rad", strict_json.number),
         structures=names,
-        margins=array(margins, (len(names),)),
-        touch=None if touch is None else number(touch),
+        margins=strict_json.array(margins, (len(names),)),
+        touch=None if touch is None else strict_json.number(touch),
     )
-    tree = field(document, "tree", texts)
+    tree = strict_json.field(document, "tree", strict_json.texts)
     leaves = leaves_of(question.cap(), tree, path)
     rows = document["witness"]
     if len(rows) != len(leaves):
@@ -303,20 +383,20 @@ def _certificate(document: dict[str, Any], path: Path) -> Certificate:
     reasons, structures, triangles, bounds = zip(*rows, strict=True)
     return Certificate(
         question=question,
-        size=field(document, "size_rad", number),
+        size=strict_json.field(document, "size_rad", strict_json.number),
         tree=tree,
         leaves=leaves,
         verdict=np.array([letter for level in tree for letter in level if letter in "SRU"], dtype="U1"),
         reason=np.array([Reason(reason).value for reason in reasons], dtype=np.str_),
-        structure=np.array([text(name) for name in structures], dtype=np.str_),
-        triangle=np.array([whole(triangle) for triangle in triangles], dtype=np.int64),
-        bound=np.array([number_or_nan(bound) for bound in bounds]),
-        queries=field(document, "queries", whole),
+        structure=np.array([strict_json.text(name) for name in structures], dtype=np.str_),
+        triangle=np.array([strict_json.whole(triangle) for triangle in triangles], dtype=np.int64),
+        bound=np.array([strict_json.number_or_nan(bound) for bound in bounds]),
+        queries=strict_json.field(document, "queries", strict_json.whole),
     )
 
 
 def _range(values: Any) -> tuple[float, float]:
-    low, high = map(number, values)
+    low, high = map(strict_json.number, values)
     return low, high
 
 

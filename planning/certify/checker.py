@@ -19,9 +19,8 @@ from puncture_twin.planning.base.progress import Count
 from puncture_twin.planning.base.provenance import differing_input
 from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.case.case import Case
-from puncture_twin.planning.certify.certificate import Certificate
+from puncture_twin.planning.certify.certificate import Certificate, question_of
 from puncture_twin.planning.certify.plain_skin import PlainSkin, SkinFacts
-from puncture_twin.planning.certify.question import question_of
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.reach.standoff import waiting_flange
 from puncture_twin.planning.uncertainty.pose_error import PoseError
@@ -102,14 +101,10 @@ def verify(
     *,
     error: PoseError | None = None,
 ) -> Verification:
-    """Prove every cell of a certificate again.
+    """Prove every cell of a certificate again, as `read_certificate` gives it: the cells tile the cap.
 
-    Args:
-        certificate: As read from a file; `read_certificate` has checked that the cells tile the cap.
-        error: Of the case's needle; needed where the certificate states a chance to touch.
-
-    Raises:
-        InputError: Other inputs, or a cell whose claim does not follow.
+    The error of the case's needle is needed where the certificate states a chance to touch. Raises InputError: Other
+    inputs, or a cell whose claim does not follow.
     """
     _check_question(certificate, case, anatomy, error)
     return _Checker(certificate, case, anatomy).run(progress)

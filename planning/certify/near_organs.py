@@ -12,8 +12,7 @@ import numpy as np
 
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints
 from puncture_twin.planning.base.numba_kernels import nb
-from puncture_twin.planning.certify.cells import Cones
-from puncture_twin.planning.certify.cones import Lists, Zones
+from puncture_twin.planning.certify.cells import Cones, Lists, Zones
 from puncture_twin.planning.clearance.kernels.segment_triangle import axis_triangle
 
 BULGES = 3.0
@@ -21,7 +20,6 @@ BULGES = 3.0
 SURELY_MIXED = np.radians(0.5)
 """A cell with a smaller radius of which the inherited witness rejects some corners, not all, is split unmeasured:
 it is not safe, and at such a size another triangle rejects all of it in one case of a hundred."""
-
 HOPELESS = 0.6
 """At a corner of a cell the axis is farther from a triangle next to it by about this part of the cone's radius at
 least: a triangle that is no witness by this estimate is not tried."""
@@ -31,12 +29,9 @@ least: a triangle that is no witness by this estimate is not tried."""
 class Organs:
     """The m triangles of k structures that demand a margin, from the target."""
 
-    corners: Floats
-    """Shape (m, 9), mm."""
-    group: Ints
-    """Shape (m,), the structure of each, 0 to k - 1."""
-    limits: Floats
-    """Shape (k,), needle radius plus margin, mm."""
+    corners: Floats  # shape (m, 9), mm
+    group: Ints  # shape (m,), the structure of each, 0 to k - 1
+    limits: Floats  # shape (k,), needle radius plus margin, mm
     zones: Zones
 
 
@@ -48,10 +43,8 @@ class OrganFacts:
     """The triangles of which a cell is not proven clear; a cell without one is clear of all."""
     witness: Ints
     """Shape (n,), a triangle, -1 for none. In a rejected cell every axis comes too near to it."""
-    rejected: Bools
-    """Shape (n,), every axis comes too near to a structure."""
-    largest: Floats
-    """Shape (n,), in a rejected cell every axis comes at least so near to the witness, mm."""
+    rejected: Bools  # shape (n,), every axis comes too near to a structure
+    largest: Floats  # shape (n,), in a rejected cell every axis comes at least so near to the witness, mm
     measured: int
     """Cells for which a triangle was measured that their parents' witness had not settled."""
 
@@ -59,14 +52,11 @@ class OrganFacts:
 def organ_facts(
     organs: Organs, lists: Lists, parent: Ints, witness: Ints, cones: Cones, lengths: Floats, *, wide: float, pad: float
 ) -> OrganFacts:
-    """Evaluate cells against the triangles that matter to their parents.
+    """Evaluate n cells against the triangles that matter to their parents, by rows (n,).
 
-    Args:
-        parent: Shape (n,), row of each cell's parent.
-        witness: Shape (n,), the triangle that nearly rejected each parent, or -1.
-        lengths: Shape (n, 2), how far their axes are checked, at least and at most, mm.
-        wide: Cells with a larger radius are only narrowed, rad.
-        pad: Kept from every limit, mm.
+    ``witness`` (n,) is the triangle that nearly rejected each parent, or -1; axes are checked as far as ``lengths`` (n,
+    2), at least and at most, mm; cells wider than ``wide``, rad, are only narrowed; ``pad``, mm, is kept from every
+    limit.
     """
     n = len(parent)
     found, rejected, largest = np.full(n, -1), np.zeros(n, bool), np.full(n, np.nan)

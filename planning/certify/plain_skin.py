@@ -50,9 +50,7 @@ class PlainSkin:
     def facts(self, rows: Ints, u: Floats, rho: float, ray: Floats, *, length: float, longest: float) -> SkinFacts:
         """Everything about the triangles ``rows`` over the cone of half-angle ``rho`` about ``u``, mm and rad.
 
-        Args:
-            rows: Triangles among which are all that the cone intersects.
-            ray: Shape (3,), a direction inside the cell.
+        Among them are all that the cone intersects; ``ray`` (3,) is a direction inside the cell.
         """
         rho = rho + CONE_PAD_RAD
         near, far = _depths(self.corners[rows], u, rho)

@@ -16,13 +16,17 @@ from puncture_twin.planning.base.numba_kernels import nb
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.settings import Needle
-from puncture_twin.planning.certify.cells import OFF_CENTRE, Cells, Cones, split
-from puncture_twin.planning.certify.certificate import PROVED_SAFE, REJECTED, UNDECIDED, Certificate
-from puncture_twin.planning.certify.cones import Lists, narrowed, zones
+from puncture_twin.planning.certify.cells import OFF_CENTRE, Cells, Cones, Lists, narrowed, split, zones
+from puncture_twin.planning.certify.certificate import (
+    PROVED_SAFE,
+    REJECTED,
+    UNDECIDED,
+    Certificate,
+    Question,
+    question_of,
+)
 from puncture_twin.planning.certify.near_organs import Organs, organ_facts
-from puncture_twin.planning.certify.question import Question, question_of
-from puncture_twin.planning.certify.skin_cones import LENGTH_PAD_MM, SkinBounds, skin_bounds
-from puncture_twin.planning.certify.skin_surface import SkinSurface, skin_surface
+from puncture_twin.planning.certify.skin_cones import LENGTH_PAD_MM, SkinBounds, SkinSurface, skin_bounds, skin_surface
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.reach.standoff import waiting_flange
 from puncture_twin.planning.uncertainty.pose_error import PoseError
@@ -55,16 +59,13 @@ def certify(
     touch: float | None = None,
     error: PoseError | None = None,
 ) -> Certificate:
-    """Certify a cap of directions.
+    """Certify a cap of directions, by θ and β, rad; None for the case's own.
 
-    Args:
-        size: Cells of a smaller angular diameter stay undecided, rad.
-        theta: The cap's puncture angles, rad, and ``beta`` its azimuths; None for the case's own.
-        touch: A chance to touch each structure that no safe cell may exceed in any configuration of the arm.
-        error: Of the case's needle; needed for a chance.
+    Cells of a smaller angular diameter than ``size``, rad, stay undecided. ``touch`` is a chance to touch each
+    structure that no safe cell may exceed in any configuration of the arm; the error of the case's needle is needed for
+    it.
 
-    Raises:
-        InputError: The size, the cap or the chance makes no sense, or nothing gives a chance.
+    Raises InputError: The size, the cap or the chance makes no sense, or nothing gives a chance.
     """
     question = question_of(case, anatomy, theta=theta, beta=beta, touch=touch, error=error)
     if not SMALLEST_SIZE <= size <= np.pi:
@@ -81,9 +82,8 @@ def certify(
         columns = cells.theta, cells.beta, letters, verdicts.reason, verdicts.triangle, verdicts.bound
         leaves.append([column[np.char.isupper(letters)] for column in columns])
         inner = np.flatnonzero(np.char.islower(letters))
-        children = split(cells.take(inner), letters[inner])
-        state = verdicts.state.of(inner[children.parent])
-        cells = children.cells
+        cells, parent = split(cells.take(inner), letters[inner])
+        state = verdicts.state.of(inner[parent])
     low_high, first_last, verdict, code, triangle, bound = map(np.concatenate, zip(*leaves, strict=True))
     reason = np.array([reason.value for reason in REASONS], dtype=np.str_)[code]
     structure, face = evaluator.names(triangle)
@@ -95,16 +95,12 @@ def certify(
 class _State:
     """Knowledge of n cells, inherited from the cells that they are parts of."""
 
-    parent: Ints
-    """Shape (n,), row of each cell's lists."""
-    skin: Lists
-    """Triangles of the skin that may matter."""
+    parent: Ints  # shape (n,), row of each cell's lists
+    skin: Lists  # triangles of the skin that may matter
     organs: tuple[Lists, Lists]
     """Triangles of the body's structures that may matter, and behind them those outside of the body."""
-    witness: Ints
-    """Shape (2, n), of both the triangle that nearly rejected the whole, or -1."""
-    skin_good: Bools
-    """Shape (n,), the skin's constraints hold."""
+    witness: Ints  # shape (2, n), of both the triangle that nearly rejected the whole, or -1
+    skin_good: Bools  # shape (n,), the skin's constraints hold
     flange: Floats
     """Shape (n, 2), how far from the target flanges are while the tip waits, at least and at most, mm."""
 

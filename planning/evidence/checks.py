@@ -33,8 +33,7 @@ STEP_SLACK = 1e-9
 def findings(case: Case, anatomy: Anatomy, placement: Placement | None, cache: Cache = NO_CACHE) -> tuple[Finding, ...]:
     """Hold the inputs of a case against each other, and warnings and notes in the order in which they are shown.
 
-    Raises:
-        InputError: Everything that is refused, in one line; its code and numbers are those of the first.
+    Raises InputError: Everything that is refused, in one line; its code and numbers are those of the first.
     """
     places = tuple(label_placement(case, anatomy))
     on_edges = {one.code for one in places} - {"outline_unconfirmed"} == {"labels_on_edges"}

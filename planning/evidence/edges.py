@@ -32,27 +32,20 @@ from puncture_twin.planning.geometry.rigid import apply, exp_rotation
 
 HU_RANGE = (-200.0, 400.0)
 """What lies beyond counts as its end: air against skin or the core of a bone must not outweigh an organ's edge."""
-
 COPY_MM = 2.0
 """The CT is averaged to voxels of at most so much: fine enough for edges, and filtered in no time."""
-
 POINTS, LEAST_POINTS, REFINING_POINTS = 15_000, 200, 4_000
 """On all surfaces together, by area; on each of them, unless they are very many; and where a place is refined."""
-
 PATCH_MM = 20.0
 
 LEAST_SHIFT_MM, LEAST_SHIFT_VOXELS, MOST_SHIFT_MM = 6.0, 1.5, 50.0
 """Shifts that are tried: from the larger of the first two, doubled up to the last."""
-
 SCALES, TURNS = (0.9, 0.95, 1.05, 1.1), np.radians([-24.0, -12.0, -6.0, 6.0, 12.0, 24.0])
 """The second about each axis: what was resampled in another pose lies turned on the CT's own grid."""
-
 LEAST_SEEN = 0.5
 """A placement that leaves less than this in the image, of the points that are in it as they are, says nothing."""
-
 OFFSETS = (-1.0, -0.5, 0.5, 1.0)
 """Voxels by which a segmentation may be drawn thicker or thinner than what it shows."""
-
 LEAST_SUM = 1e-12
 """Below every sum of edge strengths, so that nothing is divided by 0."""
 
@@ -192,9 +185,8 @@ def sample_surfaces(meshes: Sequence[TriangleMesh], count: int = POINTS) -> Samp
 def shifts(axes: Floats, voxel_mm: Floats, most_mm: Floats | float = MOST_SHIFT_MM) -> Iterator[Placement]:
     """Moved along each axis (unit columns (3, 3)), doubling from the least shift that counts.
 
-    Args:
-        voxel_mm: Shape (3,), of the coarser of image and labels along these axes.
-        most_mm: The largest shift, of all axes or of each (3,); the least is tried whatever it is.
+    Voxels (3,) are the coarser ones of image and labels along these axes, the largest shift is one of all axes or of
+    each (3,); the least is tried whatever it is.
     """
     largest = np.broadcast_to(np.minimum(most_mm, MOST_SHIFT_MM), 3)
     for axis, least, most in zip(axes.T, least_shift_mm(voxel_mm), largest, strict=True):
@@ -225,11 +217,9 @@ def turns(about: Floats, axes: Floats) -> Iterator[Placement]:
 
 
 def axis_slips(about: Sequence[Floats], axes: Floats) -> Iterator[Placement]:
-    """Every other way to name and to direct three axes: mirror images, half and quarter turns, arrays reversed.
+    """Every other way to name and to direct three axes (unit columns (3, 3)) about points (3,).
 
-    Args:
-        about: Points (3,) that stay in place.
-        axes: Shape (3, 3), unit columns: of the patient, or of a grid.
+    Of the patient or a grid: mirror images, half and quarter turns, arrays reversed.
     """
     orders, signs_of = itertools.permutations(range(3)), itertools.product((1, -1), repeat=3)
     for point, order, signs in itertools.product(about, orders, signs_of):

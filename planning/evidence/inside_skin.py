@@ -16,7 +16,7 @@ import scipy
 
 from puncture_twin.planning.anatomy.anatomy import OWN_TARGET, Anatomy
 from puncture_twin.planning.anatomy.body.cut_ends import FieldOfView
-from puncture_twin.planning.anatomy.default_roles import BONES, LESION, VESSEL_WORDS, default_role, plain_name
+from puncture_twin.planning.anatomy.default_roles import BONES, LESION, VESSEL_WORDS, default_role, plain_name, words
 from puncture_twin.planning.anatomy.skin import Skin
 from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.arrays import Bools, Floats
@@ -31,22 +31,17 @@ from puncture_twin.planning.geometry.triangle_distance import squared_distance
 
 CELL_MM, MOST_CELLS = 2.0, 30e6
 """Cells in which volumes are counted, wider where there would be more."""
-
 LEAST_SHARED, LEAST_CELLS = 0.05, 20
 """Of the smaller one's volume, and of cells: less is what smoothing and partial volume move."""
-
 NESTED = 0.95
 """From here on one lies in the other: a part, a vessel or a lesion does, and few organs do not."""
 
-TUBES = (VESSEL_WORDS - {"aorta"}) | frozenset(
-    (
-        *("nerve", "nerves", "cord", "canal", "duct", "ducts", "bronchus", "bronchi", "trachea", "airway", "airways"),
-        *("portal", "urethra", "ureter", "catheter", "stent", "electrode", "implant", "cava"),
-    )
-)
+TUBES = (VESSEL_WORDS - {"aorta"}) | words("""
+    nerve nerves cord canal duct ducts bronchus bronchi trachea airway airways portal urethra ureter catheter stent
+    electrode implant cava
+""")
 """What runs into organs; but for the cord not into bones."""
-
-TISSUES = frozenset(("fat", "muscle", "muscles", "tissue", "cavity", "compartment", "mediastinum", "peritoneum"))
+TISSUES = words("fat muscle muscles tissue cavity compartment mediastinum peritoneum")
 """What other structures are parts of, or lie in."""
 
 COMPACT = frozenset(
@@ -59,10 +54,8 @@ COMPACT = frozenset(
 
 ENLARGED = {"cm": 10.0, "m": 1000.0}
 """Units of a mesh that was read in mm."""
-
 ALIKE, UNLIKE = 2.5, 4.0
 """Times by which the lengths of triangles of meshes that were made together may differ; and from where on they do."""
-
 TRIANGLES = 2_000
 """Whose edges tell of a mesh's."""
 
@@ -159,20 +152,15 @@ def _edge_mm(mesh: TriangleMesh) -> float:
 
 SAMPLES = 1000
 """Points on a structure's surface, each for the same area: a fraction is found to 0.1 %."""
-
 AIMS = 100
 """Lines along which a point inside the skin is sought."""
-
 LEAST_TOLERANCE_MM = 2.0
 """A point this near to the skin counts as inside. Surfaces of label maps run up to half a voxel outside of the organ, a
 skin from a CT up to half a voxel inside of the dermis, and meshes of other programs are smoothed by about as much."""
-
 USUAL_INSIDE = 0.99
 """Of a structure's area, inside the skin; a smaller fraction is a warning. One percent is what smoothing moves."""
-
 LEAST_INSIDE = 0.9
 """A smaller fraction is refused: whatever the cause is, the organ is not where the search takes it to be."""
-
 CODE = "outside_skin"
 ALLOWED_INSIDE = (
     f"at least {100 * LEAST_INSIDE:g} % of a structure's surface inside the skin; "

@@ -43,31 +43,24 @@ from puncture_twin.planning.geometry.spaces import Space
 REFUSING_Z, WARNING_Z = 6.0, 3.0
 """z of true placements stays below the first, also of one structure alone, and of six and more below the second: the
 table of `python -m benchmarks.placements`."""
-
 LEAST_SLIP = {"shift": 0.9, "turn": 0.9, "axes": 0.9, "grid": 0.9, "unit": 0.9, "scale": 1.25}
 """In shifts of the least that counts, by kind of placement: what moves the surfaces by less is never refused. A rib
 cage by itself lies better on the edge of the lungs, 4 % smaller: .96."""
-
 LEAST_SCALE_RATIO = 1.3
 """Edges so many times as strong refuse a scale: 5 % off has 1.5 to 2. What ends at one depth below the skin lies better
 on the skin, scaled, by 1.22, however well it lies on weaker edges of its own."""
-
 STRUCTURES = ((2.5, 1.2, 1.0), (1.5, 1.2, 0.5))
 AGREEING = (4.0, 1.5, 1.0)
 """z, ratio of edges and of unevenness: one structure of a source that fits is named where it lies so much better
 elsewhere by itself (either), and several are refused that do so at one place. Of 512 true ones, in noise, cropped, on
 thick slices and blurred, none does; of those that are 15 mm off half do."""
-
 UNCONFIRMED = ((0.5, 0.0, 1.3), (1.4, 0.0, 3.5))
 """Of a structure that does so by no more than this (either) the CT does not confirm where it lies: 95 of 100 that are
 15 mm off, and 1 in 5 of true ones."""
-
 INSIDE_MM, LEAST_HU = 3.0, 3.0
 """So deep below a surface lies what must be even within it; what deviates less than noise alone is even."""
-
 UNITS, LEAST_EXTENT_MM = (0.001, 0.1, 10.0, 1000.0), 50.0
 """Meshes in m or cm taken for mm, and the other way round; what becomes smaller than this lies on any one edge."""
-
 LEAST_SCALE, LEAST_TURN = 0.015, np.radians(1.5)
 """What a refined place may be off is not said."""
 
@@ -83,7 +76,6 @@ KINDS = {
 AS_IT_IS = edges.Placement("shift", np.eye(4))
 OTHER_SPACE = np.diag([-1.0, -1.0, 1.0, 1.0])
 """LPS as RAS."""
-
 CODE = "labels_beside_image"
 ALLOWED = (
     "structures where the CT shows them; or init --trust-labels, or [search] trust_labels = true, if you compared "
@@ -97,14 +89,11 @@ class Source:
 
     name: str
     meshes: dict[str, TriangleMesh]
-    axes: Floats
-    """Shape (3, 3), unit columns: of its grid, or of the patient."""
+    axes: Floats  # shape (3, 3), unit columns: of its grid, or of the patient
     middles: tuple[Floats, Floats]
     """Places (3,) about which it may be mirrored or turned: of its grid or the image the middle; the origin."""
-    first: Floats
-    """Shape (3,), the first voxel of its grid, about which it may be scaled too."""
-    voxel_mm: Floats
-    """Shape (3,), of the coarser of its voxels and the image's along each of its axes."""
+    first: Floats  # shape (3,), the first voxel of its grid, about which it may be scaled too
+    voxel_mm: Floats  # shape (3,), of the coarser of its voxels and the image's along each of its axes
     in_units: bool = False
     grid_slip: Floats | None = None
     """Where the CT has its matrix on another grid: the map (4, 4) to that; else None."""
@@ -133,25 +122,17 @@ class Assessed(NamedTuple):
 
     z: float
     """The largest over all placements that were tried; -inf where the image shows none of the surfaces."""
-    ratio: float
-    """Of the edge strength there to that as it is."""
+    ratio: float  # of the edge strength there to that as it is
     kind: str
-    slip: float
-    """How far it is, rms over the surfaces, in shifts of the least that counts."""
-    T: Floats | None
-    """Shape (4, 4), LPS mm: the refined place where one is named, else None."""
-    middle_ct: Floats
-    """Shape (3,), of the surfaces as they are."""
-    open: tuple[str, ...]
-    """The kinds of placements that are not excluded."""
-    odd: tuple[str, ...]
-    """Structures that lie better shifted by themselves."""
+    slip: float  # how far it is, rms over the surfaces, in shifts of the least that counts
+    T: Floats | None  # shape (4, 4), LPS mm: the refined place where one is named, else None
+    middle_ct: Floats  # shape (3,), of the surfaces as they are
+    open: tuple[str, ...]  # the kinds of placements that are not excluded
+    odd: tuple[str, ...]  # structures that lie better shifted by themselves
     agreeing: tuple[str, ...]
     """Structures of which two or more lie better at one place, whatever it is."""
-    unconfirmed: tuple[str, ...]
-    """Structures that may lie better shifted by themselves."""
-    unseen: tuple[str, ...]
-    """Structures of which the image shows less than half."""
+    unconfirmed: tuple[str, ...]  # structures that may lie better shifted by themselves
+    unseen: tuple[str, ...]  # structures of which the image shows less than half
     uneven: float
     """Of the best placement to as it is, over all structures: what is above 1 is no place of organs."""
 

@@ -38,14 +38,11 @@ second's, in nearly every body: in situs inversus, one of ten thousand, sides ar
 
 SEVERAL = frozenset(("vertebrae", "kidney", "lung", "hip", "rib", "femur"))
 """Of these there are several, with a side or a number behind the name."""
-
 OF_LIMBS = frozenset(("limbs and girdles", "other vessels", "iliac vessels", "nerves", "muscles"))
 NOT_OF_LIMBS = re.compile(r"hepatic|renal|scapula|clavic|autochthon")
 """Groups of the table of default roles whose structures move with a limb, and what does not."""
-
 CLEARLY_MM = 10.0
 """Middles nearer to each other along the axis say nothing: a field of view may cut off most of an organ."""
-
 ALLOWED = (
     "structures whose names, sides and places agree; or init --trust-labels, or [search] trust_labels = true, if you "
     "checked that they do"
@@ -53,7 +50,6 @@ ALLOWED = (
 
 INWARD_MM = 2.0
 """So deep below its surface a point lies within the organ, and not yet in a bone's marrow."""
-
 SAMPLES = 200
 """Points on each structure."""
 
@@ -171,7 +167,9 @@ def densities(case: Case, anatomy: Anatomy, *, on_edges: bool) -> Iterator[Findi
         made_from = {"what": tissue.name, "meshes": [mesh.digest for mesh in meshes]}
 
         def make(tissue: Tissue = tissue, meshes: list[TriangleMesh] = meshes, scan: Scan = scan) -> Arrays:
-            hu = scan.hu_at(np.concatenate([_below(mesh) for mesh in meshes]))
+            spread = [(mesh, spread_on(mesh, SAMPLES)) for mesh in meshes]
+            inner = [one.points - np.copysign(INWARD_MM, mesh.volume) * one.normals for mesh, one in spread]
+            hu = scan.hu_at(np.concatenate(inner))
             return {"within": np.array(tissue.fraction(hu[np.isfinite(hu)]))}
 
         within = scan.source.kept(made_from, make, lambda stored: float(stored["within"]), by=__name__)
@@ -184,8 +182,3 @@ def densities(case: Case, anatomy: Anatomy, *, on_edges: bool) -> Iterator[Findi
                 "together?",
                 {"within": round(within, 3), "least": tissue.least},
             )
-
-
-def _below(mesh: TriangleMesh) -> Floats:
-    spread = spread_on(mesh, SAMPLES)
-    return np.asarray(spread.points - np.copysign(INWARD_MM, mesh.volume) * spread.normals)

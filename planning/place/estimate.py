@@ -42,16 +42,14 @@ nearly always do. FCL finds 31 % of 1,500 random states of a UR3 in contact with
 class ArmSpheres:
     """Bounding spheres of the links, the needle's holder and the tool, by body; not the needle."""
 
-    centres: Floats
-    """Shape (n, 3), mm, each in its body's frame."""
-    radii: Floats
-    """Shape (n,), mm."""
+    centres: Floats  # shape (n, 3), mm, each in its body's frame
+    radii: Floats  # shape (n,), mm
     starts: NDArray[np.int64]
     """Shape (k + 1,): the first sphere of each body, which encloses all of the body; the others cover it."""
-    frames: NDArray[np.int64]
-    """Shape (k,), the body's frame among ``link_poses``: 0 is the base's."""
+    frames: NDArray[np.int64]  # shape (k,), the body's frame among ``link_poses``: 0 is the base's
 
     @classmethod
+    @cache
     def of(cls, model: UrModel, tool: Tool) -> ArmSpheres:
         """The spheres of an arm with its tool.
 
@@ -80,8 +78,7 @@ class ArmSpheres:
         return self.centres, radii, self.starts, self.frames, np.argwhere(self.frames - self.frames[:, None] >= 2)
 
 
-@dataclass(frozen=True, eq=False)
-class Surroundings:
+class Surroundings(NamedTuple):
     """Patient, boxes that stand with them (CT frame) and with the arm (base frame), and the distance to be kept."""
 
     skin: SkinField
@@ -90,25 +87,18 @@ class Surroundings:
     padding_mm: float
 
     @property
-    def compiled(self) -> tuple[tuple[Floats, Floats], ...]:
-        """As compiled code takes them."""
-        boxes = ((some.T_box_frame, some.halves) for some in (self.fixed, self.carried))
-        return (self.skin.origin, self.skin.values), *boxes
+    def compiled(self) -> tuple[tuple[Floats, ...], ...]:
+        """As compiled code takes them: plain tuples."""
+        return tuple(self.skin), tuple(self.fixed), tuple(self.carried)
 
 
 def clear_branches(
     spheres: ArmSpheres, surroundings: Surroundings, T_ct_base: Floats, frames: Floats
 ) -> NDArray[np.bool_]:
-    """Which motions keep clear of the surroundings, and the arm of itself, at each of their states.
+    """Which of k motions keep clear of the surroundings, and the arm of itself, at each of m states.
 
-    The base is checked against the arm alone.
-
-    Args:
-        T_ct_base: Shape (4, 4), mm.
-        frames: Shape (k, m, 7, 4, 4), mm, base frame: ``link_poses`` of k motions of m states.
-
-    Returns:
-        Shape (k,).
+    The base (T_ct_base (4, 4), mm) is checked against the arm alone. ``frames`` (k, m, 7, 4, 4), mm, are their
+    ``link_poses``, base frame.
     """
     arm = (spheres.centres, spheres.radii + surroundings.padding_mm, spheres.starts[1:], spheres.frames[1:])
     clear = np.empty(len(frames), np.bool_)
@@ -119,8 +109,7 @@ def clear_branches(
 def base_is_clear(spheres: ArmSpheres, surroundings: Surroundings, T_ct_base: Floats) -> bool:
     """Whether the base itself is free of the patient and of the boxes that are fixed to them. Exact for boxes."""
     base = (spheres.centres, spheres.radii + surroundings.padding_mm, spheres.starts[:2], spheres.frames[:1])
-    # the base is bolted to what it carries
-    alone = Surroundings(surroundings.skin, surroundings.fixed, Boxes.of([]), surroundings.padding_mm)
+    alone = surroundings._replace(carried=Boxes.of([]))  # the base is bolted to what it carries
     clear = np.empty(1, np.bool_)
     own = (*spheres.own[:4], spheres.own[4][:0])
     _clear(base, own, alone.compiled, np.ascontiguousarray(T_ct_base), np.tile(np.eye(4), (1, 1, 7, 1, 1)), clear)
@@ -247,19 +236,15 @@ CELL_MM = 8.0
 SAMPLE_MM = 6.0
 """The skin's triangles are divided until no edge is longer: the distance to a corner exceeds that to the skin by
 little where it matters, some mm away."""
-
 MARGIN_CELLS = 4
 """Nodes around the skin's box; beyond them the distance to the box counts."""
 
 
-@dataclass(frozen=True, eq=False)
-class SkinField:
+class SkinField(NamedTuple):
     """Signed distance to the skin on a regular grid: negative inside, where the skin has an inside."""
 
-    origin: Floats
-    """Shape (3,), mm, CT frame: the first node."""
-    values: Floats
-    """Shape (i, j, k), mm; nodes stand ``CELL_MM`` apart."""
+    origin: Floats  # shape (3,), mm, CT frame: the first node
+    values: Floats  # shape (i, j, k), mm; nodes stand ``CELL_MM`` apart
 
     @classmethod
     def of(cls, skin: TriangleMesh) -> SkinField:
@@ -284,12 +269,11 @@ class SkinField:
         return cls(origin, np.where(inside, -distance, distance))
 
 
-@dataclass(frozen=True, eq=False)
-class Boxes:
+class Boxes(NamedTuple):
     """Boxes of one frame: ``T_box_frame`` (k, 4, 4), mm, and half sizes (k, 3), mm."""
 
     T_box_frame: Floats
-    halves: Floats  # shape (k, 3), half sizes, mm
+    halves: Floats
 
     @classmethod
     def of(cls, boxes: Sequence[Box]) -> Boxes:
@@ -306,8 +290,7 @@ STATES = 3
 class Branches(NamedTuple):
     """The straight insertions along n directions on every branch, looked at in m states each."""
 
-    q: Floats
-    """Shape (n, 8, m, 6), rad, standoff first; NaN where a branch does not exist."""
+    q: Floats  # shape (n, 8, m, 6), rad, standoff first; NaN where a branch does not exist
     margin: Floats
     """Shape (n, 8): least distance from a singularity over the states, 0..1; 0 where the insertion is not possible."""
 
@@ -315,27 +298,20 @@ class Branches(NamedTuple):
 class ReachEstimate(NamedTuple):
     """Fractions of the directions, 0..1: each counts those that the one before left and that pass its own test."""
 
-    reach: float
-    """Kinematics allow the insertion."""
+    reach: float  # kinematics allow the insertion
     fraction: float
     """Links and holder keep clear of the patient and of what is around, and of one another, too."""
     margin: float
     """Mean distance of the reached directions from singularities, 0..1; 0 where none is reached."""
 
 
-NOTHING = ReachEstimate(0.0, 0.0, 0.0)
-
-
 def insertion_branches(
     model: UrModel, target_base: Floats, outward_base: Floats, distances_mm: Floats, at_least: float = MIN_SINGULARITY
 ) -> Branches:
-    """Every branch of many insertions, by kinematics alone; joint limits are not tested.
+    """Every branch of n insertions to a target (3,), mm, by kinematics alone; joint limits are not tested.
 
-    Args:
-        target_base: Shape (3,), mm.
-        outward_base: Shape (n, 3), unit.
-        distances_mm: Shape (n, m): target to flange at each state.
-        at_least: Each singularity must be farther than this.
+    Along unit vectors (n, 3), with the flange at ``distances_mm`` (n, m) at each state, farther than so much from each
+    singularity.
     """
     count, states = distances_mm.shape
     poses = flange_poses(target_base, np.repeat(outward_base, states, axis=0), distances_mm.reshape(-1))
@@ -351,16 +327,15 @@ class Estimator:
     model: UrModel
     tool: Tool
     surroundings: Surroundings
-    T_ct_bed: Floats
-    """Its origin is the target."""
+    T_ct_bed: Floats  # its origin is the target
     wanted: WantedDirections
 
     def estimate(self, site: Site) -> ReachEstimate:
-        """The fractions at one site; ``NOTHING`` where the base would lie in something."""
-        model, spheres = self.model, _spheres(self.model, self.tool)
+        """The fractions at one site, 0 where the base would lie in something."""
+        model, spheres = self.model, ArmSpheres.of(self.model, self.tool)
         T_ct_base = self.T_ct_bed @ site.T_bed_base()
         if not base_is_clear(spheres, self.surroundings, T_ct_base):
-            return NOTHING
+            return ReachEstimate(0.0, 0.0, 0.0)
         T_base_ct = np.linalg.inv(T_ct_base)
         target = T_base_ct[:3, :3] @ self.T_ct_bed[:3, 3] + T_base_ct[:3, 3]
         depths = np.linspace(0.0, 1.0, STATES)
@@ -378,8 +353,3 @@ class Estimator:
             rows = rows[~clear]
         reach, fraction = (float(weight[some > 0.0].sum()) for some in (found.margin.max(axis=1), best))
         return ReachEstimate(reach, fraction, float(best @ weight) / fraction if fraction > 0.0 else 0.0)
-
-
-@cache
-def _spheres(model: UrModel, tool: Tool) -> ArmSpheres:
-    return ArmSpheres.of(model, tool)

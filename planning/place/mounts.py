@@ -52,10 +52,8 @@ class Region:
 
     mount: MountName
     facing: str
-    axis: tuple[int, int, int]
-    """The base's z axis, unit."""
-    low: tuple[float, float, float]
-    """Lowest position of the base's origin, mm."""
+    axis: tuple[int, int, int]  # the base's z axis, unit
+    low: tuple[float, float, float]  # lowest position of the base's origin, mm
     high: tuple[float, float, float]
 
     @property
@@ -88,11 +86,7 @@ class Site:
     """The base's origin in the bed frame: along, across, up from the target, mm."""
 
     def T_bed_base(self) -> Floats:  # noqa: N802  # the field writes T_a_b
-        """The base's pose: its x axis leads away from the target, so that the arm reaches for it at q1 = 0.
-
-        Returns:
-            Shape (4, 4), mm.
-        """
+        """The base's pose (4, 4), mm; its x axis leads away from the target, which the arm so reaches for at q1 = 0."""
         z, at = np.array(self.region.axis, dtype=float), np.array(self.position)
         x = at - z * (z @ at)
         if np.linalg.norm(x) < STRAIGHT_UP_MM:
@@ -102,11 +96,7 @@ class Site:
 
 
 def regions(case: Case, T_ct_bed: Floats) -> tuple[Region, ...]:
-    """Regions of the case in which a base may be placed.
-
-    Raises:
-        InputError: A rail is wanted, and there is no table to which it belongs.
-    """
+    """The case's regions for a base. Raises InputError: A rail is wanted, and no table is there to which it belongs."""
     settings, model = case.place, case.robot.model
     table = next((o for o in case.obstacles if o.name == settings.table and o.frame == "ct"), None)
     mounts = settings.mounts or ("floor", "rail", "ceiling", "side")
@@ -156,18 +146,11 @@ def _rails(case: Case, table: Obstacle, T_ct_bed: Floats, reach: float) -> list[
 
 
 def mount_section(T_ct_base: Floats, space: Space) -> MountSection:
-    """The section that states this pose in the case's space, rounded.
-
-    Args:
-        T_ct_base: Shape (4, 4), mm.
-    """
+    """The section that states a pose (4, 4), mm, in the case's space, rounded."""
     # LPS to RAS is its own inverse.
     position, x, z = to_lps(np.stack([T_ct_base[:3, 3], T_ct_base[:3, 0], T_ct_base[:3, 2]]), space)
-    return MountSection(
-        position_mm=_rounded(position, POSITION_DIGITS),
-        x_axis=_rounded(x, AXIS_DIGITS),
-        z_axis=_rounded(z, AXIS_DIGITS),
-    )
+    at, x_axis, z_axis = _rounded(position, POSITION_DIGITS), _rounded(x, AXIS_DIGITS), _rounded(z, AXIS_DIGITS)
+    return MountSection(position_mm=at, x_axis=x_axis, z_axis=z_axis)
 
 
 def mount_lines(mount: MountSection) -> str:
@@ -189,12 +172,9 @@ SAME_RING_DIGITS = 7
 class WantedDirections:
     """n directions to be reached, each with the solid angle that it represents."""
 
-    outward_ct: Floats
-    """Shape (n, 3), unit, from the target outward."""
-    standoff_mm: Floats
-    """Shape (n,), tip to target before the insertion."""
-    weight: Floats
-    """Shape (n,), fraction of the organ-safe solid angle that each stands for."""
+    outward_ct: Floats  # shape (n, 3), unit, from the target outward
+    standoff_mm: Floats  # shape (n,), tip to target before the insertion
+    weight: Floats  # shape (n,), fraction of the organ-safe solid angle that each stands for
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -228,20 +208,12 @@ def wanted_directions(case: Case, candidates: Candidates) -> WantedDirections:
     """The safe rows of a search, in their order."""
     rows = np.flatnonzero(candidates.safe)
     weight = ring_weights(candidates.theta, case.search.step)[rows]
-    return WantedDirections(
-        candidates.outward_ct[rows],
-        standoffs(case.needle, candidates.path.length[rows], candidates.path.skin_angle[rows]),
-        weight / weight.sum() if len(rows) else weight,
-    )
+    standoff = standoffs(case.needle, candidates.path.length[rows], candidates.path.skin_angle[rows])
+    return WantedDirections(candidates.outward_ct[rows], standoff, weight / weight.sum() if len(rows) else weight)
 
 
 def ring_weights(theta: Floats, step: float) -> Floats:
-    """The solid angle of each cell of a grid of (θ, β), up to a common factor: a grid is denser near θ = 0.
-
-    Args:
-        theta: Shape (n,), rad.
-        step: Of the grid, rad.
-    """
+    """The solid angle, up to a factor, of each cell of a grid of (θ, β), by θ (n,) and step, rad: denser near θ = 0."""
     low, high = np.maximum(theta - step / 2, 0.0), np.minimum(theta + step / 2, np.pi)
     _, ring, sizes = np.unique(np.round(theta, SAME_RING_DIGITS), return_inverse=True, return_counts=True)
     return np.asarray((np.cos(low) - np.cos(high)) / sizes[ring])

@@ -13,46 +13,187 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import fcl
 import numpy as np
+from numpy.typing import NDArray
 
 from puncture_twin.planning.anatomy.anatomy import Anatomy
 from puncture_twin.planning.anatomy.structure import Role
 from puncture_twin.planning.anatomy.unseen import BEYOND_IMAGE
-from puncture_twin.planning.arm.tool import Box
+from puncture_twin.planning.arm.insertion import flange_poses
+from puncture_twin.planning.arm.tool import Box, Tool
+from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
-from puncture_twin.planning.base.errors import NoAnswerError
+from puncture_twin.planning.base.cache.array_cache import user_cache
+from puncture_twin.planning.base.errors import InputError, NoAnswerError
 from puncture_twin.planning.base.files import atomic
 from puncture_twin.planning.base.processes import working
+from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.base.text import Shown
 from puncture_twin.planning.case.case import Case, bed_frame
 from puncture_twin.planning.case.settings import mount_pose
 from puncture_twin.planning.case.tables import MountSection
-from puncture_twin.planning.collision.bodies import connected_parts
+from puncture_twin.planning.collision import workcell
+from puncture_twin.planning.collision.bodies import Solid, connected_parts
 from puncture_twin.planning.collision.checker import CellChecker
+from puncture_twin.planning.collision.fast_checker import FastChecker
+from puncture_twin.planning.collision.patient import FclSkin
+from puncture_twin.planning.collision.state_checker import PATIENT
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, patient_surface
 from puncture_twin.planning.geometry.mesh import TriangleMesh, box_of, joined
-from puncture_twin.planning.geometry.rigid import pose
-from puncture_twin.planning.place.check import (
-    Checked,
-    PlacementCheck,
-    Verdict,
-    expected_tip_error_mm,
-    needle_can_start,
-    placement_check,
-)
+from puncture_twin.planning.geometry.rigid import apply, pose
 from puncture_twin.planning.place.estimate import Boxes, Estimator, ReachEstimate, SkinField, Surroundings
-from puncture_twin.planning.place.mounts import Site, mount_lines, mount_section, regions
-from puncture_twin.planning.reach.survey import ReachAnswer
-from puncture_twin.planning.registration.placement import Placement
+from puncture_twin.planning.place.mounts import (
+    Site,
+    WantedDirections,
+    mount_lines,
+    mount_section,
+    regions,
+    wanted_directions,
+)
+from puncture_twin.planning.reach.reach import assess_reach_all
+from puncture_twin.planning.reach.survey import ReachAnswer, ReachRequest
+from puncture_twin.planning.registration.fit_uncertainty import reading_noise, touches
+from puncture_twin.planning.registration.marker_pairs import MarkerPairs
+from puncture_twin.planning.registration.placement import Placement, default_method
+from puncture_twin.planning.registration.registration import Registration, register
 from puncture_twin.planning.search.candidates import Candidates
+from puncture_twin.planning.uncertainty.pose_error import PoseError
+
+
+def placement_check(case: Case, anatomy: Anatomy, candidates: Candidates) -> PlacementCheck:
+    """The case's workcell, with what moves with the patient apart from what moves with the arm, and its directions."""
+    carried = {obstacle.name for obstacle in case.obstacles if obstacle.frame == "base"}
+    boxes = workcell.case_boxes(case, np.eye(4))  # with the two frames in one place each box stands in its own
+    return PlacementCheck(
+        model=case.robot.model,
+        tool=workcell.case_tool(case),
+        skin=anatomy.skin.mesh,
+        outside=workcell.outside_surface(anatomy),
+        fixed=tuple(box for box in boxes if box.name not in carried),
+        carried=tuple(box for box in boxes if box.name in carried),
+        target_ct=case.target_ct,
+        wanted=wanted_directions(case, candidates),
+        home=workcell.home_configuration(case),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """Exact reach from one placement, in the directions that were checked."""
+
+    fraction: float
+    """Of the wanted solid angle, 0..1; where not all were checked, each counts for those nearest to it."""
+    reached: int
+    count: int
+    margin: float  # mean reach margin of the reached ones, 0..1; 0 for none
+    reasons: Mapping[str, int]
+    home_contact: str  # what the arm touches in its home configuration, or ""
+    q_insertion: Floats  # shape (reached, 6), rad, the tip on the target
+    answers: tuple[ReachAnswer, ...]
+    """Of each checked direction; where all were checked, in the order of the candidates."""
+
+
+class Checked(NamedTuple):
+    """Directions checked from one placement: of each insertion the last state alone is kept."""
+
+    answers: list[ReachAnswer]
+    home_contact: str
+
+
+@dataclass(frozen=True, eq=False)
+class PlacementCheck:
+    """Checks placements. Its values can be sent to another process."""
+
+    model: UrModel
+    tool: Tool
+    skin: TriangleMesh
+    outside: TriangleMesh | None
+    """What the CT shows outside of the skin, or None; CT frame, as the skin."""
+    fixed: tuple[Box, ...]
+    """Boxes that stand with the patient; their ``T_base_box`` is in the CT frame."""
+    carried: tuple[Box, ...]  # boxes that stand with the arm, base frame
+    target_ct: Floats  # shape (3,), mm
+    wanted: WantedDirections
+    home: Floats  # shape (6,), rad
+
+    def checked(self, piece: tuple[Floats, NDArray[np.int64]]) -> Checked:
+        """Check some directions from a pose ``T_base_ct`` (4, 4); a base in the patient or the unseen reaches none."""
+        T_base_ct, rows = piece
+        try:
+            checker = FastChecker(
+                self.model,
+                self.tool,
+                (*(Box(box.name, T_base_ct @ box.T_base_box, box.size_mm) for box in self.fixed), *self.carried),
+                self.skin.transformed(T_base_ct),
+                outside=None if self.outside is None else self.outside.transformed(T_base_ct),
+                padding_mm=ARM_PADDING_MM,
+                cache=user_cache(),
+            )
+        except InputError as error:
+            if not error.code.startswith("base_in"):
+                raise
+            return Checked([ReachAnswer.refused(Reason.ARM_COLLISION, None, str(error))] * len(rows), str(error))
+        target = T_base_ct[:3, :3] @ self.target_ct + T_base_ct[:3, 3]
+        requests = [
+            ReachRequest(target, T_base_ct[:3, :3] @ outward, self.tool.needle_length_mm, float(standoff))
+            for outward, standoff in zip(self.wanted.outward_ct[rows], self.wanted.standoff_mm[rows], strict=True)
+        ]
+        home = checker.contact(self.home, needle_may_touch_patient=False)
+        answers = assess_reach_all(checker, requests)
+        touched = "" if home is None else f"{home.body} touches {home.other}"
+        return Checked([replace(one, insertion_q=one.insertion_q[-1:]) for one in answers], touched)
+
+
+def expected_tip_error_mm(case: Case, placement: Placement | None, T_base_ct: Floats, q: Floats) -> float | None:
+    """Root mean square over insertions (n, 6), rad, of sqrt(trace(Sigma_dd)); None without errors, markers or any.
+
+    The arm is to stand at T_base_ct (4, 4), mm. How it will touch the markers from there nobody has said, so that its
+    own errors do not cancel (2 J_f Sigma_eta J_f' stands for them); the residuals of the old touches say nothing of the
+    new ones.
+    """
+    registration = None if placement is None else placement.registration
+    if case.errors is None or registration is None or not len(q):
+        return None
+    covariance = pose_error_from(case, registration, T_base_ct).covariance(q)
+    return float(np.sqrt(np.trace(covariance[:, :3, :3], axis1=1, axis2=2).mean()))
+
+
+def pose_error_from(case: Case, registration: Registration, T_base_ct: Floats) -> PoseError:
+    """The needle's pose error from another placement; arguments as above, the case with errors."""
+    assert case.errors is not None  # the caller has looked
+    errors, old = replace(case.errors, found=False), registration.markers
+    markers = MarkerPairs(old.names, old.points_ct, apply(T_base_ct, old.points_ct))
+    model, tip = case.robot.model, case.needle.length_mm
+    noise = reading_noise(errors, model, tip, touches(case, markers), known=False)
+    method = (None if case.registration is None else case.registration.method) or default_method(errors)
+    fitted = register(markers, method=method, target_ct=case.target_ct, noise=noise)
+    assert fitted.uncertainty is not None  # its markers have noise
+    return PoseError(model, tip, apply(T_base_ct, case.target_ct), errors, fitted.uncertainty)
+
+
+def needle_can_start(tool: Tool, skin: TriangleMesh, target_ct: Floats, wanted: WantedDirections) -> NDArray[np.bool_]:
+    """Which directions (n,) leave the padded needle at standoff clear of the skin: no placement reaches others."""
+    start, end = tool.needle_span_mm
+    radius, length = tool.needle_diameter_mm / 2 + ARM_PADDING_MM, end - start + 2 * ARM_PADDING_MM
+    needle, half = Solid(partial(fcl.Cylinder, radius, length)), np.array([radius, radius, length / 2])
+    patient = FclSkin(skin, PATIENT)
+    # From the tip, at the standoff from the target, the needle's middle is half its body farther out.
+    poses = flange_poses(target_ct, wanted.outward_ct, wanted.standoff_mm + (end - start) / 2)
+    clear = np.empty(len(wanted), np.bool_)
+    for row, T in enumerate(poses):
+        needle.place(fcl.Transform(T[:3, :3], T[:3, 3]))
+        clear[row] = not patient.touches(needle, np.array([-half, half]))
+    return clear
+
 
 GoesOn = Callable[[int, int | None], bool]
 """Called with how many directions were checked, summed over placements, of how many (None before the finalists are
 known); False ends the search."""
-
 COARSE_DIRECTIONS = 64
 """Directions that a site is estimated with at first."""
 FINE_DIRECTIONS = 128
@@ -77,13 +218,10 @@ ERROR_DIGITS = 2
 class RatedPlacement:
     """A placement, checked and rated."""
 
-    site: Site | None
-    """Position of the base; None for the case's own placement."""
+    site: Site | None  # position of the base; None for the case's own placement
     mount: MountSection
-    estimate: ReachEstimate | None
-    """The estimate that it was chosen by; None for the case's own."""
-    verdict: Verdict
-    """The result of the exact check, in some directions or all."""
+    estimate: ReachEstimate | None  # the estimate that it was chosen by; None for the case's own
+    verdict: Verdict  # the result of the exact check, in some directions or all
     expected_mm: float | None
     """Expected (rms) error of the tip over its insertions, the markers touched anew from there; None where the case
     declares no errors, or has no markers."""
@@ -100,19 +238,21 @@ class PlaceSearch(Shown):
 
     T_ct_bed: Floats  # shape (4, 4), mm: the frame of the sites
     coarse: tuple[tuple[Site, ReachEstimate], ...]
-    refined: int
-    """How many more sites were estimated."""
-    resolution_mm: float
-    """The step between sites at the end."""
+    refined: int  # how many more sites were estimated
+    resolution_mm: float  # the step between sites at the end
     possible: float
     """Fraction of directions, 0..1, in which the needle may wait at its standoff: no placement reaches more."""
     directions: int
     checked: tuple[int, int | None]
     """Directions checked, summed over placements, and how many would have been in the end, if known."""
-    rated: tuple[RatedPlacement, ...]
-    """Best first; the case's own placement is not among them."""
+    rated: tuple[RatedPlacement, ...]  # best first; the case's own placement is not among them
     own: RatedPlacement | None
     """The case's own placement, checked; None where it has none, or the search ended before."""
+
+    @property
+    def every(self) -> tuple[RatedPlacement, ...]:
+        """All that were rated, the case's own last."""
+        return self.rated if self.own is None else (*self.rated, self.own)
 
     @property
     def complete(self) -> bool:
@@ -134,9 +274,8 @@ def search_placements(
 
     One placement at least is checked, in `FIRST` directions. The answer does not depend on ``jobs``.
 
-    Raises:
-        InputError: Bounds that contradict the case, or an own arm or tool with a shape that hangs on nothing.
-        NoAnswerError: No direction is safe for the organs, or in none the needle could start.
+    Raises InputError: Bounds that contradict the case, or an own arm or tool with a shape that hangs on nothing. Raises
+    NoAnswerError: No direction is safe for the organs, or in none the needle could start.
     """
     if not candidates.safe.any():
         what = "no direction is safe for the organs: no placement can change that"
@@ -150,7 +289,7 @@ def search_placements(
         SkinField.of(near), Boxes.of((*check.fixed, *beyond)), Boxes.of(check.carried), ARM_PADDING_MM
     )
     spread = check.wanted.spread(SECOND)
-    starts = needle_can_start(check.tool, patient_surface(anatomy), case.target_ct, spread, ARM_PADDING_MM)
+    starts = needle_can_start(check.tool, patient_surface(anatomy), case.target_ct, spread)
     if not starts.any():
         what = "in every organ-safe direction the needle would start too near the skin"
         raise NoAnswerError(what, code="standoff_in_skin")
@@ -170,17 +309,17 @@ def search_placements(
         first(race.rated(one, placement))
     # 3. The best walk to better places, by ever shorter steps; 4. where they end is checked, the best further.
     fine = replace(estimator, wanted=startable.spread(FINE_DIRECTIONS))
-    walk = _walked(fine, seeds, step_mm, race.goes_on) if going else _Walk(seeds, 0, step_mm)
-    ends = [end for end in _best_apart(walk.ends, step_mm / 2, SEEDS, OF_MOUNT) if end not in seeds[:1]]
-    contenders += [race.contender(*end) for end in ends]
+    ends, estimated, last_mm = _walked(fine, seeds, step_mm, race.goes_on) if going else (seeds, 0, step_mm)
+    best_ends = _best_apart(ends, step_mm / 2, SEEDS, OF_MOUNT)
+    contenders += [race.contender(*end) for end in best_ends if end not in seeds[:1]]
     own = None if placement is None else race.own(placement)
     if going:
         race.run(contenders, own, jobs)
     rated = sorted((race.rated(one, placement) for one in contenders if one.answers), key=_worth)
     rated_own = None if own is None or not own.answers else race.rated(own, placement)
     possible, count = float(startable.weight.sum()), len(check.wanted)
-    walked = (coarse, walk.estimated, walk.step_mm, possible, count)
-    return PlaceSearch(T_ct_bed, *walked, (race.done, race.total), tuple(rated), rated_own)
+    checked = (race.done, race.total)
+    return PlaceSearch(T_ct_bed, coarse, estimated, last_mm, possible, count, checked, tuple(rated), rated_own)
 
 
 def _worth(one: RatedPlacement) -> tuple[float, float, float]:
@@ -274,7 +413,7 @@ class _Race:
             while left or others:
                 most = max((len(one.answers) for one in contenders), default=self._all)
                 follows = others and (len(others[0].answers) < most or not left)
-                one = others[0] if follows else max(left, key=self.fraction)
+                one = others[0] if follows else max(left, key=lambda one: self.verdict(one).fraction)
                 if not self.further(work, [one], SECOND if len(one.answers) < SECOND else self._all):
                     return
                 left, others = ([one for one in some if len(one.answers) < self._all] for some in (left, others))
@@ -292,10 +431,6 @@ class _Race:
             if not self.goes_on():
                 return False
         return True
-
-    def fraction(self, one: _Contender) -> float:
-        """What a contender reaches by its checks so far."""
-        return self.verdict(one).fraction
 
     def verdict(self, one: _Contender) -> Verdict:
         """What the checks of a contender say so far; each direction stands for all that are nearest to it."""
@@ -325,18 +460,12 @@ class _Race:
         return RatedPlacement(one.site, one.mount, one.estimate, verdict, expected)
 
 
-class _Walk(NamedTuple):
-    ends: Sequence[tuple[Site, ReachEstimate]]
-    estimated: int
-    step_mm: float
-
-
 def _walked(
-    estimator: Estimator, seeds: Sequence[tuple[Site, ReachEstimate]], step_mm: float, goes_on: Callable[[], bool]
-) -> _Walk:
-    """The ends of walks uphill, by ever shorter steps, each end once; no site is estimated twice."""
+    estimator: Estimator, seeds: list[tuple[Site, ReachEstimate]], step_mm: float, goes_on: Callable[[], bool]
+) -> tuple[list[tuple[Site, ReachEstimate]], int, float]:
+    """The ends of walks uphill, by ever shorter steps, each once; how many sites were estimated, and the last step."""
     known: dict[Site, ReachEstimate] = {}
-    pairs, halvings = list(seeds), 0
+    pairs, halvings = seeds, 0
     while halvings < HALVINGS and goes_on():
         halvings += 1
         groups = []
@@ -346,7 +475,7 @@ def _walked(
         for site in (site for group in groups for site in group if site not in known):
             known[site] = estimator.estimate(site)
         pairs = [max(((site, known[site]) for site in group), key=lambda pair: _score(pair[1])) for group in groups]
-    return _Walk(list(dict(pairs).items()), len(known), step_mm / 2**halvings)
+    return list(dict(pairs).items()), len(known), step_mm / 2**halvings
 
 
 Scored = TypeVar("Scored", ReachEstimate, Verdict)
@@ -367,15 +496,12 @@ def _best_apart(
     for pair in sorted(reaching, key=lambda pair: _score(pair[1]), reverse=True):
         mount = pair[0].region.mount
         chosen = firsts if mounts[mount] < of_mount else others
-        if (chosen is firsts or len(others) < count) and all(_far(pair[0], k, distance_mm) for k, _ in firsts + others):
+        same = [site for site, _ in firsts + others if site.region == pair[0].region]
+        near = any(np.linalg.norm(np.subtract(pair[0].position, site.position)) < distance_mm for site in same)
+        if (chosen is firsts or len(others) < count) and not near:
             chosen.append(pair)
             mounts[mount] += 1
     return firsts + others[: max(0, count - len(firsts))]
-
-
-def _far(one: Site, other: Site, distance_mm: float) -> bool:
-    apart = float(np.linalg.norm(np.subtract(one.position, other.position)))
-    return one.region != other.region or apart >= distance_mm
 
 
 PLACE_VERSION = 2
@@ -391,22 +517,20 @@ EXPECTED = "expected_error_mm"
 
 def placement_rows(found: PlaceSearch) -> list[dict[str, Any]]:
     """One row a checked placement, best first, rank 1; the case's own comes last, without a rank."""
-    rows = [_row(rank, one) for rank, one in enumerate(found.rated, start=1)]
-    return rows if found.own is None else [*rows, _row(None, found.own)]
-
-
-def _row(rank: int | None, one: RatedPlacement) -> dict[str, Any]:
-    along, across, height = (None, None, None) if one.site is None else one.site.position
-    values = (rank, one.name, along, across, height, one.verdict.fraction, one.verdict.reached, one.verdict.count)
-    rest = (one.verdict.margin, one.verdict.home_contact, *one.mount.position_mm)
-    row = dict(zip(COLUMNS, (*values, *rest), strict=True))
-    return row if one.expected_mm is None else {**row, EXPECTED: round(one.expected_mm, 4)}
+    rows = []
+    for number, one in enumerate(found.every, start=1):
+        rank, position = (number, one.site.position) if one.site is not None else (None, (None, None, None))
+        verdict = one.verdict
+        result = (verdict.fraction, verdict.reached, verdict.count, verdict.margin, verdict.home_contact)
+        row = dict(zip(COLUMNS, (rank, one.name, *position, *result, *one.mount.position_mm), strict=True))
+        rows.append(row if one.expected_mm is None else {**row, EXPECTED: round(one.expected_mm, 4)})
+    return rows
 
 
 def place_document(found: PlaceSearch, provenance: Mapping[str, Any]) -> dict[str, Any]:
     """Everything as plain values: mm; fractions and margins 0..1."""
     rows = placement_rows(found)
-    for row, one in zip(rows, (*found.rated, *((found.own,) if found.own else ())), strict=True):
+    for row, one in zip(rows, found.every, strict=True):
         row["mount"] = {key: list(value) for key, value in one.mount.model_dump().items()}
         row["reasons"] = dict(one.verdict.reasons)
         row["estimate"] = None

@@ -109,23 +109,16 @@ class Shape(NamedTuple):
 class Reading:
     """One dense thing, read as a marker."""
 
-    centre_ct: Floats
-    """Shape (3,), LPS mm."""
-    cov_ct: Floats
-    """Shape (3, 3), mm²."""
+    centre_ct: Floats  # shape (3,), LPS mm
+    cov_ct: Floats  # shape (3, 3), mm²
     shape: Shape
-    contrast_hu: float
-    """Its greatest value above soft tissue's; of clipped metal at least so much."""
-    clipped: bool
-    """Whether the image's range clips it."""
+    contrast_hu: float  # its greatest value above soft tissue's; of clipped metal at least so much
+    clipped: bool  # whether the image's range clips it
     misfit: float
     """Root mean square of what its drawing lacks beyond noise, over that of its contrast."""
-    make: Floats
-    """Logarithms of density (HU) and diameter (mm), shape (2,)."""
-    cov_make: Floats
-    """Of these, shape (2, 2)."""
-    others: tuple[Kind, ...] = ()
-    """Kinds whose drawing is about as near."""
+    make: Floats  # logarithms of density (HU) and diameter (mm), shape (2,)
+    cov_make: Floats  # of these, shape (2, 2)
+    others: tuple[Kind, ...] = ()  # kinds whose drawing is about as near
 
     def alike(self, other: Reading) -> bool:
         """Whether both may be of one product: of one kind, and as large and dense as their readings tell."""
@@ -142,15 +135,11 @@ class Reading:
 class Box(NamedTuple):
     """What surrounds one thing."""
 
-    volume: Volume
-    """The voxels of the box, as an image of its own, float64."""
-    peak: Ints
-    """Shape (3,), index of its densest voxel."""
-    ceiling_hu: float
-    """Where the whole image clips; infinite where it does not."""
+    volume: Volume  # the voxels of the box, as an image of its own, float64
+    peak: Ints  # shape (3,), index of its densest voxel
+    ceiling_hu: float  # where the whole image clips; infinite where it does not
     noise_hu: float
-    cut: bool
-    """Whether the image ends at the thing."""
+    cut: bool  # whether the image ends at the thing
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,15 +148,11 @@ class Middle:
 
     box: Box
     voxels: Bools
-    centre_ct: Floats
-    """Shape (3,), LPS mm."""
-    spread: Floats
-    """Shape (3, 3), mm², second moment about it."""
+    centre_ct: Floats  # shape (3,), LPS mm
+    spread: Floats  # shape (3, 3), mm², second moment about it
     peak_hu: float
-    solid_hu: float
-    """Of what it is made."""
-    clear: Bools
-    """Of the box: which voxels it does not reach."""
+    solid_hu: float  # of what it is made
+    clear: Bools  # of the box: which voxels it does not reach
 
     @property
     def near(self) -> Bools:
@@ -175,11 +160,7 @@ class Middle:
         return np.asarray(ndimage.binary_dilation(self.voxels, np.ones((3, 3, 3)), iterations=2))
 
     def background(self, normal: Floats) -> Floats:
-        """What the voxels near it would show without, shape (n,), HU, by others that lie as deep in the skin.
-
-        Args:
-            normal: Shape (3,), unit, of the skin.
-        """
+        """What the voxels near it would show without, shape (n,), HU, by others as deep in a skin of that normal."""
         A = self.box.volume.T_ct_index[:3, :3]
         along = DEEP * float(np.linalg.norm(A.T @ normal))
         metric = np.eye(3) / ASIDE_MM + (1 / along - 1 / ASIDE_MM) * np.outer(normal, normal)
@@ -228,11 +209,7 @@ class Middle:
 
 
 def find_middle(box: Box) -> Middle | None:
-    """The middle of what holds together with a box's densest voxel at half of its contrast.
-
-    Returns:
-        None where it ends nowhere near: a part of something larger.
-    """
+    """The middle of what holds together with the densest voxel at half of its contrast; None of what goes on."""
     volume, spacing = box.volume, spacing_mm(box.volume)
     contrast = float(volume.values[tuple(box.peak)]) - TISSUE_HU
     level = TISSUE_HU + contrast / 2
@@ -279,10 +256,8 @@ def read_marker(
 ) -> Reading:
     """Read a thing as a marker of the kind that is nearest to it; where others are as near, their centres count too.
 
-    Args:
-        normal: Shape (3,), unit, of the skin: a disc or ring lies about so.
-        kinds: Those that it may be.
-        diameter_mm: As a person states it.
+    A disc or ring lies about as the skin does, whose normal (3,) is a unit vector; ``diameter_mm`` as a person states
+    it.
     """
     unresolved = middle.wide_mm < UNRESOLVED * float(spacing_mm(middle.box.volume).min())
     every, background = list[tuple[float, Reading]](), middle.background(normal)
@@ -306,7 +281,7 @@ def _fitted(drawing: _Drawing) -> tuple[float, Reading]:
     def linearised(p: Floats) -> System[Floats]:
         image = drawing.image(p)
         sd = max(noise, float(np.sqrt(np.mean((drawing.seen - image) ** 2))))
-        slopes = [(drawing.image(p + step) - image) / step.sum() for step in np.diag(drawing.steps)]
+        slopes = [(drawing.image(p + step) - image) / step.sum() for step in np.diag(STEPS[: len(start)])]
 
         def residuals(q: Floats, image: Floats) -> Floats:
             return np.concatenate([(image - drawing.seen) / sd, (q - start) / known])
@@ -337,21 +312,17 @@ def _fitted(drawing: _Drawing) -> tuple[float, Reading]:
 class _Drawing:
     """A marker drawn into what lies about it.
 
-    Its unknowns are the shift (3), logarithms of density and size, the blur; of a disc or ring the logarithm of its
-    thickness and two tilts too.
+    Its unknowns are the shift (3), logarithms of density (HU) and size, the blur; of a disc or ring the logarithm of
+    its thickness and two tilts too.
     """
 
     middle: Middle
     kind: Kind
     normal: Floats
-    start: Floats
-    """Shape (p,), of the unknowns."""
-    known: Floats
-    """Shape (p,), how well each is known beforehand, standard deviations."""
-    near: Bools
-    """Shape of the box: the voxels that are compared."""
-    background: Floats
-    """Of them, shape (n,), HU."""
+    start: Floats  # shape (p,), of the unknowns
+    known: Floats  # shape (p,), how well each is known beforehand, standard deviations
+    near: Bools  # shape of the box: the voxels that are compared
+    background: Floats  # of them, shape (n,), HU
 
     @classmethod
     def of(cls, middle: Middle, kind: Kind, normal: Floats, diameter_mm: float | None, background: Floats) -> _Drawing:
@@ -373,15 +344,6 @@ class _Drawing:
         """Root mean square of what is seen above what lies about it."""
         return float(np.sqrt(np.mean((self.seen - self.background).clip(0.0) ** 2)))
 
-    @property
-    def steps(self) -> Floats:
-        """By which derivatives are taken, shape (p,)."""
-        return STEPS[: len(self.start)]
-
-    def solid_hu(self, p: Floats) -> float:
-        """What it is made of."""
-        return float(np.exp(p[3]))
-
     def shape(self, p: Floats) -> Shape:
         """The marker of unknowns (p,)."""
         if self.kind == "ball":
@@ -395,7 +357,7 @@ class _Drawing:
         part = filled(box.volume, self.shape(p), self.middle.centre_ct + p[:3])
         sigma = abs(p[5]) / spacing_mm(box.volume)[:2]
         part = ndimage.gaussian_filter(part, [*sigma, 0.0], mode="nearest")[self.near]
-        return np.minimum(self.background + part * (self.solid_hu(p) - self.background), box.ceiling_hu)
+        return np.minimum(self.background + part * (float(np.exp(p[3])) - self.background), box.ceiling_hu)
 
     def unknown(self, p: Floats, misfit: float) -> Floats:
         """What no drawing knows of a centre, shape (3, 3), mm²: in a voxel that is wider, and at the skin's edge."""
@@ -403,7 +365,7 @@ class _Drawing:
         axes = self.middle.box.volume.T_ct_index[:3, :3] / spacing
         free = np.maximum(0.0, spacing**2 - self.shape(p).diameter_mm ** 2) / 12
         along = FLOOR_MM**2 + (LACKING * misfit * spacing) ** 2 + free
-        edge = SKIN_EDGE_MM * min(1.0, 1000.0 / self.solid_hu(p))
+        edge = SKIN_EDGE_MM * min(1.0, 1000.0 / float(np.exp(p[3])))
         return np.asarray(axes @ np.diag(along) @ axes.T + edge**2 * np.outer(self.normal, self.normal))
 
 

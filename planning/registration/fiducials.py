@@ -113,8 +113,7 @@ class Fiducial:
 
     name: str
     reading: Reading
-    gap_mm: float
-    """Of its centre from the skin, negative inside of the body."""
+    gap_mm: float  # of its centre from the skin, negative inside of the body
 
     @property
     def position_ct(self) -> Floats:
@@ -130,13 +129,10 @@ class Fiducial:
 class Passed(NamedTuple):
     """A dense thing that is not taken for a marker."""
 
-    point_ct: Floats
-    """Shape (3,), LPS mm."""
+    point_ct: Floats  # shape (3,), LPS mm
     why: str
-    nearly: bool
-    """Whether it lacks little: a person should look at it."""
-    middle: Middle | None = None
-    """How wide and dense it is, where it is on the skin and ends."""
+    nearly: bool  # whether it lacks little: a person should look at it
+    middle: Middle | None = None  # how wide and dense it is, where it is on the skin and ends
 
     def resembles(self, group: Sequence[Fiducial]) -> bool:
         """Whether markers of a group may be in it, or be it in part."""
@@ -160,11 +156,7 @@ class Seen(NamedTuple):
 
 
 def look_for_fiducials(volume: Volume, skin: Skin, stated: Stated = NOTHING_STATED) -> Seen:
-    """Everything on the skin that looks like a marker, from head to feet.
-
-    Args:
-        volume: The CT in Hounsfield units, axes to the left, back and head.
-    """
+    """Everything on the skin of a CT (HU, canonical axes) that looks like a marker, from head to feet."""
     kinds = tuple(one for one in get_args(Kind) if stated.kind in (None, one))
     noise, ceiling = noise_hu(volume.values), clipped_at(volume.values)
     found, passed, voxel = list[Fiducial](), list[Passed](), float(spacing_mm(volume).max())
@@ -323,15 +315,10 @@ def order_along_body(points_ct: Floats) -> list[int]:
 def find_fiducials(
     volume: Volume, skin: Skin, stated: Stated, layout: NamedPoints | None = None, *, where: str | Path
 ) -> Seen:
-    """The markers of a CT, named by a layout or from head to feet.
+    """The markers of a CT (HU, canonical axes), named by a layout (any frame, mm) or from head to feet.
 
-    Args:
-        volume: The CT in Hounsfield units, axes to the left, back and head.
-        layout: Where the markers are to each other, in any frame, mm.
-
-    Raises:
-        NoAnswerError: None, too few, too many, several sizes, or none that a layout tells; it says what was seen.
-        InputError: A layout that is mirrored.
+    Raises NoAnswerError: None, too few, too many, several sizes, or none that a layout tells; it says what was seen.
+    Raises InputError: A layout that is mirrored.
     """
     return choose_fiducials(look_for_fiducials(volume, skin, stated), stated, layout, where=where)
 

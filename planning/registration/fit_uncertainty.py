@@ -30,12 +30,9 @@ class FitUncertainty:
     """The declared errors of the markers, and the map from them to the pose; base axes, mm and rad."""
 
     noise: fits.ReadingNoise
-    R_base_ct: Floats
-    """Shape (3, 3), as registered."""
-    center_base: Floats
-    """Shape (3,), the markers' centroid, about which `fit_map` turns."""
-    fit_map: Floats
-    """L, shape (6, 3 N), from the stacked reading errors to shift and rotation."""
+    R_base_ct: Floats  # shape (3, 3), as registered
+    center_base: Floats  # shape (3,), the markers' centroid, about which `fit_map` turns
+    fit_map: Floats  # L, shape (6, 3 N), from the stacked reading errors to shift and rotation
     test: NoiseTest
     """Whether the residuals agree with the declaration; its scale is not yet in the covariances below."""
 
@@ -76,15 +73,10 @@ def fit_uncertainty(
     *,
     found: bool,
 ) -> FitUncertainty:
-    """The uncertainty of a pose that a method fitted.
+    """The uncertainty of a pose (4, 4) that a method's fit gave of points (N, 3) in both frames, mm.
 
-    Args:
-        method: ``rigid``, ``weighted`` and ``joint`` have a formula; of others ``fit`` is differenced.
-        fit: From points (N, 3) in both frames to T_base_ct.
-        T_base_ct: Shape (4, 4), what it gave.
-        points_ct: Shape (N, 3), mm.
-        points_base: Shape (N, 3), mm.
-        found: Whether the residuals give the errors' size.
+    ``rigid``, ``weighted`` and ``joint`` have a formula; of others ``fit`` is differenced. ``found``: the residuals
+    give the errors' size.
     """
     R, center = T_base_ct[:3, :3], points_base.mean(axis=0)
     fitted = points_ct @ R.T + T_base_ct[:3, 3]
@@ -117,12 +109,7 @@ def parameter_variances(arm: ArmUncertainty) -> Floats:
 def reading_noise(
     errors: ErrorModel, model: UrModel, tip_mm: float, q_touch: Floats, *, known: bool
 ) -> fits.ReadingNoise:
-    """The noise of markers that were touched in given configurations.
-
-    Args:
-        q_touch: Shape (N, 6), rad.
-        known: Whether these are the real ones.
-    """
+    """The noise of markers touched in configurations (N, 6), rad, which are the real ones (known) or are assumed."""
     eta_variances = parameter_variances(errors.arm)
     J = kinematics.error_jacobian(model, q_touch, tip_mm)[:, :3]
     Jq = J[..., kinematics.PARAMETERS["joint"]]
@@ -134,10 +121,8 @@ def reading_noise(
 
 TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
 """How far the needle may lean from the wished direction, tried in this order."""
-
 AZIMUTHS = 12
 """Sides to which it may lean."""
-
 LEAST_SINGULARITY = 0.05
 """A pose nearer than this to a singularity is not used to measure (of 0..1)."""
 
@@ -145,15 +130,11 @@ LEAST_SINGULARITY = 0.05
 def touching_configuration(model: UrModel, tip_mm: float, point_base: Floats, needle_base: Floats) -> Floats:
     """Joint angles that put the tip on a point, shape (6,), rad: the least tilt, then the farthest from singular.
 
-    Of equals the one with its elbow on the side from which the needle comes: mirrored branches are equal.
+    Of equals the one with its elbow on the side from which the needle comes: mirrored branches are equal. ``tip_mm`` is
+    from the flange to the tip along z, the point (3,) in mm, and the wished direction (3,) from the needle's top to its
+    tip a unit vector.
 
-    Args:
-        tip_mm: Flange to tip, along the flange's z.
-        point_base: Shape (3,), mm.
-        needle_base: Shape (3,), unit: the wished direction from the needle's top to its tip.
-
-    Raises:
-        NoAnswerError: There are none in the tried directions.
+    Raises NoAnswerError: There are none in the tried directions.
     """
     frame = frame_about(needle_base)
     for tilt in np.radians(TILTS_DEG):
@@ -178,8 +159,7 @@ GUESSED_HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
 def marker_noise(case: Case, errors: ErrorModel, markers: MarkerPairs, *, where: str | Path) -> fits.ReadingNoise:
     """The declared noise of a case's markers, with the arm as it stood at the touches, or as it is guessed to have.
 
-    Raises:
-        InputError: Too few markers to fit, or joints that do not put the tip where the file says that it touched.
+    Raises InputError: Too few markers to fit, or joints that do not put the tip where the file says that it touched.
     """
     model, tip = case.robot.model, case.needle.length_mm
     check_pairs(markers, where)

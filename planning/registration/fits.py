@@ -58,15 +58,11 @@ def differenced_map(fit: Callable[[Floats, Floats], Floats], points_ct: Floats, 
     """L, shape (6, 3 N), of any method, by central differences of its pose over the base readings."""
     center = points_base.mean(axis=0)
     T = fit(points_ct, points_base)
-    columns = []
-    for k in range(points_base.size):
-        nudge = np.zeros(points_base.size)
-        nudge[k] = NUDGE_MM
-        moved = [fit(points_ct, points_base + sign * nudge.reshape(-1, 3)) for sign in (1.0, -1.0)]
-        back = np.linalg.inv(T)
-        shift = (apply(moved[0], apply(back, center)) - apply(moved[1], apply(back, center))) / (2 * NUDGE_MM)
-        turn = log_rotation(moved[0][:3, :3] @ moved[1][:3, :3].T) / (2 * NUDGE_MM)
-        columns.append(np.concatenate([shift, turn]))
+    center_ct, columns = apply(np.linalg.inv(T), center), []
+    for nudge in NUDGE_MM * np.eye(points_base.size):
+        plus, minus = (fit(points_ct, points_base + sign * nudge.reshape(-1, 3)) for sign in (1.0, -1.0))
+        shift = (apply(plus, center_ct) - apply(minus, center_ct)) / (2 * NUDGE_MM)
+        columns.append(np.concatenate([shift, log_rotation(plus[:3, :3] @ minus[:3, :3].T) / (2 * NUDGE_MM)]))
     return np.array(columns).T
 
 
@@ -86,10 +82,7 @@ def carried_along(points: Floats, cov: Floats) -> Floats:
 def fit_rigid(points_ct: Floats, points_base: Floats, *, mirrored: bool = False) -> Floats:
     """T_base_ct that minimises the squared residuals over rotations (Arun 1987, by SVD; det = +1 after Umeyama 1991).
 
-    Args:
-        points_ct: Shape (..., n, 3), n >= 3, not collinear, mm; one set, or many.
-        points_base: Shape (..., n, 3), the same markers.
-        mirrored: Over the reflections instead.
+    Of points (..., n, 3), n >= 3, not collinear, mm, one set or many; ``mirrored``: over the reflections instead.
     """
     center_ct, center_base = points_ct.mean(axis=-2), points_base.mean(axis=-2)
     spread = np.swapaxes(points_base - center_base[..., None, :], -1, -2) @ (points_ct - center_ct[..., None, :])
@@ -106,23 +99,14 @@ def rms(vectors: Floats) -> float:
 
 
 def rigid_fre_mm(points_ct: Floats, points_base: Floats) -> float:
-    """The fiducial registration error (rms residual) of `fit_rigid`, mm: the chi-squared test is about that.
-
-    Args:
-        points_ct: Shape (n, 3), n >= 3, not collinear, mm.
-        points_base: Shape (n, 3), the same markers.
-    """
+    """The FRE (rms residual), mm, of `fit_rigid` of points (n, 3): the chi-squared test is about that."""
     return rms(apply(fit_rigid(points_ct, points_base), points_ct) - points_base)
 
 
 def fit_triad(points_ct: Floats, points_base: Floats) -> Floats:
-    """T_base_ct by the frames that three markers span (Chen 2019, Eq. 1-9).
+    """T_base_ct by the frames that three markers span, points (..., 3, 3), mm, one set or many (Chen 2019, Eq. 1-9).
 
     R_base_ct = R_base R_ct^T; the translation is the mean over the three markers.
-
-    Args:
-        points_ct: Shape (..., 3, 3), rows M1, M2, M3, mm; one set, or many.
-        points_base: Shape (..., 3, 3), the same markers.
     """
     R_ct = np.swapaxes(frame_of_points(points_ct), -1, -2)
     R = frame_of_points(points_base) @ R_ct
@@ -148,11 +132,8 @@ STEPS = 6
 def fit_weighted(points_ct: Floats, points_base: Floats, noise: ReadingNoise, T_start: Floats) -> Floats:
     """T_base_ct, shape (..., 4, 4), that minimises z' Omega^-1 z over rigid motions, z the stacked residuals.
 
-    Args:
-        points_ct: Shape (..., N, 3), mm: one set of markers, or many of one noise.
-        points_base: Shape (..., N, 3), mm.
-        noise: Gives Omega, for the rotation found so far.
-        T_start: Shape (..., 4, 4), such as the least-squares fit.
+    Of points (..., N, 3), mm, one set or many of one noise, which gives Omega for the rotation found so far; from
+    T_start (..., 4, 4) on, such as the least-squares fit.
     """
 
     def step(R: Floats, blocks: Floats, residuals: Floats) -> Floats:
@@ -197,10 +178,8 @@ SIGNIFICANT, SURE = 0.05, 0.01
 """True lists look so deformed once in 20 registrations, and once in 100: it is said, and nothing is refused for it.
 Where one axis is read five times as badly as the others and nobody declares it, the second is up to one in ten (1,000
 draws each, 3 to 12 markers)."""
-
 LEAST_MM = 0.05
 """Rms of what a deformation moves the markers by, below which it does not matter, however sure it is."""
-
 KINDS = ("xyz", "x", "y", "z", "xy", "xz", "yz")
 """A similarity, three stretches, and shears: the first axis runs askew along the second."""
 
@@ -209,21 +188,15 @@ KINDS = ("xyz", "x", "y", "z", "xy", "xz", "yz")
 class Distortion:
     """The deformation that explains most of the residuals."""
 
-    axes: str
-    """Of ``KINDS``, in the case's CT frame."""
+    axes: str  # of ``KINDS``, in the case's CT frame
     amount: float
     """The factor less 1 by which markers_base are longer; of a shear by how much a point moves along the first axis per
     mm along the second."""
-    probability: float
-    """Of one so sure in any of the seven, where there is none."""
-    moved_mm: float
-    """What it moves the markers by beside a rigid motion, rms."""
-    reading_mm: float
-    """The standard deviation per coordinate that it leaves to the readings."""
-    rms_mm: float
-    """Expected error at the target by the residuals of the rigid fit."""
-    rms_without_mm: float
-    """The rms by the residuals of the fit with the deformation."""
+    probability: float  # of one so sure in any of the seven, where there is none
+    moved_mm: float  # what it moves the markers by beside a rigid motion, rms
+    reading_mm: float  # the standard deviation per coordinate that it leaves to the readings
+    rms_mm: float  # expected error at the target by the residuals of the rigid fit
+    rms_without_mm: float  # the rms by the residuals of the fit with the deformation
 
     @property
     def significant(self) -> bool:
@@ -256,10 +229,8 @@ def distortion(
 ) -> Distortion | None:
     """The likeliest deformation of a registration's lists; None where its markers cannot show any.
 
-    Args:
-        T_base_ct: Shape (4, 4), near the least-squares fit.
-        noise: What is declared of the readings; None weighs all alike.
-        target_ct: Shape (3,), mm, where the error matters.
+    T_base_ct (4, 4) is near the least-squares fit, the error matters at target_ct (3,), mm; without noise all weigh
+    alike.
     """
     fitted = apply(T_base_ct, markers.points_ct)
     cov = np.eye(fitted.size) if noise is None else noise.covariance(T_base_ct[:3, :3]).whole
@@ -309,8 +280,7 @@ def _weighted_rms(B: Floats, X: Floats, variance: float) -> float:
 class NoiseCovariance(NamedTuple):
     """The covariance of N stacked readings, mm^2, base axes."""
 
-    independent: Floats
-    """Omega, shape (..., 3 N, 3 N): what errs anew at each marker."""
+    independent: Floats  # Omega, shape (..., 3 N, 3 N): what errs anew at each marker
     shared: Floats
     """J Sigma_eta J', shape (3 N, 3 N): what the arm does wrong at all markers together."""
 
@@ -332,14 +302,10 @@ class NoiseCovariance(NamedTuple):
 class ReadingNoise:
     """Declared errors of the readings of N markers, all normal with mean zero."""
 
-    cov_ct: Floats
-    """Shape (3, 3), mm^2, of each reading in the CT."""
-    cov_base: Floats
-    """Shape (N, 3, 3), mm^2, of each touch: its own noise, and the arm's repeatability there."""
-    arm_jacobian: Floats
-    """Shape (3 N, 28), how the arm's parameters move the tip at the touches."""
-    eta_variances: Floats
-    """Shape (28,), of those parameters."""
+    cov_ct: Floats  # shape (3, 3), mm^2, of each reading in the CT
+    cov_base: Floats  # shape (N, 3, 3), mm^2, of each touch: its own noise, and the arm's repeatability there
+    arm_jacobian: Floats  # shape (3 N, 28), how the arm's parameters move the tip at the touches
+    eta_variances: Floats  # shape (28,), of those parameters
     touches_known: bool
     """Whether the file says how the arm stood at the touches; else they are the planner's guess."""
 

@@ -38,32 +38,23 @@ from puncture_twin.planning.geometry.rigid import exp_rotation, inverse, log_rot
 
 LENGTH_MM = 100.0
 """Lengths are counted in this unit where columns are compared."""
-
 LEAST_RATIO = 9e-3
 """Least over largest singular value of the Jacobian below which poses are refused: rotations of about a degree."""
-
 LEAST_TURN = float(np.radians(2.0))
 """Rotations (rms) about an axis below which it does not count, where a refusal says what is missing."""
-
 SUSPECT_MM = 3.0
 """Residuals, mm + 100 mm x rad (rms), from which on other readings are tried."""
-
 SOUND_MM = 20.0
 """Residuals beyond which the poses do not belong together."""
-
 BETTER = 1 / 3
 """A reading whose residuals are below this part of the given one's is the right one."""
-
 METRES = 20.0
 """Translations none of which is longer may be in metres."""
-
 FAR_MM = 1000.0
 """A camera is hardly farther from the flange."""
-
 MOST_STEPS, SMALL_STEP = 50, 1e-9
 LEAST = 1e-9
 """Rad and mm: below it there is rounding alone."""
-
 ALLOWED = "A = T_base_flange and B = T_board_camera in mm (with motions: of flange and of camera), rotations by rows"
 MAX_BYTES = 50_000_000
 
@@ -80,8 +71,7 @@ class HandEyeNoise(NamedTuple):
 def noise_of(stated: Sequence[float | None]) -> HandEyeNoise | None:
     """The noise from mm, degrees, mm, degrees: flange, then camera; None of four times None.
 
-    Raises:
-        InputError: Some of them alone, or what is no positive noise of places and of rotations.
+    Raises InputError: Some of them alone, or what is no positive noise of places and of rotations.
     """
     known = [value for value in stated if value is not None]
     if not known:
@@ -98,8 +88,7 @@ def noise_of(stated: Sequence[float | None]) -> HandEyeNoise | None:
 class PosePairs(Shown):
     """What arm and camera said. Checked when made; the arrays are read-only.
 
-    Raises:
-        InputError: Other shapes, names that are used twice, or a matrix that is no rigid motion.
+    Raises InputError: Other shapes, names that are used twice, or a matrix that is no rigid motion.
     """
 
     A: Floats
@@ -124,11 +113,7 @@ class PosePairs(Shown):
 def read_pose_pairs(path: Path, *, motions: bool = False) -> PosePairs:
     """Pairs of poses from a CSV: ``name``, ``A_r11 .. A_r33, A_x_mm, A_y_mm, A_z_mm``, and the same for B.
 
-    Args:
-        motions: Whether its rows are motions.
-
-    Raises:
-        InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
+    Raises InputError: Another header, a field that is no finite number, or a matrix that is no rigid motion.
     """
     content = read_input(path, max_bytes=MAX_BYTES, where=str(path))
     groups = {letter: pose_columns(letter) for letter in "AB"}
@@ -226,14 +211,10 @@ class HandEye(Shown):
 
 
 def calibrate_hand_eye(pairs: PosePairs, noise: HandEyeNoise | None = None) -> HandEye:
-    """Solve A X = Z B, or A X = X B of motions.
+    """Solve A X = Z B of three poses or more, or A X = X B of two motions; None as noise finds the spreads.
 
-    Args:
-        pairs: At least three poses, or two motions, with rotations about two axes.
-        noise: Of both; None finds the residuals' spreads.
-
-    Raises:
-        InputError: Too few poses, rotations that cannot show X, or poses that fit only in another reading, or in none.
+    Raises InputError: Too few poses, rotations that cannot show X, or poses that fit only in another reading, or in
+    none.
     """
     least = 2 if pairs.motions else 3
     if len(pairs.names) < least:
@@ -299,11 +280,7 @@ def _residuals(pairs: PosePairs, value: _Value) -> Floats:
 
 
 def _slopes(pairs: PosePairs, value: _Value, centre: Floats | None = None) -> Floats:
-    """Their derivatives by (w_X, t_X, w_Z, t_Z), shape (n, 6, 12), or (n, 6, 6) of motions.
-
-    Args:
-        centre: c, shape (3,), about which Z rotates instead of about the board's origin.
-    """
+    """Their derivatives by (w_X, t_X, w_Z, t_Z), (n, 6, 12), or (n, 6, 6) of motions; Z turns about a centre (3,)."""
     J = np.zeros((len(pairs.names), 6, 12))
     J[:, :3, :3] = np.eye(3)
     J[:, 3:, 3:6] = pairs.A[:, :3, :3]

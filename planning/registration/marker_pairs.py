@@ -14,28 +14,22 @@ from puncture_twin.planning.formats.points import NamedPoints
 
 MIN_MARKERS = 3
 """Two points leave a rotation free."""
-
 COLLINEAR = 0.01
 """Second over first singular value of the centred markers below which they count as one line."""
-
 LEAST_SPAN_MM = 5.0
 """A needle's tip tells no two places of the skin apart that are nearer: markers in metres or cm, read as mm."""
-
 UNIT_SLIP = 5.0
 """Ratio of the two marker sets' spreads from which on a unit (mm, cm, m) is wrong, not a measurement."""
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerPairs:
-    """The same markers in both frames, matched by name; shapes (n, 3), mm.
-
-    Joints: how the arm stood at each touch, shape (n, 6), rad, where the file has them.
-    """
+    """The same markers in both frames, matched by name."""
 
     names: tuple[str, ...]
-    points_ct: Floats
-    points_base: Floats
-    joints: Floats | None = None
+    points_ct: Floats  # shape (n, 3), mm
+    points_base: Floats  # shape (n, 3), mm
+    joints: Floats | None = None  # shape (n, 6), rad: the arm at each touch, where the file has it
 
     def __len__(self) -> int:
         return len(self.names)
@@ -48,15 +42,9 @@ def match(
     use: tuple[str, ...] | None,
     where: str | Path = "registration",
 ) -> MarkerPairs:
-    """Pair markers by name.
+    """Pair markers by name: those of ``use``, in this order; None demands the same names on both sides.
 
-    Args:
-        markers_ct: Markers in the CT frame.
-        markers_base: Markers in the base frame.
-        use: The names to use, in this order; None demands the same names on both sides.
-
-    Raises:
-        InputError: A name that one side lacks, or fewer than three markers.
+    Raises InputError: A name that one side lacks, or that is used twice.
     """
     names = markers_ct.names if use is None else use
     for side, points, other in (("CT", markers_ct, markers_base), ("base", markers_base, markers_ct)):
@@ -77,8 +65,7 @@ def match(
 def check_pairs(markers: MarkerPairs, where: str | Path) -> None:
     """Whether markers can be fitted at all.
 
-    Raises:
-        InputError: Fewer than three, not finite, on a line, of two sizes, or all at one place.
+    Raises InputError: Fewer than three, not finite, on a line, of two sizes, or all at one place.
     """
     if len(markers) < MIN_MARKERS:
         refuse(plural(len(markers), "marker"), where, "3 or more, by the same names", "too_few_markers")

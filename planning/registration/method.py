@@ -33,7 +33,6 @@ Fit = Callable[[Floats, Floats], Floats]
 
 LEAST_FOUND_MM = 0.01
 """FRE from which on the markers can say how large the errors are: no arm repeats so well, so one side was computed."""
-
 SINGULAR = 1e-12
 """Least over greatest variance of the readings below which some of them count as free of error."""
 
@@ -41,13 +40,9 @@ SINGULAR = 1e-12
 def checked_fit(
     markers: MarkerPairs, method: Method, noise: ReadingNoise | None, found_in_mm: float | None, *, where: str | Path
 ) -> Fit:
-    """The fit of a method, which the declared noise has passed.
+    """The fit of a method, which the declared noise has passed; the FRE is given where its size is to be found in it.
 
-    Args:
-        found_in_mm: The FRE, where the noise's size is to be found in it.
-
-    Raises:
-        InputError: ``affine``, ``weighted`` or ``joint`` without noise, or noise that cannot be weighed.
+    Raises InputError: ``affine``, ``weighted`` or ``joint`` without noise, or noise that cannot be weighed.
     """
     if method == "affine":
         allowed = "triad, rigid or weighted; affine only reproduces the paper's Table 6"
@@ -76,25 +71,17 @@ def checked_fit(
 
 MAX_RESIDUAL_MM = 15.0
 """A marker that misses by more was swapped, moved or typed wrongly: the paper's worst set misses by 7 mm."""
-
 MIRROR_GAIN = 2.0
 """Factor (and 1 mm) by which a mirrored fit must be better than the proper one: then one list is mirrored."""
 
 
 def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, where: str | Path) -> None:
-    """Refuse a fit that is far better mirrored, or that a marker misses by far.
+    """Refuse a fit that is far better mirrored, or that a marker misses by far; residuals (n, 3), mm.
 
-    Args:
-        residuals: Shape (n, 3), mm.
-        target_ct: Shape (3,), mm.
-
-    Raises:
-        InputError: Naming the markers, and the permutations of their names that would fit.
+    Raises InputError: Naming the markers, and the permutations of their names that would fit.
     """
-    given = rms(residuals)
-    mirrored = rms(
-        apply(fit_rigid(markers.points_ct, markers.points_base, mirrored=True), markers.points_ct) - markers.points_base
-    )
+    T_mirrored = fit_rigid(markers.points_ct, markers.points_base, mirrored=True)
+    given, mirrored = rms(residuals), rms(apply(T_mirrored, markers.points_ct) - markers.points_base)
     if given > MIRROR_GAIN * mirrored + 1.0:
         what = (
             f"markers {', '.join(markers.names)} match only mirrored (rms {mirrored:.2f} mm against "
@@ -113,7 +100,6 @@ def check_residuals(markers: MarkerPairs, residuals: Floats, target_ct: Floats, 
 
 MAX_NUMBERS = 20_000_000
 """Of one table of beginnings (160 MB): sets that are more alike than that are tested for swaps of two names only."""
-
 HARMLESS_MM = 1.0
 """A permutation that moves target and markers by less changes nothing: two markers that all but coincide."""
 
@@ -122,18 +108,12 @@ HARMLESS_MM = 1.0
 class Renaming:
     """Names permuted, and what follows."""
 
-    names: tuple[str, ...]
-    """The CT markers that are paired with another's touch."""
-    touched_as: tuple[str, ...]
-    """The touches that they are paired with, in the same order."""
-    fre_mm: float
-    """Root mean square residual of the permuted pairs."""
-    T_base_ct: Floats
-    """Their rigid fit, shape (4, 4), mm."""
-    target_mm: float
-    """How far from the believed target the true one would be."""
-    turn: float
-    """By how much the patient would be turned against the belief, rad."""
+    names: tuple[str, ...]  # the CT markers that are paired with another's touch
+    touched_as: tuple[str, ...]  # the touches that they are paired with, in the same order
+    fre_mm: float  # root mean square residual of the permuted pairs
+    T_base_ct: Floats  # their rigid fit, shape (4, 4), mm
+    target_mm: float  # how far from the believed target the true one would be
+    turn: float  # by how much the patient would be turned against the belief, rad
 
     @property
     def slip(self) -> str:
@@ -155,18 +135,14 @@ class Renamings(NamedTuple):
 
     found: tuple[Renaming, ...]
     """The one that moves the target most first; without those that move neither target nor markers."""
-    complete: bool
-    """Whether all permutations were tested, or only swaps of two names."""
+    complete: bool  # whether all permutations were tested, or only swaps of two names
 
 
 def renamings(markers: MarkerPairs, target_ct: Floats, alike_mm: float, *, moving_mm: float = HARMLESS_MM) -> Renamings:
-    """Permutations of the names whose rigid fit has an FRE of at most ``alike_mm``.
+    """Permutations of three names or more whose rigid fit has an FRE of at most ``alike_mm``.
 
-    Args:
-        markers: At least three, matched as the user named them.
-        target_ct: Shape (3,), mm.
-        alike_mm: The bound, mm.
-        moving_mm: Those that move neither target nor a marker by more, against the fit as named, are left out.
+    Those that move neither the target (3,) nor a marker by more than ``moving_mm`` against the fit as named are left
+    out.
     """
     x, y = (points - points.mean(axis=0) for points in (markers.points_ct, markers.points_base))
     bound = len(markers) * alike_mm**2
@@ -213,8 +189,7 @@ def _fitting_swaps(x: Floats, y: Floats, bound: float) -> Ints:
     exchanged = (y[first] - y[second])[:, :, None] * (x[first] - x[second])[:, None, :]
     fits = _rss(y.T @ x - exchanged, float(np.sum(x**2) + np.sum(y**2))) <= bound
     first, second = first[fits], second[fits]
-    orders = np.tile(np.arange(len(x)), (len(first), 1))
-    rows = np.arange(len(first))
+    orders, rows = np.tile(np.arange(len(x)), (len(first), 1)), np.arange(len(first))
     orders[rows, first], orders[rows, second] = second, first
     return orders
 
@@ -234,17 +209,12 @@ def _renaming(markers: MarkerPairs, order: Ints, T_given: Floats, target_ct: Flo
 
 BETTER = 3.0
 """So many times better than the given names a permutation must fit to be named."""
-
 SHOWN = 3
 """Permutations that a message lists."""
 
 
 def better_names(markers: MarkerPairs, target_ct: Floats, fre_mm: float) -> str:
-    """Sentence on permutations of the names that fit where the given ones do not, the best first; empty for none.
-
-    Args:
-        target_ct: Shape (3,), mm.
-    """
+    """Sentence on permutations of the names that fit where the given ones do not, the best first; empty for none."""
     found = renamings(markers, target_ct, min(fre_mm / BETTER, MAX_FRE_MM), moving_mm=0.0).found
     if not found:
         return ""

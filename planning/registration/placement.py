@@ -51,19 +51,15 @@ MAX_AIM_OFF_MM = 20.0
 class Placement:
     """The belief of where CT and base are to each other."""
 
-    T_base_ct: Floats
-    """Shape (4, 4), mm."""
-    registration: Registration | None
-    """How markers gave it, or None where the case states a mount."""
-    target_error_mm: float
-    """Expected (rms) error at the target, NaN without markers."""
+    T_base_ct: Floats  # shape (4, 4), mm
+    registration: Registration | None  # how markers gave it, or None where the case states a mount
+    target_error_mm: float  # expected (rms) error at the target, NaN without markers
 
 
 def load_placement(case: Case) -> Placement | None:
     """Register the case's markers, or take its mount; None where it has neither.
 
-    Raises:
-        InputError: Marker files that cannot be read, matched or trusted.
+    Raises InputError: Marker files that cannot be read, matched or trusted.
     """
     if case.registration is None:
         mount = case.robot.T_base_ct_mount
@@ -77,20 +73,11 @@ def load_placement(case: Case) -> Placement | None:
 
 
 def registered(case: Case, settings: MarkerSection) -> Registration:
-    """The registration of two lists of markers as a case states it; nothing is corrected.
-
-    Raises:
-        InputError: Marker files that cannot be read, matched or trusted.
-    """
-    where = f"{case.path}: registration"
-    errors = case.errors
+    """The registration of two lists of markers as a case states it, uncorrected; raises as `load_placement`."""
+    where, errors = f"{case.path}: registration", case.errors
     method = "joint" if settings.correct else settings.method or default_method(errors)
-    markers = match(
-        _points(case, settings.markers_ct, case.space),
-        _points(case, settings.markers_base, Space.LOCAL),
-        use=settings.use,
-        where=where,
-    )
+    in_ct, in_base = _points(case, settings.markers_ct, case.space), _points(case, settings.markers_base, Space.LOCAL)
+    markers = match(in_ct, in_base, use=settings.use, where=where)
     check_pairs(markers, where)
     return register(
         markers,
@@ -107,9 +94,7 @@ def registered(case: Case, settings: MarkerSection) -> Registration:
 def corrected(case: Case, registration: Registration, *, where: str | Path) -> Registration:
     """A joint registration whose aim is corrected for the insertion that the case states, or for one that is reached.
 
-    Raises:
-        InputError: Nobody says how the arm stood at the touches, the stated insertion is not at the target, or none is
-            reached.
+    Raises InputError: No joints at the touches, or a stated insertion that is not at the target, or none is reached.
     """
     if registration.markers.joints is None:
         message = "correct = true, but the touches have no joint angles: they give no information on the arm's errors"
@@ -171,13 +156,7 @@ def aimed(registration: Registration, aim: Aim) -> Registration:
 def aimed_uncertainty(
     fit: FitUncertainty, points_ct: Floats, T_base_ct: Floats, target_base: Floats, aim: Aim
 ) -> FitUncertainty:
-    """The uncertainty of a joint fit whose pose was corrected.
-
-    Args:
-        points_ct: Shape (N, 3), mm, its markers.
-        T_base_ct: Shape (4, 4), the corrected pose.
-        target_base: Shape (3,), mm, where the pose was turned about.
-    """
+    """The uncertainty of a joint fit of markers (N, 3) whose pose was corrected, turned about a target (3,), mm."""
     A = design(apply(T_base_ct, points_ct), fit.center_base)
     M = np.eye(len(A)) - A @ fit.fit_map
     weights = np.asarray(np.linalg.inv(fit.noise.covariance(fit.R_base_ct).whole), dtype=np.float64)
@@ -206,8 +185,7 @@ class WithoutMarker:
 class OneMore:
     """The place on the skin where a further marker would help most."""
 
-    point_ct: Floats
-    """Shape (3,), mm."""
+    point_ct: Floats  # shape (3,), mm
     rms_mm: float
     """Expected error at the target with it, by the readings, scaled to the residuals where they are."""
 
@@ -226,19 +204,17 @@ def without_each(registration: Registration, target_ct: Floats) -> tuple[Without
         kept = np.delete(np.arange(len(markers)), row)
         axes = (3 * kept[:, None] + np.arange(3)).ravel()
         A, center = design(fitted[kept], fitted[kept].mean(axis=0)), fitted[kept].mean(axis=0)
-        rms = uncertainty.test.scale * _rms(A.T @ np.linalg.inv(omega[np.ix_(axes, axes)]) @ A, center, target)
+        information, X = A.T @ np.linalg.inv(omega[np.ix_(axes, axes)]) @ A, carried(center, target)[:3]
+        rms = uncertainty.test.scale * float(np.sqrt(np.trace(X @ np.linalg.inv(information) @ X.T)))
         test = noise_test(residuals[kept].ravel(), whole[np.ix_(axes, axes)], A)
         found.append(WithoutMarker(name, rms, test.probability))
     return tuple(found)
 
 
 def one_more(registration: Registration, target_ct: Floats, skin_points_ct: Floats) -> OneMore | None:
-    """Find the place on the skin where a further marker, read and touched like the others, would leave the least error.
+    """The place among skin points (n, 3), mm, where one more marker, read and touched alike, leaves the least error.
 
-    Args:
-        registration: With declared errors; None is returned without them.
-        target_ct: Shape (3,).
-        skin_points_ct: Shape (n, 3), where a marker could sit, mm.
+    None without declared errors.
     """
     uncertainty, markers = registration.uncertainty, registration.markers
     points = skin_points_ct
@@ -266,8 +242,3 @@ def odd_branches(registration: Registration, model: UrModel) -> tuple[str, ...]:
     branches = branch_of(model, markers.joints).tolist()
     usual = max(set(branches), key=branches.count)
     return tuple(name for name, branch in zip(markers.names, branches, strict=True) if branch != usual)
-
-
-def _rms(information: Floats, center: Floats, point: Floats) -> float:
-    X = carried(center, point)[:3]
-    return float(np.sqrt(np.trace(X @ np.linalg.inv(information) @ X.T)))

@@ -42,11 +42,9 @@ class Registration(Shown):
     """T_base_ct from markers, and what is known of its error."""
 
     method: str
-    T_base_ct: Floats
-    """Shape (4, 4), rigid, mm."""
+    T_base_ct: Floats  # shape (4, 4), rigid, mm
     markers: MarkerPairs
-    residuals: Floats
-    """Shape (n, 3), T_base_ct markers_ct - markers_base, mm."""
+    residuals: Floats  # shape (n, 3), T_base_ct markers_ct - markers_base, mm
     residual_test: ResidualTest
     conditioning: Conditioning
     """The three flags of a weak set, for the target given."""
@@ -102,7 +100,7 @@ class Registration(Shown):
         if not (self.residual_test.explained if self.uncertainty is None else self.uncertainty.test.agrees):
             scaled = self.uncertainty is not None and test.explained
             said = test.text() + ("; all errors are scaled to them" if scaled else "; accepted by the case")
-            numbers: dict[str, float | str] = {"chi_squared": test.chi_squared}
+            numbers = {"chi_squared": test.chi_squared}
             found.append(Finding("residuals_unexplained", Severity.WARNING, said, numbers))
         if (outlier := outlier_marker(self.markers, self.residual_test.declared_fle_mm)) is not None:
             found.append(outlier.finding())
@@ -223,21 +221,14 @@ def register(
 class Aim:
     """The insertion for which a pose is corrected."""
 
-    target_ct: Floats
-    """Shape (3,), mm."""
-    q: Floats
-    """Shape (6,), rad, the tip on the target."""
-    arm_jacobian: Floats
-    """Shape (6, 28), J_f: motion of the needle there per arm parameter, base axes."""
+    target_ct: Floats  # shape (3,), mm
+    q: Floats  # shape (6,), rad, the tip on the target
+    arm_jacobian: Floats  # shape (6, 28), J_f: motion of the needle there per arm parameter, base axes
 
     def response(self, noise: fits.ReadingNoise, weights: Floats) -> Floats:
-        """Correction of the pose at the target per residual, shape (..., 6, 3 N).
+        """Correction of the pose at the target per residual of weights W (..., 3 N, 3 N), shape (..., 6, 3 N).
 
-            J_f Sigma_eta J' W        (Sigma_eta, J: the arm's parameters and their effect on the touches)
-
-        Args:
-            noise: Of the readings, with the arm's parameters.
-            weights: W, shape (..., 3 N, 3 N), of the residuals.
+        J_f Sigma_eta J' W, with Sigma_eta, J the arm's parameters and their effect on the touches.
         """
         return np.asarray((self.arm_jacobian * noise.eta_variances) @ noise.arm_jacobian.T @ weights)
 
@@ -249,7 +240,6 @@ def aim_at(model: UrModel, tip_mm: float, target_ct: Floats, q: Floats) -> Aim:
 
 TILTS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0, 75.0)
 """Puncture angles that are tried for an insertion that the arm reaches, in this order."""
-
 AZIMUTHS = 12
 """Directions tried at each."""
 
@@ -259,15 +249,13 @@ def reached_insertion(case: Case, T_base_ct: Floats) -> Floats | None:
 
     Kinematics alone, to estimate an error: organs and collisions are not checked.
     """
-    model = case.robot.model
-    target = apply(T_base_ct, case.target_ct)
-    home = np.zeros(6)
+    model, target = case.robot.model, apply(T_base_ct, case.target_ct)
     for tilt in np.radians(TILTS_DEG):
         azimuths = np.linspace(0, 2 * np.pi, AZIMUTHS if tilt else 1, endpoint=False)
         local = np.array([outward(float(tilt), float(azimuth)) for azimuth in azimuths])
         directions = local @ (T_base_ct[:3, :3] @ case.T_ct_entry[:3, :3]).T
         q = inverse(model, flange_poses(target, directions, case.needle.length_mm)).reshape(-1, 6)
-        q = nearest_within_limits(model, q, home)
+        q = nearest_within_limits(model, q, np.zeros(6))
         q = q[~np.isnan(q).any(axis=1)]
         q = q[away_from_singularities(model, q)]
         if len(q):

@@ -23,16 +23,12 @@ from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 
 REJECT_LEVEL = 0.001
 """Significance level of rejection: honest noise exceeds such residuals once in 1,000 registrations."""
-
 MAX_FRE_MM = 5.0
 """Without a declared noise: markers that miss by more (rms) are not the same markers, or have moved."""
-
 MIN_FLE_MM = 0.3
 """An estimate below is luck, not accuracy: a voxel of 0.4 mm leaves 0.2 mm, a touch of 0.1 mm in each axis 0.17 mm."""
-
 ALIKE_MM = 1.0
 """Without a declared noise: a permuted fit with a smaller FRE is always as good as the given one."""
-
 INTERVAL = 0.95
 """Of every interval and region that is printed."""
 
@@ -56,8 +52,7 @@ class Interval(NamedTuple):
 class ResidualTest:
     """The residuals of a rigid fit against the noise."""
 
-    count: int
-    """Markers, N >= 3."""
+    count: int  # markers, N >= 3
     fre_mm: float
     """Root mean square residual of the least-squares rigid fit, whatever method the case takes."""
     declared_fle_mm: float | None = None
@@ -101,7 +96,7 @@ class ResidualTest:
 
     @property
     def fle_mm(self) -> float:
-        """The noise to compute with, rms length: declared (and scaled), or estimated and never below a floor.
+        """The noise to compute with, rms length: declared (and scaled), or no less than a floor.
 
         The estimate is <FRE^2> = (1 - 2/N) <FLE^2> (Fitzpatrick 1998).
         """
@@ -176,11 +171,9 @@ class OutlierMarker(NamedTuple):
     """A marker that does not fit the others."""
 
     name: str
-    miss_mm: float
-    """How far off its reading the others place it."""
+    miss_mm: float  # how far off its reading the others place it
     others: int
-    others_fre_mm: float
-    """How well they fit each other, root mean square."""
+    others_fre_mm: float  # how well they fit each other, root mean square
 
     def text(self) -> str:
         """Which marker does not fit, by how much, and what to check; one sentence."""
@@ -197,15 +190,12 @@ class OutlierMarker(NamedTuple):
 
 
 def outlier_marker(markers: MarkerPairs, fle_mm: float | None) -> OutlierMarker | None:
-    """The marker that least fits the others, if chance does not explain it.
+    """The marker that least fits the others, if chance does not explain it; ``fle_mm`` is their declared noise (rms).
 
     A residual of the common fit hides it, since the outlier pulls the fit. Marker i left out, the others fit with
     residuals r_j and nu = 3 (n-1) - 6 degrees of freedom; they place it d_i off its reading, whose expected square is
-    FLE^2 (1 + l_i^2) with l_i the leverage at its place (Fitzpatrick 1998). Where all markers err alike,
-    F_i = (d_i^2 / 3) / ((1 + l_i^2) s^2) with s^2 = sum |r_j|^2 / nu follows F(3, nu).
-
-    Args:
-        fle_mm: Their noise (rms length, both sides together) where it is declared: no less is taken.
+    FLE^2 (1 + l_i^2) with l_i the leverage at its place (Fitzpatrick 1998). Where all markers err alike, F_i = (d_i^2 /
+    3) / ((1 + l_i^2) s^2) with s^2 = sum |r_j|^2 / nu, no less than declared, follows F(3, nu).
     """
     if len(markers) < LEAST_MARKERS:
         return None
@@ -234,8 +224,7 @@ WARNED = 0.01
 class NoiseTest:
     """The residuals of a weighted fit against the declared errors."""
 
-    count: int
-    """Markers, N >= 3."""
+    count: int  # markers, N >= 3
     chi_squared: float
     """r' C^-1 r of the weighted residuals: chi-squared with 3 N - 6 degrees where the declaration holds."""
     found: bool = False
@@ -315,10 +304,8 @@ def noise_test(residuals: Floats, cov: Floats, A: Floats, *, found: bool = False
 
 WEAK_SPREAD = 0.2
 """Conditioning flag: s2/s1 below it (spec: trips on the paper's A-C-D only)."""
-
 WEAK_ALTITUDE_MM = 30.0
 """Conditioning flag: least altitude of the widest triangle below it."""
-
 WEAK_LEVERAGE = 3.0
 """Conditioning flag: TRE(target)/FLE above it."""
 
@@ -327,12 +314,9 @@ WEAK_LEVERAGE = 3.0
 class Conditioning:
     """How well a marker set determines the pose at the target."""
 
-    spread_ratio: float
-    """s2/s1, singular values of the centred markers."""
-    altitude_mm: float
-    """Least altitude of the widest triangle of markers."""
-    leverage: float
-    """Expected TRE at the target over FLE."""
+    spread_ratio: float  # s2/s1, singular values of the centred markers
+    altitude_mm: float  # least altitude of the widest triangle of markers
+    leverage: float  # expected TRE at the target over FLE
     flags: tuple[Finding, ...]
 
 

@@ -38,7 +38,7 @@ from puncture_twin.planning.search.candidates import Candidates
 from puncture_twin.planning.search.context import CaseContext
 from puncture_twin.planning.touch.touch_planner import MOST_MARKERS, PLANNED_PADDING_MM, approach_checkers
 from puncture_twin.planning.touch.tour_motions import why_not
-from puncture_twin.planning.uncertainty.touch_choice import touch_candidates
+from puncture_twin.planning.uncertainty.pose_error import touch_candidates
 
 DRAWN, PLACES, BETWEEN_PLACES_MM = 12_000, 300, 9.0
 """Places of the skin that are drawn and that are tried, and the least distance between two of these."""

@@ -45,8 +45,7 @@ from puncture_twin.planning.touch.tour_motions import (
     tour_through,
     why_not,
 )
-from puncture_twin.planning.uncertainty.pose_error import PoseError, expected_error_mm
-from puncture_twin.planning.uncertainty.touch_choice import least_error, touch_candidates
+from puncture_twin.planning.uncertainty.pose_error import PoseError, expected_error_mm, least_error, touch_candidates
 
 PLANNED_PADDING_MM = 4.0
 """Distance of a touching needle's shaft from the patient in a plan: the markers are only believed to be there."""

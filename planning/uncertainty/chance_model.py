@@ -110,12 +110,10 @@ class ChanceModel:
         return self.hit.chance(self.error, cov_ct, self.target_surface_mm)
 
     def chances(self, outward_ct: Floats, q: Floats, axes: AxisDistances | None = None) -> Chances:
-        """The chances of some needles to first order, the joint one unknown.
+        """The chances of needles along unit vectors (n, 3) to first order, the joint one unknown.
 
-        Args:
-            outward_ct: Shape (n, 3), unit.
-            q: Shape (n, 6), rad, the tip on the target.
-            axes: What the engine has measured of the needles already; None measures them.
+        The joints (n, 6), rad, put the tip on the target; what the engine has measured of them already is not measured
+        again.
         """
         needles = self.needles(outward_ct, q, axes)
         near, freedom = needles.near, self.error.freedom
@@ -138,9 +136,8 @@ class ChanceModel:
 def chance_model(case: Case, anatomy: Anatomy, engine: ClearanceEngine, error: PoseError | None) -> ChanceModel | None:
     """The model of a case; None where it declares no errors, or nothing ties its frames.
 
-    Raises:
-        InputError: Neither a radius nor a closed mesh says where the target is hit, or a structure has the name of
-            another column.
+    Raises InputError: Neither a radius nor a closed mesh says where the target is hit, or a structure has a column's
+    name.
     """
     if error is None:
         return None
@@ -160,11 +157,8 @@ def refined_chances(
 ) -> Chances:
     """Chances to touch, to break a margin and to touch any, by line sampling; the others as they are.
 
-    Args:
-        outward_ct: Shape (n, 3), as in `ChanceModel.chances`.
-        q: Shape (n, 6).
-        first: Of these needles, to first order.
-        wanted: Shape (n, k), which chances to touch are refined, those of margins not; None refines all of both.
+    Of needles as of `ChanceModel.chances`, with theirs to first order; of those ``wanted`` (n, k) the chances to touch
+    alone, None: all of both.
     """
     every = np.ones(first.touch.shape, bool)
     blocks, lengths = model.engine.blocks, case_axis_lengths(model.case, model.anatomy, outward_ct)[:, model.columns]
@@ -177,12 +171,7 @@ def refined_chances(
 
 
 def satisfies_limits(model: ChanceModel, outward_ct: Floats, q: Floats) -> Bools:
-    """Whether needles satisfy the case's limits in any configuration that reaches the target, shape (n,).
-
-    Args:
-        outward_ct: Shape (n, 3), unit.
-        q: Shape (n, 6), rad, the tip on the target.
-    """
+    """Whether needles, as of `chances`, satisfy the case's limits in any configuration at the target: shape (n,)."""
     kept, least, limits = np.ones(len(q), bool), model.case.search.min_hit, model.limits
     if least is not None:
         kept &= model.hit_chance(model.error.covariance_ct(q)) >= least
@@ -198,22 +187,16 @@ class Chances(Columns):
     """Chances of n candidates and k structures that demand a margin; NaN where nothing was computed."""
 
     structures: tuple[str, ...]
-    hit: Floats
-    """Shape (n,), that the tip is in the target's mesh, or within its radius."""
-    touch: Floats
-    """Shape (n, k), that the needle touches each structure."""
-    margin: Floats
-    """Shape (n, k), that it breaks each structure's margin."""
-    touch_any: Floats
-    """Shape (n,), min(1, sum of touch): never below the truth of what `touch` says."""
+    hit: Floats  # shape (n,), that the tip is in the target's mesh, or within its radius
+    touch: Floats  # shape (n, k), that the needle touches each structure
+    margin: Floats  # shape (n, k), that it breaks each structure's margin
+    touch_any: Floats  # shape (n,), min(1, sum of touch): never below the truth of what `touch` says
     touch_joint: Floats
     """Shape (n,), that it touches any, all linearised together; of the best candidates alone."""
     lateral_mm: Floats
     """Shape (n,), expected (rms) error of the tip across the needle, target reading included."""
-    depth_mm: Floats
-    """Shape (n,), along it."""
-    refined: Bools
-    """Shape (n,), whether touch and margin are line-sampled; else they are of first order."""
+    depth_mm: Floats  # shape (n,), along it
+    refined: Bools  # shape (n,), whether touch and margin are line-sampled; else they are of first order
 
     @classmethod
     def unknown(cls, structures: tuple[str, ...], count: int) -> Chances:
@@ -239,8 +222,7 @@ def demanding(structures: tuple[Structure, ...]) -> Ints:
 def check_limits(case: Case, anatomy: Anatomy, error_known: bool) -> None:
     """Refuse limits that no candidate can be tested against: every one would pass untested.
 
-    Raises:
-        InputError: Limits without a pose error, or of a structure that has no chance to be touched.
+    Raises InputError: Limits without a pose error, or of a structure that has no chance to be touched.
     """
     settings = case.search
     limited = settings.min_hit is not None or settings.max_touch is not None or bool(settings.max_touch_of)

@@ -77,7 +77,6 @@ ALIKE_MM = 1e-6
 FREE = 0.01
 """mm that the tip's estimate may follow per mm of a flat part that no reading shows: more, and it is open. Cameras do
 not see a roll about the needle; where the registered target is .1 mm beside its line, that is .001."""
-
 STOP_DRAWS = 20_000
 """Draws of the estimates after all looks together: a chance to be stopped is known to .004."""
 CAMERAS = "cameras"
@@ -129,12 +128,9 @@ def scan_roots(scan: ControlScanSection, errors: ErrorModel) -> tuple[Floats, Fl
 class Look(NamedTuple):
     """One look of the devices on the way in."""
 
-    q: Floats
-    """Shape (6,), rad: the arm as it is planned there."""
-    out_mm: float
-    """Tip to target."""
-    inserted: float
-    """Fraction of the way: 1 at the target, 0 at the skin, below 0 before it."""
+    q: Floats  # shape (6,), rad: the arm as it is planned there
+    out_mm: float  # tip to target
+    inserted: float  # fraction of the way: 1 at the target, 0 at the skin, below 0 before it
     hidden: Mapping[str, str] = MappingProxyType({})
     """What is out of sight, by the names of `Reading`, and why; `CAMERAS` is all of theirs."""
 
@@ -157,12 +153,10 @@ WHOLLY = Follows(1.0, 1.0)
 class Reading(NamedTuple):
     """Some rows of z."""
 
-    device: str
-    """touch, cameras, target, tip or scan."""
+    device: str  # touch, cameras, target, tip or scan
     name: str
     """touch, ``marker <name>``, ``ball <mm behind the tip> mm``, target, tip, ``scanned target`` or ``scanned tip``."""
-    look: int
-    """-1 for the touches, which precede all looks."""
+    look: int  # -1 for the touches, which precede all looks
     rows: Rows
 
 
@@ -170,8 +164,7 @@ class Reading(NamedTuple):
 class GuidedModel:
     """One insertion as guidance knows it; base axes."""
 
-    error: PoseError
-    """Of the needle by its registration, the touches known or assumed."""
+    error: PoseError  # of the needle by its registration, the touches known or assumed
     markers: tuple[str, ...]
     points_base: Floats  # shape (N, 3), mm, by the registration
     q_insertion: Floats  # shape (6,), rad, the tip on the target
@@ -180,12 +173,10 @@ class GuidedModel:
     """Shape (3, 3), mm^2: covariance of the motion of the target and its surroundings since the scan."""
     breath: Floats
     """Shape (3, 2), mm: mean and deviation of the target's displacement by the breath; 0 without breathing."""
-    skin_weight: float = 0.0
-    """By how much of it the markers move."""
+    skin_weight: float = 0.0  # by how much of it the markers move
     stereo: Stereo | None = None
     ultrasound: Ultrasound | None = None
-    across: Floats | None = None
-    """Shape (3,), unit: the normal of its picture."""
+    across: Floats | None = None  # shape (3,), unit: the normal of its picture
     scan: ControlScanSection | None = None
     push: Floats | None = None
     """Shape (looks + 1, 3), mm: by how much the needle pushes the target at each look, and at the end."""
@@ -471,10 +462,8 @@ class Guided(NamedTuple):
     """Sigma6, shape (6, 6), of the needle against the CT's anatomy about the target, what is known of it included."""
     breath: Floats
     """Shape (6, 2): what the breath's mean and one deviation add to it; no correction of the way takes them out."""
-    tip_cov: Floats
-    """Shape (3, 3), mm^2, of the tip about the true target."""
-    parts: Mapping[str, float]
-    """Mean square of the tip by source, mm^2."""
+    tip_cov: Floats  # shape (3, 3), mm^2, of the tip about the true target
+    parts: Mapping[str, float]  # mean square of the tip by source, mm^2
     aside: Floats
     """Shape (3, m): estimates from all readings how far the corrected needle is from its plan in the body at rest."""
 
@@ -485,12 +474,10 @@ class WayChance(NamedTuple):
     way: str
     expected_error_mm: float
     """Rms of the tip about the target; NaN where the way does not see enough."""
-    p_hit: float
-    """That it is not stopped, and hits."""
+    p_hit: float  # that it is not stopped, and hits
     p_stop: float
     """That a correction would lead out of the corridor: it is not executed, and the needle is stopped."""
-    lost_sight: str
-    """What is not seen, and why; empty where all is."""
+    lost_sight: str  # what is not seen, and why; empty where all is
 
     def document(self) -> dict[str, Any]:
         """Plain values for JSON; null where there is no number."""
@@ -524,8 +511,7 @@ class GuidedError(PoseError):
     def about_breath(self, deviations: float | None = None) -> tuple[GuidedError, Floats]:
         """The error about what is known of the breath, and where the tip ends by that: shape (3,), mm, CT axes.
 
-        Args:
-            deviations: So far from its mean the breath is; None where its mean alone is known, which is no chance.
+        The breath is so many deviations off its mean; None where its mean alone is known, which is no chance.
         """
         one = self.known
         known = one.breath[:, :1] if deviations is None else one.breath

@@ -41,8 +41,7 @@ from puncture_twin.planning.uncertainty.pose_error import PoseError
 class HitModel:
     """When a tip hits: within a radius of the target, or within its mesh."""
 
-    radius_mm: float | None
-    """Where a case gives one."""
+    radius_mm: float | None  # where a case gives one
     rays: TargetRays | None
     """The target's mesh, else; or the ball about a target that tips are off on average."""
 
@@ -60,8 +59,7 @@ def hit_model(
 ) -> HitModel:
     """Model of hitting the target: by its radius where one is stated, else by the mesh of its structure.
 
-    Args:
-        mean_ct: Shape (3,), mm: by how much tips are off the target on average; None where they are not.
+    ``mean_ct``, shape (3,), mm, is by how much tips are off the target on average; None where they are not.
     """
     if radius_mm is None:
         return HitModel(None, target_rays(mesh, target_ct if mean_ct is None else target_ct + mean_ct))
@@ -69,12 +67,7 @@ def hit_model(
 
 
 def hit_in_ball(cov: Floats, radius_mm: float, freedom: int | None = None) -> Floats:
-    """The chance that the tip is within a radius of the intended point, shape (n,).
-
-    Args:
-        cov: Shape (n, 3, 3), mm^2, of tip against that point, any frame.
-        freedom: Degrees of the errors' size, where the residuals gave it.
-    """
+    """The chance (n,) that the tip, of covariances (n, 3, 3), mm², is within a radius of the intended point."""
     values = np.asarray(np.linalg.eigvalsh(cov) + LEAST_VARIANCE, dtype=np.float64)
     if freedom is None:
         return chance_within(values, np.full((len(cov), 1), radius_mm))[:, 0]
@@ -105,15 +98,11 @@ QUANTILES = 64
 
 
 def chance_within(eigenvalues: Floats, radii: Floats) -> Floats:
-    """The chance that a normal error stays within a radius, by Ruben's series (Ann. Math. Stat. 33, 1962).
+    """The chance that a normal error stays within radii (n, m), mm, by Ruben's series (Ann. Math. Stat. 33, 1962).
 
-    With beta the least eigenvalue and gamma_i = 1 - beta / lambda_i, P = sum_k c_k F_{3+2k}(x / beta), F the
-    chi-squared distribution; one gamma is 0, and (k+1) c_{k+1} = e1 (k + 1/2) c_k - e2 k c_{k-1} with e1 and e2 the sum
-    and product of the other two.
-
-    Args:
-        eigenvalues: Shape (n, 3), of the covariance, mm^2, all above 0.
-        radii: Shape (n, m), mm, as what is returned.
+    Of eigenvalues (n, 3), mm², above 0. With beta the least and gamma_i = 1 - beta / lambda_i, P = sum_k c_k F_{3+2k}(x
+    / beta), F the chi-squared distribution; one gamma is 0, and (k+1) c_{k+1} = e1 (k + 1/2) c_k - e2 k c_{k-1} with e1
+    and e2 the sum and product of the other two.
     """
     chances = np.empty(radii.shape)
     _ruben(np.sort(eigenvalues, axis=1), np.ascontiguousarray(radii, dtype=np.float64) ** 2, chances)
@@ -161,12 +150,9 @@ class TargetRays:
     """A target's mesh as its point sees it."""
 
     directions: Floats  # shape (n, 3), unit vectors, CT frame
-    ray: Ints
-    """Shape (c,), row of each crossing's direction."""
-    depth: Floats
-    """Shape (c,), mm from the target."""
-    sign: Floats
-    """Shape (c,), +1 for a direction's last crossing, alternating inwards."""
+    ray: Ints  # shape (c,), row of each crossing's direction
+    depth: Floats  # shape (c,), mm from the target
+    sign: Floats  # shape (c,), +1 for a direction's last crossing, alternating inwards
     moved: Floats | None = None
     """Shape (c,), by which a crossing's depth grows where the surface lies farther out by 1; None for a ball."""
 
@@ -189,11 +175,7 @@ def target_rays(mesh: TriangleMesh, target_ct: Floats) -> TargetRays:
 
 
 def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
-    """A ball about the target for a tip that is believed elsewhere: a known mean error besides the covariance.
-
-    Args:
-        offset: Shape (3,), mm, believed tip minus target, in the covariance's axes.
-    """
+    """A ball about the target for a tip that is believed elsewhere, off by (3,), mm: a known mean error besides."""
     directions = even_directions(DIRECTIONS)
     along = directions @ offset
     inside = along**2 - offset @ offset + radius_mm**2  # below 0 the ray misses the ball
@@ -205,13 +187,7 @@ def rays_to_ball(offset: Floats, radius_mm: float) -> TargetRays:
 
 
 def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, surface_mm: float = 0.0) -> Floats:
-    """The chance that the tip is within a mesh, shape (n,).
-
-    Args:
-        cov_ct: Shape (n, 3, 3), mm^2, of tip against mesh, CT frame.
-        freedom: Degrees of the errors' size, where the residuals gave it.
-        surface_mm: By which the mesh may lie off as a whole.
-    """
+    """The chance (n,) that the tip, of covariances (n, 3, 3), mm², CT axes, is in a mesh that may lie off whole."""
     if surface_mm > 0 and rays.moved is not None:
         z = ndtri((np.arange(SURFACES) + 0.5) / SURFACES)
         lying = [replace(rays, depth=rays.depth + off * rays.moved) for off in surface_mm * z]
@@ -235,7 +211,6 @@ def hit_in_mesh(rays: TargetRays, cov_ct: Floats, freedom: int | None = None, su
 SURFACES = 32
 """Positions of a surface that lies off, at the middles of equal chances: however sharply it decides, P errs by half of
 one."""
-
 GRAZING = 0.2
 """Least cosine between ray and normal: a crossing that a surface moves farther than this says is not moved by it."""
 ROWS_AT_ONCE = 512
@@ -291,26 +266,20 @@ def _length_table() -> Floats:
 class Proximity:
     """Distances, gradients and deviations of n needles and k structures; CT frame."""
 
-    distance: Floats
-    """Shape (n, k), of the axis from the surface, mm."""
+    distance: Floats  # shape (n, k), of the axis from the surface, mm
     gradient: Floats
     """Shape (n, k, 6), g: what the pose's error (mm, rad) does to it; NaN where they intersect."""
-    deviation: Floats
-    """Shape (n, k), sigma, mm."""
+    deviation: Floats  # shape (n, k), sigma, mm
 
 
 def proximity(
     distance: Floats, depth: Floats, normal: Floats, outward_ct: Floats, cov_ct: Floats, surface_mm: Floats | float
 ) -> Proximity:
-    """The first-order model of every needle and structure.
+    """The first-order model of n needles and k structures, by distances (n, k), mm.
 
-    Args:
-        distance: Shape (n, k), mm.
-        depth: Shape (n, k), of the nearest axis point, from the target, mm.
-        normal: Shape (n, k, 3), unit, from the structure to that point.
-        outward_ct: Shape (n, 3), unit.
-        cov_ct: Shape (n, 6, 6), Sigma6, CT axes, its point of reference the target.
-        surface_mm: By which each structure's surface may lie off as a whole along that normal: one number or (n, k).
+    ``depth`` (n, k) is that of the nearest axis point, mm from the target, and ``normal`` (n, k, 3), unit, points from
+    the structure to it; Sigma6 (n, 6, 6), CT axes, is about the target; along the normal each surface may lie off as a
+    whole, by one number or (n, k).
     """
     gradient, deviation = np.empty((*distance.shape, 6)), np.empty(distance.shape)
     near = (np.ascontiguousarray(depth), np.ascontiguousarray(normal), np.array(outward_ct, order="C"))
@@ -339,9 +308,8 @@ def _first_order(depth, normal, outward, cov, surface, gradient, deviation):  # 
 def touch_chance(near: Proximity, threshold_mm: Floats | float, freedom: int | None = None) -> Floats:
     """P that each needle comes nearer to each structure than a threshold, shape (n, k); NaN where they intersect.
 
-    Args:
-        threshold_mm: One number or shape (k,): needle radius, or that and a margin.
-        freedom: Degrees of the errors' size where the residuals gave it: Student's t instead of the normal.
+    The threshold is the needle's radius, or that and a margin: one number or (k,). By Student's t of ``freedom``
+    degrees where the residuals gave the errors' size, else by the normal.
     """
     slack = near.distance - threshold_mm
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -367,14 +335,8 @@ def touch_bound(
 
     A needle that leans may touch a structure far from where it is nearest, which first order does not see. No point of
     the axis is nearer than the nearest, and none is more doubtful than the worse end: the variance is convex in depth.
-
-    Args:
-        slack_mm: Shape (n, k), distance beyond the threshold.
-        outward_ct: Shape (n, 3), unit.
-        cov_ct: Shape (n, 6, 6), Sigma6, CT axes, its point of reference the target.
-        length_mm: Of the axis.
-        surface_mm: The most that each structure's surface may lie off by along any normal: one number or (k,).
-        freedom: As in `touch_chance`.
+    ``slack_mm`` (n, k) is the distance beyond the threshold, ``surface_mm`` the most that a surface may lie off along
+    any normal, one number or (k,); the others as of `proximity` and `touch_chance`.
     """
     lever = np.concatenate([np.broadcast_to(np.eye(3), (len(cov_ct), 3, 3)), -length_mm * skew(outward_ct)], axis=-1)
     ends = np.stack([cov_ct[:, :3, :3], lever @ cov_ct @ np.swapaxes(lever, -1, -2)])

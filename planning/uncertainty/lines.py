@@ -46,16 +46,12 @@ from puncture_twin.planning.uncertainty.hit import Proximity
 class Needles:
     """n needles with their covariances and proximity to the structures."""
 
-    outward_ct: Floats
-    """Shape (n, 3), unit."""
-    cov_ct: Floats
-    """Shape (n, 6, 6), Sigma6, CT axes."""
-    near: Proximity
-    """How they pass the k structures, to first order."""
+    outward_ct: Floats  # shape (n, 3), unit
+    cov_ct: Floats  # shape (n, 6, 6), Sigma6, CT axes
+    near: Proximity  # how they pass the k structures, to first order
     surface_mm: Floats
     """Shape (n, k), by which each structure's surface may lie off as a whole where the needle passes it."""
-    freedom: int | None
-    """Degrees of the errors' size where the residuals gave it."""
+    freedom: int | None  # degrees of the errors' size where the residuals gave it
 
 
 def refined(
@@ -67,18 +63,11 @@ def refined(
     first: Floats,
     wanted: Bools,
 ) -> Floats:
-    """First-order chances with the wanted ones refined by line sampling, shape (n, k).
+    """First-order chances (n, k) with the wanted ones refined by line sampling; NaN where a needle intersects already.
 
-    A structure of which no face is within the needle's reach keeps its first order: it is touched less than once in
-    100,000 times.
-
-    Args:
-        blocks: The faces of each of the k structures.
-        length: Shape (n, k), of each needle's axis for each, mm.
-        target_ct: Shape (3,), mm, where every axis starts.
-        threshold_mm: Shape (k,), needle radius, or that and a margin.
-        first: Shape (n, k), to first order; NaN where a needle intersects a structure already.
-        wanted: Shape (n, k).
+    Of the faces of k structures in blocks, axes of a length (n, k) from the target (3,), and thresholds (k,): radius,
+    or that and a margin; mm. A structure of which no face is within the needle's reach keeps its first order: it is
+    touched less than once in 100,000 times.
     """
     found = first.copy()
     rows = np.flatnonzero((wanted & np.isfinite(first)).any(axis=1))
@@ -102,16 +91,11 @@ def refined(
 def line_chance(
     near: NearFaces, uncertainty: NeedleUncertainty, length: float, threshold: float, gradient: Floats
 ) -> float:
-    """P that the needle comes nearer to a structure than a threshold; NaN where nothing displaces it.
+    """P that the needle comes nearer to a structure than a threshold, mm; NaN where nothing displaces it.
 
     By the small rule; by many lines where its lines disagree, or several things are touched, or by most lines. Where
-    the errors' size is uncertain every line has its own, and the lines say by how much first order errs.
-
-    Args:
-        near: The structure's faces within `NeedleUncertainty.reach` of the axis.
-        length: Of the axis, mm.
-        threshold: Needle radius, or that and a margin, mm.
-        gradient: Shape (6,), g: what shift and rotation do to the distance, to first order.
+    the errors' size is uncertain every line has its own, and the lines say by how much first order errs. The faces are
+    those within `NeedleUncertainty.reach`, and g (6,) is what shift and rotation do to the distance, to first order.
     """
     origin, outward, freedom = uncertainty.origin, uncertainty.outward, uncertainty.freedom
     problem = (near.triangles, near.faces, near.blocks, origin, outward, float(length), float(threshold))
@@ -149,12 +133,9 @@ at most, and by .013 where it is .2 (three anatomies; next to a lung and between
 class Lines(NamedTuple):
     """Offsets and sizes of n lines."""
 
-    offsets: Floats
-    """Shape (n, 5), standard deviations, four of the pose and one mixed with the surface."""
-    sizes: Floats
-    """Shape (n,), of each line's errors over the estimate."""
-    weights: Floats
-    """Shape (n,), their sum is 1."""
+    offsets: Floats  # shape (n, 5), standard deviations, four of the pose and one mixed with the surface
+    sizes: Floats  # shape (n,), of each line's errors over the estimate
+    weights: Floats  # shape (n,), their sum is 1
 
 
 @cache
@@ -221,15 +202,11 @@ SIZES = 16
 class NeedleUncertainty:
     """One needle and the distribution of its displacement; CT frame, mm and rad."""
 
-    origin: Floats
-    """Shape (3,), the tip's own place, where the axis starts."""
+    origin: Floats  # shape (3,), the tip's own place, where the axis starts
     outward: Floats  # shape (3,), unit
-    root: Floats
-    """Shape (6, 5), B: shift and lean of each of five standard normals."""
-    surface_mm: float
-    """Standard deviation of the surface, as a whole, of the structure in question."""
-    freedom: int | None
-    """Degrees of the errors' size where the residuals gave it."""
+    root: Floats  # shape (6, 5), B: shift and lean of each of five standard normals
+    surface_mm: float  # standard deviation of the surface, as a whole, of the structure in question
+    freedom: int | None  # degrees of the errors' size where the residuals gave it
 
     def reach(self, length: float, threshold: float) -> tuple[float, float]:
         """Distance within which a face may matter, mm, at the tip and at the axis' other end."""
@@ -260,13 +237,7 @@ class NeedleUncertainty:
 def needle_uncertainty(
     origin: Floats, outward: Floats, cov_ct: Floats, surface_mm: float, freedom: int | None = None
 ) -> NeedleUncertainty:
-    """The uncertainty of one needle from its Sigma6.
-
-    Args:
-        origin: Shape (3,), mm, the covariance's point of reference.
-        cov_ct: Shape (6, 6), CT axes.
-        surface_mm: Deviation of each structure's surface, mm, as in `proximity`.
-    """
+    """The uncertainty of one needle from its Sigma6 (6, 6), CT axes, about its origin (3,), mm; of a surface too."""
     across = frame_about(outward)[:, :2]
     keep = np.zeros((6, 5))
     keep[:3, :3], keep[3:, 3:] = np.eye(3), across

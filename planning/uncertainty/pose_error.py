@@ -7,37 +7,39 @@ transport to the target, Omega what errs anew at each marker:
 
 The minus sign is the cancellation: what the arm does wrong at the markers it does again at the target.
 `AnyPose` bounds the error in all configurations that put the tip on the target.
+
+How to touch the markers so that the arm's errors cancel best: touched with the insertion's own orientation and branch,
+errors of a nominal UR3 fall to a third; touched from elsewhere they add up. Motion and contact are not tested here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri, fdtri
 
-from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose
+from puncture_twin.planning.arm.inverse_kinematics import branch_of, inverse, nearest_within_limits
+from puncture_twin.planning.arm.kinematics import PARAMETERS, error_jacobian, flange_pose, singularity
 from puncture_twin.planning.arm.ur import UrModel
 from puncture_twin.planning.base.arrays import Floats
+from puncture_twin.planning.base.errors import NoAnswerError
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
-from puncture_twin.planning.geometry.rigid import apply
-from puncture_twin.planning.registration.fit_uncertainty import FitUncertainty
+from puncture_twin.planning.geometry.rigid import apply, exp_rotation
+from puncture_twin.planning.registration.fit_uncertainty import LEAST_SINGULARITY, FitUncertainty
 from puncture_twin.planning.registration.registration import Registration
 from puncture_twin.planning.uncertainty.sources import reading_parts
 
 
 def not_cancelled(fit: FitUncertainty, J: Floats, target_base: Floats) -> Floats:
-    """G = J_f - X L J: the arm's error Jacobian without the part that the registration cancels.
+    """G = J_f - X L J: the arm's error Jacobian (n, 6, 28) without the part that the registration cancels.
 
-    Where it is not stated how the arm touched the markers, sqrt(2) J_f replaces it: errors of equal size at the markers
-    and at the target, independent.
-
-    Args:
-        J: Shape (n, 6, 28), J_f, of configurations with the tip on the target; tip (mm) then rotation (rad), base axes.
-        target_base: Shape (3,), mm, to which X carries the registration's shift and rotation.
+    Tip (mm) then rotation (rad), base axes; X carries the registration to the target (3,), mm. Where it is not stated
+    how the arm touched the markers, sqrt(2) J_f replaces it: errors of equal size at the markers and at the target,
+    independent.
     """
     if not fit.noise.touches_known:
         return np.asarray(np.sqrt(2.0) * J)  # as if the markers' errors were new ones of the same size
@@ -182,10 +184,8 @@ class ErrorBudget:
     """Tip to the point that was meant; ``lateral_mm`` across, ``depth_mm`` along the needle."""
     lateral_mm: float
     depth_mm: float
-    half_axes_mm: Floats
-    """Shape (3,), of the 95 % ellipsoid, longest first."""
-    fraction: Mapping[str, float]
-    """Source to its part of rms_mm squared; they add up to 1."""
+    half_axes_mm: Floats  # shape (3,), of the 95 % ellipsoid, longest first
+    fraction: Mapping[str, float]  # source to its part of rms_mm squared; they add up to 1
 
 
 def expected_error_mm(error: PoseError, q: Floats) -> float:
@@ -194,12 +194,7 @@ def expected_error_mm(error: PoseError, q: Floats) -> float:
 
 
 def error_budget(error: PoseError, q: Floats, outward_base: Floats) -> ErrorBudget:
-    """The budget of one configuration.
-
-    Args:
-        q: Shape (6,), rad, the tip on the target.
-        outward_base: Shape (3,), unit, from the target along the needle.
-    """
+    """The budget of one configuration (6,), rad, with the tip on the target, along a needle (3,), unit, outward."""
     parts, whole = error.mean_squares(q), error.tip_covariance(q[None])[0]
     variance, along = float(np.trace(whole)), float(outward_base @ whole @ outward_base)
     return ErrorBudget(
@@ -248,14 +243,9 @@ class AnyPose(NamedTuple):
     ) -> Floats:
         """Clearance at which no needle touches a structure more often than ``chance``, whatever its shape, (k,), mm.
 
-        Beyond ``farthest`` the axis leaves the structure by as much as it goes on, which is more than it is displaced
-        by as soon as it has left it by ``beyond``: deeper points never decide.
-
-        Args:
-            freedom: Of the residuals that gave the noise's size; None where it is declared.
-            farthest_mm: Shape (k,), the structures' greatest distances from the target.
-            lengths_mm: Shape (k,), how long the axis is.
-            surface_mm: Shape (k,), by which each structure's surface may lie off as a whole, at most.
+        Beyond ``farthest`` (the structure's greatest distance from the target) the axis leaves the structure by as much
+        as it goes on, which is more than it is displaced by as soon as it has left it by ``beyond``: deeper points
+        never decide.
         """
         count = 5 + int((surface_mm > 0).any())  # normals: shift, lean across the axis, the surface's
         square = chdtri(count, chance) if freedom is None else count * fdtri(count, freedom, 1.0 - chance)
@@ -296,3 +286,78 @@ def any_pose(error: PoseError) -> AnyPose:
         largest = np.linalg.eigvalsh(readings[rows, rows])[-1]  # ascending: the last is the largest
         bounds.append(float(np.sqrt(largest + scale**2 * (lasting**2 + arrival**2))))
     return AnyPose(bounds[0], bounds[1])
+
+
+TILTS_DEG = (0.0, 10.0, 20.0, 30.0, 45.0)
+"""By how much a touch may lean from the insertion's orientation."""
+AZIMUTHS = 12
+"""Sides to which it may lean."""
+SWEEPS = 4
+"""Over all markers; the choice is settled after two or three."""
+
+
+class Candidates(NamedTuple):
+    """Joints (n, 6), rad, that keep the tip on a point; the nearest to the insertion's first."""
+
+    alike: Floats  # on the insertion's own branch
+    others: Floats  # on the other branches: between them the arm passes a singularity
+
+
+def choose_touches(error: PoseError, points_base: Floats, q_insertion: Floats) -> Floats:
+    """Joints that touch each marker (N, 3), mm, shape (N, 6), rad, and leave the least error at the target.
+
+    Of the case's error the registration's map is kept, and its touches are replaced. Raises NoAnswerError: A marker
+    that the arm cannot touch near the orientation of the insertion (6,), rad.
+    """
+    found = [touch_candidates(error.model, error.tip_mm, point, q_insertion) for point in points_base]
+    candidates = [one.alike if len(one.alike) else one.others for one in found]
+    for point, q in zip(points_base, candidates, strict=True):
+        if not len(q):
+            place = ", ".join(f"{value:.1f}" for value in point)
+            what = f"a {error.model.name} cannot touch ({place}) mm near the insertion's orientation"
+            raise NoAnswerError(what, code="marker_out_of_reach")
+    return least_error(error, candidates, q_insertion)
+
+
+def least_error(error: PoseError, candidates: Sequence[Floats], q_insertion: Floats, *, worst: bool = False) -> Floats:
+    """One candidate of each marker, shape (N, 6), rad, that together leave the least error at the target.
+
+    Marker by marker the candidate of the least trace(Sigma_dd) is taken, given the others, until nothing changes; the
+    most error (``worst``) is for comparison. The error as of `choose_touches`, candidates (n, 6) of each marker.
+    """
+    maps = error.fit.map_at(error.target_base)[:3].reshape(3, -1, 3)
+    eta, repeatability = error.fit.noise.eta_variances, error.errors.arm.repeatability
+    J = [error_jacobian(error.model, q, error.tip_mm)[:, :3] for q in candidates]
+    moved = [np.einsum("ab,nbc->nac", maps[:, row], part) for row, part in enumerate(J)]
+    anew = [repeatability**2 * np.sum(part[..., PARAMETERS["joint"]] ** 2, axis=(1, 2)) for part in moved]
+    chosen = np.zeros(len(candidates), int)  # the first candidates turn least from the insertion
+    at_target = error_jacobian(error.model, q_insertion, error.tip_mm)[:3]
+    sign = -1.0 if worst else 1.0
+    for _ in range(SWEEPS):
+        before = chosen.copy()
+        for row in range(len(candidates)):
+            others = sum(moved[k][chosen[k]] for k in range(len(candidates)) if k != row)
+            left = at_target - others - moved[row]
+            chosen[row] = np.argmin(sign * (np.sum(left**2 * eta, axis=(1, 2)) + anew[row]))
+        if np.array_equal(before, chosen):
+            break
+    return np.array([q[row] for q, row in zip(candidates, chosen, strict=True)])
+
+
+def touch_candidates(model: UrModel, tip_mm: float, point_base: Floats, q_insertion: Floats) -> Candidates:
+    """Configurations within the joint limits and away from singularities that touch a point, near the insertion's.
+
+    The point (3,) in mm, the insertion (6,) in rad: by its orientation, or leaning from it by up to `TILTS_DEG`.
+    """
+    R = flange_pose(model, q_insertion)[:3, :3]
+    sides = np.linspace(0, 2 * np.pi, AZIMUTHS, endpoint=False)
+    leans = [tilt * np.array([np.cos(side), np.sin(side), 0.0]) for tilt in np.radians(TILTS_DEG[1:]) for side in sides]
+    poses = np.zeros((1 + len(leans), 4, 4))
+    poses[:, :3, :3] = R @ exp_rotation(np.array([np.zeros(3), *leans]))
+    poses[:, :3, 3], poses[:, 3, 3] = point_base - tip_mm * poses[:, :3, 2], 1.0
+    q = nearest_within_limits(model, inverse(model, poses).reshape(-1, 6), q_insertion)
+    q = q[~np.isnan(q).any(axis=1)]
+    q = q[singularity(model, q).least() >= LEAST_SINGULARITY]
+    q = q[np.argsort(np.abs(q - q_insertion).max(axis=1), kind="stable")]
+    alike = branch_of(model, q) == branch_of(model, q_insertion[None])[0]
+    return Candidates(q[alike], q[~alike])

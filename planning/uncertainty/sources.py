@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -12,26 +11,17 @@ from puncture_twin.planning.base.arrays import Floats
 from puncture_twin.planning.case.case import Case
 from puncture_twin.planning.case.errors import ErrorModel
 
-NOT_MODELLED: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "breathing": ("breathing", "breathing in the chances (they are for the body as in the CT)"),
-        "bending": (
-            "needle bending",
-            "needle bending in the chances (the greatest deflection is added to the margins)",
-        ),
-    }
-)
+NOT_MODELLED: Mapping[str, tuple[str, str]] = {
+    "breathing": ("breathing", "breathing in the chances (they are for the body as in the CT)"),
+    "bending": ("needle bending", "needle bending in the chances (the greatest deflection is added to the margins)"),
+}
 """Effects that no source models, which does not make them 0; and where the case declares them, what is done instead."""
 NAMED = 3
 """Meshes that are named; of more their number is stated."""
 
 
 def not_modelled(case: Case, *, counted: Collection[str] = ()) -> str:
-    """Sentences on what the chances of a case leave out: undeclared errors, and those counted elsewhere.
-
-    Args:
-        counted: Of breathing, bending and motion, what these chances count.
-    """
+    """Sentences on what the chances of a case leave out, but for what is counted: of breathing, bending, motion."""
     declared = {"breathing": case.breathing, "bending": case.bending}
     left_out = [texts[declared[name] is not None] for name, texts in NOT_MODELLED.items() if name not in counted]
     moving = [] if "motion" in counted else ["tissue motion"]
@@ -60,32 +50,28 @@ class Source(NamedTuple):
     unit: str
 
 
-SOURCES: Mapping[str, Source] = MappingProxyType(
-    {
-        "ct_slice": Source("reading across the CT slices", "ct_slice_mm", "mm"),
-        "ct_in_plane": Source("reading within the CT slices", "ct_in_plane_mm", "mm"),
-        "markers_ct": Source("reading in the CT", "ct_in_plane_mm and ct_slice_mm", "mm"),
-        "touch": Source("touch noise", "touch_mm", "mm"),
-        "target": Source("reading of the target", "target_mm", "mm"),
-        "link": Source("the arm's lengths", "link_mm", "mm"),
-        "twist": Source("the arm's twists", "twist_deg", "deg"),
-        "joint": Source("zeros of the joints", "joint_deg", "deg"),
-        "repeatability": Source("repeatability", "repeatability_deg", "deg"),
-        "drift": Source("drift since the touch", "joint_drift_deg", "deg"),
-        "jitter": Source("jitter of the joints", "jitter_deg", "deg"),
-        "tip_offset": Source("offset of the needle's tip", "tip_offset_mm", "mm"),
-        "needle_direction": Source("direction of the needle", "needle_direction_deg", "deg"),
-        "bend": Source("bending of the needle", "bevel_deg", "deg"),
-        "breathing": Source("breathing while it is inserted", "amplitude_mm", "mm"),
-        "motion": Source(
-            "target's motion, breath and push", "motion.target_sd_mm, [breathing], tissue held_n_mm", "mm"
-        ),
-        "cameras": Source("points seen by the cameras", "stereo.sd_mm", "mm"),
-        "pictures": Source("ultrasound pictures", "ultrasound.target_sd_mm, tip_sd_mm, calibration_sd_mm", "mm"),
-        "scans": Source("readings of the control scans", "control_scan.slice_mm and [errors] target_mm", "mm"),
-        "surface": Source("surfaces of the structures", "surface_mm", "mm"),
-    }
-)
+SOURCES: Mapping[str, Source] = {
+    "ct_slice": Source("reading across the CT slices", "ct_slice_mm", "mm"),
+    "ct_in_plane": Source("reading within the CT slices", "ct_in_plane_mm", "mm"),
+    "markers_ct": Source("reading in the CT", "ct_in_plane_mm and ct_slice_mm", "mm"),
+    "touch": Source("touch noise", "touch_mm", "mm"),
+    "target": Source("reading of the target", "target_mm", "mm"),
+    "link": Source("the arm's lengths", "link_mm", "mm"),
+    "twist": Source("the arm's twists", "twist_deg", "deg"),
+    "joint": Source("zeros of the joints", "joint_deg", "deg"),
+    "repeatability": Source("repeatability", "repeatability_deg", "deg"),
+    "drift": Source("drift since the touch", "joint_drift_deg", "deg"),
+    "jitter": Source("jitter of the joints", "jitter_deg", "deg"),
+    "tip_offset": Source("offset of the needle's tip", "tip_offset_mm", "mm"),
+    "needle_direction": Source("direction of the needle", "needle_direction_deg", "deg"),
+    "bend": Source("bending of the needle", "bevel_deg", "deg"),
+    "breathing": Source("breathing while it is inserted", "amplitude_mm", "mm"),
+    "motion": Source("target's motion, breath and push", "motion.target_sd_mm, [breathing], tissue held_n_mm", "mm"),
+    "cameras": Source("points seen by the cameras", "stereo.sd_mm", "mm"),
+    "pictures": Source("ultrasound pictures", "ultrasound.target_sd_mm, tip_sd_mm, calibration_sd_mm", "mm"),
+    "scans": Source("readings of the control scans", "control_scan.slice_mm and [errors] target_mm", "mm"),
+    "surface": Source("surfaces of the structures", "surface_mm", "mm"),
+}
 """By the names under which `PoseError.parts` and `ErrorBudget.share` give their parts, and the surfaces' own."""
 
 

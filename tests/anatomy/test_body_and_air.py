@@ -1,6 +1,7 @@
 """What counts as body and as air: patients on a table, with arms, mattress, sheet and line, whose truth is known."""
 
 from collections import Counter
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -18,7 +19,7 @@ from puncture_twin.planning.anatomy.body.body_mask import (
     find_unscanned,
     measured_hu,
 )
-from puncture_twin.planning.anatomy.unnamed import Named
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.reasons import Reason
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.certify.checker import verify
@@ -266,7 +267,7 @@ def test_a_bone_that_nobody_labelled_is_unknown(scene):
     labels = searched(folder, structures=KIDNEY, search="trust_labels = true")[1]
     np.testing.assert_array_equal(labels.safe, found.safe)
     unnamed = context.anatomy.scan.unnamed(
-        [Named("lesion", context.anatomy.structures[0].mesh)], context.case.ct.dense_hu
+        [replace(context.anatomy.structures[0], name="lesion")], context.case.ct.dense_hu
     )
     far, near = ball(context.case.target_ct + [0.0, 0.0, 500.0], 5.0), ball(unnamed.dense.vertices.mean(axis=0), 5.0)
     assert [context.anatomy.scan.may_hold(unnamed, one) for one in (far, near)] == [False, True]  # a target's own ball
@@ -572,4 +573,4 @@ def test_an_arm_that_is_pressed_against_the_trunk_is_no_way_in(tmp_path, arm, bo
      ("oral_cavity", True), ("liver", False), ("hair", False), ("trachea", True)],
 )  # fmt: skip
 def test_whose_name_may_contain_gas(name, contains):
-    assert Named(name, None).may_contain_gas is contains
+    assert Structure(name, Role.AVOID, 0.0, None, "").may_contain_gas is contains

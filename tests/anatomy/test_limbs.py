@@ -10,7 +10,7 @@ from places import DATA, REAL_CT
 from puncture_twin.planning.anatomy.anatomy import ball
 from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, CtImage, ct_image
 from puncture_twin.planning.anatomy.body.limbs import limb_search
-from puncture_twin.planning.anatomy.unnamed import Named
+from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.formats.volumes.volume_files import read_volume
 from puncture_twin.planning.geometry.rigid import pose
 
@@ -49,6 +49,10 @@ def search(hu, body, structures=()):
     return limb_search(CtImage(hu, T, Path("ct.nii.gz")), body, structures)
 
 
+def named(name, mesh):
+    return Structure(name, Role.AVOID, 0.0, mesh, "")
+
+
 def limbs_of(hu, body, target=TARGET, structures=()):
     found = search(hu, body, structures)
     return found.limbs(found.chosen(target))
@@ -81,10 +85,10 @@ def test_a_bone_that_a_structure_names_is_no_evidence(line):
     along = np.outer(axis, axis) / (axis @ axis)
     stretch = 12.0 * (np.eye(3) - along) + 0.6 * np.linalg.norm(axis) * along
     bone = ball(np.zeros(3), 1.0).transformed(pose(stretch, np.mean(line, axis=0)))
-    assert not limbs_of(hu, body, structures=[Named("rib_left_7", bone)]).any()
-    assert limbs_of(hu, body, structures=[Named("tissue", ball(TARGET, 400.0))]).any()
+    assert not limbs_of(hu, body, structures=[named("rib_left_7", bone)]).any()
+    assert limbs_of(hu, body, structures=[named("tissue", ball(TARGET, 400.0))]).any()
     for name in ("humerus_left", "bone", "Skeleton", "Segment_1", "LeftArmBones", "Elle"):  # may be, or hold, an arm's
-        assert limbs_of(hu, body, structures=[Named(name, bone)]).any(), name
+        assert limbs_of(hu, body, structures=[named(name, bone)]).any(), name
 
 
 def test_a_thigh_pressed_against_the_one_that_holds_the_target_is_found_though_its_bone_is_named():
@@ -93,7 +97,7 @@ def test_a_thigh_pressed_against_the_one_that_holds_the_target_is_found_though_i
     hu, body = image(trunk=left | right)
     hu[body & (hu > 200.0)], hu[about((87.0, 140.0, 0.0), (87.0, 140.0, 180.0)) < 14.0] = 30.0, 600.0
     femur = ball(np.zeros(3), 1.0).transformed(pose(np.diag([14.0, 14.0, 120.0]), [87.0, 140.0, 90.0]))
-    found = limbs_of(hu, body, np.array([200.0, 140.0, 90.0]), [Named("femur_right", femur)])
+    found = limbs_of(hu, body, np.array([200.0, 140.0, 90.0]), [named("femur_right", femur)])
     assert found[right & ~left].mean() > 0.98
 
 

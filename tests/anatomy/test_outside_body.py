@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import scipy
 
-from puncture_twin.planning.anatomy.body.outside_body import (
+from puncture_twin.planning.anatomy.body.tables import TableSide
+from puncture_twin.planning.anatomy.scan import (
     BEYOND_MM,
     BLOCK_MM,
     BULKY_ML,
@@ -15,7 +16,6 @@ from puncture_twin.planning.anatomy.body.outside_body import (
     outside_mask,
     outside_surface,
 )
-from puncture_twin.planning.anatomy.body.tables import TableSide
 from puncture_twin.planning.geometry.containment import Side, inside_each, side_of
 from puncture_twin.planning.geometry.mesh import TriangleMesh
 

@@ -6,7 +6,6 @@ import SimpleITK as sitk  # noqa: N813
 from places import REAL_CT
 
 from puncture_twin.planning.anatomy.body.body_mask import BODY_HU, CtImage, body_mask
-from puncture_twin.planning.anatomy.body.outside_body import OutsideImage, outside_mask
 from puncture_twin.planning.anatomy.body.tables import (
     Shown,
     drawn_sides,
@@ -15,6 +14,7 @@ from puncture_twin.planning.anatomy.body.tables import (
     surface_ends,
     touching_tables,
 )
+from puncture_twin.planning.anatomy.scan import OutsideImage, outside_mask
 from puncture_twin.planning.geometry.parts import largest_part
 
 CT = REAL_CT / "ct.nii.gz"

@@ -19,13 +19,11 @@ from puncture_twin.planning.anatomy.structure import Role, Structure
 from puncture_twin.planning.base.provenance import InputFiles
 from puncture_twin.planning.case.entry import Directions, angles, entry_frame, outward
 from puncture_twin.planning.case.tables import EntryAxes
-from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, nearest_cell, split
+from puncture_twin.planning.certify.cells import SQUARE_DEGREES, Cells, Lists, nearest_cell, split, zones
 from puncture_twin.planning.certify.certificate import read_certificate, write_certificate
 from puncture_twin.planning.certify.checker import _apart, _Cell, verify
-from puncture_twin.planning.certify.cones import Lists, zones
 from puncture_twin.planning.certify.near_organs import Organs, organ_facts
-from puncture_twin.planning.certify.skin_cones import skin_bounds
-from puncture_twin.planning.certify.skin_surface import skin_surface
+from puncture_twin.planning.certify.skin_cones import skin_bounds, skin_surface
 from puncture_twin.planning.certify.subdivision import certify
 from puncture_twin.planning.clearance.fcl_engine import FclEngine
 from puncture_twin.planning.geometry.mesh import BOX_FACES, TriangleMesh
@@ -98,7 +96,7 @@ def test_halves_and_quarters_tile_their_cell(theta, rng):
     cells = Cells(np.array([theta], float), np.array([[0, 2 * np.pi]]))
     area = cells.solid_angle()[0]
     for _ in range(6):
-        cells = split(cells, cells.splits(cells.radius())).cells
+        cells, _ = split(cells, cells.splits(cells.radius()))
     assert cells.solid_angle().sum() == pytest.approx(area, rel=1e-12)
     t, b = rng.uniform(*theta, 500), rng.uniform(0, 2 * np.pi, 500)
     within = (cells.theta[:, :1] < t) & (t < cells.theta[:, 1:]) & (cells.beta[:, :1] < b) & (b < cells.beta[:, 1:])

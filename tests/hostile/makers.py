@@ -7,8 +7,7 @@ from case_world import case_text, structure, whole, write_balls
 from mesh_bytes import glb
 
 from puncture_twin.planning.certify.cells import Cells
-from puncture_twin.planning.certify.certificate import Certificate, write_certificate
-from puncture_twin.planning.certify.question import Question
+from puncture_twin.planning.certify.certificate import Certificate, Question, write_certificate
 from puncture_twin.planning.plan.plan_document import write_plan
 from puncture_twin.twin.guidance.ultrasound.axp_ybq.recording import Recording
 from puncture_twin.twin.guidance.ultrasound.recording_file import write_recording

@@ -11,8 +11,7 @@ from puncture_twin.planning.arm.inverse_kinematics import inverse
 from puncture_twin.planning.arm.kinematics import farthest_from_singular
 from puncture_twin.planning.case.case import load_case
 from puncture_twin.planning.geometry.rigid import apply, pose
-from puncture_twin.planning.place.check import expected_tip_error_mm, pose_error_from
-from puncture_twin.planning.place.search import _worth
+from puncture_twin.planning.place.search import _worth, expected_tip_error_mm, pose_error_from
 from puncture_twin.planning.registration.placement import load_placement
 
 

@@ -32,7 +32,6 @@ from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import case_checker
 from puncture_twin.planning.geometry.containment import Side, side_of
 from puncture_twin.planning.geometry.mesh import joined
-from puncture_twin.planning.place.check import PlacementCheck, needle_can_start, placement_check
 from puncture_twin.planning.place.estimate import (
     ArmSpheres,
     Boxes,
@@ -54,7 +53,13 @@ from puncture_twin.planning.place.mounts import (
     ring_weights,
     wanted_directions,
 )
-from puncture_twin.planning.place.search import _parted, search_placements
+from puncture_twin.planning.place.search import (
+    PlacementCheck,
+    _parted,
+    needle_can_start,
+    placement_check,
+    search_placements,
+)
 from puncture_twin.planning.registration.placement import load_placement
 from puncture_twin.planning.search.constraints import ArmReach, with_reach
 from puncture_twin.planning.search.context import prepare
@@ -270,7 +275,7 @@ def test_a_needle_that_would_start_in_the_skin_is_known(box):
     target, tilt = np.array([0.0, 0.0, -50.0]), np.radians([0.0, 41.0, 43.0])
     u = np.stack([np.sin(tilt), np.zeros(3), np.cos(tilt)], axis=1)
     wanted = WantedDirections(u, 60.0 / np.cos(tilt) + 10.0, np.ones(3) / 3)
-    assert needle_can_start(TOOL, box((2000.0, 2000.0, 20.0)), target, wanted, 5.0).tolist() == [True, True, False]
+    assert needle_can_start(TOOL, box((2000.0, 2000.0, 20.0)), target, wanted).tolist() == [True, True, False]
 
 
 def test_turning_the_base_about_its_own_axis_changes_no_share(ball):
@@ -279,7 +284,7 @@ def test_turning_the_base_about_its_own_axis_changes_no_share(ball):
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     wanted = WantedDirections(u, np.full(30, 110.0), np.full(30, 1 / 30))
     skin = ball(80.0, subdivisions=2)
-    check = PlacementCheck(UR3, TOOL, skin, skin, (), (), 5.0, np.zeros(3), wanted, np.zeros(6))
+    check = PlacementCheck(UR3, TOOL, skin, skin, (), (), np.zeros(3), wanted, np.zeros(6))
     T = Site(Region("floor", "", (0, 0, 1), ANYWHERE, ANYWHERE), (300.0, 0.0, -250.0)).T_bed_base()
     shares = set()
     for turn in (0.0, 2.5):

@@ -16,8 +16,8 @@ from puncture_twin.planning.case.settings import Needle
 from puncture_twin.planning.collision.checker import CellChecker
 from puncture_twin.planning.collision.workcell import ARM_PADDING_MM, case_tool
 from puncture_twin.planning.geometry.mesh import TriangleMesh
-from puncture_twin.planning.place.check import needle_can_start
 from puncture_twin.planning.place.mounts import wanted_directions
+from puncture_twin.planning.place.search import needle_can_start
 from puncture_twin.planning.reach.standoff import (
     MAX_GAP_MM,
     UNEVEN_SKIN_MM,
@@ -96,7 +96,7 @@ def test_no_direction_of_the_abdomen_is_lost_to_its_own_needle():
     found = organ_candidates(case, context.anatomy, context.engine, case.directions())
     wanted = wanted_directions(case, found)
     tool, skin = case_tool(case), context.anatomy.skin.mesh
-    assert needle_can_start(tool, skin, case.target_ct, wanted, ARM_PADDING_MM).all()
+    assert needle_can_start(tool, skin, case.target_ct, wanted).all()
     oblique = found.path.skin_angle[found.safe] > 43.0 * DEG
     assert oblique.sum() > 100 and (wanted.standoff_mm - found.path.length[found.safe])[oblique].min() > 10.0
 

@@ -13,8 +13,7 @@ from puncture_twin.planning.registration.fit_uncertainty import reading_noise
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
 from puncture_twin.planning.registration.residuals import leverage
-from puncture_twin.planning.uncertainty.pose_error import error_budget
-from puncture_twin.planning.uncertainty.touch_choice import choose_touches
+from puncture_twin.planning.uncertainty.pose_error import choose_touches, error_budget
 from puncture_twin.twin.rehearsal.trials import draw_trials
 
 ROOMS = 20_000

@@ -15,8 +15,7 @@ from puncture_twin.planning.geometry.spaces import Space
 from puncture_twin.planning.registration.fit_uncertainty import reading_noise
 from puncture_twin.planning.registration.marker_pairs import MarkerPairs
 from puncture_twin.planning.registration.registration import register
-from puncture_twin.planning.uncertainty.pose_error import PoseError
-from puncture_twin.planning.uncertainty.touch_choice import choose_touches
+from puncture_twin.planning.uncertainty.pose_error import PoseError, choose_touches
 from tools.phantoms import torso
 from tools.phantoms.viscera import LESION_CENTRE_LPS_MM
 

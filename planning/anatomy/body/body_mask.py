@@ -115,10 +115,8 @@ class CtImage:
     T_ct_index: Floats  # shape (4, 4), voxel index to LPS mm
     where: Path
     shown: Shown = PATIENT
-    as_stored: NDArray[Any] | None = None
-    """As the file has them, where that differs."""
-    not_measured: Bools | None = None
-    """What was not, where that is known."""
+    as_stored: NDArray[Any] | None = None  # as the file has them, where that differs
+    not_measured: Bools | None = None  # what was not, where that is known
 
     @property
     def stored(self) -> NDArray[Any]:
@@ -172,17 +170,13 @@ def body_mask(
     unscanned: Bools | None = None,
     at: Ints | None = None,
 ) -> BodyMask:
-    """The patient, or the phantom, in a CT.
+    """The patient, or the phantom, in a CT (nx, ny, nz), HU of `measured_hu`, axis 2 along the patient.
 
-    Threshold, opening, largest part without the table that touches it, and all others that look like a limb; then air
-    that each encloses in an axial slice is filled, and air at the image's border that does not look like the room's.
+    Threshold, opening, largest part (or that of a voxel (3,)) without the table that touches it, and all others that
+    look like a limb; then air that each encloses in an axial slice is filled, and air at the border that does not look
+    like the room's.
 
-    Args:
-        hu: Shape (nx, ny, nz), Hounsfield units, axis 2 along the patient; of `measured_hu`.
-        at: Shape (3,), a voxel of the part that is meant, where that need not be the largest.
-
-    Raises:
-        InputError: No body, an implausibly small one, or no air around it.
+    Raises InputError: No body, an implausibly small one, or no air around it.
     """
     voxel_ml, dense = float(np.prod(spacing_mm)) / 1000.0, hu > BODY_HU
     trunk, parts = np.zeros(hu.shape, bool), thick_parts(dense, spacing_mm, at)
@@ -193,10 +187,10 @@ def body_mask(
         refuse(what, where, f"a CT in Hounsfield units with at least {MIN_BODY_ML:g} ml of body", "no_body")
     tables, warnings = tuple[TableSide, ...](), list[str]()
     if shown.tables:
-        touching = touching_tables(hu, trunk, spacing_mm, shown, level=BODY_HU)
-        tables, warnings = touching.sides, list(touching.warnings)
-        if touching.cut_off.any():
-            dense &= ~touching.cut_off  # what is left of parts is still drawn from it
+        cut_off, tables, said = touching_tables(hu, trunk, spacing_mm, shown, level=BODY_HU)
+        warnings += said
+        if cut_off.any():
+            dense &= ~cut_off  # what is left of parts is still drawn from it
             trunk = largest_part(trunk & dense)
     limbs = [part for part in (parts if shown.limbs else ()) if _is_limb(part.mask, hu[part.box], spacing_mm)]
     if limbs:
@@ -266,11 +260,9 @@ def thick_parts(mask: Bools, spacing_mm: Floats, at: Ints | None = None) -> Iter
 
 
 def nearest_parts(mask: Bools, radius_mm: float, spacing_mm: Floats, most_mm: float = np.inf) -> Ints32:
-    """Number the parts of a mask into which a ball fits, 1 the largest, and what lies nearest to each; 0 elsewhere.
+    """Number the parts of a mask (nx, ny, nz) into which a ball fits, 1 the largest, and what lies nearest to each.
 
-    Args:
-        mask: Shape (nx, ny, nz); beyond its border it goes on.
-        most_mm: So far from where the ball's middle may lie.
+    0 elsewhere, and farther from where the ball's middle may lie than a limit. Beyond its border the mask goes on.
     """
     reach = np.ceil(radius_mm / spacing_mm).astype(int)
     padded = np.pad(mask, [(r, r) for r in reach], mode="edge")

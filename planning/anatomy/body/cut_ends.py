@@ -8,7 +8,7 @@ there that does not run through it; the key ``cut`` of the skin says what is rig
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -24,7 +24,6 @@ SIDES: Mapping[str, tuple[int, int]] = MappingProxyType(
     {"right": (0, 0), "left": (0, 1), "front": (1, 0), "back": (1, 1), "feet": (2, 0), "head": (2, 1)}
 )
 """The patient's sides: LPS axis, and whether its low (0) or high (1) end."""
-
 SPECK_MM2, THICK_MM = 100.0, 12.0
 """What is dense in a slice and smaller is noise, a line or a sheet; into a body that was cut such a ball fits."""
 WIDE, ROUND_MM = 0.75, 150.0
@@ -33,10 +32,8 @@ stump is flatter than a ball of this radius."""
 CAP_MM2, WALL, AT_PLANE = 100.0, 0.5, 0.75
 """Area of the flat end of an organ that was cut; what is so much of the face is the body, or a phantom's wall. It ends
 so near to the face, voxels."""
-
 Box = tuple[tuple[int, int], ...]
 """Along each axis the first voxel and the one after the last."""
-
 FILLED = (
     "behind the body's {names} side the image has only air, up to {voxels} voxels: the body counts as cut there and "
     "the image as padded (override in the skin's table: cut = [] if it ends there{or_phantom})"
@@ -54,8 +51,7 @@ class FieldOfView:
     T_ct_box: NDArray[np.float64]
     """Shape (4, 4), rigid; the box frame's origin is its low corner, its axes run mostly to the patient's left, back
     and head."""
-    size_mm: NDArray[np.float64]
-    """Shape (3,), of the image, or of the mesh that was cut."""
+    size_mm: NDArray[np.float64]  # shape (3,), of the image, or of the mesh that was cut
     cut: NDArray[np.bool_]
     """Shape (3, 2), which low and high face the body reaches: those of the image, or of a mesh that was cut."""
 
@@ -127,11 +123,9 @@ def _is_thick(section: Bools, spacing_mm: Floats) -> bool:
 def cut_ends(content: Content, organs: Iterable[tuple[TriangleMesh, float]], *, whole: bool) -> Bools:
     """The sides at which an image was cut and then filled up, shape (3, 2).
 
-    A side behind which lie as many slices as behind one that was cut counts as cut too, but not of a phantom.
-
-    Args:
-        organs: Structures inside the body, LPS mm, and the longest side of the voxels that they were made of.
-        whole: Whether the body may end flat by itself, and what runs through it too, as phantoms do.
+    A side behind which lie as many slices as behind one that was cut counts as cut too, but not of a phantom: that may
+    be whole, and end flat by itself with what runs through it. Of the organs inside, LPS mm, the longest side of their
+    voxels is known.
     """
     filled = content.thick & (content.beyond > 0)
     across_bed = np.array([[False], [False], [not whole]])
@@ -173,10 +167,9 @@ def shifted(T_ct_index: Floats, box: Box) -> Floats:
     return T_ct_box
 
 
-def stated_ends(names: Iterable[str]) -> Bools:
+def stated_ends(names: Collection[str]) -> Bools:
     """Sides by their names, shape (3, 2)."""
-    stated = frozenset(names)
-    return np.array([name in stated for name in SIDES]).reshape(3, 2)
+    return np.array([name in names for name in SIDES]).reshape(3, 2)
 
 
 def end_warnings(content: Content, cut: Bools, whole: bool) -> tuple[str, ...]:

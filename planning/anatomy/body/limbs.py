@@ -20,7 +20,7 @@ import scipy
 
 from puncture_twin.planning.anatomy.body.body_mask import BONE_HU, MIN_BONE_ML, CtImage, nearest_parts
 from puncture_twin.planning.anatomy.default_roles import default_role, plain_name
-from puncture_twin.planning.anatomy.unnamed import Named
+from puncture_twin.planning.anatomy.structure import Structure
 from puncture_twin.planning.base.arrays import Bools, Floats, Ints32
 from puncture_twin.planning.geometry.parts import in_blocks, voxels_inside
 
@@ -49,15 +49,13 @@ LEAST_MM, LINE_MM = 60.0, 12.0
 FLAT, SLACK_MM, BEYOND_ENDS_MM = 1.25, 5.0, 30.0
 """From its bone a limb pressed flat reaches so many times as far as the air is away, and so much farther, and beyond
 the bone's ends: that holds .994 and more of the arms of drawn patients."""
-
 FULL = np.ones((3, 3, 3), bool)
 
 
 class Piece(NamedTuple):
     """What may be a limb, as blocks; it is none where the target lies in ``near``."""
 
-    near: Bools
-    """Alone a limb's where the target lies in ``whole``."""
+    near: Bools  # alone a limb's where the target lies in ``whole``
     whole: Bools
     ml: float = 0.0
     """Of a part beyond a neck: if neither it nor what holds the target is as small as a limb, it is none. Else 0."""
@@ -92,7 +90,7 @@ class LimbSearch(NamedTuple):
         return limbs & (self.parts == chosen[0])
 
 
-def limb_search(image: CtImage, body: Bools, structures: Sequence[Named]) -> LimbSearch:
+def limb_search(image: CtImage, body: Bools, structures: Sequence[Structure]) -> LimbSearch:
     """The limbs of a CT and its body, sampled; bones that structures name are no evidence."""
     stride = np.maximum(1, (SAMPLING_MM / image.spacing_mm).astype(int))
     T = image.T_ct_index.copy()
@@ -168,13 +166,13 @@ def _about(bones: Bools, depth_mm: Floats, spacing_mm: Floats) -> Piece:
     return Piece(np.asarray(gap < radius), scipy.ndimage.binary_dilation(gap <= FLAT * radius + SLACK_MM, rod))
 
 
-def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[Named]) -> Bools:
+def _explained(bone: Bools, T_ct_index: Floats, structures: Sequence[Structure]) -> Bools:
     """Blocks within, or beside, a structure that is a bone of a known name, no arm's."""
     explained = np.zeros(bone.shape, bool)
-    for name, mesh in structures:
-        line = default_role(name, "other")
-        if line is not None and (line.group != LIMBS or NO_ARM.search(plain_name(name))):
-            inside = voxels_inside(mesh, T_ct_index, bone.shape)
+    for one in structures:
+        line = default_role(one.name, "other")
+        if line is not None and (line.group != LIMBS or NO_ARM.search(plain_name(one.name))):
+            inside = voxels_inside(one.mesh, T_ct_index, bone.shape)
             if np.count_nonzero(inside & bone) >= NAMED_DENSE * np.count_nonzero(inside):
                 explained |= inside
     return np.asarray(scipy.ndimage.binary_dilation(explained, FULL))

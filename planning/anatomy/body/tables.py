@@ -1,9 +1,8 @@
 """What a body lies on: tables, cradles, boards and pads, touching it or not, and what of them the image does not show.
 
 A table has one section, drawn along the bed; a patient has not. Seen from its far side it ends at one line in most
-slices, or along a hand's breadth, and nothing comes from beyond. Where it touches a body as dense as itself and is
-wider, its thickness is seen beside the body, and it is cut off there. A body that has one section at all four sides is
-no table, but a phantom.
+slices, or along a hand's breadth. Where it touches a body as dense as itself and is wider, its thickness is seen beside
+the body, and it is cut off there. A body that has one section at all four sides is no table, but a phantom.
 """
 
 from __future__ import annotations
@@ -66,8 +65,7 @@ class Shown:
     phantom: bool = False
     arms: str | None = None
     table: str | None = None
-    whole: bool = False
-    """The image shows all of it, in air."""
+    whole: bool = False  # the image shows all of it, in air
     about: tuple[float, ...] | None = None
     """Of several phantoms the one that holds this point is meant, LPS mm; the largest where none does."""
 
@@ -91,13 +89,10 @@ class TableSide(NamedTuple):
     face: Face
     line: Floats
     """Shape (n, nz), by line of sight and slice, where it ends or may end, voxels along the face's axis."""
-    lines: Bools
-    """Shape (n,), which lines of sight are those of the table; ``width_mm`` of them are drawn."""
-    slope: float
-    """How it moves along the face's axis, mm per mm along the bed."""
+    lines: Bools  # shape (n,), which lines of sight are those of the table; ``width_mm`` of them are drawn
+    slope: float  # how it moves along the face's axis, mm per mm along the bed
     width_mm: float
-    firm: bool
-    """Whether the ends keep to one another, as those of a straight flank do less."""
+    firm: bool  # whether the ends keep to one another, as those of a straight flank do less
 
     def beyond(self, shape: tuple[int, ...]) -> Bools:
         """The voxels of an image beyond the line."""
@@ -190,12 +185,9 @@ def surface_ends(hu: NDArray[Any], body: Bools, level: float = 0.0) -> dict[Face
 def drawn_sides(
     surfaces: dict[Face, Floats], body: Bools, spacing_mm: Floats, *, touching: bool = True
 ) -> tuple[TableSide, ...]:
-    """The sides at which surfaces end in one section along the bed, beyond the middle of a body.
+    """The sides at which `surface_ends` have one section along the bed, beyond the middle of a body (nx, ny, nz).
 
-    Args:
-        surfaces: By face, as `surface_ends` gives them.
-        body: Shape (nx, ny, nz).
-        touching: Whether the body itself ends there, or what is apart from it: that is known to a voxel.
+    Either the body itself ends there (``touching``), or what is apart from it: that is known to a voxel.
     """
     if body.shape[2] * spacing_mm[2] < LEAST_LENGTH_MM:
         return ()
@@ -292,8 +284,7 @@ def find_support(
         return Support((), False, ())
     surfaces = {}
     for face, first, own in zip(FACES, ends_of(outside | body), ends_of(outside), strict=True):
-        outer_face = first + (0.5 if face[1] else -0.5)
-        surfaces[face] = np.where((first == own) & (own >= 0), outer_face, np.nan)
+        surfaces[face] = np.where((first == own) & (own >= 0), first + (0.5 if face[1] else -0.5), np.nan)
     sides = drawn_sides(surfaces, body, spacing_mm, touching=False)
     drawn = tuple(sorted(sides, key=lambda side: side.width_mm)[-1:])
     supports = {side.face[0] for side in (*drawn, *touching)}

@@ -28,14 +28,11 @@ from puncture_twin.planning.registration.registration import Registration
 
 UPRIGHT = np.radians(30.0)
 """Angle of the base's z axis from up up to which an arm is upright: on a floor, a rail or a cart, as most are."""
-
 EXPLAINED = 3.29
 """Times the expected (rms) error of a point: normal errors exceed it at most once in 1,000, in whatever directions they
 lie. It is the normal distribution's own bound, and errors along one line, of one size, reach it most often."""
-
 MAX_APART_MM = 5.0
 """Markers and a transform that differ by more, and by more than both errors explain, are of two patients or robots."""
-
 CAUSES = (
     "the usual causes are a transform in the other direction (transform_maps), other axes at the robot (base_axes; a "
     "URDF's base_link is rotated in this way), and a transform of another image"
@@ -43,7 +40,6 @@ CAUSES = (
 MARKERS_TELL = " (markers_ct and markers_base with it would check it)"
 BOX_TELLS = " (so does the patient support, as an obstacle of frame base)"
 """What makes a warning needless."""
-
 ALLOWED = "a transform between this CT and this robot's base, with transform_maps and base_axes as saved"
 
 
@@ -51,16 +47,12 @@ ALLOWED = "a transform between this CT and this robot's base, with transform_map
 class Reading:
     """The transform that the file would state under some of its keys."""
 
-    keys: str
-    """Those that differ from the case's; empty as stated."""
-    T_base_ct: Floats
-    """Shape (4, 4), mm."""
+    keys: str  # those that differ from the case's; empty as stated
+    T_base_ct: Floats  # shape (4, 4), mm
     impossible: str
     unlikely: str
-    rests_on: str
-    """The obstacle of frame ``base`` that the patient lies on, or empty."""
-    tilt: float
-    """Between the robot's z axis and up, rad."""
+    rests_on: str  # the obstacle of frame ``base`` that the patient lies on, or empty
+    tilt: float  # between the robot's z axis and up, rad
 
     @property
     def plausible(self) -> bool:
@@ -90,16 +82,10 @@ def marker_registration(case: Case, stated: RegistrationSection) -> Registration
 def check_transform(
     case: Case, skin: TriangleMesh, T_base_ct: Floats, registration: Registration | None = None
 ) -> Iterator[Finding]:
-    """Compare a stated transform with the markers beside it, if any, and with what physics excludes.
+    """Compare a stated transform (4, 4), mm, with the markers beside it, if any, and with what physics excludes.
 
-    Args:
-        case: Nothing is done where it states no transform.
-        skin: CT frame.
-        T_base_ct: Shape (4, 4), mm, as stated.
-        registration: Of `marker_registration`, whose own checks are `check_markers`.
-
-    Yields:
-        Warnings; how far markers that agree are from it is a note.
+    Yields warnings, and a note on how far markers that agree (of `marker_registration`; their own checks are
+    `check_markers`) are from it; nothing where the case states none.
     """
     stated = case.robot.stated
     if stated is None:
@@ -181,8 +167,7 @@ class Apart(NamedTuple):
 
     where: str
     apart_mm: float
-    expected_mm: float
-    """The expected (rms) error of the markers there."""
+    expected_mm: float  # the expected (rms) error of the markers there
     contradicts: bool
     """Whether some point differs by more than both errors explain, and by more than `MAX_APART_MM`."""
 
@@ -212,8 +197,7 @@ class CheckedPlacement(NamedTuple):
 def checked_placement(case: Case, cache: Cache) -> CheckedPlacement | None:
     """The patient's pose for the robot, its markers checked; None where the case does not say it.
 
-    Raises:
-        InputError: As `load_placement` and `placement_findings`, or a skin or CT that cannot be read.
+    Raises InputError: As `load_placement` and `placement_findings`, or a skin or CT that cannot be read.
     """
     placement = load_placement(case)
     if placement is None:
@@ -227,8 +211,6 @@ def placement_findings(
     case: Case, around: Surroundings, placement: Placement, cache: Cache = NO_CACHE
 ) -> tuple[Finding, ...]:
     """Check what places the robot: the markers, a mount, or a stated transform and the markers beside it.
-
-    However it is stated, what physics says of the place of the base is told (`base_place`).
 
     Markers that agree with a transform are checked as those that place the robot are: who made the transform from the
     same two lists has the slip of a list in both.

@@ -14,7 +14,6 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -46,8 +45,7 @@ class SkinFit:
 
     gaps_mm: Floats
     """Shape (n,), distance from the skin, negative inside the body (of an open skin that is not known)."""
-    normals_ct: Floats
-    """Shape (n, 3), unit vectors out of the skin at its nearest triangle."""
+    normals_ct: Floats  # shape (n, 3), unit vectors out of the skin at its nearest triangle
 
     @property
     def on_skin(self) -> bool:
@@ -92,8 +90,7 @@ class Surroundings(NamedTuple):
     """Surfaces that markers are compared with, CT frame."""
 
     skin: Skin
-    couch: TriangleMesh | None
-    """What lies beyond what the patient lies on, where the CT shows it."""
+    couch: TriangleMesh | None  # what lies beyond what the patient lies on, where the CT shows it
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +100,8 @@ class MarkerList:
     fit: SkinFit
     behind: tuple[tuple[int, str], ...]
     """Rows of markers that no needle can have touched, and what is before each, in words."""
-    excluded: str
-    """Why the robot cannot stand where this list puts it, or empty."""
-    target_mm: float
-    """How far this list puts the target from where the given one puts it."""
+    excluded: str  # why the robot cannot stand where this list puts it, or empty
+    target_mm: float  # how far this list puts the target from where the given one puts it
 
     @property
     def plausible(self) -> bool:
@@ -121,13 +116,9 @@ def marker_list(
     signs: Signs = (1.0, 1.0, 1.0),
     cache: Cache = NO_CACHE,
 ) -> MarkerList:
-    """The CT markers with some axes negated, compared with skin, couch and the robot's place.
-
-    How they lie on the skin depends on no target: ``cache`` keeps it.
-    """
+    """The CT markers with some axes negated, against skin (a fit that ``cache`` keeps), couch and robot's place."""
     points = registration.markers.points_ct * np.array(signs)
-    skin = around.skin
-    cut = hashlib.sha256(skin.cut_faces.tobytes()).hexdigest()
+    skin, cut = around.skin, hashlib.sha256(around.skin.cut_faces.tobytes()).hexdigest()
     made_from = {"what": "skin fit", "skin": skin.mesh.digest, "cut": cut, "points": points.tolist()}
     fit = SkinFit(**cache.arrays(made_from, lambda: vars(skin_fit(points, skin)), by=__name__))
     T_base_ct = fit_rigid(points, registration.markers.points_base)
@@ -139,21 +130,11 @@ def marker_list(
     return MarkerList(fit, behind, place_excluded(case, skin.mesh, T_base_ct), float(np.linalg.norm(moved)))
 
 
-ALLOWED_NAMES = (
-    "markers without symmetry, the smallest known fle_mm, or registration.accept_symmetry = true after you checked "
-    "the names at the patient"
-)
-
-
 def check_names(case: Case, skin: Skin, registration: Registration) -> Iterator[Finding]:
-    """Compare the names with their permutations.
+    """Compare the names with their permutations; yields warnings.
 
-    Yields:
-        Warnings.
-
-    Raises:
-        InputError: Permuted names fit much better; or they fit as well, nothing excludes them, and the case does not
-            accept that.
+    Raises InputError: Permuted names fit much better; or as well, nothing excludes them, and the case does not accept
+    that.
     """
     test, where = registration.residual_test, f"{case.path}: registration"
     found, complete = renamings(registration.markers, case.target_ct, test.alike_mm)
@@ -167,7 +148,11 @@ def check_names(case: Case, skin: Skin, registration: Registration) -> Iterator[
     stated = case.registration or case.robot.stated
     if possible and not (stated is not None and stated.accept_symmetry):
         what = f"swapped marker names would go unnoticed: {_worst(possible)}; {given}"
-        refuse(what, where, ALLOWED_NAMES, "markers_ambiguous")
+        allowed = (
+            "markers without symmetry, the smallest known fle_mm, or registration.accept_symmetry = true after you "
+            "checked the names at the patient"
+        )
+        refuse(what, where, allowed, "markers_ambiguous")
     if not complete:
         said = f"with {len(registration.markers)} markers, only swaps of two names were tested"
         yield Finding("names_not_all_tested", Severity.WARNING, said)
@@ -185,24 +170,19 @@ def _worst(found: Sequence[Renaming]) -> str:
     return found[0].text() + (f" (and {plural(more, 'more permutation')})" if more else "")
 
 
-HALF_TURNS: Mapping[str, Signs] = MappingProxyType(
-    {
-        "x and y negated, as LPS and RAS differ,": (-1.0, -1.0, 1.0),
-        "y and z negated": (1.0, -1.0, -1.0),
-        "x and z negated": (-1.0, 1.0, -1.0),
-    }
-)
+HALF_TURNS: Mapping[str, Signs] = {
+    "x and y negated, as LPS and RAS differ,": (-1.0, -1.0, 1.0),
+    "y and z negated": (1.0, -1.0, -1.0),
+    "x and z negated": (-1.0, 1.0, -1.0),
+}
 """The slips of axes that are proper rotations; a list with one or three axes negated is refused as mirrored."""
 
 REFUSING_LEVEL = 0.01
 """Significance level at which a list is refused; honest lists are less often: on a symmetric body both are alike."""
-
 SCATTER_MM = 0.25
 """No skin is known better: a third of a millimetre's voxel, and the marker's own reading."""
-
 USUAL_SCATTER_MM = 3.0
 """Markers of one kind on the skin of their own CT scatter less."""
-
 EXCLUDING_LEVEL = 0.001
 """Significance level at which a half turn is excluded, and no more mentioned."""
 
@@ -287,12 +267,9 @@ def check_markers(
 ) -> Iterator[Finding]:
     """Check a registration's markers against permuted names, half turns, skin and couch.
 
-    Yields:
-        What these markers leave open, warnings; and what no markers can show, notes.
+    Yields warnings of what these markers leave open, and notes of what no markers can show.
 
-    Raises:
-        InputError: Names that fit much better permuted, or as well where nothing tells them apart; a list that lies on
-            the skin only after a half turn.
+    Raises InputError: Names as of `check_names`, or a list that lies on the skin only after a half turn.
     """
     yield from check_names(case, around.skin, registration)
     given = marker_list(case, around, registration, cache=cache)

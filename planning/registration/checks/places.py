@@ -27,13 +27,10 @@ from puncture_twin.planning.geometry.rigid import apply
 
 ALLOWANCE_MM = 30.0
 """A mattress gives way and a box is measured by hand: so deep a patient may lie in one, or to its middle."""
-
 THIN = 0.05
 """Of a box's half size is left of it at least, so that a patient who goes through a thin one is seen."""
-
 REST_MM = 100.0
 """Mattress and cushions between a table and the patient on it."""
-
 FAR_MM = 400.0
 """What lies farther below is a floor, what lies farther above a ceiling."""
 
@@ -41,12 +38,8 @@ FAR_MM = 400.0
 def in_box(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
     """The obstacle of frame ``base`` in which the patient would lie deeper than `ALLOWANCE_MM`; empty for none.
 
-    FCL is asked whether the skin touches what is left of the box without the allowance, and a point whether the whole
-    box lies in the patient.
-
-    Args:
-        skin: CT frame.
-        T_base_ct: Shape (4, 4), mm.
+    FCL is asked whether the skin (CT frame) touches what is left of the box without the allowance, and a point whether
+    the whole box lies in the patient. T_base_ct: shape (4, 4), mm.
     """
     points_base = apply(T_base_ct, skin.vertices)
     for box in _boxes(case, "base"):
@@ -68,10 +61,8 @@ def lying(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> tuple[str, str]:
     """How the patient lies to the boxes of the robot's frame, by the skin's vertices; arguments as of `in_box`.
 
     The obstacle under the patient, no farther away than `REST_MM`, or empty; and where they lie on none, that an
-    obstacle is below or above them, with its distance, or empty.
-
-    Up is the axis of the robot's frame that is nearest to it, within 45 degrees: an arm may stand, hang or reach out of
-    a wall.
+    obstacle is below or above them, with its distance, or empty. Up is the axis of the robot's frame that is nearest to
+    it, within 45 degrees: an arm may stand, hang or reach out of a wall.
     """
     up = up_base(case, T_base_ct)
     axis = int(np.argmax(np.abs(up)))
@@ -105,23 +96,17 @@ def _boxes(case: Case, frame: str) -> tuple[Obstacle, ...]:
 
 SKIN_POINTS = 2000
 """Places of the skin that are tried for a marker."""
-
 CONE = np.radians(60.0)
 """A marker is touched from within this angle of the skin's outward normal."""
-
 CONE_DIRECTIONS = 100
 """Tried in that cone: one every 10 degrees."""
 
 
 def place_excluded(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> str:
-    """Why the arm cannot stand where a registration puts it, in words; empty where it can.
+    """Why the arm cannot stand where a registration puts it, in words; empty where it can; arguments as of `in_box`.
 
     Its base or shoulder lies in the patient or in a box of the CT frame, or the target is farther from the shoulder
     than links and needle span.
-
-    Args:
-        skin: CT frame.
-        T_base_ct: Shape (4, 4), mm.
     """
     column = _column_ct(case, T_base_ct)
     if base_in_patient(case, skin, T_base_ct):
@@ -155,15 +140,10 @@ COUCH = "the couch that the CT shows"
 def untouchable(
     case: Case, points_ct: Floats, normals_ct: Floats, couch: TriangleMesh | None = None
 ) -> tuple[tuple[int, str], ...]:
-    """Which points no needle can have touched: a box of the CT frame, or its couch, lies before them on all sides.
+    """Which points (n, 3), mm, with unit normals (n, 3) out of the skin no needle can have touched from any side.
 
-    Args:
-        points_ct: Shape (n, 3), mm.
-        normals_ct: Shape (n, 3), unit vectors out of the skin there.
-        couch: What lies beyond what the patient lies on, closed, or None.
-
-    Returns:
-        Row, and in words what is before it.
+    A box of the CT frame is before them, or the couch: what lies beyond what the patient lies on, closed, or None. By
+    row, in words what is before it.
     """
     boxes, length = boxes_ct(case), case.needle.length_mm
     if (not boxes and couch is None) or not len(points_ct):
@@ -189,12 +169,7 @@ def _crosses(mesh: TriangleMesh, points: Floats, directions: Floats, length_mm: 
 
 
 def touchable_points(case: Case, skin: TriangleMesh, T_base_ct: Floats) -> Floats:
-    """Where on the skin a marker could sit and be touched straight: no box before it, within reach, shape (n, 3), mm.
-
-    Args:
-        skin: CT frame.
-        T_base_ct: Shape (4, 4), mm.
-    """
+    """Where on the skin a marker could sit and be touched straight, shape (n, 3), mm; arguments as of `in_box`."""
     a, b, c = np.moveaxis(skin.triangles[:: max(1, len(skin.triangles) // SKIN_POINTS)], 1, 0)
     normals = np.cross(b - a, c - a) * np.copysign(1.0, skin.volume)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(float).tiny)
@@ -247,22 +222,13 @@ OF_MARKERS = (
 class BasePlace(NamedTuple):
     """Arguments for and against a position of the base."""
 
-    impossible: str
-    """Why nothing can be so, or empty."""
-    unlikely: str
-    """What hardly is so, or empty."""
-    rests_on: str
-    """The obstacle of frame ``base`` that the patient lies on, or empty."""
+    impossible: str  # why nothing can be so, or empty
+    unlikely: str  # what hardly is so, or empty
+    rests_on: str  # the obstacle of frame ``base`` that the patient lies on, or empty
 
 
 def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats, memory: Memory = NO_MEMORY) -> BasePlace:
-    """Check a position of the base for plausibility.
-
-    Args:
-        skin: CT frame.
-        T_base_ct: Shape (4, 4), mm.
-        memory: Keeps how the skin lies to the boxes, which depends on no target.
-    """
+    """Check a position of the base, as of `in_box`; ``memory`` keeps how the skin lies to the boxes."""
 
     def lies() -> tuple[str, str, str]:
         return in_box(case, skin, T_base_ct), *lying(case, skin, T_base_ct)
@@ -285,14 +251,10 @@ def base_place(case: Case, skin: TriangleMesh, T_base_ct: Floats, memory: Memory
 def place_warnings(
     case: Case, skin: TriangleMesh, T_base_ct: Floats, text: str, memory: Memory = NO_MEMORY
 ) -> Iterator[Finding]:
-    """One warning where something speaks against the place of a mount or of markers.
+    """One warning where something speaks against the place of a mount or of markers; arguments as of `in_box`.
 
     They say in words where the base is, and have no other reading that could be meant, so they are not refused: without
     an arm the verdicts are about the organs alone, and with one nothing is reached from there.
-
-    Args:
-        skin: CT frame.
-        T_base_ct: Shape (4, 4), mm.
     """
     place = base_place(case, skin, T_base_ct, memory)
     if what := place.impossible or place.unlikely:

@@ -60,7 +60,7 @@ def search_case(
 ) -> Run:
     """Search; write ``candidates.parquet`` and, if wanted, the certificate, the pictures and the page."""
     if certify is not None:
-        from puncture_twin.planning.certify.question import question_of
+        from puncture_twin.planning.certify.certificate import question_of
 
         question_of(context.case, context.anatomy)
     names = ("candidates.parquet", *(PICTURES if pictures else ()), *(() if certify is None else (CERTIFICATE,)))
